@@ -1,9 +1,10 @@
 """Speed and memory as ratios against named baselines of the same run: `make bench [DATA=folder-of-SHREC07-meshes]`.
 
-Each figure runs in a process of its own, so that its peak memory is its own. Without DATA meshes are generated. Ours
-and the baseline are timed in turn, and the medians of the repetitions count. Where the repetitions of either differ by
-more than SPREAD of their median, or other machines took more than STEAL of the processors meanwhile, the figure was
-disturbed: it is measured anew, at most ATTEMPTS times in all, and the calmest counts. The table says how busy it was.
+Each figure is measured in a separate process, so that its peak memory can be told. Without DATA, meshes are generated.
+Our function and the baseline are timed in alternation; the medians of the repetitions count. A measurement is disturbed
+if its repetitions differ by more than SPREAD of their median, or if other virtual machines took more than STEAL of the
+processor time. It is then repeated, at most ATTEMPTS times in all, and the least disturbed one counts. The table shows
+the load of the machine.
 """
 
 from __future__ import annotations
@@ -48,13 +49,13 @@ from igps.spectra import eigenpairs
 K = 250
 SPREAD, STEAL, ATTEMPTS = 0.3, 0.05, 3
 PROJECT = Path(__file__).parents[2]
-BEFORE = "8140bb3"  # whose time from meshes to the table is the baseline
+BEFORE = "8140bb3"  # the commit whose time from meshes to tables of results is the baseline
 VERSION_0_2_0 = "fa3a05e"
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One line of the table: `ratio` is how many times better ours is than the baseline or the target."""
+    """One line of the table. `ratio` is the factor by which our value is better than the baseline or the target."""
 
     value: float
     unit: str
@@ -65,21 +66,21 @@ class Figure:
 
 
 spreads: list[float] = []
-"""Of all that was timed in this process: how far repetitions lie apart, over their median."""
+"""Range of the repetitions over their median, for all timings in this process."""
 
 
 def timed(ours: Callable[[], object], baseline: Callable[[], object], repeat: int = 3) -> tuple[float, float]:
-    """Seconds of both, medians of alternating repetitions."""
+    """Median seconds of both functions, over alternating repetitions."""
     return timed_by(lambda: _seconds(ours), lambda: _seconds(baseline), repeat)
 
 
 def timed_by(ours: Callable[[], float], baseline: Callable[[], float], repeat: int = 3) -> tuple[float, float]:
-    """`timed`, where each tells its seconds itself."""
+    """Like `timed`, for functions that return their own seconds."""
     seconds: tuple[list[float], list[float]] = ([], [])
     for _ in range(repeat):
-        for of, function in zip(seconds, (ours, baseline), strict=True):
-            of.append(function())
-    spreads.extend((max(of) - min(of)) / median(of) for of in seconds)
+        for times, function in zip(seconds, (ours, baseline), strict=True):
+            times.append(function())
+    spreads.extend((max(times) - min(times)) / median(times) for times in seconds)
     return median(seconds[0]), median(seconds[1])
 
 
@@ -90,20 +91,20 @@ def _seconds(function: Callable[[], object]) -> float:
 
 
 class Machine:
-    """How busy the machine is: by its load average, and by what other machines took of its processors since the start.
+    """Load of the machine: its load average, and the processor time that other virtual machines took since the start.
 
-    Both are unknown, NaN, where there is no /proc/stat.
+    Values that the system does not provide are NaN.
     """
 
     def __init__(self) -> None:
         self._start = self._ticks()
 
     def load(self) -> float:
-        """Processes that want to run, mean of a minute; those of the bench among them."""
+        """Mean number of runnable processes over a minute, those of the benchmark included."""
         return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
 
     def steal(self) -> float:
-        """Share of processor time."""
+        """Share of the processor time that other virtual machines took."""
         (total, stolen), (total_now, stolen_now) = self._start, self._ticks()
         return (stolen_now - stolen) / (total_now - total) if total_now > total else float("nan")
 
@@ -113,7 +114,7 @@ class Machine:
             ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
         except OSError:
             return 0.0, 0.0
-        return float(sum(ticks[:8])), float(ticks[7])  # guests are counted in user time already
+        return float(sum(ticks[:8])), float(ticks[7])  # user time includes the time of guests
 
 
 def against(
@@ -128,7 +129,7 @@ def within(limit: float, seconds: float, note: str = "") -> Figure:
 
 
 def model(data: Path | None, n_vertices: int, subdivisions: int = 0) -> Mesh:
-    """The SHREC'07 model, or else a generated body, of about so many vertices; then subdivided at edge midpoints."""
+    """A SHREC'07 model or a generated body of about `n_vertices` vertices, after subdivision at edge midpoints."""
     start = n_vertices // 4**subdivisions
     if data is not None:
         sizes = {path: vertex_count(path) for path in sorted(data.glob("*.off"))}
@@ -158,7 +159,7 @@ def eigen(data: Path | None, n_vertices: int, subdivisions: int = 0, repeat: int
     spectrum = eigenpairs(stiffness, mass, k, positions=mesh.vertices)
     weighted = mass[:, None] * spectrum.eigenfunctions
     error = stiffness @ spectrum.eigenfunctions - weighted * spectrum.eigenvalues
-    # Relative residual in the norm in which the problem is self-adjoint, ‖Lφ − λMφ‖ in M⁻¹ over λ.
+    # Relative residual ‖Lφ − λMφ‖ / λ in the norm of M⁻¹, in which the problem is self-adjoint
     residual = np.sqrt(np.einsum("vk,vk->k", error, error / mass[:, None])) / spectrum.eigenvalues
     return against(
         "scipy eigsh",
@@ -270,7 +271,7 @@ def histogram_backward(data: Path | None) -> Figure:
         (joint_histogram(classes.memberships(potential), [distances]) * upstream).sum().backward()
 
     def by_autograd() -> None:
-        # The same kernel without classes, as autograd runs it: all (pairs, bins) at once, for a sixteenth of the pairs.
+        # The same kernel without classes, by autograd on an array (pairs, bins), for a sixteenth of the pairs
         position = torch.pdist(small)[:, None] - centres
         (torch.relu(1 - position.abs() * 16).sum(dim=0) * upstream[0]).sum().backward()
 
@@ -291,7 +292,7 @@ def chi_square_distances(data: Path | None) -> Figure:
         "scikit-learn additive_chi2_kernel",
         lambda: chi_square(histograms, histograms),
         lambda: additive_chi2_kernel(histograms.numpy(), histograms.numpy()),
-        note="2,000 histograms of 512 cells with one another",
+        note="2,000 histograms of 512 cells, all pairs",
     )
 
 
@@ -302,7 +303,7 @@ def euclidean_distances(data: Path | None) -> Figure:
         "torch cdist",
         lambda: euclidean(vectors, vectors),
         lambda: torch.cdist(vectors, vectors, compute_mode="donot_use_mm_for_euclid_dist"),
-        note="4,000 vectors of 252 numbers with one another; baseline: as exact, without products of matrices",
+        note="4,000 vectors of 252 numbers, all pairs; baseline: of the same accuracy, without matrix products",
     )
 
 
@@ -336,10 +337,10 @@ def oriented_pairs(data: Path | None) -> Figure:
 
 
 def describe_before(data: Path | None) -> dict[str, Figure]:
-    """A body from its signature, one thread, over commit 8140bb3 in turn; seconds of the processor."""
+    """Processor time for the description of a signature on one thread, against commit 8140bb3."""
     mesh = model(data, 10_000)
-    needs = igps.descriptor("multiscale").requirements | igps.descriptor("rich").requirements
-    signature = igps.compute_signature(mesh, needs.apply_to(igps.SignatureConfig()))
+    requirements = igps.descriptor("multiscale").requirements | igps.descriptor("rich").requirements
+    signature = igps.compute_signature(mesh, requirements.apply_to(igps.SignatureConfig()))
     figures = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "signature.npz"
@@ -353,7 +354,7 @@ def describe_before(data: Path | None) -> dict[str, Figure]:
 
 
 def signature_1500(data: Path | None) -> Figure:
-    """A small body to its signature as `pretrained` requires it, one thread, over version 0.2.0 in turn."""
+    """The signature of a small body as `pretrained` requires it, on one thread, against version 0.2.0."""
     mesh = model(data, 1_500)
     config = igps.descriptor("pretrained").requirements.apply_to(igps.SignatureConfig())
     n_samples = len(igps.compute_signature(mesh, config).interior)
@@ -367,24 +368,25 @@ def signature_1500(data: Path | None) -> Figure:
 
 
 def epoch(data: Path | None) -> dict[str, Figure]:
-    """An epoch over 400 stored signatures: without and with workers, over version 0.2.0, and with over without."""
+    """An epoch over 400 stored signatures, without and with workers, against version 0.2.0 and each other."""
     figures = {}
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "meshes"
         igps.ArticulatedShapes(n_classes=4, n_per_class=5, n_vertices=1500).write(root)
         with two_versions("epochs.py", root, VERSION_0_2_0) as seconds_of:
-            alone, before = seconds_of("0")
-            helped, before_helped = seconds_of("2")
+            without_workers, before = seconds_of("0")
+            with_workers, before_with_workers = seconds_of("2")
     note = "400 items of 20 generated bodies, batches of 16; ours from one file, without meshes"
-    figures["epoch"] = Figure(alone, "s", before, "version 0.2.0", before / alone, note)
-    faster = before_helped / helped
-    figures["epoch_workers"] = Figure(helped, "s", before_helped, "version 0.2.0", faster, "two workers")
-    figures["epoch_helped"] = Figure(helped, "s", alone, "no worker", alone / helped, "two workers")
+    figures["epoch"] = Figure(without_workers, "s", before, "version 0.2.0", before / without_workers, note)
+    ratio = before_with_workers / with_workers
+    figures["epoch_workers"] = Figure(with_workers, "s", before_with_workers, "version 0.2.0", ratio, "two workers")
+    ratio = without_workers / with_workers
+    figures["epoch_helped"] = Figure(with_workers, "s", without_workers, "no worker", ratio, "two workers")
     return figures
 
 
 def learned_step(data: Path | None) -> Figure:
-    """A training step of `rich` with learnable bins, 40 shapes of 400 samples, one thread, over version 0.2.0."""
+    """A training step of `rich` with learnable bins, 40 shapes of 400 samples, on one thread, against version 0.2.0."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "meshes"
         igps.ArticulatedShapes(n_classes=4, n_per_class=5, n_vertices=1500).write(root)
@@ -394,72 +396,74 @@ def learned_step(data: Path | None) -> Figure:
 
 
 def together(data: Path | None) -> dict[str, Figure]:
-    """32 bodies described at once, one thread, over one after the other; seconds of the processor."""
+    """Processor time for the description of 32 bodies as one batch, on one thread, against batches of one body."""
     torch.set_num_threads(1)
-    needs = igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
+    requirements = igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
     with tempfile.TemporaryDirectory() as folder:
         igps.ArticulatedShapes(n_classes=8, n_per_class=4, n_vertices=1500).write(f"{folder}/meshes")
-        dataset = igps.SignatureDataset(f"{folder}/meshes", cache_dir=f"{folder}/cache", descriptor=needs).to_memory()
+        dataset = igps.SignatureDataset(f"{folder}/meshes", cache_dir=f"{folder}/cache", descriptor=requirements)
+        signatures = dataset.to_memory()
     figures = {}
-    for n_samples, which in ((400, "400"), (None, "all")):
-        bodies = dataset.to_memory(FewerSamples(n_interior=n_samples, n_surface=n_samples, seed=0))
-        batch, alone = bodies.batch(range(len(bodies))), [bodies.batch([i]) for i in range(len(bodies))]
+    for n_samples, amount in ((400, "400"), (None, "all")):
+        bodies = signatures.to_memory(FewerSamples(n_interior=n_samples, n_surface=n_samples, seed=0))
+        batch, single_bodies = bodies.batch(range(len(bodies))), [bodies.batch([i]) for i in range(len(bodies))]
         for name in ("interior", "pretrained"):
             descriptor = igps.descriptor(name)
 
             def seconds(batches: Sequence[igps.SignatureBatch], descriptor: igps.Descriptor = descriptor) -> float:
                 start = time.process_time()
                 with torch.no_grad():
-                    for one in batches:
-                        descriptor(one)
+                    for batch in batches:
+                        descriptor(batch)
                 return time.process_time() - start
 
-            ours, before = timed_by(lambda: seconds([batch]), lambda: seconds(alone), 5)  # noqa: B023
-            note = f"32 generated bodies, {which} samples"
-            figures[f"together_{name}_{which}"] = Figure(ours, "s", before, "one by one", before / ours, note)
+            ours, before = timed_by(lambda: seconds([batch]), lambda: seconds(single_bodies), 5)  # noqa: B023
+            note = f"32 generated bodies, {amount} samples"
+            figures[f"together_{name}_{amount}"] = Figure(ours, "s", before, "one by one", before / ours, note)
     return figures
 
 
 @contextlib.contextmanager
 def two_versions(script: str, path: Path, commit: str) -> Iterator[Callable[[str], tuple[float, float]]]:
-    """A script beside this one, run by now's igps and by that of a commit on one thread: gives seconds for a line.
+    """Run a script of this folder with the current igps and with that of a commit, each on one thread.
 
-    They are medians of seven turns.
+    Gives a function from a line of input to the seconds that both scripts print, medians of seven repetitions.
     """
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         archive = subprocess.run(["git", "archive", commit, "src"], check=True, capture_output=True, cwd=PROJECT).stdout
         subprocess.run(["tar", "x", "-C", folder], check=True, input=archive)
-        ask = []
+        processes = []
         for source in (PROJECT / "src", Path(folder) / "src"):
+            environment = {**os.environ, **one_thread, "PYTHONPATH": str(source)}
             process = subprocess.Popen(
                 [sys.executable, str(Path(__file__).with_name(script)), str(path)], text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **one, "PYTHONPATH": str(source)},
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment,
             )  # fmt: skip
             stack.enter_context(process)
-            ask.append(process)
+            processes.append(process)
 
         def seconds_of(line: str) -> tuple[float, float]:
             seconds: tuple[list[float], list[float]] = ([], [])
             for _ in range(7):
-                for of, process in zip(seconds, ask, strict=True):
+                for times, process in zip(seconds, processes, strict=True):
                     print(line, file=process.stdin, flush=True)
-                    of.append(float(process.stdout.readline()))  # type: ignore[union-attr]
+                    times.append(float(process.stdout.readline()))  # type: ignore[union-attr]
             return median(seconds[0]), median(seconds[1])
 
         yield seconds_of
-        for process in ask:
+        for process in processes:
             process.stdin.close()  # type: ignore[union-attr]
 
 
 def descriptor_15k(data: Path | None) -> Figure:
-    """Peak memory beside the library itself, for a body of 15,000 samples: 112 million pairs."""
+    """Growth of the peak memory by the histogram of a body of 15,000 samples, which have 112 million pairs."""
     embedding = torch.randn(15_000, K, generator=torch.Generator().manual_seed(0)) * 0.06
     potential = embedding.norm(dim=1)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     pair_histogram(embedding, potential)
-    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20 - before
-    return Figure(grown, "GiB", 1.0, "target", 1.0 / max(grown, 1e-3), "memory beyond the embedding's own 14 MiB")
+    growth = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20 - before
+    return Figure(growth, "GiB", 1.0, "target", 1.0 / max(growth, 1e-3), "memory beyond the embedding's own 14 MiB")
 
 
 def mesh_to_histogram(mesh: Mesh) -> float:
@@ -486,7 +490,7 @@ def mesh_1m(data: Path | None) -> Figure:
 
 
 def shrec07(data: Path | None) -> dict[str, Figure]:
-    """All models to the table by the command line, from nothing over the same at commit BEFORE, and from the cache."""
+    """Retrieval of all models by the command line: without cache against commit BEFORE, and from the cache."""
     if data is None:
         return {}
     figures = {}
@@ -495,7 +499,7 @@ def shrec07(data: Path | None) -> dict[str, Figure]:
         before.mkdir()
         archive = subprocess.run(["git", "archive", BEFORE, "src"], check=True, capture_output=True, cwd=PROJECT).stdout
         subprocess.run(["tar", "x", "-C", before], check=True, input=archive)
-        then = {**os.environ, "PYTHONPATH": str(before / "src")}
+        environment_before = {**os.environ, "PYTHONPATH": str(before / "src")}
 
         def retrieve(descriptor: str, option: str, cache: str, environment: dict[str, str] | None = None) -> float:
             command = [sys.executable, "-m", "igps.cli", "retrieve", str(data), "--descriptor", descriptor]
@@ -504,39 +508,39 @@ def shrec07(data: Path | None) -> dict[str, Figure]:
 
         for name in ("interior", "pretrained"):
             seconds = retrieve(name, "--cache_dir", name)
-            reference = retrieve(name, "--cache", f"{name} before", then)
+            reference = retrieve(name, "--cache", f"{name} before", environment_before)
             figures[f"shrec07_{name}"] = Figure(seconds, "s", reference, f"commit {BEFORE}", reference / seconds)
         figures["shrec07_warm"] = within(10, retrieve("interior", "--cache_dir", "interior"), "interior")
         shutil.rmtree(Path(folder) / "interior" / "descriptions")
-        again = retrieve("interior", "--cache_dir", "interior")
-        figures["shrec07_described"] = within(20, again, "interior, signatures alone from the cache")
+        seconds = retrieve("interior", "--cache_dir", "interior")
+        figures["shrec07_described"] = within(20, seconds, "interior, with signatures but no descriptions in the cache")
     return figures
 
 
 def company(data: Path | None) -> dict[str, Figure]:
-    """Each task beside two busy processes: with the threads of the policy, over the same with one thread.
+    """Each task beside two busy processes: with the library's choice of threads, against one thread.
 
-    How many threads the libraries may use is read when they are loaded, so that each has a process of its own; while
-    one works the other waits for a word.
+    Libraries read their number of threads when they are loaded. So each setting has a worker process, and one waits for
+    input while the other one computes.
     """
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    free = {name: value for name, value in os.environ.items() if name not in (*one, "OMP_WAIT_POLICY")}
+    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    default = {name: value for name, value in os.environ.items() if name not in (*one_thread, "OMP_WAIT_POLICY")}
     figures = {}
     with contextlib.ExitStack() as stack:
-        policy, single = (stack.enter_context(worker(data, environment)) for environment in (free, {**free, **one}))
+        ours, single = (stack.enter_context(worker(data, env)) for env in (default, {**default, **one_thread}))
         for _ in range(2):
             stack.enter_context(busy())
         for task in COMPANY:
-            seconds, reference = timed_by(lambda task=task: policy(task), lambda task=task: single(task), 5)  # type: ignore[misc]
-            slower = seconds / reference
+            seconds, reference = timed_by(lambda task=task: ours(task), lambda task=task: single(task), 5)  # type: ignore[misc]
+            slowdown = seconds / reference
             note = f"{seconds:.2f} s beside two busy processes, {reference:.2f} s with one thread"
-            figures[f"company_{task}"] = Figure(slower, "×", 1.5, "target", 1.5 / slower, note)
+            figures[f"company_{task}"] = Figure(slowdown, "×", 1.5, "target", 1.5 / slowdown, note)
     return figures
 
 
 @contextlib.contextmanager
 def busy() -> Iterator[None]:
-    """A process that computes without end."""
+    """Run a process that keeps a core busy."""
     process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
         yield
@@ -547,28 +551,28 @@ def busy() -> Iterator[None]:
 
 @contextlib.contextmanager
 def worker(data: Path | None, environment: dict[str, str]) -> Iterator[Callable[[str], float]]:
-    """A process that does tasks of `COMPANY` by name, and tells the seconds of each."""
+    """Start a process that runs tasks of `COMPANY`. Gives a function from the name of a task to its seconds."""
     command = [sys.executable, __file__, "--worker"] + (["--data", str(data)] if data else [])
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
     assert process.stdin is not None
     assert process.stdout is not None
     write, read = process.stdin, process.stdout
 
-    def ask(task: str) -> float:
+    def run(task: str) -> float:
         print(task, file=write, flush=True)
         return float(read.readline())
 
     with process:
         try:
-            for task in COMPANY:  # the first time, with all that is loaded and allocated then
-                ask(task)
-            yield ask
+            for task in COMPANY:  # the first run loads libraries and compiles functions
+                run(task)
+            yield run
         finally:
             write.close()
 
 
 def work(data: Path | None) -> None:
-    """What a `worker` does."""
+    """Run tasks by the names on standard input, and print the seconds of each; the main function of a `worker`."""
     mesh = model(data, 3_600)
     descriptor = igps.descriptor("rich")
     with tempfile.TemporaryDirectory() as folder:
@@ -589,7 +593,7 @@ COMPANY = ("signature", "describe", "step")
 
 
 def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
-    """A step of Lightning's, with its loss, gradients and update, on four shapes of two classes."""
+    """A training step by Lightning, with loss, gradients and update, on four shapes of two classes."""
     from pytorch_lightning import Trainer
     from torch.utils.data import DataLoader
 
@@ -601,7 +605,7 @@ def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
     learner = igps.RetrievalLearner(descriptor, BlendedDistance(ProjectionHead(width=16, n_hidden=32)))
     batch = replace(batch, labels=torch.tensor([0, 0, 1, 1]))
     loader: DataLoader[igps.SignatureBatch] = DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
-    learner.on_train_start = lambda: None  # type: ignore[method-assign]  # the fit of the head is no part of a step
+    learner.on_train_start = lambda: None  # type: ignore[method-assign]  # a step does not include the fit of the head
     learner.on_train_epoch_end = lambda: None  # type: ignore[method-assign]
 
     def step() -> None:
@@ -615,16 +619,16 @@ def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
 
 
 def starting(data: Path | None) -> dict[str, Figure]:
-    """What the first line costs: `import igps` beyond `import torch`, and the command line's help."""
+    """Time of `import igps` beyond `import torch`, and of the command line's help."""
 
     def run(*arguments: str) -> Callable[[], object]:
         return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
 
     ours, torch_alone = timed(run("-c", "import igps"), run("-c", "import torch"), 5)
-    helped, _ = timed(run("-m", "igps.cli", "--help"), run("-c", ""), 5)
-    beyond = max(ours - torch_alone, 1e-3)
+    help_seconds, _ = timed(run("-m", "igps.cli", "--help"), run("-c", ""), 5)
+    difference = max(ours - torch_alone, 1e-3)
     note = f"beyond the {torch_alone:.2f} s of `import torch`"
-    return {"import_igps": within(1.5, beyond, note), "igps_help": within(3, helped)}
+    return {"import_igps": within(1.5, difference, note), "igps_help": within(3, help_seconds)}
 
 
 FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
@@ -656,40 +660,40 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
     "import": starting,
     "shrec07": shrec07,
 }
-# What these need is measured of the processes that they start.
+# The peak memory of these figures is that of the processes that they start.
 WITH_PROCESSES = ("company", "import", "shrec07")
 
 
 def run_one(name: str, data: Path | None) -> None:
     result = FIGURES[name](data)
     figures = result if isinstance(result, dict) else {name: result}
-    who = resource.RUSAGE_CHILDREN if name in WITH_PROCESSES else resource.RUSAGE_SELF
-    peak = resource.getrusage(who).ru_maxrss / 2**20
-    measured = {"peak_gib": peak, "spread": max(spreads, default=0.0)}
-    print(json.dumps({key: {**asdict(figure), **measured} for key, figure in figures.items()}))
+    processes = resource.RUSAGE_CHILDREN if name in WITH_PROCESSES else resource.RUSAGE_SELF
+    peak = resource.getrusage(processes).ru_maxrss / 2**20
+    columns = {"peak_gib": peak, "spread": max(spreads, default=0.0)}
+    print(json.dumps({key: {**asdict(figure), **columns} for key, figure in figures.items()}))
 
 
-def calmest(name: str, data: Path | None) -> dict[str, dict[str, float | str]]:
-    """The rows of a figure, measured anew while the machine disturbs them."""
+def least_disturbed(name: str, data: Path | None) -> dict[str, dict[str, float | str]]:
+    """Measure the rows of a figure, again if the measurement was disturbed."""
     command = [sys.executable, __file__, "--here", name] + (["--data", str(data)] if data else [])
     best: dict[str, dict[str, float | str]] = {}
-    least = float("inf")
+    min_disturbance = float("inf")
     for attempt in range(1, ATTEMPTS + 1):
         machine = Machine()
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            sys.exit(f"{name}: failed\n{done.stderr}")
-        rows = json.loads(done.stdout.splitlines()[-1])
+        process = subprocess.run(command, capture_output=True, text=True)
+        if process.returncode:
+            sys.exit(f"{name}: failed\n{process.stderr}")
+        rows = json.loads(process.stdout.splitlines()[-1])
         steal = machine.steal()
         spread = max((row["spread"] for row in rows.values()), default=0.0)
-        disturbed = max(spread / SPREAD, steal / STEAL)
-        if disturbed < least or not best:
-            least, best = disturbed, rows
+        disturbance = max(spread / SPREAD, steal / STEAL)
+        if disturbance < min_disturbance or not best:
+            min_disturbance, best = disturbance, rows
             for row in best.values():
                 row.update(load=machine.load(), steal=steal)
         for row in best.values():
             row["attempts"] = attempt
-        if not disturbed > 1:
+        if not disturbance > 1:
             break
     return best
 
@@ -715,13 +719,13 @@ def main() -> None:
         f"{'steal':>5}  {'spread':>6}  baseline; note"
     )
     for name in options.only:
-        for key, row in calmest(name, options.data).items():
+        for key, row in least_disturbed(name, options.data).items():
             table[key] = row
-            again = f"; measured {row['attempts']} times" if row["attempts"] != 1 else ""
+            attempts = f"; measured {row['attempts']} times" if row["attempts"] != 1 else ""
             print(
                 f"{key:<18}{row['value']:>10.3g} {row['unit']:<10}{row['baseline']:>10.3g}  {row['ratio']:>6.1f}×  "
                 f"{row['peak_gib']:>5.2f} GiB  {row['load']:>5.1f}  {row['steal']:>5.0%}  {row['spread']:>6.0%}  "
-                f"{row['baseline_name']}; {row['note']}{again}",
+                f"{row['baseline_name']}; {row['note']}{attempts}",
                 flush=True,
             )
     options.out.parent.mkdir(parents=True, exist_ok=True)

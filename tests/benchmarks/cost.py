@@ -1,9 +1,9 @@
-"""What a signature costs by vertices and eigenpairs, for `igps doctor`: `python tests/benchmarks/cost.py`.
+"""Cost of a signature by vertices and eigenpairs, for `igps doctor`: `python tests/benchmarks/cost.py`.
 
-Measures the processor time and the peak memory of the signatures of generated bodies, each in a process of its own on
-one thread, fits the constants of `igps.analysis.doctor`, prints them as they stand there, and tells how far off they
-are, on the bodies they were fitted to and, fitted to the others, on each body that is left out. Run it again when the
-eigensolver or the coordinates change; --table keeps what was measured, and what is there is not measured again.
+The script measures processor time and peak memory of the signatures of generated bodies, each in a separate process on
+one thread. It fits the constants of `igps.analysis.doctor`, and prints them in the form of that module, with their
+errors: for the bodies of the fit, and for each body in turn by a fit to the others. Run it again after changes of the
+eigensolver or the coordinates. Measurements are stored in --table, and not repeated.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from igps.signature.signature import SignatureConfig, compute_signature
 
 SIZES = (1_000, 2_500, 6_000, 15_000, 40_000, 100_000)
 EIGENPAIRS = (50, 250)
-# Bodies of each size: classes of generated shapes, fewer of the largest.
+# Classes of generated shapes, one body of each per size; of large bodies only the first few classes.
 CLASSES = (0, 3, 7, 12, 20, 31)
-FEWER = {40_000: 4, 100_000: 3}
-WITHIN = 1.5
+N_CLASSES = {40_000: 4, 100_000: 3}
+TOLERANCE = 1.5  # factor between expected and measured cost
 
 
 def measure(path: Path, n_eigenpairs: int) -> dict[str, float]:
-    """Seconds of the processor for one signature, and bytes at most of this process, which has done nothing else."""
+    """Measure seconds of processor time for one signature, and the peak memory of this process."""
     mesh = load_mesh(path, least_vertices=n_eigenpairs + 2)
     start = time.process_time()
     compute_signature(mesh, SignatureConfig(n_eigenpairs=n_eigenpairs))
@@ -48,28 +48,29 @@ def measure(path: Path, n_eigenpairs: int) -> dict[str, float]:
 
 
 def terms(vertices: NDArray[np.float64], eigenpairs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the costs are sums of: a constant, vertices, and vertices times eigenpairs."""
+    """The terms of the cost: a constant, vertices, and vertices times eigenpairs."""
     return np.stack([np.ones_like(vertices), vertices, vertices * eigenpairs], axis=1)
 
 
 def fitted(columns: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Constants that are not negative, of the least squared relative errors.
+    """Fit non-negative constants by least squares of relative errors.
 
-    Weights are divided by the fit of the pass before, so that what is too high counts as what is too low.
+    The errors are relative to the geometric mean of a value and its fit in the previous pass, so that values that are
+    too high and too low by the same factor count alike.
     """
     weights = 1 / values
     for _ in range(20):
-        found, _ = nnls(columns * weights[:, None], values * weights)
-        weights = 1 / np.sqrt(values * np.maximum(columns @ found, 1e-12))
-    return np.asarray(found)
+        constants, _ = nnls(columns * weights[:, None], values * weights)
+        weights = 1 / np.sqrt(values * np.maximum(columns @ constants, 1e-12))
+    return np.asarray(constants)
 
 
 def accuracy(expected: NDArray[np.float64], measured: NDArray[np.float64]) -> str:
     ratio = expected / measured
-    off = np.exp(np.abs(np.log(ratio)))
+    factor = np.exp(np.abs(np.log(ratio)))
     return (
-        f"within {WITHIN}-fold {100 * (off <= WITHIN).mean():.0f} %, within {np.quantile(off, 0.9):.2f}-fold 90 %; "
-        f"expected over measured {ratio.min():.2f} to {ratio.max():.2f}"
+        f"{100 * (factor <= TOLERANCE).mean():.0f} % within a factor of {TOLERANCE}, 90 % within "
+        f"{np.quantile(factor, 0.9):.2f}; expected over measured {ratio.min():.2f} to {ratio.max():.2f}"
     )
 
 
@@ -80,20 +81,20 @@ def report(rows: list[dict[str, float]]) -> None:
         values = np.array([row[key] for row in rows])
         constants = fitted(columns, values)
         print(f"{name}, {name}_PER_VERTEX, {name}_PER_ENTRY = {', '.join(f'{x:.3g}' for x in constants)}")
-        print(f"  fitted: {accuracy(columns @ constants, values)}")
-        left_out = np.empty(len(values))
+        print(f"  bodies of the fit: {accuracy(columns @ constants, values)}")
+        expected = np.empty(len(values))
         for body in np.unique(bodies):
             own = bodies == body
-            left_out[own] = columns[own] @ fitted(columns[~own], values[~own])
-        print(f"  bodies left out: {accuracy(left_out, values)}")
-        now = np.array([expected_cost(int(v), int(k)) for v, k in zip(vertices, eigenpairs, strict=True)])
-        print(f"  constants as they are: {accuracy(now[:, int(key == 'bytes')], values)}", flush=True)
+            expected[own] = columns[own] @ fitted(columns[~own], values[~own])
+        print(f"  bodies left out: {accuracy(expected, values)}")
+        current = np.array([expected_cost(int(v), int(k)) for v, k in zip(vertices, eigenpairs, strict=True)])
+        print(f"  current constants: {accuracy(current[:, int(key == 'bytes')], values)}", flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, default=Path("build/cost.csv"), help="what was measured")
-    parser.add_argument("--largest", type=int, default=max(SIZES), help="bodies of at most so many vertices")
+    parser.add_argument("--table", type=Path, default=Path("build/cost.csv"), help="file of the measurements")
+    parser.add_argument("--largest", type=int, default=max(SIZES), help="number of vertices of the largest bodies")
     parser.add_argument("--here", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.here:
@@ -106,16 +107,16 @@ def main() -> None:
     done = {(row["size"], row["body"], row["eigenpairs"]) for row in rows}
     options.table.parent.mkdir(parents=True, exist_ok=True)
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    bodies = [(size, body) for size in SIZES if size <= options.largest for body in CLASSES[: FEWER.get(size)]]
+    bodies = [(size, body) for size in SIZES if size <= options.largest for body in CLASSES[: N_CLASSES.get(size)]]
     for size, body in bodies:
-        wanted = [n_eigenpairs for n_eigenpairs in EIGENPAIRS if (size, body, n_eigenpairs) not in done]
-        if not wanted:
+        missing = [n_eigenpairs for n_eigenpairs in EIGENPAIRS if (size, body, n_eigenpairs) not in done]
+        if not missing:
             continue
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "body.off"
             shape = ArticulatedShapes(body + 1, 1, seed=5, n_vertices=size)[body]
             path.write_text(off_text(shape.vertices, shape.faces))
-            for n_eigenpairs in wanted:
+            for n_eigenpairs in missing:
                 command = [sys.executable, __file__, "--here", str(path), str(n_eigenpairs)]
                 output = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | threads)
                 rows.append({"size": size, "body": body, **json.loads(output.stdout.splitlines()[-1])})

@@ -1,8 +1,8 @@
-"""What describing a stored signature costs, by whichever igps is on the path: of now, or of commit 8140bb3.
+"""Cost of describing a stored signature, by the igps on the path: the current version, or that of commit 8140bb3.
 
     python describing.py SIGNATURE.npz
 
-For each descriptor named on a line of its input it tells the seconds of processor time.
+Each line of standard input names a descriptor. The script prints the seconds of processor time for each.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ try:
 except ModuleNotFoundError:  # its place in commit 8140bb3
     from igps.geometry.signature import Samples, Signature, SignatureConfig
 
-ROOMS = ("interior", "surface")
+KINDS = ("interior", "surface")
 
 
 def save(signature: Signature, path: Path) -> None:
-    """Write what both versions know of a signature."""
+    """Write the fields of a signature that both versions have."""
     arrays: dict[str, Any] = {"eigenvalues": signature.eigenvalues, "scalars": [signature.area, signature.volume]}
-    for room in ROOMS:
-        samples: Samples = getattr(signature, room)
-        arrays |= {f"{room} points": samples.points, f"{room} eigenfunctions": samples.eigenfunctions}
-        arrays |= {f"{room} attribute {name}": values for name, values in samples.attributes.items()}
+    for kind in KINDS:
+        samples: Samples = getattr(signature, kind)
+        arrays |= {f"{kind} points": samples.points, f"{kind} eigenfunctions": samples.eigenfunctions}
+        arrays |= {f"{kind} attribute {name}": values for name, values in samples.attributes.items()}
     np.savez(path, **arrays)
 
 
 def load(path: Path) -> Signature:
     with np.load(path) as arrays:
-        rooms = []
-        for room in ROOMS:
-            prefix = f"{room} attribute "
+        samples = []
+        for kind in KINDS:
+            prefix = f"{kind} attribute "
             names = [name.removeprefix(prefix) for name in arrays.files if name.startswith(prefix)]
             attributes = {name: arrays[prefix + name] for name in names}
-            rooms.append(Samples(arrays[f"{room} points"], arrays[f"{room} eigenfunctions"], attributes))
+            samples.append(Samples(arrays[f"{kind} points"], arrays[f"{kind} eigenfunctions"], attributes))
         area, volume = arrays["scalars"].tolist()
-        return Signature(arrays["eigenvalues"], *rooms, area, volume, SignatureConfig())
+        return Signature(arrays["eigenvalues"], *samples, area, volume, SignatureConfig())
 
 
 def main() -> None:
@@ -65,7 +65,7 @@ def main() -> None:
             name = line.strip()
             if name not in made:
                 made[name] = make(name).eval()
-                made[name](collate([signature]))  # with all that is loaded and compiled the first time
+                made[name](collate([signature]))  # the first call loads and compiles functions
             start = time.process_time()
             made[name](collate([signature]))
             print(time.process_time() - start, flush=True)

@@ -1,10 +1,10 @@
-"""What an epoch over stored signatures costs, by whichever igps is on the path: of now, or of version 0.2.0.
+"""Cost of an epoch over stored signatures, by the igps on the path: the current version, or version 0.2.0.
 
     python epochs.py FOLDER-OF-MESHES
 
-Each line of its input is a number of worker processes, with "memory" behind it for signatures in memory; for each it
-tells the seconds of an epoch of batches of 16, the start of the workers not counted. Now's igps reads an exported file,
-without the meshes; version 0.2.0 its cache.
+Each line of standard input is a number of worker processes, followed by "memory" for signatures in memory. The script
+prints the seconds of an epoch in batches of 16 for each, without the start of the workers. The current version reads an
+exported file without meshes; version 0.2.0 reads its cache.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def main() -> None:
         path = root.parent / f"{version}.igps"
         dataset.to_file(path)
         dataset = igps.SignatureDataset.from_file(path)
-    whole = [i % len(dataset) for i in range(N_ITEMS)]
+    indices = [i % len(dataset) for i in range(N_ITEMS)]
     collate = importlib.import_module("igps").collate
     loaders: dict[str, Any] = {}
     for line in sys.stdin:
@@ -46,7 +46,7 @@ def main() -> None:
             items = dataset.to_memory() if where and hasattr(dataset, "to_memory") else dataset
             n = int(n_workers)
             loaders[line] = DataLoader(
-                items, 16, sampler=whole, num_workers=n, persistent_workers=n > 0, collate_fn=collate
+                items, 16, sampler=indices, num_workers=n, persistent_workers=n > 0, collate_fn=collate
             )
             epoch(loaders[line])
         print(epoch(loaders[line]), flush=True)

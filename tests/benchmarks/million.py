@@ -1,8 +1,9 @@
-"""A gallery of a million made vectors: `python tests/benchmarks/million.py [--n N] [--folder FOLDER]`.
+"""A gallery of a million random vectors: `python tests/benchmarks/million.py [--n N] [--folder FOLDER]`.
 
-Families of 250, whose members differ by noise of a tenth of their length and come in any order, as those of a gallery;
-with `--noise 0.7` the nearest of a query are members and strangers, spread over many clusters. It tells what building
-costs, how long queries take, with conditions and without, and how many of the nearest ten of all are found.
+The vectors form families of 250, whose members differ by noise of a tenth of their length and are in random order, as
+in a gallery. With `--noise 0.7`, the nearest vectors of a query belong to several families and are spread over many
+clusters of the index. The script prints the cost of building the gallery, the time of queries with and without
+conditions, and the recall of the ten nearest vectors.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ def members(centres: np.ndarray, noise: float, generator: np.random.Generator) -
 
 @cache
 def families(n_rows: int) -> np.ndarray:
-    """(n_rows / 250, 256) what the members of each have in common."""
+    """(n_rows / 250, 256) centres of the families."""
     return np.random.default_rng(0).standard_normal((n_rows // FAMILY, WIDTH), dtype=np.float32)
 
 
 def batch(start: int, n_rows: int, noise: float) -> tuple[torch.Tensor, list[dict[str, Any]]]:
-    """Each family has the same share of every batch."""
+    """Vectors and rows of the table from a position on. Each family has the same share of every batch."""
     generator, centres = np.random.default_rng([1, start]), families(n_rows)
     family = np.arange(start, start + BATCH) % len(centres)
     vectors = members(centres[family], noise, generator)
@@ -55,32 +56,34 @@ def batch(start: int, n_rows: int, noise: float) -> tuple[torch.Tensor, list[dic
 
 
 def queries(n: int, n_rows: int, noise: float) -> np.ndarray:
-    """Further members of families."""
+    """(n, 256) further members of random families."""
     generator = np.random.default_rng(2)
     centres = families(n_rows)
     return members(centres[generator.integers(0, len(centres), n)], noise, generator)
 
 
-def nearest_of_all(asked: np.ndarray, n_rows: int, noise: float) -> dict[str, np.ndarray]:
-    """The numbers (Q, 10) of the nearest under each condition, by comparing all."""
-    far = {name: np.full((len(asked), TOP), np.inf) for name in CONDITIONS}
-    found = {name: np.zeros((len(asked), TOP), dtype=np.int64) for name in CONDITIONS}
+def exact_nearest(vectors: np.ndarray, n_rows: int, noise: float) -> dict[str, np.ndarray]:
+    """Indices (Q, 10) of the nearest rows under each condition, by comparison with all rows."""
+    distances = {name: np.full((len(vectors), TOP), np.inf) for name in CONDITIONS}
+    indices = {name: np.zeros((len(vectors), TOP), dtype=np.int64) for name in CONDITIONS}
     for start in range(0, n_rows, BATCH):
-        vectors, rows = batch(start, n_rows, noise)
-        away = 1 - asked @ vectors.numpy().T
+        batch_vectors, rows = batch(start, n_rows, noise)
+        batch_distances = 1 - vectors @ batch_vectors.numpy().T
         label = np.array([int(row["class"]) for row in rows])
-        kept = {"all": np.ones(BATCH, bool), "1 % at random": np.array([row["volume"] < 0.01 for row in rows]),
-                "1 % by class": (label >= 3) & (label <= 7)}  # fmt: skip
-        for name, mask in kept.items():
-            numbers = np.broadcast_to(start + np.flatnonzero(mask), (len(asked), int(mask.sum())))
-            both, which = np.hstack([far[name], away[:, mask]]), np.hstack([found[name], numbers])
-            best = np.argsort(both, axis=1)[:, :TOP]
-            far[name], found[name] = (np.take_along_axis(one, best, axis=1) for one in (both, which))
-    return found
+        masks = {"all": np.ones(BATCH, bool), "1 % at random": np.array([row["volume"] < 0.01 for row in rows]),
+                 "1 % by class": (label >= 3) & (label <= 7)}  # fmt: skip
+        for name, mask in masks.items():
+            batch_indices = np.broadcast_to(start + np.flatnonzero(mask), (len(vectors), int(mask.sum())))
+            candidates = np.hstack([distances[name], batch_distances[:, mask]])
+            candidate_indices = np.hstack([indices[name], batch_indices])
+            best = np.argsort(candidates, axis=1)[:, :TOP]
+            distances[name] = np.take_along_axis(candidates, best, axis=1)
+            indices[name] = np.take_along_axis(candidate_indices, best, axis=1)
+    return indices
 
 
 def main() -> None:
-    """Build it if it is not there, and ask."""
+    """Build the gallery if it does not exist, and search it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--n", type=int, default=1_000_000)
     parser.add_argument("--noise", type=float, default=0.1)
@@ -93,26 +96,26 @@ def main() -> None:
         _table.write(arguments.folder, {"descriptor": "made"}, "cosine", batches, {})
         size = sum(path.stat().st_size for path in arguments.folder.rglob("*") if path.is_file())
         print(f"built in {time.monotonic() - start:.0f} s, {size / 2**30:.2f} GiB, {memory()}", flush=True)
-    table, asked = BodyTable(arguments.folder), queries(arguments.n_queries, arguments.n, arguments.noise)
+    table, vectors = BodyTable(arguments.folder), queries(arguments.n_queries, arguments.n, arguments.noise)
     answers: dict[str, list[list[int]]] = {}
     seconds: dict[str, list[float]] = {}
     for name, where in CONDITIONS.items():
-        for query in torch.from_numpy(asked):
-            begun = time.perf_counter()
+        for query in torch.from_numpy(vectors):
+            start = time.perf_counter()
             rows, _, _ = nearest_rows(table, query[None], cosine, top=TOP, candidates=CANDIDATES, where=where or None)
-            seconds.setdefault(name, []).append(time.perf_counter() - begun)
+            seconds.setdefault(name, []).append(time.perf_counter() - start)
             answers.setdefault(name, []).append([int(row["name"]) for row in rows])
-    asking = memory()
-    for name, expected in nearest_of_all(asked, arguments.n, arguments.noise).items():
-        both = zip(answers[name], expected.tolist(), strict=True)
-        recall = np.mean([len(set(one) & set(other)) / TOP for one, other in both])
-        median, rare = (1e3 * np.quantile(seconds[name], share) for share in (0.5, 0.99))
-        print(f"{name}: {median:.1f} ms (median), {rare:.1f} ms (99 %), {recall:.4f} of the nearest {TOP}; {asking}")
+    search_memory = memory()
+    for name, expected in exact_nearest(vectors, arguments.n, arguments.noise).items():
+        pairs = zip(answers[name], expected.tolist(), strict=True)
+        recall = np.mean([len(set(answer) & set(exact)) / TOP for answer, exact in pairs])
+        median, slow = (1e3 * np.quantile(seconds[name], share) for share in (0.5, 0.99))
+        print(f"{name}: {median:.1f} ms (median), {slow:.1f} ms (99 %), recall {recall:.4f} at {TOP}; {search_memory}")
 
 
 def memory() -> str:
-    """The most that this process has had."""
-    return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB of memory at most"
+    """The peak memory of this process."""
+    return f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB"
 
 
 if __name__ == "__main__":

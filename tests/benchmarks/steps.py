@@ -1,9 +1,10 @@
-"""What a training step costs, by whichever igps is on the path: of now, or of version 0.2.0.
+"""Cost of a training step, by the igps on the path: the current version, or version 0.2.0.
 
     python steps.py FOLDER-OF-MESHES
 
-For each line of its input it tells the seconds of a step of `rich` with learnable bins and filters: 40 shapes of 4
-classes with 400 samples each, the distances of all to all, a contrastive loss, its gradients, and the update.
+For each line of standard input, the script prints the seconds of a step of `rich` with learnable bins and filters: the
+descriptions of 40 shapes of 4 classes with 400 samples each, all pairwise distances, a contrastive loss, its gradients,
+and the update.
 """
 
 from __future__ import annotations
@@ -36,20 +37,20 @@ def main() -> None:
     )
     dataset: Any = igps.SignatureDataset(root, config, root.parent / f"cache-{version}")
     batch = importlib.import_module("igps").collate([dataset[i % len(dataset)] for i in range(N_SHAPES)])
-    same = torch.arange(N_SHAPES) % N_CLASSES
+    classes = torch.arange(N_SHAPES) % N_CLASSES
     optimizer = torch.optim.Adam(descriptor.parameters())
-    step(descriptor, optimizer, batch, same)  # with all that is loaded and compiled the first time
+    step(descriptor, optimizer, batch, classes)  # the first call loads and compiles functions
     for _ in sys.stdin:
         start = time.process_time()
-        step(descriptor, optimizer, batch, same)
+        step(descriptor, optimizer, batch, classes)
         print(time.process_time() - start, flush=True)
 
 
 def step(descriptor: Any, optimizer: torch.optim.Optimizer, batch: Any, classes: Tensor) -> None:
-    described = descriptor(batch).flatten(1)
-    likeness = -20 * torch.cdist(described.clamp(min=1e-9).sqrt(), described.clamp(min=1e-9).sqrt())
-    likeness = likeness.masked_fill(torch.eye(len(classes), dtype=torch.bool), -torch.inf).log_softmax(dim=1)
-    loss = -likeness[(classes[:, None] == classes) & ~torch.eye(len(classes), dtype=torch.bool)].mean()
+    roots = descriptor(batch).flatten(1).clamp(min=1e-9).sqrt()
+    is_self = torch.eye(len(classes), dtype=torch.bool)
+    similarity = (-20 * torch.cdist(roots, roots)).masked_fill(is_self, -torch.inf).log_softmax(dim=1)
+    loss = -similarity[(classes[:, None] == classes) & ~is_self].mean()
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()

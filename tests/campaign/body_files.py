@@ -1,4 +1,4 @@
-"""Label volumes, molecules, scenes, and images, grids and vertex values beside bodies, whole or with a fault."""
+"""Label volumes, molecules, scenes, and images, grids and vertex values beside bodies, intact or with a fault."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ REFUSED, AS_IT_IS = "refused", "as it is"
 
 @dataclass(frozen=True)
 class BodyFile:
-    """A file of bodies, with what lies beside it.
+    """A file of bodies, and the files beside it.
 
     Args:
         kind: "volume", "molecule", "scene" or "image".
-        files: their contents by name, that of the bodies first.
-        expected: `REFUSED` as a whole; or by the name of a body its volume, `REFUSED`, or `AS_IT_IS` if it is that of
-            the file without a fault; None where whatever is read must hold against a second reader.
-        story: what was done to it.
-        options: how it is read, of `LoadOptions`.
+        files: contents by name, the file of the bodies first.
+        expected: `REFUSED` if the whole file is refused. Else for each body, by name, the volume, `REFUSED`, or
+            `AS_IT_IS` for the volume in the file without a fault. None if a second reader provides the expected result.
+        story: the fault, in words.
+        options: arguments of `LoadOptions`.
     """
 
     kind: str
@@ -50,12 +50,12 @@ class BodyFile:
 
     @property
     def name(self) -> str:
-        """Of the file of the bodies."""
+        """Name of the file of the bodies."""
         return next(iter(self.files))
 
 
 def body_file(seed: int, number: int) -> BodyFile:
-    """The file of this number; kinds take turns, and faults are drawn."""
+    """Make the file of a seed and a number. Kinds alternate, and faults are random."""
     generator = np.random.default_rng([seed, number])
     make = (_volume, _molecule, _image, _volume, _molecule, _scene, _pqr, _beside, _dicom, _beside)[number % 10]
     return make(generator)
@@ -66,7 +66,7 @@ def _drawn(generator: Generator, faults: Iterable[str]) -> str:
 
 
 def _damaged(generator: Generator, given: BodyFile, packed: bool) -> BodyFile:
-    """With bytes or words that are others, or cut off; inside the compression or outside."""
+    """Damage bytes or words of a file, inside or outside the compression."""
     name, content = given.name, given.files[given.name]
     inside = packed and generator.random() < 0.5
     if inside:
@@ -87,16 +87,16 @@ _VOLUMES = ("nii", "nii.gz", "mgz", "nrrd", "mha", "tif")
 
 @cache
 def labels() -> Array:
-    """Three ellipsoids, two of which touch, and one at the border."""
+    """Three ellipsoids; two of them touch, and one is at the border."""
     x, y, z = np.indices(SHAPE)
-    found = np.zeros(SHAPE, dtype=np.int16)
+    volume = np.zeros(SHAPE, dtype=np.int16)
     for label, (cx, cy, cz), (a, b, c) in (
         (1, (7, 7, 7), (6, 6, 5)),
         (4, (17, 7, 7), (5, 5, 4)),
         (9, (12, 19, 6), (8, 5, 5)),
     ):
-        found[(found == 0) & (((x - cx) / a) ** 2 + ((y - cy) / b) ** 2 + ((z - cz) / c) ** 2 < 1)] = label
-    return found
+        volume[(volume == 0) & (((x - cx) / a) ** 2 + ((y - cy) / b) ** 2 + ((z - cz) / c) ** 2 < 1)] = label
+    return volume
 
 
 def _volume(generator: Generator) -> BodyFile:
@@ -121,13 +121,13 @@ def _volume(generator: Generator) -> BodyFile:
             fault
         ]
         beside["x.csv"] = "\n".join(["label,name", *(f"{label},{name}" for label, name in given.items())]).encode()
-        twice = fault == "names repeat"  # they get their numbers behind
-        expected = {f"liver ({k})" if twice else given.get(int(k), k): v for k, v in expected.items()}
+        is_repeated = fault == "names repeat"  # repeated names are followed by the number of the label
+        expected = {f"liver ({k})" if is_repeated else given.get(int(k), k): v for k, v in expected.items()}
     elif fault in ("no names", "no such names"):
         options["names"] = "names.csv" if fault == "no names" else "none.csv"
         beside = {"names.csv": b"nothing is named here\n"} if fault == "no names" else {}
         expected = "refused, the table is named"
-    if fault in ("complex", "colours"):  # of the formats that have them
+    if fault in ("complex", "colours"):  # NIfTI supports these types
         suffix = "nii"
     if fault in ("singular", "axis without length"):
         suffix = suffix if suffix in ("nii", "nii.gz") else "nii"
@@ -135,13 +135,13 @@ def _volume(generator: Generator) -> BodyFile:
         values = values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
     if suffix == "tif" and values.ndim == 4:
         suffix = "nrrd"
-    content = _promising(generator, suffix) if fault == "promises" else written_volume(suffix, values, affine)
+    content = _oversized(generator, suffix) if fault == "promises" else written_volume(suffix, values, affine)
     expected = REFUSED if fault == "promises" else expected
     return BodyFile("volume", {f"x.{suffix}": content, **beside}, expected, f"{suffix}: {fault}", options)
 
 
 def written_volume(suffix: str, values: Array, affine: Array) -> bytes:
-    """The file of any array."""
+    """Write an array, valid or not, in a format."""
     if suffix in ("nii", "nii.gz"):
         image = nibabel.Nifti1Image(values, None, dtype=values.dtype)
         for row, words in zip("xyz", affine, strict=False):
@@ -158,25 +158,25 @@ def written_volume(suffix: str, values: Array, affine: Array) -> bytes:
     lps = np.diag([-1, -1, 1, 1]) @ affine
     raw = np.asfortranarray(values).tobytes(order="F")
     sizes = " ".join(map(str, values.shape))
-    ways = lps[:3, :3].T
+    axes = lps[:3, :3].T
     if suffix == "mha":
         kinds = {"int16": "MET_SHORT", "float32": "MET_FLOAT", "float64": "MET_DOUBLE"}
-        sides = np.linalg.norm(ways, axis=1)
-        more = [0.0] * (values.ndim - 3)
-        turn = np.eye(values.ndim)
-        turn[:3, :3] = ways / sides[:, None]
+        sides = np.linalg.norm(axes, axis=1)
+        zeros = [0.0] * (values.ndim - 3)
+        directions = np.eye(values.ndim)
+        directions[:3, :3] = axes / sides[:, None]
         rows = (
             f"ObjectType = Image\nNDims = {values.ndim}\nBinaryData = True\nBinaryDataByteOrderMSB = False\n"
-            f"TransformMatrix = {_words(turn.ravel())}\nOffset = {_words([*lps[:3, 3], *more])}\n"
-            f"ElementSpacing = {_words([*sides, *(1 + x for x in more)])}\nDimSize = {sizes}\n"
+            f"TransformMatrix = {_words(directions.ravel())}\nOffset = {_words([*lps[:3, 3], *zeros])}\n"
+            f"ElementSpacing = {_words([*sides, *(1 + x for x in zeros)])}\nDimSize = {sizes}\n"
             f"ElementType = {kinds[str(values.dtype)]}\nElementDataFile = LOCAL\n"
         )
         return rows.encode() + raw
     kinds = {"int16": "short", "float32": "float", "float64": "double"}
-    directions = " ".join(f"({','.join(map(str, way))})" for way in ways) + " none" * (values.ndim - 3)
+    space = " ".join(f"({','.join(map(str, axis))})" for axis in axes) + " none" * (values.ndim - 3)
     rows = (
         f"NRRD0004\ntype: {kinds[str(values.dtype)]}\ndimension: {values.ndim}\nspace: left-posterior-superior\n"
-        f"sizes: {sizes}\nspace directions: {directions}\nkinds:{' domain' * 3}{' list' * (values.ndim - 3)}\n"
+        f"sizes: {sizes}\nspace directions: {space}\nkinds:{' domain' * 3}{' list' * (values.ndim - 3)}\n"
         f"endian: little\nencoding: gzip\nspace origin: ({','.join(map(str, lps[:3, 3]))})\n\n"
     )
     return rows.encode() + gzip.compress(raw, mtime=0)
@@ -186,8 +186,8 @@ def _words(numbers: Iterable[float]) -> str:
     return " ".join(repr(float(x)) for x in numbers)
 
 
-def _promising(generator: Generator, suffix: str) -> bytes:
-    """A header of 10^13 voxels and more, and a few."""
+def _oversized(generator: Generator, suffix: str) -> bytes:
+    """A file with few voxels, whose header declares 10^13 voxels or more."""
     content = written_volume(suffix, labels(), AFFINE)
     if suffix in ("nrrd", "mha"):
         return content.replace(b" ".join(b"%d" % n for n in SHAPE), b"100000 100000 100000")
@@ -274,7 +274,7 @@ def _dicom(generator: Generator) -> BodyFile:
 
 @cache
 def helices() -> tuple[str, ...]:
-    """The lines of a PDB file of two helices, A and B, without hydrogens."""
+    """Lines of a PDB file of two helices, A and B, without hydrogens."""
     lines, serial = [], 0
     for chain, n, x in (("A", 12, 0.0), ("B", 9, 14.0)):
         for i in range(n):
@@ -299,10 +299,10 @@ def atom_line(
     serial: int, name: str, residue: str, chain: str, number: int, at: Iterable[float], *, element: str | None = None,
     altloc: str = " ", occupancy: float = 1.0, record: str = "ATOM",
 ) -> str:  # fmt: skip
-    """Of a PDB file."""
-    place = "".join(f"{x:8.3f}"[:8] for x in at)
+    """A line of an atom in a PDB file."""
+    position = "".join(f"{x:8.3f}"[:8] for x in at)
     return (
-        f"{record:<6}{serial:>5} {f' {name}':<4}{altloc}{residue:>3} {chain}{number:>4}    {place}"
+        f"{record:<6}{serial:>5} {f' {name}':<4}{altloc}{residue:>3} {chain}{number:>4}    {position}"
         f"{occupancy:6.2f}{20:6.2f}          {element or name[0]:>2}"
     )
 
@@ -315,7 +315,7 @@ def _molecule(generator: Generator) -> BodyFile:
     if fault != "damage":
         lines, changed = _ON_MOLECULES[fault](generator, lines)
         expected = {**expected, **changed} if isinstance(changed, dict) else changed
-    if fault in ("nowhere", "all nowhere"):  # stars are words of a PDB file alone
+    if fault in ("nowhere", "all nowhere"):  # only PDB files may have asterisks in place of numbers
         suffix = "pdb"
     text = "\n".join(lines) + "\n"
     content = gemmi.read_pdb_string(text).make_mmcif_document().as_string() if suffix == "cif" else text
@@ -331,9 +331,9 @@ Change = tuple[list[str], Any]
 
 
 def _each_atom(lines: list[str], change: Callable[[str, int], str | None]) -> list[str]:
-    """The atoms changed or, where it is None, left out."""
-    found = [change(line, i) if line.startswith("ATOM") else line for i, line in enumerate(lines)]
-    return [line for line in found if line is not None]
+    """Change the line of each atom, or leave it out if the change is None."""
+    changed = [change(line, i) if line.startswith("ATOM") else line for i, line in enumerate(lines)]
+    return [line for line in changed if line is not None]
 
 
 def _of_chain_a(change: Callable[[str], str], last: int = 10**6) -> Callable[[Generator, list[str]], list[str]]:
@@ -400,10 +400,10 @@ _ON_MOLECULES: dict[str, Callable[[Generator, list[str]], Change]] = {
 
 
 def _pqr(generator: Generator) -> BodyFile:
-    """Charges and radii in the last columns, by words."""
+    """A PQR file: words separated by spaces, with charges and radii in the last columns."""
     lines = [
         f"ATOM {line[6:11]} {line[12:16]} {line[17:20]} {line[21]} {line[22:26]} {line[30:54]} {charge:.4f} 1.80"
-        for line, charge in zip((one for one in helices() if one.startswith("ATOM")), cycle([0.1, -0.1]), strict=False)
+        for line, charge in zip((x for x in helices() if x.startswith("ATOM")), cycle([0.1, -0.1]), strict=False)
     ]
     fault = _drawn(generator, ("nothing", "remarks", "no chains", "radius", "charge", "damage", "damage"))
     expected: Any = {"chain A": None, "chain B": None}
@@ -461,7 +461,7 @@ def _scene(generator: Generator) -> BodyFile:
 
 
 def field_at(points: Array) -> Array:
-    """What the image says at points (P, 3)."""
+    """Values of the image at points (P, 3)."""
     return 100 + points @ np.array([2.0, -3.0, 1.0])
 
 
@@ -492,14 +492,15 @@ def _image(generator: Generator) -> BodyFile:
 
 
 def _beside(generator: Generator) -> BodyFile:
-    """Grids and values at vertices beside a ball."""
+    """A grid or values at vertices, beside a ball."""
     suffix = str(generator.choice(["dx", "mrc", "map", "ply", "vtk", "shape.gii", "curv"]))
     is_grid = suffix in ("dx", "mrc", "map")
     faults = ["nothing", "damage", "damage", "some holes", "not finite"]
     fault = _drawn(generator, [*faults, "half", "of another", "border"] if is_grid else [*faults, "of another"])
     ball = trimesh.creation.icosphere(subdivisions=2, radius=3.0)
     content = (_grid if is_grid else _at_vertices)(generator, suffix, fault, ball)
-    # A vertex whose value is that of a neighbour, 2 off, has a share of 1/162 inside, at most twice that in nearly all.
+    # One vertex gets the value of a neighbour, with an error of 2. The mean weight of a vertex inside is 1/162, and at
+    # nearly all points its weight is at most twice the mean.
     slack = 2 * 2 / len(ball.vertices) if fault == "some holes" and not is_grid else 0.0
     beside, expected = {f"x.{suffix}": content}, {"linear": slack}
     if fault in ("half", "of another", "not finite"):
@@ -551,7 +552,7 @@ def _integers(numbers: Iterable[int]) -> str:
 
 
 def _at_vertices(generator: Generator, suffix: str, fault: str, ball: trimesh.Trimesh) -> bytes:
-    """Written by hand, but for GIFTI by nibabel."""
+    """A file of values at vertices. GIFTI is written by nibabel, other formats are assembled here."""
     values = _holed(generator, field_at(ball.vertices).astype(np.float32), fault)
     values = values[:-1] if fault == "of another" else values
     if suffix == "shape.gii":

@@ -1,6 +1,6 @@
-"""Broken volumes, molecules, scenes and images end in a sentence with a remedy, or in right bodies.
+"""Broken volumes, molecules, scenes and images give a message with a remedy, or correct bodies.
 
-`python tests/campaign/broken_bodies.py --case 123` repeats one file and keeps it.
+`python tests/campaign/broken_bodies.py --case 123` repeats the trial of one file, and stores the file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import SimpleITK
 import trimesh
 from body_files import AS_IT_IS, REFUSED, BodyFile, body_file, field_at, helices
-from broken_meshes import Verdict, tallied
+from broken_meshes import Verdict, count_verdicts
 from outcome import Row
 from scipy import ndimage
 
@@ -28,20 +28,20 @@ from igps.data.attribute_sources import attribute_source
 from igps.mesh.loading import BodyRef, each_body, list_bodies
 
 SEED = 17
-# The surface of a label encloses the volume of its voxels, and that of a scene is exact.
+# Relative tolerances of volumes: of the surface of a label against its voxels, and of a scene.
 VOLUME, EXACT = 5e-3, 1e-5
-# A sentence, and then what to do.
+# The end of a message: a remedy after the first sentence
 _REMEDY = re.compile(r"[.;:] [A-Z][^.]*.*[.)]$", re.DOTALL)
 
 
 def examine(job: tuple[int, int]) -> Verdict:
-    """Read the bodies of the file of a number, in a folder that is removed."""
+    """Try the file of a seed and a number, in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
         return judge(body_file(*job), Path(folder))
 
 
 def judge(given: BodyFile, folder: Path) -> Verdict:
-    """What becomes of the file."""
+    """Read the bodies of a file, and check the result."""
     for name, content in given.files.items():
         (folder / name).write_bytes(content)
     path = folder / given.name
@@ -54,9 +54,9 @@ def judge(given: BodyFile, folder: Path) -> Verdict:
         try:
             if given.kind == "image":
                 return _judge_image(given, path)
-            read = LoadOptions(**options)
-            bodies = {str(ref.part): (ref, body) for ref, body in each_body(path, read)}
-            listed = [str(ref.part) for ref in list_bodies(path, read)]
+            load_options = LoadOptions(**options)
+            bodies = {str(ref.part): (ref, body) for ref, body in each_body(path, load_options)}
+            listed = [str(ref.part) for ref in list_bodies(path, load_options)]
         except MeshError as error:
             expected = given.expected if isinstance(given.expected, str) else None
             if given.expected is not None and expected is None:
@@ -74,10 +74,11 @@ def judge(given: BodyFile, folder: Path) -> Verdict:
         return _judge_bodies(given, path, bodies)
 
 
-def _refused(error: Exception, named: Path | str, folder: Path) -> Verdict:
+def _refused(error: Exception, name: Path | str, folder: Path) -> Verdict:
+    """The verdict on a message, which must contain a name and a remedy."""
     text = str(error)
-    if str(named) not in text:
-        return Verdict("wrong", f"{named} is not named: {text}")
+    if str(name) not in text:
+        return Verdict("wrong", f"{name} is not named: {text}")
     if not _REMEDY.search(text):
         return Verdict("wrong", f"no remedy: {text}")
     return Verdict("refused", text.replace(str(folder), "FOLDER"))
@@ -88,7 +89,7 @@ def _judge_bodies(given: BodyFile, path: Path, bodies: dict[str, tuple[BodyRef, 
     if expected is not None and set(expected) != set(bodies):
         return Verdict("wrong", f"{sorted(bodies)} were read, {sorted(expected)} expected")
     bounds = _bounds(path) if given.kind == "volume" and expected is None else {}
-    said = []
+    refusals = []
     for part, (ref, body) in bodies.items():
         wanted = None if expected is None else expected[part]
         if isinstance(body, MeshError):
@@ -97,7 +98,7 @@ def _judge_bodies(given: BodyFile, path: Path, bodies: dict[str, tuple[BodyRef, 
                 return Verdict("wrong", f"{part}: refused, {wanted} expected: {body}")
             if verdict.kind == "wrong":
                 return verdict
-            said.append(verdict.reason)
+            refusals.append(verdict.reason)
             continue
         if wanted == REFUSED:
             return Verdict("wrong", f"{part}: read, and a refusal was expected")
@@ -112,11 +113,15 @@ def _judge_bodies(given: BodyFile, path: Path, bodies: dict[str, tuple[BodyRef, 
             low, high = wanted * (1 - error), wanted * (1 + error)
         if not low <= surface.volume <= high:
             return Verdict("wrong", f"{part}: volume {surface.volume}, between {low} and {high} expected")
-    return Verdict("refused" if said else "confirmed", "; ".join(said), ("bodies",) * (len(bodies) - len(said)))
+    kind, n_confirmed = "refused" if refusals else "confirmed", len(bodies) - len(refusals)
+    return Verdict(kind, "; ".join(refusals), ("bodies",) * n_confirmed)
 
 
 def _bounds(path: Path) -> dict[str, tuple[float, float]]:
-    """What the volume of each label lies between, by another reader: pieces of some size, and all with holes filled."""
+    """Lower and upper bounds of the volume of each label, by another reader.
+
+    The lower bound counts the larger connected components, the upper bound all voxels and filled holes.
+    """
     if path.name.endswith(("nii", "gz", "mgz")):
         image: Any = nibabel.load(path)
         values, affine = np.asanyarray(image.dataobj).squeeze(), np.array(image.affine)
@@ -130,19 +135,20 @@ def _bounds(path: Path) -> dict[str, tuple[float, float]]:
         cell = abs(np.prod(image.GetSpacing()) * np.linalg.det(np.reshape(image.GetDirection(), (3, 3))))
     else:
         return {}
-    found = {}
+    bounds = {}
     for value in np.unique(values).tolist():
         mask = values == value
-        label, n_pieces = ndimage.label(mask, np.ones((3, 3, 3)))
-        sizes = np.bincount(label.ravel())[1:] if n_pieces else np.zeros(1)
-        least, most = sizes[sizes >= 0.02 * sizes.sum()].sum(), ndimage.binary_fill_holes(mask).sum()
-        # Joining pieces that share a corner adds voxels.
-        found[str(int(value))] = (cell * least * (1 - VOLUME), cell * most * 1.05)
-    return found
+        label, n_components = ndimage.label(mask, np.ones((3, 3, 3)))
+        sizes = np.bincount(label.ravel())[1:] if n_components else np.zeros(1)
+        low, high = sizes[sizes >= 0.02 * sizes.sum()].sum(), ndimage.binary_fill_holes(mask).sum()
+        # Joining components that share a corner adds voxels.
+        bounds[str(int(value))] = (cell * low * (1 - VOLUME), cell * high * 1.05)
+    return bounds
 
 
 @cache
 def _clean() -> dict[str, float]:
+    """Volumes of the molecule without a fault."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "x.pdb"
         path.write_text("\n".join(helices()) + "\n")
@@ -167,16 +173,16 @@ def _judge_image(given: BodyFile, path: Path) -> Verdict:
     if not np.isfinite(values).all() or np.abs(values).max() > 1e15:
         return Verdict("wrong", f"values up to {np.abs(values).max()}")
     if given.expected is not None:
-        far = np.abs(values - field_at(points))
-        slack = max(1e-2, given.expected["linear"])
-        if np.quantile(far, 0.9) > slack or far.max() > 3:  # next to a hole it is that of a neighbour
-            return Verdict("wrong", f"values are off by {np.quantile(far, 0.9)}, at most {far.max()}")
+        error = np.abs(values - field_at(points))
+        tolerance = max(1e-2, given.expected["linear"])
+        if np.quantile(error, 0.9) > tolerance or error.max() > 3:  # values next to a hole are those of neighbours
+            return Verdict("wrong", f"values are off by {np.quantile(error, 0.9)}, at most {error.max()}")
     return Verdict("confirmed", "", ("values",))
 
 
 def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
-    """Read so many files."""
-    return tallied(
+    """Try `n_cases` files."""
+    return count_verdicts(
         "broken bodies",
         "volumes, molecules, scenes; images, grids and vertex values beside bodies",
         "a sentence that names file, body and remedy, or right bodies; no fault of one loses another",
@@ -188,10 +194,10 @@ def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
 
 
 def main() -> None:
-    """Repeat one case and say what became of it."""
+    """Repeat one case and print its verdict."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--case", type=int, required=True, help="number of the file")
-    parser.add_argument("--out", type=Path, default=Path("build/campaign"), help="folder that keeps the file")
+    parser.add_argument("--out", type=Path, default=Path("build/campaign"), help="folder for the file")
     arguments = parser.parse_args()
     given = body_file(SEED, arguments.case)
     arguments.out.mkdir(parents=True, exist_ok=True)

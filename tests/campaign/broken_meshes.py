@@ -1,6 +1,6 @@
-"""Broken mesh files are refused in a sentence that names them, or every number made of them is confirmed.
+"""Broken mesh files are refused with a message that names the file, or all their numbers are confirmed.
 
-`python tests/campaign/broken_meshes.py --case 123` repeats one file and keeps it.
+`python tests/campaign/broken_meshes.py --case 123` repeats the trial of one file, and stores the file.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from igps.spectra._lanczos import ConvergenceError
 
 SEED = 13
 CONFIG = SignatureConfig(n_eigenpairs=6, resolution=9, min_samples=0, n_surface_samples=40)
-MANY_VERTICES = 1000
-# The surfaces are small, and a coarse grid shows as much of them as the ordinary one of 96 cells, in a tenth of the
-# time. One file in so many is mended on the ordinary one nevertheless.
-COARSE, ORDINARY_EACH = 32, 10
-# A case takes a tenth of a second, the first one of a process some seconds. What takes longer than this hangs, on a
-# machine that has ten times as much to do beside as well.
-SECONDS = 300.0
-MEMORY = 4 * 2**30
+MAX_VERTICES = 1000
+# On these small surfaces, a coarse grid is as good as the default grid of 96 cells, and takes a tenth of the time. One
+# file in DEFAULT_GRID_EVERY is nevertheless mended on the default grid.
+COARSE_RESOLUTION, DEFAULT_GRID_EVERY = 32, 10
+# Limits of a trial, which takes a tenth of a second, or some seconds for the first one of a process. Even on a machine
+# with ten times this load, a longer trial hangs.
+MAX_SECONDS = 300.0
+MAX_BYTES = 4 * 2**30
 _MISSING = "needs a module that is not installed"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a file.
+    """Result of the trial of a file.
 
     Args:
         kind: "refused", "confirmed" or "wrong".
-        reason: what was said of a refused one; what is wrong.
-        checks: how often each number was confirmed, by name.
+        reason: the message of a refusal, or what is wrong.
+        checks: names of the confirmed numbers.
     """
 
     kind: str
@@ -61,24 +61,24 @@ class Verdict:
 
 
 def examine(job: tuple[int, int]) -> Verdict:
-    """Read and describe the file of a number, in a folder that is removed."""
+    """Try the file of a seed and a number, in a temporary folder."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
         return judge(broken_mesh(*job), Path(folder), number=job[1])
 
 
 def judge(broken: Broken, folder: Path, number: int) -> Verdict:
-    """What becomes of a file, read as half of the users would."""
+    """Read and describe a file with the options of its number, and check the result."""
     path = folder / broken.name
     path.write_bytes(broken.content)
-    reading, changed = _reading(number)
+    options, may_change = _options(number)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of overflow in readers, among others; the numbers are checked
+        warnings.simplefilter("ignore")  # such as those of overflow in readers; the numbers are checked below
         try:
             with _grid(number):
-                mesh = load_mesh(path, reading)
-            if len(mesh.vertices) > MANY_VERTICES:  # mending may make many
-                mesh = simplify(mesh, MANY_VERTICES)
+                mesh = load_mesh(path, options)
+            if len(mesh.vertices) > MAX_VERTICES:  # mending may add many vertices
+                mesh = simplify(mesh, MAX_VERTICES)
             signature = compute_signature(mesh, CONFIG)
         except (MeshError, ValueError) as error:
             if str(path) not in str(error):
@@ -92,18 +92,18 @@ def judge(broken: Broken, folder: Path, number: int) -> Verdict:
             where = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{Path(where.filename).name}:{where.lineno}"
             return Verdict("wrong", f"a traceback of {type(error).__name__} from {place}: {error}")
-        # Where nothing may be changed, what is read is what was written.
-        wanted = None if changed else broken.arrays
+        # If reading may not change the surface, the arrays are those that were written.
+        written = None if may_change else broken.arrays
         try:
             with np.errstate(all="ignore"):
-                doubts, checks = confirm(mesh, signature, wanted, CONFIG, path.suffix)
+                doubts, checks = confirm(mesh, signature, written, CONFIG, path.suffix)
         except MeshError as error:
             return Verdict("wrong", f"the moved mesh is refused: {error}")
     return Verdict("wrong", "; ".join(doubts), tuple(checks)) if doubts else Verdict("confirmed", "", tuple(checks))
 
 
-def _reading(number: int) -> tuple[LoadOptions, bool]:
-    """How the file of this number is read, and whether that may change the surface."""
+def _options(number: int) -> tuple[LoadOptions, bool]:
+    """Options for reading the file of a number, and whether they may change the surface."""
     component: Component | None = "largest" if number % 7 == 1 else None
     allow_open = number % 3 == 1
     mend = ("never", "auto", "never", "auto", "never", "auto", "never", "always")[number % 8]
@@ -111,15 +111,15 @@ def _reading(number: int) -> tuple[LoadOptions, bool]:
 
 
 def _grid(number: int) -> AbstractContextManager[object]:
-    """While it lasts, what is made watertight is so on the grid of this file's number."""
-    if number % ORDINARY_EACH == 0:
+    """A context in which surfaces are made watertight on the grid of the file of a number."""
+    if number % DEFAULT_GRID_EVERY == 0:
         return nullcontext()
-    return patch.object(mending, "watertight", partial(watertight, resolution=COARSE))
+    return patch.object(mending, "watertight", partial(watertight, resolution=COARSE_RESOLUTION))
 
 
 def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
-    """Read and describe so many files."""
-    return tallied(
+    """Try `n_cases` files."""
+    return count_verdicts(
         "broken meshes",
         "OFF, OBJ, PLY, STL, GLB and 3MF read and described",
         "no traceback, hang or crash, every number confirmed",
@@ -130,23 +130,23 @@ def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
     )
 
 
-def tallied(
+def count_verdicts(
     part: str,
     what: str,
     target: str,
-    examined: Callable[[tuple[int, int]], Verdict],
+    examine: Callable[[tuple[int, int]], Verdict],
     jobs: Sequence[tuple[int, int]],
     story: Callable[[int], str],
     n_workers: int | None,
 ) -> list[Row]:
-    """The row of a part, from what becomes of each file by its seed and number; a story tells what was broken."""
+    """Examine the file of each job, a seed and a number, and make the row. A story tells how a file was broken."""
     start = time.monotonic()
     kinds: Counter[str] = Counter()
     reasons: Counter[str] = Counter()
     checks: Counter[str] = Counter()
     missed = []
-    for place, verdict in run(examined, jobs, n_workers=n_workers, limits=Limits(SECONDS, MEMORY)):
-        number = jobs[place][1]
+    for index, verdict in run(examine, jobs, n_workers=n_workers, limits=Limits(MAX_SECONDS, MAX_BYTES)):
+        number = jobs[index][1]
         if isinstance(verdict, Failed):
             verdict = Verdict("wrong", verdict.reason)
         kinds[verdict.kind] += 1
@@ -170,10 +170,10 @@ def tallied(
 
 
 def main() -> None:
-    """Repeat one case and say what became of it."""
+    """Repeat one case and print its verdict."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--case", type=int, required=True, help="number of the file")
-    parser.add_argument("--out", type=Path, default=Path("build/campaign"), help="folder that keeps the file")
+    parser.add_argument("--out", type=Path, default=Path("build/campaign"), help="folder for the file")
     arguments = parser.parse_args()
     broken = broken_mesh(SEED, arguments.case)
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
 """A plugin of pytest that records which functions of the library each test calls, and how long it takes.
 
-The file that IGPS_CAMPAIGN_CALLED names holds, for each test that passes, its seconds of processors, those of its own
-processes too, and its functions, each as "module.py:line" of where it begins; apart, the functions that the fixtures of
-more than one test call.
+The environment variable IGPS_CAMPAIGN_CALLED names the report, a JSON file. For each test that passes, it holds the
+seconds of processor time, child processes included, and the functions, each as "module.py:line" of its first line. It
+also lists the functions that are called by fixtures of more than one test.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 _SOURCES = str(Path("src").resolve())
-_found: dict[str, dict[str, Any]] = {}
+_tests: dict[str, dict[str, Any]] = {}
 _failed: list[str] = []
 _shared: set[CodeType] = set()
 _own: set[CodeType] = set()
@@ -36,7 +36,7 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     global _own, _called
     _own = _called = set()
     start = os.times()
-    if "compiled" not in item.name:  # what torch compiles, it cannot trace while somebody looks on
+    if "compiled" not in item.name:  # torch.compile cannot trace code while a profiler is active
         threading.setprofile(_record)
         sys.setprofile(_record)
     try:
@@ -44,19 +44,19 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     finally:
         sys.setprofile(None)
         threading.setprofile(None)  # type: ignore[arg-type]
-        _found[item.nodeid] = {"seconds": sum(os.times()[:4]) - sum(start[:4]), "functions": _names(_own)}
+        _tests[item.nodeid] = {"seconds": sum(os.times()[:4]) - sum(start[:4]), "functions": _names(_own)}
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_fixture_setup(fixturedef: Any, request: pytest.FixtureRequest) -> Iterator[object]:
     global _called
-    before = _called
+    outer = _called
     if fixturedef.scope != "function":
         _called = _shared
     try:
         return (yield)
     finally:
-        _called = before
+        _called = outer
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
@@ -65,9 +65,9 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 
 def pytest_sessionfinish() -> None:
-    tests = {name: test for name, test in _found.items() if name not in _failed}
-    words = json.dumps({"tests": tests, "shared": _names(_shared), "failed": _failed})
-    Path(os.environ["IGPS_CAMPAIGN_CALLED"]).write_text(words)
+    tests = {name: test for name, test in _tests.items() if name not in _failed}
+    report = json.dumps({"tests": tests, "shared": _names(_shared), "failed": _failed})
+    Path(os.environ["IGPS_CAMPAIGN_CALLED"]).write_text(report)
 
 
 def _names(codes: set[CodeType]) -> list[str]:

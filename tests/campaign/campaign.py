@@ -1,6 +1,6 @@
-"""The campaign: broken meshes and other bodies, kills, a machine at fault, properties, deliberate faults.
+"""The campaign: broken meshes and other bodies, killed processes, faults of the machine, properties, mutants.
 
-It prints a table, writes it to a JSON file, and ends with status 1 where a target is missed.
+It prints a table of the results, writes it to a JSON file, and ends with status 1 if a target is missed.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-# Before anything reads it: workers and runs side by side have one thread each.
+# One thread for each of the parallel processes. Libraries read this variable when they are imported.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from outcome import Row, table
 
-# How much of each part: the whole campaign, and the small one of two minutes. None leaves a part out.
+# Number of cases of each part, in the whole campaign and in the small one of two minutes. None leaves a part out.
 _AMOUNTS: dict[str, tuple[int, int | None]] = {
     "broken_meshes": (10_000, 200),
     "broken_bodies": (3_000, 90),
@@ -33,8 +33,9 @@ _AMOUNTS: dict[str, tuple[int, int | None]] = {
 }
 
 
-# One after the other; and side by side, those of a line in turn. Most kills and all properties keep one core busy.
-_ORDER = (
+# Stages run one after the other. The lines of a stage run in parallel, the parts of a line one after the other. Most
+# kills and all properties keep one core busy.
+_STAGES = (
     (("broken_meshes",),),
     (("broken_bodies",),),
     (("kills",), ("properties", "machine_faults", "gallery_kills")),
@@ -52,38 +53,37 @@ def _run(part: str, amount: int) -> list[Row]:
 
 
 def _line(parts: Sequence[tuple[str, int]]) -> dict[str, list[Row]]:
-    """Each part in a process of its own.
+    """Run the parts of a line, each in a separate process.
 
-    Those that a part starts and kills have nothing to do with those of another, such as the helper of multiprocessing
-    that counts semaphores.
+    So parts do not share the processes that they start and kill, such as the resource tracker of multiprocessing.
     """
-    found = {}
+    results = {}
     for part, amount in parts:
         with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as process:
-            found[part] = process.submit(_run, part, amount).result()
-    return found
+            results[part] = process.submit(_run, part, amount).result()
+    return results
 
 
 def main() -> None:
     """Run the campaign, or parts of it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--small", action="store_true", help="the one of two minutes")
-    parser.add_argument("--parts", nargs="+", choices=_AMOUNTS, default=list(_AMOUNTS), help="of the campaign")
+    parser.add_argument("--small", action="store_true", help="run the campaign of two minutes")
+    parser.add_argument("--parts", nargs="+", choices=_AMOUNTS, default=list(_AMOUNTS), help="parts to run")
     parser.add_argument("--out", type=Path, default=Path("build/campaign.json"), help="JSON file of the table")
     arguments = parser.parse_args()
     amounts = {part: amount[arguments.small] for part, amount in _AMOUNTS.items()}
-    found: dict[str, list[Row]] = {}
-    for lines in _ORDER:
-        wanted = [[(part, amounts[part]) for part in line if part in arguments.parts] for line in lines]
-        wanted = [[(part, amount) for part, amount in line if amount is not None] for line in wanted]
-        wanted = [line for line in wanted if line]
-        if not wanted:
+    results: dict[str, list[Row]] = {}
+    for stage in _STAGES:
+        lines = [[(part, amounts[part]) for part in line if part in arguments.parts] for line in stage]
+        lines = [[(part, amount) for part, amount in line if amount is not None] for line in lines]
+        lines = [line for line in lines if line]
+        if not lines:
             continue
-        print(f"{', '.join(part for line in wanted for part, _ in line)} ...", flush=True)
-        with ProcessPoolExecutor(len(wanted), multiprocessing.get_context("fork")) as processes:
-            for rows_of in processes.map(_line, wanted):
-                found |= rows_of
-    rows = [row for part in _AMOUNTS for row in found.get(part, [])]
+        print(f"{', '.join(part for line in lines for part, _ in line)} ...", flush=True)
+        with ProcessPoolExecutor(len(lines), multiprocessing.get_context("fork")) as processes:
+            for line_results in processes.map(_line, lines):
+                results |= line_results
+    rows = [row for part in _AMOUNTS for row in results.get(part, [])]
     print(table(rows))
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps([row.as_dict() for row in rows], indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""A descriptor that costs next to nothing, for runs that are killed again and again."""
+"""A descriptor of very low cost, for runs that are killed many times."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ N_EIGENPAIRS = 6
 
 
 def cheap() -> HistogramDescriptor:
-    """The paper's histogram of few eigenpairs in few bins."""
+    """The histogram of `interior` with few eigenpairs and few bins."""
     embedding = SpectralEmbedding(n_eigenpairs=N_EIGENPAIRS)
     return HistogramDescriptor(PairHistogram([Potential(2), InteriorDistance(16)], embedding), name="cheap")

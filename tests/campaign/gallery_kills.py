@@ -1,4 +1,4 @@
-"""Two processes write to one gallery and are killed at random moments; it holds what they had finished, and no half."""
+"""Two processes write to a gallery and are killed at random times; it holds all finished changes, no partial one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from outcome import Row
 
-import igps.gallery.gallery  # once, and not LanceDB, whose threads no fork takes along
+import igps.gallery.gallery  # before the forks; this does not import LanceDB, whose threads do not survive a fork
 from igps.gallery.about import about_of
 from igps.mesh.options import LoadOptions
 from igps.retrieval import cosine
@@ -22,28 +22,28 @@ from igps.signature.signature import SignatureConfig
 
 SEED = 14
 WIDTH, N_UNCHANGED, N_IDS = 24, 400, 300
-# A writer is killed so many seconds after its first change, at most.
-_LONGEST = 0.8
-_PATIENCE = 120.0
+# Longest time from the first change of a writer to its kill, seconds
+_MAX_DELAY = 0.8
+_TIMEOUT = 120.0
 
 Rows = dict[str, tuple[float, int]]
-"""By id the volume, and the seed of the vector."""
+"""Volume, and seed of the vector, by id."""
 
 
 def vector(seed: int) -> np.ndarray:
-    found = np.random.default_rng(seed).standard_normal(WIDTH, dtype=np.float32)
-    return found / np.linalg.norm(found)
+    values = np.random.default_rng(seed).standard_normal(WIDTH, dtype=np.float32)
+    return values / np.linalg.norm(values)
 
 
 def change(writer: int, number: int) -> tuple[str, list[int], int]:
-    """What a writer does: the kind, to which of its ids, and a number for it."""
+    """A change by a writer: its kind, the chosen ids, and a value."""
     generator = np.random.default_rng([SEED, writer, number])
     chosen = generator.choice(N_IDS, int(generator.integers(1, 60)), replace=False).tolist()
     return str(generator.choice(["add", "add", "remove", "update"])), chosen, number
 
 
 def changed(rows: Rows, writer: int, number: int) -> Rows:
-    """The rows of a writer after a change, as a dictionary has them."""
+    """The rows of a writer after a change."""
     kind, chosen, value = change(writer, number)
     ids = [f"{writer}/{i}" for i in chosen]
     if kind == "add":
@@ -55,7 +55,7 @@ def changed(rows: Rows, writer: int, number: int) -> Rows:
 
 
 def _tables() -> Any:
-    """LanceDB is loaded here, in processes of its own; a few rows are many, so that there are indices."""
+    """Import the module of tables, and with it LanceDB, in a child process, with lower limits to build indices."""
     torch.set_num_threads(1)
     from igps.gallery import _table
 
@@ -63,19 +63,19 @@ def _tables() -> Any:
     return _table
 
 
-def _told(rows: Rows) -> tuple[torch.Tensor, list[dict[str, Any]]]:
+def _vectors_and_rows(rows: Rows) -> tuple[torch.Tensor, list[dict[str, Any]]]:
     vectors = torch.from_numpy(np.stack([vector(seed) for _, seed in rows.values()]))
     return vectors, [{"id": id_, "name": id_, "volume": volume} for id_, (volume, _) in rows.items()]
 
 
-def _begin(path: Path) -> None:
+def _create(path: Path) -> None:
     about = about_of(SignatureConfig(), LoadOptions(), "interior")
     unchanged = {f"unchanged/{i}": (1.0, 10**9 + i) for i in range(N_UNCHANGED)}
-    _tables().write(path, about, "cosine", [_told(unchanged)], {})
+    _tables().write(path, about, "cosine", [_vectors_and_rows(unchanged)], {})
 
 
 def _write(path: Path, writer: int, number: int, journal: Path) -> None:
-    """Change after change until the end, each finished one in the journal."""
+    """Make changes until the process is killed, and write the number of each finished change to the journal."""
     _tables()
     gallery = igps.gallery.gallery.Gallery(path)
     with journal.open("a", buffering=1) as file:
@@ -83,7 +83,7 @@ def _write(path: Path, writer: int, number: int, journal: Path) -> None:
             kind, chosen, value = change(writer, number)
             where = "id IN ({})".format(", ".join(f"'{writer}/{i}'" for i in chosen))
             if kind == "add":
-                gallery.table.add(*_told(changed({}, writer, number)), {})
+                gallery.table.add(*_vectors_and_rows(changed({}, writer, number)), {})
             elif kind == "remove":
                 gallery.remove(where)
             else:
@@ -93,16 +93,18 @@ def _write(path: Path, writer: int, number: int, journal: Path) -> None:
 
 
 def _read(path: Path, out: Path) -> None:
-    """All rows by what the table tells, and of some whether they are their own nearest."""
+    """Write all rows of the table to a file, and whether some of them are found as nearest to themselves."""
     table = _tables().BodyTable(path)
-    found = {row["id"]: (row["volume"], vectors) for some in table.batches()
-             for vectors, row in zip(*table.decoded(some), strict=True)}  # fmt: skip
-    ids = sorted(found)[:: max(len(found) // 10, 1)]
-    own = [table.search(found[id_][1][None], cosine, top=1)[0][0]["id"] == id_ for id_ in ids]
-    out.write_bytes(pickle.dumps(({id_: (volume, one.numpy()) for id_, (volume, one) in found.items()}, all(own))))
+    rows = {row["id"]: (row["volume"], vectors) for batch in table.batches()
+            for vectors, row in zip(*table.decoded(batch), strict=True)}  # fmt: skip
+    ids = sorted(rows)[:: max(len(rows) // 10, 1)]
+    are_nearest = all(table.search(rows[id_][1][None], cosine, top=1)[0][0]["id"] == id_ for id_ in ids)
+    arrays = {id_: (volume, values.numpy()) for id_, (volume, values) in rows.items()}
+    out.write_bytes(pickle.dumps((arrays, are_nearest)))
 
 
-def _forked(function: Any, *arguments: Any) -> int:
+def _fork(function: Any, *arguments: Any) -> int:
+    """Call a function in a fork of this process, and return the id of the fork."""
     pid = os.fork()
     if pid == 0:
         status = 1
@@ -118,40 +120,41 @@ def _forked(function: Any, *arguments: Any) -> int:
     return pid
 
 
-def _done(pid: int) -> bool:
+def _succeeds(pid: int) -> bool:
+    """Wait for the end of a process, and return whether its exit status is 0."""
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
 
 def campaign(n_kills: int) -> list[Row]:
-    """Both writers of a round are killed, one after the other, while they add, remove and update."""
+    """Kill both writers of a round, one after the other, while they add, remove and update rows."""
     start, missed = time.monotonic(), list[str]()
     n_killed = n_changes = n_rounds = 0
     with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
         path, rows, numbers = Path(folder) / "gallery.igps", [Rows(), Rows()], [0, 0]
-        if not _done(_forked(_begin, path)):
+        if not _succeeds(_fork(_create, path)):
             raise RuntimeError("the gallery could not be made")
         while n_killed < n_kills and not missed:
             generator = np.random.default_rng([SEED, n_rounds])
             n_rounds += 1
             journals = [Path(folder) / f"{n_rounds}-{writer}" for writer in range(2)]
-            writers = [_forked(_write, path, i, numbers[i], journals[i]) for i in range(2)]
-            begun = time.monotonic()
-            while not all(one.exists() and one.stat().st_size for one in journals):
-                if time.monotonic() - begun > _PATIENCE:
+            writers = [_fork(_write, path, i, numbers[i], journals[i]) for i in range(2)]
+            round_start = time.monotonic()
+            while not all(journal.exists() and journal.stat().st_size for journal in journals):
+                if time.monotonic() - round_start > _TIMEOUT:
                     missed.append(f"round {n_rounds}: a writer waits for ever")
                     break
                 time.sleep(0.005)
             for writer in generator.permutation(2):
-                time.sleep(generator.uniform(0, _LONGEST / 2))
+                time.sleep(generator.uniform(0, _MAX_DELAY / 2))
                 if os.waitpid(writers[writer], os.WNOHANG) == (0, 0):
                     os.kill(writers[writer], signal.SIGKILL)
                     os.waitpid(writers[writer], 0)
                     n_killed += 1
                 else:
                     missed.append(f"round {n_rounds}: writer {writer} ended by itself")
-            found, seen = Path(folder) / "found", None
-            if _done(_forked(_read, path, found)):
-                seen, are_nearest = pickle.loads(found.read_bytes())
+            out, actual = Path(folder) / "rows", None
+            if _succeeds(_fork(_read, path, out)):
+                actual, are_nearest = pickle.loads(out.read_bytes())
                 if not are_nearest:
                     missed.append(f"round {n_rounds}: a row is not the nearest to itself")
             else:
@@ -163,15 +166,15 @@ def campaign(n_kills: int) -> list[Row]:
                 for number in range(numbers[i], numbers[i] + n_finished):
                     rows[i] = changed(rows[i], i, number)
                 numbers[i] += n_finished
-                own = {id_: row for id_, row in seen.items() if id_.startswith(f"{i}/")}
-                # The last may be finished, and not yet in the journal.
+                own = {id_: row for id_, row in actual.items() if id_.startswith(f"{i}/")}
+                # The last change may be finished, but not yet in the journal.
                 after = changed(rows[i], i, numbers[i])
                 if _equal(own, after) and not _equal(own, rows[i]):
                     rows[i], numbers[i] = after, numbers[i] + 1
                 elif not _equal(own, rows[i]):
                     missed.append(f"round {n_rounds}: writer {i} had finished {numbers[i]} changes, the rows differ")
             unchanged = {f"unchanged/{i}": (1.0, 10**9 + i) for i in range(N_UNCHANGED)}
-            if not _equal({id_: row for id_, row in seen.items() if id_.startswith("u")}, unchanged):
+            if not _equal({id_: row for id_, row in actual.items() if id_.startswith("u")}, unchanged):
                 missed.append(f"round {n_rounds}: rows that nobody touched differ")
     return [
         Row(
@@ -186,8 +189,8 @@ def campaign(n_kills: int) -> list[Row]:
     ]
 
 
-def _equal(found: dict[str, Any], expected: Rows) -> bool:
-    return found.keys() == expected.keys() and all(
-        found[id_][0] == volume and np.allclose(found[id_][1], vector(seed), atol=1e-6)
+def _equal(actual: dict[str, Any], expected: Rows) -> bool:
+    return actual.keys() == expected.keys() and all(
+        actual[id_][0] == volume and np.allclose(actual[id_][1], vector(seed), atol=1e-6)
         for id_, (volume, seed) in expected.items()
     )

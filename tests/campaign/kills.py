@@ -1,4 +1,4 @@
-"""Processes are killed at random moments; what is computed afterwards is what an undisturbed run computes."""
+"""Processes are killed at random times; later runs compute the same results as an undisturbed run."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from retrieving import Command, is_python_worker, partials, table, write_shapes
 SEED = 13
 N_PROCESSES = 8
 N_KILLED = 4
-# Kills of workers in one run: each costs the start of another process, as much as all that there is to compute.
-N_STRUCK = 3
+# Kills of workers in one run. Each one starts a new process, which takes as long as all computation of the run.
+N_WORKER_KILLS = 3
 _DAY = 24 * 3600
-# A run of twelve small shapes takes seconds, and a worker ends at once; on a machine that has much to do, longer.
-_PATIENCE = 600.0
-_ORPHAN = 120.0
+# Time limits for a run of twelve small shapes and for the end of a worker, seconds. The runs take some seconds and
+# workers end at once, but not on a busy machine.
+_RUN_TIMEOUT = 600.0
+_WORKER_TIMEOUT = 120.0
 _TARGET = "table equals the undisturbed one"
 
 
@@ -35,14 +36,14 @@ def _workplace() -> Iterator[Path]:
 
 
 def campaign(n_kills: int) -> list[Row]:
-    """A quarter of the kills for workers, a quarter for parents, half for eight processes on one cache."""
+    """Kill workers and parents (a quarter of the kills each), and some of eight processes on one cache (half)."""
     with _workplace() as folder:
         seconds = {}
         for n_workers in (1, 2):
             undisturbed = _Run(folder, f"undisturbed-{n_workers}")
             start = time.monotonic()
             if undisturbed.command(n_workers).wait() != 0:
-                raise RuntimeError(f"the undisturbed run failed: {undisturbed.said()}")
+                raise RuntimeError(f"the undisturbed run failed: {undisturbed.log_end()}")
             seconds[n_workers] = time.monotonic() - start
         expected = undisturbed.table()
         quarter = max(n_kills // 4, 1)
@@ -56,7 +57,7 @@ def campaign(n_kills: int) -> list[Row]:
 
 
 class _Run:
-    """A cache of its own, and a folder for the table."""
+    """A run with a separate cache and output folder."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self.shapes, self.cache, self.out = folder / "shapes", folder / "caches" / name, folder / "out" / name
@@ -68,75 +69,79 @@ class _Run:
         return table(self.out)
 
     def blames_mesh(self) -> bool:
-        """Whether a mesh was given up because its worker was killed twice."""
+        """Whether a mesh was skipped because its worker was killed twice."""
         failures = self.out / "failures.csv"
         return failures.exists() and "killed twice" in failures.read_text()
 
-    def said(self) -> str:
+    def has_message(self) -> bool:
+        """Whether the log ends with a message of the command, and without a traceback."""
+        return "igps:" in self.log_end() and "Traceback" not in self.log_end()
+
+    def log_end(self) -> str:
         return self.out.with_suffix(".log").read_text()[-300:]
 
 
-def _settled(run: _Run, expected: object, what: str) -> list[str]:
-    """What is wrong after one more run that nobody disturbs."""
+def _check_rerun(run: _Run, expected: object, what: str) -> list[str]:
+    """Run once more without disturbance, and return what is wrong with the results."""
     shutil.rmtree(run.out, ignore_errors=True)
     status = run.command(1).wait()
     if status != 0:
-        return [f"{what}: the run afterwards ends with status {status}: {run.said()}"]
+        return [f"{what}: the run afterwards ends with status {status}: {run.log_end()}"]
     return [] if run.table() == expected else [f"{what}: the run afterwards leaves another table"]
 
 
 def _workers(folder: Path, expected: object, n_kills: int, seconds: float) -> Row:
     start = time.monotonic()
     missed: list[str] = []
-    same = asked = killed = 0
-    number = 0
-    while killed < n_kills and number < 4 * n_kills:
+    n_same = n_explained = n_killed = number = 0
+    while n_killed < n_kills and number < 4 * n_kills:
         generator = np.random.default_rng([SEED, 0, number])
         run = _Run(folder, f"worker-{number}")
         command = run.command(2)
-        begun = time.monotonic()
-        moments = np.sort(generator.uniform(0, seconds, min(N_STRUCK, n_kills - killed))).tolist()
-        while command.status() is None and time.monotonic() < begun + seconds + _PATIENCE:
+        run_start = time.monotonic()
+        kill_times = np.sort(generator.uniform(0, seconds, min(N_WORKER_KILLS, n_kills - n_killed))).tolist()
+        while command.status() is None and time.monotonic() < run_start + seconds + _RUN_TIMEOUT:
             workers = [pid for pid in command.children() if is_python_worker(pid)]
-            if moments and time.monotonic() >= begun + moments[0] and workers:
-                struck = _kill(int(generator.choice(workers)))
-                moments = moments[struck:]
-                killed += struck
+            if kill_times and time.monotonic() >= run_start + kill_times[0] and workers:
+                is_killed = _kill(int(generator.choice(workers)))
+                kill_times = kill_times[is_killed:]
+                n_killed += is_killed
             time.sleep(0.01)
         if command.status() is None:
             os.kill(command.pid, signal.SIGKILL)
             command.wait()
             missed.append(f"worker {number}: the run hangs after a worker was killed")
         elif command.status() == 0 and run.table() == expected:
-            same += 1
-        # Killed twice while it starts, a worker says nothing of a mesh, and the command blames the machine; killed
-        # twice with one mesh, it blames the mesh.
-        elif (command.status() == 2 and "igps:" in run.said() and "Traceback" not in run.said()) or run.blames_mesh():
-            asked += 1
+            n_same += 1
+        # If a worker is killed twice while it starts, the command blames the machine; if it is killed twice with the
+        # same mesh, the command blames the mesh.
+        elif run.blames_mesh() or (command.status() == 2 and run.has_message()):
+            n_explained += 1
         else:
             missed.append(
-                f"worker {number}: status {command.status()}, table the same: {run.table() == expected}; {run.said()}"
+                f"worker {number}: status {command.status()}, table the same: {run.table() == expected}; "
+                f"{run.log_end()}"
             )
-        missed += _settled(run, expected, f"worker {number}")
+        missed += _check_rerun(run, expected, f"worker {number}")
         number += 1
     return Row(
         "kills",
         "a worker",
-        killed,
+        n_killed,
         _TARGET,
-        f"{same} runs went on to the same table, {asked} said what to do, {len(missed)} wrong",
+        f"{n_same} runs went on to the same table, {n_explained} said what to do, {len(missed)} wrong",
         missed,
         seconds=time.monotonic() - start,
     )
 
 
 def _parents(folder: Path, expected: object, n_kills: int, seconds: dict[int, float]) -> Row:
-    """Up to three kills of one run after another on a cache, the last one left alone."""
+    """Kill up to three successive runs on each cache, followed by an undisturbed run."""
     start = time.monotonic()
     missed: list[str] = []
-    killed = orphans = chain = number = 0
-    while killed < n_kills and number < 4 * n_kills:
-        run = _Run(folder, f"parent-{chain}")
+    n_killed = n_orphans = n_caches = number = 0
+    while n_killed < n_kills and number < 4 * n_kills:
+        run = _Run(folder, f"parent-{n_caches}")
         for _ in range(3):
             generator = np.random.default_rng([SEED, 1, number])
             number += 1
@@ -144,21 +149,21 @@ def _parents(folder: Path, expected: object, n_kills: int, seconds: dict[int, fl
             command = run.command(n_workers)
             time.sleep(generator.uniform(0, 0.8 * seconds[n_workers]))
             workers = command.children()
-            killed += command.status() is None and _kill(command.pid)
+            n_killed += command.status() is None and _kill(command.pid)
             command.wait()
-            orphans += len(_alive_after(workers, _ORPHAN))
-            if killed == n_kills:
+            n_orphans += len(_alive_after(workers, _WORKER_TIMEOUT))
+            if n_killed == n_kills:
                 break
-        missed += _settled(run, expected, f"parent {chain}")
-        chain += 1
-    if orphans:
-        missed.append(f"{orphans} workers outlived their parent by {_ORPHAN:.0f} s")
+        missed += _check_rerun(run, expected, f"parent {n_caches}")
+        n_caches += 1
+    if n_orphans:
+        missed.append(f"{n_orphans} workers outlived their parent by {_WORKER_TIMEOUT:.0f} s")
     return Row(
         "kills",
         "the parent",
-        killed,
+        n_killed,
         _TARGET,
-        f"{chain} caches after them: {chain - len(missed)} to the same table",
+        f"{n_caches} caches after them: {n_caches - len(missed)} to the same table",
         missed,
         seconds=time.monotonic() - start,
     )
@@ -167,62 +172,62 @@ def _parents(folder: Path, expected: object, n_kills: int, seconds: dict[int, fl
 def _eight(folder: Path, expected: object, n_kills: int) -> Row:
     start = time.monotonic()
     missed: list[str] = []
-    killed = number = survivors = 0
+    n_killed = number = n_survivors = 0
     seconds = 1.0
-    while killed < n_kills and number < 4 * n_kills:
+    while n_killed < n_kills and number < 4 * n_kills:
         generator = np.random.default_rng([SEED, 2, number])
         run = _Run(folder, f"eight-{number}")
-        begun = time.monotonic()
+        run_start = time.monotonic()
         commands = [run.command(1, run.out.with_name(f"{run.out.name}-{i}")) for i in range(N_PROCESSES)]
-        moments = np.sort(generator.uniform(0, seconds, N_KILLED))
-        for i, moment in enumerate(moments):
-            time.sleep(max(0.0, begun + moment - time.monotonic()))
-            killed += commands[i].status() is None and _kill(commands[i].pid)
+        kill_times = np.sort(generator.uniform(0, seconds, N_KILLED))
+        for i, kill_time in enumerate(kill_times):
+            time.sleep(max(0.0, run_start + kill_time - time.monotonic()))
+            n_killed += commands[i].status() is None and _kill(commands[i].pid)
         for i, command in enumerate(commands):
             if command.wait() < 0:
                 continue
-            survivors += 1
+            n_survivors += 1
             out = run.out.with_name(f"{run.out.name}-{i}")
             if command.wait() != 0 or table(out) != expected:
-                said = out.with_suffix(".log").read_text()[-300:]
-                missed.append(f"eight {number}: process {i} ends with status {command.wait()} or another table: {said}")
-        seconds = 0.8 * (time.monotonic() - begun)
-        missed += _settled(run, expected, f"eight {number}")
+                log = out.with_suffix(".log").read_text()[-300:]
+                missed.append(f"eight {number}: process {i} ends with status {command.wait()} or another table: {log}")
+        seconds = 0.8 * (time.monotonic() - run_start)
+        missed += _check_rerun(run, expected, f"eight {number}")
         number += 1
     return Row(
         "kills",
         "of eight processes on one cache",
-        killed,
+        n_killed,
         _TARGET,
-        f"{number} caches, {survivors} processes left alone: {len(missed)} with another table",
+        f"{number} caches, {n_survivors} processes left alone: {len(missed)} with another table",
         missed,
         seconds=time.monotonic() - start,
     )
 
 
 def _leftovers(folder: Path, expected: object) -> Row:
-    """What kills leave of files that were being written is gone two days and one run later."""
+    """Partially written files of killed processes are removed by a run two days later."""
     start = time.monotonic()
     caches = sorted((folder / "caches").iterdir())
-    # A kill in the midst of a write is rare: leave such a file where each version of the library looks for its own.
+    # A kill during a write is rare. So such files are also planted, in the folder of each version of the library.
     for cache in caches[:2]:
         written = next(cache.rglob("*.safetensors"))
         written.with_name(f"{written.stem}.{2**22}-planted.partial").write_bytes(written.read_bytes()[:1000])
-    left = [path for cache in caches for path in partials(cache)]
-    for path in left:
+    leftovers = [path for cache in caches for path in partials(cache)]
+    for path in leftovers:
         os.utime(path, (time.time() - 2 * _DAY,) * 2)
     missed = []
-    for cache in {path.parents[1] for path in left}:
-        missed += _settled(_Run(folder, cache.name), expected, f"leftover in {cache.name}")
-    still = [path for path in left if path.exists()]
-    if still:
-        missed.append(f"{len(still)} files that a killed process left stay for ever, such as {still[0].name}")
+    for cache in {path.parents[1] for path in leftovers}:
+        missed += _check_rerun(_Run(folder, cache.name), expected, f"leftover in {cache.name}")
+    remaining = [path for path in leftovers if path.exists()]
+    if remaining:
+        missed.append(f"{len(remaining)} files that a killed process left stay for ever, such as {remaining[0].name}")
     return Row(
         "kills",
         "files half written, two days and one run later",
-        len(left),
+        len(leftovers),
         "none stays",
-        f"{len(still)} stay",
+        f"{len(remaining)} stay",
         missed,
         seconds=time.monotonic() - start,
     )
@@ -238,12 +243,12 @@ def _kill(pid: int) -> bool:
 
 def _alive_after(pids: list[int], seconds: float) -> list[int]:
     deadline = time.monotonic() + seconds
-    while (alive := [pid for pid in pids if _runs(pid)]) and time.monotonic() < deadline:
+    while (alive := [pid for pid in pids if _is_running(pid)]) and time.monotonic() < deadline:
         time.sleep(0.05)
     return alive
 
 
-def _runs(pid: int) -> bool:
+def _is_running(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:

@@ -1,4 +1,4 @@
-"""A machine at fault is named, ends the command with status 2, and costs nothing of what is done."""
+"""A fault of the machine is named, ends the command with status 2, and loses no finished work."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 from outcome import Row
 from retrieving import Command, retrieve, table, write_shapes
 
-_WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-dac_override")
+_WITHOUT_OVERRIDE = ("setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-dac_override")
 Expected = Any
 Attempt = Callable[[Path, Expected], tuple[list[str], str]]
 
@@ -23,7 +23,7 @@ _YEAR = 365 * 24 * 3600.0
 
 
 def campaign() -> list[Row]:
-    """Each fault once."""
+    """Try each fault once."""
     resumes, same = "status 2, named, resumes", "status 0, same table"
     attempts: tuple[tuple[str, str, Attempt], ...] = (
         ("disk full, in the cache", resumes, _disk_full),
@@ -92,16 +92,16 @@ def _read_only(place: Path, expected: Expected) -> tuple[list[str], str]:
 
 
 def _another_user(place: Path, expected: Expected) -> tuple[list[str], str]:
-    """A folder where this user may not write; root may everywhere, and so gives that right away."""
+    """A folder without write permission. Root, which may write everywhere, gives up this capability first."""
     cache, out = place / "cache", place / "out"
     cache.mkdir()
     out.mkdir(mode=0o777)
     os.chmod(out, 0o777)
     os.chmod(cache, 0o555)
     root = os.geteuid() == 0
-    if root and not _run(*_WITHOUT_RIGHTS, "true"):
+    if root and not _run(*_WITHOUT_OVERRIDE, "true"):
         return [], "not tried: root cannot give its rights away here"
-    run = retrieve(place / "shapes", cache, out, under=_WITHOUT_RIGHTS if root else ())
+    run = retrieve(place / "shapes", cache, out, under=_WITHOUT_OVERRIDE if root else ())
     missed = _is_named(run, "Permission denied", str(cache))
     os.chmod(cache, 0o777)
     missed += _resumes(place, cache, expected, {})
@@ -109,7 +109,7 @@ def _another_user(place: Path, expected: Expected) -> tuple[list[str], str]:
 
 
 def _no_rename(place: Path, expected: Expected) -> tuple[list[str], str]:
-    """Four processes compute the same signatures; the one that comes second may not put its file over the first's."""
+    """Four processes compute the same signatures; none can replace a file that another one wrote before."""
     cache = place / "cache"
     outs = [place / f"out-{i}" for i in range(4)]
     with ThreadPoolExecutor(len(outs)) as pool:
@@ -119,7 +119,7 @@ def _no_rename(place: Path, expected: Expected) -> tuple[list[str], str]:
         for i, run in enumerate(runs)
         if run.returncode or table(place / f"out-{i}") != expected
     ]
-    # A file that cannot be used cannot be replaced either.
+    # A damaged file cannot be replaced either.
     damaged = next(cache.rglob("*.safetensors"))
     damaged.write_bytes(damaged.read_bytes()[:100])
     run = retrieve(place / "shapes", cache, place / "out", fault="rename")
@@ -140,7 +140,7 @@ def _clock_back(place: Path, expected: Expected) -> tuple[list[str], str]:
     if first.status() is None:
         os.kill(first.pid, 9)
         first.wait()
-    # All that is there is of a year ahead, seen from the clock that is set back; and of two, as of a clock ahead.
+    # All files of the cache are one year in the future by the true clock, and two years by the clock that is set back.
     for path in cache.rglob("*"):
         os.utime(path, (time.time() + _YEAR,) * 2)
     kept = _stamps(cache)
@@ -152,27 +152,29 @@ def _clock_back(place: Path, expected: Expected) -> tuple[list[str], str]:
 
 
 def _is_named(run: subprocess.CompletedProcess[str], *words: str) -> list[str]:
-    """What is wrong with how a machine's fault is told."""
-    said = run.stderr[-400:]
+    """What is wrong with the message about a fault of the machine."""
+    output = run.stderr[-400:]
     missed = []
     if run.returncode != 2:
-        missed.append(f"status {run.returncode}, expected 2: {said}")
+        missed.append(f"status {run.returncode}, expected 2: {output}")
     if "Traceback" in run.stderr:
-        missed.append(f"a traceback: {said}")
+        missed.append(f"a traceback: {output}")
     message = [line for line in run.stderr.splitlines() if line.startswith("igps:")]
     if not message or not all(word in message[-1] for word in words):
-        missed.append(f"no message that says {' and '.join(words)}: {said}")
+        missed.append(f"no message that says {' and '.join(words)}: {output}")
     return missed
 
 
 def _resumes(place: Path, cache: Path, expected: Expected, kept: dict[Path, int]) -> list[str]:
-    """What is wrong with a run once the machine is well: another table, or what was kept computed again."""
+    """What is wrong with a run after the fault: other results, or signatures of the cache that are computed again."""
     run = retrieve(place / "shapes", cache, place / "out")
     if run.returncode:
         return [f"the run afterwards ends with status {run.returncode}: {run.stderr[-300:]}"]
     missed = [] if table(place / "out") == expected else ["the run afterwards leaves another table"]
-    again = [path for path, stamp in kept.items() if not path.exists() or path.stat().st_mtime_ns != stamp]
-    return [*missed, *([f"{len(again)} of {len(kept)} signatures that were kept are computed again"] if again else [])]
+    recomputed = [path for path, stamp in kept.items() if not path.exists() or path.stat().st_mtime_ns != stamp]
+    if recomputed:
+        missed.append(f"{len(recomputed)} of {len(kept)} signatures that were kept are computed again")
+    return missed
 
 
 def _stamps(cache: Path) -> dict[Path, int]:
@@ -181,7 +183,7 @@ def _stamps(cache: Path) -> dict[Path, int]:
 
 @contextmanager
 def _tmpfs(folder: Path, options: str) -> Iterator[bool]:
-    """A small file system on a folder, where one may be mounted."""
+    """Mount a small file system on a folder, and yield whether that was possible."""
     mounted = _run("mount", "-t", "tmpfs", "-o", f"{options},mode=1777", "tmpfs", str(folder))
     try:
         yield mounted

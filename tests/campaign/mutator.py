@@ -1,4 +1,4 @@
-"""Small valid meshes, written in six formats and broken on the way, each by a number that repeats it."""
+"""Small valid meshes, written in six formats and broken in random ways; a seed and a number repeat each file."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Broken:
     Args:
         name: of the file.
         content: of the file.
-        arrays: the vertices and faces that were written, where the file itself was not broken afterwards.
-        story: what was done to it.
+        arrays: vertices and faces in the file; None if the file itself was broken afterwards.
+        story: the faults, in words.
     """
 
     name: str
@@ -53,7 +53,7 @@ def valid_surfaces() -> tuple[Surface, ...]:
     box = trimesh.creation.box(extents=(1.0, 0.7, 0.4))
     for _ in range(3):
         box = box.subdivide()
-    made = [
+    meshes = [
         trimesh.creation.icosphere(subdivisions=2),
         trimesh.creation.torus(1.0, 0.35, major_sections=20, minor_sections=9),
         trimesh.creation.capsule(height=1.5, radius=0.4, count=[12, 12]),
@@ -62,10 +62,10 @@ def valid_surfaces() -> tuple[Surface, ...]:
         box,
     ]
     surfaces = []
-    for number, mesh in enumerate(made):
+    for number, mesh in enumerate(meshes):
         mesh.merge_vertices()
         x, y, z = np.asarray(mesh.vertices).T
-        # Smooth and injective, so that nothing is symmetric and eigenvalues lie apart.
+        # A smooth and injective map, so that nothing is symmetric and eigenvalues are distinct
         bent = np.stack(
             [1.3 * x + 0.11 * y * z, y + 0.13 * x * x + 0.05 * z, 0.8 * z + 0.09 * np.sin(2 * x + number)], 1
         )
@@ -74,42 +74,45 @@ def valid_surfaces() -> tuple[Surface, ...]:
 
 
 def broken_mesh(seed: int, number: int) -> Broken:
-    """The file of this number: a valid surface, a format, and one to three faults; one in twenty has none."""
+    """Make the file of a seed and a number: a valid surface in a random format with one to three faults.
+
+    One file in twenty has no fault.
+    """
     generator = np.random.default_rng([seed, number])
     surfaces = valid_surfaces()
     vertices, faces = (np.array(array) for array in surfaces[generator.integers(len(surfaces))])
     suffix = str(generator.choice(FORMATS))
     story = []
     n_faults = 0 if generator.random() < 0.05 else int(generator.choice([1, 1, 1, 2, 3]))
-    # A third of all faults are those of files.
-    among = [*_ON_ARRAYS, *3 * list(_ON_FILES)]
-    faults = [among[i] for i in generator.integers(len(among), size=n_faults)]
+    # A third of all faults are faults of the file.
+    candidates = [*_ON_ARRAYS, *3 * list(_ON_FILES)]
+    faults = [candidates[i] for i in generator.integers(len(candidates), size=n_faults)]
     with np.errstate(all="ignore"):
         for fault in (fault for fault in faults if fault in _ON_ARRAYS):
             vertices, faces = _ON_ARRAYS[fault](generator, vertices, faces)
             story.append(fault)
         kind = f"{suffix}_ascii" if suffix in ("ply", "stl") and generator.random() < 0.5 else suffix
         content = written(vertices, faces, kind)
-    damaged = [fault for fault in faults if fault in _ON_FILES]
-    for fault in damaged:
+    file_faults = [fault for fault in faults if fault in _ON_FILES]
+    for fault in file_faults:
         break_file = _ON_FILES[fault]
         if suffix == "3mf":
             content = _in_archive(break_file, generator, content)
         else:
             content = break_file(generator, content, suffix)
         story.append(fault)
-    arrays = None if damaged else (vertices, faces)
+    arrays = None if file_faults else (vertices, faces)
     return Broken(f"{number:06d}.{suffix}", content, arrays, f"{kind}: {', '.join(story) or 'nothing'}")
 
 
 def broken_bytes(generator: Generator, content: bytes) -> tuple[str, bytes]:
-    """Any file with a fault that needs no knowledge of its format, and what it is."""
+    """Break a file of any format, and return the name of the fault and the broken content."""
     fault = str(generator.choice(["bytes", "tokens"]))
     return fault, _ON_FILES[fault](generator, content, "")
 
 
 def written(vertices: NDArray[np.float64], faces: NDArray[np.int64], kind: str) -> bytes:
-    """A file of any arrays, even such as no exporter would write."""
+    """Write arrays in a format, even invalid ones, which no exporter would write."""
     points = [" ".join(repr(float(x)) for x in row) for row in vertices]
     if kind == "off":
         rows = [f"OFF\n{len(vertices)} {len(faces)} 0", *points, *(f"3 {a} {b} {c}" for a, b, c in faces)]
@@ -191,14 +194,14 @@ def _archive(model: bytes) -> bytes:
 
 
 def _in_archive(fault: Callable[..., bytes], generator: Generator, content: bytes) -> bytes:
-    """A fault in the model within the archive, so that it is not the archive's checksum that finds every one."""
+    """Break the model within the archive, so that the archive's checksum does not reveal every fault."""
     if generator.random() < 0.2:
         return fault(generator, content, "zip")
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             model = archive.read("3D/3dmodel.model")
     except (zipfile.BadZipFile, KeyError, OSError, ValueError, EOFError, RuntimeError, zipfile.zlib.error):
-        return fault(generator, content, "zip")  # broken already
+        return fault(generator, content, "zip")  # the archive is broken already
     return _archive(fault(generator, model, "3mf"))
 
 
@@ -249,9 +252,9 @@ def _tokens(generator: Generator, content: bytes, suffix: str) -> bytes:
 
 
 def _counts(generator: Generator, content: bytes, suffix: str) -> bytes:
-    """A number that says how many of something follow, made another."""
-    other = generator.choice([-1, 0, 1, 2, 7, 100, 10**6, 2**31 - 1, 2**32 - 1])
-    wrong = int(other) if generator.random() < 0.5 else None
+    """Change a declared count, or delete or repeat lines."""
+    replacement = generator.choice([-1, 0, 1, 2, 7, 100, 10**6, 2**31 - 1, 2**32 - 1])
+    wrong = int(replacement) if generator.random() < 0.5 else None
     if suffix == "stl" and not content.startswith(b"solid") and len(content) >= 84:
         (count,) = struct.unpack("<I", content[80:84])
         count = wrong % 2**32 if wrong is not None else max(count + int(generator.integers(-3, 4)), 0)
@@ -262,15 +265,15 @@ def _counts(generator: Generator, content: bytes, suffix: str) -> bytes:
         "glb": rb'(?<="count":)(\d+)|(?<="byteLength":)(\d+)|(?<="byteOffset":)(\d+)|(?<="componentType":)(\d+)',
     }
     if suffix in patterns:
-        found = list(re.finditer(patterns[suffix], content[:4000]))
-        if found:
-            one = found[generator.integers(len(found))]
-            value = wrong if wrong is not None else int(one.group()) + int(generator.integers(-3, 4))
+        matches = list(re.finditer(patterns[suffix], content[:4000]))
+        if matches:
+            match = matches[generator.integers(len(matches))]
+            value = wrong if wrong is not None else int(match.group()) + int(generator.integers(-3, 4))
             word = str(value).encode()
-            # A GLB says its lengths: keep them by padding, so that it is the count that is wrong.
+            # GLB files declare the lengths of their chunks. Padding keeps these lengths correct.
             if suffix == "glb":
-                word = word[: len(one.group())].ljust(len(one.group()))
-            return content[: one.start()] + word + content[one.end() :]
+                word = word[: len(match.group())].ljust(len(match.group()))
+            return content[: match.start()] + word + content[match.end() :]
     lines = content.splitlines(keepends=True) if suffix != "3mf" else re.split(rb"(?=<)", content)
     for _ in range(generator.integers(1, 4)):
         if lines:
@@ -300,12 +303,12 @@ def _hole(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np
 
 
 def _double(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-    again = faces[generator.integers(len(faces), size=generator.choice([1, 5]))]
-    return vertices, np.concatenate([faces, again[:, ::-1] if generator.random() < 0.5 else again])
+    copies = faces[generator.integers(len(faces), size=generator.choice([1, 5]))]
+    return vertices, np.concatenate([faces, copies[:, ::-1] if generator.random() < 0.5 else copies])
 
 
 def _glue(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-    """Two vertices made one: a pinch, or an edge of more than two faces."""
+    """Merge two vertices, which makes a pinch or an edge of more than two faces."""
     a, b = generator.integers(len(vertices), size=2)
     faces[faces == a] = b
     return vertices, faces
@@ -326,27 +329,27 @@ def _strays(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[
 
 
 def _twins(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-    """A second body, apart, touching or inside."""
+    """Add a second body, outside, touching or inside."""
     offset = generator.choice([0.0, 0.1, 5.0])
     factor = generator.choice([1.0, 0.5, 1e-3])
     return np.concatenate([vertices, factor * vertices + offset]), np.concatenate([faces, faces + len(vertices)])
 
 
 def _seam(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-    """Every face, or some, with vertices of their own."""
-    own = generator.random(len(faces)) < generator.choice([0.02, 0.5, 1.0])
-    own &= ((faces >= 0) & (faces < len(vertices))).all(axis=1)  # before it, a fault may have named others
-    corners = faces[own].ravel()
-    new = faces.copy()
-    new[own] = len(vertices) + np.arange(len(corners)).reshape(-1, 3)
-    return np.concatenate([vertices, vertices[corners]]), new
+    """Give some or all faces separate vertices."""
+    chosen = generator.random(len(faces)) < generator.choice([0.02, 0.5, 1.0])
+    chosen &= ((faces >= 0) & (faces < len(vertices))).all(axis=1)  # an earlier fault may have made invalid indices
+    corners = faces[chosen].ravel()
+    split = faces.copy()
+    split[chosen] = len(vertices) + np.arange(len(corners)).reshape(-1, 3)
+    return np.concatenate([vertices, vertices[corners]]), split
 
 
 def _order(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
     order = generator.permutation(len(vertices))
-    place = np.argsort(order)
-    inside = (faces >= 0) & (faces < len(vertices))
-    return vertices[order], np.where(inside, place[np.where(inside, faces, 0)], faces)
+    position = np.argsort(order)
+    is_valid = (faces >= 0) & (faces < len(vertices))
+    return vertices[order], np.where(is_valid, position[np.where(is_valid, faces, 0)], faces)
 
 
 def _not_finite(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
@@ -370,12 +373,12 @@ def _flat(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np
 
 
 def _slivers(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-    """Some vertices drawn to a neighbour, all the way or nearly."""
+    """Move some vertices to a neighbour, or almost to it."""
     for face in faces[generator.integers(len(faces), size=generator.choice([1, 10]))]:
-        inside = face[(face >= 0) & (face < len(vertices))]
-        if len(inside) > 1:
+        corners = face[(face >= 0) & (face < len(vertices))]
+        if len(corners) > 1:
             share = generator.choice([1.0, 1 - 1e-15, 1 - 1e-9, 1 - 1e-5, 0.99])
-            vertices[inside[0]] += share * (vertices[inside[1]] - vertices[inside[0]])
+            vertices[corners[0]] += share * (vertices[corners[1]] - vertices[corners[0]])
     return vertices, faces
 
 

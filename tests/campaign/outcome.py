@@ -1,4 +1,4 @@
-"""What a part of the campaign found, one row for each thing that it promises."""
+"""Results of the parts of the campaign: one row for each target."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ class Row:
     """One line of the table.
 
     Args:
-        part: of the campaign.
-        what: was tried.
-        tried: how many times.
-        target: in words.
-        measured: in words.
-        missed: a sentence for each miss of the target, with what repeats it; none where the target is met.
-        notes: what a reader should know, beside that.
+        part: name of the part of the campaign.
+        what: the subject of the trials.
+        tried: number of trials.
+        target: the target, in words.
+        measured: the result, in words.
+        missed: a sentence for each miss of the target, with the means to repeat it; empty if the target is met.
+        notes: further remarks for the reader.
         details: numbers, for the JSON file.
-        seconds: of wall time.
+        seconds: wall time.
     """
 
     part: str
@@ -44,7 +44,7 @@ class Row:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The rows as a Markdown table, and below it what was missed and what is to be known."""
+    """Format rows as a Markdown table, followed by the misses and notes."""
     header = ("part", "what", "tried", "target", "measured", "met", "s")
     lines = [
         (
@@ -60,10 +60,10 @@ def table(rows: Sequence[Row]) -> str:
     ]
     widths = [max(len(line[i]) for line in (header, *lines)) for i in range(len(header))]
 
-    def written(line: Sequence[str]) -> str:
+    def formatted(line: Sequence[str]) -> str:
         return "| " + " | ".join(word.ljust(width) for word, width in zip(line, widths, strict=True)) + " |"
 
-    text = [written(header), written(["-" * width for width in widths]), *map(written, lines)]
+    text = [formatted(header), formatted(["-" * width for width in widths]), *map(formatted, lines)]
     for row in rows:
         text += [f"MISSED {row.part}, {row.what}: {miss}" for miss in row.missed]
         text += [f"note   {row.part}, {row.what}: {note}" for note in row.notes]

@@ -1,7 +1,7 @@
-"""What no descriptor may notice, for every named one, on bodies and changes that hypothesis chooses.
+"""Invariances of all named descriptors, tested on bodies and changes that hypothesis chooses.
 
-A movement is the distance between the descriptions of a body before and after, by the descriptor's own distance, in
-percent of the median distance between different bodies.
+A movement is the distance between the descriptions of a body before and after a change, by the descriptor's distance,
+in percent of the median distance between different bodies.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from igps.signature.signature import Samples, Signature
 
 SEED = 13
 
-# What is promised, and so how far a description may move, in percent of the median distance between bodies.
-EXACT = 0.1  # nothing but rounding: what single precision and the ties of a histogram leave
-DISCRETE = 10.0  # the same body on another grid or mesh: small beside the distance between bodies
+# Largest movements of a description, in percent of the median distance between bodies
+EXACT = 0.1  # for rounding errors of single precision, and of values at the edges of bins
+DISCRETE = 10.0  # for the same body on another grid or mesh: small compared with the distance between bodies
 _PROMISES = {
     "motion": "nothing but rounding, but for the grid and the rays of a reflection",
     "turned grid": "a turn that takes the axes of the grid to each other: nothing but rounding",
@@ -44,26 +44,26 @@ _PROMISES = {
     "batch size": "nothing at all",
     "threads": "nothing at all",
 }
-# A motion moves the body within the grid of its samples, and a reflection exchanges the corners of faces, by which rays
-# are laid out.
+# A motion moves the body relative to the grid of its samples. A reflection exchanges the corners of faces, which
+# determine the directions of rays.
 _GRID = {"interior", "multiscale", "rich", "pretrained", "inner_distance", "volume_shape_dna"}
 _RAYS = {"local_diameter_centricity"}
 
 
 @dataclass(frozen=True)
 class Bound:
-    """How far a description may move.
+    """Bound of the movement of a description.
 
     Args:
         percent: of the median distance between bodies.
-        known: why today's code moves it farther, if it does; the movement is reported, and no miss.
+        known: the reason for a larger movement, if it is known; such a movement is reported, and is not a miss.
     """
 
     percent: float
     known: str = ""
 
 
-# Where a description moves farther than promised, and why.
+# Known movements above the bound, and their reasons
 KNOWN: dict[tuple[str, str], str] = {
     # The worst body moves by 14 % from one subdivision to two, and by 2 % from two to three.
     ("subdivision", "gps"): "one subdivision has too few vertices for the last of its 250 eigenpairs",
@@ -71,12 +71,12 @@ KNOWN: dict[tuple[str, str], str] = {
 
 
 def bound(prop: str, name: str) -> Bound:
-    """Of a property and a descriptor."""
+    """Bound for a property and a descriptor."""
     exact = prop != "subdivision" and not (prop == "motion" and name in _GRID | _RAYS)
     return Bound(EXACT if exact else DISCRETE, KNOWN.get((prop, name), ""))
 
 
-# As many samples of the surface as by default, which random ones need to tell the same of a body twice.
+# The default number of surface samples: with fewer random samples, descriptions of a body would differ.
 CONFIG = SignatureConfig(resolution=20, min_samples=0)
 
 
@@ -86,36 +86,36 @@ def bodies() -> tuple[Mesh, ...]:
     box = trimesh.creation.box(extents=(1.0, 0.8, 0.5))
     for _ in range(3):
         box = box.subdivide()
-    made = [
+    surfaces = [
         trimesh.creation.icosphere(subdivisions=3),
         trimesh.creation.torus(1.0, 0.4, major_sections=30, minor_sections=14),
         trimesh.creation.icosphere(subdivisions=3).apply_scale([0.5, 0.6, 2.0]),
         box,
     ]
-    found = []
-    for number, surface in enumerate(made):
+    meshes = []
+    for number, surface in enumerate(surfaces):
         surface.merge_vertices()
         x, y, z = np.asarray(surface.vertices).T
         bent = np.stack(
             [1.2 * x + 0.15 * y * z, y + 0.2 * x * x + 0.07 * z, 0.9 * z + 0.15 * np.sin(2 * x + number)], 1
         )
-        found.append(Mesh(bent, np.asarray(surface.faces), name=f"body {number}"))
-    return tuple(found)
+        meshes.append(Mesh(bent, np.asarray(surface.faces), name=f"body {number}"))
+    return tuple(meshes)
 
 
 @cache
-def _cut(number: int, times: int) -> Mesh:
-    """A body each face of which was cut into four, so many times."""
+def _subdivided(number: int, n_times: int) -> Mesh:
+    """A body after subdivision of each face into four, repeated `n_times`."""
     mesh = bodies()[number]
-    for _ in range(times):
+    for _ in range(n_times):
         vertices, faces = trimesh.remesh.subdivide(mesh.vertices, mesh.faces)
         mesh = replace(mesh, vertices=vertices, faces=faces)
     return mesh
 
 
-def _distance(one: Descriptor) -> Distance:
-    """That of the descriptor; of vectors the cosine, as the distance of a head may be blind to small movements."""
-    return cosine if isinstance(one, EmbeddedDescriptor) else one.distances
+def _distance(module: Descriptor) -> Distance:
+    """Distance of a descriptor; the cosine distance for embeddings, as a head's distance may ignore small movements."""
+    return cosine if isinstance(module, EmbeddedDescriptor) else module.distances
 
 
 class Describer:
@@ -124,43 +124,43 @@ class Describer:
     def __init__(self, names: Sequence[str] = NAMES) -> None:
         self.descriptors: dict[str, Descriptor] = {name: descriptor(name) for name in names}
         requirements = Requirements()
-        for one in self.descriptors.values():
-            requirements = requirements | one.requirements
+        for module in self.descriptors.values():
+            requirements = requirements | module.requirements
         self.config = requirements.apply_to(CONFIG)
         self.signatures = [compute_signature(mesh, self.config) for mesh in bodies()]
-        self.whole = [self.describe(s, m) for s, m in zip(self.signatures, bodies(), strict=True)]
+        self.unchanged = [self.describe(s, m) for s, m in zip(self.signatures, bodies(), strict=True)]
         self.median = {}
-        for name, one in self.descriptors.items():
-            together = torch.cat([description[name] for description in self.whole])
-            distances = _distance(one)(together, together)
-            self.median[name] = float(distances[~torch.eye(len(together), dtype=torch.bool)].median())
+        for name, module in self.descriptors.items():
+            descriptions = torch.cat([description[name] for description in self.unchanged])
+            distances = _distance(module)(descriptions, descriptions)
+            self.median[name] = float(distances[~torch.eye(len(descriptions), dtype=torch.bool)].median())
 
-    def describe(self, signature: Signature, mesh: Mesh, among: Sequence[str] | None = None) -> dict[str, torch.Tensor]:
-        """(1, ...) by each descriptor."""
+    def describe(self, signature: Signature, mesh: Mesh, names: Sequence[str] | None = None) -> dict[str, torch.Tensor]:
+        """Description (1, ...) by each descriptor, or by some of them."""
         batch = collate([signature], [mesh])
         with torch.inference_mode():
-            return {name: self.descriptors[name](batch) for name in (self.descriptors if among is None else among)}
+            return {name: self.descriptors[name](batch) for name in (self.descriptors if names is None else names)}
 
     @cache  # noqa: B019 (there is one describer in a campaign)
-    def subdivided(self, number: int, times: int) -> dict[str, torch.Tensor]:
-        """Descriptions of a body each face of which was cut into four, so many times."""
-        mesh = _cut(number, times)
+    def describe_subdivided(self, number: int, n_times: int) -> dict[str, torch.Tensor]:
+        """Descriptions of a body after subdivision of each face into four, repeated `n_times`."""
+        mesh = _subdivided(number, n_times)
         return self.describe(compute_signature(mesh, self.config), mesh)
 
     def simplifying(self, mesh: Mesh) -> list[str]:
-        """The descriptors that simplify a mesh first."""
-        most = {name: getattr(one, "max_vertices", None) for name, one in self.descriptors.items()}
-        return [name for name, number in most.items() if number is not None and number < len(mesh.vertices)]
+        """Names of the descriptors that simplify a mesh first."""
+        limits = {name: getattr(module, "max_vertices", None) for name, module in self.descriptors.items()}
+        return [name for name, limit in limits.items() if limit is not None and limit < len(mesh.vertices)]
 
     def movements(self, before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> dict[str, float]:
-        """Percent of the median distance, by each descriptor."""
+        """Movement by each descriptor, in percent of the median distance."""
         return {
             name: 100 * float(_distance(self.descriptors[name])(before[name], value)) / self.median[name]
             for name, value in after.items()
         }
 
 
-# Descriptions before and after.
+# Descriptions before and after a change
 Pair = tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]
 Change = Callable[[Describer, st.DataObject], Pair]
 
@@ -169,11 +169,11 @@ _seeds = st.integers(0, 2**32 - 1)
 
 
 def _moved_mesh(describer: Describer, number: int, mesh: Mesh) -> Pair:
-    return describer.whole[number], describer.describe(compute_signature(mesh, describer.config), mesh)
+    return describer.unchanged[number], describer.describe(compute_signature(mesh, describer.config), mesh)
 
 
 def _motion(describer: Describer, data: st.DataObject) -> Pair:
-    """A rotation, or a reflection with one, and a shift."""
+    """A rotation and a shift, with or without a reflection."""
     number = data.draw(_numbers)
     generator = np.random.default_rng(data.draw(_seeds))
     turn = Rotation.from_quat(generator.normal(size=4)).as_matrix() * data.draw(st.sampled_from([1.0, -1.0]))
@@ -184,7 +184,7 @@ def _motion(describer: Describer, data: st.DataObject) -> Pair:
 
 
 def _turned_grid(describer: Describer, data: st.DataObject) -> Pair:
-    """One of the turns of a cube, which leaves the order of faces and corners as it is."""
+    """A rotation of the cube, which keeps the order of faces and corners."""
     number = data.draw(_numbers)
     order = data.draw(st.permutations(range(3)))
     signs = np.array(data.draw(st.tuples(*[st.sampled_from([-1.0, 1.0])] * 3)))
@@ -205,11 +205,11 @@ def _vertices(describer: Describer, data: st.DataObject) -> Pair:
 
 
 def _many_vertices(describer: Describer, data: st.DataObject) -> Pair:
-    """More of them than some descriptors keep, which choose points by form after simplifying the mesh."""
+    """A renumbering of large meshes, for descriptors that simplify them before they choose samples."""
     number = data.draw(_numbers)
-    mesh = _renumbered(_cut(number, 1), data.draw(_seeds))
-    among = describer.simplifying(mesh)
-    return describer.subdivided(number, 1), describer.describe(compute_signature(mesh, describer.config), mesh, among)
+    mesh = _renumbered(_subdivided(number, 1), data.draw(_seeds))
+    after = describer.describe(compute_signature(mesh, describer.config), mesh, describer.simplifying(mesh))
+    return describer.describe_subdivided(number, 1), after
 
 
 def _renumbered(mesh: Mesh, seed: int) -> Mesh:
@@ -228,29 +228,29 @@ def _faces(describer: Describer, data: st.DataObject) -> Pair:
 
 
 def _subdivision(describer: Describer, data: st.DataObject) -> Pair:
-    """From one subdivision to two: the bodies themselves are too coarse for 250 eigenpairs that mean anything."""
+    """From one subdivision to two. The original meshes are too coarse for 250 meaningful eigenpairs."""
     number = data.draw(_numbers)
-    return describer.subdivided(number, 1), describer.subdivided(number, 2)
+    return describer.describe_subdivided(number, 1), describer.describe_subdivided(number, 2)
 
 
 def _signs(describer: Describer, data: st.DataObject) -> Pair:
-    """Every sign may change, and neighbours within a multiplet, of two equal eigenvalues, are turned."""
+    """Random signs of all eigenfunctions."""
     number = data.draw(_numbers)
     generator = np.random.default_rng(data.draw(_seeds))
     signature = describer.signatures[number]
     n_eigenpairs = len(signature.eigenvalues)
     basis = np.diag(generator.choice([-1.0, 1.0], n_eigenpairs))
     after = describer.describe(_in_basis(signature, basis, signature.eigenvalues), bodies()[number])
-    return describer.whole[number], after
+    return describer.unchanged[number], after
 
 
 def _multiplet(describer: Describer, data: st.DataObject) -> Pair:
-    """A multiplet is made by taking the mean of some neighbouring eigenvalues, before and after the basis is turned."""
+    """A random basis of a multiplet. Neighbouring eigenvalues are averaged before and after the change to make one."""
     number = data.draw(_numbers)
     generator = np.random.default_rng(data.draw(_seeds))
     signature = describer.signatures[number]
     n_eigenpairs = len(signature.eigenvalues)
-    # No descriptor's eigenpairs end within one of these: 4, 8, 12, 16, 50 and 250 are the numbers in use.
+    # No descriptor splits one of these multiplets: they use the first 4, 8, 12, 16, 50 and 250 eigenpairs.
     first, size = int(generator.choice([0, 5, 9, 13, 20, 60, 150])), int(generator.choice([2, 3]))
     values = signature.eigenvalues.copy()
     values[first : first + size] = values[first : first + size].mean()
@@ -271,7 +271,7 @@ def _in_basis(signature: Signature, basis: NDArray[np.float64], values: NDArray[
 
 
 def _padding(describer: Describer, data: st.DataObject) -> Pair:
-    """Beside a body that has more samples and more eigenpairs, whatever its place."""
+    """A batch with a body of more samples and more eigenpairs, in any order."""
     number = data.draw(_numbers)
     other = data.draw(_numbers)
     repeated = describer.signatures[other]
@@ -294,15 +294,16 @@ def _padding(describer: Describer, data: st.DataObject) -> Pair:
     pair = [(describer.signatures[number], bodies()[number]), (larger, bodies()[other])]
     batch = collate(*zip(*(pair if place == 0 else pair[::-1]), strict=True))
     with torch.inference_mode():
-        # Those that look at one body at a time would do all their work twice.
-        return describer.whole[number], {name: one(batch)[[place]] for name, one in describer.descriptors.items()}
+        after = {name: module(batch)[[place]] for name, module in describer.descriptors.items()}
+    return describer.unchanged[number], after
 
 
 def _batch_size(describer: Describer, data: st.DataObject) -> Pair:
     numbers = data.draw(st.lists(_numbers, min_size=2, max_size=3))
     batch = collate([describer.signatures[i] for i in numbers], [bodies()[i] for i in numbers])
     with torch.inference_mode():
-        return describer.whole[numbers[-1]], {name: one(batch)[[-1]] for name, one in describer.descriptors.items()}
+        after = {name: module(batch)[[-1]] for name, module in describer.descriptors.items()}
+    return describer.unchanged[numbers[-1]], after
 
 
 def _threads(describer: Describer, data: st.DataObject) -> Pair:
@@ -331,7 +332,7 @@ CHANGES: dict[str, tuple[Change, ...]] = {
 
 
 def campaign(n_examples: int, names: Sequence[str] = NAMES) -> list[Row]:
-    """So many examples of each change."""
+    """Try `n_examples` examples of each change."""
     torch.set_num_threads(1)
     describer = Describer(names)
     return [_row(describer, prop, changes, n_examples) for prop, changes in CHANGES.items()]
@@ -349,7 +350,7 @@ def _row(describer: Describer, prop: str, changes: tuple[Change, ...], n_example
             movements = describer.movements(*change(describer, data))
             for name, movement in movements.items():
                 largest[name] = max(largest[name], movement if np.isfinite(movement) else np.inf)
-            # Hypothesis looks for the largest share of what is allowed.
+            # Hypothesis searches for the largest movement relative to its bound.
             shares = [min(movement, 1e6) / bound(prop, name).percent for name, movement in movements.items()]
             target(max(shares, default=0.0), label=change.__name__)
 
@@ -365,13 +366,13 @@ def _row(describer: Describer, prop: str, changes: tuple[Change, ...], n_example
     run()
     missed, notes = [], []
     for name, movement in largest.items():
-        allowed = bound(prop, name)
-        if movement > allowed.percent:
-            words = f"{name} moves by {movement:.3g} %, {allowed.percent:g} % allowed"
-            if allowed.known:
-                notes.append(f"{words}: {allowed.known}")
+        limit = bound(prop, name)
+        if movement > limit.percent:
+            sentence = f"{name} moves by {movement:.3g} %, {limit.percent:g} % allowed"
+            if limit.known:
+                notes.append(f"{sentence}: {limit.known}")
             else:
-                missed.append(words)
+                missed.append(sentence)
     worst = max(largest, key=lambda name: largest[name] / bound(prop, name).percent)
     return Row(
         "properties",

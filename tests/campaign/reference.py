@@ -1,4 +1,4 @@
-"""A second path from a mesh to its numbers: libigl's matrices, a dense eigensolver and loops of NumPy."""
+"""An independent reference for the numbers of a mesh: libigl's matrices, a dense eigensolver and NumPy loops."""
 
 from __future__ import annotations
 
@@ -22,38 +22,42 @@ Floats = NDArray[np.float64]
 Surface = tuple[Floats, NDArray[np.int64]]
 
 N_CLASSES, N_BINS, REACH = 4, 16, 4.0
-# Twice a face's area over its longest side squared. Thinner ones are mollified by the library, not by libigl, and what
-# rounding makes of the cotangents of thin ones differs from formula to formula.
-_THIN = 1e-5
+# Smallest ratio of twice the area of a face to its longest side squared. The library mollifies thinner faces and libigl
+# does not; rounding errors of the cotangents of thin faces differ between formulas.
+_MIN_ASPECT = 1e-5
 _ROUNDING = 1e-9
-_DENSE = 500
-# Samples at which the extension is computed again, one by one.
-_FEW = 25
+# Largest number of vertices for the dense eigensolver
+_MAX_DENSE = 500
+# Number of samples at which the extension is checked
+_N_CHECKED = 25
 
 
 def confirm(
     mesh: Mesh, signature: Signature, written: Surface | None, config: SignatureConfig, suffix: str
 ) -> tuple[list[str], list[str]]:
-    """What the second path does not confirm, in words; and the names of what it does.
+    """Compare a signature with the reference.
 
     Args:
-        mesh: as read.
-        signature: of it.
-        written: the arrays that the file was made of; None where it was broken or repaired afterwards.
+        mesh: the mesh as read.
+        signature: of the mesh.
+        written: the arrays in the file; None if the file was broken or the mesh repaired afterwards.
         config: of the signature.
         suffix: of the file.
+
+    Returns:
+        Sentences about numbers that are not confirmed, and the names of the confirmed numbers.
     """
     doubts: list[str] = []
     checks: list[str] = []
 
-    def check(name: str, sound: bool, words: str = "") -> None:
-        if sound:
+    def check(name: str, is_confirmed: bool, doubt: str = "") -> None:
+        if is_confirmed:
             checks.append(name)
         else:
-            doubts.append(f"{name}: {words}")
+            doubts.append(f"{name}: {doubt}")
 
     vertices, faces, scale = _in_unit_scale(mesh)
-    if written is not None and suffix != ".stl":  # STL has no vertices, only corners
+    if written is not None and suffix != ".stl":  # STL files repeat the vertices of each face
         check("arrays", *_same_arrays(mesh, written, single=suffix == ".glb"))
     check("topology", *_is_surface(vertices, faces, mesh.allow_open))
     area, volume = _area_and_volume(vertices, faces)
@@ -71,7 +75,7 @@ def confirm(
         "eigenvalues or eigenfunctions are not",
     )
     check("ascending", bool((np.diff(values) >= 0).all() and values[0] > 0), f"{values}")
-    well_shaped = bool(_thinness(vertices, faces).min() > _THIN)
+    well_shaped = bool(_thinness(vertices, faces).min() > _MIN_ASPECT)
     functions = None
     if well_shaped:
         expected, functions = eigenpairs(vertices, faces, config.n_eigenpairs + 1)
@@ -81,58 +85,58 @@ def confirm(
     if closed:
         check("interior samples", *_samples_confirmed(mesh, signature, vertices, faces, config.resolution))
     if functions is not None and expected[-1] / expected[-2] > 1 + 1e-3:
-        # The accuracy is promised inside closed surfaces: beside an opening only the closed form keeps it.
+        # The accuracy holds inside closed surfaces. Next to openings, only the closed form reaches it.
         exact = signature if closed else compute_signature(mesh, replace(config, accuracy=None))
-        some = np.linspace(0, len(exact.interior) - 1, min(_FEW, len(exact.interior))).astype(int)
-        potential = np.square(exact.interior.eigenfunctions[some].astype(np.float64)) @ (1 / values)
-        points = (exact.interior.points[some] - _centre(mesh)) / scale
+        checked = np.linspace(0, len(exact.interior) - 1, min(_N_CHECKED, len(exact.interior))).astype(int)
+        potential = np.square(exact.interior.eigenfunctions[checked].astype(np.float64)) @ (1 / values)
+        points = (exact.interior.points[checked] - _centre(mesh)) / scale
         extended = mean_values(vertices, faces, points, functions[:, :-1])
-        wanted = np.square(extended) @ (1 / expected[:-1])
-        error = np.abs(potential - wanted).max() / np.abs(wanted).max()
+        reference = np.square(extended) @ (1 / expected[:-1])
+        error = np.abs(potential - reference).max() / np.abs(reference).max()
         check("extension", error < 1e-3, f"the potential of a sample is off by {error:.2g}")
     batch = collate([signature])
-    counted = _describe(signature)
-    for name, value in counted.items():
+    histograms = _describe(signature)
+    for name, value in histograms.items():
         check(f"{name} sum", bool(np.isfinite(value).all() and abs(value.sum() - 1) < 1e-5), f"{value.sum()}")
-    area_there = float(batch.area[0])
-    wanted, doubtful = distances_histogram(batch.surface.points[0].double().numpy() / np.sqrt(area_there))
-    error = np.abs(counted["d2"] - wanted).sum() / 2
+    batch_area = float(batch.area[0])
+    reference, doubtful = distances_histogram(batch.surface.points[0].double().numpy() / np.sqrt(batch_area))
+    error = np.abs(histograms["d2"] - reference).sum() / 2
     check("d2", error < 1e-5 + doubtful, f"{error:.2g} of the pairs are in other bins")
     if len(signature.interior) > 1:
-        wanted, doubtful = interior_histogram(signature.interior.eigenfunctions / np.sqrt(values))
-        error = np.abs(counted["interior"] - wanted).sum() / 2
+        reference, doubtful = interior_histogram(signature.interior.eigenfunctions / np.sqrt(values))
+        error = np.abs(histograms["interior"] - reference).sum() / 2
         check("interior histogram", error < 1e-4 + doubtful, f"{error:.2g} of the pairs are in other cells")
-    _check_motion(mesh, signature, counted, config, check)
+    _check_motion(mesh, signature, histograms, config, check)
     return doubts, checks
 
 
-def _check_motion(mesh, signature, counted, config, check) -> None:  # type: ignore[no-untyped-def]
-    """The same after a quarter turn, which the grid does not notice, and a shift."""
+def _check_motion(mesh, signature, histograms, config, check) -> None:  # type: ignore[no-untyped-def]
+    """Check that a quarter turn, which maps the grid to itself, and a shift leave the numbers as they are."""
     turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     centred = mesh.vertices - _centre(mesh)
     shift = np.ptp(mesh.vertices, axis=0).max() * np.array([0.37, -0.61, 0.23])
-    moved = replace(mesh, vertices=centred @ turn.T + shift)
-    again = compute_signature(moved, config)
+    moved_mesh = replace(mesh, vertices=centred @ turn.T + shift)
+    moved = compute_signature(moved_mesh, config)
     for name in ("area", "volume"):
-        one, other = getattr(signature, name), getattr(again, name)
-        check(f"{name} moved", _close(one, other, 1e-6), f"{one!r} and {other!r}")
-    error = np.abs(again.eigenvalues / signature.eigenvalues - 1).max()
-    # A thin face's cotangents are differences of squares, which a shift rounds otherwise.
+        before, after = getattr(signature, name), getattr(moved, name)
+        check(f"{name} moved", _close(before, after, 1e-6), f"{before!r} and {after!r}")
+    error = np.abs(moved.eigenvalues / signature.eigenvalues - 1).max()
+    # The cotangents of thin faces are differences of squares, whose rounding errors change with a shift.
     check("eigenvalues moved", error < 1e-4, f"relative difference {error:.2g}")
-    for name, value in _describe(again).items():
-        error = np.abs(value - counted[name]).sum() / 2
+    for name, value in _describe(moved).items():
+        error = np.abs(value - histograms[name]).sum() / 2
         check(f"{name} moved", error < 0.02, f"{error:.2g} of the pairs are in other cells")
 
 
 def _describe(signature: Signature) -> dict[str, Floats]:
     batch = collate([signature])
-    found = {"d2": D2()(batch)[0].double().numpy()}
+    histograms = {"d2": D2()(batch)[0].double().numpy()}
     if len(signature.interior) > 1:
         embedding = SpectralEmbedding(n_eigenpairs=len(signature.eigenvalues))
         histogram = PairHistogram([Potential(N_CLASSES), InteriorDistance(N_BINS, REACH)], embedding)
         with torch.inference_mode():
-            found["interior"] = histogram(batch)[0].double().numpy()
-    return found
+            histograms["interior"] = histogram(batch)[0].double().numpy()
+    return histograms
 
 
 def _centre(mesh: Mesh) -> Floats:
@@ -146,6 +150,7 @@ def _in_unit_scale(mesh: Mesh) -> tuple[Floats, NDArray[np.int64], float]:
 
 
 def _scaled(value: float, scale: float, power: int) -> float:
+    """value · scale ** power, without overflow of the power itself."""
     with np.errstate(all="ignore"):
         for _ in range(power):
             value = float(np.float64(value) * scale)
@@ -162,23 +167,23 @@ def _same_arrays(mesh: Mesh, written: Surface, single: bool) -> tuple[bool, str]
         vertices = vertices.astype(np.float32).astype(np.float64)
     if mesh.vertices.shape != vertices.shape or mesh.faces.shape != faces.shape:
         return False, f"{len(mesh.vertices)} vertices and {len(mesh.faces)} faces of {len(vertices)} and {len(faces)}"
-    turned = np.array_equal(mesh.faces, faces) or np.array_equal(mesh.faces, faces[:, ::-1])
-    return bool(np.array_equal(mesh.vertices, vertices) and turned), "other than those written"
+    same_faces = np.array_equal(mesh.faces, faces) or np.array_equal(mesh.faces, faces[:, ::-1])
+    return bool(np.array_equal(mesh.vertices, vertices) and same_faces), "other than those written"
 
 
 def _is_surface(vertices: Floats, faces: NDArray[np.int64], allow_open: bool) -> tuple[bool, str]:
-    """By trimesh: closed or allowed to be open, of one piece, oriented, with no edge of three faces."""
+    """Whether a surface is closed (unless it may be open), connected and oriented, without edges of three faces."""
     surface = trimesh.Trimesh(vertices, faces, process=False)
     edges, count = np.unique(np.sort(surface.edges, axis=1), axis=0, return_counts=True)
-    pieces = trimesh.graph.connected_component_labels(edges, node_count=len(vertices)).max() + 1
-    sound = (
+    n_components = trimesh.graph.connected_component_labels(edges, node_count=len(vertices)).max() + 1
+    is_surface = (
         (surface.is_watertight or allow_open)
         and surface.is_winding_consistent
         and count.max() <= 2
-        and pieces == 1
+        and n_components == 1
         and len(np.unique(faces)) == len(vertices)
     )
-    return bool(sound), f"trimesh says otherwise ({pieces} pieces, an edge of {count.max()} faces)"
+    return bool(is_surface), f"trimesh finds {n_components} components and an edge of {count.max()} faces"
 
 
 def _area_and_volume(vertices: Floats, faces: NDArray[np.int64]) -> tuple[float, float]:
@@ -193,15 +198,15 @@ def _thinness(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
 
 
 def eigenpairs(vertices: Floats, faces: NDArray[np.int64], n_eigenpairs: int) -> tuple[Floats, Floats]:
-    """(K,) and (V, K) of libigl's cotangent stiffness and mixed Voronoi mass, without the zero.
+    """Eigenpairs (K,) and (V, K) of libigl's cotangent stiffness and mixed Voronoi mass, without the zero mode.
 
-    By a dense solver, or of larger surfaces by ARPACK with a shift below the spectrum.
+    They are computed by a dense solver, or for larger surfaces by ARPACK with a shift below the spectrum.
     """
     stiffness = -igl.cotmatrix(vertices, faces)
     mass = igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_VORONOI).diagonal()
     root = scipy.sparse.diags(1 / np.sqrt(mass))
     symmetric = (root @ stiffness @ root).tocsc()
-    if len(vertices) <= _DENSE:
+    if len(vertices) <= _MAX_DENSE:
         values, vectors = scipy.linalg.eigh(symmetric.toarray(), subset_by_index=[1, n_eigenpairs])
     else:
         start = np.sqrt(mass) * (1 + vertices[:, 0] ** 2 + vertices[:, 1])
@@ -212,36 +217,36 @@ def eigenpairs(vertices: Floats, faces: NDArray[np.int64], n_eigenpairs: int) ->
 
 
 def mean_values(vertices: Floats, faces: NDArray[np.int64], points: Floats, functions: Floats) -> Floats:
-    """(P, K) mean value interpolation of functions (V, K), point by point, after Ju, Schaefer and Warren 2005."""
-    found = np.empty((len(points), functions.shape[1]))
+    """(P, K) mean value interpolation of functions (V, K), point by point (Ju, Schaefer and Warren 2005)."""
+    values = np.empty((len(points), functions.shape[1]))
     for i, point in enumerate(points):
-        away = vertices - point
-        distance = np.linalg.norm(away, axis=1)
-        u = (away / distance[:, None])[faces]
+        offset = vertices - point
+        distance = np.linalg.norm(offset, axis=1)
+        u = (offset / distance[:, None])[faces]
         sides = np.linalg.norm(np.roll(u, -1, axis=1) - np.roll(u, -2, axis=1), axis=2)
         angles = 2 * np.arcsin(np.clip(sides / 2, 0, 1))
         half = angles.sum(axis=1, keepdims=True) / 2
         sines = np.sin(angles)
-        after, before = np.roll(sines, -1, axis=1), np.roll(sines, -2, axis=1)
-        cosines = 2 * np.sin(half) * np.sin(half - angles) / (after * before) - 1
-        turned = np.sign(np.linalg.det(u))[:, None] * np.sqrt(np.clip(1 - cosines**2, 0, None))
-        across = (
+        sine_after, sine_before = np.roll(sines, -1, axis=1), np.roll(sines, -2, axis=1)
+        cosines = 2 * np.sin(half) * np.sin(half - angles) / (sine_after * sine_before) - 1
+        signed_sines = np.sign(np.linalg.det(u))[:, None] * np.sqrt(np.clip(1 - cosines**2, 0, None))
+        numerators = (
             angles
             - np.roll(cosines, -1, axis=1) * np.roll(angles, -2, axis=1)
             - np.roll(cosines, -2, axis=1) * np.roll(angles, -1, axis=1)
         )
-        weights = across / (distance[faces] * after * np.roll(turned, -2, axis=1))
-        # In the plane of a face, but outside of it, the face counts nothing.
-        weights[(np.abs(turned) < 1e-7).any(axis=1)] = 0
+        weights = numerators / (distance[faces] * sine_after * np.roll(signed_sines, -2, axis=1))
+        # A face does not count for points in its plane outside the face.
+        weights[(np.abs(signed_sines) < 1e-7).any(axis=1)] = 0
         total = np.bincount(faces.ravel(), weights.ravel(), len(vertices))
-        found[i] = total @ functions / total.sum()
-    return found
+        values[i] = total @ functions / total.sum()
+    return values
 
 
 def _samples_confirmed(
     mesh: Mesh, signature: Signature, vertices: Floats, faces: NDArray[np.int64], resolution: int
 ) -> tuple[bool, str]:
-    """The samples are the cell centres whose winding number is above one half, but for those on the surface."""
+    """Whether the samples are the cell centres of winding number above one half, except for centres on the surface."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     cell = (high - low).max() / resolution
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1).astype(int)
@@ -249,32 +254,32 @@ def _samples_confirmed(
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     winding = igl.winding_number(vertices, faces, grid)
     squared, *_ = igl.point_mesh_squared_distance(grid, vertices, faces)
-    clear = np.sqrt(squared) > 1e-6 * cell
-    certain, possible = grid[(winding > 0.5) & clear], grid[(winding > 0.5) | ~clear]
+    is_off_surface = np.sqrt(squared) > 1e-6 * cell
+    certain, possible = grid[(winding > 0.5) & is_off_surface], grid[(winding > 0.5) | ~is_off_surface]
     scale = np.abs(mesh.vertices - _centre(mesh)).max()
     points = (signature.interior.points - _centre(mesh)) / scale
 
-    def cells(places: Floats) -> set[tuple[int, ...]]:
-        return {tuple(place) for place in np.rint((places - [axis[0] for axis in axes]) / cell).astype(int)}
+    def cells(centres: Floats) -> set[tuple[int, ...]]:
+        return {tuple(index) for index in np.rint((centres - [axis[0] for axis in axes]) / cell).astype(int)}
 
-    missing, invented = cells(certain) - cells(points), cells(points) - cells(possible)
-    return not missing and not invented, f"{len(missing)} missing, {len(invented)} not inside, of {len(points)}"
+    missing, outside = cells(certain) - cells(points), cells(points) - cells(possible)
+    return not missing and not outside, f"{len(missing)} missing, {len(outside)} not inside, of {len(points)}"
 
 
 def distances_histogram(points: Floats, n_bins: int = 64, reach: float = 2.0) -> tuple[Floats, float]:
-    """D2 by a loop, and the share of distances so near to an edge of a bin that rounding decides."""
+    """D2 by a loop, and the share of distances so close to an edge of a bin that their bin depends on rounding."""
     counts = np.zeros(n_bins)
     doubtful = 0
     for i in range(len(points)):
-        position = np.linalg.norm(points[i + 1 :] - points[i], axis=1) * n_bins / reach
-        for place in position:
-            counts[min(int(place), n_bins - 1)] += 1
-            doubtful += abs(place - round(place)) < 1e-3
+        positions = np.linalg.norm(points[i + 1 :] - points[i], axis=1) * n_bins / reach
+        for position in positions:
+            counts[min(int(position), n_bins - 1)] += 1
+            doubtful += abs(position - round(position)) < 1e-3
     return counts / counts.sum(), doubtful / counts.sum()
 
 
 def interior_histogram(embedding: Floats) -> tuple[Floats, float]:
-    """The paper's histogram by loops, and the share of pairs whose class rounding decides."""
+    """The histogram of Rustamov 2010 by loops, and the share of pairs whose class depends on rounding."""
     embedding = np.asarray(embedding, dtype=np.float64)
     level = np.linalg.norm(embedding, axis=1) * N_CLASSES / 1.5
     classes = np.minimum(level.astype(int), N_CLASSES - 1)
@@ -282,12 +287,12 @@ def interior_histogram(embedding: Floats) -> tuple[Floats, float]:
     histogram = np.zeros((len(rows), N_BINS))
     for i in range(len(embedding)):
         distances = np.linalg.norm(embedding[i + 1 :] - embedding[i], axis=1)
-        places = np.clip(distances * N_BINS / REACH - 0.5, 0, N_BINS - 1)
-        for j, place in enumerate(places, start=i + 1):
+        positions = np.clip(distances * N_BINS / REACH - 0.5, 0, N_BINS - 1)
+        for j, position in enumerate(positions, start=i + 1):
             row = rows[tuple(sorted((classes[i], classes[j])))]
-            lower = int(place)
-            histogram[row, lower] += 1 - (place - lower)
-            if place > lower:
-                histogram[row, lower + 1] += place - lower
+            lower = int(position)
+            histogram[row, lower] += 1 - (position - lower)
+            if position > lower:
+                histogram[row, lower + 1] += position - lower
     near = np.abs(level - np.rint(level)) < 1e-5
     return histogram / histogram.sum(), float(2 * near.mean())

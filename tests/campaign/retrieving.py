@@ -1,4 +1,4 @@
-"""`igps retrieve` on a few small shapes, as a command that can be killed, and the table that it leaves."""
+"""`igps retrieve` on a few small shapes, as a process that can be killed, and its results."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ import trimesh
 from igps.shapes.benchmark import off_text
 
 HERE = Path(__file__).parent
-SHAPES_A_CLASS = 4
+SHAPES_PER_CLASS = 4
 
 
 def write_shapes(folder: Path) -> None:
-    """Three classes of four closed surfaces of some two hundred vertices, with a folder each."""
-    made = {
+    """Write three classes of four closed surfaces of about two hundred vertices, a folder for each class."""
+    meshes = {
         "ball": trimesh.creation.icosphere(subdivisions=2),
         "ring": trimesh.creation.torus(1.0, 0.35, major_sections=20, minor_sections=10),
         "rod": trimesh.creation.capsule(height=2.0, radius=0.5, count=[14, 14]),
     }
     generator = np.random.default_rng(0)
-    for label, mesh in made.items():
+    for label, mesh in meshes.items():
         (folder / label).mkdir(parents=True)
-        for number in range(SHAPES_A_CLASS):
+        for number in range(SHAPES_PER_CLASS):
             x, y, z = np.asarray(mesh.vertices).T
             a, b, c = generator.uniform(0.05, 0.3, 3)
             vertices = np.stack([x * (1 + a), y + b * x * x, z + c * np.sin(2 * x)], axis=1)
@@ -40,7 +40,7 @@ def write_shapes(folder: Path) -> None:
 
 
 def arguments(shapes: Path, cache: Path, out: Path, n_workers: int) -> list[str]:
-    """Of the command, without its name."""
+    """Arguments of the command, without its name."""
     signature = {"n_eigenpairs": 6, "resolution": 10, "min_samples": 0, "n_surface_samples": 20}
     return [
         *("retrieve", str(shapes), "--descriptor", "cheap_descriptor:cheap", "--n_workers", str(n_workers)),
@@ -50,7 +50,7 @@ def arguments(shapes: Path, cache: Path, out: Path, n_workers: int) -> list[str]
 
 
 def environment(fault: str = "") -> dict[str, str]:
-    """Of a command: the descriptor can be imported, and a fault of the machine is in force."""
+    """Environment of a command that can import the descriptor, with a fault of the machine if one is named."""
     paths = [str(HERE), *([str(HERE / "shims")] if fault else []), *sys.path]
     path = os.pathsep.join(dict.fromkeys(path for path in paths if path))
     return {**os.environ, "PYTHONPATH": path, "IGPS_CAMPAIGN_FAULT": fault, "OMP_NUM_THREADS": "1"}
@@ -59,13 +59,13 @@ def environment(fault: str = "") -> dict[str, str]:
 def retrieve(
     shapes: Path, cache: Path, out: Path, n_workers: int = 1, fault: str = "", under: Sequence[str] = ()
 ) -> subprocess.CompletedProcess[str]:
-    """The command, run to its end, with a fault of the machine, or under another command."""
+    """Run the command to its end, with a fault of the machine, or under another command."""
     command = [*under, sys.executable, "-m", "igps.cli", *arguments(shapes, cache, out, n_workers)]
     return subprocess.run(command, env=environment(fault), capture_output=True, text=True, timeout=300, check=False)
 
 
 class Command:
-    """The command in a process forked from this one, which has imported all that it needs: it starts at once."""
+    """The command in a fork of this process, which starts at once, because all modules are imported already."""
 
     def __init__(self, shapes: Path, cache: Path, out: Path, n_workers: int) -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -79,18 +79,18 @@ class Command:
         self._status: int | None = None
 
     def children(self) -> list[int]:
-        """Processes of its workers."""
+        """Return the process ids of the command's workers."""
         return children(self.pid)
 
     def status(self) -> int | None:
-        """Exit status; minus the signal that ended it; None while it runs."""
+        """Return the exit status, minus the signal that ended the command, or None while it runs."""
         if self._status is None:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             self._status = os.waitstatus_to_exitcode(status) if pid else None
         return self._status
 
     def wait(self) -> int:
-        """Exit status, at its end."""
+        """Wait for the end of the command and return its exit status."""
         if self._status is None:
             self._status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         return self._status
@@ -104,7 +104,7 @@ def _become(words: list[str], log: Path) -> None:
         for stream in (1, 2):
             os.dup2(handle, stream)
         sys.argv = words
-        # Workers import the main module, which is to be none of the campaign's.
+        # Workers import the main module. Without this line, it would be a module of the campaign.
         sys.modules["__main__"] = types.ModuleType("__main__")
         os.environ.update(environment())
         sys.path.insert(0, str(HERE))
@@ -131,7 +131,7 @@ def _command() -> Callable[[], None]:
 
 
 def children(pid: int) -> list[int]:
-    """Processes whose parent this one is."""
+    """Return the ids of the child processes of a process."""
     try:
         return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     except OSError:
@@ -139,7 +139,7 @@ def children(pid: int) -> list[int]:
 
 
 def is_python_worker(pid: int) -> bool:
-    """Whether a process is a worker, and not the helper of multiprocessing that looks after semaphores."""
+    """Return whether a process is a worker, and not the resource tracker of multiprocessing."""
     try:
         return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
@@ -147,7 +147,7 @@ def is_python_worker(pid: int) -> bool:
 
 
 def table(out: Path) -> Mapping[str, Any] | None:
-    """All that a run leaves, to the bit; None where it is not whole."""
+    """Return the complete results of a run, bit by bit; None if they are incomplete."""
     try:
         scores = json.loads((out / "scores.json").read_text())
         with (out / "ranking.csv").open(newline="") as file:
@@ -160,6 +160,6 @@ def table(out: Path) -> Mapping[str, Any] | None:
 
 
 def partials(cache: Path) -> list[Path]:
-    """Files that somebody began to write; the memory of files is a database, which mends itself."""
+    """Return partially written files of a cache, without the database of known files, which repairs itself."""
     others = [path for path in cache.rglob("*") if path.is_file() and path.suffix != ".safetensors"]
     return [path for path in others if not path.name.startswith("known_files.sqlite")]

@@ -1,7 +1,7 @@
-"""The headline figures: what the named descriptors score on SHREC'07, against the table kept beside this script.
+"""Scores of the named descriptors on SHREC'07, compared with the table of expected scores beside this script.
 
-`python tests/campaign/shrec07.py FOLDER` compares, and ends with status 1 on a difference; `--write` keeps what it
-finds as what is expected.
+`python tests/campaign/shrec07.py FOLDER` ends with status 1 if a score differs. `--write` stores the measured scores as
+the expected ones.
 """
 
 from __future__ import annotations
@@ -22,66 +22,66 @@ from igps.nn.description import describe
 
 EXPECTED = Path(__file__).with_name("shrec07.json")
 SCORES = ("nn", "ft", "st", "dcg")
-# Scores are compared as the documentation prints them, in percent to a tenth.
+# Scores are compared with the precision of the documentation, tenths of a percent.
 _POINT = 10
 
 Table = Mapping[str, Mapping[str, float]]
 
 
 def measure(folder: Path, names: list[str], cache_dir: Path | None, n_workers: int | None) -> Table:
-    """The scores in percent, to a tenth, by descriptor; the paper's parameters."""
+    """Measure the scores of each descriptor with the parameters of the paper, in percent, rounded to tenths."""
     descriptors = {name: descriptor(name) for name in names}
     requirements = Requirements()
-    for one in descriptors.values():
-        requirements = requirements | one.requirements
+    for module in descriptors.values():
+        requirements = requirements | module.requirements
     config = requirements.apply_to(SignatureConfig.paper())
     dataset = SignatureDataset(find_bodies(folder, labelled=True), config, cache_dir, reading=LoadOptions())
     dataset.precompute(n_workers=n_workers, strict=True)
-    found = {}
-    for name, one in descriptors.items():
+    table = {}
+    for name, module in descriptors.items():
         failures: list[Failure] = []
-        descriptions = describe(dataset, one, failures=failures, n_workers=n_workers, progress=True)
-        distances = pair_distances(one, descriptions)
+        descriptions = describe(dataset, module, failures=failures, n_workers=n_workers, progress=True)
+        distances = pair_distances(module, descriptions)
         means = retrieval_scores(distances, dataset.usable(failures).bodies.labels or ()).mean()
-        found[name] = {score: round(100 * _POINT * float(means[score])) / _POINT for score in SCORES}
-        found[name]["n_described"] = len(descriptions)
-    return found
+        table[name] = {score: round(100 * _POINT * float(means[score])) / _POINT for score in SCORES}
+        table[name]["n_described"] = len(descriptions)
+    return table
 
 
-def differences(found: Table, expected: Table) -> list[str]:
-    """What differs from what is expected, in words."""
-    words = []
-    for name, scores in found.items():
+def differences(measured: Table, expected: Table) -> list[str]:
+    """Describe each difference from the expected scores in a sentence."""
+    sentences = []
+    for name, scores in measured.items():
         if name not in expected:
-            words.append(f"{name}: no scores are expected yet; keep these by --write")
+            sentences.append(f"{name}: there are no expected scores; store these with --write")
             continue
         for score, value in scores.items():
             if value != expected[name].get(score):
-                words.append(f"{name}: {score} is {value}, expected {expected[name].get(score)}")
-    return words
+                sentences.append(f"{name}: {score} is {value}, expected {expected[name].get(score)}")
+    return sentences
 
 
 def main() -> None:
-    """Compare the scores with those expected, or keep them."""
+    """Compare the scores with the expected ones, or store them."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, help="the SHREC'07 meshes, with labels.csv")
-    parser.add_argument("--descriptors", nargs="+", choices=NAMES, help="those with expected scores by default")
-    parser.add_argument("--cache_dir", type=Path, help="of signatures; the user's if not given")
-    parser.add_argument("--n_workers", type=int, help="processes; all cores if not given")
-    parser.add_argument("--write", action="store_true", help="keep the scores as those that are expected")
+    parser.add_argument("folder", type=Path, help="folder of the SHREC'07 meshes, with labels.csv")
+    parser.add_argument("--descriptors", nargs="+", choices=NAMES, help="default: those with expected scores")
+    parser.add_argument("--cache_dir", type=Path, help="cache of signatures; default: the user's cache")
+    parser.add_argument("--n_workers", type=int, help="number of processes; default: all cores")
+    parser.add_argument("--write", action="store_true", help="store the scores as the expected ones")
     arguments = parser.parse_args()
     expected: dict[str, Mapping[str, float]] = json.loads(EXPECTED.read_text()) if EXPECTED.exists() else {}
     names = arguments.descriptors or list(expected) or list(NAMES)
-    found = measure(arguments.folder, names, arguments.cache_dir, arguments.n_workers)
-    for name, scores in found.items():
+    measured = measure(arguments.folder, names, arguments.cache_dir, arguments.n_workers)
+    for name, scores in measured.items():
         print(f"{name:<28}" + "".join(f"{score} {value:<8g}" for score, value in scores.items()))
     if arguments.write:
-        EXPECTED.write_text(json.dumps({**expected, **found}, indent=2) + "\n")
+        EXPECTED.write_text(json.dumps({**expected, **measured}, indent=2) + "\n")
         print(f"written to {EXPECTED}")
         return
-    wrong = differences(found, expected)
-    print("\n".join(wrong) or "as expected")
-    sys.exit(bool(wrong))
+    sentences = differences(measured, expected)
+    print("\n".join(sentences) or "as expected")
+    sys.exit(bool(sentences))
 
 
 if __name__ == "__main__":

@@ -137,7 +137,9 @@ def test_volumes_are_compared_in_one_unit(
                 trimesh.load(path, process=False).apply_scale(1e-3).export(path.with_suffix(".glb"))
                 path.unlink()
     igps(monkeypatch, root, "groups", root, *OWN, "--size", "--out", tmp_path)
-    assert "6 of 10 bodies have no unit of length; their numbers count as millimetres" in capsys.readouterr().out
+    assert (
+        "6 of 10 bodies have no unit of length; their coordinates are taken as millimetres" in capsys.readouterr().out
+    )
     assert float(table(tmp_path / "groups.csv")[1]["effect"]) > 0.9
     igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", "volume", "--out", tmp_path)
     found = {row["name"][:-4]: float(row["volume"]) for row in table(tmp_path / "map.csv")}

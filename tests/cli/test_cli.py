@@ -612,7 +612,7 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["figure", "map", "TWO"], "root: expected three bodies or more, TWO has 2."),
         (["figure", "map", "ROOT", "--seed", "-1"], "seed: expected at least 0, got -1."),
         (["figure", "map", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
-        (["retrieve", "ROOT", "--with", "ct=-1"], "descriptor: expected +NAME or +NAME=WEIGHT behind a descriptor"),
+        (["retrieve", "ROOT", "--with", "ct=-1"], "descriptor: expected +NAME or +NAME=WEIGHT after the name"),
         (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
         (
             ["duplicates", "ROOT", "--poses", "--tolerance", "0.01"],

@@ -20,9 +20,9 @@ from igps.nn.histograms.pairs import PairHistogram
 
 @pytest.fixture(autouse=True)
 def _forgotten() -> Iterator[None]:
-    fingerprint._code.cache_clear()
+    fingerprint._code_tag.cache_clear()
     yield
-    fingerprint._code.cache_clear()
+    fingerprint._code_tag.cache_clear()
 
 
 def words() -> str:
@@ -73,17 +73,17 @@ def test_the_code_changes_the_words(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     copied = tmp_path / "igps"
     shutil.copytree(Path(fingerprint.__file__).parents[1], copied)
     monkeypatch.setattr(fingerprint, "__file__", str(copied / "descriptors" / "fingerprint.py"))
-    fingerprint._code.cache_clear()
+    fingerprint._code_tag.cache_clear()
     assert words() == before
     with (copied / "nn" / "histogram.py").open("a") as source:
         source.write("# one more line\n")
-    fingerprint._code.cache_clear()
+    fingerprint._code_tag.cache_clear()
     assert words() != before
 
 
 def test_versions_change_the_words(monkeypatch: pytest.MonkeyPatch) -> None:
     before = words()
-    fingerprint._code.cache_clear()
+    fingerprint._code_tag.cache_clear()
     version = fingerprint.importlib.metadata.version
     monkeypatch.setattr(
         fingerprint.importlib.metadata, "version", lambda name: version(name) + (name == "torch") * "+1"

@@ -174,7 +174,7 @@ def test_names_carry_the_choice() -> None:
 
 
 def test_what_cannot_be_weighed_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"size: expected .* the units of the bodies beside \"auto\""):
+    with pytest.raises(ValueError, match=r"size: expected .* or \"auto\" with the units of the bodies"):
         igps.descriptor("gps", size="auto")
     with pytest.raises(ValueError, match="mirror: expected one of same, distinct, got 'different'"):
         igps.descriptor("gps", mirror="different")  # type: ignore[arg-type]
@@ -201,10 +201,10 @@ def test_what_cannot_be_weighed_is_refused() -> None:
     [
         ("auto", ["mm", "cm"], True, ""),
         ("auto", [None, None], False, ""),
-        ("auto", ["mm", None], False, "size is ignored: 1 of 2 bodies have no unit of length; where"),
+        ("auto", ["mm", None], False, "size is ignored: 1 of 2 bodies have no unit of length; if"),
         ("auto", ["mm", "furlong"], False, "size is ignored: 1 of 2"),
         ("keep", [None, None], True, ""),
-        ("keep", ["mm", None], True, "size is kept: 1 of 2 bodies have no unit of length; their numbers count as"),
+        ("keep", ["mm", None], True, "size is kept: 1 of 2 bodies have no unit of length; their coordinates are"),
         ("ignore", ["mm", "mm"], False, ""),
     ],
 )

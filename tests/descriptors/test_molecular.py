@@ -133,7 +133,7 @@ def test_it_has_a_name_but_is_not_for_any_body() -> None:
 
 
 def test_shares_of_another_kind_are_named() -> None:
-    with pytest.raises(ValueError, match="expected 7 shares of each sample as 'residue_shares'"):
+    with pytest.raises(ValueError, match="expected 'residue_shares' with 7 shares for each sample"):
         PairHistogram([Shares("residue_shares", 7), InteriorDistance(4)])(collate([signature(0, 0.0)]))
     with pytest.raises(ValueError, match="expected finite shares"):
         Shares("residue_shares", 2).memberships(torch.tensor([[float("nan"), 1.0]]))

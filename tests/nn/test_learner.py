@@ -310,7 +310,7 @@ def test_bodies_of_unknown_classes_are_refused(items: list[LabelledSignature], t
     unknown = [replace(item, label=-1) for item in items]
     with pytest.raises(ValueError, match="labels: expected the class of each body, got −1"):
         trainer(1, tmp_path).fit(learner(), loader([*items[:-1], unknown[-1]]))
-    with pytest.raises(ValueError, match="query_labels: expected the class of each, got −1"):
+    with pytest.raises(ValueError, match="query_labels: expected known classes, got −1"):
         trainer(1, tmp_path).test(learner(), loader(unknown), verbose=False)
 
 

@@ -37,7 +37,7 @@ def test_with_lists_of_all_walks_by_steps_are_those_of_the_inverse(
     points = torch.randn(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     distances = own_distances(points)
     expected = rerank(distances, **numbers)  # type: ignore[arg-type]
-    monkeypatch.setattr(graph_reranking, "MOST_WHOLE", 0)
+    monkeypatch.setattr(graph_reranking, "MAX_DENSE", 0)
     found = rerank_graph(nearest(distances, 59), mean_of(distances), **numbers)  # type: ignore[arg-type]
     torch.testing.assert_close(found.distances, expected.gather(1, found.indices), rtol=0, atol=2e-5)
     assert (found.distances.diff(dim=1) >= 0).all()
@@ -50,8 +50,8 @@ def test_short_lists_find_classes_as_well(monkeypatch: pytest.MonkeyPatch) -> No
     points = (torch.randn(12, 1, 20, generator=generator) + torch.randn(12, 20, 20, generator=generator)).flatten(0, 1)
     labels, own = torch.arange(12).repeat_interleave(20), own_distances(points)
     whole = rerank(own)
-    monkeypatch.setattr(reranking, "MOST_WHOLE", 200)
-    monkeypatch.setattr(reranking, "_LISTED", (120, 120))
+    monkeypatch.setattr(reranking, "MAX_DENSE", 200)
+    monkeypatch.setattr(reranking, "_LIST_LIMITS", (120, 120))
     found = rerank(own)
     before, expected, tier = (retrieval_scores(one, labels).mean()["ft"] for one in (own, whole, found))
     assert expected > before + 0.1

@@ -51,7 +51,7 @@ def test_search_refuses_more_than_the_gallery_holds(top: int) -> None:
     ("distances", "message"),
     [
         (torch.ones(3), "expected a real matrix"),
-        (np.ones((2, 2)), "distances: expected a tensor, got ndarray; make one by torch.as_tensor"),
+        (np.ones((2, 2)), "distances: expected a tensor, got ndarray; convert with torch.as_tensor"),
         (torch.ones(2, 2, 2), "expected a real matrix"),
         (torch.ones(2, 2, dtype=torch.complex64), "expected a real matrix"),
         (torch.ones(2, 2, dtype=torch.bool), "expected a real matrix"),

@@ -208,7 +208,7 @@ def test_few_shapes_and_equal_ones() -> None:
     ("distances", "numbers", "message"),
     [
         (np.zeros((3, 3)), {}, "distances: expected a tensor, got ndarray"),
-        (torch.zeros(2, 3), {}, r"expected those of a collection to itself, \(N, N\), got \(2, 3\)"),
+        (torch.zeros(2, 3), {}, r"expected \(N, N\), of a collection to itself, got \(2, 3\)"),
         (-torch.ones(2, 2), {}, "finite numbers ≥ 0"),
         (torch.full((2, 2), math.nan), {}, "finite numbers ≥ 0"),
         (torch.zeros(2, 2), {"n_neighbours": 0}, "n_neighbours: expected at least 1, got 0"),

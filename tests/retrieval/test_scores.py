@@ -243,7 +243,7 @@ def test_per_class_means_are_those_of_the_members() -> None:
         (torch.ones(2, 2), torch.zeros(2, 1, dtype=torch.int64), None, "query_labels: expected shape"),
         (torch.ones(2, 2), torch.zeros(2), None, "query_labels: expected an integer tensor"),
         (torch.ones(2, 2), [torch.tensor(0), torch.tensor(0)], None, "query_labels: expected an integer tensor"),
-        (torch.ones(2, 2), torch.tensor([-1, -1]), None, "query_labels: .* got −1, which is unknown"),
+        (torch.ones(2, 2), torch.tensor([-1, -1]), None, "query_labels: .* got −1, which means unknown"),
         (torch.ones(2, 2), "aa", None, "query_labels: expected an integer tensor"),
         (torch.ones(2, 2), ["a", "b"], None, "nothing to score"),
         (torch.ones(1, 2), ["1"], [1, 1], "nothing to score"),
@@ -390,9 +390,9 @@ def test_metric_refuses_names_that_are_not_aligned() -> None:
     with pytest.raises(ValueError, match="ids: expected one name for each of 2"):
         metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a"])
     metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a", "b"])
-    with pytest.raises(ValueError, match="ids: expected with every update or with none"):
+    with pytest.raises(ValueError, match="ids: expected in every update or in none"):
         metric.update(torch.ones(2, 2), torch.tensor([0, 0]))
     metric.reset()
     metric.update(torch.ones(2, 2), torch.tensor([0, 0]))
-    with pytest.raises(ValueError, match="ids: expected with every update or with none"):
+    with pytest.raises(ValueError, match="ids: expected in every update or in none"):
         metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a", "b"])

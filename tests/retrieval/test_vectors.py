@@ -37,7 +37,7 @@ def test_features_order_as_chi_square_does() -> None:
 
 
 def test_rows_are_taken_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_ROWS_AT_ONCE", 8)
+    monkeypatch.setattr(module, "_BLOCK_ROWS", 8)
     rows = histograms(30, 40)
     features = AdditiveChi2Sampler(sample_steps=2).fit_transform(rows)
     expected = PCA(30, svd_solver="full").fit(features).transform(features)

@@ -1,4 +1,4 @@
-"""Every descriptor by its name, one file each."""
+"""The library's descriptors, one file each, and their registry by name."""
 
 from igps.descriptors.registry import NAMES, descriptor, load
 

@@ -1,4 +1,4 @@
-"""Shape distributions: the histogram of a simple function of random points of the surface (Osada et al. 2002)."""
+"""Shape distributions: histograms of a simple function of random surface points (Osada et al. 2002)."""
 
 import math
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ _N_POINTS = {"d2": 2, "a3": 3, "d1": 1}
 
 @dataclass(eq=False, repr=False)
 class D2(BodyDescriptor):
-    """The distribution of a shape function over the surface, of which D2 is the one that retrieves best.
+    """Histogram of a shape function over the surface: "d2", which retrieves best, "d1" or "a3".
 
-    D2 is the distance of two points, taken over all pairs of the signature's surface samples; D1 the distance of one
-    point from the centroid of the surface; both over √area. A3 is the angle between three points, in [0, π].
+    D2 is the distance between two points, over all pairs of the signature's surface samples. D1 is the distance of a
+    point from the centroid of the surface. Both are in units of √area. A3 is the angle between three points, in [0, π].
 
-    Source: Osada, Funkhouser, Chazelle and Dobkin 2002, with 64 values and the L1 norm, as recommended there; the
-    scale is that of the area, in place of the mean distance.
+    Source: Osada, Funkhouser, Chazelle and Dobkin 2002, with 64 bins and the L1 norm, as recommended there. Lengths are
+    normalised by the area in place of the mean distance.
     """
 
     name = "d2"
@@ -36,10 +36,10 @@ class D2(BodyDescriptor):
     requirements = Requirements()
 
     function: ShapeFunction = "d2"
-    n_bins: int = 64  # equal bins of the histogram
-    reach: float = 2.0  # end of the last bin, a distance over √area; what lies beyond counts in the last
+    n_bins: int = 64  # bins of equal width
+    reach: float = 2.0  # upper end of the last bin for distances, in units of √area; larger values go into this bin
     n_triples: int = 1024**2  # random triples of samples for A3; 1024² in the source
-    seed: int = 0  # of these triples
+    seed: int = 0  # of the random triples
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class D2(BodyDescriptor):
         check_positive(reach=self.reach)
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_bins,) histogram of the shape function, without unit, of sum 1; a ValueError of too few samples."""
+        """(n_bins,) histogram of sum 1; a ValueError if the signature has too few surface samples."""
         points = body.surface.points / math.sqrt(body.area)
         if len(points) < _N_POINTS[self.function]:
             raise ValueError(
@@ -64,7 +64,7 @@ class D2(BodyDescriptor):
         return torch.cdist(queries, gallery, p=1) / 2
 
     def _values(self, points: Floats) -> tuple[Floats, float]:
-        """The shape function of the samples, and the end of its bins."""
+        """Values of the shape function, and the upper end of its last bin."""
         if self.function == "d2":
             return torch.pdist(torch.from_numpy(points)).numpy(), self.reach
         if self.function == "d1":
@@ -73,12 +73,12 @@ class D2(BodyDescriptor):
 
 
 def _angles(points: Floats, n_triples: int, generator: np.random.Generator) -> Floats:
-    """Angle at the first of three distinct random samples, (n_triples,) radian."""
+    """(n_triples,) angles at the first of three distinct random samples, in radians."""
     n_points = len(points)
     corner = generator.integers(n_points, size=n_triples)
-    # Steps around the ring of samples: neither is zero, and they differ.
+    # Index offsets, modulo the number of samples. They are neither zero nor equal, so the three samples are distinct.
     first = generator.integers(1, n_points, size=n_triples)
     second = generator.integers(1, n_points - 1, size=n_triples)
     second += second >= first
-    a, b = (points[(corner + step) % n_points] - points[corner] for step in (first, second))
+    a, b = (points[(corner + offset) % n_points] - points[corner] for offset in (first, second))
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ni,ni->n", a, b))

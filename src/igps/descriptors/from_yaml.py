@@ -1,7 +1,7 @@
-"""Descriptors that are written down, in YAML: parts, histograms, axes, centres. Nothing runs when one is read."""
+"""Histogram descriptors that are specified in YAML. Reading such a file runs no code from it."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,23 +25,26 @@ HISTOGRAMS: Mapping[str, type[DescriptionPart]] = {
     "pieces": PieceHistogram,
     "spectrum": SpectrumShares,
 }
-"""What `histogram` may be."""
+"""Classes of histograms by their names in YAML files."""
 
-_MOST_BYTES, _MOST = 100_000, 10_000
-_ABOUT = ("name", "source", "invariant_to", "scale")
+_MAX_BYTES = 100_000  # of a file
+_MAX_INTEGER = 10_000  # of any number in a file: files are untrusted, and must not ask for huge histograms
+_METADATA_KEYS = ("name", "source", "invariant_to", "scale")
 
 
 def load_yaml(path: str | Path) -> HistogramDescriptor:
-    """The descriptor that a YAML file specifies, in evaluation mode.
+    """Load the descriptor that a YAML file specifies, in evaluation mode.
 
-    Its `parts` are histograms, or lists of histograms, with one share each. A histogram has `axes`, each a name or a
-    name with its options; `eigenpairs` of its embedding, which an axis may have of its own; `samples`, `n_samples`, and
-    `histogram`, its kind, "pairs" unless given. A name that is no axis of the library is an attribute, with `centres`
-    or with `quantiles`.
+    The key `parts` lists histograms, or lists of histograms; each part has the same share of a description. A histogram
+    has the key `histogram`, its kind ("pairs" by default), and the arguments of its class, such as `axes`, `samples`
+    and `n_samples`. In place of the argument `embedding`, the key `eigenpairs` is a number of eigenpairs; an axis may
+    have its own. An axis is a name, or a name with options. A name that is not among the library's axes is that of an
+    attribute, with the option `centres` or `quantiles`. Optional keys of the descriptor are `name`, `source`,
+    `invariant_to` and `scale`, see `Descriptor`.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: it tells of something else, and what there is.
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not such a specification; the message says what was expected.
     """
     import yaml
 
@@ -49,24 +52,24 @@ def load_yaml(path: str | Path) -> HistogramDescriptor:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file. Check the path.")
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError(f"expected at most {_MOST_BYTES} bytes, got {path.stat().st_size}")
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError(f"expected at most {_MAX_BYTES} bytes, got {path.stat().st_size}")
         spec = yaml.safe_load(path.read_text(encoding="utf-8"))
-        _only(spec, ("parts", *_ABOUT), "a descriptor")
+        _check_keys(spec, ("parts", *_METADATA_KEYS), "a descriptor")
         if not isinstance(spec.get("parts"), list):
             raise ValueError("expected a list of `parts`, got none")
         embedding = cache(lambda n: SpectralEmbedding(n_eigenpairs=n))
         parts = [
-            [_histogram(each, embedding) for each in one] if isinstance(one, list) else _histogram(one, embedding)
-            for one in spec["parts"]
+            [_histogram(item, embedding) for item in part] if isinstance(part, list) else _histogram(part, embedding)
+            for part in spec["parts"]
         ]
-        about = {name: spec[name] for name in ("source", "invariant_to") if name in spec}
-        made = HistogramDescriptor(parts, name=str(spec.get("name", path.stem)), **about)
-        made.scale = spec.get("scale")
+        metadata = {key: spec[key] for key in ("source", "invariant_to") if key in spec}
+        descriptor = HistogramDescriptor(parts, name=str(spec.get("name", path.stem)), **metadata)
+        descriptor.scale = spec.get("scale")
     except (ValueError, TypeError, AttributeError, KeyError, yaml.YAMLError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: expected a descriptor ({reason}). Correct it.") from error
-    return made.eval()
+    return descriptor.eval()
 
 
 def _histogram(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> DescriptionPart:
@@ -75,8 +78,8 @@ def _histogram(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> Desc
         raise ValueError(f"histogram: expected one of {', '.join(HISTOGRAMS)}, got {kind!r}")
     options = {name: value for name, value in spec.items() if name != "histogram"}
     if "axes" in options:
-        options["axes"] = [_axis(one, embedding) for one in options["axes"]]
-    return _made(HISTOGRAMS[kind], options, embedding, kind)
+        options["axes"] = [_axis(axis, embedding) for axis in options["axes"]]
+    return _build(HISTOGRAMS[kind], options, embedding, kind)
 
 
 def _axis(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> Any:
@@ -88,30 +91,26 @@ def _axis(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> Any:
             f"axes: expected one of {', '.join(AXES)}, or an attribute with centres or quantiles, got {name!r}"
         )
     if name in AXES:
-        return _made(AXES[name], dict(options or {}), embedding, name)
-    return _made(Attribute, {"name": name, **(options or {})}, embedding, name)
+        return _build(AXES[name], dict(options or {}), embedding, name)
+    return _build(Attribute, {"name": name, **(options or {})}, embedding, name)
 
 
-def _made(kind: type, options: dict[str, Any], embedding: Callable[[int], SpectralEmbedding], name: str) -> Any:
-    known = [one for one in inspect.signature(kind).parameters if one != "embedding"]
-    takes_embedding = len(known) < len(inspect.signature(kind).parameters)
-    _only(options, (*known, *(["eigenpairs"] if takes_embedding else [])), name)
-    if takes_embedding and "eigenpairs" in options:
-        options["embedding"] = embedding(_number(options.pop("eigenpairs")))
+def _build(kind: type, options: dict[str, Any], embedding: Callable[[int], SpectralEmbedding], name: str) -> Any:
+    """Check the options of a class, which messages call `name`, and make an instance of it."""
+    parameters = inspect.signature(kind).parameters
+    keys = [key for key in parameters if key != "embedding"] + ["eigenpairs"] * ("embedding" in parameters)
+    _check_keys(options, keys, name)
     for value in options.values():
-        for one in value if isinstance(value, list) else [value]:
-            _number(one)
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, int) and abs(number) > _MAX_INTEGER:
+                raise ValueError(f"expected numbers of at most {_MAX_INTEGER}, got {number}")
+    if "eigenpairs" in options:
+        options["embedding"] = embedding(options.pop("eigenpairs"))
     return kind(**options)
 
 
-def _number(value: Any) -> Any:
-    if isinstance(value, int) and abs(value) > _MOST:
-        raise ValueError(f"expected numbers of at most {_MOST}, got {value}")
-    return value
-
-
-def _only(spec: Any, known: tuple[str, ...], what: str) -> None:
-    if not isinstance(spec, Mapping) or (unknown := [one for one in spec if one not in known]):
+def _check_keys(spec: Any, known: Sequence[str], name: str) -> None:
+    if not isinstance(spec, Mapping) or (unknown := [key for key in spec if key not in known]):
         raise ValueError(
-            f"{what}: expected {', '.join(known)}, got {unknown[0] if isinstance(spec, Mapping) else spec!r}"
+            f"{name}: expected {', '.join(known)}, got {unknown[0] if isinstance(spec, Mapping) else spec!r}"
         )

@@ -1,4 +1,4 @@
-"""Eigenvalues of the affinities of geodesic distances (Jain and Zhang 2007)."""
+"""Eigenvalues of an affinity matrix of geodesic distances (Jain and Zhang 2007)."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,10 @@ from igps.nn.descriptor import BodyDescriptor
 
 @dataclass(eq=False, repr=False)
 class GeodesicSpectral(BodyDescriptor):
-    """Square roots of the largest eigenvalues of exp(−d²/2σ²), d the geodesic distances and σ the longest of them.
+    """Square roots of the largest eigenvalues of the matrix exp(−d²/2σ²) of geodesic distances d, with σ their maximum.
 
-    The matrix is that of farthest points, as for Nyström's method, and its eigenvalues are taken per point, so that
-    their number does not matter but for accuracy. σ takes out the scale.
+    The distances are those between samples by farthest-point sampling, as for Nyström's method. The eigenvalues are
+    divided by the number of samples, which then affects only the accuracy. σ removes the scale.
     """
 
     name = "geodesic_spectral"
@@ -26,7 +26,7 @@ class GeodesicSpectral(BodyDescriptor):
     requirements = Requirements(mesh=True)
 
     n_eigenvalues: int = 20  # largest first
-    n_samples: int = 200  # farthest points of the surface
+    n_samples: int = 200  # samples of the surface, by farthest-point sampling
     max_vertices: int = 1000  # larger meshes are simplified first
 
     def __post_init__(self) -> None:
@@ -39,16 +39,16 @@ class GeodesicSpectral(BodyDescriptor):
             )
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_eigenvalues,) √|λₖ|, without unit; errors as of `geodesic_samples`."""
+        """(n_eigenvalues,) √|λₖ|, without unit; raises the errors of `geodesic_samples`."""
         samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
         values = affinity_eigenvalues(samples.mutual, self.n_eigenvalues)
         return np.sqrt(np.abs(values)).astype(np.float32)
 
 
 def affinity_eigenvalues(distances: Floats, n_eigenvalues: int) -> Floats:
-    """The largest eigenvalues of exp(−d²/2σ²) over the number of points, descending, σ the longest of distances (P, P).
+    """Largest eigenvalues of exp(−d²/2σ²) / P of distances d (P, P), descending, with σ the largest distance.
 
-    The last ones may be below zero: geodesic distances need not fit into a Euclidean space.
+    The smaller ones may be negative, because geodesic distances need not embed in a Euclidean space.
     """
     affinity = np.exp(-np.square(distances / distances.max()) / 2)
     return np.linalg.eigvalsh(affinity / len(affinity))[::-1][:n_eigenvalues]

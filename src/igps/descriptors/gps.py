@@ -1,4 +1,4 @@
-"""The Global Point Signature of the surface: the paper's histograms without the volume (Rustamov 2007)."""
+"""The Global Point Signature of the surface (Rustamov 2007): the histograms of `interior` over surface samples."""
 
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.descriptor import HistogramDescriptor
@@ -7,9 +7,9 @@ from igps.nn.histograms.pairs import PairHistogram
 
 
 def gps(n_eigenpairs: int = 250) -> HistogramDescriptor:
-    """Histograms of the commute-time distances between surface samples, by pairs of potential classes.
+    """Histograms of the commute-time distances between surface samples, one for each pair of potential classes.
 
-    Source: Rustamov 2007, with the 4 classes, 64 bins and χ² of the comparison in Rustamov 2010.
+    Source: Rustamov 2007, with 4 classes, 64 bins and χ² as in the comparison of Rustamov 2010.
     """
     embedding = SpectralEmbedding(n_eigenpairs=n_eigenpairs)
     histogram = PairHistogram([Potential(4), InteriorDistance(64)], embedding, samples="surface")

@@ -1,4 +1,4 @@
-"""What tells individuals apart beside their form: size, and which of two mirror images a body is."""
+"""Descriptors that compare size and handedness beside the form, to tell individuals apart."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ Size = Literal["auto", "keep", "ignore"]
 Mirror = Literal["same", "distinct"]
 
 SIZE, SIDE = "+size", "+side"
-"""Behind the name of a descriptor that keeps size, and of one that tells a body from its mirror image."""
+"""Suffixes of the names of descriptors that keep size, and that distinguish a body from its mirror image."""
 
 SCALES: Mapping[str, float] = {
     "interior": 0.017, "gps": 0.017, "multiscale": 0.03, "rich": 0.026, "pretrained": 0.1, "d2": 0.035,
@@ -31,34 +31,39 @@ SCALES: Mapping[str, float] = {
 }  # fmt: skip
 """The median distance between generated bodies of one class, by descriptor, as `training.study scales` prints it."""
 
-# The distance between individuals of a body is a quarter of that, but for `pretrained`, which leaves little of it.
-_SHARE, _NEAR = 0.25, {"pretrained": 0.0043}
-# How much more a distance counts at most where size differs; the difference in size of half that; and the differences
-# in twist and in signed volumes between individuals of one body.
-_MOST, _HALF, _TWIST, _VOLUME = 2.0, 0.3, 0.002, 0.0085
-# Vectors of `signed_volumes`, and diffusion times over area
+# The usual distance between individuals of one body, as a share of the scale of the descriptor. `pretrained` has a
+# separate value, because its head reduces these distances to almost nothing.
+_INDIVIDUAL_SHARE, _INDIVIDUAL_DISTANCES = 0.25, {"pretrained": 0.0043}
+# A difference in size, in logarithms, adds at most _MAX_GAIN times the distance, and half of that at _HALF_SIZE.
+_MAX_GAIN, _HALF_SIZE = 2.0, 0.3
+# The usual differences in twist and in signed volumes between individuals of one body.
+_USUAL_TWIST, _USUAL_VOLUME = 0.002, 0.0085
+# Vectors in `signed_volumes`, and their diffusion times over area
 _N_VECTORS, _TIMES = 7, (0.01, 0.04, 0.15)
 
 
 class IndividualDescriptor(Descriptor):
-    """A descriptor that also keeps size, or tells left from right, or both: `NAME+side+size`.
+    """A descriptor that also compares size, or distinguishes mirror images, or both: `NAME+side+size`.
 
-    A description is that of the descriptor, then for the side `signed_volumes` and the odd part of a histogram of
-    `PairTwist`, whose signs a mirror image turns, then for size log √area and log ∛volume, of millimetres where the
-    unit is known. With d the distance of the descriptor, n what is usual between individuals of a body (a quarter of
-    its scale if not known), t the Euclidean distance of the numbers of side and s the sum of the two differences in
-    size, that of the bodies is e + 2 (e + n) s/(0.3 + s) of e = d + t. So where bodies are much the same in form size
-    adds to the distance, and else multiplies it, up to three times; no collection is looked at. The numbers of side and
-    size are written so that Euclidean distances of whole descriptions, too, count them like this.
+    A description has up to three blocks: the description by the wrapped descriptor, a side block and a size block. The
+    side block holds `signed_volumes` and the odd part of a histogram of `PairTwist`; a mirror image has the same
+    numbers with opposite signs. The size block holds log √area and log ∛volume, in millimetres if the unit is known.
+
+    Let d be the distance by the descriptor, t the Euclidean distance of the side blocks, and s the sum of the
+    differences of the two logarithms. Let n be the usual distance between individuals of one body; if it is not known,
+    it is taken as a quarter of the descriptor's scale. The distance of two bodies is e + 2 (e + n) s / (0.3 + s) with
+    e = d + t. So size adds to the distance of bodies of nearly the same form, and multiplies other distances by up
+    to 3. The distance does not depend on the collection. Both blocks are scaled so that they count alike in Euclidean
+    distances of whole descriptions.
 
     Args:
-        descriptor: any.
-        size: whether to keep size.
-        side: whether to tell a body from its mirror image.
-        scale: of the descriptor, see `Descriptor`; its own, or that of `SCALES`, if None.
+        descriptor: any descriptor.
+        size: whether to compare size.
+        side: whether to distinguish a body from its mirror image.
+        scale: of the descriptor, see `Descriptor`; its own scale, or its entry in `SCALES`, if None.
 
     Raises:
-        ValueError: the scale of the descriptor is not known, or it keeps size already.
+        ValueError: the scale of the descriptor is not known, or the descriptor keeps size already.
     """
 
     def __init__(
@@ -70,66 +75,67 @@ class IndividualDescriptor(Descriptor):
         scale = scale or scale_of(descriptor)
         if scale is None:
             raise ValueError(
-                f"size, mirror: expected a descriptor whose distances are known, got {descriptor.name!r}. Set its "
-                "attribute `scale` to the median of its distances between bodies of one class."
+                f"size, mirror: expected a descriptor of known scale, got {descriptor.name!r}. Set its attribute "
+                "`scale` to the median of its distances between bodies of one class."
             )
         self.descriptor, self.scale, self.keeps_size = descriptor, scale, size
-        self._unit = _NEAR.get(descriptor.name, _SHARE * scale)
+        self._unit = _INDIVIDUAL_DISTANCES.get(descriptor.name, _INDIVIDUAL_SHARE * scale)
         embedding = SpectralEmbedding(n_eigenpairs=16)
         axes = [InteriorDistance(6, 3.0), PairTwist()]
         self.twists = PairHistogram(axes, embedding) if side else None
         self.name, self.source = descriptor.name + SIDE * side + SIZE * size, descriptor.source
-        # "motion" holds reflections
+        # "motion" includes reflections
         lost = ["scale"] * size + ["motion"] * side
-        self.invariant_to = tuple(one for one in descriptor.invariant_to if one not in lost)
+        self.invariant_to = tuple(name for name in descriptor.invariant_to if name not in lost)
         self.requirements = descriptor.requirements
         if self.twists is not None:
             self.requirements |= self.twists.requirements
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, D + 53 + 2); without the numbers of side or of size where these are not kept."""
+        """(N, D + 53 + 2) descriptions; without the side or the size block if it is not compared."""
         parts = [self.descriptor(batch).flatten(1)]
         if self.twists is not None:
             counts = self.twists(BatchFeatures(batch, self.training))
             odd = (counts - counts.flip(-1))[..., counts.shape[-1] // 2 :] / 2
-            parts += [self._unit / _VOLUME * signed_volumes(batch).to(odd), self._unit / _TWIST * odd.flatten(1)]
+            volumes = signed_volumes(batch).to(odd)
+            parts += [self._unit / _USUAL_VOLUME * volumes, self._unit / _USUAL_TWIST * odd.flatten(1)]
         if self.keeps_size:
-            lengths = [millimetres(one) for one in batch.units or [None] * len(batch)]
+            factors = [millimetres(unit) for unit in batch.units or [None] * len(batch)]
             size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
-            size = size + torch.tensor(lengths, dtype=size.dtype, device=size.device).log()[:, None]
-            parts.append(self._unit * _MOST / _HALF * size.to(parts[0].dtype))
+            size = size + torch.tensor(factors, dtype=size.dtype, device=size.device).log()[:, None]
+            parts.append(self._unit * _MAX_GAIN / _HALF_SIZE * size.to(parts[0].dtype))
         return torch.cat(parts, dim=1)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, D) and (G, D) descriptions to (Q, G) distances."""
         (form, side, size), (forms, sides, sizes) = self.split(queries), self.split(gallery)
-        found = self.descriptor.distances(form, forms)
+        distances = self.descriptor.distances(form, forms)
         if self.twists is not None:
-            found = found + euclidean(side, sides)
+            distances = distances + euclidean(side, sides)
         if self.keeps_size:
-            apart = torch.cdist(size, sizes, p=1) / (self._unit * _MOST)  # over 0.3
-            found = found + _MOST * (found + self._unit) * apart / (1 + apart)
-        return found
+            ratio = torch.cdist(size, sizes, p=1) / (self._unit * _MAX_GAIN)  # s / 0.3
+            distances = distances + _MAX_GAIN * (distances + self._unit) * ratio / (1 + ratio)
+        return distances
 
     def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
-        """(N, D) descriptions to the coordinates of the descriptor, and the numbers of side and size."""
+        """(N, D) descriptions to the coordinates of the descriptor, then the side and size blocks."""
         form, *others = self.split(descriptions)
         return torch.cat([self.descriptor.coordinates(form, of_one_kind=of_one_kind), *others], dim=1)
 
     def short(self, descriptions: Tensor) -> Tensor:
-        """(N, D) descriptions to (N, ≤ 256 + 55): those of the descriptor, or a ValueError, and of side and size."""
+        """(N, D) descriptions to (N, ≤ 256 + 55): `short` of the descriptor (or its ValueError), then other blocks."""
         form, *others = self.split(descriptions)
         return torch.cat([self.descriptor.short(form), *others], dim=1)
 
     def wrap(self, descriptor: Descriptor) -> "IndividualDescriptor":
-        """The same numbers of side and size beside another descriptor."""
-        kept = {"size": self.keeps_size, "side": self.twists is not None}
-        found = IndividualDescriptor(descriptor, scale=self.scale, **kept)
-        found._unit = self._unit
-        return found
+        """Return an `IndividualDescriptor` of another descriptor with the same options and scales."""
+        options = {"size": self.keeps_size, "side": self.twists is not None}
+        wrapped = IndividualDescriptor(descriptor, scale=self.scale, **options)
+        wrapped._unit = self._unit
+        return wrapped
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(N, D) descriptions split into the descriptor's own, in its shape, and the numbers of side and of size."""
+        """Split descriptions (N, D) into the descriptor's own, in its shape, the side block and the size block."""
         n_volumes = math.comb(_N_VECTORS, 3)
         n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else n_volumes + self.twists.n_cells // 2
         n_form = descriptions.shape[1] - n_side - n_size
@@ -138,28 +144,32 @@ class IndividualDescriptor(Descriptor):
 
 
 def signed_volumes(batch: SignatureBatch) -> Tensor:
-    """(N, 35) volumes of what three of seven vectors span, whose signs a mirror image turns.
+    """(N, 35) signed volumes of the parallelepipeds of all triples of seven vectors that rotate with the body.
 
-    The vectors are means of samples about their middle: of interior ones and of surface ones by their distance from it,
-    of surface ones by the heat that stays with them at three times; and two of these by the second moments of the
-    interior. They turn with the body. Each volume is over the product of its three lengths to the power of 2/3, in
-    units of √area. A body that looks the same after two turns of its own has none.
+    The volumes of a mirror image have opposite signs. The first five vectors are weighted means of samples relative to
+    their centroid: of the interior samples and of the surface samples by their distances from it, and of the surface
+    samples by the heat that remains at each after three diffusion times. The last two are the second and the third
+    vector, multiplied by the matrix of second moments of the interior. A volume is divided by the product of its three
+    lengths to the power of 2/3, in units of √area. A body that is symmetric under rotations about two axes has zero
+    volumes.
     """
     root = batch.area.sqrt()[:, None, None]
-    (inside, real), (outside, shown) = (
-        (one.points / root, (one.mask / one.mask.sum(dim=1, keepdim=True))[..., None].to(root))
-        for one in (batch.interior, batch.surface)
+    (interior, interior_weights), (surface, surface_weights) = (
+        (samples.points / root, (samples.mask / samples.mask.sum(dim=1, keepdim=True))[..., None].to(root))
+        for samples in (batch.interior, batch.surface)
     )
-    inside, outside = inside - (inside * real).sum(dim=1)[:, None], outside - (outside * shown).sum(dim=1)[:, None]
-    moments = (inside * real).mT @ inside
+    interior = interior - (interior * interior_weights).sum(dim=1)[:, None]
+    surface = surface - (surface * surface_weights).sum(dim=1)[:, None]
+    moments = (interior * interior_weights).mT @ interior
     moments = moments / moments.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None]
     k = min(16, batch.eigenvalues.shape[1])
     eigenvalues = batch.eigenvalues[:, None, :k] * batch.area[:, None, None]
     decay = torch.exp(-root.new_tensor(_TIMES)[:, None] * eigenvalues)
     heat = batch.surface.eigenfunctions[..., :k].to(root).square() @ decay.mT
-    heat = heat / (heat * shown).sum(dim=1, keepdim=True)
-    weights = torch.cat([outside.norm(dim=2, keepdim=True), heat], dim=2) * shown
-    vectors = torch.cat([(inside.norm(dim=2, keepdim=True) * real).mT @ inside, weights.mT @ outside], dim=1)
+    heat = heat / (heat * surface_weights).sum(dim=1, keepdim=True)
+    weights = torch.cat([surface.norm(dim=2, keepdim=True), heat], dim=2) * surface_weights
+    mean = (interior.norm(dim=2, keepdim=True) * interior_weights).mT @ interior
+    vectors = torch.cat([mean, weights.mT @ surface], dim=1)
     vectors = torch.cat([vectors, vectors[:, 1:3] @ moments], dim=1)
     triples = vectors[:, torch.tensor([*combinations(range(_N_VECTORS), 3)], device=vectors.device)]
     lengths = triples.norm(dim=3).prod(dim=2).clamp_min(torch.finfo(triples.dtype).tiny)
@@ -167,22 +177,22 @@ def signed_volumes(batch: SignatureBatch) -> Tensor:
 
 
 def scale_of(descriptor: Descriptor) -> float | None:
-    """The median of the distances of a descriptor between bodies of one class; None if it is not known."""
+    """Return the median distance between bodies of one class by a descriptor; None if it is not known."""
     return descriptor.scale or SCALES.get(descriptor.name)
 
 
 def keeps_size(size: Size, units: Sequence[str | None]) -> tuple[bool, str]:
-    """Whether bodies are to be compared in size, too, and a sentence where their units leave that open.
+    """Return whether sizes are compared, and a warning about bodies without a unit of length ("" if not needed).
 
     Args:
-        size: "auto" keeps it where all have a unit, and ignores it else.
+        size: "auto" compares sizes if all bodies have a unit of length.
         units: of the N bodies.
     """
     check_one_of(get_args(Size), size=size)
     n_known = sum(unit in MILLIMETRES for unit in units)
     if size == "ignore" or n_known == len(units) or (n_known == 0 and size == "auto"):
         return size == "keep" or (size == "auto" and n_known > 0), ""
-    some = f"{len(units) - n_known} of {len(units)} bodies have no unit of length"
+    reason = f"{len(units) - n_known} of {len(units)} bodies have no unit of length"
     if size == "keep":
-        return True, f"size is kept: {some}; their numbers count as millimetres" if n_known else ""
-    return False, f"size is ignored: {some}; where their numbers are millimetres, say --size keep"
+        return True, f"size is kept: {reason}; their coordinates are taken as millimetres" if n_known else ""
+    return False, f"size is ignored: {reason}; if their coordinates are millimetres, give --size keep"

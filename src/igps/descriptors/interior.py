@@ -1,4 +1,4 @@
-"""The paper's own descriptor: joint histograms of interior distance and potential (Rustamov 2010)."""
+"""The descriptor of Rustamov 2010: joint histograms of interior distance and potential."""
 
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.descriptor import HistogramDescriptor
@@ -7,7 +7,7 @@ from igps.nn.histograms.pairs import PairHistogram
 
 
 def interior(n_eigenpairs: int = 250) -> HistogramDescriptor:
-    """Histograms of the commute-time distances between interior samples, by pairs of potential classes.
+    """Histograms of the commute-time distances between interior samples, one for each pair of potential classes.
 
     Source: Rustamov 2010, sections 3 and 4: 4 classes, 64 bins, 250 eigenpairs, χ².
     """

@@ -1,4 +1,4 @@
-"""Pose-oblivious signature: how thick a body is at its surface, and how central (Gal, Shamir and Cohen-Or 2007)."""
+"""Pose-oblivious signature of local diameter and centricity (Gal, Shamir and Cohen-Or 2007)."""
 
 from dataclasses import dataclass
 
@@ -16,18 +16,18 @@ from igps.nn.descriptor import BodyDescriptor
 from igps.signature.ordering import canonically_ordered
 from igps.signature.sampling import surface_points
 
-# Rays start so far inside the surface, in units of the bounding box, that they do not meet the face they come from.
-_LIFT = 1e-6
-# Of the graph of geodesics: distances come out 1 % longer than with two, in less than half the time.
+# Depth below the surface at which rays start, so that they do not hit their own face, in longest sides of the body.
+_RAY_OFFSET = 1e-6
+# For the graph of geodesics. Distances are 1 % longer than with two points, and take less than half the time.
 _POINTS_PER_EDGE = 1
 
 
 @dataclass(eq=False, repr=False)
 class LocalDiameterCentricity(BodyDescriptor):
-    """Joint histogram, over the surface, of the local diameter and the centricity, both over √area.
+    """Joint histogram of the local diameter and the centricity over the surface, both in units of √area.
 
-    Source: Gal, Shamir and Cohen-Or 2007, with the cone and the statistics of its rays as in Shapira, Shamir and
-    Cohen-Or 2008, and scale taken from the area. Of the histogram distances that they compare, this is χ².
+    Source: Gal, Shamir and Cohen-Or 2007. The cone and the statistics of its rays follow Shapira, Shamir and Cohen-Or
+    2008. The distance is χ², one of the histogram distances that the source compares.
     """
 
     name = "local_diameter_centricity"
@@ -37,10 +37,10 @@ class LocalDiameterCentricity(BodyDescriptor):
 
     n_diameter_bins: int = 32  # with a linear kernel
     n_centricity_bins: int = 32  # with a linear kernel
-    max_diameter: float = 0.45  # upper end of the last bin, in units of √area; larger values go into it
-    max_centricity: float = 2.0  # the same of the centricity
+    max_diameter: float = 0.45  # upper end of the last bin, in units of √area; larger values go into this bin
+    max_centricity: float = 2.0  # the same for the centricity
     n_samples: int = 2000  # area-weighted random points of the surface
-    n_rays: int = 30  # of each sample
+    n_rays: int = 30  # per sample
     opening_angle: float = 120.0  # of the cone about the inward normal, degrees
     n_sources: int = 40  # points of the surface over which the geodesic distances are averaged
     seed: int = 0  # of the samples
@@ -54,27 +54,28 @@ class LocalDiameterCentricity(BodyDescriptor):
             raise ValueError(f"opening_angle: expected between 0 and 180 degrees, got {self.opening_angle}.")
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_diameter_bins, n_centricity_bins) histogram of sum 1; a MeshError where no ray meets the far side."""
+        """(n_diameter_bins, n_centricity_bins) histogram of sum 1; a MeshError if no ray meets the far side."""
         mesh = canonically_ordered(body.mesh)
         points = surface_points(mesh, self.n_samples, self.seed)
         diameter = local_diameters(mesh, points.face, points.weights, self.n_rays, self.opening_angle)
         central = points.interpolate(centricity(mesh, self.n_sources)[:, None])[:, 0]
-        seen = np.isfinite(diameter)
-        if not seen.any():
+        valid = np.isfinite(diameter)
+        if not valid.any():
             raise MeshError(
                 f"{mesh.name}: no ray from the surface inwards meets its far side. Close the surface or repair it."
             )
         scale = np.sqrt(mesh.area)
-        ratios = [diameter[seen] / scale / self.max_diameter, central[seen] / scale / self.max_centricity]
+        ratios = [diameter[valid] / scale / self.max_diameter, central[valid] / scale / self.max_centricity]
         return linear_histogram(ratios, [self.n_diameter_bins, self.n_centricity_bins]).astype(np.float32)
 
 
 def local_diameters(mesh: Mesh, face: Integers, weights: Floats, n_rays: int, opening_angle: float) -> Floats:
-    """Thickness of the body at points of its surface: the mean length of inward rays that is left without outliers.
+    """Thickness (P,) of the body at points of its surface: the mean length of inward rays, without outliers.
 
-    The rays fill the cone about the inward normal evenly. A ray counts if it meets the surface from within; of the
-    lengths that count, those within a standard deviation of their median are averaged (Shapira et al. 2008, section 3).
-    Points are given by their faces (P,) and barycentric weights (P, 3). It is (P,), and NaN where no ray counts.
+    Points are given by their faces (P,) and barycentric weights (P, 3). From each point, rays fill a cone about the
+    inward normal evenly; its opening angle is in degrees. A ray is valid if it meets the surface from within. The
+    lengths of valid rays within a standard deviation of their median are averaged (Shapira et al. 2008, section 3).
+    The thickness is NaN where no ray is valid.
     """
     import igl
 
@@ -83,27 +84,27 @@ def local_diameters(mesh: Mesh, face: Integers, weights: Floats, n_rays: int, op
     faces = np.asfortranarray(mesh.faces)
     normals = unit(area_vectors(vertices, mesh.faces))
 
-    # An edge of the face turns with the body, and so do the rays.
+    # The frame of the rays contains an edge of the face, so that the rays rotate with the body.
     corner = vertices[faces[face]]
     inward = -normals[face]
     side = unit(corner[:, 1] - corner[:, 0])
     along, across, ahead = _cone(n_rays, opening_angle).T
     frame = np.stack([side, np.cross(inward, side), inward], axis=1)
     directions = np.einsum("rk,pkj->prj", np.stack([along, across, ahead], axis=1), frame)
-    origins = np.einsum("pi,pij->pj", weights, corner) + _LIFT * inward
+    origins = np.einsum("pi,pij->pj", weights, corner) + _RAY_OFFSET * inward
 
     tree = igl.AABB()
     tree.init(vertices, faces)
     rays = directions.reshape(-1, 3)
     hit, length, _ = tree.intersect_ray_first(vertices, faces, np.repeat(origins, n_rays, axis=0), rays)
-    within = (hit >= 0) & (np.einsum("ij,ij->i", normals[hit], rays) > 0)
-    return size * _robust_mean(np.where(within, length, np.nan).reshape(-1, n_rays))
+    valid = (hit >= 0) & (np.einsum("ij,ij->i", normals[hit], rays) > 0)
+    return size * _robust_mean(np.where(valid, length, np.nan).reshape(-1, n_rays))
 
 
 def centricity(mesh: Mesh, n_sources: int) -> Floats:
-    """(V,) average geodesic distance of each vertex from the whole surface.
+    """(V,) mean geodesic distance of each vertex from the whole surface.
 
-    The integral is a sum over evenly spread vertices, `n_sources` or all, each weighted by the area nearest to it.
+    The mean is over at most `n_sources` vertices by farthest-point sampling, each weighted by the area nearest to it.
     """
     n_vertices = len(mesh.vertices)
     distances = farthest_points(mesh, min(n_sources, n_vertices), _POINTS_PER_EDGE).distances
@@ -113,7 +114,7 @@ def centricity(mesh: Mesh, n_sources: int) -> Floats:
 
 
 def _cone(n_rays: int, opening_angle: float) -> Floats:
-    """(R, 3) unit vectors of equal solid angle about the third axis, on a golden spiral (Vogel 1979)."""
+    """(R, 3) unit vectors in a cone about the third axis, on a golden spiral of equal solid angles (Vogel 1979)."""
     rank = np.arange(n_rays) + 0.5
     cosine = 1 - rank / n_rays * (1 - np.cos(np.radians(opening_angle / 2)))
     azimuth = rank * np.pi * (3 - np.sqrt(5))
@@ -122,15 +123,15 @@ def _cone(n_rays: int, opening_angle: float) -> Floats:
 
 
 def _robust_mean(lengths: Floats) -> Floats:
-    """Mean of each row's numbers within a standard deviation of their median; NaN for a row of NaN alone."""
-    result = np.full(len(lengths), np.nan)
+    """Mean of the values of each row within a standard deviation of their median; NaN for a row of NaN alone."""
+    means = np.full(len(lengths), np.nan)
     rows = np.isfinite(lengths).any(axis=1)
     values = lengths[rows]
     median, deviation = np.nanmedian(values, axis=1, keepdims=True), np.nanstd(values, axis=1, keepdims=True)
-    # The slack keeps the median itself where all lengths are equal but for rounding.
+    # The tolerance keeps lengths that differ from the median by rounding alone.
     outlier = np.abs(values - median) > deviation + 1e-9 * median
     trimmed = np.where(outlier, np.nan, values)
-    # Of an even number of lengths in two distant groups, none may be near the median.
-    none_left = np.isnan(trimmed).all(axis=1, keepdims=True)
-    result[rows] = np.nanmean(np.where(none_left, values, trimmed), axis=1)
-    return result
+    # If an even number of lengths forms two distant groups, none may be near the median. Then all are averaged.
+    is_empty = np.isnan(trimmed).all(axis=1, keepdims=True)
+    means[rows] = np.nanmean(np.where(is_empty, values, trimmed), axis=1)
+    return means

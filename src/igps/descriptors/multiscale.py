@@ -1,4 +1,4 @@
-"""Interior distances alone, on several scales, side by side."""
+"""Histograms of interior distances at several scales."""
 
 from igps.nn.axes import EmbeddedPairCosines, InteriorDistance, Potential
 from igps.nn.descriptor import HistogramDescriptor
@@ -6,17 +6,18 @@ from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
 from igps.signature.signature import SampleKind
 
-# Of the bodies with the most samples so many tell the histograms well enough, and the time grows with their square.
+# Largest numbers of samples. More samples hardly change the histograms, and the time grows with their square.
 N_SAMPLES = 1500
 N_ORIENTED_SAMPLES = 1000
 
 
 def multiscale() -> HistogramDescriptor:
-    """Interior distances alone, in four parts.
+    """Histograms of interior distances at several scales, in four parts.
 
-    The histograms of the first 250, 50 and 16 eigenpairs (fine, middle and coarse); the joint histogram of the
-    distances of 50 and of 4; how the interior samples lie to the surface in the embedding of 16, and how the surface
-    samples lie to the interior ones in that of 8.
+    - Distances by the first 250, 50 and 16 eigenpairs: fine, middle and coarse.
+    - The joint histogram of the distances by 50 and by 4 eigenpairs.
+    - Distances between interior samples and their directions to the surface, in the embedding of 16 eigenpairs.
+    - Distances between surface samples and their directions away from the interior, in the embedding of 8 eigenpairs.
     """
     embeddings = {n: SpectralEmbedding(n_eigenpairs=n) for n in (250, 50, 16, 8, 4)}
 

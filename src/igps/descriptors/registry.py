@@ -32,7 +32,7 @@ from igps.nn.descriptor import NAME, Descriptor, EmbeddedDescriptor, HistogramDe
 from igps.nn.heads import ClassifierHead
 from igps.nn.specification import IN_FOLDER, load_module
 
-_MAKERS: Mapping[str, Callable[[], Descriptor]] = {
+_FACTORIES: Mapping[str, Callable[[], Descriptor]] = {
     "interior": interior,
     "gps": gps,
     "multiscale": multiscale,
@@ -49,27 +49,28 @@ _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
     "molecular": molecular,
 }
 
-# "molecular" needs attributes that only molecules bring
-NAMES: tuple[str, ...] = tuple(name for name in _MAKERS if name != "molecular")
-"""The names of the library's descriptors of any body."""
+# "molecular" needs attributes that only molecules have
+NAMES: tuple[str, ...] = tuple(name for name in _FACTORIES if name != "molecular")
+"""The names of the library's descriptors that describe any body."""
 
-_MARK = re.compile(r"\+(?:size|side)(?=\+|$)")
-_WITH = re.compile(r"\+(\w+)(?:=(\d+\.?\d*|\.\d+))?")
-_WRITTEN = (".yaml", ".yml")
+_INDIVIDUAL_SUFFIX = re.compile(r"\+(?:size|side)(?=\+|$)")
+_ATTRIBUTE_SUFFIX = re.compile(r"\+(\w+)(?:=(\d+\.?\d*|\.\d+))?")
+_YAML_SUFFIXES = (".yaml", ".yml")
 
 
 def is_file(which: str | Path) -> bool:
-    """Whether a descriptor is asked for by its file, or by its folder."""
-    if str(which) in _MAKERS:
+    """Return whether an argument for a descriptor is the path of a descriptor's file or folder."""
+    if str(which) in _FACTORIES:
         return False
-    in_folder = bool(which) and os.path.isfile(os.path.join(which, IN_FOLDER))  # False of what cannot be a path
-    return str(which).lower().endswith((".safetensors", *_WRITTEN)) or in_folder
+    is_folder = bool(which) and os.path.isfile(os.path.join(which, IN_FOLDER))  # False if `which` is no valid path
+    return str(which).lower().endswith((".safetensors", *_YAML_SUFFIXES)) or is_folder
 
 
 def load(path: str | Path) -> Descriptor:
-    """A descriptor that `Descriptor.save` or `igps fit` wrote, in evaluation mode, with its `card`. No code runs.
+    """Load a descriptor from a file or folder, in evaluation mode, with its `card`. No code from the file runs.
 
-    From a file or a folder. Or one that is written in YAML, see `igps.descriptors.from_yaml`.
+    The file was written by `Descriptor.save` or `igps fit`, or is a specification in YAML, see
+    `igps.descriptors.from_yaml`.
 
     Example:
         >>> import tempfile
@@ -80,10 +81,10 @@ def load(path: str | Path) -> Descriptor:
         ('interior', {'author': 'me'})
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: it is another file, or a damaged one.
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, or does not hold a descriptor.
     """
-    if str(path).lower().endswith(_WRITTEN):
+    if str(path).lower().endswith(_YAML_SUFFIXES):
         return load_yaml(path)
     module, card = load_module(path)
     if not isinstance(module, Descriptor):
@@ -92,24 +93,24 @@ def load(path: str | Path) -> Descriptor:
         raise ValueError(f"{path}: expected a descriptor's name of letters, digits and _, got {module.name[:80]!r}.")
     _check_heads(module, path)
     module.card = card
-    scale = card.get("scale")  # a card of one's own may say anything by this word
+    scale = card.get("scale")  # cards may come from users: this entry may be anything
     if isinstance(scale, int | float) and 0 < scale < math.inf:
         module.scale = scale
     return module
 
 
 def _check_heads(module: Descriptor, path: str | Path) -> None:
-    """Raise a ValueError where sizes of a head do not fit each other, which else shows when all is described."""
-    for one in module.modules():
-        if not isinstance(one, EmbeddedDescriptor) or not isinstance(one.descriptor, HistogramDescriptor):
+    """Raise a ValueError if the sizes of a head's tensors are inconsistent, before any body is described."""
+    for submodule in module.modules():
+        if not isinstance(submodule, EmbeddedDescriptor) or not isinstance(submodule.descriptor, HistogramDescriptor):
             continue
-        cells = torch.ones(2, one.descriptor.n_features)
+        head, cells = submodule.head, torch.ones(2, submodule.descriptor.n_features)
         try:
-            one.head(cells)
-            if isinstance(one.head, ClassifierHead):
-                one.head.strangeness(cells)
+            head(cells)
+            if isinstance(head, ClassifierHead):
+                head.strangeness(cells)
         except (ValueError, RuntimeError, TypeError, LookupError, ArithmeticError) as error:
-            raise ValueError(f"{path}: expected a head of {cells.shape[1]} cells ({error}). Save it again.") from error
+            raise ValueError(f"{path}: expected a head for {cells.shape[1]} cells ({error}). Save it again.") from error
 
 
 def descriptor(
@@ -119,7 +120,7 @@ def descriptor(
     mirror: Mirror = "same",
     units: Sequence[str | None] | None = None,
 ) -> Descriptor:
-    """A descriptor by its name or file, in evaluation mode; one that is given is returned as it is.
+    """Return a descriptor by its name or file, in evaluation mode; a descriptor object is returned as it is.
 
     Example:
         >>> descriptor("interior").requirements.n_eigenpairs
@@ -129,70 +130,72 @@ def descriptor(
 
     Args:
         which: one of `NAMES`, or "molecular"; or a file, see `load`; or "package.module:NAME", where NAME is a
-            descriptor of your own or makes one when called; or a descriptor. "+size" behind a name keeps size, "+side"
-            tells mirror images apart, "+ct" or "+ct=0.5" adds an attribute, see `WithAttributes`.
-        size: "keep" lets differences in size count, see `IndividualDescriptor`; "auto" where all bodies have a unit of
-            length.
-        mirror: "distinct" tells a body from its mirror image.
+            descriptor of your own or a function that makes one; or a descriptor. The suffix "+size" of a name compares
+            size, "+side" distinguishes mirror images, "+ct" or "+ct=0.5" adds an attribute, see `WithAttributes`.
+        size: "keep" compares size, see `IndividualDescriptor`; "auto" does so if all bodies have a unit of length.
+        mirror: "distinct" distinguishes a body from its mirror image.
         units: of the bodies, for size="auto", see `SignatureDataset.units`.
 
     Raises:
-        ValueError: no descriptor has this name, or see `load`.
+        ValueError: no descriptor has this name, or the file is not valid, see `load`.
     """
     check_one_of(get_args(Size), size=size)
     check_one_of(get_args(Mirror), mirror=mirror)
     if size == "auto" and units is None:
-        raise ValueError('size: expected "keep" or "ignore", or the units of the bodies beside "auto", got none.')
-    marks = ""
+        raise ValueError('size: expected "keep" or "ignore", or "auto" with the units of the bodies, got no units.')
+    suffixes = ""
     if isinstance(which, str):
-        marks, which = "".join(_MARK.findall(which)), _MARK.sub("", which)
-    plain = _plain(which)
-    with_size = SIZE in marks or (size == "keep" if units is None else keeps_size(size, units)[0])
-    with_side = SIDE in marks or mirror == "distinct"
+        suffixes, which = "".join(_INDIVIDUAL_SUFFIX.findall(which)), _INDIVIDUAL_SUFFIX.sub("", which)
+    base = _base_descriptor(which)
+    with_size = SIZE in suffixes or (size == "keep" if units is None else keeps_size(size, units)[0])
+    with_side = SIDE in suffixes or mirror == "distinct"
     if not (with_size or with_side):
-        return plain
-    scale = plain.scale
-    if isinstance(plain, IndividualDescriptor):  # of a file
-        with_size, with_side = with_size or plain.keeps_size, with_side or plain.twists is not None
-        plain = plain.descriptor
-    return IndividualDescriptor(plain, size=with_size, side=with_side, scale=scale).eval()
+        return base
+    scale = base.scale
+    if isinstance(base, IndividualDescriptor):  # loaded from a file
+        with_size, with_side = with_size or base.keeps_size, with_side or base.twists is not None
+        base = base.descriptor
+    return IndividualDescriptor(base, size=with_size, side=with_side, scale=scale).eval()
 
 
-def _plain(which: str | Path | Descriptor) -> Descriptor:
+def _base_descriptor(which: str | Path | Descriptor) -> Descriptor:
+    """Return a descriptor by its name without "+size" and "+side", or by its file."""
     if isinstance(which, Descriptor):
         return which
     if is_file(which):
         return load(which)
     which = str(which)
-    base, *words = re.split(r"(?=\+)", which)
-    found = [_WITH.fullmatch(word) for word in words]
-    if words:
-        if not all(found):
-            told = "expected +NAME or +NAME=WEIGHT behind a descriptor, such as +ct=0.5, the weight above 0"
-            raise ValueError(f"descriptor: {told}, got {which!r}.")
-        attributes, weights = zip(*((one[1], float(one[2] or 1)) for one in found if one), strict=True)
-        return WithAttributes(_plain(base), attributes, weights).eval()
-    if which in _MAKERS:
-        return _MAKERS[which]().eval()
+    base, *suffixes = re.split(r"(?=\+)", which)
+    if suffixes:
+        matches = [match for suffix in suffixes if (match := _ATTRIBUTE_SUFFIX.fullmatch(suffix))]
+        if len(matches) < len(suffixes):
+            raise ValueError(
+                "descriptor: expected +NAME or +NAME=WEIGHT after the name of a descriptor, such as +ct=0.5, with a "
+                f"weight above 0, got {which!r}."
+            )
+        attributes, weights = zip(*((match[1], float(match[2] or 1)) for match in matches), strict=True)
+        return WithAttributes(_base_descriptor(base), attributes, weights).eval()
+    if which in _FACTORIES:
+        return _FACTORIES[which]().eval()
     module, colon, name = which.partition(":")
     if not colon:
         raise ValueError(
-            f"descriptor: expected one of {', '.join(_MAKERS)}, or package.module:NAME of one of your own, got "
-            f"{which!r}."
+            f"descriptor: expected one of {', '.join(_FACTORIES)}, or package.module:NAME of a descriptor of your own, "
+            f"got {which!r}."
         )
     try:
         own = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
             f"descriptor: expected package.module:NAME to be importable, got {which!r} ({error}). Check the spelling, "
-            "and that its folder is on the Python path."
+            "and that the folder of the module is on the Python path."
         ) from error
     try:
-        made = own if isinstance(own, Descriptor) or not callable(own) else own()
+        instance = own if isinstance(own, Descriptor) or not callable(own) else own()
     except TypeError as error:
         raise ValueError(f"descriptor: expected {which} to make one without arguments ({error}).") from error
-    if not isinstance(made, Descriptor):
+    if not isinstance(instance, Descriptor):
         raise ValueError(
-            f"descriptor: expected {which} to be or to make an igps.Descriptor, got {type(made).__name__}."
+            f"descriptor: expected {which} to be or to make an igps.Descriptor, got {type(instance).__name__}."
         )
-    return made.eval()
+    return instance.eval()

@@ -1,4 +1,4 @@
-"""Interior distances joined with all else there is of the body in space."""
+"""Interior distances joined with Euclidean distances, directions and attributes of the samples."""
 
 from functools import partial
 
@@ -8,24 +8,25 @@ from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
 
-# Centres of classes; those of the depth have their boundaries at 0.015, 0.03 and 0.06 of √area.
+# Centres of the classes. The classes of the depth have their boundaries at 0.015, 0.03 and 0.06 of √area.
 _DEPTH = (0.0075, 0.0225, 0.0375, 0.0825)
 _ELECTROSTATIC_POTENTIAL = (2.4, 2.8, 3.2, 3.6)
 _N_KNOTS = 12
 
 
 def rich(*, learnable: bool = False, n_training_samples: int | None = None) -> HistogramDescriptor:
-    """Interior distances joined with all else there is, in three parts.
+    """Interior distances joined with Euclidean distances, directions and attributes of the samples, in three parts.
 
-    The histograms with Euclidean distances, depth and electrostatic potential of the samples; how interior samples lie
-    to each other and to the surface, by interior distance; and the same of surface samples, by Euclidean distance.
+    - Interior distances, some jointly with Euclidean distances, depth and electrostatic potential of the samples.
+    - Interior distances of interior samples, jointly with the angles of their directions to the surface.
+    - Euclidean distances of surface samples, jointly with the angles of their directions.
 
     Args:
-        learnable: whether the centres of bins and classes and the spectral filters, one for each histogram, are
-            parameters; the classes are soft ones then.
+        learnable: whether the centres of bins and classes, and a spectral filter for each histogram, are parameters.
+            Classes are soft in this case.
         n_training_samples: of each histogram, see `PairHistogram`.
     """
-    # Fixed embeddings are the same for all, and computed once; learned filters go their own way.
+    # Histograms share fixed embeddings, which are computed once. Each histogram has a learned filter of its own.
     fixed = {n: SpectralEmbedding(n_eigenpairs=n) for n in (50, 16)}
 
     def histogram(n_eigenpairs: int, *axes: PointAxis | PairAxis, n_samples: int = N_SAMPLES) -> PairHistogram:

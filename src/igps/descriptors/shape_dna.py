@@ -18,13 +18,13 @@ Normalisation = Literal["area", "slope"]
 
 @dataclass(eq=False, repr=False)
 class ShapeDNA(BodyDescriptor):
-    """The first eigenvalues of the Laplace–Beltrami operator, made free of scale, without the zero.
+    """The first non-zero eigenvalues of the Laplace–Beltrami operator, normalised for scale.
 
-    "area" multiplies them by the area of the surface. "slope" divides them by the slope c of the line λₖ = c·k that
-    fits them best; for many eigenvalues that is Weyl's law, c = 4π / area.
+    The normalisation "area" multiplies the eigenvalues by the area of the surface. "slope" divides them by the slope c
+    of the line λₖ = c·k that fits them best; for many eigenvalues, c tends to 4π / area (Weyl's law).
 
-    Source: Reuter, Wolter and Peinecke 2005 and 2006 (normalisations, Euclidean distance); 12 eigenvalues over the
-    area as in Reuter's run at SHREC'11 (Lian et al. 2011).
+    Source: Reuter, Wolter and Peinecke 2005 and 2006 (normalisations, Euclidean distance); 12 eigenvalues with the
+    normalisation by area as in Reuter's run at SHREC'11 (Lian et al. 2011).
     """
 
     name = "shape_dna"

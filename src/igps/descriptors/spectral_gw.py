@@ -1,14 +1,14 @@
-"""Spectral Gromov-Wasserstein distances: shapes compared through their heat kernels (Mémoli 2009).
+"""Spectral Gromov-Wasserstein distances: shapes compared by their heat kernels (Mémoli 2009).
 
-With A the area and t a time, the kernel K_t(x, y) = A k_t(x, y) = 1 + A Σₖ exp(−λₖt) φₖ(x) φₖ(y) has mean 1 over the
-surface. The distance of two shapes is, over all couplings μ of their points,
+Let A be the area and t a time. The kernel K_t(x, y) = A k_t(x, y) = 1 + A Σₖ exp(−λₖt) φₖ(x) φₖ(y) has mean 1 over the
+surface. The distance of two shapes, with the minimum over all couplings μ of their points, is
 
-    min_μ sup_t c²(t) (∫∫ |K_t(x, x') − K'_t(y, y')|² dμ(x, y) dμ(x', y'))^½,   c(t) = exp(−(t + 1/t)),
+    min_μ sup_t c²(t) (∫∫ |K_t(x, x') − K'_t(y, y')|² dμ(x, y) dμ(x', y'))^½,   c(t) = exp(−(t + 1/t)).
 
-the form of exponent 2. Time is counted in the decay time of the slowest heat on a sphere of the same area, A/8π, so
-that scale does not matter. The lower bounds compare what each shape tells of itself. The samples stand for the shape,
-each with the same weight; between the samples, at the given times, the bounds hold exactly. In the interior the
-eigenfunctions are those that Rustamov 2010 extends from the surface: the volumetric counterpart he leaves to others.
+This is the form of exponent 2. The unit of time is the slowest decay time of heat on a sphere of the same area, A/8π,
+so that the distance does not depend on scale. The lower bounds compare invariants of the single shapes. A shape is
+represented by its samples with equal weights; for the samples and the chosen times, the bounds hold exactly. The
+eigenfunctions in the interior are those of the surface, extended as in Rustamov 2010.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature
 
 Bound = Literal["trace", "signature", "pairs"]
 
-# Around the largest c², which falls off steeply on both sides.
+# c² is largest at t = 1 and falls off steeply on both sides.
 TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 
@@ -38,9 +38,9 @@ TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)
 class SpectralGromovWasserstein(BodyDescriptor):
     """Lower bounds of the spectral Gromov-Wasserstein distance.
 
-    "trace" compares the norms ‖K_t‖₂, whose squares are the heat traces; "signature" the distributions over the points
-    x of ‖K_t(x, ·)‖₂, on the surface the square root of the heat kernel signature at 2t; "pairs" the distributions of
-    K_t(x, y) over the pairs of points.
+    The bound "trace" compares the norms ‖K_t‖₂, whose squares are the heat traces. "signature" compares the
+    distributions of ‖K_t(x, ·)‖₂ over the points x; on the surface, this norm is the square root of the heat kernel
+    signature at 2t. "pairs" compares the distributions of K_t(x, y) over the pairs of points.
     """
 
     name = "spectral_gw"
@@ -50,10 +50,10 @@ class SpectralGromovWasserstein(BodyDescriptor):
     samples: SampleKind = "surface"
     bound: Bound = "pairs"
     times: tuple[float, ...] = TIMES  # in units of A/8π
-    n_samples: int = 500  # at most so many of the body's samples, at equal steps of their order of form
+    n_samples: int = 500  # at most, at equal steps along the order of the samples
     n_quantiles: int = 200  # steps of the quantile functions
     n_eigenpairs: int = 100  # of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
-    seed: int = 0  # of the first step
+    seed: int = 0  # of the offset of the steps along the order of the samples
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class SpectralGromovWasserstein(BodyDescriptor):
         self.requirements = Requirements(n_eigenpairs=self.n_eigenpairs)
 
     def describe_body(self, body: Body) -> Singles:
-        """(times, n_quantiles) quantile functions, with the factor c²(t); (times, 1) for the bound "trace"."""
+        """(times, n_quantiles) quantile functions times c²(t); (times, 1) for the bound "trace"."""
         kernels = heat_kernels(body, self.samples, self.times, self.n_samples, self.n_eigenpairs, self.seed)
         rows = []
         for time, kernel in zip(self.times, kernels, strict=True):
@@ -79,7 +79,7 @@ class SpectralGromovWasserstein(BodyDescriptor):
         return np.array(rows, dtype=np.float32)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, G) the largest over the times of the Wasserstein distances of exponent 2."""
+        """(Q, G) Wasserstein distances of exponent 2, the largest over the times."""
         at_times = [euclidean(queries[:, i], gallery[:, i]) for i in range(queries.shape[1])]
         return torch.stack(at_times).amax(dim=0) / queries.shape[2] ** 0.5
 
@@ -92,17 +92,17 @@ def heat_kernels(
     n_eigenpairs: int | None = None,
     seed: int = 0,
 ) -> list[Floats]:
-    """A k_t(x, y) among some samples: for every time a (P, P) array without unit, P ≤ `n_samples`.
+    """Heat kernels A k_t(x, y) between samples of a body: for every time a (P, P) array without unit, P ≤ `n_samples`.
 
-    For the parameters and errors see `SpectralGromovWasserstein`; without a number of eigenpairs all are taken.
+    For the parameters and errors see `SpectralGromovWasserstein`; all eigenpairs are used if `n_eigenpairs` is None.
     """
     _check(samples, times, n_samples)
     eigenfunctions = getattr(body, samples).eigenfunctions[:, :n_eigenpairs]
-    # Samples come in an order of form, along which the like are neighbours: steps of it see all parts of the body.
-    count = min(n_samples, len(eigenfunctions))
-    step = len(eigenfunctions) / count
-    places = (np.arange(count) + np.random.default_rng(seed).random()) * step
-    chosen = np.minimum(places.astype(np.int64), len(eigenfunctions) - 1)
+    # Samples are in a canonical order in which similar samples are neighbours, so that equal steps reach all parts.
+    n_chosen = min(n_samples, len(eigenfunctions))
+    step = len(eigenfunctions) / n_chosen
+    positions = (np.arange(n_chosen) + np.random.default_rng(seed).random()) * step
+    chosen = np.minimum(positions.astype(np.int64), len(eigenfunctions) - 1)
     values = np.sqrt(body.area) * eigenfunctions[chosen].astype(np.float64)
     exponents = body.eigenvalues[:n_eigenpairs] * body.area / (8 * np.pi)
     return [1 + (values * np.exp(-exponents * time)) @ values.T for time in times]
@@ -114,10 +114,10 @@ def time_weight(time: float) -> float:
 
 
 def quantiles(values: ArrayLike, n_quantiles: int) -> Floats:
-    """Means of the quantile function of a sample over equal steps.
+    """(n_quantiles,) means of the quantile function of some values over equal steps, ascending.
 
-    For any exponent p ≥ 1, (mean |q − q'|ᵖ)^(1/p) of two samples' means q, q' is at most their Wasserstein distance
-    (Jensen), and tends to it with the number of steps. They ascend, (n_quantiles,).
+    Let q and q' be such means of two sets of values. For any exponent p ≥ 1, (mean |q − q'|ᵖ)^(1/p) is at most the
+    Wasserstein distance of the two sets (Jensen), and converges to it as the number of steps grows.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64), axis=None)
     integral = np.concatenate([[0.0], np.cumsum(ordered)]) / len(ordered)
@@ -134,11 +134,12 @@ def gromov_wasserstein(
     n_samples: int = 50,
     seed: int = 0,
 ) -> float:
-    """The spectral Gromov-Wasserstein distance of two small sets of samples, with a coupling of its own for each time.
+    """Approximate the spectral Gromov-Wasserstein distance of two small sets of samples.
 
-    The largest over the times of local minima over the couplings, by conditional gradients from the uniform coupling
-    and from the one of the bound "signature". No lower bound of `SpectralGromovWasserstein` for the same
-    samples and times exceeds it. For the parameters see `SpectralGromovWasserstein`; an ImportError without POT.
+    The couplings are optimised for each time separately, by conditional gradients from the uniform coupling and from
+    the coupling of the bound "signature". The result is the largest of these local minima over the times. No lower
+    bound of `SpectralGromovWasserstein` for the same samples and times exceeds it. For the parameters see
+    `SpectralGromovWasserstein`. An ImportError is raised if POT is not installed.
     """
     try:
         import ot

@@ -1,15 +1,15 @@
 """Volumetric Shape-DNA: the spectrum of the Laplacian in the body (Reuter, Wolter and Peinecke 2005, 2006).
 
-The body is cut into cubic cells of one share of its volume, so that a thin body gets as fine cells as a stout one, and
-the grid adapts to scale. Each cell is sampled at 3³ points, which tell how much of it the body fills.
+The body is divided into cubic cells. The volume of a cell is a fixed share of the body's volume, so that the grid
+adapts to scale and a thin body has as many cells as a stout one. The filled share of a cell is sampled at 3³ points.
 
-Neumann: finite volumes of the cut cells (Ng, Min and Gibou 2009 for the fractions). A cell's mass is its filled volume,
-and the flux between two cells goes through the open share of their common face. A limb thinner than a cell keeps
-its cross-section and its connection. The second-lowest eigenvalue of a body of several pieces is zero, as the limit of
-ever thinner necks demands: only the first zero is left out.
+Neumann: finite volumes of the cut cells (Ng, Min and Gibou 2009 for the fractions). The mass of a cell is its filled
+volume, and the flux between two cells goes through the open share of their common face. So a limb thinner than a cell
+keeps its cross-section and its connection. A body of several components has several zero eigenvalues, as in the limit
+of ever thinner necks. Only the first zero is left out.
 
 Dirichlet: finite differences at the cell centres inside, with the wall at its distance along the grid line, in the
-symmetric second-order form of Gibou, Fedkiw, Cheng and Kang 2002. Parts thinner than a cell take no part; they would
+symmetric second-order form of Gibou, Fedkiw, Cheng and Kang 2002. Parts thinner than a cell are left out; they would
 only add eigenvalues far above the first ones.
 """
 
@@ -34,21 +34,21 @@ from igps.signature.voxels import grid_axes, inside_grid
 
 Boundary = Literal["dirichlet", "neumann"]
 
-# Pieces of a smaller share of the volume are crumbs of the sampling, at tips and seams. Each would add a zero.
-_CRUMB = 0.01
-# Cells along the longest side at most: 3³ points each must fit into memory.
+# Components with a smaller share of the volume are artefacts of the sampling, at tips and seams. Each adds a zero.
+_MIN_COMPONENT_SHARE = 0.01
+# Cells along the longest side: 3³ points for each cell must fit into memory.
 _MAX_RESOLUTION = 128
-# The shift of the inverse iteration, in units of volume^(-2/3): below the zero mode, and far from singular.
+# Shift of the inverse iteration, in units of volume^(-2/3): below the zero mode, and far from singular.
 _SHIFT = -1.0
-# Relative accuracy of the eigenvalues' distance from the shift, far below the grid's.
+# Relative accuracy of the eigenvalues' distances from the shift, far below the error of the grid.
 _TOLERANCE = 1e-8
-# Eigenvalues looked for at a time when searching for missed ones.
+# Number of eigenvalues in each search for missed copies of multiple eigenvalues.
 _N_RECHECKED = 3
 
 
 @dataclass(eq=False, repr=False)
 class VolumeShapeDNA(BodyDescriptor):
-    """The first eigenvalues of the Laplacian in the body, times volume^(2/3).
+    """The first non-zero eigenvalues of the Laplacian in the body, times volume^(2/3).
 
     Source: Reuter, Wolter and Peinecke 2005, 2006 (normalisation, Euclidean distance); 12 eigenvalues as in `ShapeDNA`.
     """
@@ -58,9 +58,9 @@ class VolumeShapeDNA(BodyDescriptor):
     invariant_to = ("motion", "scale")
     requirements = Requirements(mesh=True)
 
-    boundary: Boundary = "dirichlet"  # zero on the surface, or "neumann": no flux through it
-    n_eigenvalues: int = 12  # without the first zero of Neumann's
-    n_voxels: int = 4000  # the cells have 1/`n_voxels` of the volume each, but at least 1/128 of the longest side
+    boundary: Boundary = "dirichlet"  # zero on the surface; or "neumann": no flux through the surface
+    n_eigenvalues: int = 12  # without the first zero under Neumann conditions
+    n_voxels: int = 4000  # a cell has 1/`n_voxels` of the volume, but its side is at least 1/128 of the longest side
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ class VolumeShapeDNA(BodyDescriptor):
         check_at_least(1, n_eigenvalues=self.n_eigenvalues, n_voxels=self.n_voxels)
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_eigenvalues,) normalised eigenvalues, ascending, without unit; for errors see `volume_spectrum`."""
+        """(n_eigenvalues,) normalised eigenvalues, ascending, without unit; raises the errors of `volume_spectrum`."""
         return volume_spectrum(body.mesh, self.n_eigenvalues, self.boundary, self.n_voxels).astype(np.float32)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
@@ -77,30 +77,32 @@ class VolumeShapeDNA(BodyDescriptor):
 
 
 def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels: int) -> Floats:
-    """The smallest eigenvalues of −Δ in the body, times its volume^(2/3), ascending, without Neumann's first zero.
+    """Smallest eigenvalues of −Δ in the body, times volume^(2/3), ascending, without the first zero under "neumann".
 
     Raises:
         MeshError: the body is too thin for the grid, or has too few cells for the eigenvalues.
     """
-    fine, cell = _sampled_cells(mesh, n_voxels)
-    stiffness, mass = _dirichlet(fine) if boundary == "dirichlet" else _neumann(fine)
-    skipped = int(boundary == "neumann")
-    # ARPACK needs room for its basis, and the search for what it missed room in the complement.
-    least = 2 * (n_eigenvalues + skipped + _N_RECHECKED) + 1
-    if len(mass) < least:
+    inside, cell = _sampled_cells(mesh, n_voxels)
+    stiffness, mass = _dirichlet(inside) if boundary == "dirichlet" else _neumann(inside)
+    n_skipped = int(boundary == "neumann")
+    # ARPACK needs space for its basis, and the search for missed eigenvalues needs a complement of that size.
+    min_cells = 2 * (n_eigenvalues + n_skipped + _N_RECHECKED) + 1
+    if len(mass) < min_cells:
         raise MeshError(
-            f"{mesh.name}: {len(mass)} cells are too few for {n_eigenvalues} eigenvalues; at least {least} are needed. "
-            "Raise n_voxels, or lower n_eigenvalues."
+            f"{mesh.name}: {len(mass)} cells are too few for {n_eigenvalues} eigenvalues; at least {min_cells} are "
+            "needed. Raise n_voxels, or lower n_eigenvalues."
         )
     scale = (abs(mesh.volume) / cell**3) ** (2 / 3)
-    values = _smallest(stiffness, mass, n_eigenvalues + skipped, _SHIFT / scale)
-    return np.maximum(values[skipped:], 0) * scale
+    values = _smallest_eigenvalues(stiffness, mass, n_eigenvalues + n_skipped, _SHIFT / scale)
+    return np.maximum(values[n_skipped:], 0) * scale
 
 
 def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[Booleans, float]:
-    """Whether the 3³ points of every cell are inside: (X, 3, Y, 3, Z, 3), with a layer of empty cells all round.
+    """Sample a grid of cells at 3³ points each.
 
-    The second result is the side of a cell, length.
+    Returns:
+        Whether each point is inside, (X, 3, Y, 3, Z, 3), with a margin of one layer of empty cells; and the side of a
+        cell, in units of length.
     """
     longest = longest_side(mesh.vertices)
     resolution = int(np.clip(np.ceil(longest * (n_voxels / abs(mesh.volume)) ** (1 / 3)), 1, _MAX_RESOLUTION))
@@ -114,49 +116,49 @@ def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[Booleans, float]:
     return inside.reshape(x, 3, y, 3, z, 3), cell
 
 
-def _neumann(fine: Booleans) -> tuple[sparse.csr_array, Floats]:
-    """Stiffness and diagonal mass of the cells that are not empty, lengths in cells."""
-    filled = fine.mean(axis=(1, 3, 5))
+def _neumann(inside: Booleans) -> tuple[sparse.csr_array, Floats]:
+    """Stiffness and diagonal mass of the non-empty cells, lengths in cells."""
+    filled = inside.mean(axis=(1, 3, 5))
     mass = filled[filled > 0]
-    number = np.full(filled.shape, -1)
-    number[filled > 0] = np.arange(len(mass))
+    index = np.full(filled.shape, -1)
+    index[filled > 0] = np.arange(len(mass))
     rows, columns, weights = [], [], []
     for i in range(3):
-        # Along axis i first: (X, 3, Y, 3, Z, 3) becomes (X, 3, others), and the facing layers of neighbours are
-        # sampled at the same 3 × 3 places.
-        along = np.moveaxis(fine, (2 * i, 2 * i + 1), (0, 1))
-        aperture = (along[:-1, 2] & along[1:, 0]).mean(axis=(2, 4))
-        here = np.nonzero(aperture)
-        cell = np.moveaxis(number, i, 0)
-        rows.append(cell[:-1][here])
-        columns.append(cell[1:][here])
-        weights.append(aperture[here])
+        # With axis i first, (X, 3, Y, 3, Z, 3) becomes (X, 3, others). The facing layers of two neighbours are sampled
+        # at the same 3 × 3 positions.
+        layers = np.moveaxis(inside, (2 * i, 2 * i + 1), (0, 1))
+        aperture = (layers[:-1, 2] & layers[1:, 0]).mean(axis=(2, 4))
+        is_open = np.nonzero(aperture)
+        cell = np.moveaxis(index, i, 0)
+        rows.append(cell[:-1][is_open])
+        columns.append(cell[1:][is_open])
+        weights.append(aperture[is_open])
     graph = _symmetric(np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), len(mass))
-    n_pieces, piece = connected_components(graph, directed=False)
-    share = np.bincount(piece, weights=mass, minlength=n_pieces) / mass.sum()
-    kept = np.nonzero((share >= _CRUMB)[piece])[0]
+    n_components, component = connected_components(graph, directed=False)
+    share = np.bincount(component, weights=mass, minlength=n_components) / mass.sum()
+    kept = np.nonzero((share >= _MIN_COMPONENT_SHARE)[component])[0]
     graph, mass = graph[kept][:, kept], mass[kept]
     return sparse.diags_array(graph.sum(axis=1)) - graph, mass
 
 
-def _dirichlet(fine: Booleans) -> tuple[sparse.csr_array, Floats]:
+def _dirichlet(inside: Booleans) -> tuple[sparse.csr_array, Floats]:
     """Stiffness and unit mass of the cells whose centre is inside, lengths in cells."""
-    inside = fine[:, 1, :, 1, :, 1]
-    n_cells = int(inside.sum())
-    number = np.full(inside.shape, -1)
-    number[inside] = np.arange(n_cells)
+    is_cell = inside[:, 1, :, 1, :, 1]
+    n_cells = int(is_cell.sum())
+    index = np.full(is_cell.shape, -1)
+    index[is_cell] = np.arange(n_cells)
     rows, columns = [], []
-    diagonal = np.zeros(inside.shape)
+    diagonal = np.zeros(is_cell.shape)
     for i in range(3):
-        # The points on the grid line through the cell centres along axis i.
-        line = np.moveaxis(fine, (2 * i, 2 * i + 1), (0, 1))[:, :, :, 1, :, 1]
-        cell = np.moveaxis(number, i, 0)
+        # The points on the grid lines through the cell centres along axis i
+        line = np.moveaxis(inside, (2 * i, 2 * i + 1), (0, 1))[:, :, :, 1, :, 1]
+        cell = np.moveaxis(index, i, 0)
         for step in (-1, 1):
-            # The layer of empty cells all round makes the wrap harmless.
+            # `np.roll` wraps around only into the margin of empty cells.
             first, second = line[:, 1 + step], np.roll(line, -step, axis=0)[:, 1 - step]
             beyond = np.roll(line, -step, axis=0)[:, 1]
             linked = line[:, 1] & first & second & beyond
-            # The wall lies between the last point inside and the next one: on average half way.
+            # The wall lies between the last point inside and the next point, on average half way.
             wall = (first.astype(int) + (first & second) + 0.5) / 3
             diagonal += np.moveaxis(np.where(linked, 1.0, 1.0 / wall), 0, i)
             if step == 1:
@@ -164,7 +166,7 @@ def _dirichlet(fine: Booleans) -> tuple[sparse.csr_array, Floats]:
                 columns.append(np.roll(cell, -1, axis=0)[linked])
     row, column = np.concatenate(rows), np.concatenate(columns)
     graph = _symmetric(row, column, np.ones(len(row)), n_cells)
-    return sparse.diags_array(diagonal[inside]) - graph, np.ones(n_cells)
+    return sparse.diags_array(diagonal[is_cell]) - graph, np.ones(n_cells)
 
 
 def _symmetric(rows: Integers, columns: Integers, weights: Floats, size: int) -> sparse.csr_array:
@@ -172,30 +174,29 @@ def _symmetric(rows: Integers, columns: Integers, weights: Floats, size: int) ->
     return sparse.coo_array(entries, shape=(size, size)).tocsr()
 
 
-def _smallest(stiffness: sparse.csr_array, mass: Floats, count: int, shift: float) -> Floats:
-    """The smallest eigenvalues of K u = λ M u, ascending, by Lanczos iteration on (K − shift M)⁻¹."""
+def _smallest_eigenvalues(stiffness: sparse.csr_array, mass: Floats, n_values: int, shift: float) -> Floats:
+    """Smallest eigenvalues of K u = λ M u, ascending, by Lanczos iteration on (K − shift M)⁻¹."""
     scaling = sparse.diags_array(1 / np.sqrt(mass))
     matrix = (scaling @ stiffness @ scaling).tocsc()
     shifted = (matrix - shift * sparse.eye_array(len(mass))).tocsc()
-    # Positive definite: no pivoting, and the elimination order of a symmetric matrix.
+    # The matrix is positive definite: factorize without pivoting, in an elimination order for symmetric matrices.
     factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     inverse = LinearOperator(matrix.shape, factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(len(mass))
-    values, vectors = eigsh(matrix, count, sigma=shift, OPinv=inverse, v0=start, tol=_TOLERANCE)
+    values, vectors = eigsh(matrix, n_values, sigma=shift, OPinv=inverse, v0=start, tol=_TOLERANCE)
     while True:
-        # The iteration from one vector may see one copy of a multiple eigenvalue: the others lie in the complement of
-        # what was found.
-        found = vectors
+        # An iteration from a single vector may find only one copy of a multiple eigenvalue. The missed copies lie in
+        # the orthogonal complement of the eigenvectors found so far.
         complement = LinearOperator(
-            matrix.shape, lambda u, q=found: _project(factor.solve(_project(u, q)), q), dtype=np.float64
+            matrix.shape, lambda u, q=vectors: _project(factor.solve(_project(u, q)), q), dtype=np.float64
         )
-        inverted, more = eigsh(complement, _N_RECHECKED, which="LA", v0=_project(start, found), tol=_TOLERANCE)
-        missed = shift + 1 / inverted < values.max() - _TOLERANCE * (values.max() - shift)
+        inverses, candidates = eigsh(complement, _N_RECHECKED, which="LA", v0=_project(start, vectors), tol=_TOLERANCE)
+        missed = shift + 1 / inverses < values.max() - _TOLERANCE * (values.max() - shift)
         if not missed.any():
             return np.sort(values)
-        values = np.concatenate([values, shift + 1 / inverted[missed]])
-        kept = np.argsort(values)[:count]
-        values, vectors = values[kept], np.hstack([vectors, more[:, missed]])[:, kept]
+        values = np.concatenate([values, shift + 1 / inverses[missed]])
+        smallest = np.argsort(values)[:n_values]
+        values, vectors = values[smallest], np.hstack([vectors, candidates[:, missed]])[:, smallest]
 
 
 def _project(vector: Floats, basis: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Any descriptor, and beside it what bodies are like inside: attributes of their own, by interior distance."""
+"""Descriptors that are combined with histograms of attributes of the samples."""
 
 from collections.abc import Sequence
 
@@ -14,26 +14,26 @@ from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
 
 _N_SAMPLES = 2000
-# Bins of distance, and how many of them are taken together for the levels of the comparison: fine textures need narrow
-# bins, conformations of a molecule change distances, and of some bodies it is the mixture alone that counts.
-_N_BINS, _LEVELS = 32, (1, 4, 32)
+# Number of distance bins, and how many of them are merged at each level of the comparison. Fine textures need narrow
+# bins, conformations of a molecule change distances, and for some bodies only the mixture of attributes counts.
+_N_BINS, _N_MERGED_BINS = 32, (1, 4, 32)
 
 
 class WithAttributes(Descriptor):
-    """A descriptor and joint histograms of attributes and interior distances: `NAME+ATTRIBUTE`, or `NAME+ATTRIBUTE=w`.
+    """A descriptor with joint histograms of attributes and interior distances: `NAME+ATTRIBUTE` or `NAME+ATTRIBUTE=w`.
 
-    With d the distance of the descriptor and s its scale between bodies of one class, that of the bodies is
-    d + w·s/t·c: c the χ² distance of the attribute's histograms, in the mean over 32, 8 and 1 bins of distance, and t
-    the scale of `interior`, which is of that kind. So a weight of 1 lets form and attributes count alike. Classes of an
-    attribute are eight quantiles of the collection.
+    The distance of two bodies is d + w·(s/t)·c. Here d is the distance by the descriptor, s its scale (the median
+    distance between bodies of one class), c the χ² distance of the histograms of the attribute, averaged over 32, 8 and
+    1 distance bins, and t the scale of `interior`, which compares similar histograms. So form and attribute count alike
+    for a weight w of 1. An attribute has eight classes, whose centres are quantiles of the collection.
 
     Args:
-        descriptor: any whose scale is known.
-        attributes: names of scalars.
-        weights: of each attribute.
+        descriptor: a descriptor of known scale.
+        attributes: names of scalar attributes.
+        weights: one for each attribute.
 
     Raises:
-        ValueError: the descriptor's scale is not known, or a weight is not positive.
+        ValueError: the scale of the descriptor is not known, or a weight is not positive.
     """
 
     def __init__(self, descriptor: Descriptor, attributes: Sequence[str], weights: Sequence[float]) -> None:
@@ -41,7 +41,7 @@ class WithAttributes(Descriptor):
         scale = scale_of(descriptor)
         if scale is None or not all(0 < weight < float("inf") for weight in weights):
             raise ValueError(
-                f"with: expected positive weights and a descriptor whose distances are known, got {weights} and "
+                f"with: expected positive weights and a descriptor of known scale, got {weights} and "
                 f"{descriptor.name!r}. Set its attribute `scale` to the median of its distances within a class."
             )
         self.descriptor, self.scale = descriptor, scale
@@ -53,34 +53,34 @@ class WithAttributes(Descriptor):
             return PairHistogram(axes, embedding, n_samples=_N_SAMPLES)
 
         self.inside = HistogramDescriptor([histogram(name) for name in attributes])
-        marks = (f"+{name}" + f"={weight:g}" * (weight != 1) for name, weight in zip(attributes, weights, strict=True))
-        self.name, self.source = descriptor.name + "".join(marks), f"{descriptor.source}; Rustamov 2010, section 4"
+        suffixes = (f"+{name}" + f"={w:g}" * (w != 1) for name, w in zip(attributes, weights, strict=True))
+        self.name, self.source = descriptor.name + "".join(suffixes), f"{descriptor.source}; Rustamov 2010, section 4"
         self.invariant_to = descriptor.invariant_to
         self.requirements = descriptor.requirements | self.inside.requirements
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, D + cells)."""
+        """(N, D + cells) descriptions: the descriptor's own, then the histograms."""
         inside = self.inside(batch).flatten(1) * len(self.weights)
         return torch.cat([self.descriptor(batch).flatten(1), inside], dim=1)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, G)."""
-        (form, *own), (forms, *others) = self._split(queries), self._split(gallery)
-        found = self.descriptor.distances(form, forms)
-        for weight, one, other in zip(self.weights, own, others, strict=True):
-            for n_together in _LEVELS:
-                levels = (cells.unflatten(1, (-1, n_together)).sum(dim=2) for cells in (one, other))
-                found = found + weight / len(_LEVELS) * chi_square(*levels)
-        return found
+        """(Q, G) distances."""
+        (form, *histograms), (forms, *gallery_histograms) = self._split(queries), self._split(gallery)
+        distances = self.descriptor.distances(form, forms)
+        for weight, *pair in zip(self.weights, histograms, gallery_histograms, strict=True):
+            for n_merged in _N_MERGED_BINS:
+                merged = (cells.unflatten(1, (-1, n_merged)).sum(dim=2) for cells in pair)
+                distances = distances + weight / len(_N_MERGED_BINS) * chi_square(*merged)
+        return distances
 
     def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
-        """(N, ≤ D + cells) the coordinates of the descriptor, and roots of the histograms times their weights."""
-        form, *own = self._split(descriptions)
-        roots = [(weight * cells).sqrt() for weight, cells in zip(self.weights, own, strict=True)]
+        """(N, ≤ D + cells) coordinates of the descriptor, then square roots of the weighted histograms."""
+        form, *histograms = self._split(descriptions)
+        roots = [(weight * cells).sqrt() for weight, cells in zip(self.weights, histograms, strict=True)]
         return torch.cat([self.descriptor.coordinates(form, of_one_kind=of_one_kind), *roots], dim=1)
 
     def _split(self, descriptions: Tensor) -> list[Tensor]:
-        """The descriptor's part of (N, D + cells) descriptions, in its shape, and the histograms of each attribute."""
+        """Split descriptions (N, D + cells) into the descriptor's own, in its shape, and each attribute's histogram."""
         sizes = list(self.inside.part_cells)
-        form, *own = torch.split(descriptions, [descriptions.shape[1] - sum(sizes), *sizes], dim=1)
-        return [form.unflatten(1, self.descriptor.description_shape), *own]
+        form, *histograms = torch.split(descriptions, [descriptions.shape[1] - sum(sizes), *sizes], dim=1)
+        return [form.unflatten(1, self.descriptor.description_shape), *histograms]

@@ -1,4 +1,4 @@
-"""Tensors in, numbers out: distances between descriptors, rankings and retrieval scores."""
+"""Distances between descriptors, rankings, re-ranking and retrieval scores: functions of tensors alone."""
 
 from igps.retrieval.distances import Distance, chi_square, cosine, euclidean
 from igps.retrieval.graph_reranking import rerank_graph

@@ -1,10 +1,12 @@
-"""Distances between every query and every gallery descriptor: tensors (Q, ...) and (G, ...) in, (Q, G) out.
+"""Distances between queries (Q, ...) and gallery descriptors (G, ...), as tensors (Q, G).
 
-Smaller is closer, identical descriptors are at exactly zero, and a distance matrix of a set with itself is exactly
-symmetric. All dimensions after the first are cells, or entries of one vector. All functions are differentiable, χ² and
-what `torch.func` follows any number of times, the others once; they run on the device of their inputs, and compute half
-precision in float32. All raise a ValueError for shapes, dtypes or devices that do not fit, for NaN or infinite entries,
-and χ² for negative ones; to check that waits for the device once per argument.
+Smaller is closer, identical descriptors have distance exactly 0, and a distance matrix of a set with itself is exactly
+symmetric. All dimensions after the first are cells of a histogram or entries of a vector.
+
+All functions run on the device of their inputs, and in float32 for inputs in half precision. They are differentiable:
+χ² any number of times, the others once, or any number of times under `torch.func`. They raise a ValueError for shapes,
+dtypes or devices that do not match, for NaN or infinite entries, and χ² for negative entries. This check synchronises
+with the device once per argument.
 """
 
 import math
@@ -21,25 +23,25 @@ from igps.retrieval.distance_loops import fill
 Distance = Callable[[Tensor, Tensor], Tensor]
 """A distance function: queries (Q, ...) and gallery (G, ...) to distances (Q, G) ≥ 0, smaller is closer."""
 
-# A tile of (query, gallery, cell) triples is sized for the cache of a CPU; elsewhere for few, large kernel launches.
-# At most three temporaries of that size are alive at once, so that they stay below 256 MiB on any device.
+# A tile of (query, gallery, cell) triples fits the cache of a CPU, and makes few, large kernel launches on other
+# devices. At most three temporaries of that size exist at once, so that they stay below 256 MiB on any device.
 _CPU_TILE_BYTES = 2**20
 _DEVICE_TILE_BYTES = 48 * 2**20
 _CELLS_PER_TILE = 4096
-# Triples that a thread of the compiled loops computes at least: some milliseconds
+# Minimum of triples for each thread of the compiled loops: some milliseconds
 _TRIPLES_PER_THREAD = 2**24
-# Of the squares of lengths: what of their sum in double precision is rounding
-_CANCELLED = 1e-14
+# Squared distances below this share of the sum of the two squared lengths are rounding errors of double precision.
+_CANCELLATION = 1e-14
 
 
 def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
     """χ² distance ½ Σ (a−b)² / (a+b) between histograms, over all cells, with the factor ½.
 
-    With the ½ the distance of two histograms that each sum to 1 lies in [0, 1], and is 1 where they have no cell in
-    common. To weigh a cell, multiply it in both by the weight. A cell empty in both adds nothing, and the gradients of
-    such a cell are set to zero, where the function has no derivative. Memory beyond inputs, result and gradients stays
-    below 256 MiB, but derivatives of gradients hold all triples of query, gallery and cell. Source: Rustamov 2010
-    (comparison of histograms by χ²).
+    The distance of two histograms of sum 1 lies in [0, 1], and is 1 if no cell is filled in both. To weight a cell,
+    multiply its entries in both histograms by the weight. A cell that is empty in both adds nothing; its gradients are
+    set to zero, because the function has no derivative there. Memory beyond inputs, result and gradients stays below
+    256 MiB, but derivatives of gradients hold all triples of query, gallery and cell. Source: Rustamov 2010 (comparison
+    of histograms by χ²).
 
     Example:
         >>> import torch
@@ -55,31 +57,31 @@ def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
         (Q, G) distances, without unit.
     """
     a, b = _as_rows(queries, gallery, non_negative=True)
-    return _all_at_once(a, b) if in_transforms() else _ChiSquare.apply(a, b)
+    return _chi_square_by_torch(a, b) if in_transforms() else _ChiSquare.apply(a, b)
 
 
 def euclidean(queries: Tensor, gallery: Tensor) -> Tensor:
-    """Euclidean distance √(Σ (a−b)²), in the unit of the descriptors; its gradient at distance zero is set to zero."""
+    """Euclidean distance √(Σ (a−b)²), in the unit of the descriptors; the gradient at distance 0 is set to 0."""
     return _row_distance(*_as_rows(queries, gallery, non_negative=False))
 
 
 def cosine(queries: Tensor, gallery: Tensor) -> Tensor:
-    """Cosine distance 1 − cos(a, b), in [0, 2], as ½ ‖a/‖a‖ − b/‖b‖‖², which does not cancel for near descriptors.
+    """Cosine distance 1 − cos(a, b), in [0, 2], as ½ ‖a/‖a‖ − b/‖b‖‖², which avoids cancellation for close descriptors.
 
-    A ValueError also of a descriptor of length zero, which has no direction.
+    A descriptor of length zero has no direction and raises a ValueError.
     """
     a, b = _as_rows(queries, gallery, non_negative=False)
     return _row_distance(_unit("queries", a), _unit("gallery", b)).square() / 2.0
 
 
 class _ChiSquare(torch.autograd.Function):
-    """χ² tile by tile; the backward pass recomputes its tiles, so that no (Q, G, cells) array is ever kept."""
+    """χ² tile by tile. The backward pass recomputes the tiles, so that no array (Q, G, cells) is stored."""
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
         ctx.save_for_backward(a, b)
-        if _is_for_loops(a):
-            return _by_loops(a, b, chi_square=True).mul_(0.5)
+        if _can_use_loops(a):
+            return _sums_by_loops(a, b, chi_square=True).mul_(0.5)
         distances = a.new_zeros(len(a), len(b))
         for q, g, c in _tiles(a, b):
             ratio, difference = _ratio(a[q, c], b[g, c])
@@ -89,10 +91,10 @@ class _ChiSquare(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         a, b = ctx.saved_tensors
-        if torch.is_grad_enabled():  # derivatives of the gradient are asked for
-            leaves = [one for one, is_needed in zip((a, b), ctx.needs_input_grad, strict=True) if is_needed]
-            found = iter(torch.autograd.grad(_all_at_once(a, b), leaves, grad, create_graph=True))
-            return tuple(next(found) if is_needed else None for is_needed in ctx.needs_input_grad)
+        if torch.is_grad_enabled():  # derivatives of the gradient are needed, too
+            leaves = [leaf for leaf, is_needed in zip((a, b), ctx.needs_input_grad, strict=True) if is_needed]
+            gradients = iter(torch.autograd.grad(_chi_square_by_torch(a, b), leaves, grad, create_graph=True))
+            return tuple(next(gradients) if is_needed else None for is_needed in ctx.needs_input_grad)
         grad_a, grad_b = torch.zeros_like(a), torch.zeros_like(b)
         for q, g, c in _tiles(a, b):
             # With u = (a−b)/(a+b): ∂/∂a (a−b)²/(a+b) = 2u − u², and ∂/∂b = −2u − u².
@@ -104,28 +106,28 @@ class _ChiSquare(torch.autograd.Function):
         return grad_a, grad_b
 
 
-def _all_at_once(a: Tensor, b: Tensor) -> Tensor:
-    """χ² in operations of PyTorch, which hold all (Q, G, cells) and have derivatives of any order."""
+def _chi_square_by_torch(a: Tensor, b: Tensor) -> Tensor:
+    """χ² in operations of PyTorch, which have derivatives of any order and hold arrays (Q, G, cells)."""
     total = a[:, None] + b
     filled = total > 0
     difference = torch.where(filled, a[:, None] - b, 0)
     return (difference.square() / torch.where(filled, total, 1)).sum(dim=-1) / 2
 
 
-def _is_for_loops(tensor: Tensor) -> bool:
-    """Whether compiled loops can read it: those of a device, and what is traced, compute by PyTorch's tiles."""
+def _can_use_loops(tensor: Tensor) -> bool:
+    """Whether compiled loops can read a tensor: it is on the CPU, and not traced or transformed."""
     return tensor.device.type == "cpu" and not torch.compiler.is_compiling() and not in_transforms()
 
 
 def in_transforms() -> bool:
-    """Whether `torch.func`, or forward mode, follows what is computed."""
+    """Return whether a transform of `torch.func` or forward-mode differentiation is active."""
     return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
-def _by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
-    """What `distance_loops.fill` writes, (Q, G). Threads share the longer of both sides."""
-    found = a.new_empty(len(a), len(b))
-    queries, gallery, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, found))
+def _sums_by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
+    """(Q, G) sums by `distance_loops.fill`. The longer one of queries and gallery is divided among threads."""
+    sums = a.new_empty(len(a), len(b))
+    queries, gallery, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, sums))
 
     def write(part: slice) -> None:
         if len(a) >= len(b):
@@ -133,23 +135,23 @@ def _by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
         else:
             fill(queries, gallery[part], chi_square, result[:, part])
 
-    large = found.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
-    with Team(None if large else 1) as team:
+    is_large = sums.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
+    with Team(None if is_large else 1) as team:
         length = max(len(a), len(b))
-        step = max(1, math.ceil(length / (4 * team.n_threads))) if large else length
+        step = max(1, math.ceil(length / (4 * team.n_threads))) if is_large else length
         team.each(write, [slice(begin, begin + step) for begin in range(0, length, step)])
-    return found
+    return sums
 
 
 def _ratio(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """(a−b)/(a+b), 0 where both are 0, and a−b, for all pairs of rows: both (Q, G, cells)."""
+    """(a−b)/(a+b), 0 where both are 0, and a−b for all pairs of rows, each (Q, G, cells)."""
     difference = a[:, None] - b
     total = (a[:, None] + b).clamp_min_(torch.finfo(a.dtype).tiny)  # 0/tiny = 0: an empty cell needs no mask
     return torch.div(difference, total, out=total), difference
 
 
 def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
-    """Slices of queries, gallery and cells that cover all triples, each tile of a bounded size."""
+    """Slices of queries, gallery and cells of tiles of bounded size that cover all triples."""
     (n_queries, n_cells), n_gallery = a.shape, len(b)
     n_bytes = _CPU_TILE_BYTES if a.device.type == "cpu" else _DEVICE_TILE_BYTES
     cells = min(n_cells, _CELLS_PER_TILE)
@@ -163,63 +165,63 @@ def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
 
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
-    if _is_for_loops(a) and not (torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)):
-        return _by_loops(a, b, chi_square=False).sqrt_()
+    if _can_use_loops(a) and not (torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)):
+        return _sums_by_loops(a, b, chi_square=False).sqrt_()
     return row_distances(a, b)
 
 
-# The faster form by a matrix product cancels: it leaves a diagonal that is not zero.
+# By default without the faster matrix product, whose cancellation leaves non-zero distances on the diagonal.
 def row_distances(a: Tensor, b: Tensor, compute_mode: str = "donot_use_mm_for_euclid_dist") -> Tensor:
-    """Euclidean distances (..., I, J) of rows (..., I, D) and (..., J, D), by `torch.cdist`, see there for the mode."""
+    """Euclidean distances (..., I, J) of rows (..., I, D) and (..., J, D); for the mode see `torch.cdist`."""
     if not in_transforms():
         return torch.cdist(a, b, compute_mode=compute_mode)
-    # That has no forward derivatives, and no second ones. In double precision a product cancels less.
+    # `torch.cdist` has no forward-mode and no second derivatives. Double precision reduces the product's cancellation.
     centre = a.detach().mean(dim=-2, keepdim=True)
     x, y = (a - centre).double(), (b - centre).double()
     sums = x.square().sum(dim=-1).unsqueeze(-1) + y.square().sum(dim=-1).unsqueeze(-2)
     squares = sums - 2 * x @ y.mT
-    apart = squares > _CANCELLED * sums
-    return torch.where(apart, torch.where(apart, squares, 1).sqrt(), 0).to(a.dtype)
+    is_positive = squares > _CANCELLATION * sums
+    return torch.where(is_positive, torch.where(is_positive, squares, 1).sqrt(), 0).to(a.dtype)
 
 
 def square_root(values: Tensor) -> Tensor:
-    """Square root of non-negative values, with a zero gradient at zero, where it has none."""
-    filled = values > 0
-    return torch.where(filled, torch.where(filled, values, 1.0).sqrt(), 0.0)
+    """Square root of non-negative values, whose gradient at 0 is 0 in place of infinity."""
+    is_positive = values > 0
+    return torch.where(is_positive, torch.where(is_positive, values, 1.0).sqrt(), 0.0)
 
 
 def _unit(name: str, rows: Tensor) -> Tensor:
     lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
     limits = torch.finfo(rows.dtype)
-    traced = torch.compiler.is_compiling()  # what is traced cannot look at numbers
-    if not traced and bool(((lengths > limits.tiny**0.25) & (lengths < limits.max**0.25)).all()):
+    is_traced = torch.compiler.is_compiling()  # traced code cannot depend on values of tensors
+    if not is_traced and bool(((lengths > limits.tiny**0.25) & (lengths < limits.max**0.25)).all()):
         return rows / lengths
-    # By the largest entry first: the sum of squares of tiny or huge entries leaves the range of the dtype.
+    # Divide by the largest entry first: the sum of squares of tiny or huge entries leaves the range of the dtype.
     largest = rows.detach().abs().amax(dim=1, keepdim=True)
-    empty = 0 if traced else (largest == 0).sum().item()
-    if empty:
+    n_empty = 0 if is_traced else (largest == 0).sum().item()
+    if n_empty:
         raise ValueError(
-            f"{name}: expected descriptors of non-zero length, {empty} of {len(rows)} are all zeros and have no "
+            f"{name}: expected descriptors of non-zero length, {n_empty} of {len(rows)} are all zeros and have no "
             "direction; remove them or use another distance"
         )
     scaled = rows / largest
     return scaled / torch.linalg.vector_norm(scaled, dim=1, keepdim=True)
 
 
-def check_tensor(name: str, given: Any) -> None:
-    """Raise a ValueError of anything but a tensor, such as a NumPy array."""
-    if not isinstance(given, Tensor):
-        raise ValueError(f"{name}: expected a tensor, got {type(given).__name__}; make one by torch.as_tensor")
+def check_tensor(name: str, value: Any) -> None:
+    """Raise a ValueError if an argument is not a tensor, but for example a NumPy array."""
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name}: expected a tensor, got {type(value).__name__}; convert with torch.as_tensor")
 
 
 def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[Tensor, Tensor]:
-    """Both arguments checked, as (Q, cells) and (G, cells) of one dtype of at least 32 bits."""
+    """Check both arguments, and return them as (Q, cells) and (G, cells) of one dtype of at least 32 bits."""
     for name, tensor in (("queries", queries), ("gallery", gallery)):
         check_tensor(name, tensor)
         if tensor.ndim < 2 or tensor.shape[1:].numel() == 0:
             raise ValueError(
-                f"{name}: expected shape (N, ...) with at least one entry a descriptor, got {tuple(tensor.shape)}; "
-                "a single descriptor takes a leading dimension, descriptor[None]"
+                f"{name}: expected shape (N, ...) with at least one entry per descriptor, got {tuple(tensor.shape)}; "
+                "a single descriptor needs a leading dimension, descriptor[None]"
             )
         _check_entries(name, tensor, non_negative=non_negative)
     if queries.shape[1:] != gallery.shape[1:]:
@@ -229,7 +231,7 @@ def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[T
         )
     if queries.device != gallery.device:
         raise ValueError(
-            f"gallery: expected on {queries.device} as the queries, got {gallery.device}; move one of them"
+            f"gallery: expected on {queries.device} like the queries, got {gallery.device}; move one of them"
         )
     dtype = torch.promote_types(torch.promote_types(queries.dtype, gallery.dtype), torch.float32)
     return queries.flatten(1).to(dtype), gallery.flatten(1).to(dtype)
@@ -240,10 +242,10 @@ def _check_entries(name: str, tensor: Tensor, *, non_negative: bool) -> None:
         raise ValueError(f"{name}: expected a real floating dtype, got {tensor.dtype}; convert with .float()")
     if torch.compiler.is_compiling() or tensor.numel() == 0:
         return
-    low, high = torch.stack(torch.aminmax(tensor.detach())).tolist()  # both are NaN if any entry is
+    low, high = torch.stack(torch.aminmax(tensor.detach())).tolist()  # both are NaN if any entry is NaN
     if not (math.isfinite(low) and math.isfinite(high)):
-        raise ValueError(f"{name}: expected finite entries, got NaN or infinity; look for the descriptor that has them")
+        raise ValueError(f"{name}: expected finite entries, got NaN or infinity; look for the descriptor with them")
     if non_negative and low < 0:
         raise ValueError(
-            f"{name}: expected entries ≥ 0, the smallest is {low:g}; embeddings are compared by euclidean or cosine"
+            f"{name}: expected entries ≥ 0, the smallest is {low:g}; compare embeddings by euclidean or cosine"
         )

@@ -1,4 +1,4 @@
-"""Re-ranking on the graph of nearest neighbours: time and memory grow with the number of shapes, not its square."""
+"""Re-ranking on a graph of nearest neighbours, in time and memory proportional to the number of shapes."""
 
 import numpy as np
 import torch
@@ -9,13 +9,13 @@ from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 from igps.retrieval.ranking import SearchResult
 
-MOST_WHOLE = 2000
-"""Shapes whose pairs are all taken, and the sums over walks of them by the inverse."""
+MAX_DENSE = 2000
+"""Largest number of shapes for which all pairs are used, and walks are summed by a matrix inverse."""
 
-# Of conjugate gradients, for walks whose condition is below 40
-_ROUNDS = 40
-# Rows whose pairs are compared at a time
-_AT_ONCE = 20
+# Maximum of iterations of conjugate gradients; the condition number of the matrices is below 40.
+_MAX_ITERATIONS = 40
+# Rows of the graph that are compared at a time
+_BLOCK_ROWS = 20
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -30,88 +30,90 @@ def rerank_graph(
     keep_nearest: bool = True,
     progress: bool = False,
 ) -> SearchResult:
-    """`rerank` of a collection of which each shape's nearest are known.
+    """Re-rank a collection like `rerank`, from lists of nearest neighbours in place of all distances.
 
-    Walks are those among a shape and its nearest (Yang, Hinami, Matsui, Ly and Satoh 2019). With lists of all others,
-    this is `rerank`.
+    Walks stay among a shape and the shapes in its list (Yang, Hinami, Matsui, Ly and Satoh 2019). If the lists hold all
+    other shapes, the result is that of `rerank`.
 
     Args:
-        found: of each of N shapes, the M others that are nearest, closest first: (N, M).
+        found: (N, M) the M nearest neighbours of each of N shapes, closest first, without the shape itself.
         mean: distance of two shapes of the collection, over all pairs or a sample of them.
         n_neighbours, n_expanded, share, diffusion, keep_nearest, progress: see `rerank`.
 
     Returns:
-        the same shapes in their new order, (N, M), and their distances, without unit; of two shapes of which neither is
-        in the other's list, it would be 1 - share and more.
+        The same neighbours in their new order, (N, M), and their distances, without unit. Distances of two shapes of
+        which neither is in the other's list would be at least 1 - share.
 
     Raises:
-        ValueError: shorter lists than there shall be neighbours, or a mean of 0.
+        ValueError: the lists are too short for the number of neighbours, or the mean is not positive.
     """
-    lists, given = found.indices.numpy(), found.distances.double().numpy()
-    n, m = lists.shape
-    n_near = max(n_neighbours, n_expanded - 1)
-    if n_near > m or mean <= 0:
+    neighbours, distances = found.indices.numpy(), found.distances.double().numpy()
+    n, m = neighbours.shape
+    n_required = max(n_neighbours, n_expanded - 1)
+    if n_required > m or mean <= 0:
         raise ValueError(
-            f"found, mean: expected at least {n_near} neighbours of each shape and a mean above 0, got {m} and {mean}."
+            f"found, mean: expected at least {n_required} neighbours of each shape and a mean above 0, got {m} and "
+            f"{mean}."
         )
     n_pairs, half = n * (n - 1), max(1, round(n_neighbours / 2))
-    graph = _symmetric(lists, given)
-    apart = graph.data / mean
+    graph = _symmetric(neighbours, distances)
+    values = graph.data / mean
     if diffusion:
-        walked = _symmetric(lists, _diffused(lists, given, half, diffusion)).data
-        average = 1 - (graph.nnz - walked.sum()) / n_pairs  # of those in no list, it is 1
-        apart = (1 - share) * walked / max(average, _TINY) + share * apart
-        del walked
-    before = apart.sum()
+        diffused = _symmetric(neighbours, _diffused(neighbours, distances, half, diffusion)).data
+        average = 1 - (graph.nnz - diffused.sum()) / n_pairs  # pairs outside the graph have distance 1
+        values = (1 - share) * diffused / max(average, _TINY) + share * values
+        del diffused
+    total = values.sum()
     if diffusion and keep_nearest:
-        apart = _brought_forward(apart, graph, lists[:, 0])
-    average = 1 + (apart.sum() - before) / n_pairs
-    weights = _neighbourhoods(apart, graph, n_neighbours, half, n_expanded)
-    anew = (1 - share) * jaccard(weights, graph, progress) + share * apart / average
+        values = _with_nearest_first(values, graph, neighbours[:, 0])
+    average = 1 + (values.sum() - total) / n_pairs  # over all pairs, where the mean was 1 before
+    weights = _neighbourhoods(values, graph, n_neighbours, half, n_expanded)
+    values = (1 - share) * jaccard(weights, graph, progress) + share * values / average
     if keep_nearest:
-        anew = _brought_forward(anew, graph, lists[:, 0])
-    ranked = _like(graph, anew)[np.repeat(np.arange(n), m), lists.ravel()].reshape(n, m)
-    best = np.argsort(ranked, axis=1, kind="stable")
-    return SearchResult(*(torch.from_numpy(np.take_along_axis(one, best, axis=1)) for one in (lists, ranked)))
+        values = _with_nearest_first(values, graph, neighbours[:, 0])
+    reranked = _with_values(graph, values)[np.repeat(np.arange(n), m), neighbours.ravel()].reshape(n, m)
+    order = np.argsort(reranked, axis=1, kind="stable")
+    return SearchResult(*(torch.from_numpy(np.take_along_axis(x, order, axis=1)) for x in (neighbours, reranked)))
 
 
-def _diffused(lists: Integers, given: Floats, half: int, diffusion: float) -> Floats:
-    """Distances (N, M) of each shape to its list: one minus the scaled sums over the walks between them."""
-    n, m = lists.shape
-    scale = np.maximum(given[:, :half].mean(axis=1), _TINY)
-    ends = lists[:, :half]
-    tied = _symmetric(ends, np.exp(-np.square(given[:, :half]) / np.maximum(scale[:, None] * scale[ends], _TINY)))
-    degree = sparse.diags_array(1 / np.sqrt(np.maximum(tied.sum(axis=1), _TINY)))
-    steps = sparse.csr_array(diffusion * (degree @ tied @ degree))
-    inside = np.column_stack([np.arange(n), lists])
-    if m == n - 1 < MOST_WHOLE:
-        alike = np.take_along_axis(np.linalg.inv(np.eye(n) - steps.toarray()), inside, axis=1)
+def _diffused(neighbours: Integers, distances: Floats, half: int, diffusion: float) -> Floats:
+    """Distances (N, M) of each shape to its neighbours: 1 minus the normalised sums over the walks between them."""
+    n, m = neighbours.shape
+    scale = np.maximum(distances[:, :half].mean(axis=1), _TINY)
+    nearest = neighbours[:, :half]
+    exponents = np.square(distances[:, :half]) / np.maximum(scale[:, None] * scale[nearest], _TINY)
+    affinity = _symmetric(nearest, np.exp(-exponents))
+    degree = sparse.diags_array(1 / np.sqrt(np.maximum(affinity.sum(axis=1), _TINY)))
+    steps = sparse.csr_array(diffusion * (degree @ affinity @ degree))
+    members = np.column_stack([np.arange(n), neighbours])
+    if m == n - 1 < MAX_DENSE:
+        sums = np.take_along_axis(np.linalg.inv(np.eye(n) - steps.toarray()), members, axis=1)
     else:
-        alike = np.zeros((n, m + 1))
-        walks(inside, steps.indptr, steps.indices, steps.data, _ROUNDS, alike)
-    length = 1 / np.sqrt(alike[:, 0])
-    return (1 - length[:, None] * alike[:, 1:] * length[lists]).clip(0)
+        sums = np.zeros((n, m + 1))
+        walks(members, steps.indptr, steps.indices, steps.data, _MAX_ITERATIONS, sums)
+    factor = 1 / np.sqrt(sums[:, 0])
+    return (1 - factor[:, None] * sums[:, 1:] * factor[neighbours]).clip(0)
 
 
 def _neighbourhoods(
-    apart: Floats, graph: sparse.csr_array, n_neighbours: int, half: int, n_expanded: int
+    distances: Floats, graph: sparse.csr_array, n_neighbours: int, half: int, n_expanded: int
 ) -> sparse.csr_array:
-    """(N, N) weights of the members of each shape's neighbourhood, averaged over its nearest; rows add up to 1."""
+    """(N, N) weights of the members of each shape's neighbourhood, averaged over its nearest shapes; rows sum to 1."""
     n = graph.shape[0]
-    n_first = max(n_neighbours, n_expanded - 1)
-    rows = map(slice, graph.indptr, graph.indptr[1:])
-    firsts = [graph.indices[row][apart[row].argsort(kind="stable")[:n_first]] for row in rows]
-    order = np.column_stack([np.arange(n), firsts])
-    members, halves = (_reciprocal(order[:, : k + 1]) for k in (n_neighbours, half))
-    joins = sparse.csr_array(members @ halves.T).multiply(members).tocsr()
-    joins.data = (2 / 3 * halves.sum(axis=1)[joins.indices] <= joins.data).astype(np.float64)
-    of, to = (members + joins @ halves).nonzero()
-    nearest = order[:, 1 : n_neighbours + 1]
-    near = _like(graph, apart)[np.repeat(np.arange(n), n_neighbours), nearest.ravel()].reshape(n, -1).mean(axis=1)
-    scale = np.repeat(-np.maximum(near, _TINY), np.diff(graph.indptr))
-    alike = np.exp(np.divide(apart, scale, out=scale), out=scale)
-    weight = np.where(of == to, 1.0, _like(graph, alike)[of, to])
-    weights = sparse.csr_array((weight, (of, to)), shape=(n, n))
+    n_nearest = max(n_neighbours, n_expanded - 1)
+    slices = map(slice, graph.indptr, graph.indptr[1:])
+    nearest = [graph.indices[row][distances[row].argsort(kind="stable")[:n_nearest]] for row in slices]
+    order = np.column_stack([np.arange(n), nearest])  # each shape, then its nearest ones
+    members, half_members = (_reciprocal(order[:, : k + 1]) for k in (n_neighbours, half))
+    joins = sparse.csr_array(members @ half_members.T).multiply(members).tocsr()
+    joins.data = (2 / 3 * half_members.sum(axis=1)[joins.indices] <= joins.data).astype(np.float64)
+    rows, columns = (members + joins @ half_members).nonzero()
+    pairs = np.repeat(np.arange(n), n_neighbours), order[:, 1 : n_neighbours + 1].ravel()
+    mean = _with_values(graph, distances)[pairs].reshape(n, -1).mean(axis=1)
+    scale = np.repeat(-np.maximum(mean, _TINY), np.diff(graph.indptr))
+    similarity = np.exp(np.divide(distances, scale, out=scale), out=scale)
+    entries = np.where(rows == columns, 1.0, _with_values(graph, similarity)[rows, columns])
+    weights = sparse.csr_array((entries, (rows, columns)), shape=(n, n))
     weights = _binary(order[:, :n_expanded]) @ sparse.diags_array(1 / (n_expanded * weights.sum(axis=1))) @ weights
     weights = sparse.csr_array(weights)
     weights.sort_indices()
@@ -119,94 +121,94 @@ def _neighbourhoods(
 
 
 def jaccard(weights: sparse.csr_array, graph: sparse.csr_array, progress: bool) -> Floats:
-    """Distances of the pairs of a graph, 0 to 1, by the share of weights that their neighbourhoods have in common."""
-    n, rows, smaller = graph.shape[0], _rows(graph), np.empty(graph.nnz)
+    """Jaccard distances, 0 to 1, of the weights of neighbourhoods (rows of sum 1) for the pairs of a graph."""
+    n, rows, common = graph.shape[0], _rows(graph), np.empty(graph.nnz)
     ones = np.ones(n)
     with tqdm(total=n, desc="re-ranked", disable=not progress) as bar:
-        for first in range(0, n, _AT_ONCE):
-            last = min(first + _AT_ONCE, n)
+        for first in range(0, n, _BLOCK_ROWS):
+            last = min(first + _BLOCK_ROWS, n)
             pairs = slice(graph.indptr[first], graph.indptr[last])
-            smaller[pairs] = weights[rows[pairs]].minimum(weights[graph.indices[pairs]]) @ ones
+            common[pairs] = weights[rows[pairs]].minimum(weights[graph.indices[pairs]]) @ ones
             bar.update(last - first)
-    return (1 - smaller / (2 - smaller)).clip(0)
+    return (1 - common / (2 - common)).clip(0)
 
 
-def _symmetric(lists: Integers, values: Floats) -> sparse.csr_array:
-    """(N, N) of values (N, M) of pairs (i, lists[i]) and of those the other way round; the mean of both where given."""
-    n, m = lists.shape
-    number = np.int32 if 2 * n * m < 2**31 else np.int64
-    places = lists.ravel().astype(number), np.arange(0, n * m + 1, m, dtype=number)
-    given = sparse.csr_array((values.flatten(), *places), shape=(n, n))
-    given.sort_indices()
-    ones = sparse.csr_array((np.ones(n * m, dtype=np.int8), given.indices, given.indptr), shape=(n, n))
-    times = ones + ones.T.tocsr()  # how often each pair is given: once or twice, in a byte
-    rows = _rows(times)
-    means = given[rows, times.indices]  # 0 where not given
-    means += given[times.indices, rows]
-    means /= times.data
-    return _like(times, means)
+def _symmetric(neighbours: Integers, values: Floats) -> sparse.csr_array:
+    """Symmetric (N, N) matrix of values (N, M) of pairs (i, neighbours[i]); pairs that occur twice have the mean."""
+    n, m = neighbours.shape
+    dtype = np.int32 if 2 * n * m < 2**31 else np.int64
+    structure = neighbours.ravel().astype(dtype), np.arange(0, n * m + 1, m, dtype=dtype)
+    matrix = sparse.csr_array((values.flatten(), *structure), shape=(n, n))
+    matrix.sort_indices()
+    ones = sparse.csr_array((np.ones(n * m, dtype=np.int8), matrix.indices, matrix.indptr), shape=(n, n))
+    counts = ones + ones.T.tocsr()  # each pair occurs once or twice; a byte per pair saves memory
+    rows = _rows(counts)
+    means = matrix[rows, counts.indices]  # 0 where the pair does not occur
+    means += matrix[counts.indices, rows]
+    means /= counts.data
+    return _with_values(counts, means)
 
 
-def _binary(lists: Integers) -> sparse.csr_array:
-    n, m = lists.shape
-    return sparse.csr_array((np.ones(n * m), (np.repeat(np.arange(n), m), lists.ravel())), shape=(n, n))
+def _binary(neighbours: Integers) -> sparse.csr_array:
+    n, m = neighbours.shape
+    return sparse.csr_array((np.ones(n * m), (np.repeat(np.arange(n), m), neighbours.ravel())), shape=(n, n))
 
 
-def _reciprocal(lists: Integers) -> sparse.csr_array:
-    """Ones for the pairs that lie in each other's lists."""
-    ones = _binary(lists)
+def _reciprocal(neighbours: Integers) -> sparse.csr_array:
+    """Binary matrix of the pairs of shapes that are neighbours of each other."""
+    ones = _binary(neighbours)
     return ones.multiply(ones.T).tocsr()
 
 
-def _like(graph: sparse.csr_array, values: Floats) -> sparse.csr_array:
-    """Other values of the pairs of a graph."""
+def _with_values(graph: sparse.csr_array, values: Floats) -> sparse.csr_array:
+    """A matrix with the structure of a graph and other values."""
     return sparse.csr_array((values, graph.indices, graph.indptr), shape=graph.shape)
 
 
 def _rows(graph: sparse.csr_array) -> Integers:
-    """The first shape of each pair."""
+    """The row of each entry."""
     return np.repeat(np.arange(graph.shape[0], dtype=graph.indices.dtype), np.diff(graph.indptr))
 
 
-def _brought_forward(values: Floats, graph: sparse.csr_array, nearest: Integers) -> Floats:
-    """The values of pairs; those of pairs of nearest neighbours made smaller than all others, in their own order."""
+def _with_nearest_first(values: Floats, graph: sparse.csr_array, nearest: Integers) -> Floats:
+    """Values of the pairs in which pairs of nearest neighbours come before all others, in the order of the graph."""
     nearest = nearest.astype(graph.indices.dtype)
     rows = _rows(graph)
-    first = (nearest[rows] == graph.indices) | (nearest[graph.indices] == rows)
-    least = values.min(where=~first & (values > 0), initial=np.inf)
-    found, forward = values.copy(), graph.data[first]
-    # half of the least, so that single precision leaves no tie
-    found[first] = 0.5 * (least if np.isfinite(least) else 1.0) * forward / max(forward.max(), _TINY)
-    return found
+    is_nearest = (nearest[rows] == graph.indices) | (nearest[graph.indices] == rows)
+    smallest = values.min(where=~is_nearest & (values > 0), initial=np.inf)
+    result, distances = values.copy(), graph.data[is_nearest]
+    # Half of the smallest value, so that rounding to single precision makes no ties
+    result[is_nearest] = 0.5 * (smallest if np.isfinite(smallest) else 1.0) * distances / max(distances.max(), _TINY)
+    return result
 
 
 @compiled()
-def walks(lists: Integers, starts: Integers, ends: Integers, steps: Floats, n_rounds: int, alike: Floats) -> None:
-    """Write, of each shape, the sums over all walks from it to those of its list (N, L), itself first, among these.
+def walks(lists: Integers, starts: Integers, columns: Integers, steps: Floats, n_rounds: int, sums: Floats) -> None:
+    """Add the sums over all walks from each shape to the members of its list that stay in the list to `sums` (N, L).
 
-    Rows of (I - S) x = e by conjugate gradients, S sparse: `starts`, `ends` and `steps` are those of its rows.
+    A list (N, L) starts with its own shape. For each list, (I - S) x = e is solved by conjugate gradients, where S, the
+    matrix of single steps, is restricted to the members; `starts`, `columns` and `steps` are its CSR form.
     """
-    place = np.full(len(lists), -1)
+    position = np.full(len(lists), -1)
     for i in range(len(lists)):
-        here = lists[i]
-        for a in range(len(here)):
-            place[here[a]] = a
-        residual = np.zeros(len(here))
+        members = lists[i]
+        for a in range(len(members)):
+            position[members[a]] = a
+        residual = np.zeros(len(members))
         residual[0] = 1.0
-        direction, size = residual.copy(), 1.0
+        direction, squared_norm = residual.copy(), 1.0
         for _ in range(n_rounds):
-            moved = direction.copy()
-            for a in range(len(here)):
-                for e in range(starts[here[a]], starts[here[a] + 1]):
-                    if place[ends[e]] >= 0:
-                        moved[a] -= steps[e] * direction[place[ends[e]]]
-            along = size / (direction * moved).sum()
-            alike[i] += along * direction
-            residual -= along * moved
-            left = (residual * residual).sum()
-            if left < 1e-10:
+            product = direction.copy()
+            for a in range(len(members)):
+                for e in range(starts[members[a]], starts[members[a] + 1]):
+                    if position[columns[e]] >= 0:
+                        product[a] -= steps[e] * direction[position[columns[e]]]
+            length = squared_norm / (direction * product).sum()
+            sums[i] += length * direction
+            residual -= length * product
+            previous, squared_norm = squared_norm, (residual * residual).sum()
+            if squared_norm < 1e-10:
                 break
-            direction = residual + left / size * direction
-            size = left
-        for a in range(len(here)):
-            place[here[a]] = -1
+            direction = residual + squared_norm / previous * direction
+        for a in range(len(members)):
+            position[members[a]] = -1

@@ -1,4 +1,4 @@
-"""Retrieval scores accumulated over batches, as a metric of torchmetrics."""
+"""Retrieval scores as a metric of torchmetrics, accumulated over batches."""
 
 import hashlib
 from collections.abc import Sequence
@@ -15,12 +15,12 @@ from igps.retrieval.scores import retrieval_scores
 
 
 class RetrievalScoresMetric(Metric):
-    """Leave-one-out retrieval scores of all descriptors seen, accumulated over batches (see retrieval_scores).
+    """Leave-one-out retrieval scores of all descriptors, accumulated over batches, see `retrieval_scores`.
 
-    `update` takes descriptors (N, ...) and integer labels (N,); `compute` returns the means as a dict of scalar
-    tensors, fractions. Call `update` and `compute`, not the metric itself: single batches seldom hold two of a class.
-    A repeated shape would be a perfect match, and a distributed sampler repeats some to fill its batches: give `ids`,
-    and each shape counts once, whatever the number of processes.
+    `update` takes descriptors (N, ...) and integer labels (N,). `compute` returns the mean scores by name, as scalar
+    tensors in [0, 1]. Call these methods rather than the metric itself, because a single batch seldom has two shapes
+    of a class. Distributed samplers repeat some shapes to fill their batches, and a repeated shape would be a perfect
+    match for itself. With `ids`, each shape counts once, whatever the number of processes.
     """
 
     is_differentiable = False
@@ -39,7 +39,7 @@ class RetrievalScoresMetric(Metric):
         self.add_state("ids", default=[], dist_reduce_fx="cat")
 
     def update(self, descriptors: Tensor, labels: Tensor, ids: Sequence[str] | None = None) -> None:
-        """Add descriptors (N, ...), integer labels (N,), names that tell shapes apart; a ValueError if not aligned."""
+        """Add descriptors (N, ...), integer labels (N,) and unique names of shapes; a ValueError if lengths differ."""
         if labels.ndim != 1 or labels.is_floating_point() or descriptors.ndim < 2 or len(labels) != len(descriptors):
             raise ValueError(
                 f"labels: expected one integer for each of the descriptors (N, ...), got {tuple(labels.shape)} of "
@@ -48,23 +48,23 @@ class RetrievalScoresMetric(Metric):
         if ids is not None and len(ids) != len(labels):
             raise ValueError(f"ids: expected one name for each of {len(labels)} descriptors, got {len(ids)}")
         if self.labels and (ids is None) == bool(self.ids):
-            raise ValueError("ids: expected with every update or with none, got them with some")
+            raise ValueError("ids: expected in every update or in none, got them in some")
         self.descriptors.append(descriptors.detach())
         self.labels.append(labels)
         if ids is not None:
-            self.ids.append(torch.tensor([_number(name) for name in ids], dtype=torch.int64, device=labels.device))
+            self.ids.append(torch.tensor([_hash64(name) for name in ids], dtype=torch.int64, device=labels.device))
 
     def compute(self) -> dict[str, Tensor]:
-        """Mean scores by name; ValueError if no two descriptors share a label."""
+        """Return the mean scores by name; a ValueError if no two descriptors share a label."""
         descriptors, labels = dim_zero_cat(self.descriptors), dim_zero_cat(self.labels)
         if len(self.ids):
             _, first = np.unique(dim_zero_cat(self.ids).cpu().numpy(), return_index=True)
-            kept = torch.from_numpy(np.sort(first)).to(labels.device)
-            descriptors, labels = descriptors[kept], labels[kept]
+            unique = torch.from_numpy(np.sort(first)).to(labels.device)
+            descriptors, labels = descriptors[unique], labels[unique]
         scores = retrieval_scores(self.distance(descriptors, descriptors), labels)
         return {name: torch.tensor(value, device=descriptors.device) for name, value in scores.mean().items()}
 
 
-def _number(name: str) -> int:
-    """64 bits of a name, the same in every process: names cannot be gathered, numbers can."""
+def _hash64(name: str) -> int:
+    """A 64-bit hash of a name, the same in every process, because processes can gather numbers but no strings."""
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little", signed=True)

@@ -1,4 +1,4 @@
-"""Rank a gallery against queries."""
+"""Ranking of a gallery for each query."""
 
 from dataclasses import dataclass
 
@@ -10,16 +10,16 @@ from igps.retrieval.distances import Distance, check_tensor, chi_square
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The closest gallery entries of every query, closest first."""
+    """The gallery entries closest to each query, closest first."""
 
     indices: Tensor  # (Q, top) int64, positions in the gallery
     distances: Tensor  # (Q, top), ascending along each row
 
 
 def rank(distances: Tensor) -> Tensor:
-    """(Q, G) int64 gallery indices, closest first, ties in gallery order.
+    """Return gallery indices (Q, G) as int64, closest first, ties in gallery order.
 
-    A ValueError unless the distances are a real (Q, G) matrix without NaN and negative entries; infinity may be.
+    A ValueError is raised unless the distances are a real matrix (Q, G) with entries ≥ 0. Infinity is allowed.
     """
     check_tensor("distances", distances)
     if distances.ndim != 2 or distances.is_complex() or distances.dtype == torch.bool:
@@ -27,13 +27,13 @@ def rank(distances: Tensor) -> Tensor:
             f"distances: expected a real matrix (Q, G), got shape {tuple(distances.shape)} of {distances.dtype}; "
             "compute it with a function of igps.retrieval.distances"
         )
-    smallest = distances.detach().amin().item() if distances.numel() else 0.0  # NaN if any entry is
+    smallest = distances.detach().amin().item() if distances.numel() else 0.0  # NaN if any entry is NaN
     if smallest != smallest:
-        raise ValueError("distances: expected numbers, got NaN, which has no rank; look for the descriptor that has it")
+        raise ValueError("distances: expected numbers, got NaN, which has no rank; look for the descriptor with NaN")
     if smallest < 0:
         raise ValueError(
             f"distances: expected entries ≥ 0 (smaller is closer), the smallest is {smallest:g}; give distances in "
-            "place of similarities, and clear rounding below zero by .clamp_min(0)"
+            "place of similarities, and remove rounding errors below zero with .clamp_min(0)"
         )
     return torch.sort(distances, dim=1, stable=True).indices
 
@@ -41,9 +41,9 @@ def rank(distances: Tensor) -> Tensor:
 def search(
     query_descriptors: Tensor, gallery_descriptors: Tensor, *, top: int, distance: Distance = chi_square
 ) -> SearchResult:
-    """The `top` closest gallery descriptors of every query, ties in gallery order.
+    """Return the `top` gallery entries closest to each query, ties in gallery order.
 
-    A query that is itself in the gallery is found there like any other entry, at distance zero.
+    A query that is itself in the gallery is found like any other entry, at distance 0.
 
     Example:
         >>> import torch
@@ -53,13 +53,13 @@ def search(
         ([[1, 2]], [[1.0, 2.0]])
 
     Args:
-        query_descriptors: (Q, ...) as the distance takes them.
+        query_descriptors: (Q, ...).
         gallery_descriptors: (G, ...).
-        top: how many to return for each query, 1 to G.
+        top: number of entries for each query, 1 to G.
         distance: the distance function.
 
     Raises:
-        ValueError: if top is outside 1..G, or the distance refuses the descriptors.
+        ValueError: `top` is out of range, or the distance function rejects the descriptors.
     """
     n_gallery = len(gallery_descriptors)
     if not 1 <= top <= n_gallery:

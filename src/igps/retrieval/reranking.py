@@ -1,4 +1,4 @@
-"""Re-ranking: distances of a collection are changed by which neighbours shapes have in common, without labels."""
+"""Re-ranking: new distances of a collection from the neighbours that shapes have in common, without labels."""
 
 from collections.abc import Callable
 
@@ -7,15 +7,15 @@ from torch import Tensor
 
 from igps._parameters import check_at_least
 from igps.retrieval.distances import Distance, check_tensor
-from igps.retrieval.graph_reranking import MOST_WHOLE, rerank_graph
+from igps.retrieval.graph_reranking import MAX_DENSE, rerank_graph
 from igps.retrieval.ranking import SearchResult, rank
 
 N_RERANKED = 200
-"""Nearest entries whose neighbourhoods among each other put those of a single query in order."""
+"""Number of nearest entries of a single query that are re-ranked, by their neighbourhoods among each other."""
 
-# Of more than `MOST_WHOLE` shapes each is tied to so many nearest: as many as make no more pairs than that, but within
-# these limits. All pairs would take time as the number of shapes cubed.
-_PAIRS, _LISTED = 3_000_000, (300, 1000)
+# In a collection of more than `MAX_DENSE` shapes, each has a list of nearest neighbours, whose length is within these
+# limits and makes about this many pairs at most. With all pairs, time would grow with the cube of the number of shapes.
+_MAX_PAIRS, _LIST_LIMITS = 3_000_000, (300, 1000)
 
 
 def rerank(
@@ -28,42 +28,44 @@ def rerank(
     keep_nearest: bool = True,
     progress: bool = False,
 ) -> Tensor:
-    """Diffusion, then k-reciprocal re-ranking: shapes are close that share neighbours.
+    """Re-rank a collection by diffusion, then by k-reciprocal neighbours: shapes with common neighbours become closer.
 
-    *Diffusion* (Zhou, Weston, Gretton, Bousquet and Schölkopf 2004): shapes are tied to their k/2 nearest, by weights
-    exp(−d² / σσ′), σ the mean distance to these (Zelnik-Manor and Perona 2004). With S = D^−½ W D^−½, two shapes are as
-    alike as the sum over all walks between them, (I − diffusion · S)⁻¹ scaled to ones on the diagonal.
+    *Diffusion* (Zhou, Weston, Gretton, Bousquet and Schölkopf 2004): each shape is linked to its k/2 nearest, with
+    weights exp(−d² / σσ′), where σ is the mean distance to them (Zelnik-Manor and Perona 2004). With S = D^−½ W D^−½,
+    the similarity of two shapes is the sum over all walks between them, (I − diffusion · S)⁻¹, scaled to ones on the
+    diagonal.
 
-    *k-reciprocal neighbours* (Zhong, Zheng, Cao and Li 2017), by the distances that diffusion gave: the neighbourhood
-    of a shape are those among its k nearest that have it among theirs, joined by the neighbourhoods, of k/2, of its
-    members where two thirds of those are in it already. Its members weigh exp(−d), d in units of the mean distance to
-    the k nearest; the weights are averaged over the nearest shapes, and two such neighbourhoods have their Jaccard
-    distance.
+    *k-reciprocal neighbours* (Zhong, Zheng, Cao and Li 2017), by the distances after diffusion: the neighbourhood of a
+    shape consists of those of its k nearest that have the shape among their k nearest. The neighbourhood of a member,
+    for k/2, is added if two thirds of it are in the neighbourhood already. Members have weights exp(−d), with d in
+    units of the mean distance to the k nearest. These weights are averaged over the nearest shapes. The new distance of
+    two shapes is the Jaccard distance of their weighted neighbourhoods.
 
-    The result of each step is mixed with the distances it started from. It depends on the whole collection: without
-    one of the shapes, the others may rank differently. Common neighbours tell the class of a shape rather than its
-    body, so the nearest shape of each stays its nearest. Of more than 2,000 shapes each is tied to its nearest 1,000,
-    of more than 10,000 to 300, by `rerank_graph`; others have no common neighbour with it.
+    The result of each step is mixed with the distances before it. It depends on the whole collection: without one of
+    the shapes, the others may rank differently. Common neighbours indicate the class of a shape rather than its body,
+    so each shape keeps its nearest one. In collections of more than 2,000 shapes, each shape has a list of its nearest
+    1,000 shapes, of more than 10,000 of its nearest 300, see `rerank_graph`. Two shapes of which neither is in the list
+    of the other count as having no common neighbours.
 
     Args:
         distances: (N, N) of a collection to itself, symmetric, ≥ 0.
         n_neighbours: k, at most N − 1.
-        n_expanded: nearest shapes, itself among them, that the weights are averaged over.
-        share: of the distance that a step was given, in units of its mean, in the sum.
-        diffusion: how slowly walks fade, from 0 to less than 1; with 0 there is no such step.
-        keep_nearest: pairs of which one is the other's nearest come before all others, in their own order, after each
-            step; the papers leave them where they fall.
-        progress: show a bar.
+        n_expanded: number of nearest shapes, the shape itself included, over which weights are averaged.
+        share: of the distances before a step, in units of their mean, in the mixture after it.
+        diffusion: factor for each step of a walk, at least 0 and less than 1; 0 leaves diffusion out.
+        keep_nearest: after each step, put all pairs in which one shape is the nearest of the other before all other
+            pairs, in their original order; the papers do not do so.
+        progress: show a progress bar.
 
     Returns:
         (N, N) distances ≥ 0, symmetric, 0 on the diagonal; without unit.
 
     Raises:
-        ValueError: distances that are no such matrix, or numbers out of range.
+        ValueError: the distances are not such a matrix, or an argument is out of range.
     """
     check_tensor("distances", distances)
     if distances.ndim != 2 or distances.shape[0] != distances.shape[1]:
-        raise ValueError(f"distances: expected those of a collection to itself, (N, N), got {tuple(distances.shape)}.")
+        raise ValueError(f"distances: expected (N, N), of a collection to itself, got {tuple(distances.shape)}.")
     if not bool((distances >= 0).all() and torch.isfinite(distances).all()):
         raise ValueError("distances: expected finite numbers ≥ 0.")
     check_at_least(1, n_neighbours=n_neighbours, n_expanded=n_expanded)
@@ -73,39 +75,45 @@ def rerank(
     if n < 2:
         return torch.zeros_like(distances)
     k, n_expanded = min(n_neighbours, n - 1), min(n_expanded, n)
-    fewest, most = _LISTED
-    n_listed = n - 1 if n <= MOST_WHOLE else min(max(fewest, min(most, _PAIRS // n), k, n_expanded), n - 1)
+    low, high = _LIST_LIMITS
+    n_listed = n - 1 if n <= MAX_DENSE else min(max(low, min(high, _MAX_PAIRS // n), k, n_expanded), n - 1)
     mean = float((distances.sum(dtype=torch.float64) - distances.trace()) / (n * (n - 1)))
     mean = max(mean, torch.finfo(torch.float64).tiny)
     others = distances.clone().fill_diagonal_(torch.inf)
-    order = others.argsort(dim=1, stable=True) if n <= MOST_WHOLE else others.topk(n_listed, largest=False).indices
+    order = others.argsort(dim=1, stable=True) if n <= MAX_DENSE else others.topk(n_listed, largest=False).indices
     order = order[:, :n_listed]
-    near = SearchResult(order.cpu(), distances.gather(1, order).cpu())
-    found = rerank_graph(near, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest, progress=progress)
-    whole = distances / mean  # of those without a common neighbour
+    nearest = SearchResult(order.cpu(), distances.gather(1, order).cpu())
+    lists = rerank_graph(nearest, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest, progress=progress)
+    result = distances / mean  # for pairs without common neighbours, which each step puts at distance 1
     for _ in range(2 if diffusion else 1):
-        whole = whole.mul_(share).add_(1 - share)
-    rows, columns = torch.arange(n, device=whole.device)[:, None].expand(-1, n_listed), found.indices.to(whole.device)
-    values = found.distances.to(whole)
-    whole[rows, columns] = values
-    whole[columns, rows] = values
-    return whole.fill_diagonal_(0)
+        result = result.mul_(share).add_(1 - share)
+    rows, columns = torch.arange(n, device=result.device)[:, None].expand(-1, n_listed), lists.indices.to(result.device)
+    values = lists.distances.to(result)
+    result[rows, columns] = values
+    result[columns, rows] = values
+    return result.fill_diagonal_(0)
 
 
 def rerank_found(
     queries: Tensor, found: SearchResult, descriptions: Callable[[Tensor], Tensor], distance: Distance, *, top: int
 ) -> SearchResult:
-    """The entries that each query found, put in order by `rerank` of the query and them: not of the whole collection.
+    """Re-rank the search results of each query by `rerank` of the query and these results alone.
 
-    Of the nearest M entries of each query (Q, ...), more than `top` are of use: `N_RERANKED`; `descriptions` gives
-    those (M, ...) of entries (M,). The re-ranked distances have no unit.
+    The new distances have no unit.
+
+    Args:
+        queries: (Q, ...) descriptions.
+        found: (Q, M) the nearest entries of each query. M should be larger than `top`, such as `N_RERANKED`.
+        descriptions: a function from entries (M,) to their descriptions (M, ...).
+        distance: of descriptions.
+        top: number of entries to return for each query.
     """
     results = []
     for query, entries in zip(queries, found.indices, strict=True):
-        together = torch.cat([query[None], descriptions(entries).to(query)])
-        own = distance(together, together)
-        own = torch.minimum(own, own.T).fill_diagonal_(0)  # the two differ by rounding
-        anew = rerank(own)[:1, 1:]
-        best = rank(anew)[:, :top]
-        results.append((entries[best[0].to(entries.device)], anew.gather(1, best)[0]))
-    return SearchResult(*(torch.stack(each) for each in zip(*results, strict=True)))
+        members = torch.cat([query[None], descriptions(entries).to(query)])
+        distances = distance(members, members)
+        distances = torch.minimum(distances, distances.T).fill_diagonal_(0)  # the two triangles differ by rounding
+        reranked = rerank(distances)[:1, 1:]
+        best = rank(reranked)[:, :top]
+        results.append((entries[best[0].to(entries.device)], reranked.gather(1, best)[0]))
+    return SearchResult(*(torch.stack(rows) for rows in zip(*results, strict=True)))

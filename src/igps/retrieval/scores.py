@@ -1,8 +1,8 @@
 """Retrieval scores of the Princeton Shape Benchmark and of SHREC, from distances and labels.
 
-Every score is computed for each query from the ranked gallery, ties in gallery order, and lies in [0, 1]. rel(k) is 1
-where the entry at rank k has the label of the query, R is the number of relevant entries in the gallery. A query with
-R = 0 has no defined score: it is NaN for that query and left out of every mean.
+Every score is computed for each query from the ranked gallery, ties in gallery order, and lies in [0, 1]. An entry is
+relevant if it has the label of the query. rel(k) is 1 if the entry at rank k is relevant, and R is the number of
+relevant entries in the gallery. Scores of a query with R = 0 are undefined: they are NaN, and left out of all means.
 """
 
 import numbers
@@ -22,16 +22,16 @@ Labels = Tensor | Sequence[Any]
 SCORE_NAMES = ("nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map")
 
 E_MEASURE_RANKS = 32
-"""Ranks the E-measure looks at (Shilane et al. 2004)."""
+"""Number of ranks in the E-measure (Shilane et al. 2004)."""
 
 
 @dataclass(frozen=True, eq=False)
 class RetrievalScores:
-    """Scores of every query, as fractions: (Q,) float64 on the CPU, NaN for a query without a relevant entry.
+    """Scores of every query in [0, 1]: (Q,) float64 on the CPU, NaN for a query without a relevant entry.
 
-    The E-measure looks at the first 32 entries, or the whole, shorter gallery: a perfect ranking reaches 1 only where
-    R = 32. `adr_self` is that of a ranking that keeps the query itself, as a hit, at rank 1, with R + 1 in place of R:
-    the form of SHREC'07. It is None where query and gallery sets are separate.
+    The E-measure uses the first 32 entries, or the whole gallery if it is shorter, so that a perfect ranking reaches 1
+    only if R = 32. `adr_self` is the average dynamic recall of SHREC'07, in which the query itself is a hit at rank 1,
+    and R + 1 replaces R. It is None if query and gallery sets are separate.
     """
 
     nn: Tensor  # nearest neighbour, rel(1)
@@ -47,20 +47,20 @@ class RetrievalScores:
 
     @property
     def n_queries(self) -> int:
-        """Number of queries that are scored, over which the means go."""
+        """Number of scored queries, over which the means are taken."""
         return int(self.scored.sum())
 
     @property
     def n_excluded(self) -> int:
-        """Number of queries without a relevant entry, left out of the means."""
+        """Number of queries without a relevant entry, which are left out of the means."""
         return len(self.labels) - self.n_queries
 
     def mean(self) -> dict[str, float]:
-        """Mean of every score over the scored queries, as fractions; without adr_self where that is None."""
+        """Return the mean of every score over the scored queries, without `adr_self` if it is None."""
         return self._mean_over(self.scored)
 
     def per_class(self) -> dict[Hashable, dict[str, float]]:
-        """The means over the scored queries of each class, classes in order of appearance; only classes with one."""
+        """Return the means over the scored queries of each class that has any, classes in order of appearance."""
         queries: dict[Hashable, list[int]] = {}
         for query, (label, scored) in enumerate(zip(self.labels, self.scored.tolist(), strict=True)):
             if scored:
@@ -74,21 +74,21 @@ class RetrievalScores:
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecallCurve:
-    """Interpolated precision at levels of recall, mean over the scored queries."""
+    """Interpolated precision at levels of recall, averaged over the scored queries."""
 
     recall: Tensor  # (20,) float64: 0.05, 0.10, …, 1
-    precision: Tensor  # (20,) float64, never ascending
-    n_queries: int  # in the mean
+    precision: Tensor  # (20,) float64, non-increasing
+    n_queries: int  # number of queries in the mean
 
 
 def retrieval_scores(
     distances: Tensor | NDArray[Any], query_labels: Labels, gallery_labels: Labels | None = None
 ) -> RetrievalScores:
-    """NN, FT, ST, E-measure, DCG, ADR and mAP of every query (see RetrievalScores).
+    """Compute NN, FT, ST, E-measure, DCG, ADR and mAP of every query, see `RetrievalScores`.
 
-    Without gallery labels the queries are the gallery: every shape queries all others (leave-one-out), itself removed
-    from the ranking by its index whatever its distance, so that R = class size − 1. Give gallery labels only for a
-    gallery that does not hold the queries: a query found at distance zero would count as a hit.
+    Without gallery labels, the queries are the gallery: every shape is a query against all others (leave-one-out), and
+    is removed from its own ranking by its index, so that R is the class size minus 1. Give gallery labels only for a
+    gallery that does not contain the queries, because a query that finds itself would count as a hit.
 
     Sources: Shilane, Min, Kazhdan, Funkhouser 2004 (Princeton Shape Benchmark); Typke, Veltkamp, Wiering 2006 (ADR).
 
@@ -107,8 +107,8 @@ def retrieval_scores(
         gallery_labels: G class labels of a separate gallery; None for leave-one-out.
 
     Raises:
-        ValueError: if the distances are not a (Q, G) matrix (square for leave-one-out) without NaN and negative
-            entries, the labels are not aligned with it, or no query has a relevant entry.
+        ValueError: the distances are not a matrix (Q, G) of entries ≥ 0 (square for leave-one-out), the labels do not
+            match its sizes, or no query has a relevant entry.
     """
     relevant, labels = _ranked_relevance(distances, query_labels, gallery_labels)
     length = relevant.shape[1]
@@ -149,10 +149,10 @@ def retrieval_scores(
 def precision_recall_curve(
     distances: Tensor | NDArray[Any], query_labels: Labels, gallery_labels: Labels | None = None
 ) -> PrecisionRecallCurve:
-    """Interpolated precision at 20 recall levels, 0.05, 0.10, …, 1, mean over the queries with a relevant entry.
+    """Compute the interpolated precision at 20 recall levels, averaged over the queries with a relevant entry.
 
-    The precision at level r is the highest of all precisions at a recall of r or more (Princeton Shape Benchmark,
-    Shilane et al. 2004). Distances and labels, and errors, as for retrieval_scores.
+    The levels are 0.05, 0.10, …, 1. The precision at level r is the highest precision at a recall of r or more
+    (Princeton Shape Benchmark, Shilane et al. 2004). For arguments and errors see `retrieval_scores`.
     """
     recall = torch.arange(1, 21, dtype=torch.float64, device="cpu") / 20
     relevant, _ = _ranked_relevance(distances, query_labels, gallery_labels)
@@ -160,7 +160,7 @@ def precision_recall_curve(
     n_relevant = hits[:, -1:]
     precision = hits / torch.arange(1, hits.shape[1] + 1, dtype=torch.float64, device="cpu")
     interpolated = precision.flip(1).cummax(1).values.flip(1)
-    # A level of 0.55 of a hundred is 55 hits, although the product is rounded up.
+    # The tolerance undoes rounding: a recall of 0.55 with 100 relevant entries needs 55 hits, not 56.
     hits_needed = (recall * n_relevant - 1e-6).ceil()
     first_rank = torch.searchsorted(hits, hits_needed)
     return PrecisionRecallCurve(recall, interpolated.gather(1, first_rank).mean(0), n_queries=len(hits))
@@ -169,7 +169,7 @@ def precision_recall_curve(
 def _ranked_relevance(
     distances: Tensor | NDArray[Any], query_labels: Labels, gallery_labels: Labels | None
 ) -> tuple[Tensor, tuple[Hashable, ...]]:
-    """rel(k) of every query as float64 (Q, G), or (Q, Q−1) without the query itself, on the CPU; the query labels."""
+    """rel(k) of every query, float64 on the CPU: (Q, G), or (Q, Q−1) without the query itself; and the query labels."""
     order = rank(distances if isinstance(distances, Tensor) else torch.as_tensor(distances, device="cpu")).cpu()
     n_queries, n_gallery = order.shape
     queries = _label_tuple("query_labels", query_labels, n_queries)
@@ -208,9 +208,9 @@ def _label_tuple(name: str, labels: Labels, n_expected: int) -> tuple[Hashable, 
             f"{name}: expected an integer tensor (N,) or a sequence of integers or strings, got {labels!r}"
         )
     if -1 in labels:
-        raise ValueError(f"{name}: expected the class of each, got −1, which is unknown. Leave those out.")
+        raise ValueError(f"{name}: expected known classes, got −1, which means unknown. Leave such shapes out.")
     if len(labels) != n_expected:
         raise ValueError(
-            f"{name}: expected {n_expected} labels, one for each of the distances' entries, got {len(labels)}"
+            f"{name}: expected {n_expected} labels, one for each row or column of the distances, got {len(labels)}"
         )
     return tuple(labels)

@@ -1,4 +1,4 @@
-"""Short vectors of descriptions, for engines that find nearest neighbours by Euclidean distances alone."""
+"""Short vectors of descriptions, for search engines that support Euclidean distances alone."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, Self
@@ -8,59 +8,60 @@ import numpy as np
 from igps._arrays import Singles
 
 SearchDistance = Literal["cosine", "chi_square"]
-"""A distance of descriptions that Euclidean distances of short vectors follow."""
+"""Distances of descriptions that Euclidean distances of short vectors approximate."""
 
 MOST_NUMBERS = 256
 """The largest width of a short vector."""
 
-# The squared Euclidean distance of the features is then a fifth to a third below 2 χ², in nearly the same order.
+# With two steps, the squared Euclidean distance of the features is a fifth to a third below 2 χ², in nearly the same
+# order.
 _SAMPLE_STEPS = 2
-_ROWS_AT_ONCE = 512
+_BLOCK_ROWS = 512
 
 
 @dataclass(frozen=True, eq=False)
 class VectorMap:
-    """Descriptions (N, F) to vectors (N, D ≤ 256) whose Euclidean distances order them nearly as their own do.
+    """A map of descriptions (N, F) to vectors (N, D ≤ 256) whose Euclidean distances give nearly the same ranking.
 
-    Unit vectors, compared by the cosine, are such vectors if they are short, and else are reduced to their principal
-    components. Histograms, compared by χ², become their features first, whose squared Euclidean distance is nearly in
-    proportion to χ² (Vedaldi and Zisserman 2012).
+    Unit vectors, compared by the cosine, are kept if they are short, and else reduced to their principal components.
+    Histograms, compared by χ², are first mapped to features whose squared Euclidean distance is nearly proportional to
+    χ² (Vedaldi and Zisserman 2012), and then reduced.
     """
 
     searched_by: SearchDistance  # the distance of the descriptions
-    mean: Singles | None = None  # (F,) of the descriptions, or of their features; None where they are taken as they are
-    components: Singles | None = None  # (D, F) orthonormal directions
+    mean: Singles | None = None  # (F,) of the descriptions or their features; None if descriptions stay as they are
+    components: Singles | None = None  # (D, F) principal directions, orthonormal
 
     @classmethod
     def fit(cls, descriptions: Singles, searched_by: SearchDistance, seed: int = 0) -> Self:
-        """The map of descriptions (N, F) such as these; a few thousand are enough."""
+        """Fit a map to example descriptions (N, F); a few thousand are enough."""
         if searched_by == "cosine" and descriptions.shape[1] <= MOST_NUMBERS:
             return cls(searched_by)
         from sklearn.decomposition import PCA
 
         features = _features(descriptions, searched_by)
-        n_kept = min(MOST_NUMBERS, *features.shape)
-        found = PCA(n_kept, svd_solver="randomized" if n_kept < min(features.shape) else "full", random_state=seed)
-        found.fit(features)
-        return cls(searched_by, found.mean_.astype(np.float32), found.components_.astype(np.float32))
+        n_components = min(MOST_NUMBERS, *features.shape)
+        solver = "randomized" if n_components < min(features.shape) else "full"
+        pca = PCA(n_components, svd_solver=solver, random_state=seed).fit(features)
+        return cls(searched_by, pca.mean_.astype(np.float32), pca.components_.astype(np.float32))
 
     def __call__(self, descriptions: Singles) -> Singles:
         """(N, F) descriptions to (N, D) vectors."""
         if self.components is None or self.mean is None:
             return np.ascontiguousarray(descriptions, dtype=np.float32)
-        parts = [
-            (_features(descriptions[i : i + _ROWS_AT_ONCE], self.searched_by) - self.mean) @ self.components.T
-            for i in range(0, len(descriptions), _ROWS_AT_ONCE)
+        blocks = [
+            (_features(descriptions[i : i + _BLOCK_ROWS], self.searched_by) - self.mean) @ self.components.T
+            for i in range(0, len(descriptions), _BLOCK_ROWS)
         ]
-        return np.concatenate([*parts, np.zeros((0, len(self.components)), dtype=np.float32)])
+        return np.concatenate([*blocks, np.zeros((0, len(self.components)), dtype=np.float32)])
 
     def arrays(self) -> dict[str, Any]:
-        """Its arrays by name, for `numpy.savez`."""
+        """Return the fields that are not None by name, for `numpy.savez`."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
     def of_arrays(cls, arrays: Any) -> Self:
-        """The map of such arrays."""
+        """Restore a map from its `arrays`."""
         names = [name for name in ("mean", "components") if name in arrays]
         return cls(str(arrays["searched_by"]), **{name: arrays[name] for name in names})  # type: ignore[arg-type]
 

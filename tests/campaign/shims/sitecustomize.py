@@ -1,8 +1,8 @@
-"""Faults of a machine, put into every Python process that has this folder on its path and names one of them.
+"""Simulated faults of the machine, in every Python process that has this folder on its path.
 
-FAULT is one of
-    full N     the disk is full: the files of the cache hold no more than N bytes in all;
-    rename     a file cannot be renamed over another one, as where somebody else holds that one open;
+The environment variable IGPS_CAMPAIGN_FAULT is one of
+    full N     the disk is full: the files of the cache hold at most N bytes in total;
+    rename     a file cannot be renamed over another file, as if that file were open in another process;
     clock S    the clock is S seconds behind.
 """
 
@@ -29,15 +29,15 @@ def _no_rename() -> None:
 
 
 def _no_space(limit: int) -> None:
-    """A write to a file of the cache fails once the files there hold so many bytes."""
+    """A write to a file of the cache fails if the files of the cache would exceed `limit` bytes."""
     import builtins
     import errno
     import io
 
-    ordinary = builtins.open
+    builtin_open = builtins.open
 
-    def opened(file, mode="r", *arguments, **options):  # type: ignore[no-untyped-def]
-        stream = ordinary(file, mode, *arguments, **options)
+    def limited_open(file, mode="r", *arguments, **options):  # type: ignore[no-untyped-def]
+        stream = builtin_open(file, mode, *arguments, **options)
         if (".safetensors" not in str(file) and ".partial" not in str(file)) or not set(mode) & set("wax"):
             return stream
         root = os.path.dirname(os.path.dirname(os.path.abspath(file)))
@@ -51,10 +51,10 @@ def _no_space(limit: int) -> None:
 
         return Full(stream.detach())
 
-    builtins.open = opened
+    builtins.open = limited_open
 
 
-def _earlier(seconds: float) -> None:
+def _clock_behind(seconds: float) -> None:
     now, now_ns = time.time, time.time_ns
     time.time = lambda: now() - seconds
     time.time_ns = lambda: now_ns() - int(seconds * 1e9)
@@ -65,4 +65,4 @@ if _NAME == "rename":
 elif _NAME == "full":
     _no_space(int(_VALUE))
 elif _NAME == "clock":
-    _earlier(float(_VALUE))
+    _clock_behind(float(_VALUE))

@@ -183,7 +183,7 @@ def test_layouts_that_are_none_are_named() -> None:
         PieceHistogram(n_bins=(1, 5))
     batch = two_bodies()
     broken = replace(batch.surface, points=torch.full_like(batch.surface.points, torch.inf))
-    with pytest.raises(ValueError, match="PieceHistogram: expected finite places"):
+    with pytest.raises(ValueError, match="PieceHistogram: expected finite positions"):
         PieceHistogram(embedding=EMBEDDING)(replace(batch, surface=broken))
 
 

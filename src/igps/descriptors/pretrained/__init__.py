@@ -1,4 +1,4 @@
-"""The descriptor `pretrained`: its histograms, and the head that was fitted to generated shapes."""
+"""The descriptor `pretrained`: histograms under a head that was fitted to generated shapes."""
 
 from igps.descriptors.pretrained.descriptor import pretrained
 

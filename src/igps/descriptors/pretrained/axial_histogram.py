@@ -1,4 +1,4 @@
-"""How the samples of a body lie to its principal axes."""
+"""Histograms of samples and their directions in cylindrical coordinates about the principal axes of a body."""
 
 from contextlib import nullcontext
 
@@ -15,29 +15,34 @@ from igps.nn.histograms.base import SampleHistogram, counted, joint
 from igps.retrieval.distances import in_transforms
 from igps.signature.signature import SampleKind
 
-# The weight of a sample is so great a power of its potential: the trunk decides where the axes lie, limbs hardly
+# The weight of a sample is this power of its potential, so that the trunk determines the axes rather than the limbs.
 _POWER = -4
-# Of places, in units of the root mean square distance from the centre
+# Largest coordinate, in units of the root mean square distance from the centre
 _REACH = 2.2
 
 
 class AxialHistogram(SampleHistogram):
-    """Where samples lie along each principal axis of the body and beside it, and how their directions lie to it.
+    """Histograms of the positions and directions of samples in cylindrical coordinates about each principal axis.
 
-    Histograms of pairs do not know where in the body a pair is; this one does. The axes are those of the covariance of
-    the samples, each weighted by U⁻⁴, U its barycentroid potential: so the trunk decides, and a limb may move without
-    turning them. Each axis points to where the samples' third moment is positive, so that neither a motion nor a
-    reflection changes anything. About an axis the histogram has no angle: of a body that is round about one axis, the
-    other two are arbitrary, and so only a part of its cells. Source: principal axes as in Vranić and Saupe 2001;
-    cylindrical bins as in Papadakis, Pratikakis, Theoharis and Perantonis 2010.
+    The coordinates of a sample are its height along the axis, its distance from the axis, and the cosines of its
+    direction with the axis and with the radial line from the axis. Unlike histograms of pairs, they tell where in the
+    body a sample lies. There is no angle about the axis. In a body that is round about one axis, the other two axes are
+    arbitrary, but this affects only their own cells.
 
-    The histogram is differentiable in directions and places along fixed axes; the axes themselves have no gradient, as
-    that of close eigenvalues has no bound.
+    The axes are those of the covariance of the samples, with the weights U⁻⁴, where U is the barycentroid potential. So
+    the trunk determines the axes, and moving limbs hardly rotate them. Each axis points to the side where the third
+    moment of the samples is positive, so that the histogram does not change with motions and reflections.
+
+    Source: principal axes as in Vranić and Saupe 2001; cylindrical bins as in Papadakis, Pratikakis, Theoharis and
+    Perantonis 2010.
+
+    The histogram is differentiable in directions and positions for fixed axes. The axes themselves have no gradient,
+    because the gradient is unbounded for close eigenvalues.
 
     Args:
-        embedding: of the potential that weighs the samples.
+        embedding: of the potential in the weights of the samples.
         samples, n_samples, n_training_samples: see `SampleHistogram`.
-        n_bins: along the axis, beside it, and of the cosines of the direction with the axis and with the line from it.
+        n_bins: of the height, of the distance from the axis, and of the two cosines.
     """
 
     along: Tensor
@@ -65,21 +70,21 @@ class AxialHistogram(SampleHistogram):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Axes, the longest first, and the bins of each."""
+        """Three axes, the longest first, and the bins of the four coordinates."""
         return (3, *self.n_bins)
 
     @property
     def requirements(self) -> Requirements:
-        """Those of the embedding, and the directions."""
+        """Requirements of the embedding, and the directions of the samples."""
         return super().requirements | Requirements(attributes=("surface_direction",))
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
-        """(N, 3, ...) histograms of some samples of N shapes."""
+        """(N, 3, ...) histograms of the samples of N shapes."""
         mask, potential = features.samples.mask, barycentroid_potential(features.embedded(self.embedding))
-        # Padding may hold anything, and counts nowhere
-        points, directions, potential, own = (
-            one.masked_fill(~mask.view(*mask.shape, *[1] * (one.ndim - 2)), 0)
-            for one in (
+        # Padding may hold any value, and must not count.
+        points, directions, potential, sample_weights = (
+            values.masked_fill(~mask.view(*mask.shape, *[1] * (values.ndim - 2)), 0)
+            for values in (
                 features.positions(), features.attribute("surface_direction"), potential,
                 features.weights_or_ones(potential),
             )
@@ -88,33 +93,33 @@ class AxialHistogram(SampleHistogram):
             raise ValueError("AxialHistogram: expected finite values, got NaN or infinity.")
         with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False) if in_transforms() else nullcontext():
             weights = potential.double().clamp_min(torch.finfo().tiny).pow(_POWER) * mask
-            centre, axes = (one.to(points.dtype) for one in principal_axes(points, weights))
+            centre, axes = (values.to(points.dtype) for values in principal_axes(points, weights))
         n_points = mask.sum(dim=1)
-        places, directions = (points - centre) @ axes * mask[:, :, None], directions @ axes
-        places = places / (places.square().sum(dim=(1, 2)) / n_points).sqrt()[:, None, None]
-        # (N, 3, P) along each axis, and (N, 3, P, 2) along the two others
-        along, of_direction = places.mT, directions.mT
-        aside, of_aside = (torch.stack([one.roll(n, 1) for n in (1, 2)], dim=3) for one in (along, of_direction))
-        outward = (of_aside * normalize(aside, dim=3)).sum(dim=3)
-        place = [soft_memberships(along, self.along), soft_memberships(aside.norm(dim=3), self.beside)]
-        # towards the nearer end of the axis: so a body and its mirror image agree
-        away = torch.where(along < 0, -of_direction, of_direction)
-        direction = [soft_memberships(away, self.cosine), soft_memberships(outward, self.outward)]
-        counts = counted(joint(place) * own[:, None, :, None], joint(direction), n_points[:, None])
+        positions, directions = (points - centre) @ axes * mask[:, :, None], directions @ axes
+        positions = positions / (positions.square().sum(dim=(1, 2)) / n_points).sqrt()[:, None, None]
+        # Components along each axis, (N, 3, P), and along the two other axes, (N, 3, P, 2)
+        height, axial = positions.mT, directions.mT
+        across, radial = (torch.stack([values.roll(n, 1) for n in (1, 2)], dim=3) for values in (height, axial))
+        outward = (radial * normalize(across, dim=3)).sum(dim=3)
+        place = [soft_memberships(height, self.along), soft_memberships(across.norm(dim=3), self.beside)]
+        # Relative to the nearer end of the axis, so that a body and its mirror image agree
+        towards_end = torch.where(height < 0, -axial, axial)
+        direction = [soft_memberships(towards_end, self.cosine), soft_memberships(outward, self.outward)]
+        counts = counted(joint(place) * sample_weights[:, None, :, None], joint(direction), n_points[:, None])
         return counts.view(-1, *self.shape) / 3
 
 
 def principal_axes(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """The centres (N, 1, 3) of points (N, P, 3) of weights (N, P) and their principal axes (N, 3, 3).
+    """Centres (N, 1, 3) and principal axes (N, 3, 3) of points (N, P, 3) with weights (N, P).
 
-    Axes are in columns, the longest first. Each points to where the third moment of all points of any weight about the
-    centre, each counted once, is positive.
+    The axes are columns, the longest first. Each axis points to the side where the third moment about the centre is
+    positive. In this moment, all points of positive weight count equally.
     """
     weights = (weights / weights.sum(dim=1, keepdim=True))[:, :, None]
     points = points.to(weights.dtype)
     centre = (weights * points).sum(dim=1, keepdim=True)
-    places = (points - centre) * (weights > 0)
-    _, axes = torch.linalg.eigh(places.mT @ (places * weights))
+    centred = (points - centre) * (weights > 0)
+    _, axes = torch.linalg.eigh(centred.mT @ (centred * weights))
     axes = axes.flip(2)
-    third = (places @ axes).pow(3).sum(dim=1, keepdim=True)
+    third = (centred @ axes).pow(3).sum(dim=1, keepdim=True)
     return centre, axes * torch.where(third < 0, -1, 1)

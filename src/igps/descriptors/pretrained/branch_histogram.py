@@ -1,4 +1,4 @@
-"""How many limbs the samples of a body make, and how far each reaches."""
+"""Histograms of the number and lengths of a body's limbs."""
 
 import torch
 from torch import Tensor, nn
@@ -13,13 +13,13 @@ from igps.signature.signature import SampleKind
 
 
 class BranchHistogram(SampleHistogram):
-    """How the length of a body's limbs is shared among them, the longest first.
+    """Lengths of a body's limbs as shares of their sum, the longest first.
 
-    The barycentroid potential U is least in the middle of a body and has a peak at the end of each limb. The branches
-    of the merge tree of log U, on the graph of nearest samples in the embedding, are the limbs, each as long as its
-    peak is above where it joins another; the first reaches from the middle to the end that is farthest. So a body of
-    six like legs has six like shares, however it holds them. Histograms of pairs cannot count: to them, six limbs
-    differ little from five. Source: `merge_tree`.
+    The barycentroid potential U is least in the middle of a body and has a peak at the end of each limb. The limbs are
+    the branches of the merge tree of log U, on the graph of nearest samples in the embedding. The length of a limb is
+    the height of its peak above the saddle where it joins another limb; the first limb reaches from the middle of the
+    body to the farthest end. So a body with six equal legs has six equal shares in any pose. Histograms of pairs cannot
+    count: six limbs differ little from five in them. Source: see `merge_tree`.
 
     The histogram is differentiable in the potential.
 
@@ -30,7 +30,7 @@ class BranchHistogram(SampleHistogram):
     Args:
         embedding: of the potential and of the graph.
         samples, n_samples, n_training_samples: see `SampleHistogram`.
-        n_branches: how many of the longest are told; the others are left out.
+        n_branches: number of limbs, the longest ones; the others are left out.
     """
 
     def __init__(
@@ -49,29 +49,30 @@ class BranchHistogram(SampleHistogram):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Branches."""
+        """Number of branches."""
         return (self.n_branches,)
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
-        """(N, B) histograms of some samples of N shapes."""
-        (ends, _), mask = merge_trees(features, self.embedding), features.samples.mask
+        """(N, B) histograms of the samples of N shapes."""
+        (saddles, _), mask = merge_trees(features, self.embedding), features.samples.mask
         heights = features.log_potential(self.embedding).masked_fill(~mask, 0)
-        lengths, longest = (heights - heights.gather(1, ends)).sort(dim=1, descending=True)
+        lengths, longest = (heights - heights.gather(1, saddles)).sort(dim=1, descending=True)
         lengths, longest = lengths[:, : self.n_branches], longest[:, : self.n_branches]
         total = lengths.sum(dim=1, keepdim=True)
         shares = lengths / torch.where(total > 0, total, 1)
         if (weights := features.weights()) is not None:
-            asked = ends, longest, heights.detach(), features.neighbours(self.embedding), mask
-            limbs = torch.stack([_limbs(*body) for body in zip(*(one.cpu() for one in asked), strict=True)]).to(weights)
+            inputs = saddles, longest, heights.detach(), features.neighbours(self.embedding), mask
+            bodies = zip(*(values.cpu() for values in inputs), strict=True)
+            limbs = torch.stack([_limbs(*body) for body in bodies]).to(weights)
             shares = shares * (limbs @ weights[:, :, None])[:, :, 0] / limbs.sum(dim=2).clamp_min(1)
-        found = functional.pad(shares, (0, self.n_branches - shares.shape[1]))
-        # A body that is the same everywhere has one branch, of no length.
-        return torch.where(total > 0, found, functional.pad(torch.ones_like(total), (0, self.n_branches - 1)))
+        histogram = functional.pad(shares, (0, self.n_branches - shares.shape[1]))
+        # If the potential is constant, the only branch has length 0.
+        return torch.where(total > 0, histogram, functional.pad(torch.ones_like(total), (0, self.n_branches - 1)))
 
 
-def _limbs(ends: Tensor, longest: Tensor, heights: Tensor, neighbours: Tensor, mask: Tensor) -> Tensor:
-    """(B, P) the samples of each of the longest branches: those of its piece before it joins another."""
+def _limbs(saddles: Tensor, longest: Tensor, heights: Tensor, neighbours: Tensor, mask: Tensor) -> Tensor:
+    """(B, P) whether each sample belongs to each of the longest branches: to its piece just above its saddle."""
     order = heights.masked_fill(~mask, -torch.inf).argsort(descending=True, stable=True)
-    above = order.argsort()[ends[longest]].clamp_min(1)
-    levels, which = above.unique(return_inverse=True)
-    return merge_tree(heights, neighbours, levels.tolist(), mask).pieces[which] == longest[:, None]
+    n_above = order.argsort()[saddles[longest]].clamp_min(1)
+    counts, level = n_above.unique(return_inverse=True)
+    return merge_tree(heights, neighbours, counts.tolist(), mask).pieces[level] == longest[:, None]

@@ -1,4 +1,4 @@
-"""Histograms of a body's interior and surface under a head that was fitted to generated shapes."""
+"""The descriptor `pretrained`: nine histograms of a body under a head that was fitted to generated shapes."""
 
 from pathlib import Path
 
@@ -20,26 +20,31 @@ from igps.nn.histograms.points import PointHistogram
 PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 """The parameters of `pretrained`, written by training/pretrain.py."""
 
-# Of `pretrained_parts`: what bending leaves alone tells bodies, all others tell classes
+# Indices into `pretrained_parts`. Body heads use parts that bending leaves as they are; the class head uses the others,
+# and the balls, which serve both.
 BODY_PARTS, CLASS_PARTS = (0, 5, 8), (1, 2, 3, 4, 5, 6, 7)
-# Balls are too rough to tell individuals apart
+# The balls are too coarse to tell individuals apart.
 INDIVIDUAL_PARTS = (0, 8)
-# Of the body heads: the median distance of training shapes is 0.5
+# Scales of the body heads, in units in which the median distance between training shapes is 0.5
 _SCALES = (0.125, 0.21, 0.125)
 
 
 def pretrained_parts() -> HistogramDescriptor:
-    """What `pretrained` sees of a body, of at most 64 eigenpairs.
+    """Return the histograms of `pretrained`, from at most 64 eigenpairs, as one descriptor with nine parts.
 
-    By interior distances alone: those of surface samples, and how interior samples lie to the surface in the embedding
-    of 16 eigenpairs. With directions in space: how surface samples lie to each other by Euclidean distance, and by that
-    of the embedding; and how they lie to the body's principal axes. Of surface samples the balls that touch them from
-    both sides, by the potentials of 4 and 16 eigenpairs. By the latter, the body's limbs: how far each reaches, and how
-    large and how long the pieces are that remain of the body without its middle. And the eigenvalues alone.
+    0. Interior distances between surface samples.
+    1. Interior distances between interior samples, with directions to the surface in the embedding of 16 eigenpairs.
+    2. Euclidean distances between surface samples, with directions in space.
+    3. Interior distances between surface samples, with directions in space.
+    4. Positions of surface samples about the principal axes of the body.
+    5. Radii of the balls that touch the surface from both sides, by the potentials of 4 and 16 eigenpairs.
+    6. Lengths of the limbs, by the potential of 16 eigenpairs.
+    7. Sizes and lengths of the pieces of the body without its middle, by the same potential.
+    8. Eigenvalues.
     """
     embeddings = {n: SpectralEmbedding(n_eigenpairs=n) for n in (64, 50, 16, 4)}
     n = N_ORIENTED_SAMPLES
-    # 2,000 samples lie 0.022 apart: what is thinner than that is thin
+    # The spacing of 2,000 samples is 0.022 √area. Thinner parts all belong to the first class.
     balls = [BallRadius("inside", 0.022, 0.25), BallRadius("outside", 0.03, 1.5)]
     potentials = [Potential(6, 0.9, embedding=embeddings[4], soft=True), Potential(6, 0.96, soft=True)]
     return HistogramDescriptor(
@@ -62,7 +67,7 @@ def pretrained_parts() -> HistogramDescriptor:
 
 
 def pretrained_head(*, individuals: bool = True) -> TwoLevelHead:
-    """The head of `pretrained`, not fitted; without the level of individuals if not `individuals`."""
+    """Return the unfitted head of `pretrained`, with or without an individual head."""
     surface, balls, spectrum = BODY_PARTS
     body_heads = [
         WCCNHead([surface], n_directions=90, shrinkage=0.3, lengths=True),
@@ -75,12 +80,18 @@ def pretrained_head(*, individuals: bool = True) -> TwoLevelHead:
 
 
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
-    """Unit vectors, in evaluation mode: `pretrained_parts` under a head that was fitted to generated shapes.
+    """Return the histograms of `pretrained_parts` under a head that was fitted to generated shapes, in evaluation mode.
 
-    It needs no label of the shapes that it compares: by the head's distance, other poses of a body come first, then
-    other bodies of its class. The head's `short` makes vectors of 256 numbers of its 1,210. The model card is in the
-    documentation. The parameters are those of a file that training/pretrain.py wrote, a FileNotFoundError without one,
-    and a ValueError where it holds others.
+    Descriptions are unit vectors of 1,210 numbers, which the head's `short` reduces to 256. By the distance of the
+    head, other poses of a body come first, then other bodies of its class. No labels are needed for the shapes that are
+    compared. The model card is in the documentation.
+
+    Args:
+        path: the file of parameters that training/pretrain.py wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file holds the parameters of another descriptor or version.
     """
     module = EmbeddedDescriptor(
         pretrained_parts(),

@@ -1,4 +1,4 @@
-"""Into which pieces a body falls when its middle is taken away."""
+"""Histograms of the pieces of a body without its middle."""
 
 from collections.abc import Sequence
 
@@ -12,31 +12,32 @@ from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram
 from igps.signature.signature import SampleKind
 
-# Centres are logarithms to base 2. Of sizes, from one sample in 64 on
-_SMALLEST, _LARGEST = -6.0, -0.5
-# Of lengths: a ball lies at −0.8, a rod that is a hundred times as long as it is thick at 2.5
-_ROUNDEST, _LONGEST = -1.0, 2.5
-# Of fewer samples the length says nothing
-_FEWEST = 4
+# Centres of the bins, as logarithms to base 2. Sizes start at one sample in 64.
+_MIN_SIZE, _MAX_SIZE = -6.0, -0.5
+# The length of a ball is at −0.8, that of a rod a hundred times as long as it is thick at 2.5.
+_MIN_LENGTH, _MAX_LENGTH = -1.0, 2.5
+# Fewer samples determine no length.
+_MIN_SAMPLES = 4
 
 
 class PieceHistogram(SampleHistogram):
-    """How large and how long the pieces are that are left of a body without its middle, at several levels.
+    """Joint histograms of the sizes and lengths of the pieces of a body without its middle, at several levels.
 
-    At each level a share of the samples is left, those of the largest barycentroid potential: first the ends of limbs,
-    then whole limbs, at last the body but for its middle. Each sample counts by the size of the piece it belongs to, as
-    a share of all samples, and by the length of that piece, √(12 λ₁), λ₁ the largest eigenvalue of the covariance of
-    its samples (a rod's own length), over the root of its area. Sizes are pose-invariant, and so are lengths as long as
-    limbs only turn. Pieces are those of `merge_trees`.
+    At each level, a share of the samples remains, those with the largest barycentroid potential: the ends of limbs at
+    low levels, whole limbs at middle ones, and the body except its middle at high ones. The pieces are the connected
+    components of the remaining samples, see `merge_trees`. Each sample counts in the bins of the size and length of its
+    piece. The size is the share of all samples. The length is √(12 λ₁) over the square root of the area of the piece,
+    where λ₁ is the largest eigenvalue of the covariance of its samples; for a rod, √(12 λ₁) is its length. Sizes are
+    pose-invariant, and so are lengths as long as limbs only rotate.
 
-    The histogram is differentiable in places within given pieces; sizes have no gradient.
+    The histogram is differentiable in the positions of the samples for fixed pieces; sizes have no gradient.
 
     Example:
         >>> PieceHistogram([0.1, 0.3]).shape
         (2, 6, 5)
 
     Args:
-        levels: shares of the samples, ascending.
+        levels: shares of the samples that remain, ascending.
         embedding: of the potential, and of the graph on which pieces are connected.
         samples, n_samples, n_training_samples: see `SampleHistogram`.
         n_bins: of size and length, both in geometric progression.
@@ -62,44 +63,46 @@ class PieceHistogram(SampleHistogram):
             raise ValueError(f"n_bins: expected two numbers, each at least 2, got {n_bins}.")
         self.levels, self.n_bins = tuple(levels), n_bins
         self.embedding = embedding or SpectralEmbedding()
-        self.register_buffer("sizes", torch.linspace(_SMALLEST, _LARGEST, n_bins[0]))
-        self.register_buffer("lengths", torch.linspace(_ROUNDEST, _LONGEST, n_bins[1]))
+        self.register_buffer("sizes", torch.linspace(_MIN_SIZE, _MAX_SIZE, n_bins[0]))
+        self.register_buffer("lengths", torch.linspace(_MIN_LENGTH, _MAX_LENGTH, n_bins[1]))
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Levels, and the bins of size and length."""
+        """Number of levels, and of the bins of size and length."""
         return (len(self.levels), *self.n_bins)
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
-        """(N, L, ...) histograms of some samples of N shapes."""
+        """(N, L, ...) histograms of the samples of N shapes."""
         mask, points = features.samples.mask, features.positions()
         points, weights = points.masked_fill(~mask[:, :, None], 0), features.weights_or_ones(points[..., 0])
-        traced = torch.compiler.is_compiling()  # what is traced cannot look at numbers
-        if not traced and not torch.isfinite(points).all():
-            raise ValueError("PieceHistogram: expected finite places, got NaN or infinity.")
+        is_traced = torch.compiler.is_compiling()  # traced code cannot depend on values of tensors
+        if not is_traced and not torch.isfinite(points).all():
+            raise ValueError("PieceHistogram: expected finite positions, got NaN or infinity.")
         _, peaks = merge_trees(features, self.embedding, self.levels)
-        left, n_longest = peaks >= 0, mask.shape[1]
-        # Pieces of a level are numbered by their peaks, and samples that are not left count nowhere
-        numbers = (peaks == torch.arange(n_longest, device=peaks.device)).cumsum(dim=2) - 1
-        piece = numbers.gather(2, peaks.clamp_min(0)).masked_fill(~left, 0)
-        n_pieces = n_longest if traced else int(piece.max()) + 1
+        remains, n_samples = peaks >= 0, mask.shape[1]
+        # The pieces of a level are numbered in the order of their peaks. Samples that do not remain get a piece, too,
+        # but are left out of all sums.
+        numbers = (peaks == torch.arange(n_samples, device=peaks.device)).cumsum(dim=2) - 1
+        piece = numbers.gather(2, peaks.clamp_min(0)).masked_fill(~remains, 0)
+        n_pieces = n_samples if is_traced else int(piece.max()) + 1
 
         def sums(values: Tensor) -> Tensor:
-            """(N, L, pieces, k) of values (N, P, k) or (N, L, P, k) of the samples."""
-            of_left = torch.where(left[..., None], values if values.ndim == 4 else values[:, None], 0)
-            into = of_left.new_zeros(*left.shape[:2], n_pieces, values.shape[-1])
-            return into.scatter_add(2, piece[..., None].expand_as(of_left), of_left)
+            """Sum values (N, P, k) or (N, L, P, k) of the samples over each piece: (N, L, pieces, k)."""
+            values = torch.where(remains[..., None], values if values.ndim == 4 else values[:, None], 0)
+            zeros = values.new_zeros(*remains.shape[:2], n_pieces, values.shape[-1])
+            return zeros.scatter_add(2, piece[..., None].expand_as(values), values)
 
         n_points = sums(torch.ones_like(points[..., :1])).clamp_min(1)
         means = sums(points) / n_points
-        places = points[:, None] - means.gather(2, piece[..., None].expand(*left.shape, 3))
-        covariance = sums((places[..., :, None] * places[..., None, :]).flatten(3)) / n_points
-        few = n_points < _FEWEST  # eigenvalues that are equal have no second derivatives
-        covariance = torch.where(few, covariance.new_tensor([1, 0, 0, 0, 2, 0, 0, 0, 3]), covariance)
-        spread = torch.linalg.eigvalsh(covariance.unflatten(3, (3, 3)))[..., -1]
+        centred = points[:, None] - means.gather(2, piece[..., None].expand(*remains.shape, 3))
+        covariance = sums((centred[..., :, None] * centred[..., None, :]).flatten(3)) / n_points
+        # Small pieces get distinct eigenvalues: equal ones have no second derivatives.
+        is_small = n_points < _MIN_SAMPLES
+        covariance = torch.where(is_small, covariance.new_tensor([1, 0, 0, 0, 2, 0, 0, 0, 3]), covariance)
+        largest = torch.linalg.eigvalsh(covariance.unflatten(3, (3, 3)))[..., -1]
         sizes = n_points[..., 0] / mask.sum(dim=1)[:, None, None]
-        lengths = 12 * torch.where(few[..., 0], 0, spread) / sizes
-        lengths = lengths.clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
-        of_sizes = soft_memberships(sizes.log2(), self.sizes) * sums(weights[..., None].to(points.dtype))
-        counts = of_sizes.mT @ soft_memberships(lengths, self.lengths)
-        return counts / left.sum(dim=(1, 2))[:, None, None, None]
+        squared_lengths = 12 * torch.where(is_small[..., 0], 0, largest) / sizes
+        lengths = squared_lengths.clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
+        size_memberships = soft_memberships(sizes.log2(), self.sizes) * sums(weights[..., None].to(points.dtype))
+        counts = size_memberships.mT @ soft_memberships(lengths, self.lengths)
+        return counts / remains.sum(dim=(1, 2))[:, None, None, None]

@@ -1,4 +1,4 @@
-"""How the spectrum of a body departs from Weyl's law."""
+"""Eigenvalues of a body's surface relative to Weyl's law."""
 
 import torch
 from torch import Tensor
@@ -10,15 +10,15 @@ from igps.nn.histograms.base import DescriptionPart
 
 
 class SpectrumShares(DescriptionPart):
-    """The eigenvalues λₖ of a body's surface, each over its number k, as shares of their sum.
+    """The ratios λₖ / k of the eigenvalues of a body's surface, as shares of their sum, from k = 2 on.
 
-    By Weyl's law λₖ grows as 4πk over the area, so that all shares are nearly alike, and how they differ is the body's
-    own. Bending leaves eigenvalues as they are, and scale multiplies all by one number. The first of them, λ₁, is left
-    out: of all shares it differs most between bodies and between poses of one, and would outweigh the others. Source:
-    Reuter, Wolter and Peinecke 2006, who compare bodies by such sequences.
+    By Weyl's law, λₖ grows like 4πk over the area, so that all shares are nearly equal; their differences characterise
+    the body. Bending leaves eigenvalues as they are, and scaling multiplies all by the same factor. The first
+    eigenvalue is left out, because its share varies most between bodies and between poses of one body, and would
+    outweigh the others. Source: Reuter, Wolter and Peinecke 2006, who compare bodies by such sequences.
 
     Example:
-        Of a sphere λ = l (l + 1), 2 l + 1 times; what is over is the number k, from 2 on.
+        The eigenvalues of a sphere are l (l + 1), each 2 l + 1 times.
 
         >>> import trimesh
         >>> from igps import SignatureConfig, collate, compute_signature
@@ -30,7 +30,7 @@ class SpectrumShares(DescriptionPart):
         True
 
     Args:
-        n_eigenpairs: of which it looks at the eigenvalues.
+        n_eigenpairs: number of eigenvalues, the first one included.
     """
 
     def __init__(self, n_eigenpairs: int = 64) -> None:
@@ -40,23 +40,23 @@ class SpectrumShares(DescriptionPart):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Eigenvalues but the first."""
+        """Number of eigenvalues without the first."""
         return (self.n_eigenpairs - 1,)
 
     @property
     def requirements(self) -> Requirements:
-        """As many eigenpairs."""
+        """The number of eigenpairs."""
         return Requirements(n_eigenpairs=self.n_eigenpairs)
 
     def of_features(self, features: BatchFeatures) -> Tensor:
         """(N, K − 1) shares of N shapes."""
         batch = features.batch
-        numbers = torch.arange(2, self.n_eigenpairs + 1, device=batch.eigenvalues.device)
-        over_number = batch.eigenvalues[:, 1 : self.n_eigenpairs] / numbers
-        shares = (over_number / over_number.sum(dim=1, keepdim=True)).to(batch.surface.eigenfunctions.dtype)
+        k = torch.arange(2, self.n_eigenpairs + 1, device=batch.eigenvalues.device)
+        ratios = batch.eigenvalues[:, 1 : self.n_eigenpairs] / k
+        shares = (ratios / ratios.sum(dim=1, keepdim=True)).to(batch.surface.eigenfunctions.dtype)
         weights = batch.surface.attributes.get(WEIGHT)
         if weights is None:
             return shares
-        # Where an eigenfunction is large, the surface decides on its eigenvalue (Hadamard 1908)
+        # An eigenvalue depends on the surface most where its eigenfunction is large (Hadamard 1908).
         densities = batch.surface.eigenfunctions[:, :, 1 : self.n_eigenpairs].square()
         return shares * (densities * weights[:, :, None]).sum(dim=1) / densities.sum(dim=1)
