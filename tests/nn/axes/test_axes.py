@@ -105,7 +105,7 @@ def test_a_missing_attribute_lists_what_there_is() -> None:
 
 
 def test_directions_are_no_classes() -> None:
-    with pytest.raises(ValueError, match="expected a scalar to split by, but 'surface_direction' is a direction"):
+    with pytest.raises(ValueError, match="expected a scalar, got 'surface_direction', which is a direction"):
         Attribute("surface_direction", [0.0, 1.0]).values(view(), nn.Identity())
 
 

@@ -85,7 +85,7 @@ def test_what_it_cannot_count_is_named() -> None:
     with pytest.raises(ValueError, match="expected 0 < smallest < largest"):
         BallRadius("inside", 0.3, 0.2)
     none = replace(batch.surface, mask=torch.zeros_like(batch.surface.mask))
-    with pytest.raises(ValueError, match="expected at least 3 of each body, which tell its balls, got 0"):
+    with pytest.raises(ValueError, match="expected at least 3 of each body for its balls, got 0"):
         layout()(replace(batch, surface=none))
 
 
