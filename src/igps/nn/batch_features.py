@@ -50,7 +50,7 @@ class SampleFeatures:
         """Return an attribute (N, P) or (N, P, 3) of the samples; raise a ValueError if they do not have it."""
         if name not in self.samples.attributes:
             raise ValueError(
-                f"attributes: expected {name!r} among those of the {self.kind} samples, got "
+                f"attributes: expected the {self.kind} samples to have {name!r}, got "
                 f"{sorted(self.samples.attributes)}. Name it in SignatureConfig(attributes=...), or give its function "
                 "to SignatureDataset(attributes=...)."
             )
@@ -102,10 +102,7 @@ class BatchFeatures:
         self._features: dict[tuple[SampleKind, int | None, bool], SampleFeatures] = {}
 
     def of(self, kind: SampleKind, n_samples: int | None, n_training_samples: int | None) -> SampleFeatures:
-        """Return the features of at most `n_samples` samples of a kind, or of all samples if None.
-
-        In training mode, `n_training_samples` samples are drawn at random instead, unless this number is None.
-        """
+        """Return features of `n_samples` samples at most (None: all), or of `n_training_samples` drawn in training."""
         is_random = self._training and n_training_samples is not None
         max_samples = n_training_samples if is_random else n_samples
         key = (kind, max_samples, is_random)

@@ -65,7 +65,7 @@ class Descriptor(Specified, ABC):
             leave descriptions unchanged, apart from discretisation.
         requirements: what a body must have; by default, all eigenpairs.
         searched_by: the distance by which an index finds candidates, "cosine" for unit vectors or "chi_square" for
-            histograms. The bodies that are nearest by `distances` must be among the few hundred that are nearest by it.
+            histograms. The nearest bodies by `distances` must be among the few hundred nearest bodies by this distance.
             If None, an index compares a query with all bodies.
         card: facts about a fitted descriptor, by name.
         scale: median distance between bodies of one class, against which `IndividualDescriptor` weighs size and side;
@@ -102,8 +102,7 @@ class Descriptor(Specified, ABC):
             card: facts about the descriptor, for JSON; its own `card` if None.
 
         Raises:
-            ValueError: the descriptor contains modules of other packages, or its name has other characters than
-                letters, digits and _.
+            ValueError: the descriptor contains modules of other packages, or its name is not of letters, digits and _.
         """
         if not NAME.fullmatch(self.name):
             raise ValueError(f"name: expected letters, digits and _, got {self.name!r}. Choose another name.")
@@ -116,7 +115,7 @@ class Descriptor(Specified, ABC):
     def forward(self, batch: SignatureBatch) -> Tensor:
         """Return descriptions (N, ...) of N shapes; raise a ValueError if the batch does not meet the requirements."""
         self.requirements.check(batch)
-        # One thread: on other devices it has no advantage, and traced code runs later.
+        # On other devices a limit on threads has no advantage, and traced code runs later.
         with one_thread() if blocks.uses_loops(batch.device) else contextlib.nullcontext():
             return self.describe(batch)
 
@@ -131,17 +130,14 @@ class Descriptor(Specified, ABC):
 
         Args:
             descriptions: (N, ...).
-            of_one_kind: whether all bodies are of one kind, such as an organ; a descriptor may then leave out the
-                entries that distinguish kinds.
+            of_one_kind: whether all bodies are of one kind, such as an organ; entries that tell kinds apart may be
+                left out then.
         """
         rows = descriptions.flatten(1)
         return rows.sqrt() if self.searched_by == "chi_square" else rows
 
     def short(self, descriptions: Tensor) -> Tensor:
-        """Map descriptions (N, D) to (N, ≤ 256), for engines with the cosine distance and a limit on dimensions.
-
-        By default, raises a ValueError.
-        """
+        """Map descriptions (N, D) to (N, ≤ 256) for engines with cosine distances; by default, raise a ValueError."""
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {self.name!r}.")
 
 
@@ -191,8 +187,7 @@ class HistogramDescriptor(Descriptor):
         ((640, 64), [[0.0, 1.0, 1.0]])
 
     Args:
-        histograms: one `DescriptionPart`, such as a `PairHistogram`; or a list of parts, each a `DescriptionPart` or a
-            list of them.
+        histograms: one `DescriptionPart`, such as a `PairHistogram`; or a list of parts, each one or several of them.
         name, source, invariant_to: see `Descriptor`.
 
     Raises:

@@ -56,11 +56,9 @@ def spectral_embedding(
     time: float | None = None,
     n_eigenpairs: int | None = None,
 ) -> Tensor:
-    """Multiply eigenfunctions by their `spectral_weights`, which takes the other arguments and raises the errors.
+    """Multiply eigenfunctions (..., P, K), 1/length, by `spectral_weights`; see there for other arguments and errors.
 
     Args:
-        eigenfunctions: (..., P, K), 1/length.
-        eigenvalues, area, kind, time: see `spectral_weights`.
         n_eigenpairs: number of leading eigenpairs to use; None, or a number above K, uses all.
 
     Returns:

@@ -91,14 +91,10 @@ def specification(module: nn.Module) -> dict[str, Any]:
 
 
 def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
-    """Build the module of a `specification`.
-
-    Args:
-        spec: a `specification`.
-        n_bytes: size of the parameters that will be loaded; a module that may need many more is refused.
+    """Build the module of a `specification`, whose saved parameters take `n_bytes` bytes.
 
     Raises:
-        ValueError: it specifies anything but modules of the library, or a module that is too large.
+        ValueError: it contains anything but modules of the library, or a module that is too large.
     """
     modules: list[nn.Module] = []
 
@@ -163,10 +159,7 @@ def _check_unchanged(module: nn.Module, rebuilt: nn.Module) -> None:
             changed = [name for name, value in plain.items() if getattr(submodule, name, value) != value]
         if changed:
             name = ".".join(filter(None, (path, changed[0])))
-            raise ValueError(
-                f"{name}: expected the value that it was constructed with, got a changed one, which a file does not "
-                "preserve. Construct the descriptor with the new value."
-            )
+            raise ValueError(f"{name}: expected its initial value, got another, which is not saved. Make a new module.")
 
 
 def _is_plain(name: str, value: Any) -> bool:

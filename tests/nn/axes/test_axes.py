@@ -96,11 +96,11 @@ def test_values_that_are_not_finite_are_refused() -> None:
 def test_a_missing_attribute_lists_what_there_is() -> None:
     with pytest.raises(
         ValueError,
-        match=r"attributes: expected 'charge' among those of the surface samples, got \['depth', 'surface_direction'\]",
+        match=r"attributes: expected the surface samples to have 'charge', got \['depth', 'surface_direction'\]",
     ):
         Attribute("charge", [0.1, 0.2]).values(view("surface"), nn.Identity())
     bare = batch_of(torch.rand(1, 5, 3))
-    with pytest.raises(ValueError, match="expected 'surface_direction' among those of the interior samples"):
+    with pytest.raises(ValueError, match="expected the interior samples to have 'surface_direction'"):
         PairCosines().pairs(SampleFeatures(bare, "interior", bare.interior), SpectralEmbedding())
 
 

@@ -90,8 +90,7 @@ def write_curvatures(
     Pairs are processed row by row, without a matrix of all pairs.
 
     Args:
-        points: (3, P).
-        directions: (3, P).
+        points, directions: (3, P).
         min_sine: points at a smaller angle to the tangent plane are ignored.
         curvatures: (P, 2) to write, inside and outside; must be 0.
     """

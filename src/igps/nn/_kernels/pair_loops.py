@@ -4,11 +4,9 @@ A block of pairs has rows and columns. Row i is point ``row + i`` and column j i
 row ≤ column. Only pairs whose second point comes after the first are counted, so that each unordered pair counts once.
 
 Along each of K axes, a pair lies between the centres of two bins; these intervals form its cell. The pair is shared
-between the 2^K corners of the cell. Each cell stores the counts of all its corners side by side, where a single store
-reaches several of them; the corners are added to their bins at the end.
-
-For each row, vectorised loops first compute the cells of all pairs and their shares along each axis (`pair_cells`).
-Each pair is then added to the corners of its cell (`pair_sums`), or, for the gradient, reads their values.
+between the 2^K corners of the cell, whose counts are stored side by side and only added to their bins at the end. For
+each row, vectorised loops first compute the cells of all pairs and their shares along each axis (`pair_cells`). Each
+pair is then added to the corners of its cell (`pair_sums`), or, for the gradient, reads their values.
 """
 
 from typing import Any
@@ -38,12 +36,10 @@ def count_block(
     """Count a block of pairs.
 
     Args:
-        values: (R, I, J) values of the axes that are not cosines, in order; for distances the inner products, which are
-            overwritten.
+        values: (R, I, J) of the axes other than cosines, in order; overwritten. For distances, the inner products.
         axes: see `Axes`.
         row, column: first point of the rows and of the columns.
-        classes: (M, P) classes of each point.
-        weights: (M, P) weights of each point in its classes.
+        classes, weights: (M, P) classes of each point, and its weights in them.
         packs: whether there is one axis, in single precision, and M and all weights are 1.
         total: (C(C+1)/2, cells·2^K) to add to; among the corners, the last axis varies fastest.
     """
@@ -105,8 +101,7 @@ def gradient_block(
         upstream: (C(C+1)/2, cells·2^K) derivatives by the counts.
         by_cosines: (S, 4, I, J) to fill, for each triple of cosines, with the derivatives by u·(y − x), v·(x − y), u·v
             and |y − x|², where x and u are the point and direction of the row, y and v those of the column.
-        by_weights: (M, P) to add to.
-        by_centres: (K, B) to add to.
+        by_weights, by_centres: (M, P) and (K, B) to add to.
     """
     n_rows, n_columns = values.shape[1:]
     n_axes, n_members = len(axes.n_centres), len(classes)
@@ -171,7 +166,7 @@ def gradient_block(
 
 @compiled(inline="always")
 def interpolate(upstream: Numbers, start: Any, shares: Numbers, j: int, weight: float, slopes: Floats) -> float:
-    """Return the mean of the upstream derivatives (cells·2^K,) at the corners of a cell, by shares (K, J).
+    """Return the mean of upstream derivatives (cells·2^K,) at the corners of the cell of pair j, by its shares (K, J).
 
     The corners begin at index ``start``. The derivatives of the mean by the shares, times the weight, are added to the
     slopes (K,). For the last two axes, the four corners are read together and stay in registers; the loop is over the
@@ -210,9 +205,8 @@ def corner_share(share: Any, is_upper: int) -> float:
 
 @compiled()
 def initial_range(n_cells: int, n_members: int) -> tuple[int, int]:
-    """Return the initial lowest and highest cell with counts: an empty range, or all cells.
+    """Return the initial range of cells with counts: empty, or all cells if each point has one class.
 
-    All cells if each point has one class: many rows are then flushed together, and adding empty cells takes less time
-    than tracking the range.
+    In that case many rows are flushed together, and adding empty cells takes less time than tracking the range.
     """
     return (n_cells, -1) if n_members > 1 else (0, n_cells - 1)

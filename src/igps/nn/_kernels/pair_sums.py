@@ -1,7 +1,6 @@
 """Compiled loops that add pairs to the sums of their cells, and the sums to the counts.
 
-A weight w with share s adds w·s to one corner of the cell, and w − w·s to the other, which rounding cannot make
-negative.
+A weight w with share s is split into w·s and w − w·s, which rounding cannot make negative.
 """
 
 from typing import Any
@@ -53,8 +52,7 @@ def unpack(packed: Integers, sums: Floats) -> None:
 def add_one_axis(cell: Indices, home: Indices, share: Numbers, weights: Floats, sums: Floats) -> None:
     """Add pairs (n,) of one row to the sums (cells, 2).
 
-    The index of a pair is its cell plus the first cell of the class of the other point (``home``); the weights are
-    those of the other point.
+    The class of a pair's second point determines its first cell (``home``); the weights are those of the second point.
     """
     for j in range(len(cell)):
         i = np.uint32(cell[j] + home[j])

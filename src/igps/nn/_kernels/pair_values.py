@@ -17,19 +17,13 @@ class PairValues:
     """One or several values of every pair of points, and the centres of the bins of each value.
 
     A value must not depend on the order of the two points.
-
-    Attributes:
-        inputs: finite tensors (N, P, ...) or (P, ...) that the values are computed from.
-        centres: (B,) ascending, for each of the k values.
-        between: differentiable function from the inputs (N, I, ...) of I points and those of J other points to their
-            values (N, k, I, J).
-        kinds: how compiled loops obtain the values: `VALUES` (from `between`, the default), `DISTANCES` or `COSINES`.
     """
 
-    inputs: tuple[Tensor, ...]
-    centres: tuple[Tensor, ...]
+    inputs: tuple[Tensor, ...]  # (N, P, ...) or (P, ...) each, finite: the values are computed from them
+    centres: tuple[Tensor, ...]  # (B,) ascending, for each of the k values
+    # Differentiable function from inputs (N, I, ...) of I points and (N, J, ...) of J points to values (N, k, I, J)
     between: Callable[[Inputs, Inputs], Tensor]
-    kinds: tuple[int, ...] = ()
+    kinds: tuple[int, ...] = ()  # how compiled loops obtain the values, see `pair_cells`; by default from `between`
 
     def __post_init__(self) -> None:
         if not self.kinds:
@@ -141,12 +135,8 @@ def _inverse_distances(x: Tensor, y: Tensor) -> Tensor:
     return torch.where(squares > 0, torch.where(squares > 0, squares, 1).rsqrt(), 0)
 
 
-_EMPTY = torch.empty(0, device="cpu")
-TEMPLATES = (
-    euclidean_distances(_EMPTY, _EMPTY),
-    oriented_pairs(_EMPTY, _EMPTY, _EMPTY, _EMPTY),
-    pair_twists(_EMPTY, _EMPTY, _EMPTY),
-)
+_EMPTY = [torch.empty(0, device="cpu")] * 4
+TEMPLATES = (euclidean_distances(*_EMPTY[:2]), oriented_pairs(*_EMPTY), pair_twists(*_EMPTY[:3]))
 """All values that this module defines, with empty tensors, for `with_tensors`."""
 
 

@@ -15,11 +15,7 @@ _MIN_GAP = 1e-3
 
 
 def interval_centres(n: int, reach: float, name: str) -> Tensor:
-    """Return the centres (n,) of n equal intervals of [0, reach].
-
-    Raises:
-        ValueError: n, which the message calls n_`name`, is below 1, or the reach is not positive.
-    """
+    """Return the centres (n,) of n equal intervals of [0, reach]; a ValueError of n_`name` if there are none."""
     check_at_least(1, **{f"n_{name}": n})
     check_positive(reach=reach)
     return (torch.arange(n) + 0.5) * (reach / n)
@@ -28,9 +24,8 @@ def interval_centres(n: int, reach: float, name: str) -> Tensor:
 class OrderedCentres(Specified):
     """Ascending centres of bins or classes, fixed or learned.
 
-    Learned centres are the running sum of positive gaps, so that they ascend for all values of the parameters. Each gap
-    is its start value times softplus(θ)/log 2, where the parameter θ starts at 0. Centres that start positive stay
-    positive.
+    Learned centres are running sums of positive gaps, so that they ascend for all parameters. Each gap is its start
+    value times softplus(θ)/log 2, where the parameter θ starts at 0. Centres that start positive stay positive.
 
     Args:
         start: (B,) ascending.

@@ -10,7 +10,7 @@ from torch import Tensor
 from igps.nn.specification import Specified
 from igps.retrieval.distances import cosine, square_root
 
-# Relative to the largest sum of squares: directions with a smaller sum are rounding errors.
+# Relative to the largest sum of squares; directions with a smaller sum are rounding errors.
 _MIN_RELATIVE_SQUARE = 1e-10
 
 
@@ -105,11 +105,7 @@ def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
 
 
 def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
-    """Return the classes (N,) of descriptions (N, ...), numbered from 0.
-
-    Raises:
-        ValueError: the labels do not match, or no class has two members.
-    """
+    """Return the classes (N,) of descriptions (N, ...), numbered from 0; a ValueError if no class has two members."""
     _, members = checked_labels(descriptions, labels).unique(return_inverse=True)
     if int(members.max()) + 1 == len(members):
         raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
@@ -142,14 +138,8 @@ def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: in
     factor, the identity except for a gain along each eigenvector of W. Source: within-class covariance normalisation,
     Hatch, Kajarekar and Stolcke 2006.
 
-    Args:
-        residuals: (N, D) rows of the training shapes minus the mean of their class.
-        rank: number of eigenvalues that the mean eigenvalue is taken over.
-        shrinkage: s.
-        n: maximum number of directions.
-
-    Returns:
-        k ≤ n orthonormal directions (k, D), those of the largest eigenvalues, and gains (k,) in (0, 1].
+    Residuals (N, D) are rows of the training shapes minus the mean of their class. The mean eigenvalue is taken over
+    `rank` eigenvalues. Returns k ≤ n orthonormal directions (k, D), of the largest eigenvalues, and gains (k,) ≤ 1.
     """
     directions, squares = principal_directions(residuals, min(n, rank))
     relative = squares * rank / residuals.square().sum()

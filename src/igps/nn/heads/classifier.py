@@ -14,10 +14,8 @@ from igps.nn.heads.closed_form import KernelHead
 
 _MAX_FOLDS = 5
 _TEMPERATURES = torch.logspace(-2.5, 0, 60)  # candidates of the calibration
-# Nearest training shapes of the predicted class that define strangeness.
-_N_NEAREST = 2
-# Share of the shapes of known classes that are called unknown.
-_FALSE_UNKNOWN_RATE = 0.05
+_N_NEAREST = 2  # training shapes of the predicted class that strangeness is computed from
+_FALSE_UNKNOWN_RATE = 0.05  # share of the shapes of known classes that are called unknown
 
 
 class ClassifierHead(KernelHead):

@@ -21,10 +21,8 @@ from igps.nn.heads.base import (
 )
 from igps.retrieval.distances import cosine
 
-# Average number of training shapes per class from which on the temperature of the softmax is not raised.
-_MIN_CLASS_SIZE = 6
-# Smaller variances of distances are rounding errors.
-_MIN_VARIANCE = 1e-8
+_MIN_CLASS_SIZE = 6  # with fewer training shapes per class on average, the temperature of the softmax is raised
+_MIN_VARIANCE = 1e-8  # smaller variances of distances are rounding errors
 
 
 class WhitenedHead(Head):

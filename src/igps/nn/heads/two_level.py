@@ -16,12 +16,9 @@ from igps.retrieval.vectors import MOST_NUMBERS
 
 # Usual distance of a training shape from the mean, as in many dimensions most pairs of shapes are nearly orthogonal.
 _USUAL_LENGTH = MEDIAN / math.sqrt(2)
-# Exponent of the factor that rises from 0 to 1 at the scales of the body heads.
-_STEEPNESS = 10
-# Share of the squared length of an embedding that belongs to the individual head.
-_INDIVIDUAL_SHARE = 0.1
-# Distance by the individual head at which most of its weight counts.
-_INDIVIDUAL_SCALE = 0.3
+_STEEPNESS = 10  # exponent of the factor that rises from 0 to 1 at the scales of the body heads
+_INDIVIDUAL_SHARE = 0.1  # share of the squared length of an embedding that belongs to the individual head
+_INDIVIDUAL_SCALE = 0.3  # distance by the individual head at which most of its weight counts
 
 
 class TwoLevelHead(Head):

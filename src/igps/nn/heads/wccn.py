@@ -22,12 +22,9 @@ from igps.nn.heads.base import (
 )
 from igps.retrieval.distances import square_root
 
-# Principal directions of a part that are whitened; the other directions are discretisation errors.
-_N_PRINCIPAL = 500
-# Median distance of training shapes in vectors with lengths, so that all shapes fit in a sphere of radius 1.
-MEDIAN = 0.5
-# Training shapes, at least, that the median is computed from.
-_N_MEDIAN_SHAPES = 1000
+_N_PRINCIPAL = 500  # principal directions of a part that are whitened; the others contain discretisation errors
+MEDIAN = 0.5  # median distance of training shapes, with lengths, so that all shapes fit in a sphere of radius 1
+_N_MEDIAN_SHAPES = 1000  # number of training shapes, about, that the median is computed from
 
 
 class WCCNHead(Head):

@@ -123,10 +123,7 @@ def joint(memberships: list[Tensor]) -> Tensor:
 
 
 def counted(first: Tensor, second: Tensor, n_points: Tensor) -> Tensor:
-    """Return the shares (..., C, D) of points in combinations of classes, from memberships (..., P, C), (..., P, D).
-
-    Raises a ValueError if `n_points` (...), the number of points of each body, is 0.
-    """
+    """Return the shares (..., C, D) of at least one point in combinations of classes (..., P, C) and (..., P, D)."""
     if not torch.compiler.is_compiling() and int(n_points.min()) < 1:
         raise ValueError("samples: expected at least one of each body, got none.")
     return first.mT @ second / n_points[..., None, None]
