@@ -71,14 +71,12 @@ def test_needs() -> None:
 
 
 def test_what_it_cannot_count_is_named() -> None:
-    with pytest.raises(
-        ValueError, match=r"axes: expected at least one, and all of points, got \['EuclideanDistance'\]"
-    ):
+    with pytest.raises(ValueError, match=r"axes: expected one or several axes of points, got \['EuclideanDistance'\]"):
         PointHistogram([EuclideanDistance()])  # type: ignore[list-item]
     with pytest.raises(ValueError, match="axes: expected at least one"):
         PointHistogram([])
     batch = two_bodies()
-    with pytest.raises(ValueError, match="samples: expected surface samples, which balls touch, got interior ones"):
+    with pytest.raises(ValueError, match="samples: expected surface samples for ball radii, got interior samples"):
         BallRadius().values(SampleFeatures(batch, "interior", batch.interior), SpectralEmbedding())
     with pytest.raises(ValueError, match="side: expected one of inside, outside, got 'left'"):
         BallRadius("left")  # type: ignore[arg-type]

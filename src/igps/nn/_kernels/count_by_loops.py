@@ -19,10 +19,10 @@ from igps.nn._kernels.pair_loops import count_block, gradient_block
 from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
 from igps.nn._precision import full_precision
 
-# Values in a block, which fit in a core's second-level cache; more could overflow the integers of `pair_sums`.
+# Maximum number of values in a block, so that they stay in a core's second-level cache, and of its columns. A larger
+# block could overflow the integers of `pair_sums`.
 _BLOCK_SIZE, _MAX_COLUMNS = 2**18, 2048
-# Rows of a block whose inner products are computed by one matrix product.
-_STRIP_ROWS = 128
+_STRIP_ROWS = 128  # rows of a block whose inner products are computed by one matrix product
 # Shares of the blocks that threads process in parallel. Each share has its own counts; with more counts than the
 # maximum, there is only one share, as several would take gigabytes.
 _N_SHARES, _MAX_COUNTS = 4, 2**24
@@ -31,7 +31,7 @@ Blocks = Sequence[tuple[int, int]]
 
 
 class Layout(NamedTuple):
-    """The arguments of a count without gradients, see `count_pairs`."""
+    """The arguments of `count_pairs` for which no gradient is computed."""
 
     classes: Tensor
     n_classes: int

@@ -11,10 +11,9 @@ from igps._compiled import compiled
 Numbers = NDArray[Any]
 Indices = NDArray[np.int32]
 
-# How the loops obtain the values of axes: given; distances, from inner products; three cosines, from oriented points.
+# Kinds of axes: values that are passed in; distances, from inner products; three cosines at once, from oriented points.
 VALUES, DISTANCES, COSINES = 0, 1, 2
-# Upper bound of the numbers that a compiled loop processes at once.
-_MAX_VECTOR = 32
+_MAX_VECTOR = 32  # upper bound of the numbers that a compiled loop processes at once
 
 
 class Axes(NamedTuple):
@@ -26,14 +25,14 @@ class Axes(NamedTuple):
     centres: Numbers  # (K, B) ascending; the number of centres differs between axes
     n_centres: Integers  # (K,) number of centres of each axis
     inverse_gaps: Numbers  # (K, B − 1) 1 / gap between centres; for equal gaps, the first entry is 1 / mean gap
-    has_equal_gaps: Booleans  # (K,)
+    has_equal_gaps: Booleans  # (K,) whether all gaps are equal
 
 
 class Row(NamedTuple):
     """Results for the pairs of one row of a block, with an entry for each of J columns."""
 
-    cells: Indices  # (J,) index of the cell between the centres below and above the values
-    shares: Numbers  # (K, J) position of the value between the centres below and above, from 0 to 1
+    cells: Indices  # (J,) index of the cell of each pair, over all axes
+    shares: Numbers  # (K, J) position of the value between the centres below and above it, from 0 to 1
     features: Numbers  # (S, 5, J) see `cosines`
     interval: Indices  # (J,) scratch space
 

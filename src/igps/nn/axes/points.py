@@ -137,7 +137,7 @@ class BallRadius(PointAxis):
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """Return the logarithms (N, P) of the radii over √area; raise a ValueError for interior samples."""
         if features.kind != "surface":
-            raise ValueError("samples: expected surface samples, which balls touch, got interior ones.")
+            raise ValueError("samples: expected surface samples for ball radii, got interior samples.")
         return features.ball_radii()[..., _SIDES.index(self.side)].log()
 
 

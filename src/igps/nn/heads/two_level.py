@@ -24,25 +24,24 @@ _INDIVIDUAL_SCALE = 0.3  # distance by the individual head at which most of its 
 class TwoLevelHead(Head):
     """Maps histograms to unit vectors, with a distance that ranks other poses of a body first, then its class.
 
-    An embedding concatenates the embedding of a class head, a `WCCNHead` fitted to classes, and those of body heads,
-    which have lengths, are fitted to bodies, and tell whether two shapes are the same body. The distance is the cosine
-    distance of the class embeddings, times the factor 1 − exp(−Σ (dₖ / sₖ)¹⁰), where dₖ are the distances by the body
-    heads and sₖ their scales. The factor is nearly 0 if all dₖ are below their scales, as between poses of a body, and
-    nearly 1 if any is above its scale. It saturates because the difference of two bodies does not predict their
-    classes.
+    An embedding concatenates the embeddings of a class head, a `WCCNHead` fitted to classes, and of body heads, which
+    are `WCCNHead`s with `lengths`, fitted to bodies in several poses. The distance is the cosine distance of the class
+    embeddings, times the factor 1 − exp(−Σ (dₖ / sₖ)¹⁰), where dₖ are the distances by the body heads and sₖ their
+    scales. The factor is nearly 0 if all dₖ are below their scales, as between poses of a body, and nearly 1 if any is
+    above its scale. It saturates, because the size of the difference between two bodies does not predict their classes.
 
     Far from the mean of the training shapes, distances between different bodies are as small as distances between poses
     elsewhere. The scales are therefore multiplied by √(ℓ₀ / ℓ). Here ℓ² is the product of the distances of the two
     shapes from the mean, each in quadratic mean over the body heads, and ℓ₀ is the usual distance.
 
-    Bodies can be nearly alike, such as two people. An individual head, which has lengths, is fitted by
+    Bodies can be nearly alike, such as two people. An individual head, a `WCCNHead` with `lengths`, is fitted by
     `fit_individuals` to individuals in several poses, so that it ignores the effects of bending and triangulation. With
     f its distance and w its weight, the distance is (1 − w) times the distance above plus w (1 − exp(−(f / 0.3)²)).
     This small term orders the shapes that the body heads consider the same body.
 
-    The cosine distance of whole embeddings is close to that of the class embeddings. Search engines with only cosine
-    distances find candidates by it, or by the cosine distance of `short` vectors; candidates are then ranked by
-    `distances`.
+    The cosine distance of whole embeddings is close to the cosine distance of the class embeddings. Search engines that
+    only support cosine distances find candidates by whole embeddings or by `short` vectors; the candidates are then
+    ranked by `distances`.
 
     Args:
         class_head: fitted to classes.
@@ -77,7 +76,7 @@ class TwoLevelHead(Head):
         self.body_heads = nn.ModuleList(body_heads or [WCCNHead(n_directions=64, shrinkage=0.3, lengths=True)])
         if len(scales) != len(self.body_heads) or min(scales) <= 0 or not 0 < share < 1:
             raise ValueError(
-                f"scales, share: expected a positive number for each of {len(self.body_heads)} body heads, and one "
+                f"scales, share: expected a positive scale for each of {len(self.body_heads)} body heads, and a share "
                 f"between 0 and 1, got {tuple(scales)} and {share}."
             )
         self.individual_head = individual_head

@@ -77,7 +77,7 @@ class WCCNHead(Head):
         self._note_buffers()
         n_parts = len(self.part_cells)
         if self._parts is not None and not set(self._parts) <= set(range(n_parts)):
-            raise ValueError(f"parts: expected some of 0 to {n_parts - 1}, got {self._parts}.")
+            raise ValueError(f"parts: expected indices from 0 to {n_parts - 1}, got {self._parts}.")
         used = self._select_parts(roots)
         self.mean = used.mean(dim=0)
         self.directions = used.new_zeros(self.n_directions, len(self.mean))

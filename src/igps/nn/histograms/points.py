@@ -41,8 +41,8 @@ class PointHistogram(AxesHistogram):
         super().__init__(samples, n_samples, n_training_samples)
         if not axes or not all(isinstance(axis, PointAxis) for axis in axes):
             raise ValueError(
-                f"axes: expected at least one, and all of points, got {[type(axis).__name__ for axis in axes]}. Axes "
-                "of pairs belong to a PairHistogram."
+                f"axes: expected one or several axes of points, got {[type(axis).__name__ for axis in axes]}. Axes of "
+                "pairs belong to a PairHistogram."
             )
         self.axes = nn.ModuleList(axes)
         self.embedding = embedding or SpectralEmbedding()
