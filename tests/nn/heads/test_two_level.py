@@ -258,7 +258,7 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
         TwoLevelHead(scales=[0.0])
     with pytest.raises(ValueError, match=r"a positive scale for each of 1 body heads, .* got \(0.1, 0.2\)"):
         TwoLevelHead(scales=[0.1, 0.2])
-    with pytest.raises(ValueError, match=r"one between 0 and 1, got \(0.1,\) and 1"):
+    with pytest.raises(ValueError, match=r"a share between 0 and 1, got \(0.1,\) and 1"):
         TwoLevelHead(share=1)
     with pytest.raises(ValueError, match="body_heads, individual_head: expected heads with lengths"):
         TwoLevelHead(body_heads=[WCCNHead()])
