@@ -61,8 +61,7 @@ def full_precision() -> AbstractContextManager[None]:
     `torch.set_float32_matmul_precision("medium")` and similar settings of `torch.backends` allow TF32 or bfloat16. A
     distance from inner products would then be wrong by 10⁻³ to 10⁻² of the largest, and fall into another bin.
 
-    The settings belong to the process: they hold for all threads while any thread is inside the context, and are
-    restored when the last one leaves it. Code traced by `torch.compile` or `torch.export` runs later, under the
-    settings of that time.
+    While any thread is inside, the settings hold for all threads of the process; the last thread that leaves restores
+    them. Code traced by `torch.compile` or `torch.export` runs later, under the settings of that time.
     """
     return nullcontext() if torch.compiler.is_compiling() else _setting()

@@ -113,8 +113,7 @@ def describe(
 def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
     """Fit the centres of quantile axes to the samples of a collection, and return whether any axis needed it.
 
-    Axes that are fitted already stay unchanged. Each body contributes its first 500 samples, so that bodies have equal
-    weight. Raises a ValueError if the samples lack the attribute of an axis.
+    Fitted axes stay unchanged. Each body contributes its first 500 samples. A missing attribute raises a ValueError.
     """
     axes = [axis for axis in descriptor.modules() if isinstance(axis, Attribute) and not axis.is_fitted]
     values: list[list[Singles]] = [[] for _ in axes]

@@ -130,8 +130,7 @@ class Descriptor(Specified, ABC):
 
         Args:
             descriptions: (N, ...).
-            of_one_kind: whether all bodies are of one kind, such as an organ; entries that tell kinds apart may be
-                left out then.
+            of_one_kind: whether all bodies are of one kind, such as an organ; entries for kinds may then be left out.
         """
         rows = descriptions.flatten(1)
         return rows.sqrt() if self.searched_by == "chi_square" else rows

@@ -64,8 +64,7 @@ class RetrievalLearner(LightningModule):
         learning_rate: of the head, with cosine decay over the epochs.
         bin_rate: learning rate of the descriptor's parameters.
         weight_decay: of the head only.
-        miner: maps embeddings and labels to the pairs or triplets that a loss of `pytorch-metric-learning` uses; if
-            None, the loss uses the whole batch.
+        miner: of `pytorch-metric-learning`, selects the pairs or triplets that the loss uses; if None, it uses all.
 
     Raises:
         ValueError: the descriptor has entries other than histograms, such as `molecular` with size.

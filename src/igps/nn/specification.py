@@ -35,7 +35,6 @@ _CLASS = re.compile(r"igps\.(?:nn|descriptors)(?:\.[a-z0-9_]+)*\.[A-Z][A-Za-z0-9
 # Limits on what a hostile file can allocate: modules, a single number, and the product of the numbers of a head, whose
 # memory can exceed the size of the file.
 _MAX_MODULES, _MAX_NUMBER, _MAX_PARAMETERS = 200, 100_000, 1_000_000
-
 # Errors that a damaged file can raise.
 _UNREADABLE = (SafetensorError, OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ImportError)
 
@@ -169,9 +168,7 @@ def _is_plain(name: str, value: Any) -> bool:
 def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     """Load a module that `save_module` wrote, in evaluation mode, and its card. No code of the file runs.
 
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file has another format, or is damaged.
+    Raises a FileNotFoundError for a missing file, and a ValueError for a damaged file or another format.
     """
     path = Path(path)
     path = path / IN_FOLDER if path.is_dir() else path

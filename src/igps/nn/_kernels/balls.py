@@ -82,9 +82,7 @@ def _columns(vectors: Tensor) -> Singles:
 
 
 @compiled()
-def write_curvatures(
-    points: NDArray[Real], directions: NDArray[Real], min_sine: float, curvatures: NDArray[Real]
-) -> None:
+def write_curvatures(points: NDArray[Real], directions: NDArray[Real], min_sine: float, out: NDArray[Real]) -> None:
     """Write 1 / radius of each point's balls, of the third smallest radius on each side; 0 if there is none.
 
     Pairs are processed row by row, without a matrix of all pairs.
@@ -92,7 +90,7 @@ def write_curvatures(
     Args:
         points, directions: (3, P).
         min_sine: points at a smaller angle to the tangent plane are ignored.
-        curvatures: (P, 2) to write, inside and outside; must be 0.
+        out: (P, 2) to write, inside and outside; must be 0.
     """
     n = points.shape[1]
     one = points.dtype.type(1)
@@ -119,4 +117,4 @@ def write_curvatures(
                         second, third = curvature, second
                     else:
                         third = curvature
-            curvatures[i, side] = third
+            out[i, side] = third

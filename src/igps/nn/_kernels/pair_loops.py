@@ -48,8 +48,7 @@ def count_block(
     n_corners = 1 << n_axes
     n_cells = total.shape[1] // n_corners
     n_classes = int(np.sqrt(2.0 * len(total)))
-    # Sums of a row, or of consecutive rows in the same classes, for each class of the column's point. The cells of a
-    # class start at its home.
+    # Sums of consecutive rows in the same classes, by the class of the column's point, whose cells start at its home.
     sums = np.zeros((n_classes * n_cells, n_corners))
     by_class = sums.reshape((n_classes, n_cells * n_corners))
     home = (classes[:, column : column + n_columns] * n_cells).astype(np.int32)
@@ -96,8 +95,7 @@ def gradient_block(
     """Compute the gradient of `count_block`, which takes the same first arguments.
 
     Args:
-        values: as in `count_block`; overwritten with the derivatives by the values, or by the squares of distances; 0
-            where there is no pair.
+        values: overwritten with the derivatives by them, or by squared distances; 0 where there is no pair.
         upstream: (C(C+1)/2, cells·2^K) derivatives by the counts.
         by_cosines: (S, 4, I, J) to fill, for each triple of cosines, with the derivatives by u·(y − x), v·(x − y), u·v
             and |y − x|², where x and u are the point and direction of the row, y and v those of the column.

@@ -33,9 +33,8 @@ def count_pairs(classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequenc
     """Return the share of all pairs of points in each pair of classes and in each bin, for N shapes.
 
     An unordered pair of distinct points counts once. Each point belongs to M classes, with weights of sum 1; the pair
-    counts in every combination of the classes of its points, with the product of their weights. Along each axis, the
-    pair is shared linearly between the two bins whose centres surround its value. Values beyond the outer centres count
-    in the outer bins.
+    counts in every combination of the classes of its points, with the product of their weights. Along each axis, it is
+    shared linearly between the two bins whose centres surround its value; beyond the outer centres, it counts there.
 
     Args:
         classes: (N, P, M) integers from 0 to C − 1.

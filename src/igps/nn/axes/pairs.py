@@ -20,8 +20,7 @@ class PairAxis(Specified, ABC):
     """Base class of axes of pairs: a pair counts in the two bins whose centres surround its value, linearly.
 
     An axis of your own defines `shape` and `pairs`, and `requirements` if it needs more than the samples. `pairs`
-    returns the features of the samples that the values are computed from, together with the function that computes
-    them; see `euclidean_distances` for distances of points.
+    returns features of the samples and a function that computes values from them, as `euclidean_distances` does.
 
     Example:
         The difference in depth between two samples.

@@ -147,8 +147,7 @@ class Attribute(PointAxis):
     Args:
         name: of the attribute.
         centres: of the classes, ascending, in the attribute's unit; None with `quantiles`.
-        quantiles: number of classes whose centres are quantiles of a collection, see `fit_centres`. The fitted centres
-            are saved with the descriptor.
+        quantiles: number of classes with quantiles of a collection as centres, see `fit_centres`; they are saved.
         soft, learnable: see `PointAxis`.
 
     Raises:

@@ -91,9 +91,8 @@ class ClassifierHead(KernelHead):
         scores, predicted = self.scores(descriptions).max(dim=1)
         of_parts = self._distances(self._vectors(descriptions)) / self.medians[:, None, None]
         distances = torch.einsum("k,kij->ij", self.shares, of_parts)
-        is_other = self.members != predicted[:, None]
-        n_nearest = min(_N_NEAREST, len(self.members))
-        nearest = distances.masked_fill(is_other, math.inf).topk(n_nearest, largest=False).values
+        other = self.members != predicted[:, None]
+        nearest = distances.masked_fill(other, math.inf).topk(min(_N_NEAREST, len(self.members)), largest=False).values
         is_real = torch.isfinite(nearest)  # a class may have fewer shapes
         return nearest.where(is_real, 0).sum(dim=1) / is_real.sum(dim=1) - scores
 

@@ -21,10 +21,9 @@ from igps.signature.signature import SampleKind
 class PairHistogram(AxesHistogram):
     """The joint histogram of all pairs of samples of each body, along one or several axes.
 
-    The axes of points sort the samples into classes. There are C combinations of their classes, and the histogram has a
-    row for every unordered pair of combinations. The axes of pairs are the other dimensions. Each unordered pair of
-    distinct samples counts once; the cells of a body sum to 1. By default, the axes are those of Rustamov (2010), the
-    potential and the interior distance.
+    The axes of points sort the samples into C classes, the combinations of the classes of each axis. The histogram has
+    a row for every unordered pair of classes; the axes of pairs are the other dimensions. Each unordered pair of
+    distinct samples counts once, and the cells of a body sum to 1. The default axes are those of Rustamov (2010).
 
     Example:
         >>> import trimesh
