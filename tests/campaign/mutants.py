@@ -78,7 +78,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "n_directions: int = 59,",
         ),
         # Points whose classes are not side by side only cost time.
-        ("src/igps/nn/_kernels/count_by_loops.py", "key = key * layout.n_classes - torch.where(shares > 0, classes, 0)"),
+        ("src/igps/nn/_kernels/count_by_loops.py", "key = key * layout.n_classes - torch.where(share > 0, classes, 0)"),
         # No resolution is larger than the finest: one that is asked for is refused before, one that grows is cut.
         ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == finest:"),
         # Nothing compares two of them.

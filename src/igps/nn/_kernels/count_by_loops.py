@@ -108,8 +108,8 @@ class _Members:
 
     def __init__(self, layout: Layout, weights: Tensor) -> None:
         key = torch.zeros_like(layout.classes[..., 0])
-        for classes, shares in zip(layout.classes.unbind(2), weights.unbind(2), strict=True):
-            key = key * layout.n_classes + torch.where(shares > 0, classes, 0)
+        for classes, share in zip(layout.classes.unbind(2), weights.unbind(2), strict=True):
+            key = key * layout.n_classes + torch.where(share > 0, classes, 0)
         last = torch.iinfo(key.dtype).max  # sorts padding to the end
         self.order = torch.argsort(key.masked_fill(~layout.mask, last), dim=1, stable=True)
         by_order = self.order.unsqueeze(2).expand_as(layout.classes)

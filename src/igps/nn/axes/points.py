@@ -191,7 +191,7 @@ class Attribute(PointAxis):
         """Raise a ValueError if the centres have not been fitted."""
         if not self.is_fitted:
             raise ValueError(
-                f"{self.name}: expected centres, got {self.quantiles} quantiles that are not fitted to a collection. "
+                f"{self.name}: expected centres, got {self.quantiles} quantiles that are not fitted. "
                 "Call igps.nn.fit_centres(descriptor, dataset), or use the file descriptor.safetensors that `igps "
                 "retrieve --out` writes."
             )
