@@ -77,7 +77,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "n_directions: int = 59,",
         ),
         # The order of the points affects only the time.
-        ("src/igps/nn/_kernels/count_by_loops.py", "key = key * layout.n_classes - torch.where(own > 0, classes, 0)"),
+        ("src/igps/nn/_kernels/count_by_loops.py", "key = key * layout.n_classes - torch.where(share > 0, classes, 0)"),
         # No resolution is above the finest: larger arguments are refused before, and increments are clipped.
         ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == finest:"),
         # No code compares two instances.

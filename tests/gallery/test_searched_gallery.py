@@ -531,7 +531,7 @@ def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
     assert "expected a gallery or a new folder, got a folder with ball" in told
     with_attribute = ["--out", tmp_path / "g", "--attribute", "ct=ct/{file}.nii.gz", "--with", "ct"]
     told = error_of(monkeypatch, capsys, *words, *with_attribute)
-    assert "ct: expected centres, got 8 quantiles of no collection" in told
+    assert "ct: expected centres, got 8 quantiles that are not fitted" in told
 
 
 def test_a_gallery_remembers_the_table_of_names(
