@@ -207,7 +207,7 @@ def test_a_probability_is_that_of_all_arrangements() -> None:
         ({"groups": ["a"] * 21 + ["b"] * 3}, "b has 3"),
         ({"groups": ["a"] * 24}, "expected two groups, got a alone"),
         ({"strata": PAIR}, "within strata the groups can be arranged in only 1 ways"),
-        ({"covariates": np.repeat([[0.0], [1.0]], 12, axis=0)}, "tell the groups apart by themselves"),
+        ({"covariates": np.repeat([[0.0], [1.0]], 12, axis=0)}, "covariates or strata determine the groups"),
         ({"vectors": np.ones((24, 3))}, "do not differ"),
         ({"covariates": np.random.default_rng(0).normal(size=(24, 21))}, "too few"),
     ],
