@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from igps.analysis.groups import GroupTest, group_test, squared_distances, with_discovery_rates
+from igps.analysis.groups import GroupTest, group_test, squared_distances, with_q_values
 
 PAIR = ["a"] * 12 + ["b"] * 12
 
@@ -224,11 +224,11 @@ def test_what_makes_no_sense_is_refused(given: dict[str, object], why: str) -> N
 def test_discovery_rates_are_over_what_was_tested() -> None:
     tests = [GroupTest(str(i), {}, permanova_p=p, kernel_p=p) for i, p in enumerate((0.01, 0.04, 0.03))]
     refused = GroupTest("no", {}, refused="too few")
-    found = with_discovery_rates([tests[0], refused, *tests[1:]])
+    found = with_q_values([tests[0], refused, *tests[1:]])
     assert found[1] is refused
     assert [one.permanova_q for one in found] == pytest.approx([0.03, None, 0.04, 0.04])
-    assert with_discovery_rates([refused]) == [refused]
-    same = with_discovery_rates([replace(one, body="all") for one in tests])
+    assert with_q_values([refused]) == [refused]
+    same = with_q_values([replace(one, body="all") for one in tests])
     assert [one.permanova_p for one in same] == [0.01, 0.04, 0.03]
 
 

@@ -52,16 +52,7 @@ def examine(
     limits: Limits | None = None,
     progress: bool = True,
 ) -> list[Finding]:
-    """Read and mend every body as for its signature, and return the findings in the order of the bodies.
-
-    Args:
-        files: the bodies.
-        reading: how files are read; the defaults if None.
-        config: parameters of the signatures; the defaults if None.
-        n_workers: number of worker processes; all cores if None.
-        limits: time and memory that one file may take.
-        progress: whether to show a progress bar.
-    """
+    """Read and mend every body as for its signature, and return the findings in order; `limits` apply to each file."""
     jobs = group_by_file(files, range(len(files)))
     examine_file = partial(_examine_file, reading or LoadOptions(), config or SignatureConfig())
     outcomes = run(examine_file, [[files[i] for i in job] for job in jobs], n_workers=n_workers, limits=limits)

@@ -74,7 +74,7 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     if len(one) != 1 or len(other) != 1:
         raise ValueError(f"one, other: expected a body each, got {len(one)} and {len(other)}.")
     descriptor = copy.deepcopy(descriptor).double().eval()
-    contents, pair = contents_of(descriptor), (_with_weights(one), _with_weights(other))
+    contents, pair = without_head(descriptor), (_with_weights(one), _with_weights(other))
     first, second = torch.cat([contents(batch).detach().flatten(1) for batch in pair])
     units, distance = unit_shares(descriptor, first, second)
     shares = units * (first - second)
@@ -89,7 +89,7 @@ def _place_shares(body: SignatureBatch, other: SignatureBatch, samples: Shares, 
     return {"interior": np.zeros(len(samples["interior"])), "surface": distance / 2 * weights / weights.sum()}
 
 
-def contents_of(descriptor: Descriptor) -> Descriptor:
+def without_head(descriptor: Descriptor) -> Descriptor:
     """Return the descriptor without its head: it describes the histogram cells, followed by side and size, if any."""
     histograms = _histograms(descriptor)
     return descriptor.wrap(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
@@ -100,7 +100,7 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
 
     Args:
         descriptor: see `explain`, in double precision.
-        one, other: (cells,) contents, see `contents_of`. Side and size vary linearly on the line of `explain`.
+        one, other: (cells,) contents, see `without_head`. Side and size vary linearly on the line of `explain`.
 
     Returns:
         (cells,) shares of a unit in the first body (negated: in the second), and the distance.
@@ -272,7 +272,7 @@ def explain_groups(
 
     Args:
         descriptor: see `explain`.
-        one, other: (N, ...) contents of the bodies of each group, see `contents_of`.
+        one, other: (N, ...) contents of the bodies of each group, see `without_head`.
         batches: two bodies whose samples receive shares, one of each group.
         test: options of `significant_cells`.
 

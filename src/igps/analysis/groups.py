@@ -13,9 +13,8 @@ from scipy.optimize import brentq
 from igps._arrays import Floats, Integers
 from igps._parameters import check_at_least
 
-FEWEST = 5
-"""Smallest size of a group for a test."""
-_MIN_ARRANGEMENTS = 100  # different permutations; with fewer, no small p-value is possible
+_MIN_GROUP_SIZE = 5  # for a test
+_MIN_ARRANGEMENTS = 100  # different permutations; fewer allow no small p-value
 _BLOCK = 2**24  # entries of permuted designs in memory at once
 _BODIES_PER_DEGREE = 10  # bodies per degree of freedom of the whitening, a usual rule of regression
 _MAX_RANK_SHARE = 0.9  # upper bound of the degrees of freedom of the whitening, over the rank
@@ -41,7 +40,7 @@ class GroupTest:
     effect: float | None = None
     effect_low: float | None = None
     effect_high: float | None = None
-    auc: float | None = None  # area under the curve of a ridge classifier, cross-validated, mean over the groups
+    auc: float | None = None  # area under the curve of a ridge classifier, cross-validated, group mean; 0.5 for chance
     refused: str | None = None  # reason for no test
 
 
@@ -92,13 +91,11 @@ def group_test(
     n = len(vectors)
     strata = ["all"] * n if strata is None else strata
     group, stratum = (np.unique(np.asarray(names), return_inverse=True)[1] for names in (groups, strata))
-    nuisance = (
-        np.ones((n, 0)) if covariates is None else np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
-    )
-    for name, count in (("groups", len(groups)), ("strata", len(stratum)), ("covariates", len(nuisance))):
+    design = np.ones((n, 0)) if covariates is None else np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
+    for name, count in (("groups", len(groups)), ("strata", len(stratum)), ("covariates", len(design))):
         if count != n:
             raise ValueError(f"{name}: expected one for each of {n} bodies, got {count}.")
-    for name, numbers in (("vectors", vectors), ("covariates", nuisance)):
+    for name, numbers in (("vectors", vectors), ("covariates", design)):
         if not np.isfinite(numbers).all():
             raise ValueError(f"{name}: expected finite numbers. Leave out bodies that have none.")
     untested = GroupTest(body, dict(sorted(Counter(groups).items())))
@@ -107,11 +104,9 @@ def group_test(
     # Orthonormal bases: of the nuisance terms (means of strata, then covariates), and of what the groups add to these.
     # A permutation within strata changes the covariates, but not the means of strata
     means = _orthonormal(_indicators(stratum), _ROUNDING)
-    nuisance = nuisance / np.maximum(
-        np.abs(nuisance).max(axis=0, initial=0), np.finfo(float).tiny
-    )  # independent of units
-    nuisance = _orthonormal(nuisance - nuisance.mean(axis=0), _ROUNDING)
-    permuted = _orthonormal(nuisance - means @ (means.T @ nuisance), _ROUNDING)
+    design = design / np.maximum(np.abs(design).max(axis=0, initial=0), np.finfo(float).tiny)  # whatever the units
+    design = _orthonormal(design - design.mean(axis=0), _ROUNDING)
+    permuted = _orthonormal(design - means @ (means.T @ design), _ROUNDING)
     nuisance = np.column_stack([means, permuted])
     indicators = _indicators(group)
     added = _orthonormal(indicators - nuisance @ (nuisance.T @ indicators), 1e-6)
@@ -141,9 +136,7 @@ def group_test(
         part = slice(first, first + len(orders))
         of_groups[part], of_covariates[part] = _traces(gram, added, orders), _traces(gram, permuted, orders)
         of_kernel[part], overlap[part] = _traces(kernel, added, orders), _traces(permuted @ permuted.T, added, orders)
-    share = of_groups / np.maximum(
-        np.trace(gram) - of_covariates, np.finfo(float).tiny
-    )  # increases with pseudo-F, up to 1
+    share = of_groups / np.maximum(np.trace(gram) - of_covariates, np.finfo(float).tiny)  # grows with pseudo-F, to 1
     # Covariates explain a share of the permuted groups, which the kernel of the residuals cannot contain
     unexplained = np.maximum(1 - overlap / added.shape[1], _ROUNDING)
     # For the effect, the added part is rotated to the group means, and the remainder is scaled up to the variance
@@ -171,7 +164,7 @@ def group_test(
     )
 
 
-def with_discovery_rates(tests: Sequence[GroupTest]) -> list[GroupTest]:
+def with_q_values(tests: Sequence[GroupTest]) -> list[GroupTest]:
     """Return the tests with their q-values over all bodies that were tested (Benjamini and Hochberg 1995)."""
     from scipy.stats import false_discovery_control
 
@@ -189,8 +182,8 @@ def _obstacle(sizes: Mapping[str, int], group: Integers, stratum: Integers) -> s
     if len(sizes) < 2:
         return f"expected two groups, got {', '.join(sizes) or 'none'} alone."
     smallest = min(sizes, key=lambda name: sizes[name])
-    if sizes[smallest] < FEWEST:
-        return f"{smallest} has {sizes[smallest]} bodies, a test needs at least {FEWEST} in each group."
+    if sizes[smallest] < _MIN_GROUP_SIZE:
+        return f"{smallest} has {sizes[smallest]} bodies, a test needs at least {_MIN_GROUP_SIZE} in each group."
     counts = np.zeros((stratum.max() + 1, group.max() + 1), dtype=int)
     np.add.at(counts, (stratum, group), 1)
     log_ways = sum(math.lgamma(row.sum() + 1) - sum(math.lgamma(k + 1) for k in row) for row in counts)

@@ -29,11 +29,7 @@ class BodyMap:
 
 
 def checked_distances(distances: Floats) -> Floats:
-    """Return distances (N, N) made symmetric by the mean of both directions, with a zero diagonal.
-
-    Raises:
-        ValueError: the shape is not (N, N) with N ≥ 3, or a distance is not finite.
-    """
+    """Return symmetric distances (N, N) with a zero diagonal; raise a ValueError for another shape, N < 3, or NaN."""
     square = np.asarray(distances, dtype=float)
     if square.ndim != 2 or len(square) != square.shape[-1] or len(square) < 3:
         raise ValueError(f"distances: expected (N, N) between three bodies or more, got {square.shape}.")

@@ -50,11 +50,7 @@ def gap_root(mask: Booleans, sides: Floats) -> float:
     """Return the root of the number of voxels in gaps (tunnels, notches and clefts), over that of the body.
 
     Gaps are the voxels that morphological closing (Matheron 1975) adds: no ball outside the body reaches them. The
-    radius of the ball is four fifths of that of the largest ball inside the body.
-
-    Args:
-        mask: voxels of the body.
-        sides: (3,) side lengths of a voxel.
+    radius of the ball is 0.8 times that of the largest ball inside the body. Voxels have side lengths `sides` (3,).
     """
     while mask.size > _MAX_VOXELS:
         mask = np.pad(mask, [(0, n % 2) for n in mask.shape])
@@ -72,14 +68,11 @@ def cut_end(mask: Booleans, at_border: Booleans) -> float:
     """Return how flat the flattest end of a body is along an axis of the grid, as if slices were cut off.
 
     The flatness of an end is the root of the number of voxels in its last slice, minus the root of two fifths of the
-    mean number in the two slices before it, which is typical of a round end.
+    mean number in the two slices before it, which is typical of a round end; at least 0.
 
     Args:
         mask: voxels of the body, in its bounding box.
         at_border: (3, 2) whether each end lies at the border of the volume; such ends do not count.
-
-    Returns:
-        The largest flatness of an end, at least 0.
     """
     flattest = 0.0
     for axis, end in np.argwhere(~at_border):

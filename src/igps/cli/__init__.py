@@ -135,16 +135,7 @@ def main(
 
 
 def check_place(name: str, place: Path | None, endings: Sequence[str] | None) -> None:
-    """Check that an output path has an allowed suffix and can be written.
-
-    Args:
-        name: option that holds the path, for the message.
-        place: the path; None passes.
-        endings: allowed suffixes of a file, see `ENDINGS`; None for a folder.
-
-    Raises:
-        ValueError: another suffix, a folder in place of a file or the reverse, or missing write permission.
-    """
+    """Raise a ValueError if a file with one of the suffixes (see `ENDINGS`), or a folder if None, cannot be written."""
     if place is None:
         return
     if endings and place.suffix.lower() not in endings:
@@ -157,7 +148,7 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
         kind, other = ("file", "folder") if existing.is_dir() else ("folder", "file")
         raise ValueError(f"{name}: expected a {kind}, {existing} is a {other}. Choose another path.")
     if not os.access(existing, os.W_OK):
-        raise ValueError(f"{name}: no permission to write to {existing}. Choose another path, or change its rights.")
+        raise ValueError(f"{name}: no permission to write to {existing}. Choose another path, or grant the permission.")
 
 
 def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:

@@ -9,12 +9,12 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._parameters import check_at_least, check_share
-from igps.analysis.explanation import Explanation, contents_of, explain_groups, on_surface
+from igps.analysis.explanation import Explanation, explain_groups, on_surface, without_head
 from igps.analysis.explanation import explain as explain_pair
-from igps.analysis.groups import group_test, squared_distances, with_discovery_rates
+from igps.analysis.groups import group_test, squared_distances, with_q_values
 from igps.analysis.outliers import LIMIT, measures_of
 from igps.analysis.outliers import outliers as find_outliers
-from igps.cli.reading import Folder, check_files, described, files_or_folder, is_called_by_file, print_failures
+from igps.cli.reading import Folder, check_files, described, files_or_folder, is_named_after_file, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
@@ -79,13 +79,13 @@ def groups(
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
     n_pairs = len(set(zip(bodies.parts, labels, strict=True)))
-    is_named_by_file = n_pairs == len(bodies) and all(map(is_called_by_file, bodies.names, bodies.parts))
+    is_named_by_file = n_pairs == len(bodies) and all(map(is_named_after_file, bodies.names, bodies.parts))
     if is_named_by_file or n_pairs == len(members) in (len(set(labels)), len(bodies)):
         # These names do not tell organs apart: they are the groups, or the file names of single masks, which may repeat
         # in each group
         members = {"all": list(range(len(bodies)))}
     jobs = [(body + suffix, own, rows[own]) for body, own in members.items() for suffix, rows in vectors.items()]
-    tests = with_discovery_rates([
+    tests = with_q_values([
         group_test(
             rows, labels[own].tolist(), body=body, n_permutations=n_permutations, seed=seed,
             strata=None if stratum is None else stratum[own].tolist(),
@@ -173,13 +173,13 @@ def explain(
         if len(source) != 2:
             raise ValueError(f"meshes: expected two files, or a folder of two classes, got {len(source)} files.")
         check_files(source)
-    contents_of(descriptor_of(descriptor))  # raises for other descriptors before anything is computed
+    without_head(descriptor_of(descriptor))  # raises for other descriptors before anything is computed
     if isinstance(source, Folder):
         folder = Folder(source.root, labelled=True, needs_meshes=True, check=_check_two_classes)
         result = described(folder, descriptor, **reading)
         _check_two_classes(result.dataset.bodies)  # without the bodies that could not be used
         dataset, module, labels = result.dataset, result.descriptor, np.array(result.dataset.bodies.labels)
-        inner, n_workers = contents_of(module), reading.get("n_workers")
+        inner, n_workers = without_head(module), reading.get("n_workers")
         descriptions = describe(dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True)
         members = [np.flatnonzero(labels == name) for name in sorted(set(labels))]
         squares = squared_distances(inner.coordinates(descriptions).double().numpy())

@@ -9,7 +9,7 @@ import numpy as np
 
 from igps.analysis.comparison import Result, check_names
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import Folder, MirrorOption, signatures, sized, with_side, write_notes
+from igps.cli.reading import Folder, MirrorOption, signatures, with_side, with_size, write_notes
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
@@ -54,7 +54,7 @@ def compare(
         size = "ignore"
     check_names([module.name.replace(SIZE, "") if size == "keep" else module.name for module in modules])
     dataset, failures = signatures(Folder(root, labelled=True), modules, n_workers=n_workers, strict=strict, **reading)
-    modules = [descriptor_of(sized(name, size, dataset)) for name in names]
+    modules = [descriptor_of(with_size(name, size, dataset)) for name in names]
     for module in modules:
         fit_centres(module, dataset)
     results: list[Result] = []

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from igps.cli.gallery import as_described
+from igps.cli.gallery import gallery_options
 from igps.cli.reading import Folder, check_files, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
@@ -49,7 +49,7 @@ def duplicates(
     unread: list[Failure] = []
     if is_gallery(root):
         source = Gallery(root)
-        as_described(source, reading)
+        gallery_options(source, reading)
     else:
         source, unread = signatures(Folder(root, needs_meshes=True), [descriptor_of(DESCRIPTOR)], **reading)
     units = [row["unit"] for row in source.rows("unit")] if isinstance(source, Gallery) else source.units()

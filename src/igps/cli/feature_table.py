@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from igps.cli.reading import is_called_by_file
+from igps.cli.reading import is_named_after_file
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import LABELS_FILE, file_name_of, is_number
 from igps.report.tables import write_rows
@@ -52,7 +52,7 @@ def wide_table(metadata: Table, measured: Table) -> Table:
     folders = [PurePath(file).parent.as_posix() for file in metadata["file"]]
     n, parts = len(folders), set(metadata["part"])
     has_one_body_per_file = len(set(metadata["file"])) == n == len(set(zip(folders, metadata["part"], strict=True)))
-    is_named_by_file = all(map(is_called_by_file, metadata["name"], metadata["part"]))
+    is_named_by_file = all(map(is_named_after_file, metadata["name"], metadata["part"]))
     if is_named_by_file and all(part and part.isdigit() for part in parts):
         metadata = {**metadata, "part": [None] * n}
     elif has_one_body_per_file and len(parts) > 1 and (n > len(parts) or is_named_by_file):

@@ -6,7 +6,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igps.cli.reading import Folder, MirrorOption, chosen_dataset, signatures, sized, tell_units, with_side
+from igps.cli.reading import (
+    Folder,
+    MirrorOption,
+    dataset_from_options,
+    print_unit_warning,
+    signatures,
+    with_side,
+    with_size,
+)
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import SIDE, SIZE, Size
@@ -34,7 +42,7 @@ def build(
     check_centres(module)
     tables().check_place(out)
     dataset, unread = signatures(Folder(root), [module], n_workers=n_workers, strict=strict, **reading)
-    descriptor = sized(descriptor, size, dataset)
+    descriptor = with_size(descriptor, size, dataset)
     gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
     _print_state(gallery, [*unread, *undescribed])
 
@@ -42,9 +50,9 @@ def build(
 def add(root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any) -> None:
     """Add the bodies of a folder to a gallery, with the gallery's descriptor; bodies already in it are skipped."""
     opened = Gallery(gallery)
-    reading = as_described(opened, reading)
+    reading = gallery_options(opened, reading)
     dataset, unread = signatures(Folder(root), [opened.descriptor], n_workers=n_workers, strict=strict, **reading)
-    tell_units(opened.descriptor, dataset)
+    print_unit_warning(opened.descriptor, dataset)
     undescribed = opened.add(dataset, n_workers=n_workers, strict=strict, progress=True)
     _print_state(opened, [*unread, *undescribed])
 
@@ -56,8 +64,8 @@ def sync(root: Path, gallery: Path, n_workers: int | None = None, strict: bool =
         root: folder of meshes, with or without classes; the gallery keeps bodies that come from other folders.
     """
     opened = Gallery(gallery)
-    reading = as_described(opened, reading)
-    dataset = chosen_dataset(Folder(root), opened.descriptor.requirements, **reading)
+    reading = gallery_options(opened, reading)
+    dataset = dataset_from_options(Folder(root), opened.descriptor.requirements, **reading)
     n_new, n_gone, failures = sync_folder(opened, dataset, root, n_workers=n_workers, strict=strict, progress=True)
     print(f"{n_new} bodies described, {n_gone} removed")
     _print_state(opened, failures)
@@ -128,19 +136,8 @@ def restore(gallery: Path, version: int) -> None:
     _print_state(opened, [])
 
 
-def as_described(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace the reading options of a command by those with which the gallery was built.
-
-    Args:
-        gallery: an open gallery.
-        reading: the options of the command.
-
-    Returns:
-        The options for `signatures`.
-
-    Raises:
-        ValueError: an option contradicts the gallery.
-    """
+def gallery_options(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
+    """Return reading options with those of the gallery filled in; raise a ValueError if an option contradicts them."""
     options, check = dict(reading), partial(check_alike, gallery.path, gallery.about)
     size, mirror, name = options.pop("size", "auto"), options.pop("mirror", "auto"), gallery.about["descriptor"]
     if size != "auto":

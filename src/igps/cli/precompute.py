@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from igps._parallel import MachineError
-from igps.cli.reading import Folder, chosen_dataset, limits_of, print_failures, signatures
+from igps.cli.reading import Folder, dataset_from_options, limits_of, print_failures, signatures
 from igps.data.pipeline import version
 from igps.data.requirements import Requirements
 from igps.descriptors import descriptor as descriptor_of
@@ -44,7 +44,7 @@ def precompute(
         failures: CSV file for the meshes that cannot be used.
     """
     requirements = reduce(or_, (descriptor_of(name).requirements for name in descriptors), Requirements())
-    dataset = chosen_dataset(Folder(root), requirements, **reading)
+    dataset = dataset_from_options(Folder(root), requirements, **reading)
     dataset = dataset.subset(of_shard(len(dataset), shard))
     if not len(dataset):
         print(f"{root}: no mesh in shard {shard}")
@@ -91,10 +91,9 @@ def of_shard(n_bodies: int, shard: str | None) -> range:
 
 @contextlib.contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
-    """Connect to a Dask scheduler and yield an executor that runs on its workers.
+    """Yield an executor on the workers of a Dask scheduler.
 
     Raises:
-        ImportError: Dask is not installed.
         MachineError: no scheduler answers, or a worker has another version of the library.
     """
     try:

@@ -109,7 +109,7 @@ def signatures(
         source: bodies.
         descriptors: descriptors whose requirements the signatures must meet.
         strict, n_workers, time_limit, memory_limit, reading: options of every command that reads bodies, see
-            `MEANINGS` and `chosen_dataset`.
+            `MEANINGS` and `dataset_from_options`.
 
     Returns:
         The bodies whose signatures are in the cache, and the failures of the others.
@@ -118,7 +118,7 @@ def signatures(
         ValueError: no body could be used.
     """
     requirements = reduce(or_, (d.requirements for d in descriptors), Requirements()) if descriptors else None
-    dataset = chosen_dataset(source, requirements, **reading)
+    dataset = dataset_from_options(source, requirements, **reading)
     is_file = isinstance(source, Folder) and not source.root.is_dir()  # `from_file` has checked its attributes
     for descriptor in () if is_file else descriptors:
         check_attributes(descriptor, {*dataset.config.attributes, *dataset.pipeline.attributes})
@@ -129,7 +129,7 @@ def signatures(
     if summary := mending_summary(usable, len(dataset)):
         print(summary)
     for descriptor in descriptors:
-        tell_reading(descriptor, usable)
+        print_reading_warning(descriptor, usable)
     return usable, failures
 
 
@@ -150,7 +150,7 @@ def described(
         descriptor = with_side(descriptor, mirror, size)
     dataset, failures = signatures(source, [descriptor_of(descriptor)], strict, n_workers, **reading)
     if isinstance(descriptor, str):
-        descriptor = sized(descriptor, size, dataset)
+        descriptor = with_size(descriptor, size, dataset)
     module = descriptor_of(descriptor)
     name = None if fit_centres(module, dataset) else name_of(descriptor)
     undescribed: list[Failure] | None = None if strict else []
@@ -174,7 +174,7 @@ def check_files(paths: Sequence[Path]) -> None:
             raise FileNotFoundError(f"{path}: {reason}.")
 
 
-def is_called_by_file(name: str, part: str | None) -> bool:
+def is_named_after_file(name: str, part: str | None) -> bool:
     """Return whether the part of a body is named after its file, as in a mask without label names."""
     return Path(file_name_of(name, part)).name.startswith(f"{part}.")
 
@@ -197,13 +197,13 @@ def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
     """Return the name, with +side if `mirror` is "distinct"; raise a ValueError if name and options contradict."""
     for option, value, excluded, suffix in (("size", size, "ignore", SIZE), ("mirror", mirror, "same", SIDE)):
         if value == excluded and suffix in (name := descriptor_of(descriptor).name):
-            raise ValueError(f"{option}: expected no {value!r} with {name}, which has {suffix}. Leave out one of both.")
+            raise ValueError(f"{option}: expected no {value!r} with {name}, which has {suffix}. Leave one of them out.")
     if mirror != "distinct" or SIDE in descriptor:
         return descriptor
     return descriptor.replace(SIZE, "") + SIDE + SIZE * (SIZE in descriptor)
 
 
-def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
+def with_size(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
     """Return the name, with +size if size counts by the option and the units; print a warning if that is unclear."""
     module = descriptor_of(descriptor)
     if SIZE in module.name or "scale" not in module.invariant_to:
@@ -218,14 +218,14 @@ def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
     return descriptor + SIZE * is_kept
 
 
-def tell_units(descriptor: Descriptor, dataset: SignatureDataset) -> None:
+def print_unit_warning(descriptor: Descriptor, dataset: SignatureDataset) -> None:
     """Print how many bodies have no unit and count as in millimetres, if the descriptor keeps size."""
     n_unknown = sum(unit not in MILLIMETRES for unit in dataset.units()) if SIZE in descriptor.name else 0
     if n_unknown:
         print(f"size is kept: {n_unknown} of {len(dataset)} bodies have no unit; their numbers count as millimetres")
 
 
-def tell_reading(descriptor: Descriptor, dataset: SignatureDataset) -> None:
+def print_reading_warning(descriptor: Descriptor, dataset: SignatureDataset) -> None:
     """Print a warning if a fitted model was fitted to bodies that were read with other options."""
     fitted = descriptor.card.get("reading")
     if not isinstance(fitted, Mapping):  # not a fitted model, or its card is of an earlier version
@@ -236,7 +236,7 @@ def tell_reading(descriptor: Descriptor, dataset: SignatureDataset) -> None:
         print(f"{descriptor.name} was fitted to bodies read with {', '.join(changed)}: its results may be wrong")
 
 
-def chosen_dataset(
+def dataset_from_options(
     source: Folder | Sequence[Path] | Bodies,
     requirements: Requirements | None,
     cache_dir: Path | None = None,
@@ -257,7 +257,7 @@ def chosen_dataset(
         ValueError: options that contradict each other or the source, or no classes where they are required.
     """
     if paper and signature != SignatureConfig():
-        raise ValueError("paper: expected no other parameters of the signatures with it. Leave out one of both.")
+        raise ValueError("paper: expected no other parameters of the signatures with it. Leave one of them out.")
     config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**options)
     if isinstance(source, Folder) and source.root.is_file() and not is_searched(source.root.name):
         if config != SignatureConfig() or reading != LoadOptions() or classes is not None or attribute:

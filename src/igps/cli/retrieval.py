@@ -13,7 +13,7 @@ from tqdm import tqdm
 from igps._parameters import check_at_least
 from igps.analysis.comparison import pair_distances
 from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
-from igps.cli.gallery import as_described
+from igps.cli.gallery import gallery_options
 from igps.cli.reading import (
     Described,
     Folder,
@@ -21,7 +21,7 @@ from igps.cli.reading import (
     described,
     files_or_folder,
     print_failures,
-    tell_units,
+    print_unit_warning,
     write_notes,
 )
 from igps.cli.report import check_report
@@ -157,7 +157,7 @@ def query(
     check_files([mesh])
     if is_gallery(gallery):
         opened = Gallery(gallery, descriptor)
-        wanted = _describe_one(mesh, opened.descriptor, **as_described(opened, reading))
+        wanted = _describe_one(mesh, opened.descriptor, **gallery_options(opened, reading))
         matches = opened.nearest(wanted, top=top, rerank=rerank, where=where, exact=exact)[0]
         n_missing = sum(not match.path.exists() for match in matches)
         nearest = [(match.name, match.label, match.distance) for match in matches]
@@ -171,10 +171,10 @@ def query(
         bodies, distance = known.dataset.bodies, known.descriptor.distances
         n_listed = min(top, len(bodies))
         n_candidates = min(max(top, N_RERANKED), len(bodies)) if rerank else n_listed
-        found = search(wanted, known.descriptions, top=n_candidates, distance=distance)
+        ranking = search(wanted, known.descriptions, top=n_candidates, distance=distance)
         if rerank:
-            found = rerank_found(wanted, found, lambda indices: known.descriptions[indices], distance, top=n_listed)
-        pairs = zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True)
+            ranking = rerank_found(wanted, ranking, lambda indices: known.descriptions[indices], distance, top=n_listed)
+        pairs = zip(ranking.indices[0].tolist(), ranking.distances[0].tolist(), strict=True)
         labels = bodies.labels or [None] * len(bodies)
         nearest = [(bodies.names[i], labels[i], away) for i, away in pairs]
     rows: list[dict[str, Any]] = [
@@ -193,7 +193,7 @@ def query(
 def _describe_one(mesh: Path, descriptor: Descriptor, **reading: Any) -> Tensor:
     """Return the description (1, ...) of a file with one body, or of one FILE#PART."""
     result = described([mesh], descriptor, **{**reading, "n_workers": 1})
-    tell_units(descriptor, result.dataset)
+    print_unit_warning(descriptor, result.dataset)
     if len(result.dataset) > 1:
         names = ", ".join(result.dataset.bodies.names[:5])
         raise ValueError(
