@@ -55,9 +55,9 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     nonlinear head such as that of `pretrained`. For the χ² distance, the share is the term of the cell; for a squared
     Euclidean distance under a linear head, it is the product of its two factors.
 
-    The share of a cell over the difference of its two contents is the share of one unit of content, positive in the one
-    body and negative in the other. It is passed on to the pairs of samples in the cell, half to each sample of a pair,
-    and from a limb, a piece or an eigenvalue to the samples that it is computed from.
+    The share of a cell divided by the difference of its two contents is the share of one unit of content, positive in
+    the one body and negative in the other. It is passed on to the pairs of samples in the cell, half to each sample of
+    a pair, and from a limb, a piece or an eigenvalue to the samples that it is computed from.
 
     Between poses, most pairs change a little, and these shares spread over the whole body. The field `places` locates
     small differences better: each body has half of the distance, divided among its surface samples in proportion to
@@ -74,8 +74,8 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     if len(one) != 1 or len(other) != 1:
         raise ValueError(f"one, other: expected a body each, got {len(one)} and {len(other)}.")
     descriptor = copy.deepcopy(descriptor).double().eval()
-    contents, pair = without_head(descriptor), (_with_weights(one), _with_weights(other))
-    first, second = torch.cat([contents(batch).detach().flatten(1) for batch in pair])
+    headless, pair = without_head(descriptor), (_with_weights(one), _with_weights(other))
+    first, second = torch.cat([headless(batch).detach().flatten(1) for batch in pair])
     units, distance = unit_shares(descriptor, first, second)
     shares = units * (first - second)
     samples = _sample_shares(descriptor, pair, units, shares)
