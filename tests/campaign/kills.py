@@ -70,7 +70,7 @@ class _Run:
     def blames_mesh(self) -> bool:
         """Whether a mesh was given up because its worker was killed twice."""
         failures = self.out / "failures.csv"
-        return failures.exists() and "killed, twice" in failures.read_text()
+        return failures.exists() and "killed twice" in failures.read_text()
 
     def said(self) -> str:
         return self.out.with_suffix(".log").read_text()[-300:]
