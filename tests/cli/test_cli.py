@@ -417,7 +417,7 @@ def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setattr(cli, "COMMANDS", {"wait": wait})
     with pytest.raises(SystemExit, match="130"):
         igps(monkeypatch, "wait")
-    assert capsys.readouterr().err == "igps: interrupted. Run again to continue: finished work is kept.\n"
+    assert capsys.readouterr().err == "igps: interrupted. Run again to continue: finished results are kept.\n"
 
 
 def test_what_takes_more_memory_than_there_is_is_told_in_a_line(

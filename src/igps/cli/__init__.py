@@ -93,7 +93,7 @@ def faults_in_a_sentence() -> Iterator[None]:
         print(f"igps: {machine_error_text(error) if is_system else error}", file=sys.stderr)  # type: ignore[arg-type]
         sys.exit(2 if is_system or isinstance(error, MachineError) else 1)
     except KeyboardInterrupt:
-        print("igps: interrupted. Run again to continue: finished work is kept.", file=sys.stderr)
+        print("igps: interrupted. Run again to continue: finished results are kept.", file=sys.stderr)
         sys.exit(130)  # the convention of shells: 128 + SIGINT
 
 
