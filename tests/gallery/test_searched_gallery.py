@@ -191,7 +191,7 @@ def test_commands(
     command(monkeypatch, "query", wanted, "--gallery", index, "--top", 4, *cache)
     out = capsys.readouterr().out
     assert out.startswith(expected)
-    assert out.splitlines()[-1] == "1 of these 4 files are no longer where they were when they were described."
+    assert out.splitlines()[-1] == "1 of these 4 files were moved or deleted since they were described."
 
 
 def test_what_does_not_fit_is_refused_in_a_sentence(
