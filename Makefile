@@ -9,7 +9,8 @@ READY := $(VENV)/.ready
 demo: $(READY)
 	$(BIN)/igps demo --out build/demo
 
-# A process per core, eight at most, as each loads torch; neighbours share fixtures, so that work moves only at the end.
+# One process per core, at most eight, because each loads torch. Neighbouring tests share fixtures, so --dist worksteal
+# moves tests to another process only at the end.
 test: $(READY)
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
 
@@ -18,8 +19,8 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# make campaign [SMALL=1]: broken meshes, kills, a machine at fault, properties, deliberate faults; half an hour on two
-# cores, the small one two minutes and without deliberate faults.
+# make campaign [SMALL=1]: broken meshes and bodies, killed processes, machine faults, properties, deliberate faults;
+# half an hour on two cores. SMALL=1 takes two minutes and leaves out machine faults and deliberate faults.
 campaign: $(READY) $(if $(SMALL),,$(VENV)/.ready-campaign)
 	$(BIN)/python tests/campaign/campaign.py $(if $(SMALL),--small)
 
@@ -27,23 +28,25 @@ $(VENV)/.ready-campaign: $(READY)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[campaign]"
 	touch $@
 
-# make shrec07 DATA=folder-of-meshes-with-labels.csv [WRITE=1]: the scores of the named descriptors are those expected
+# make shrec07 DATA=folder-of-meshes-with-labels.csv [WRITE=1]: compares the scores of the named descriptors with the
+# expected ones; WRITE=1 writes the scores as the expected ones.
 shrec07: $(READY)
 	@test -n "$(DATA)" || { echo "make shrec07 DATA=FOLDER: name the folder of the SHREC'07 meshes (with labels.csv)"; exit 2; }
 	$(BIN)/python tests/campaign/shrec07.py "$(DATA)" $(if $(WRITE),--write)
 
-# torch comes first and pinned: the newest build would bring gigabytes of CUDA libraries.
+# torch is installed first, pinned: the newest build would bring gigabytes of CUDA libraries.
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test,lint]"
 	touch $(READY)
 
-# make release-check: wheel and source archive in empty environments, with the lowest and the newest versions; some gigabytes
+# make release-check: tests the wheel and the source archive in empty environments, with the lowest and the newest
+# versions of the dependencies; needs some gigabytes of disk.
 release-check: $(READY)
 	$(BIN)/python tests/release_check.py
 
-# make docs: the documentation as a site, in build/site; a warning is an error. The variable silences advertisement.
+# make docs: the documentation as a site, in build/site; warnings are errors. The variable silences an advertisement.
 docs: $(READY) $(VENV)/.ready-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 

@@ -1,6 +1,6 @@
 """A picture of one shape of each class that `pretrained` was fitted to: python -m docs.classes_picture OUT.png
 
-It takes minutes, and needs matplotlib, pillow, and the extras of the generator.
+It takes minutes, and needs pillow beside the library.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What `make docs` writes into pages: the help of every command, where command-line.md says so."""
+"""MkDocs hook: insert the help of every command into command-line.md."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from unittest import mock
 
 from igps.cli import COMMANDS, Commands, main
 
-PLACE = "<!-- commands -->"
+PLACEHOLDER = "<!-- commands -->"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """The page with the help of every command."""
-    return markdown.replace(PLACE, "\n".join(_sections(COMMANDS))) if PLACE in markdown else markdown
+    """Replace the placeholder of a page by the help of every command."""
+    return markdown.replace(PLACEHOLDER, "\n".join(_sections(COMMANDS))) if PLACEHOLDER in markdown else markdown
 
 
 def _sections(commands: Commands, *group: str) -> list[str]:
-    found = []
+    sections = []
     for name, command in commands.items():
         words = (*group, name)
         if callable(command):
-            found.append(f"## igps {' '.join(words)}\n\n```text\n{_help(words)}\n```\n")
+            sections.append(f"## igps {' '.join(words)}\n\n```text\n{_help(words)}\n```\n")
         else:
-            found += _sections(command, *words)
-    return found
+            sections += _sections(command, *words)
+    return sections
 
 
 def _help(words: tuple[str, ...]) -> str:

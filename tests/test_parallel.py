@@ -89,7 +89,7 @@ def test_every_job_has_its_result_in_this_process_and_in_others(results: dict[in
 def test_a_job_that_kills_its_process_is_named(results: dict[int, object]) -> None:
     killed = results[6]
     assert isinstance(killed, Failed)
-    assert killed.reason.startswith("the process that worked on it was killed, twice. It may need more memory")
+    assert killed.reason.startswith("its process was killed twice. It may need more memory")
 
 
 def test_a_job_that_is_killed_once_is_tried_again(results: dict[int, object]) -> None:
@@ -173,11 +173,12 @@ def test_a_job_that_takes_too_long_is_ended(limited: dict[int, object]) -> None:
 @pytest.mark.parametrize(
     ("job", "message"),
     [
-        (partial(jobs.fail_with, errno.ENOSPC), "ENOSPC.*Make room.*run again"),
+        (partial(jobs.fail_with, errno.ENOSPC), "ENOSPC.*Free disk space.*run again"),
+        (partial(jobs.fail_with, errno.EMFILE), "EMFILE.*Raise the limit of open files.*run again"),
         (partial(jobs.fail_with, 0), "out of memory. Use fewer workers"),
         (partial(jobs.need_library, "no_such_library"), "No module named 'no_such_library'.*Install it and run again"),
     ],
-    ids=["disk", "memory", "library"],
+    ids=["disk", "files", "memory", "library"],
 )
 def test_the_machine_is_not_the_jobs_fault(where: str, job: Callable[[], None], message: str) -> None:
     """It is told once, and not of every job."""
@@ -216,7 +217,7 @@ def test_an_executor_that_breaks_is_the_machine() -> None:
 
 
 def test_an_executor_has_limits_of_its_own() -> None:
-    with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match="limits: expected none beside an executor"):
+    with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match="limits: expected None with an executor"):
         list(run(jobs.square, [1], executor=pool, limits=Limits(seconds=1)))
 
 

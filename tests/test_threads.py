@@ -384,15 +384,15 @@ def test_a_command_leaves_the_settings(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert settings() == before
 
 
-@pytest.mark.parametrize("most", [1, 2, 5])
-def test_a_team_does_every_job_once_and_in_order(most: int) -> None:
+@pytest.mark.parametrize("max_threads", [1, 2, 5])
+def test_a_team_does_every_job_once_and_in_order(max_threads: int) -> None:
     done: list[int] = []
 
     def square(number: int) -> tuple[int, int]:
         done.append(number)
         return number**2, n_threads() if threading.current_thread() is not threading.main_thread() else 1
 
-    with Team(most) as team:
+    with Team(max_threads) as team:
         for size in (0, 1, 3, 40, 2):
             done.clear()
             assert team.each(square, range(size)) == [(number**2, 1) for number in range(size)]

@@ -1,7 +1,7 @@
 """Interior Global Point Signatures as a PyTorch descriptor (Rustamov 2010).
 
-A mesh becomes a `Signature` (eigenfunctions sampled in its interior and on its surface), Signatures become histograms
-or embeddings, and those are compared.
+A mesh becomes a `Signature`: eigenfunctions sampled in its interior and on its surface. Signatures become histograms or
+embeddings, which are compared.
 
 Shape letters in all docstrings: V vertices, F faces, K eigenpairs, P samples, C potential classes, B distance bins,
 N shapes, Q queries, G gallery, D embedding width.
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from igps.data.datamodule import SignatureDataModule
     from igps.nn.learner import RetrievalLearner
 
-# These bring Lightning, which takes seconds to import: on first use.
+# Imported on first use, because they import Lightning, which takes seconds.
 _LAZY = {"RetrievalLearner": "igps.nn.learner", "SignatureDataModule": "igps.data.datamodule"}
 
-# The Dataset lies below the descriptors, and still takes their names.
+# `igps.data` may not import `igps.descriptors`, but its Dataset accepts names of descriptors.
 register_descriptors(descriptor)
 del register_descriptors
 

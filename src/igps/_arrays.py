@@ -1,4 +1,4 @@
-"""Names of array types, for signatures."""
+"""Array types for annotations."""
 
 from typing import TypeVar
 
@@ -10,4 +10,4 @@ Singles = NDArray[np.float32]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 Surface = tuple[Floats, Integers]  # vertices (V, 3) and faces (F, 3)
-Real = TypeVar("Real", np.float32, np.float64)  # of arrays in single or in double precision
+Real = TypeVar("Real", np.float32, np.float64)  # element type of arrays in single or double precision

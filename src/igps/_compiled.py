@@ -1,8 +1,8 @@
-"""Loops that Numba compiles when they are first called: importing them imports no compiler.
+"""Functions that Numba compiles when they are first called. Importing them does not import Numba.
 
-Numba keeps what Python calls on disk, with all that it calls itself, so that a process pays for compiling once per
-machine and version. Compiled code releases the interpreter's lock and uses one thread; `igps._threads` decides how many
-run side by side.
+Numba caches compiled functions that are called from Python on disk, together with the compiled functions that they call
+themselves, so each machine compiles once per version. Compiled code releases the global interpreter lock (GIL) and uses
+one thread; `igps._threads` decides how many run side by side.
 """
 
 import gc
@@ -15,32 +15,32 @@ from typing import Any, Generic, ParamSpec, TypeVar
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-# For `fastmath`: sums may be taken in any order, so of several terms at once
+# Value of `fastmath` that allows sums in any order, and thus vector instructions
 SUMS = {"contract", "reassoc", "nsz"}
-# A product and its sum may be rounded once, not twice
+# Value of `fastmath` that allows fused multiply-add: a product and its sum are rounded once instead of twice
 CONTRACTED = {"contract"}
 
 
 class Lazy:
-    """Something that compiled functions may call by its name; it needs Numba only when one of them is compiled."""
+    """Placeholder for a function that compiled code calls; `make` creates it when a caller is compiled."""
 
     def __init__(self, make: Callable[[], Callable[..., Any]]) -> None:
         self._make = make
 
     @property
     def dispatcher(self) -> Callable[..., Any]:
-        """What Numba knows it as; the same object for all threads."""
-        found = self.__dict__.get("_made")
-        return self.__dict__.setdefault("_made", self._make()) if found is None else found
+        """The Numba dispatcher; the same object for all threads."""
+        dispatcher = self.__dict__.get("_dispatcher")
+        return self.__dict__.setdefault("_dispatcher", self._make()) if dispatcher is None else dispatcher
 
 
 class Compiled(Lazy, Generic[Arguments, Result]):
     """A function of arrays and numbers that is compiled when it is first called.
 
-    It may call other such functions, and `Lazy` ones, of its module: in a form that Python cannot call, which takes a
-    tenth less time to compile. The options are those of `numba.njit`. With `inline="always"` it becomes a part of what
-    calls it, which takes less time to compile where that is one place: LLVM works on a function anew in each caller.
-    Division by 0 gives what NumPy gives, without an error.
+    The function may call other `Compiled` and `Lazy` functions of its module. These are compiled without a wrapper for
+    Python, which saves a tenth of the time. Division by 0 gives the result of NumPy, without an error. The options are
+    those of `numba.njit`. With `inline="always"`, the function is compiled as part of each caller, which saves time if
+    there is only one.
     """
 
     def __init__(self, function: Callable[Arguments, Result], **options: Any) -> None:
@@ -52,48 +52,48 @@ class Compiled(Lazy, Generic[Arguments, Result]):
         dispatcher: Any = self._entry.dispatcher
         try:
             return dispatcher(*args, **kwargs)
-        except AttributeError:  # what an earlier version has left on disk names a class that is gone; loops raise none
+        except AttributeError:  # a cached file names a class of an earlier version; compiled code raises none itself
             dispatcher._cache.flush()
             return dispatcher(*args, **kwargs)
 
 
 def compiled(**options: Any) -> Callable[[Callable[Arguments, Result]], Compiled[Arguments, Result]]:
-    """A decorator that makes a `Compiled` of a function; the options are those of `numba.njit`."""
+    """Return a decorator that makes a function `Compiled`, with options for `numba.njit`."""
     return lambda function: Compiled(function, **options)
 
 
 def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """The function as Numba compiles it, and so what it calls: Numba looks names up in the globals of a function."""
+    """Return the Numba dispatcher of a function, in whose globals dispatchers replace the `Lazy` objects."""
     assert isinstance(function, FunctionType)
-    names = {name: function.__globals__.get(name) for name in function.__code__.co_names}
-    called = {name: value.dispatcher for name, value in names.items() if isinstance(value, Lazy)}
-    if called:
-        defaults, linked = function.__defaults__, {**function.__globals__, **called}
-        function = FunctionType(function.__code__, linked, function.__name__, defaults)
+    used = {name: function.__globals__.get(name) for name in function.__code__.co_names}
+    dispatchers = {name: value.dispatcher for name, value in used.items() if isinstance(value, Lazy)}
+    if dispatchers:
+        names = {**function.__globals__, **dispatchers}
+        function = FunctionType(function.__code__, names, function.__name__, function.__defaults__)
     return _numba().njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options)(function)
 
 
 @cache
 def _numba() -> ModuleType:
-    """Numba. A fork waits until no thread compiles, as a child would inherit the compiler's lock, closed."""
+    """Import Numba. A fork waits until no thread compiles, because a lock that is held stays locked in the child."""
     import numba
     from numba.core import event
     from numba.core.compiler_lock import global_compiler_lock as lock
 
-    outer: list[bool] = []  # whether garbage was collected before each function that is being compiled
+    was_enabled: list[bool] = []  # a stack, as compiling a function compiles the functions that it calls
 
-    class Uncollected(event.Listener):
-        """Compiling makes so many objects that to look for garbage among them takes a tenth of the time."""
+    class GarbageCollectionOff(event.Listener):
+        """Garbage collection would take a tenth of the time of compiling, which creates many objects."""
 
         def on_start(self, event: object) -> None:
-            outer.append(gc.isenabled())
+            was_enabled.append(gc.isenabled())
             gc.disable()
 
         def on_end(self, event: object) -> None:
-            if outer.pop():
+            if was_enabled.pop():
                 gc.enable()
 
-    event.register("numba:compile", Uncollected())
+    event.register("numba:compile", GarbageCollectionOff())
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release)
     return numba

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, the same each time."""
+"""Atomic and reproducible writing of files."""
 
 import contextlib
 import json
@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import IO, Any
 
 PARTIAL = ".partial"
-"""The end of the name of a file that is still being written."""
+"""Suffix of files that are still being written."""
 
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[IO[bytes]]:
-    """A file to write beside its place, which is moved there in one step, whole or not at all."""
-    # By an ordinary open: tempfile and safetensors make files that only their owner can read, whatever the umask.
+    """Open a temporary file for writing, which replaces `path` in one step when the context ends without an error."""
+    # Plain `open` respects the umask; tempfile and safetensors create files that only their owner can read.
     partial = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(8)}{PARTIAL}")
     try:
         with open(partial, "xb") as file:
@@ -27,7 +27,7 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
 
 
 def with_ordered_metadata(content: bytes) -> bytes:
-    """A safetensors file with its metadata by name: that library writes them in an order that differs each time."""
+    """Return a safetensors file with sorted metadata. The library writes them in an order that differs each time."""
     end = 8 + int.from_bytes(content[:8], "little")
     header: dict[str, Any] = json.loads(content[8:end])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))

@@ -1,8 +1,8 @@
-"""Many jobs at once, on processes or on threads. A job that fails, or kills its process, costs no other its result.
+"""Parallel jobs in processes or threads. A job that fails, or kills its process, does not affect the other jobs.
 
-Each worker is a `ProcessPoolExecutor` of one process. So it is known which job a process had when it died, and a job
-that takes too long is ended by killing its process. Any other `concurrent.futures.Executor`, such as that of a
-cluster, may do the work instead.
+Each worker is a `ProcessPoolExecutor` with one process. Thus the job of a process that dies is known, and a job that
+takes too long is stopped by killing its process. Alternatively, any other `concurrent.futures.Executor`, such as that
+of a cluster, runs the jobs.
 """
 
 import errno
@@ -27,38 +27,35 @@ from igps._threads import Job, Result, n_cores, one_thread, stay_on_one_thread
 from igps._threads import n_threads as available_threads
 from igps._workers import MachineError, Worker, workers_environment
 
-# A job whose process died is tried once more: an administrator or another program may have been the cause.
-_MOST_DEATHS = 2
-_KILLED = (
-    "the process that worked on it was killed, twice. It may need more memory than there is: use fewer workers, or set "
-    "a memory limit to be told."
-)
-_KILLED_ELSEWHERE = (
-    "the workers that had it were killed, one after the other. It may need more memory than they have: start them with "
-    "more."
-)
-# Enough for the workers of a large cluster, few enough for the memory of the caller.
-_MOST_SUBMITTED = 10_000
-_MACHINES = frozenset(
-    getattr(errno, name, 0)
-    for name in ("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS", "EACCES", "EPERM", "EMFILE", "ENFILE", "ENOMEM")
-)
-_FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+# A job whose process died is tried once more: an administrator or another program may be the cause.
+_MAX_ATTEMPTS = 2
+_KILLED = "its process was killed twice. It may need more memory: use fewer workers, or set a memory limit to find out."
+_KILLED_ON_CLUSTER = "several workers that had it were killed. It may need more memory: start workers with more memory."
+# Jobs that an executor holds at a time: enough for the workers of a large cluster, and not too many for the memory.
+_MAX_SUBMITTED = 10_000
+_MACHINE_ERRORS = {
+    "Free disk space": ("ENOSPC", "EDQUOT", "EFBIG"),
+    "Choose a writable folder": ("EROFS", "EACCES", "EPERM"),
+    "Check the disk": ("EIO",),
+    "Raise the limit of open files": ("EMFILE", "ENFILE"),
+    "Free memory": ("ENOMEM",),
+}
+_REMEDIES = {getattr(errno, name, 0): remedy for remedy, names in _MACHINE_ERRORS.items() for name in names}
 
 
 @dataclass(frozen=True)
 class Failed:
-    """Why a job has no result, in one sentence."""
+    """The outcome of a job that failed, with the reason in one sentence."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What one job may use."""
+    """Limits of one job; None is no limit."""
 
-    seconds: float | None = None  # of wall time; None for no limit
-    memory: int | None = None  # bytes of data of its process; None for no limit. Linux alone enforces it
+    seconds: float | None = None  # wall time
+    memory: int | None = None  # bytes of data of the process; enforced only on Linux
 
     def __post_init__(self) -> None:
         for name, value in (("time_limit", self.seconds), ("memory_limit", self.memory)):
@@ -74,158 +71,157 @@ def run(
     executor: Executor | None = None,
     limits: Limits | None = None,
 ) -> Generator[tuple[int, Result | Failed], None, None]:
-    """The number and the result of every job, in the order in which they end.
+    """Run a function on many jobs, and yield the index and the result of each as it finishes.
 
     Args:
-        function: picklable; the exceptions that it raises, but for those of the machine, are failures of the job.
-        jobs: picklable.
-        n_workers: processes; as many as cores if None. One works in this process, unless there are limits.
-        executor: does the work instead of these processes.
-        limits: of each job; not with an executor.
+        function: picklable. Its exceptions become `Failed`, except for those that the machine causes.
+        jobs: picklable arguments of the function.
+        n_workers: number of processes; the number of cores if None. With 1 and no limits, jobs run in this process.
+        executor: runs the jobs instead of own processes.
+        limits: limits of each job; not allowed with an executor.
 
     Raises:
-        MachineError: the disk is full, memory runs out without a limit, a library is missing, or no process can be
-            started.
+        MachineError: the disk is full, memory runs out without a limit, a library is missing, or no process starts.
     """
     check_at_least(1, n_workers=n_workers)
     limits = limits or Limits()
     limited = limits != Limits()
     if executor is not None:
         if limited:
-            raise ValueError("limits: expected none beside an executor, which has its own.")
-        yield from _by_executor(executor, function, jobs)
+            raise ValueError("limits: expected None with an executor, which sets its own limits.")
+        yield from _run_on_executor(executor, function, jobs)
         return
     n_workers = min(n_workers or n_cores(), len(jobs))
     if n_workers > 1 or (limited and jobs):
-        yield from _by_workers(function, jobs, n_workers, limits)
+        yield from _run_on_workers(function, jobs, n_workers, limits)
         return
-    for number, job in enumerate(jobs):
-        yield number, attempt(lambda job=job: function(job), limits)  # type: ignore[misc]
+    for i, job in enumerate(jobs):
+        yield i, attempt(lambda job=job: function(job), limits)  # type: ignore[misc]
 
 
 def on_threads(
     function: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int | None = None
 ) -> Iterator[Result]:
-    """The result of every job in order, each job on one thread of its own, as PyTorch lets many compute at once.
+    """Yield the result of every job in order. Each job computes on one thread.
 
-    Splitting each small product over all cores instead makes every one of them wait for the slowest core, which on a
-    machine with other work to do costs many times the product itself. The threads are as many as `n_threads()` if None.
+    Splitting each small product over all cores instead would make every core wait for the slowest one. On a busy
+    machine, the wait takes many times as long as the product. If None, `n_threads` is `igps._threads.n_threads()`.
     """
     n_threads = min(available_threads() if n_threads is None else n_threads, len(jobs))
-    alone = one_thread()(function)
+    on_one_thread = one_thread()(function)
     if n_threads <= 1:
-        yield from map(alone, jobs)
+        yield from map(on_one_thread, jobs)
         return
     with ThreadPoolExecutor(n_threads, initializer=stay_on_one_thread) as pool:
-        yield from pool.map(alone, jobs)
+        yield from pool.map(on_one_thread, jobs)
 
 
 def is_machine_error(error: OSError) -> bool:
-    """Whether an error tells of the machine and not of a file: no room, no right to write, a broken disk."""
-    return error.errno in _MACHINES
+    """Return whether the machine is at fault, not a single file: a full or broken disk, a missing permission."""
+    return error.errno in _REMEDIES
 
 
 def machine_error_text(error: OSError) -> str:
-    """What to do about it."""
-    remedy = "Choose a folder that can be written" if error.errno in _FORBIDDEN else "Make room"
-    return f"{error}. {remedy} and run again: what is done is kept."
+    """Return the message of an error for which `is_machine_error` holds, with a remedy."""
+    return f"{error}. {_REMEDIES[error.errno or 0]} and run again: finished results are kept."
 
 
-def attempt(result: Callable[[], Result], limits: Limits = Limits()) -> Result | Failed:
-    """The result; the job's failure in words; a MachineError where the machine is at fault."""
+def attempt(function: Callable[[], Result], limits: Limits = Limits()) -> Result | Failed:
+    """Return the result or the failure of a job; raise a MachineError if the machine is at fault."""
     try:
-        return result()
+        return function()
     except (BrokenExecutor, CancelledError, MachineError):
         raise
     except MemoryError as error:
         if limits.memory is not None:
             return Failed(f"it needs more than the memory_limit of {limits.memory / 2**20:.0f} MiB.")
-        raise MachineError("out of memory. Use fewer workers or set a memory limit; what is done is kept.") from error
+        raise MachineError("out of memory. Use fewer workers or a memory limit: finished results are kept.") from error
     except ImportError as error:
-        raise MachineError(f"{str(error).rstrip('.')}. Install it and run again: what is done is kept.") from error
+        raise MachineError(f"{str(error).rstrip('.')}. Install it and run again: finished results are kept.") from error
     except OSError as error:
         if is_machine_error(error):
             raise MachineError(machine_error_text(error)) from error
         return Failed(_sentence(error))
     except Exception as error:
-        # Dask raises it after several workers died with the same job.
-        return Failed(_KILLED_ELSEWHERE if type(error).__name__ == "KilledWorker" else _sentence(error))
+        # Dask raises KilledWorker after several workers died with the same job.
+        return Failed(_KILLED_ON_CLUSTER if type(error).__name__ == "KilledWorker" else _sentence(error))
 
 
 def _sentence(error: Exception) -> str:
     return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
 
 
-def _by_executor(
+def _run_on_executor(
     executor: Executor, function: Callable[[Job], Result], jobs: Sequence[Job]
 ) -> Generator[tuple[int, Result | Failed], None, None]:
     done: queue.SimpleQueue[Future[Result]] = queue.SimpleQueue()
-    numbers: dict[Future[Result], int] = {}
+    indices: dict[Future[Result], int] = {}
     waiting = enumerate(jobs)
 
-    def submit(n_more: int) -> None:
-        for number, job in islice(waiting, n_more):
+    def submit(n_jobs: int) -> None:
+        for i, job in islice(waiting, n_jobs):
             future = executor.submit(function, job)
-            numbers[future] = number
+            indices[future] = i
             future.add_done_callback(done.put)
 
     try:
-        submit(_MOST_SUBMITTED)
-        while numbers:
+        submit(_MAX_SUBMITTED)
+        while indices:
             future = done.get()
-            yield numbers.pop(future), attempt(future.result)
+            yield indices.pop(future), attempt(future.result)
             submit(1)
     except CancelledError as error:
-        raise MachineError("the executor gave the work up. Run again: what is done is kept.") from error
+        raise MachineError("the executor cancelled a job. Run again: finished results are kept.") from error
     except MachineError:
         raise
-    except RuntimeError as error:  # it broke, or takes no work any more
-        raise MachineError(f"the executor broke ({error}). Run again: what is done is kept.") from error
+    except RuntimeError as error:  # the executor broke, or was shut down
+        raise MachineError(f"the executor broke ({error}). Run again: finished results are kept.") from error
     finally:
-        for future in numbers:
+        for future in indices:
             future.cancel()
 
 
-def _by_workers(
+def _run_on_workers(
     function: Callable[[Job], Result], jobs: Sequence[Job], n_workers: int, limits: Limits
 ) -> Generator[tuple[int, Result | Failed], None, None]:
     seconds = float("inf") if limits.seconds is None else limits.seconds
     waiting = deque(range(len(jobs)))
-    deaths: Counter[int] = Counter()
+    n_deaths: Counter[int] = Counter()
     workers = [Worker(limits.memory) for _ in range(n_workers)]
     idle = list(workers)
-    busy: dict[Future[Result], tuple[Worker, int, float]] = {}  # with the number of the job, and when it must be done
+    busy: dict[Future[Result], tuple[Worker, int, float]] = {}  # worker, index of the job, deadline
     finished = False
     try:
-        # All at the same time, as a process takes seconds to import what it needs
+        # All start at the same time, because a process needs seconds for its imports
         with workers_environment(), ThreadPoolExecutor(n_workers) as starters:
             list(starters.map(Worker.started, workers))
         while waiting or busy:
             while waiting and idle:
-                worker, number = idle.pop(), waiting.popleft()
-                future = worker.submit(function, jobs[number])
-                busy[future] = worker, number, time.monotonic() + seconds
-            soonest = min(deadline for _, _, deadline in busy.values())
-            timeout = None if limits.seconds is None else max(0.0, soonest - time.monotonic())
+                worker, i = idle.pop(), waiting.popleft()
+                future = worker.submit(function, jobs[i])
+                busy[future] = worker, i, time.monotonic() + seconds
+            next_deadline = min(deadline for _, _, deadline in busy.values())
+            timeout = None if limits.seconds is None else max(0.0, next_deadline - time.monotonic())
             done, _ = wait(busy, timeout=timeout, return_when=FIRST_COMPLETED)
             for future in done:
-                worker, number, _ = busy.pop(future)
+                worker, i, _ = busy.pop(future)
                 idle.append(worker)
                 try:
-                    yield number, attempt(future.result, limits)
+                    yield i, attempt(future.result, limits)
                 except BrokenExecutor:
                     worker.end()
-                    deaths[number] += 1
-                    if deaths[number] < _MOST_DEATHS:
-                        waiting.append(number)
+                    n_deaths[i] += 1
+                    if n_deaths[i] < _MAX_ATTEMPTS:
+                        waiting.append(i)
                     else:
-                        yield number, Failed(_KILLED)
-            for future, (worker, number, deadline) in list(busy.items()):
-                if time.monotonic() >= deadline and not future.done():  # as it may be after a slow caller
+                        yield i, Failed(_KILLED)
+            for future, (worker, i, deadline) in list(busy.items()):
+                # A job may have finished in time while the caller was slow to take results
+                if time.monotonic() >= deadline and not future.done():
                     worker.end(kill=True)
                     del busy[future]
                     idle.append(worker)
-                    yield number, Failed(f"it took longer than the time_limit of {limits.seconds:g} s.")
+                    yield i, Failed(f"it took longer than the time_limit of {limits.seconds:g} s.")
         finished = True
     finally:
         for worker in workers:

@@ -1,34 +1,34 @@
-"""Checks of parameters, in one wording; None, where a parameter may be that, is right."""
+"""Checks of parameters, with uniform messages. None passes where its type is allowed."""
 
 import math
 from collections.abc import Collection
 
 
-def check_at_least(least: int, **values: int | None) -> None:
-    """Raise a ValueError that names the first of the values that is smaller, or no whole number."""
+def check_at_least(minimum: int, **values: int | None) -> None:
+    """Raise a ValueError for the first value that is smaller than `minimum` or not a whole number."""
     for name, value in values.items():
         if value is not None and not hasattr(value, "__index__"):
             raise ValueError(f"{name}: expected a whole number, got {value!r}.")
-        if value is not None and value < least:
-            raise ValueError(f"{name}: expected at least {least}, got {value}.")
+        if value is not None and value < minimum:
+            raise ValueError(f"{name}: expected at least {minimum}, got {value}.")
 
 
 def check_positive(**values: float) -> None:
-    """Raise a ValueError that names the first of the values that is not a finite number above 0."""
+    """Raise a ValueError for the first value that is not a finite number above 0."""
     for name, value in values.items():
         if not 0 < value < math.inf:
             raise ValueError(f"{name}: expected a positive number, got {value}.")
 
 
 def check_share(**values: float | None) -> None:
-    """Raise a ValueError that names the first of the values that does not lie between 0 and 1."""
+    """Raise a ValueError for the first value that is not strictly between 0 and 1."""
     for name, value in values.items():
         if value is not None and not 0 < value < 1:
             raise ValueError(f"{name}: expected a number between 0 and 1, got {value}.")
 
 
 def check_one_of(allowed: Collection[str | None], **values: str | None) -> None:
-    """Raise a ValueError that names the first of the values that is not allowed."""
+    """Raise a ValueError for the first value that is not allowed."""
     for name, value in values.items():
         if value not in allowed:
             raise ValueError(f"{name}: expected one of {', '.join(map(str, allowed))}, got {value!r}.")

@@ -1,10 +1,10 @@
-"""How many threads a call may use: few, and none that wait for each other by spinning.
+"""Numbers of threads, chosen so that no threads wait for each other by spinning.
 
-The threads of OpenMP and of OpenBLAS divide each small product among them and spin while they wait for the slowest.
-Where another process has the core of one, or a container has fewer cores granted than it sees, all wait for it each
-time: one body then takes twenty times as long as on a single thread. So every call of the library computes on one
-thread of theirs (`one_thread`). What is large is divided into jobs for threads of Python, which compute with one thread
-each and sleep while they wait (`igps._parallel.on_threads`), at most `n_threads` of them.
+OpenMP and OpenBLAS split each small product over their threads, which spin while they wait for the slowest. If another
+process occupies a core, or a container may use fewer cores than it sees, all threads wait at each product, and one body
+takes twenty times as long as on a single thread. Therefore, every call of the library uses one thread of OpenMP and
+OpenBLAS (`one_thread`). Large computations are divided into jobs for at most `n_threads` Python threads, which sleep
+while they wait (`igps._parallel.on_threads`).
 """
 
 import contextlib
@@ -27,27 +27,27 @@ Result = TypeVar("Result")
 
 
 def n_cores() -> int:
-    """Cores that this process may keep busy: by its affinity and by the quota of its container, at least 1."""
+    """Return the number of cores that the CPU affinity of this process and the quota of its container allow."""
     return joblib.cpu_count()
 
 
 def n_threads() -> int:
-    """Threads of Python that this call may use: as many as cores, but no more than torch had before the call."""
-    if _state.most is not None:
-        return _state.most
-    most = _get_torch_threads()
-    return min(n_cores(), most) if most > 1 else most  # counting cores means reading files
+    """Return the number of Python threads for this call: the cores, but at most torch's threads before the call."""
+    if _state.max_threads is not None:
+        return _state.max_threads
+    n_torch = _get_torch_threads()
+    return min(n_cores(), n_torch) if n_torch > 1 else n_torch  # `n_cores` reads files
 
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Torch, NumPy and SciPy on one thread in this thread, and afterwards on as many as before.
+    """Make torch, NumPy and SciPy use one thread in this thread, and restore their numbers of threads afterwards.
 
-    Other threads of the process keep their torch threads, and those started meanwhile get what they would have got.
-    NumPy and SciPy have one setting for all threads: the last thread to leave restores it.
+    Other Python threads, also those started meanwhile, keep their number of torch threads. NumPy and SciPy have one
+    setting for the whole process, which the last thread that leaves the context restores.
     """
-    outside = _state.most
-    _state.most = n_threads()
+    outside = _state.max_threads
+    _state.max_threads = n_threads()
     before = _get_torch_threads()
     try:
         with _blas_on_one_thread():
@@ -55,28 +55,28 @@ def one_thread() -> Iterator[None]:
                 _set_torch_threads(1)
             yield
     finally:
-        if before > 1:  # torch may count those of MKL, which has its own again, while new threads would get one
+        if before > 1:  # even if torch reports `before`, which may be MKL's threads while new Python threads get one
             _set_torch_threads(before)
-        _state.most = outside
+        _state.max_threads = outside
 
 
 def stay_on_one_thread() -> None:
-    """As `one_thread`, but for the rest of this thread's life, and with no other beside it."""
-    _state.most = 1
+    """Make torch use one thread in this Python thread until it ends, and let `n_threads` return 1 there."""
+    _state.max_threads = 1
     if _get_torch_threads() > 1:
         _set_torch_threads(1)
 
 
 class Team:
-    """Threads that stay for a computation of many short steps, each of a few jobs.
+    """Threads for a computation of many short steps, each with a few jobs.
 
-    To start threads for every step would take longer than the step. The thread that calls `each` takes jobs as well,
-    and waits only for jobs that another thread has begun. So a thread that gets no core delays nothing. There
-    are at most so many threads, the calling one included; `n_threads` if None.
+    The threads live as long as the context, because starting threads takes longer than a step. The thread that calls
+    `each` takes jobs as well, and waits only for jobs that another thread has begun. So a thread without a core delays
+    nothing. `max_threads` includes the calling thread; it is `n_threads()` if None.
     """
 
-    def __init__(self, most: int | None = None) -> None:
-        self.n_threads = max(1, n_threads() if most is None else most)
+    def __init__(self, max_threads: int | None = None) -> None:
+        self.n_threads = max(1, n_threads() if max_threads is None else max_threads)
         self._pool: ThreadPoolExecutor | None = None
 
     def __enter__(self) -> Self:
@@ -90,20 +90,19 @@ class Team:
             self._pool = None
 
     def each(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
-        """The result of every job, in order; only functions that release the interpreter's lock get faster."""
+        """Return the result of every job, in order. Only functions that release the GIL become faster."""
         n_helpers = min(self.n_threads, len(jobs)) - 1
         if self._pool is None or n_helpers < 1:
             return [function(job) for job in jobs]
         results: list[Any] = [None] * len(jobs)
         waiting = iter(range(len(jobs)))
-
-        # PyTorch keeps the mode of each thread, and lets no other mode change tensors made in inference mode
+        # The mode is a setting of each thread. Tensors made in inference mode can only be changed in that mode
         inference = torch.is_inference_mode_enabled()
 
         def work() -> None:
             with torch.inference_mode(inference):
-                for number in waiting:  # the interpreter's lock gives each number to one thread
-                    results[number] = function(jobs[number])
+                for i in waiting:  # the GIL gives each index to one thread
+                    results[i] = function(jobs[i])
 
         helpers = [self._pool.submit(work) for _ in range(n_helpers)]
         try:
@@ -116,37 +115,34 @@ class Team:
         return results
 
 
-# Does all jobs on the calling thread
-ALONE = Team(1)
+ALONE = Team(1)  # runs all jobs on the calling thread
 
 
 class _ThreadState(threading.local):
-    """Settings of one thread."""
-
-    most: int | None = None  # `n_threads` inside `one_thread`; None outside
+    max_threads: int | None = None  # result of `n_threads` inside `one_thread`; None outside
 
 
 _state = _ThreadState()
 
 
 def _at_fork(**hooks: Callable[[], object]) -> None:
-    """`os.register_at_fork`, where a process can fork."""
+    """Call `os.register_at_fork` on systems that have it."""
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(**hooks)
 
 
 def _fork_safe_lock() -> threading.Lock:
-    """A lock that no thread holds while the process forks, else it would stay closed in the child: a fork waits."""
+    """Return a lock for which a fork waits, because a lock that is held during a fork stays locked in the child."""
     lock = threading.Lock()
     _at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release)
     return lock
 
 
 class ProcessSetting:
-    """A context in which a setting of the whole process is changed, for any number of threads at once.
+    """Context that changes a setting of the whole process, and that many threads can use at the same time.
 
-    The first that enters changes it, the last that leaves restores it, by what `change` returned. In a forked child
-    only the thread that forked lives on: the others no longer count.
+    The first thread that enters calls `change`. The last thread that leaves calls the function that `change` returned,
+    which restores the setting. In a forked child, only the thread that forked exists, and only that thread counts.
     """
 
     def __init__(self, change: Callable[[], Callable[[], None]]) -> None:
@@ -154,7 +150,7 @@ class ProcessSetting:
         self._lock = _fork_safe_lock()
         self._users: list[int] = []
         self._restore: Callable[[], None] | None = None
-        _at_fork(after_in_child=lambda: self._keep_only(threading.get_ident()))
+        _at_fork(after_in_child=lambda: self._forget_others(threading.get_ident()))
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
@@ -170,8 +166,8 @@ class ProcessSetting:
                 self._users.remove(user)
                 self._restore_if_unused()
 
-    def _keep_only(self, user: int) -> None:
-        self._users = [one for one in self._users if one == user]
+    def _forget_others(self, user: int) -> None:
+        self._users = [ident for ident in self._users if ident == user]
         self._restore_if_unused()
 
     def _restore_if_unused(self) -> None:
@@ -184,40 +180,40 @@ _torch_threads = _fork_safe_lock()
 
 
 def _get_torch_threads() -> int:
-    """Of this thread. The lock keeps it from seeing, on a new thread, what `_set_torch_threads` sets for another."""
+    """Return the torch threads of this Python thread, but not while `_set_torch_threads` sets those of another."""
     with _torch_threads:
         return torch.get_num_threads()
 
 
 def _set_torch_threads(n: int) -> None:
-    """For this thread alone.
+    """Set the number of torch threads of this Python thread only.
 
-    `torch.set_num_threads` also sets the number for threads that have not computed yet. One of those sets it back.
+    `torch.set_num_threads` also sets the default for threads that have not computed yet. A new thread restores it.
     """
     with _torch_threads, contextlib.ExitStack() as afterwards:
         with contextlib.suppress(RuntimeError):  # the system starts no more threads
-            of_new_threads = _in_new_thread(torch.get_num_threads)
-            afterwards.callback(_in_new_thread, partial(torch.set_num_threads, of_new_threads))
+            default = _in_new_thread(torch.get_num_threads)
+            afterwards.callback(_in_new_thread, partial(torch.set_num_threads, default))
         torch.set_num_threads(n)
 
 
 def _in_new_thread(function: Callable[[], Result]) -> Result:
-    """The result of a function in a thread that has not computed before."""
-    answer: SimpleQueue[Result] = SimpleQueue()
-    start_new_thread(lambda: answer.put(function()), ())  # `Thread.start` would wait until it runs
-    return answer.get()
+    """Return the result of a function that runs in a new thread."""
+    results: SimpleQueue[Result] = SimpleQueue()
+    start_new_thread(lambda: results.put(function()), ())  # `Thread.start` would wait until the thread runs
+    return results.get()
 
 
 @lru_cache(maxsize=1)
 def _libraries(n_modules: int) -> threadpoolctl.ThreadpoolController:
-    """The loaded libraries. Finding them takes as long as a small product, and only an import adds to them."""
+    """Return the loaded thread pools, cached until an import, as finding them takes as long as a small product."""
     return threadpoolctl.ThreadpoolController()
 
 
 def _blas_to_one_thread() -> Callable[[], None]:
-    """For NumPy's and SciPy's products; returns what restores their threads.
+    """Limit the BLAS libraries of NumPy and SciPy to one thread, and return a function that lifts the limit.
 
-    As long as the thread that set a limit is alive, threadpoolctl lets no other lift it: so it gives up its claim.
+    While a thread is alive, threadpoolctl lets no other thread lift its limit, unless the thread gives up control.
     """
     limits = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
     _release_control()
@@ -230,7 +226,7 @@ def _blas_to_one_thread() -> Callable[[], None]:
 
 
 def _release_control() -> None:
-    """Threadpoolctl before 3.8 lets every thread set and lift limits, and has no claim to give up."""
+    """Let other threads set and lift limits, as every thread could before threadpoolctl 3.8."""
     clear = getattr(getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", None)
     if clear is not None:
         clear()

@@ -1,4 +1,4 @@
-"""A worker process, which has one job: if it is killed, that costs no other its result."""
+"""A worker process for one job at a time. If the process is killed, only its current job is affected."""
 
 import contextlib
 import multiprocessing
@@ -12,26 +12,26 @@ from typing import Any, TypeVar
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-# A worker has one thread for linear algebra, or n workers on n cores run n² threads. And glibc's allocator keeps what
-# is freed for the next body: pages that are given back come again one by one, each cleared by the system.
-_WORKERS_ENVIRONMENT = {
+# Each worker has one thread for linear algebra; otherwise, n workers on n cores would run n² threads. The thresholds
+# make the allocator of glibc reuse freed memory for the next body, as the system clears each page that it hands out.
+_ENVIRONMENT = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
     "MALLOC_MMAP_THRESHOLD_": str(2**26),
     "MALLOC_TRIM_THRESHOLD_": str(2**28),
 }
-# A process that is killed while it starts is started once more: an administrator may have been the cause.
-_MOST_STARTS = 2
+# A process that is killed while it starts is started once more: an administrator or another program may be the cause.
+_MAX_STARTS = 2
 
 
 class MachineError(RuntimeError):
-    """The machine, not a job, is at fault: a full disk, no memory, a library that is missing. What is done is kept."""
+    """The machine is at fault, not a job: for example, the disk is full. Finished results are kept."""
 
 
 class Worker:
-    """A process for one job at a time, which may take so many bytes of data."""
+    """A process for one job at a time, whose data is limited to `max_bytes`."""
 
-    def __init__(self, memory: int | None) -> None:
-        self._memory = memory
+    def __init__(self, max_bytes: int | None) -> None:
+        self._max_bytes = max_bytes
         self._pool: ProcessPoolExecutor | None = None
         self._pid = 0
 
@@ -43,30 +43,30 @@ class Worker:
             return self.started().submit(function, job)
 
     def started(self) -> ProcessPoolExecutor:
-        """The process, started if there is none."""
+        """Return the executor of the process, which is started if it is not running."""
         context = multiprocessing.get_context("spawn")
-        starts = 0
+        n_starts = 0
         while self._pool is None:
-            starts += 1
+            n_starts += 1
             with workers_environment():
-                pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(self._memory,))
+                pool = ProcessPoolExecutor(1, context, initializer=_initialise, initargs=(self._max_bytes,))
                 try:
-                    with _uninterrupted():
+                    with _interrupts_blocked():
                         first = pool.submit(os.getpid)
                     self._pid = first.result()
                     self._pool = pool
                 except BrokenExecutor as error:
                     pool.shutdown()
-                    if starts == _MOST_STARTS:
+                    if n_starts == _MAX_STARTS:
                         raise MachineError(
-                            "no worker process could be started. A script that computes on several processes must call "
-                            "it under `if __name__ == '__main__':`; otherwise raise the memory_limit, look for a want "
-                            "of memory, or pass n_workers=1. What is done is kept."
+                            "no worker process could be started. A script that uses several processes must do so under "
+                            "`if __name__ == '__main__':`. Otherwise, raise the memory_limit, check that there is "
+                            "enough free memory, or pass n_workers=1. Finished results are kept."
                         ) from error
         return self._pool
 
     def end(self, kill: bool = False) -> None:
-        """End the process, in the midst of its work if need be."""
+        """End the process. It finishes its job unless it is killed."""
         if self._pool is None:
             return
         if kill:
@@ -78,12 +78,12 @@ class Worker:
 
 @contextlib.contextmanager
 def workers_environment() -> Generator[None, None, None]:
-    """The environment of the processes that are started meanwhile.
+    """Set the environment variables of processes that are started in this context.
 
-    The libraries read it when they are loaded, which in a spawned process is before any initialiser runs.
+    Libraries read them while they are loaded, which in a spawned process is before any initialiser runs.
     """
-    before: dict[str, Any] = {name: os.environ.get(name) for name in _WORKERS_ENVIRONMENT}
-    os.environ.update(_WORKERS_ENVIRONMENT)
+    before: dict[str, Any] = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    os.environ.update(_ENVIRONMENT)
     try:
         yield
     finally:
@@ -95,8 +95,8 @@ def workers_environment() -> Generator[None, None, None]:
 
 
 @contextlib.contextmanager
-def _uninterrupted() -> Generator[None, None, None]:
-    """Ctrl-C, which goes to all processes, is nothing to those that are started meanwhile: the parent ends them."""
+def _interrupts_blocked() -> Generator[None, None, None]:
+    """Block Ctrl-C, which reaches all processes, in those that are started in this context: the parent ends them."""
     if not hasattr(signal, "pthread_sigmask"):  # on Windows
         yield
         return
@@ -107,19 +107,19 @@ def _uninterrupted() -> Generator[None, None, None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin(memory: int | None) -> None:
-    """What a worker does first: bound its memory, and watch its parent, to end with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # where it could not be blocked before
-    if memory is not None:
+def _initialise(max_bytes: int | None) -> None:
+    """Limit the memory of a worker process, and make it end when its parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows, where it could not be blocked
+    if max_bytes is not None:
         with contextlib.suppress(ImportError, ValueError):
             import resource
 
-            resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+            resource.setrlimit(resource.RLIMIT_DATA, (max_bytes, max_bytes))
     parent = multiprocessing.parent_process()
 
-    def watch() -> None:
+    def end_with_parent() -> None:
         if parent is not None:
             parent.join()
             os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()

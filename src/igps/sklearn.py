@@ -23,10 +23,10 @@ from igps.signature.signature import SignatureConfig, compute_signature
 
 
 class VolumetricFeatures(TransformerMixin, BaseEstimator):
-    """Mesh files, or meshes, to descriptions, a row for each; nothing is fitted.
+    """Transformer of mesh files or meshes to descriptions, one row each. Nothing is fitted.
 
-    Histograms are given by the square roots of their cells: the Euclidean distance of these is Hellinger's, which
-    linear classifiers and Gaussian kernels can use. For a χ² kernel take the cells, `square_root=False`.
+    By default, cells of histograms are replaced by their square roots, whose Euclidean distance is the Hellinger
+    distance, as linear classifiers and Gaussian kernels need it. For a χ² kernel, set `square_root=False`.
 
     Example:
         >>> from igps import ArticulatedShapes, Mesh
@@ -37,11 +37,11 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
 
     Args:
         descriptor: a name, "package.module:NAME", or a `Descriptor`; see `igps.descriptor`.
-        square_root: give square roots of the cells of histograms; other descriptions are given as they are.
-        config: of the signatures; the default if None. What the descriptor needs is added.
-        reading: how mesh files are read.
-        cache_dir: of the signatures of mesh files; the user's cache directory if None. Meshes are not cached.
-        n_workers: processes that compute the signatures of mesh files; all cores if None.
+        square_root: take square roots of the cells of histograms. Other descriptions are unchanged.
+        config: configuration of the signatures, completed by the requirements of the descriptor; the default if None.
+        reading: options for reading mesh files.
+        cache_dir: cache of the signatures of mesh files; the user's cache directory if None. Meshes are not cached.
+        n_workers: number of processes that compute the signatures of mesh files; the number of cores if None.
     """
 
     def __init__(
@@ -62,30 +62,30 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         self.n_workers = n_workers
 
     def fit(self, X: Sequence[str | Path | Mesh], y: Any = None) -> Self:
-        """Check the parameters and the kind of input, and count the columns; there is nothing to learn."""
+        """Check the parameters and the input, and determine the number of columns."""
         chosen = descriptor_of(self.descriptor)
         shapes = _checked(X)
         self._name = chosen.name
         if isinstance(chosen, HistogramDescriptor):
             self._n_features_out = chosen.n_features
-        else:  # only a description tells
+        else:  # known only after describing a shape
             self._n_features_out = self._features(shapes[:1]).shape[1]
         return self
 
     def transform(self, X: Sequence[str | Path | Mesh]) -> Singles:
-        """(N, cells) features of N mesh files or N meshes.
+        """Return features (N, cells) of N mesh files or N meshes.
 
         Raises:
-            MeshError: a mesh that cannot be used; see `load_mesh`.
-            TypeError: other input.
+            MeshError: a mesh cannot be used, see `load_mesh`.
+            TypeError: the input is neither paths nor meshes.
         """
         return self._features(_checked(X))
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
-        """Names of the columns: the descriptor's name and a number; of `set_output(transform="pandas")` too.
+        """Return the names of the columns: the name of the descriptor with an index.
 
         Args:
-            input_features: ignored, as meshes have no columns.
+            input_features: ignored, because meshes have no columns.
 
         Raises:
             NotFittedError: before `fit`.
@@ -103,14 +103,14 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         else:
             dataset = SignatureDataset(shapes, self.config, self.cache_dir, descriptor=chosen, reading=self.reading)
             if len(dataset) != len(shapes):
-                more = next(name for name in dataset.bodies.names if name not in set(map(str, shapes)))
-                raise ValueError(f"X: expected files of one body, got several, such as {more}. Name each as FILE#PART.")
+                part = next(name for name in dataset.bodies.names if name not in set(map(str, shapes)))
+                raise ValueError(f"X: expected files of one body, got several, such as {part}. Name each as FILE#PART.")
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
             tag = cache_tag(chosen)
             features = describe(dataset, chosen, cache_tag=tag, n_workers=self.n_workers)
         cells = features.flatten(1)
         if self.square_root and isinstance(chosen, HistogramDescriptor):
-            cells[:, : sum(chosen.part_cells)].sqrt_()  # behind them molecules have their size
+            cells[:, : sum(chosen.part_cells)].sqrt_()  # not the size of molecules, which follows the cells
         return cells.numpy()
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -129,16 +129,14 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
 def _checked(shapes: Sequence[str | Path | Mesh]) -> list[Any]:
     if isinstance(shapes, str | Path):
         raise TypeError(f"X: expected a list of paths of mesh files, or of meshes, got {str(shapes)!r} alone.")
-    found = list(shapes)
-    if isinstance(shapes, np.ndarray) or hasattr(shapes, "to_numpy"):  # a table would tell its columns
+    items = list(shapes)
+    if isinstance(shapes, np.ndarray) or hasattr(shapes, "to_numpy"):  # a list of a table would be its column names
         table = np.asarray(shapes, dtype=object)
         if table.shape[1:] not in ((), (1,)):
             raise ValueError(f"X: expected one column of paths or meshes, got an array of shape {table.shape}.")
-        found = list(table.ravel())
-    kinds = {
-        Mesh if isinstance(shape, Mesh) else Path if isinstance(shape, str | Path) else type(shape) for shape in found
-    }
-    if kinds not in ({Mesh}, {Path}):
-        names = sorted(kind.__name__ for kind in kinds) or ["nothing"]
+        items = list(table.ravel())
+    types = {Mesh if isinstance(item, Mesh) else Path if isinstance(item, str | Path) else type(item) for item in items}
+    if types not in ({Mesh}, {Path}):
+        names = sorted(kind.__name__ for kind in types) or ["nothing"]
         raise TypeError(f"X: expected paths of mesh files, or meshes, got {', '.join(names)}.")
-    return found
+    return items

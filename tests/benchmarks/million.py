@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from igps.gallery import _table
+from igps.gallery._search import nearest_rows
 from igps.gallery._table import BodyTable
 from igps.gallery.gallery import CANDIDATES
 from igps.retrieval import cosine
@@ -101,7 +102,7 @@ def main() -> None:
     for name, where in CONDITIONS.items():
         for query in torch.from_numpy(vectors):
             start = time.perf_counter()
-            rows, _, _ = table.search(query[None], cosine, top=TOP, candidates=CANDIDATES, where=where or None)
+            rows, _, _ = nearest_rows(table, query[None], cosine, top=TOP, candidates=CANDIDATES, where=where or None)
             seconds.setdefault(name, []).append(time.perf_counter() - start)
             answers.setdefault(name, []).append([int(row["name"]) for row in rows])
     search_memory = memory()

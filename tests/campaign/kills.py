@@ -71,7 +71,7 @@ class _Run:
     def blames_mesh(self) -> bool:
         """Whether a mesh was skipped because its worker was killed twice."""
         failures = self.out / "failures.csv"
-        return failures.exists() and "killed, twice" in failures.read_text()
+        return failures.exists() and "killed twice" in failures.read_text()
 
     def has_message(self) -> bool:
         """Whether the log ends with a message of the command, and without a traceback."""

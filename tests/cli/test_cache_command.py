@@ -86,7 +86,7 @@ def test_lists_of_files_may_be_one_file_of_signatures_and_what_needs_meshes_says
         (["outliers", out, *rich, *cache], "holds signatures and no meshes"),
         (["explain", out, *rich, *cache], "holds signatures and no meshes"),
         (["duplicates", out, *cache], "holds signatures and no meshes"),
-        (["doctor", out], "a file; a folder expected"),
+        (["doctor", out], "expected a folder, got a file"),
     ):
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, *command)
@@ -113,4 +113,4 @@ def test_a_mesh_in_place_of_a_folder_is_told_as_such(
     ):
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, *command, "--cache_dir", tmp_path / "cache")
-        assert capsys.readouterr().err == f"igps: {tmp_path / 'egg.off'}: a file; a folder expected.\n"
+        assert capsys.readouterr().err == f"igps: {tmp_path / 'egg.off'}: expected a folder, got a file.\n"

@@ -225,7 +225,7 @@ def test_values_at_vertices_give_the_same_linear_function_inside(
     values = VertexAttribute(name)(body, INSIDE)
     np.testing.assert_allclose(values, linear(INSIDE), atol=1e-3)
     write(body.path.with_name(name.partition("#")[0]), mesh.subdivide(), linear(mesh.subdivide().vertices))
-    with pytest.raises(MeshError, match=r"has 642 values, its surface 162 vertices"):
+    with pytest.raises(MeshError, match=r"has 642 values, but the surface has 162 vertices"):
         VertexAttribute(name)(body, INSIDE)
 
 
@@ -322,7 +322,7 @@ def test_tetrahedra_give_a_linear_function_inside_and_nothing_far_outside(body: 
     source = attribute_source("a.vtu")
     assert isinstance(source, TetAttribute)
     np.testing.assert_allclose(source(body, INSIDE), linear(INSIDE), atol=1e-5)
-    with pytest.raises(MeshError, match="has no value at 200 of 200 places"):
+    with pytest.raises(MeshError, match="has no value at 200 of 200 points"):
         source(body, INSIDE + 5)
 
 
@@ -337,10 +337,10 @@ def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog: pytest
         assert found[39] == 38
         assert found[10] in (9, 11)
         np.testing.assert_array_equal(np.delete(found, [10, 39]), np.delete(values, [10, 39]))
-        assert "here: 2 of 40 values are those of the nearest place" in caplog.text
+        assert "here: 2 of 40 values were taken from the nearest point" in caplog.text
         given[:5] = fill
         with pytest.raises(
-            MeshError, match=r"here: has no value at 7 of 40 places .* from \(0, 0, 0\) to \(39, 0, 0\)"
+            MeshError, match=r"here: has no value at 7 of 40 points .* from \(0, 0, 0\) to \(39, 0, 0\)"
         ):
             fill_missing(given, points, "here")
 
@@ -363,9 +363,9 @@ def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body: BodyRef)
 
 def test_an_image_of_another_subject_and_a_grid_beside_the_body_are_refused(body: BodyRef) -> None:
     write_nifti(body.path.with_name("egg.nii"), image())
-    with pytest.raises(MeshError, match=r"egg\.nii: has no value at 200 of 200 places of the body, which reaches from"):
+    with pytest.raises(MeshError, match=r"egg\.nii: has no value at 200 of 200 points of the body, which extends from"):
         ImageAttribute("{stem}.nii")(body, INSIDE + 100)
-    with pytest.raises(MeshError, match=r"has no value at \d+ of 200 places"):
+    with pytest.raises(MeshError, match=r"has no value at \d+ of 200 points"):
         ImageAttribute("{stem}.nii")(body, INSIDE + TURN @ [3.4, 0, 0])
 
 
@@ -471,9 +471,9 @@ def test_words_of_the_command_line_become_sources() -> None:
     }
     assert pickle.loads(pickle.dumps(found)) == found
     for wrong in ("ct", "=a.nii", "a b=c.nii", "ct="):
-        with pytest.raises(ValueError, match="attribute: expected a pattern such as ct=images"):
+        with pytest.raises(ValueError, match="attribute: expected a new name and a path, as in ct="):
             attribute_sources([wrong], None)
-    with pytest.raises(ValueError, match=r"attribute: expected a pattern such as .*, once, got 'ct=b\.nii'"):
+    with pytest.raises(ValueError, match=r"attribute: expected a new name and a path, as in .*, got 'ct=b\.nii'"):
         attribute_sources(["ct=a.nii", "ct=b.nii"], None)
 
 
@@ -524,7 +524,7 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path: Path) -> 
         np.testing.assert_allclose(charge(BodyRef(path, "model"), points), 1.0, atol=1e-6)
         np.testing.assert_allclose(charge(BodyRef(path), points + np.array([0, 0, 30])), -1.0, atol=1e-6)
     write_body(tmp_path / "egg.off", 1, 1)
-    with pytest.raises(MeshError, match=r"egg\.off: has no atoms, which 'charge' is known of"):
+    with pytest.raises(MeshError, match=r"egg\.off: expected a PDB, mmCIF or PQR file for 'charge'"):
         charge(BodyRef(tmp_path / "egg.off"), points)
     with pytest.raises(ValueError, match=r"attribute: expected one of charge, .*, got 'mood'"):
         ResidueAttribute("mood")
@@ -555,7 +555,7 @@ def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_w
     (tmp_path / "dna.pdb").write_text(atom)
     body = BodyRef(tmp_path / "dna.pdb", "chain A")
     assert ResidueAttribute("residue_shares")(body, INSIDE).shape == (200, 25)
-    with pytest.raises(MeshError, match=r"dna\.pdb#chain A: 'hydropathy' is known of none of its residues\. Choose"):
+    with pytest.raises(MeshError, match=r"dna\.pdb#chain A: 'hydropathy' is defined for none of its residues\. Choose"):
         ResidueAttribute("hydropathy")(body, INSIDE)
 
 
@@ -622,10 +622,16 @@ def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: P
     without: dict[str, Callable[..., np.ndarray]] = {}
     exec("def written(body, points): return points[:, 0]", without)
     for function, said in (
-        (lambda body, points: factor * points[:, 0], "uses variables of what is around it"),
-        (lambda body, points, around=around: around.factor * points[:, 0], "uses variables of what is around it"),
-        (MethodType(lambda around, body, points: around.factor * points[:, 0], around), "uses variables of what is"),
-        (without["written"], "the source code of written is not known"),
+        (lambda body, points: factor * points[:, 0], "uses variables that a cache key cannot hold"),
+        (
+            lambda body, points, around=around: around.factor * points[:, 0],
+            "uses variables that a cache key cannot hold",
+        ),
+        (
+            MethodType(lambda around, body, points: around.factor * points[:, 0], around),
+            "uses variables that a cache key",
+        ),
+        (without["written"], "the source code of written is not available"),
     ):
         with pytest.raises(ValueError, match=rf"attributes: .*{said}.*cache_tag"):
             SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"told": function})
@@ -641,7 +647,7 @@ def test_constants_that_a_function_uses_tell_it_from_itself(monkeypatch: pytest.
     monkeypatch.setitem(globals(), "FACTOR", 2.0)
     assert tag() == first
     monkeypatch.setitem(globals(), "FACTOR", np.ones(3))
-    with pytest.raises(ValueError, match=r"attributes: scaled uses variables of what is around it"):
+    with pytest.raises(ValueError, match=r"attributes: scaled uses variables that a cache key cannot hold"):
         tag()
 
 
@@ -679,7 +685,7 @@ def test_what_a_function_calls_and_what_that_uses_tell_it_from_itself(monkeypatc
     assert len({first, *found}) == 4
     assert tag() == first
     monkeypatch.setitem(globals(), "doubled", SimpleNamespace(factor=2.0))
-    with pytest.raises(ValueError, match=r"attributes: Shift uses variables of what is around it"):
+    with pytest.raises(ValueError, match=r"attributes: Shift uses variables that a cache key cannot hold"):
         tag()
 
 

@@ -240,7 +240,7 @@ def test_batches_that_do_not_fit_are_not_joined(signatures: list[Signature]) -> 
     mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
     with_mesh, without = collate(signatures[:1], [mesh]), collate(signatures[1:])
     assert SignatureBatch.concatenate([with_mesh, with_mesh]).meshes == (mesh, mesh)
-    with pytest.raises(ValueError, match="batches: expected all with meshes or none"):
+    with pytest.raises(ValueError, match="batches: expected meshes in all batches or in none"):
         SignatureBatch.concatenate([with_mesh, without])
     with pytest.raises(ValueError, match="batches: expected at least one"):
         SignatureBatch.concatenate([])

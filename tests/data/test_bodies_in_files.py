@@ -15,7 +15,7 @@ import igps.data.pipeline as pipeline_module
 from igps._parallel import Limits
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import compute
-from igps.data.sources import Bodies, find_bodies, given_bodies
+from igps.data.sources import Bodies, bodies_of_files, find_bodies
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
@@ -75,7 +75,7 @@ def test_bodies_are_found_by_file_and_part(root: Path) -> None:
     assert bodies.labels is None
     assert bodies.subset([3]).parts == ("spleen",)
     assert find_bodies(root).names == ("1.obj", "2.obj")
-    given = given_bodies([root / "2.obj"], ["second"], OBJECTS)
+    given = bodies_of_files([root / "2.obj"], ["second"], OBJECTS)
     assert given.names == (f"{root / '2.obj'}#liver", f"{root / '2.obj'}#spleen")
     assert given.labels == ("second", "second")
 
@@ -153,7 +153,7 @@ def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
     (root / "labels.csv").write_text("file,age\n1.obj,30\n2.obj\n")
     bodies = find_bodies(root, OBJECTS)
     assert (bodies.labels, bodies.columns) == (None, {"age": ("30", "30", None, None)})
-    with pytest.raises(ValueError, match=r"no classes found\..* Or call one of age label"):
+    with pytest.raises(ValueError, match=r"no classes found\..* Or rename one of the columns age to label"):
         find_bodies(root, OBJECTS, labelled=True)
     assert find_bodies(root, OBJECTS, classes="body", labelled=True).labels == ("liver", "spleen", "liver", "spleen")
 

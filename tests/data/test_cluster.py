@@ -181,7 +181,8 @@ class Nowhere:
 
 
 @pytest.mark.parametrize(
-    ("executor", "words"), [(Broken(1), "gave the work up"), (Elsewhere(1), "signatures do not appear there")]
+    ("executor", "words"),
+    [(Broken(1), "the executor cancelled a job"), (Elsewhere(1), "signatures do not appear there")],
 )
 def test_a_cluster_that_fails_is_told(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor: Executor, words: str
@@ -193,6 +194,6 @@ def test_a_cluster_that_fails_is_told(
 
 def test_a_worker_of_another_version_is_refused(root: Path, tmp_path: Path) -> None:
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
-    with pytest.raises(MachineError, match=r"has igps .*, signatures \d+, where 9\.9, signatures 9 is asked for"):
+    with pytest.raises(MachineError, match=r"has igps .*, signatures \d+, but 9\.9, signatures 9 is required"):
         fill_elsewhere(dataset.pipeline.fill, "9.9, signatures 9", [BodyRef(root / "00.off")])
     assert stored(tmp_path / "cache") == {}

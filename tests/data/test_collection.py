@@ -94,7 +94,9 @@ def test_parts_of_it_are_written_again_and_go_to_other_processes(
 
 def test_what_a_descriptor_requires_is_asked_of_it(written: tuple[SignatureDataset, Path]) -> None:
     SignatureDataset.from_file(written[1], descriptor=Requirements(13, ("depth",)))
-    with pytest.raises(ValueError, match=r"\.igps: n_eigenpairs: .* at least 14, got 13\. .*export the folder again"):
+    with pytest.raises(
+        ValueError, match=r"\.igps: n_eigenpairs: .* at least 14, got 13\. .*export the collection again"
+    ):
         SignatureDataset.from_file(written[1], descriptor=Requirements(14))
 
 
@@ -195,7 +197,7 @@ def test_labels_may_be_numbers_and_each_body_is_there_once(tmp_path: Path) -> No
     assert found.classes == ("2", "10")
     assert found.labels.tolist() == [1, 0, 1]
     twice = SignatureDataset([*paths, paths[0]], CONFIG, tmp_path / "cache")
-    with pytest.raises(ValueError, match=r"twice\.igps: .*0\.off is there twice"):
+    with pytest.raises(ValueError, match=r"twice\.igps: expected unique names, got .*0\.off twice"):
         twice.to_file(tmp_path / "twice.igps")
     assert not (tmp_path / "twice.igps").exists()
 

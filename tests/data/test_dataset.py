@@ -140,7 +140,9 @@ def test_key_covers_content_and_version_but_not_the_path(
 @pytest.mark.parametrize("cache", ["file", "file/cache"])
 def test_a_cache_that_cannot_be_made_is_no_fault_of_the_bodies(root: Path, tmp_path: Path, cache: str) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(MachineError, match=rf"cache_dir: {tmp_path / cache} cannot be made .*Choose a folder"):
+    with pytest.raises(
+        MachineError, match=rf"cache_dir: {tmp_path / cache} cannot be created .*Choose a writable folder"
+    ):
         SignatureDataset(root, CONFIG, tmp_path / cache).precompute(n_workers=1)
 
 
@@ -374,7 +376,10 @@ def test_a_pre_transform_is_kept_under_a_key_of_its_own(
     assert len({*keys, *dataset.cached_keys(), *changed(1).cached_keys()}) == 10  # of the last one is, and None
     assert changed(0).cached_keys() == keys
     assert [first.key(i) for i in range(len(first))] == keys
-    for wrong, message in ((Scale(), "expected a seed"), (lambda signature: signature, "expected a cache_tag")):
+    for wrong, message in (
+        (Scale(), "expected a seed"),
+        (lambda signature: signature, "expected an object with a cache_tag"),
+    ):
         with pytest.raises(ValueError, match=f"pre_transform: {message}"):
             SignatureDataset(root, CONFIG, dataset.pipeline.cache_dir, pre_transform=wrong)  # type: ignore[arg-type]
 

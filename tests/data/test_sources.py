@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from igps.data.sources import bodies_of, file_and_part, find_bodies, given_bodies
+from igps.data.sources import bodies_of, bodies_of_files, file_and_part, find_bodies
 
 
 def touch(root: Path, *names: str) -> None:
@@ -108,19 +108,19 @@ def test_what_is_left_out_of_a_folder_is_told(
     files = find_bodies(tmp_path)
     assert files.names == ("cat/1.off", "cat/lost.off", "elsewhere/5.off", "linked/5.off")
     assert files.labels == ("cat", "cat", "elsewhere", "linked")
-    assert "dog: left out with all that is in it" in caplog.text
+    assert "dog: this folder is left out" in caplog.text
     assert r"m\xfcll.off': left out, its name is not UTF-8" in caplog.text
-    assert "1 files beside the folders of classes are left out, such as alone.off" in caplog.text
+    assert "1 files beside the folders of classes are ignored, such as alone.off" in caplog.text
     assert len(caplog.records) == 3
 
 
 def test_names_that_are_no_words_are_refused(tmp_path: Path) -> None:
     name = Path(os.fsdecode(os.fsencode(tmp_path) + b"/m\xfcll"))
     touch(name, "1.off")
-    with pytest.raises(ValueError, match=r"m\\xfcll': a name in UTF-8 expected"):
+    with pytest.raises(ValueError, match=r"m\\xfcll': expected a name in UTF-8"):
         find_bodies(name)
     with pytest.raises(ValueError, match=r"paths: expected names in UTF-8, got b'.*m\\xfcll/1.off'"):
-        given_bodies([name / "1.off"])
+        bodies_of_files([name / "1.off"])
 
 
 def test_labels_may_be_an_array_and_are_of_files_alone(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_labels_may_be_an_array_and_are_of_files_alone(tmp_path: Path) -> None:
     paths = [tmp_path / "cat" / "1.off", tmp_path / "dog" / "2.off"]
     assert bodies_of(paths, np.array(["x", "y"])).labels == ("x", "y")  # type: ignore[arg-type]
     for given in (tmp_path, find_bodies(tmp_path)):
-        with pytest.raises(ValueError, match="labels: expected None beside a folder or bodies"):
+        with pytest.raises(ValueError, match="labels: expected None with a folder or bodies"):
             bodies_of(given, ["x", "y"])
 
 
@@ -142,8 +142,8 @@ def test_nothing_there(tmp_path: Path) -> None:
 
 
 def test_given_files_need_one_label_each() -> None:
-    assert given_bodies(["b.off", "a.off"], ["x", "y"]).labels == ("x", "y")
+    assert bodies_of_files(["b.off", "a.off"], ["x", "y"]).labels == ("x", "y")
     with pytest.raises(ValueError, match="labels: expected one for each of 2"):
-        given_bodies(["b.off", "a.off"], ["x"])
+        bodies_of_files(["b.off", "a.off"], ["x"])
     with pytest.raises(ValueError, match="at least one"):
-        given_bodies([])
+        bodies_of_files([])

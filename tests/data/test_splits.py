@@ -69,16 +69,18 @@ def test_splits_depend_on_the_seed_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    ("split", "arguments", "name"),
+    ("split", "arguments", "message"),
     [
         (split_seen, {"n_train": 6}, "n_train"),
         (split_seen, {"n_train": 3, "n_validation": 3}, "n_validation"),
         (split_seen, {"n_train": 2.5}, "n_train"),
+        (split_seen, {"n_train": 0}, "n_train: expected a number above 0"),
+        (split_seen, {"n_train": 0.5, "n_validation": 1}, "n_validation: expected a share below 1"),
         (split_unseen, {"n_train": 8}, "n_train"),
         (split_unseen, {"n_train": 6, "n_test": 3}, "n_test"),
         (split_unseen, {"n_train": 3, "n_validation": 3}, "n_validation"),
     ],
 )
-def test_impossible_splits_are_refused(split, arguments: dict[str, int], name: str) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(ValueError, match=name):
+def test_impossible_splits_are_refused(split, arguments: dict[str, float], message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=message):
         split(LABELS, **arguments)

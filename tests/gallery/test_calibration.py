@@ -84,9 +84,9 @@ def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(calibrati
     calibration.check("same", Same(), CONFIG)
     with pytest.raises(ValueError, match="descriptor: expected same, whose distances are calibrated, got interior"):
         calibration.check("interior", descriptor("interior"), CONFIG)
-    with pytest.raises(ValueError, match="same: its calibration was made for other parameters of it"):
+    with pytest.raises(ValueError, match="same: its calibration was made for other parameters"):
         replace(calibration, model="0").check("same", Same(), CONFIG)
-    with pytest.raises(ValueError, match=r"resolution: expected 32, as of .* got 16\. Leave it"):
+    with pytest.raises(ValueError, match=r"resolution: expected 32, for which same is calibrated, got 16\. Use the"):
         calibration.check("same", Same(), replace(CONFIG, resolution=16))
 
 

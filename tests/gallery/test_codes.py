@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from igps.gallery import _codes
-from igps.gallery._codes import Coder, Codes
+from igps.gallery._codes import CodeIndex, Coder
 
 
 def families(n_families: int, n_members: int, noise: float, width: int = 64, seed: int = 0) -> np.ndarray:
@@ -17,10 +17,10 @@ def families(n_families: int, n_members: int, noise: float, width: int = 64, see
     return members.reshape(-1, width).astype(np.float32)
 
 
-def kept(vectors: np.ndarray, rows: np.ndarray | None = None) -> Codes:
+def kept(vectors: np.ndarray, rows: np.ndarray | None = None) -> CodeIndex:
     coder = Coder.fit(vectors, "cosine")
     rows = np.arange(len(vectors), dtype=np.uint64) if rows is None else rows
-    return Codes(coder, coder(vectors), rows)
+    return CodeIndex(coder, coder(vectors), rows)
 
 
 @pytest.mark.parametrize("width", [5, 64, 200, 256])
@@ -30,11 +30,11 @@ def test_estimates_are_right_on_average(width: int) -> None:
     codes = kept(vectors)
     coder = codes._coder
     own = coder(vectors)
-    rest = vectors @ coder.turn.T - coder.centres[own["centre"]]
+    rest = vectors @ coder.rotation.T - coder.centroids[own["centre"]]
     errors = []
     for query in families(1, 20, 1.0, width, seed=1):
-        found = codes._distances(query, len(vectors))[codes._place]
-        away = coder.turn @ query - coder.centres[own["centre"]]
+        found = codes._distances(query, len(vectors))[codes._positions]
+        away = coder.rotation @ query - coder.centroids[own["centre"]]
         lengths = np.linalg.norm(rest, axis=1) * np.linalg.norm(away, axis=1)
         # A vector that is a centre is known exactly.
         far = lengths > 1e-3

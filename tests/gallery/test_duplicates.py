@@ -382,13 +382,13 @@ def test_what_is_wrong_is_one_sentence(
     assert "meshes: expected two files, got 1" in error_of(monkeypatch, capsys, "distance", root / "bar.off", *options)
     fewer = ["--signature.n_surface_samples", "300"]
     words = error_of(monkeypatch, capsys, "distance", root / "bar.off", root / "bar.off", *options, *fewer)
-    assert "n_surface_samples: expected 2000, as of the signatures that pretrained is calibrated for, got 300" in words
+    assert "n_surface_samples: expected 2000, for which pretrained is calibrated, got 300" in words
     pytest.importorskip("lancedb")
     dataset = SignatureDataset([root / "bar.off", root / "lump.off"], None, cache)
     Gallery.build(tmp_path / "g.igps", dataset, "gps", n_workers=1)
     words = error_of(monkeypatch, capsys, "duplicates", tmp_path / "g.igps", *options)
     assert "descriptor: expected pretrained, whose distances are calibrated, got gps" in words
-    assert "built with --size ignore" in words
+    assert "build it with --size ignore" in words
 
 
 def test_other_lengths_are_no_candidates(tmp_path: Path) -> None:

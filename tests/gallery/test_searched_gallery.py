@@ -20,8 +20,8 @@ from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
 from igps.descriptors.fingerprint import fingerprint
+from igps.gallery import gallery as gallery_module
 from igps.gallery import rows
-from igps.gallery._table import BodyTable
 from igps.gallery.gallery import CANDIDATES, Gallery
 from igps.gallery.sync import sync
 from igps.mesh.options import LoadOptions
@@ -87,13 +87,13 @@ def test_more_are_ranked_under_a_head(
 ) -> None:
     """Whose distance may be only near the cosine's, by which candidates are found."""
     asked = []
-    search = BodyTable.search
+    search = gallery_module.nearest_rows
 
-    def spied(table: BodyTable, *arguments: Any, **options: Any) -> Any:
+    def spied(*arguments: Any, **options: Any) -> Any:
         asked.append(options["candidates"])
-        return search(table, *arguments, **options)
+        return search(*arguments, **options)
 
-    monkeypatch.setattr(BodyTable, "search", spied)
+    monkeypatch.setattr(gallery_module, "nearest_rows", spied)
     histograms = describe(dataset, small_interior())
     embedded = EmbeddedDescriptor(small_interior(), TwoLevelHead().fit(histograms, dataset.labels))
     for descriptor, descriptions in ((small_interior(), histograms), (embedded, embedded.head(histograms))):
@@ -257,7 +257,7 @@ def test_rows_tell_size_class_and_what_labels_tell(root: Path, tmp_path: Path) -
 def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Afterwards it is what building makes; what has not changed is neither described nor written."""
     cache = tmp_path / "cache"
-    monkeypatch.setattr(rows, "_YOUNG", 10**18)  # however busy the machine, no file is old
+    monkeypatch.setattr(rows, "_CLOCK_RESOLUTION", 10**18)  # however busy the machine, no file is old
     gallery, _ = Gallery.build(
         tmp_path / "g.igps", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1
     )
@@ -267,7 +267,7 @@ def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path, mon
     version = gallery.versions()[-1]["version"]
     assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
     assert gallery.versions()[-1]["version"] == version
-    monkeypatch.setattr(rows, "_YOUNG", 0)
+    monkeypatch.setattr(rows, "_CLOCK_RESOLUTION", 0)
     sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
     with monkeypatch.context() as context:
         context.setattr(SignatureDataset, "key", lambda *_: pytest.fail("a file was read"))
@@ -351,7 +351,7 @@ def test_commands_that_change_a_gallery(
     versions = json.loads("\n".join(lines("versions", gallery, "--json")))
     assert [one["bodies"] for one in versions][:2] == [6, 6]
     assert lines("restore", gallery, "--version", versions[0]["version"]) == [f"{gallery}: 6 bodies by {INTERIOR}"]
-    assert "version: expected one of those" in error_of(
+    assert "version: expected one that" in error_of(
         monkeypatch, capsys, "gallery", "restore", gallery, "--version", 999
     )
     wrong = error_of(monkeypatch, capsys, "gallery", "update", gallery, "--where", "area > 0", "--to", "volume=much")
@@ -372,7 +372,7 @@ def test_sync_notices_a_table_of_names_that_was_edited(tmp_path: Path, monkeypat
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "scan.nii.gz")
     table = tmp_path / "names.json"
     table.write_text('{"1": "block", "2": "bar"}')
-    monkeypatch.setattr(rows, "_YOUNG", 0)
+    monkeypatch.setattr(rows, "_CLOCK_RESOLUTION", 0)
 
     def now() -> SignatureDataset:
         reading = LoadOptions(bodies="labels", names=str(table))
@@ -390,7 +390,7 @@ def test_sync_notices_a_table_of_names_that_was_edited(tmp_path: Path, monkeypat
 def test_a_column_with_a_dot_is_told_before_anything_is_described(root: Path, tmp_path: Path) -> None:
     (root / "labels.csv").write_text("file,label,scan.age\nball/0.off,ball,3\n")
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
-    with pytest.raises(ValueError, match=r"labels.csv: .* whose name has a dot, .* got 'scan.age'"):
+    with pytest.raises(ValueError, match=r"labels.csv: expected column names without dots .* got 'scan.age'"):
         Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert not (tmp_path / "g.igps").exists()
 
@@ -401,7 +401,7 @@ def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gall
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     (root / "labels.csv").write_text("file,label,_rowid\nball/0.off,ball,3\n")
     for change in (Gallery.add, lambda one, other, **_: sync(one, other, root)):
-        with pytest.raises(ValueError, match=r"labels.csv: .* begins with an underscore, got '_rowid'"):
+        with pytest.raises(ValueError, match=r"labels.csv: .* do not begin with an underscore, got '_rowid'"):
             change(gallery, SignatureDataset(root, CONFIG, tmp_path / "cache"), n_workers=1)
     assert len([*Gallery(tmp_path / "g.igps", small_interior()).rows("name")]) == 6
 
@@ -528,7 +528,7 @@ def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
     monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
     words = ["gallery", "build", root, "--descriptor", INTERIOR]
     told = error_of(monkeypatch, capsys, *words, "--out", root)
-    assert "expected a gallery or a new folder, got one with ball" in told
+    assert "expected a gallery or a new folder, got a folder with ball" in told
     with_attribute = ["--out", tmp_path / "g", "--attribute", "ct=ct/{file}.nii.gz", "--with", "ct"]
     told = error_of(monkeypatch, capsys, *words, *with_attribute)
     assert "ct: expected centres, got 8 quantiles of no collection" in told

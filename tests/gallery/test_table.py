@@ -24,6 +24,7 @@ import lancedb
 import pyarrow as pa
 
 from igps.gallery import _table
+from igps.gallery._search import nearest_rows
 from igps.gallery._table import BodyTable
 from igps.gallery.about import check_alike, is_gallery, open_table
 from igps.retrieval import chi_square, cosine, search
@@ -68,15 +69,15 @@ def numbers(found: tuple[list[dict[str, Any]], torch.Tensor, torch.Tensor]) -> l
 
 def recall(table: BodyTable, asked: torch.Tensor, rows: torch.Tensor, distance: Any, **options: Any) -> float:
     exact = search(asked, rows, top=10, distance=distance).indices.tolist()
-    found = [numbers(table.search(one[None], distance, top=10, **options)) for one in asked]
+    found = [numbers(nearest_rows(table, one[None], distance, top=10, **options)) for one in asked]
     return float(np.mean([len(set(one) & set(other)) / 10 for one, other in zip(found, exact, strict=True)]))
 
 
 @pytest.fixture
 def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
     """Codes, and indices of columns, for a thousand rows."""
-    monkeypatch.setattr(_table, "_FEWEST_FOR_CODES", 1000)
-    monkeypatch.setattr(_table, "_CHANGES", 1)
+    monkeypatch.setattr(_table, "_MIN_ROWS_FOR_CODES", 1000)
+    monkeypatch.setattr(_table, "_INDEX_INTERVAL", 1)
 
 
 @pytest.mark.parametrize("searched_by", ["chi_square", None])
@@ -85,7 +86,7 @@ def test_few_are_compared_one_by_one(tmp_path: Path, searched_by: str | None) ->
     table = written(tmp_path / "g.igps", rows, searched_by)
     expected = search(rows[:5], rows, top=7)
     for i in range(5):
-        found = table.search(rows[i : i + 1], chi_square, top=7)
+        found = nearest_rows(table, rows[i : i + 1], chi_square, top=7)
         assert numbers(found) == expected.indices[i].tolist()
         torch.testing.assert_close(found[1], expected.distances[i], rtol=1e-6, atol=1e-7)
         assert torch.equal(found[2], rows[expected.indices[i]])
@@ -99,7 +100,7 @@ def test_the_nearest_of_many_are_those_of_all(tmp_path: Path) -> None:
     table = written(tmp_path / "g.igps", rows, "chi_square")
     assert recall(table, asked, rows, chi_square, candidates=200) >= 0.98
     exact = search(asked[:3], rows, top=10)
-    found = [table.search(one[None], chi_square, top=10, exact=True) for one in asked[:3]]
+    found = [nearest_rows(table, one[None], chi_square, top=10, exact=True) for one in asked[:3]]
     assert [numbers(one) for one in found] == exact.indices.tolist()
     torch.testing.assert_close(torch.stack([one[1] for one in found]), exact.distances, rtol=1e-5, atol=1e-6)
 
@@ -119,12 +120,12 @@ def test_a_condition_keeps_what_numpy_keeps(tmp_path: Path) -> None:
         left = np.flatnonzero(kept)
         for query in rows[:2]:
             expected = left[torch.sort(1 - rows[left] @ query, stable=True).indices[:10].numpy()].tolist()
-            assert numbers(table.search(query[None], cosine, top=10, where=where)) == expected, where
-            assert numbers(table.search(query[None], cosine, top=10, where=where, exact=True)) == expected, where
+            assert numbers(nearest_rows(table, query[None], cosine, top=10, where=where)) == expected, where
+            assert numbers(nearest_rows(table, query[None], cosine, top=10, where=where, exact=True)) == expected, where
     for wrong in ("weight > 3", "volume >", "volume > 'much' AND"):
         for exact in (False, True):
             with pytest.raises(ValueError, match=r"where: expected a condition on the columns id, name, .* age, got"):
-                table.search(rows[:1], cosine, top=1, where=wrong, exact=exact)
+                nearest_rows(table, rows[:1], cosine, top=1, where=wrong, exact=exact)
 
 
 @pytest.mark.usefixtures("few_are_many")
@@ -134,7 +135,7 @@ def test_vectors_of_any_length_are_searched(tmp_path: Path) -> None:
     table = written(tmp_path / "g.igps", rows, "cosine")
     assert recall(table, rows[:40], rows, cosine) == 1
     (expected,) = search(rows[:1], rows, top=1500, distance=cosine).indices.tolist()
-    assert numbers(table.search(rows[:1], cosine, top=1500)) == expected
+    assert numbers(nearest_rows(table, rows[:1], cosine, top=1500)) == expected
 
 
 def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
@@ -146,7 +147,7 @@ def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
     assert str(table.table.schema.field("vector").type) == "fixed_size_list<item: halffloat>[1501]"
     kept = torch.cat([table.decoded(some)[0] for some in table.batches()])
     torch.testing.assert_close(kept, rows, rtol=2**-11, atol=1e-11)
-    found = table.search(rows[:1], chi_square, top=5)
+    found = nearest_rows(table, rows[:1], chi_square, top=5)
     torch.testing.assert_close(found[1], search(rows[:1], rows, top=5).distances[0], rtol=2e-3, atol=1e-6)
 
 
@@ -191,7 +192,7 @@ def test_rows_are_added_replaced_and_removed(tmp_path: Path) -> None:
     now = torch.cat([changed[100:], rows[200:1800]])
     for query in now[::300]:
         expected = (search(query[None], now, top=6, distance=cosine).indices[0] + 100).tolist()
-        assert numbers(BodyTable(table.path).search(query[None], cosine, top=6)) == expected
+        assert numbers(nearest_rows(BodyTable(table.path), query[None], cosine, top=6)) == expected
     with pytest.raises(ValueError, match=r"age: expected numbers as in .*g\.igps, got text"):
         table.add(rows[:1], [{**told(0), "age": "old"}], {"age": str})
 
@@ -211,8 +212,8 @@ def test_each_change_is_a_version_to_return_to(tmp_path: Path) -> None:
     written(tmp_path / "g.igps", rows[:3], "cosine")
     assert [len(BodyTable(table.path, version)) for version in (first, table.table.version, None)] == [30, 40, 3]
     before = BodyTable(table.path, first)
-    assert numbers(before.search(rows[29:30], cosine, top=1)) == [29]
-    with pytest.raises(ValueError, match=r"version: expected one of those that `igps gallery versions` lists, got 99"):
+    assert numbers(nearest_rows(before, rows[29:30], cosine, top=1)) == [29]
+    with pytest.raises(ValueError, match=r"version: expected one that `igps gallery versions` lists, got 99"):
         BodyTable(table.path, 99)
 
 
@@ -222,7 +223,7 @@ def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"g\.igps: the gallery is of another signature.resolution: it has 32, not 20"):
         check_alike(table.path, table.about, other)
     with pytest.raises(ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(5,\)"):
-        table.search(units(1, 5), cosine, top=1)
+        nearest_rows(table, units(1, 5), cosine, top=1)
     with pytest.raises(ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(4, 4\)"):
         table.add(units(1).reshape(1, 4, 4), [told(0)], {})
     with pytest.raises(ValueError, match="expected finite numbers"):
@@ -231,7 +232,7 @@ def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
         _table.write(tmp_path / "new.igps", ABOUT, "cosine", [], {})
     with pytest.raises(FileNotFoundError, match=r"nowhere: no gallery there"):
         open_table(tmp_path / "nowhere")
-    with pytest.raises(ValueError, match=r"got one with g.igps"):
+    with pytest.raises(ValueError, match=r"got a folder with g.igps"):
         written(tmp_path, units(10), "cosine")
     assert len(BodyTable(tmp_path / "g.igps")) == 10
 
@@ -263,7 +264,7 @@ def test_no_damaged_file_gives_a_wrong_answer(tmp_path: Path, how: str) -> None:
 
     def answers() -> list[list[int]]:
         table = BodyTable(tmp_path / "g.igps")
-        return [numbers(table.search(one[None], chi_square, top=3)) for one in rows[:3]]
+        return [numbers(nearest_rows(table, one[None], chi_square, top=3)) for one in rows[:3]]
 
     written(tmp_path / "g.igps", rows, "chi_square")
     right = answers()
@@ -287,7 +288,7 @@ def test_no_damaged_file_gives_a_wrong_answer(tmp_path: Path, how: str) -> None:
 
 
 def _answers(path: Path) -> list[list[int]]:
-    return [numbers(BodyTable(path).search(one[None], cosine, top=3)) for one in units(1500)[::150]]
+    return [numbers(nearest_rows(BodyTable(path), one[None], cosine, top=3)) for one in units(1500)[::150]]
 
 
 def test_several_processes_read_while_one_adds(tmp_path: Path) -> None:
@@ -300,7 +301,7 @@ def test_several_processes_read_while_one_adds(tmp_path: Path) -> None:
         after = _answers(table.path)
         assert all(future.result() in (before, after) for future in futures)
     # What was opened before stays what it was.
-    assert [numbers(opened.search(one[None], cosine, top=3)) for one in rows[::150]] == before != after
+    assert [numbers(nearest_rows(opened, one[None], cosine, top=3)) for one in rows[::150]] == before != after
 
 
 def test_an_index_of_an_earlier_version_is_refused(tmp_path: Path) -> None:

@@ -180,7 +180,7 @@ def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset: S
     values, failures = describe_usable(dataset, Area(refused="1.off", dies=True), n_workers=2)
     np.testing.assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 2, 3)], rtol=1e-6)
     assert [failure.path for failure in failures] == [dataset.bodies.paths[1]]
-    assert "was killed, twice" in failures[0].error
+    assert "was killed twice" in failures[0].error
 
 
 def test_descriptions_that_are_not_finite_are_failures(dataset: SignatureDataset) -> None:

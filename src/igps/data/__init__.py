@@ -1,1 +1,1 @@
-"""Many meshes: where they come from, their cached Signatures, batches of them."""
+"""Collections of bodies: sources, cached Signatures, batches."""

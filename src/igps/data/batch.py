@@ -1,7 +1,8 @@
-"""Signatures of several bodies as padded tensors, and one body of them without the padding."""
+"""Batches of Signatures as padded tensors, and single bodies without padding."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from igps.signature.signature import Samples, Signature
 
 @dataclass(frozen=True, eq=False)
 class LabelledSignature:
-    """An item of a `SignatureDataset`: a Signature, the number of its class (−1 if unknown), and its name."""
+    """An item of a `SignatureDataset`: a Signature, the index of its class (−1 if unknown), and its name."""
 
     signature: Signature
     label: int
@@ -28,81 +29,80 @@ class LabelledSignature:
 
 @dataclass(frozen=True, eq=False)
 class SampleBatch:
-    """Samples of N shapes, padded to the longest."""
+    """Samples of N shapes, padded to the largest number of samples."""
 
-    points: Tensor  # (N, P, 3) float32, length, measured from the centre of each shape's own samples
+    points: Tensor  # (N, P, 3) float32, unit of length, relative to the mean of the samples of each shape
     eigenfunctions: Tensor  # (N, P, K) float32, 1/length; zero where padded
-    mask: Tensor  # (N, P) true where a sample is real
+    mask: Tensor  # (N, P) bool, false where padded
     attributes: Mapping[str, Tensor]  # by name, each (N, P) or (N, P, C) float32; a direction has C = 3
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SampleBatch:
-        """The batch with a function applied to each of its tensors."""
+        """Return the batch with a function applied to each of its tensors."""
         attributes = {name: function(values) for name, values in self.attributes.items()}
         return SampleBatch(function(self.points), function(self.eigenfunctions), function(self.mask), attributes)
 
     def to(self, device: torch.device | str | torch.dtype, non_blocking: bool = False) -> SampleBatch:
-        """The same batch on another device, or with numbers of another type; see `torch.Tensor.to`."""
+        """Return the batch on another device or with another floating type, see `torch.Tensor.to`."""
         if isinstance(device, torch.dtype):
             return self.map(lambda values: values.to(device) if values.is_floating_point() else values)
         return self.map(lambda values: values.to(device, non_blocking=non_blocking))
 
     def subset(self, n_samples: int, seed: int | None = None) -> SampleBatch:
-        """At most `n_samples` samples of each shape.
+        """Return at most `n_samples` samples of each shape.
 
-        A seed takes them at equal steps along the order they come in, from a start that it draws. In a Signature that
-        order is by what the body looks like, and so is the choice: it depends neither on its batch nor on how grid and
-        mesh are numbered. Without one, the global generator of their device draws them at random.
+        With a seed, samples are taken at equal steps, with a start that depends on the seed. The samples of a Signature
+        are ordered by the shape of the body, so the choice depends neither on the batch nor on how grid and mesh are
+        numbered. Without a seed, the global generator of the device draws samples at random.
         """
-        n_shapes, longest = self.mask.shape
-        n_kept = min(n_samples, longest)
+        n_shapes, n_padded = self.mask.shape
+        n_chosen = min(n_samples, n_padded)
         n_present = self.mask.sum(dim=1, keepdim=True)
-        numbers = torch.arange(n_kept, dtype=torch.float64, device=self.mask.device)
-        kept = numbers < n_present
+        numbers = torch.arange(n_chosen, dtype=torch.float64, device=self.mask.device)
+        mask = numbers < n_present
         if seed is None:
-            drawn = torch.rand(self.mask.shape, device=self.mask.device).masked_fill(~self.mask, -1)
-            index = drawn.topk(n_kept).indices
+            priority = torch.rand(self.mask.shape, device=self.mask.device).masked_fill(~self.mask, -1)
+            index = priority.topk(n_chosen).indices
         else:
-            start = _START_OF_ZERO if seed == 0 else _start(seed)
+            start = _START_OF_SEED_0 if seed == 0 else _random_start(seed)
             steps = (n_present.double() / n_samples).clamp(min=1) * (numbers + start)
             index = torch.searchsorted(self.mask.cumsum(dim=1), steps.long().clamp(max=n_present - 1) + 1)
-        index = index.masked_fill(~kept, 0)
+        index = index.masked_fill(~mask, 0)
 
-        rows = (index + longest * torch.arange(n_shapes, device=index.device)[:, None]).flatten()
-        missing = None if not torch.compiler.is_compiling() and bool(kept.all()) else ~kept
+        rows = (index + n_padded * torch.arange(n_shapes, device=index.device)[:, None]).flatten()
+        padding = None if not torch.compiler.is_compiling() and bool(mask.all()) else ~mask
 
         def take(values: Tensor) -> Tensor:
-            taken = values.flatten(0, 1).index_select(0, rows).unflatten(0, (n_shapes, n_kept))
-            return taken if missing is None else taken.masked_fill_(missing[(..., *[None] * (values.ndim - 2))], 0)
+            taken = values.flatten(0, 1).index_select(0, rows).unflatten(0, (n_shapes, n_chosen))
+            return taken if padding is None else taken.masked_fill_(padding[(..., *[None] * (values.ndim - 2))], 0)
 
         attributes = {name: take(values) for name, values in self.attributes.items()}
-        return SampleBatch(take(self.points), take(self.eigenfunctions), kept, attributes)
+        return SampleBatch(take(self.points), take(self.eigenfunctions), mask, attributes)
 
 
-def _start(seed: int) -> float:
-    """A number from 0 to 1 that follows from the seed."""
+def _random_start(seed: int) -> float:
     generator = torch.Generator("cpu").manual_seed(seed)
     return torch.rand(1, generator=generator, dtype=torch.float64, device="cpu").item()
 
 
-# Of the seed that all descriptors take: `torch.compile` cannot trace a generator.
-_START_OF_ZERO = _start(0)
+# All descriptors use seed 0, and `torch.compile` cannot trace a generator
+_START_OF_SEED_0 = _random_start(0)
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One shape of a batch, without padding, as arrays."""
+    """One shape of a batch as arrays without padding."""
 
     eigenvalues: Floats  # (K,) ascending, 1/length²
-    interior: Samples  # their points measured from their centre
-    surface: Samples  # likewise
+    interior: Samples  # points relative to their mean
+    surface: Samples  # points relative to their mean
     area: float  # of the surface, length²
     volume: float  # of the body, length³
-    id: str  # its name
-    surface_mesh: Mesh | None  # its surface; None where the batch has no meshes
+    id: str  # name
+    surface_mesh: Mesh | None  # None if the batch has no meshes
 
     @property
     def mesh(self) -> Mesh:
-        """The surface, for a descriptor that says it needs it; a ValueError where the batch has no meshes."""
+        """The surface; a ValueError if the batch has no meshes."""
         if self.surface_mesh is None:
             raise ValueError(f"{self.id}: expected a batch with meshes, got one without. See SignatureDataset.batch.")
         return self.surface_mesh
@@ -110,7 +110,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class SignatureBatch:
-    """N Signatures, padded; padding changes no description.
+    """N Signatures as padded tensors. Padding does not change descriptions.
 
     Example:
         >>> import trimesh
@@ -128,8 +128,8 @@ class SignatureBatch:
         volume: (N,) float64, length³.
         labels: (N,) int64, −1 where unknown.
         ids: N names.
-        meshes: the N surfaces, for descriptors that need more than the Signatures; None if they were not asked for.
-        units: the N units of length, None where one is not known; None if none is.
+        meshes: N surfaces, for descriptors that need more than the Signatures; None without meshes.
+        units: N units of length, each None if unknown; None if all are unknown.
     """
 
     eigenvalues: Tensor
@@ -145,35 +145,35 @@ class SignatureBatch:
     def __len__(self) -> int:
         return len(self.ids)
 
-    # No __iter__: Lightning would infer the batch size from the bodies. Indexing by numbers iterates too.
+    # No __iter__, because Lightning would infer the batch size from the bodies. Iteration works through __getitem__.
     @overload
     def __getitem__(self, index: int) -> Body: ...
     @overload
     def __getitem__(self, index: Indices) -> SignatureBatch: ...
     def __getitem__(self, index: int | Indices) -> Body | SignatureBatch:
-        """One shape as a `Body` by its number; some as a batch by a slice, numbers, or a mask."""
+        """Return one shape as a `Body` for an integer, or a batch for a slice, indices, or a mask."""
         index = scalar_index(index)
         if isinstance(index, int | np.integer):
-            number = range(len(self))[index]
-            return self[number : number + 1].to("cpu")._body(0)
-        chosen = resolve_indices(index, len(self))
-        rows: slice | Tensor = torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
-        if isinstance(index, slice) and (index.step or 1) > 0:  # views; tensors take no slices backwards
+            i = range(len(self))[index]
+            return self[i : i + 1].to("cpu")._body(0)
+        indices = resolve_indices(index, len(self))
+        rows: slice | Tensor = torch.tensor(indices, dtype=torch.int64, device=self.labels.device)
+        if isinstance(index, slice) and (index.step or 1) > 0:  # slices give views, but tensors allow no negative step
             rows = index
         return replace(
             self.map(lambda values: values[rows]),
-            ids=tuple(self.ids[i] for i in chosen),
-            meshes=None if self.meshes is None else tuple(self.meshes[i] for i in chosen),
-            units=None if self.units is None else tuple(self.units[i] for i in chosen),
+            ids=tuple(self.ids[i] for i in indices),
+            meshes=None if self.meshes is None else tuple(self.meshes[i] for i in indices),
+            units=None if self.units is None else tuple(self.units[i] for i in indices),
         )
 
     @property
     def device(self) -> torch.device:
-        """Where its tensors are."""
+        """Device of the tensors."""
         return self.area.device
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SignatureBatch:
-        """The batch with a function applied to each of its tensors."""
+        """Return the batch with a function applied to each of its tensors."""
         return replace(
             self,
             eigenvalues=function(self.eigenvalues),
@@ -185,29 +185,29 @@ class SignatureBatch:
         )
 
     def to(self, device: torch.device | str | torch.dtype, non_blocking: bool = False) -> SignatureBatch:
-        """The same batch on another device, see `torch.Tensor.to`, where meshes stay; or samples of another type.
+        """Return the batch on another device, or with samples of another floating type, see `torch.Tensor.to`.
 
-        Eigenvalues, area and volume stay in double precision.
+        Meshes stay on the CPU, and eigenvalues, area and volume in double precision.
         """
         if isinstance(device, torch.dtype):
             return replace(self, interior=self.interior.to(device), surface=self.surface.to(device))
         return self.map(lambda values: values.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> SignatureBatch:
-        """The same batch in pinned memory: what `DataLoader(pin_memory=True)` calls."""
+        """Return the batch in pinned memory; `DataLoader(pin_memory=True)` calls this method."""
         return self.map(Tensor.pin_memory)
 
     @staticmethod
     def concatenate(batches: Sequence[SignatureBatch]) -> SignatureBatch:
-        """The shapes of several batches in one, padded to the longest.
+        """Concatenate batches on one device into one batch.
 
-        They are on one device, their samples carry the same attributes, and all have meshes, or none.
+        Their samples must have the same attributes, and all batches must have meshes or none.
         """
         if not batches:
             raise ValueError("batches: expected at least one, got none.")
         meshes = [batch.meshes for batch in batches if batch.meshes is not None]
         if meshes and len(meshes) < len(batches):
-            raise ValueError("batches: expected all with meshes or none, got some of each.")
+            raise ValueError("batches: expected meshes in all batches or in none, got some of each.")
         return SignatureBatch(
             eigenvalues=_joined([batch.eigenvalues for batch in batches], math.inf),
             interior=_joined_samples([batch.interior for batch in batches]),
@@ -216,38 +216,38 @@ class SignatureBatch:
             volume=torch.cat([batch.volume for batch in batches]),
             labels=torch.cat([batch.labels for batch in batches]),
             ids=tuple(name for batch in batches for name in batch.ids),
-            meshes=tuple(mesh for several in meshes for mesh in several) if meshes else None,
+            meshes=tuple(itertools.chain(*meshes)) if meshes else None,
             units=tuple(unit for batch in batches for unit in batch.units or (None,) * len(batch)),
         )
 
     def bodies(self) -> Iterator[Body]:
-        """The shapes one by one."""
+        """Iterate over the shapes."""
         return map(self.to("cpu")._body, range(len(self)))
 
     def _body(self, i: int) -> Body:
         eigenvalues = self.eigenvalues[i][torch.isfinite(self.eigenvalues[i])].numpy()
-        interior, surface = (_samples_of(one, i, len(eigenvalues)) for one in (self.interior, self.surface))
+        interior, surface = (_samples_of(batch, i, len(eigenvalues)) for batch in (self.interior, self.surface))
         mesh = None if self.meshes is None else self.meshes[i]
         return Body(eigenvalues, interior, surface, float(self.area[i]), float(self.volume[i]), self.ids[i], mesh)
 
 
 def _refuse(batch: Any, name: str, value: Any) -> None:
-    # Not the error of a frozen dataclass, which Lightning replaces by one that names neither batch nor remedy
+    # Lightning would replace the error of a frozen dataclass by one that names neither the batch nor the remedy
     raise AttributeError(
-        f"{name}: a batch is fixed. Make another by dataclasses.replace, or by batch.to(torch.float64). Of Lightning's "
-        'precisions only "32-true", "16-mixed" and "bf16-mixed" leave batches alone, of Fabric\'s only "32-true": take '
-        "one of these, in Fabric with torch.autocast around the module."
+        f"{name}: a batch is fixed. Make another one by dataclasses.replace, or by batch.to(torch.float64). Lightning "
+        'modifies batches, except for precision "32-true", "16-mixed" or "bf16-mixed"; Fabric does, except for '
+        '"32-true". Use one of these, in Fabric with torch.autocast around the module.'
     )
 
 
 for _kind in (SampleBatch, SignatureBatch):
     _kind.__setattr__ = _refuse  # type: ignore[method-assign]
-# They hold tensors and names alone, so that torch.load(weights_only=True) may make them
+# Safe to load with torch.load(weights_only=True): they hold only tensors and names
 torch.serialization.add_safe_globals([SampleBatch, SignatureBatch])
 
 
 def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:
-    """(N₁ + N₂ + …, ...), padded up to the largest size along each further dimension."""
+    """Concatenate tensors along the first dimension, padded to the largest size along the other dimensions."""
     shape = [max(sizes) for sizes in zip(*(part.shape[1:] for part in parts), strict=True)]
     joined = parts[0].new_full((sum(map(len, parts)), *shape), padding)
     start = 0
@@ -257,12 +257,12 @@ def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:
     return joined
 
 
-def attribute_names(samples: Sequence[Samples | SampleBatch], what: str) -> list[str]:
-    """Those that all samples carry; a ValueError that names what they are of where they differ."""
-    names, *others = (sorted(one.attributes) for one in samples)
-    if differing := [one for one in others if one != names]:
-        raise ValueError(f"{what}: all must carry the same sample attributes, got {names} and {differing[0]}.")
-    return names
+def attribute_names(samples: Sequence[Samples | SampleBatch], argument: str) -> list[str]:
+    """Return the sorted attribute names of samples; raise a ValueError that names the argument if they differ."""
+    first, *others = (sorted(sample.attributes) for sample in samples)
+    if differing := [names for names in others if names != first]:
+        raise ValueError(f"{argument}: all must carry the same sample attributes, got {first} and {differing[0]}.")
+    return first
 
 
 def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
@@ -275,10 +275,10 @@ def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
 
 
 def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:
-    real = batch.mask[i]
+    mask = batch.mask[i]
 
     def array(values: Tensor) -> Singles:
-        return values[i, real].numpy()
+        return values[i, mask].numpy()
 
     return Samples(
         array(batch.points).astype(np.float64),

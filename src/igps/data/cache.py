@@ -1,4 +1,4 @@
-"""A content-addressed store of Signatures and descriptions on disk, one safetensors file each."""
+"""Content-addressed cache of Signatures and descriptions on disk, with one safetensors file for each."""
 
 import hashlib
 import json
@@ -20,68 +20,65 @@ from igps.signature.signature import SAMPLE_KINDS, SampleKind, Samples, Signatur
 
 logger = logging.getLogger(__name__)
 
-# What a Signature has beside arrays and configuration
-_OTHERS = ("area", "volume", "name", "notes", "residual", "unit")
-# A file still being written after so many seconds was left by a process that was killed: a write takes well below one.
-_ABANDONED = 24 * 3600
-_ROW = 4096  # bytes
+# Fields of a Signature besides arrays and configuration
+_SCALAR_FIELDS = ("area", "volume", "name", "notes", "residual", "unit")
+_ABANDONED_AGE = 24 * 3600  # seconds until a partial file is removed; writing a file takes well below one second
+_CHECKSUM_ROW = 4096  # bytes
 T = TypeVar("T")
-Read = TypeVar("Read")
+Result = TypeVar("Result")
 
 
 def default_cache_dir() -> Path:
-    """The user's cache directory for Signatures: `$XDG_CACHE_HOME/igps`, or `~/.cache/igps`."""
+    """Return the user's cache directory for Signatures: `$XDG_CACHE_HOME/igps`, or `~/.cache/igps`."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "igps"
 
 
-def content_digest(path: Path, *beside: Path) -> bytes:
-    """A digest of the content of a file, and of others that are read with it."""
+def content_digest(path: Path, *companions: Path) -> bytes:
+    """Return a digest of the content of a file and of the companion files that are read with it."""
     with open(path, "rb") as file:
         digest = hashlib.file_digest(file, "sha256").digest()
-    return hashlib.sha256(digest + b"".join(map(content_digest, beside))).digest() if beside else digest
+    return hashlib.sha256(digest + b"".join(map(content_digest, companions))).digest() if companions else digest
 
 
 class FileCache(Generic[T]):
-    """Values by key, shared safely by any number of processes.
+    """Cache of values by key, which any number of processes can share.
 
-    A file is written beside its place and moved there in one step, so that a reader sees all of it or nothing. What a
-    killed run leaves of one is removed a day later, see `remove_abandoned`. Two processes that compute the same value
-    write the same bytes. Permissions follow the umask.
-
-    The directory is made if it is missing.
+    Files are written atomically, so a reader sees a whole file or none. Partial files of killed processes are removed
+    after a day, see `remove_abandoned`. Processes that compute the same value write the same bytes. Permissions follow
+    the umask. The directory is created if it is missing.
     """
 
-    what: ClassVar[str]  # one word for the values, in messages
-    folder: ClassVar[str] = ""  # of the values in the directory, "" where they lie in it themselves
-    # A value to arrays and metadata, and back; the latter raises a ValueError, KeyError or TypeError if they make none
+    value_name: ClassVar[str]  # in messages and in the format
+    folder: ClassVar[str] = ""  # subfolder of the directory
+    # Convert a value to arrays and metadata, and back. Decoding raises ValueError, KeyError or TypeError on bad input
     _encode: Callable[[T], tuple[dict[str, np.ndarray], dict[str, str]]]
     _decode: Callable[[Mapping[str, np.ndarray], Mapping[str, str]], T]
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory) / self.folder
-        self._format = f"igps-{self.what}-2"
+        self._format = f"igps-{self.value_name}-2"
 
     def path(self, key: str) -> Path:
-        """The file of a key, in one of 256 folders."""
+        """Return the file of a key, in one of 256 folders."""
         return self.directory / key[:2] / f"{key}.safetensors"
 
     def __contains__(self, key: str) -> bool:
-        """Whether a value is stored under `key`, by the file's header and length."""
+        """Return whether a value is stored under `key`, judged by the header and the length of the file."""
         return self._read(key, lambda file, metadata: True) is not None
 
     def get(self, key: str) -> T | None:
-        """The value stored under `key`, or None if there is none or it cannot be trusted, which is logged.
+        """Return the value stored under `key`; None if there is none, or if it is damaged, which is logged.
 
-        Its arrays are views of the file in memory, which is not copied.
+        The arrays are views of the memory-mapped file.
         """
-        return self._read(key, self._checked)
+        return self._read(key, self._decode_checked)
 
-    def _checked(self, file: Any, metadata: Mapping[str, str]) -> T:
+    def _decode_checked(self, file: Any, metadata: Mapping[str, str]) -> T:
         tensors = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118 (no Mapping)
         check_checksum(tensors, metadata)
         return self._decode(tensors, metadata)
 
-    def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], Read]) -> Read | None:
+    def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], Result]) -> Result | None:
         path = self.path(key)
         try:
             with safe_open(path, framework="pt") as file:  # framework="numpy" would copy every array
@@ -92,7 +89,7 @@ class FileCache(Generic[T]):
         except FileNotFoundError:
             return None
         except (SafetensorError, ValueError, KeyError, TypeError, OSError) as error:
-            logger.warning("%s: cached %s is not usable (%s); it is computed again", path, self.what, error)
+            logger.warning("%s: cached %s is not usable (%s), and is computed again", path, self.value_name, error)
             return None
 
     def put(self, key: str, value: T) -> None:
@@ -106,24 +103,23 @@ class FileCache(Generic[T]):
             with whole_file(path) as file:
                 file.write(with_ordered_metadata(save(tensors, metadata=metadata)))
         except PermissionError:
-            # Some file systems replace no file that another process holds open. Where that process was first with the
-            # same value, its file serves as well.
+            # Some file systems cannot replace a file that another process has open, which holds the same value
             if key not in self:
                 raise
         except OSError as error:
             if error.errno is None or error.filename is not None:
                 raise
-            # The error of a full disk names no file
+            # The error for a full disk names no file
             raise OSError(error.errno, error.strerror, str(path)) from error
 
     def remove_abandoned(self) -> None:
-        """Remove what killed processes left of files that they were writing, a day after."""
+        """Remove partial files of killed processes that are older than a day."""
         _remove_abandoned(self.directory.glob(f"*/*{PARTIAL}"))
 
 
 def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """The arrays of a Signature by name, and all else as JSON."""
-    # A file is written as the arrays lie in memory.
+    """Return the arrays of a Signature by name, and its other fields as JSON."""
+    # safetensors writes the memory of arrays, so they must be contiguous
     tensors: dict[str, np.ndarray] = {"eigenvalues": np.ascontiguousarray(signature.eigenvalues, np.float64)}
     for kind in SAMPLE_KINDS:
         samples: Samples = getattr(signature, kind)
@@ -131,15 +127,15 @@ def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]
         tensors[f"{kind}.eigenfunctions"] = np.ascontiguousarray(samples.eigenfunctions, np.float32)
         for name, values in samples.attributes.items():
             tensors[f"{kind}.attributes.{name}"] = np.ascontiguousarray(values, np.float32)
-    others = {**{name: getattr(signature, name) for name in _OTHERS}, "config": signature.config.as_dict()}
-    return tensors, {name: json.dumps(value) for name, value in others.items()}
+    fields = {**{name: getattr(signature, name) for name in _SCALAR_FIELDS}, "config": signature.config.as_dict()}
+    return tensors, {name: json.dumps(value) for name, value in fields.items()}
 
 
 def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Signature:
-    """The Signature that `encode` was given; a ValueError, KeyError or TypeError where there is none."""
+    """Return the Signature that `encode` converted; raise a ValueError, KeyError or TypeError on bad input."""
     config: dict[str, Any] = json.loads(metadata["config"])
     if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
-        raise ValueError("made by another version of the algorithm")
+        raise ValueError("computed by another version of the algorithm")
     eigenvalues, samples_of = tensors["eigenvalues"], dict[str, Any]()
     _check_array("eigenvalues", eigenvalues, np.float64, (len(eigenvalues),))
     for kind in SAMPLE_KINDS:
@@ -151,79 +147,79 @@ def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Si
         for name, values in attributes.items():
             _check_array(f"{kind}.attributes.{name}", values, np.float32, (len(points), *values.shape[1:]))
         samples_of[kind] = Samples(points, eigenfunctions, attributes)
-    others: dict[str, Any] = {name: json.loads(metadata[name]) for name in _OTHERS}
-    others["notes"] = tuple(others["notes"])
-    return Signature(eigenvalues, **samples_of, config=SignatureConfig(**config), **others)
+    fields: dict[str, Any] = {name: json.loads(metadata[name]) for name in _SCALAR_FIELDS}
+    fields["notes"] = tuple(fields["notes"])
+    return Signature(eigenvalues, **samples_of, config=SignatureConfig(**config), **fields)
 
 
-def _check_array(name: str, values: np.ndarray, kind: type[np.floating[Any]], shape: tuple[int, ...]) -> None:
-    if values.dtype != kind or values.shape != shape:
-        raise ValueError(f"{name}: expected {kind.__name__} {shape}, got {values.dtype} {values.shape}")
+def _check_array(name: str, values: np.ndarray, dtype: type[np.floating[Any]], shape: tuple[int, ...]) -> None:
+    if values.dtype != dtype or values.shape != shape:
+        raise ValueError(f"{name}: expected {dtype.__name__} {shape}, got {values.dtype} {values.shape}")
 
 
 class SignatureCache(FileCache[Signature]):
-    """Signatures by key, see `FileCache`."""
+    """Cache of Signatures."""
 
-    what = "signature"
+    value_name = "signature"
     _encode, _decode = staticmethod(encode), staticmethod(decode)
 
     def notes(self, key: str) -> tuple[str, ...]:
-        """What was done to the mesh of the Signature under `key`, in words; nothing if there is none."""
+        """Return the notes on how the mesh of a Signature was changed; empty if there is no such Signature."""
         return self._read(key, lambda file, metadata: tuple(json.loads(metadata["notes"]))) or ()
 
     def unit(self, key: str) -> str | None:
-        """The unit of length of the Signature under `key`; None where it has none, or there is none."""
+        """Return the unit of length of a Signature; None if it is unknown, or there is no such Signature."""
         return self._read(key, lambda file, metadata: json.loads(metadata["unit"]))
 
 
-def _arrays_alone(arrays: Mapping[Any, Singles]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    return {name: np.ascontiguousarray(one) for name, one in arrays.items()}, {}
+def _without_metadata(arrays: Mapping[Any, Singles]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    return {name: np.ascontiguousarray(values) for name, values in arrays.items()}, {}
 
 
 class AttributeCache(FileCache[dict[SampleKind, Singles]]):
-    """Attributes of the samples of one Signature by kind, beside the Signatures."""
+    """Cache of attributes; a value holds one attribute of one Signature by kind of sample."""
 
-    what, folder = "attribute", "attributes"
-    _encode = staticmethod(_arrays_alone)
+    value_name, folder = "attribute", "attributes"
+    _encode = staticmethod(_without_metadata)
     _decode = staticmethod(lambda tensors, metadata: {kind: tensors[kind] for kind in SAMPLE_KINDS})
 
 
 class DescriptionCache(FileCache[Singles]):
-    """Descriptions by key, beside the Signatures, see `FileCache`."""
+    """Cache of descriptions."""
 
-    what, folder = "description", "descriptions"
-    _encode = staticmethod(lambda value: _arrays_alone({"values": value}))
+    value_name, folder = "description", "descriptions"
+    _encode = staticmethod(lambda value: _without_metadata({"values": value}))
     _decode = staticmethod(lambda tensors, metadata: tensors["values"])
 
 
 def _remove_abandoned(partials: Iterable[Path]) -> None:
     for partial in partials:
         try:
-            if time.time() - partial.stat().st_mtime > _ABANDONED:
+            if time.time() - partial.stat().st_mtime > _ABANDONED_AGE:
                 partial.unlink()
-        except OSError:  # another process was first, or only another user may
+        except OSError:  # removed by another process, or owned by another user
             continue
 
 
 def checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
-    """Of all that a value is read from, in hexadecimal, as fast as memory can be read.
+    """Return the hexadecimal CRC-32 of tensors and metadata.
 
-    The arrays enter by the sums of their columns, where each is seen as rows of 512 words of eight bytes.
+    To be as fast as reading memory, the CRC takes column sums of each tensor, as a matrix of 512 8-byte columns.
     """
-    found = 0
+    crc = 0
     for name, value in sorted(metadata.items()):
         if name not in ("format", "key", "checksum"):
-            found = zlib.crc32(f"{name}\0{value}\0".encode(), found)
+            crc = zlib.crc32(f"{name}\0{value}\0".encode(), crc)
     for name, tensor in sorted(tensors.items()):
-        found = zlib.crc32(f"{name} {tensor.dtype.str} {tensor.shape}\0".encode(), found)
+        crc = zlib.crc32(f"{name} {tensor.dtype.str} {tensor.shape}\0".encode(), crc)
         raw = tensor.reshape(-1).view(np.uint8)
-        end = raw.size // _ROW * _ROW
-        found = zlib.crc32(raw[:end].view(np.uint64).reshape(-1, _ROW // 8).sum(axis=0).data, found)
-        found = zlib.crc32(raw[end:].data, found)
-    return f"{found:08x}"
+        end = raw.size // _CHECKSUM_ROW * _CHECKSUM_ROW
+        crc = zlib.crc32(raw[:end].view(np.uint64).reshape(-1, _CHECKSUM_ROW // 8).sum(axis=0).data, crc)
+        crc = zlib.crc32(raw[end:].data, crc)
+    return f"{crc:08x}"
 
 
 def check_checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Raise a ValueError where what was read is not what was written."""
+    """Raise a ValueError if tensors and metadata do not match the checksum in the metadata."""
     if metadata.get("checksum") != checksum(tensors, metadata):
-        raise ValueError("its content is damaged: it does not have the checksum that it was written with")
+        raise ValueError("its content is damaged: the checksum differs from the one that was written")

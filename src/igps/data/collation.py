@@ -1,4 +1,4 @@
-"""Signatures become a batch, padded to the longest."""
+"""Collation of Signatures to a padded batch."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,13 +16,12 @@ from igps.signature.signature import Samples, Signature
 
 
 def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mesh] | None = None) -> SignatureBatch:
-    """Pad Signatures to a batch, as a `DataLoader` does by itself, also where they are parts of its dataset's items.
+    """Pad Signatures and collate them to a batch.
 
-    In a worker process of a DataLoader the batch lies in shared memory, from which its consumer reads it.
+    The default `collate_fn` of a `DataLoader` does the same, also for Signatures inside of tuples or dictionaries. In a
+    worker process of a DataLoader, the batch lies in shared memory.
 
     Example:
-        Bodies differ in the number of their samples, of which the shorter are padded.
-
         >>> import trimesh
         >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> config, ball = SignatureConfig(n_eigenpairs=20), trimesh.creation.icosphere(subdivisions=2)
@@ -33,48 +32,48 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
 
     Args:
         items: N Signatures, with or without labels.
-        meshes: their surfaces, for descriptors that need them.
+        meshes: the N surfaces, for descriptors that need them.
 
     Raises:
-        ValueError: no items, samples that carry different attributes, or not one mesh for each.
+        ValueError: there are no items, their samples have different attributes, or the number of meshes is not N.
     """
     if not items:
         raise ValueError("items: expected at least one signature, got none.")
     if meshes is not None and len(meshes) != len(items):
         raise ValueError(f"meshes: expected one for each of {len(items)} signatures, got {len(meshes)}.")
-    labelled = [one if isinstance(one, LabelledSignature) else LabelledSignature(one, -1, one.name) for one in items]
+    labelled = [x if isinstance(x, LabelledSignature) else LabelledSignature(x, -1, x.name) for x in items]
     signatures = [item.signature for item in labelled]
-    n_most = max(len(s.eigenvalues) for s in signatures)
-    # Infinite behind the last eigenvalue, so that every spectral weight is zero there
-    missing = [(0, n_most - len(s.eigenvalues)) for s in signatures]
-    wanted: list[list[Any]] = [
-        [np.pad(s.eigenvalues, n, constant_values=np.inf) for s, n in zip(signatures, missing, strict=True)]
+    n_eigenpairs = max(len(s.eigenvalues) for s in signatures)
+    # Padded by infinity, so that every spectral weight of the padding is zero
+    padding = [(0, n_eigenpairs - len(s.eigenvalues)) for s in signatures]
+    columns: list[list[Any]] = [
+        [np.pad(s.eigenvalues, n, constant_values=np.inf) for s, n in zip(signatures, padding, strict=True)]
     ]
-    wanted += [[np.float64(getattr(s, name)) for s in signatures] for name in ("area", "volume")]
-    wanted.append([np.int64(item.label) for item in labelled])
-    of_kinds = [[s.interior for s in signatures], [s.surface for s in signatures]]
-    for samples in of_kinds:
-        wanted += _of_samples(samples)
-    eigenvalues, area, volume, labels, *tensors = _padded(wanted)
-    rest = iter(tensors)
+    columns += [[np.float64(getattr(s, name)) for s in signatures] for name in ("area", "volume")]
+    columns.append([np.int64(item.label) for item in labelled])
+    samples_by_kind = [[s.interior for s in signatures], [s.surface for s in signatures]]
+    for samples in samples_by_kind:
+        columns += _sample_columns(samples)
+    eigenvalues, area, volume, labels, *sample_tensors = _padded(columns)
+    data = iter(sample_tensors)
     interior, surface = (
-        SampleBatch(next(rest), next(rest), next(rest), {name: next(rest) for name in sorted(samples[0].attributes)})
-        for samples in of_kinds
+        SampleBatch(next(data), next(data), next(data), {name: next(data) for name in sorted(samples[0].attributes)})
+        for samples in samples_by_kind
     )
     ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
-    given = None if meshes is None else tuple(meshes)
-    return SignatureBatch(eigenvalues, interior, surface, area, volume, labels, ids, given, units)
+    surfaces = None if meshes is None else tuple(meshes)
+    return SignatureBatch(eigenvalues, interior, surface, area, volume, labels, ids, surfaces, units)
 
 
 for _kind in (LabelledSignature, Signature):
     default_collate_fn_map[_kind] = lambda items, *, collate_fn_map: collate(items)
 
 
-def _of_samples(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
-    """Points, eigenfunctions, masks, and attributes by their names, of each."""
+def _sample_columns(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
+    """Return lists of points, eigenfunctions, masks, and attributes in the order of their names."""
     names = attribute_names(samples, "items")
     return [
-        # Centred before the cast, or a shape far from the origin would lose its digits.
+        # Centred before the conversion to single precision, where shapes far from the origin would lose digits
         [(s.points - s.points.mean(axis=0)).astype(np.float32) for s in samples],
         [np.asarray(s.eigenfunctions, dtype=np.float32) for s in samples],
         [np.ones(len(s), dtype=bool) for s in samples],
@@ -82,16 +81,16 @@ def _of_samples(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
     ]
 
 
-def _padded(wanted: Sequence[Sequence[Any]]) -> list[Tensor]:
-    """Of each list of N arrays an (N, ...) tensor, padded by zeros to the largest size along each dimension."""
-    shapes = [(len(some), *map(max, zip(*(one.shape for one in some), strict=True))) for some in wanted]
-    padded = empty_arrays(shapes, [some[0].dtype for some in wanted])
-    for some, filled in zip(wanted, padded, strict=True):
-        for i, one in enumerate(some):
-            if one.shape[1:] != filled.shape[2:]:
-                filled[i] = 0
-            where: tuple[Any, ...] = (i, *map(slice, one.shape))
-            filled[where] = one
-            if filled.ndim > 1:
-                filled[i, len(one) :] = 0
-    return [torch.from_numpy(filled) for filled in padded]
+def _padded(columns: Sequence[Sequence[Any]]) -> list[Tensor]:
+    """Stack each list of N arrays to an (N, ...) tensor, padded by zeros to the largest size of each dimension."""
+    shapes = [(len(arrays), *map(max, zip(*(a.shape for a in arrays), strict=True))) for arrays in columns]
+    stacks = empty_arrays(shapes, [arrays[0].dtype for arrays in columns])
+    for arrays, stack in zip(columns, stacks, strict=True):
+        for i, array in enumerate(arrays):
+            if array.shape[1:] != stack.shape[2:]:
+                stack[i] = 0
+            place: tuple[Any, ...] = (i, *map(slice, array.shape))
+            stack[place] = array
+            if stack.ndim > 1:
+                stack[i, len(array) :] = 0
+    return [torch.from_numpy(stack) for stack in stacks]

@@ -1,4 +1,4 @@
-"""A whole collection of Signatures in one file, which travels without its meshes."""
+"""Files that hold a whole collection of Signatures, without its meshes."""
 
 from __future__ import annotations
 
@@ -20,88 +20,88 @@ from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig
 
 _FORMAT = "igps-collection-1"
-# A longer header of names is refused by safetensors.
-_MOST_HEADER = 100_000_000
-_KINDS = {"float64": "F64", "float32": "F32"}
+_MAX_HEADER_BYTES = 100_000_000  # limit of safetensors
+_DTYPES = {"float64": "F64", "float32": "F32"}
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a collection holds beside the Signatures."""
+    """Contents of a collection, besides the Signatures."""
 
     bodies: Bodies  # without folders
-    classes: tuple[str, ...]  # all names of classes, in the order of their numbers
-    keys: tuple[str, ...]  # of the Signatures in the cache that they come from
-    reading: LoadOptions  # how the meshes were read
+    classes: tuple[str, ...]  # class names in the order of their indices
+    keys: tuple[str, ...]  # cache keys of the Signatures
+    reading: LoadOptions  # of the meshes
     config: SignatureConfig  # of the Signatures
 
     def to_json(self) -> str:
-        """All of it as JSON, but for the paths."""
+        """Return the contents as JSON, without paths."""
         bodies = {name: value for name, value in vars(self.bodies).items() if name != "paths"}
-        labels = None if self.bodies.labels is None else list(map(str, self.bodies.labels))  # numbers may be given
-        words = {"labels": labels, "classes": list(map(str, self.classes)), "keys": self.keys}
-        return json.dumps({**bodies, **words, "reading": asdict(self.reading), "config": asdict(self.config)})
+        labels = None if self.bodies.labels is None else list(map(str, self.bodies.labels))  # users may give numbers
+        names = {"labels": labels, "classes": list(map(str, self.classes)), "keys": self.keys}
+        return json.dumps({**bodies, **names, "reading": asdict(self.reading), "config": asdict(self.config)})
 
     @staticmethod
     def from_json(text: str) -> Contents:
-        """What was written; a ValueError, KeyError or TypeError where it does not fit together."""
-        told: dict[str, Any] = json.loads(text)
-        names, parts, columns = _words(told["names"]), tuple(told["parts"]), dict(told.get("columns", {}))
-        labels = None if told["labels"] is None else _words(told["labels"])
+        """Parse the text of `to_json`; raise a ValueError, KeyError or TypeError if it is invalid."""
+        data: dict[str, Any] = json.loads(text)
+        names, parts, columns = _strings(data["names"]), tuple(data["parts"]), dict(data.get("columns", {}))
+        labels = None if data["labels"] is None else _strings(data["labels"])
         columns = {name: tuple(values) for name, values in columns.items()}
         paths = tuple(Path(file_name_of(name, part)) for name, part in zip(names, parts, strict=True))
         bodies = Bodies(paths, names, labels, parts, columns)
-        classes, keys = _words(told["classes"]), _words(told["keys"])
+        classes, keys = _strings(data["classes"]), _strings(data["keys"])
         if len(keys) != len(names) or len(parts) != len(names) or len(set(names)) < len(names):
-            raise ValueError("its names, parts, labels and keys do not fit each other")
-        words = [*parts, *(value for values in columns.values() for value in values)]
-        if not set(labels or ()) <= set(classes) or not all(one is None or isinstance(one, str) for one in words):
-            raise ValueError("its labels are none of its classes, or its parts or columns no words")
+            raise ValueError("its names are not unique, or differ in number from its parts or keys")
+        optional_strings = [*parts, *(value for values in columns.values() for value in values)]
+        if not set(labels or ()) <= set(classes) or not all(s is None or isinstance(s, str) for s in optional_strings):
+            raise ValueError("a label is not one of its classes, or a part or a value of a column is not a string")
         try:
-            return Contents(bodies, classes, keys, LoadOptions(**told["reading"]), SignatureConfig(**told["config"]))
+            return Contents(bodies, classes, keys, LoadOptions(**data["reading"]), SignatureConfig(**data["config"]))
         except (TypeError, KeyError, ValueError) as error:
             raise ValueError(f"parameters of another version: {error}") from error
 
 
 def write_collection(path: Path, about: Contents, signature: Callable[[int], Signature]) -> None:
-    """Write a collection, whole or not at all: a safetensors file of the arrays of all Signatures.
+    """Write a collection atomically to a safetensors file, which is replaced if it exists.
 
-    A file that is there is replaced. Each Signature is asked for by its number, several times, and not kept.
+    To save memory, `signature` is called with each index up to three times. A ValueError is raised if names are not
+    unique, or if there are too many bodies for one file.
     """
     n = len(about.bodies)
     if len(set(about.bodies.names)) < n:
-        twice = next(name for name, count in Counter(about.bodies.names).items() if count > 1)
-        raise ValueError(f"{path}: {twice} is there twice; names that differ expected. Give each body once.")
-    arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []
-    told = []
+        duplicate = next(name for name, count in Counter(about.bodies.names).items() if count > 1)
+        raise ValueError(f"{path}: expected unique names, got {duplicate} twice. Give each body once.")
+    arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []  # dtype, shape, bytes of each Signature's arrays
+    all_metadata = []
     for i in range(n):
         tensors, metadata = encode(signature(i))
-        told.append({**metadata, "checksum": checksum(tensors, metadata)})
+        all_metadata.append({**metadata, "checksum": checksum(tensors, metadata)})
         arrays.append({name: (values.dtype.name, values.shape, values.nbytes) for name, values in tensors.items()})
-    # The format has no gaps, so arrays of longer numbers come first: each then begins where its kind may.
-    order = [(i, name) for kind in _KINDS for i in range(n) for name, (its, *_) in arrays[i].items() if its == kind]
+    # Doubles come before singles, so that all arrays are aligned: the format allows no gaps
+    order = [(i, name) for d in _DTYPES for i in range(n) for name, (dtype, *_) in arrays[i].items() if dtype == d]
     header: dict[str, Any] = {}
     end = 0
     for i, name in order:
-        kind, shape, n_bytes = arrays[i][name]
-        header[f"{i}.{name}"] = {"dtype": _KINDS[kind], "shape": shape, "data_offsets": (end, end + n_bytes)}
+        dtype, shape, n_bytes = arrays[i][name]
+        header[f"{i}.{name}"] = {"dtype": _DTYPES[dtype], "shape": shape, "data_offsets": (end, end + n_bytes)}
         end += n_bytes
-    words = {"format": _FORMAT, "about": about.to_json(), "signatures": json.dumps(told)}
-    words["checksum"] = checksum({}, {"about": words["about"]})
-    text = json.dumps({"__metadata__": words, **header}, separators=(",", ":")).encode()
+    file_metadata = {"format": _FORMAT, "about": about.to_json(), "signatures": json.dumps(all_metadata)}
+    file_metadata["checksum"] = checksum({}, {"about": file_metadata["about"]})
+    text = json.dumps({"__metadata__": file_metadata, **header}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
-    if len(text) > _MOST_HEADER:
+    if len(text) > _MAX_HEADER_BYTES:
         raise ValueError(f"{path}: {n} bodies are too many for one file. Export parts of the dataset.")
     with whole_file(path) as file:
         file.write(len(text).to_bytes(8, "little") + text)
-        for (i, _), group in groupby(order, key=lambda one: (one[0], arrays[one[0]][one[1]][0])):
+        for (i, _), group in groupby(order, key=lambda key: (key[0], arrays[key[0]][key[1]][0])):
             tensors, _ = encode(signature(i))
             for _, name in group:
                 file.write(tensors[name].data)
 
 
 def is_collection(path: Path) -> bool:
-    """Whether a file is one that `write_collection` wrote, by its beginning."""
+    """Return whether a file begins like those that `write_collection` writes."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -109,10 +109,10 @@ def is_collection(path: Path) -> bool:
 
 
 class CollectionFile:
-    """The Signatures of a file that `write_collection` wrote, read by memory map and checked at each reading.
+    """Memory-mapped file of `write_collection`; each Signature is checked when it is read.
 
-    Reading runs no code. A worker process that is given one opens the file for itself. A FileNotFoundError without it,
-    a ValueError of another file, or a damaged one.
+    Reading does not run code. A worker process that receives the object opens the file itself. A FileNotFoundError is
+    raised if there is no such file, and a ValueError if it has another format or is damaged.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -128,7 +128,7 @@ class CollectionFile:
             self.about = Contents.from_json(metadata["about"])
             self._metadata: list[dict[str, str]] = json.loads(metadata["signatures"])
             if len(self._metadata) != len(self.about.bodies):
-                raise ValueError(f"{len(self.about.bodies)} names for {len(self._metadata)} signatures")
+                raise ValueError(f"it has {len(self.about.bodies)} names for {len(self._metadata)} signatures")
             names = set(self._file.keys())
         except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(
@@ -136,15 +136,15 @@ class CollectionFile:
             ) from error
         self._arrays: list[list[str]] = [[] for _ in self._metadata]
         for name in sorted(names):
-            number, _, array = name.partition(".")
-            if number.isdecimal() and int(number) < len(self._metadata):
-                self._arrays[int(number)].append(array)
+            index, _, array = name.partition(".")
+            if index.isdecimal() and int(index) < len(self._metadata):
+                self._arrays[int(index)].append(array)
 
     def __reduce__(self) -> tuple[type[CollectionFile], tuple[Path]]:
         return CollectionFile, (self.path,)
 
     def __getitem__(self, index: int) -> Signature:
-        """A Signature by its number, its arrays views of the file; a ValueError where it is damaged, or out of date."""
+        """Return a Signature with views of the file; raise a ValueError if it is damaged or of another version."""
         metadata = self._metadata[index]
         try:
             tensors = {name: self._file.get_tensor(f"{index}.{name}").numpy() for name in self._arrays[index]}
@@ -154,19 +154,19 @@ class CollectionFile:
             name = self.about.bodies.names[index]
             raise ValueError(f"{self.path}: {name} is not usable ({error}). Export the collection again.") from error
 
-    def check_serves(self, requirements: Requirements) -> None:
-        """Raise a ValueError that names the file where its Signatures have less than what is required."""
+    def check_requirements(self, requirements: Requirements) -> None:
+        """Raise a ValueError that names the file if its Signatures do not meet the requirements."""
         try:
             requirements.check_config(self.about.config)
         except ValueError as error:
-            raise ValueError(f"{self.path}: {error} Or export the folder again for this descriptor.") from error
+            raise ValueError(f"{self.path}: {error} Or export the collection again for this descriptor.") from error
 
     def notes(self, index: int) -> tuple[str, ...]:
-        """What was done to the mesh of a Signature, in words."""
+        """Return the notes on how the mesh of a Signature was changed."""
         return tuple(json.loads(self._metadata[index]["notes"]))
 
 
-def _words(values: Sequence[object]) -> tuple[str, ...]:
-    if not isinstance(values, list) or not all(isinstance(one, str) for one in values):
-        raise ValueError("a list of names holds something else")
+def _strings(values: Sequence[object]) -> tuple[str, ...]:
+    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+        raise ValueError("names, labels, classes and keys must be lists of strings")
     return tuple(map(str, values))

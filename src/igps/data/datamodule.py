@@ -1,4 +1,4 @@
-"""Data loaders over the parts of a labelled collection, for Lightning."""
+"""Lightning data module of a labelled collection."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,20 +21,18 @@ from igps.signature.signature import SignatureConfig
 
 
 def has_configuration() -> bool:
-    """Whether Lightning's command line makes this object, from a configuration that a checkpoint can keep as words.
-
-    Objects that are given in Python could be kept only by pickling them, and reading them would run code.
-    """
+    """Return whether Lightning's command line creates an object from a configuration, which checkpoints can store."""
+    # Arguments that are passed in Python would have to be pickled, and loading a pickle can run code
     return _given_hyperparameters.get() is not None
 
 
 class SignatureDataModule(LightningDataModule):
     """Training, validation and test loaders over a folder of labelled meshes.
 
-    Training batches hold the same number of shapes of each of several classes (P×K sampling), so that every shape has
-    company of its class. They need `pytorch-metric-learning`.
+    A training batch holds K shapes of each of P classes (P×K sampling), so that every shape has others of its class.
+    This needs `pytorch-metric-learning`.
 
-    A checkpoint knows the data, for `load_from_checkpoint`, if they were made from a configuration.
+    Checkpoints store the arguments for `load_from_checkpoint` if the module was created from a configuration.
 
     Example:
         >>> import tempfile
@@ -46,20 +44,21 @@ class SignatureDataModule(LightningDataModule):
         (6, 3, 6)
 
     Args:
-        root: a folder that tells classes, see `find_bodies`.
+        root: folder with classes, see `find_bodies`.
         protocol: see `SplitProtocol`.
-        n_train: shapes of each class ("seen") or classes ("unseen") in training and validation together; below 1 a
-            share.
-        n_validation: how many of those validate; below 1 a share.
-        n_test: classes to test ("unseen" only); all others if None.
+        n_train: number of shapes of each class ("seen") or of classes ("unseen") in training and validation together;
+            a share if below 1.
+        n_validation: how many of these are for validation; a share if below 1.
+        n_test: number of test classes ("unseen" only); all other classes if None.
+        split_seed: seed of the split.
         classes_per_batch, shapes_per_class: P and K of a training batch, in each process.
-        n_samples_in_memory: interior and surface samples of each training shape, a fixed random subset, that are kept
-            in memory from step to step; None reads whole signatures from the cache at each step.
+        n_samples_in_memory: size of the fixed random subsets of interior and surface samples of each training shape
+            that are kept in memory. If None, whole signatures are read from the cache at each step.
         config, reading: see `SignatureDataset`.
-        cache_dir: of the signatures; the user's cache directory if None.
-        n_workers: processes that compute missing signatures; all cores if None.
-        n_loading_workers: processes that read signatures for the batches; none if 0.
-        evaluation_batch_size: shapes in a batch of validation and test.
+        cache_dir: directory of the signatures; the user's cache directory if None.
+        n_workers: number of processes that compute missing signatures; the number of cores if None.
+        n_loading_workers: number of processes that read signatures for batches; 0 reads in the main process.
+        evaluation_batch_size: number of shapes in a batch of validation and test.
     """
 
     def __init__(
@@ -100,18 +99,18 @@ class SignatureDataModule(LightningDataModule):
             self.split = split_unseen(labels, n_train, n_validation=n_validation, n_test=n_test, seed=split_seed)
 
     def prepare_data(self) -> None:
-        """Fill the cache. A mesh that cannot be used stops training: a split with holes is not the split."""
+        """Fill the cache. A mesh that cannot be used stops training, because the split must be complete."""
         self.dataset.precompute(n_workers=self.n_workers, strict=True)
 
     def train_dataloader(self) -> DataLoader[LabelledSignature]:
-        """P×K batches, drawn anew each epoch, which has as many as cover the training part once."""
+        """Return a loader of random P×K batches, as many as cover the training part once."""
         try:
             from pytorch_metric_learning.samplers import MPerClassSampler
         except ImportError as error:
             raise ImportError('training needs pytorch-metric-learning: pip install "interior-gps[metric]".') from error
         part = self.dataset.subset(self.split.train)
         n_batch = min(self.classes_per_batch, len(part.labels.unique())) * self.shapes_per_class
-        # Lightning deals what is drawn out to its processes one by one: each of them is to get so many of a class.
+        # Lightning distributes the drawn shapes to its processes in turn, and each gets `shapes_per_class` of a class
         n_processes = self.trainer.world_size if self.trainer is not None else 1
         sampler = MPerClassSampler(
             part.labels,
@@ -124,23 +123,23 @@ class SignatureDataModule(LightningDataModule):
         if self._in_memory is None:
             n = self.n_samples_in_memory
             self._in_memory = part.to_memory(FewerSamples(n_interior=n, n_surface=n, seed=0))
-        return self._loader(self._in_memory, n_batch, sampler, 0)  # there is nothing to read
+        return self._loader(self._in_memory, n_batch, sampler, 0)  # no workers, because there is nothing to read
 
     def val_dataloader(self) -> DataLoader[LabelledSignature] | list[DataLoader[LabelledSignature]]:
-        """The validation part in order; nothing if it is empty."""
-        return self._in_order(self.split.validation) if self.split.validation else []
+        """Return a loader of the validation part in order; an empty list if the part is empty."""
+        return self._evaluation_loader(self.split.validation) if self.split.validation else []
 
     def test_dataloader(self) -> DataLoader[LabelledSignature]:
-        """The test part in order."""
-        return self._in_order(self.split.test)
+        """Return a loader of the test part in order."""
+        return self._evaluation_loader(self.split.test)
 
     def transfer_batch_to_device(
         self, batch: SignatureBatch, device: torch.device, dataloader_index: int
     ) -> SignatureBatch:
-        """Lightning by itself moves tensors and containers of them, and no other batches."""
+        """Move a batch; by default, Lightning moves only tensors and containers of tensors."""
         return batch.to(device, non_blocking=True)
 
-    def _in_order(self, indices: Sequence[int]) -> DataLoader[LabelledSignature]:
+    def _evaluation_loader(self, indices: Sequence[int]) -> DataLoader[LabelledSignature]:
         return self._loader(self.dataset.subset(indices), self.evaluation_batch_size, None, self.n_loading_workers)
 
     def _loader(

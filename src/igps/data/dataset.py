@@ -1,4 +1,4 @@
-"""A torch Dataset of Signatures, computed on first access and cached."""
+"""Torch Dataset of cached Signatures."""
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,7 +31,7 @@ from igps.signature.signature import SAMPLE_KINDS, Signature, SignatureConfig
 
 
 class SignatureDataset(Dataset[LabelledSignature]):
-    """Signatures of bodies in files, computed on first access and cached on disk.
+    """Dataset of Signatures, which are computed on first access and cached on disk.
 
     Example:
         >>> import tempfile, trimesh
@@ -44,29 +44,30 @@ class SignatureDataset(Dataset[LabelledSignature]):
         (1, 'ball.off', (20,))
 
     Args:
-        root_or_paths: a folder (see `find_bodies`), files, or `Bodies`; or objects in memory by name: what `Mesh.of`
-            takes, of images all labels, and of arrays, given as pairs `(labels, spacing)`.
-        config: parameters of the Signatures; 250 eigenpairs where neither it nor a descriptor names a number.
-        cache_dir: where Signatures are kept, by the content of the file, how it is read, every parameter, and the
-            algorithm's version; the user's cache directory if None. One with more eigenpairs or attributes serves too.
-        descriptor: what the Signatures are for, by name or itself: they get what it requires.
-        labels: classes of the given paths, by name.
-        classes: what the class of a body is, see `ClassRule`; as the folder tells it if None.
-        reading: how files are read.
-        attributes: further attributes of the samples, by name: an `AttributeSource` or a function `(body, points)`,
-            whose values are kept beside the Signatures, which stay; or a function of points, (P, 3) in the file's
-            coordinates, to (P,) or (P, C), which is called at each reading.
-        pre_transform: a change of every Signature, cached with it; its `cache_tag` is part of the key.
-        transform: a change of a Signature at each access; see `igps.data.transforms`.
+        root_or_paths: a folder (see `find_bodies`), files, or `Bodies`; or a mapping of names to objects in memory,
+            each of which `Mesh.of` accepts. Images and pairs `(labels, spacing)` of an array give a body per label.
+        config: parameters of the Signatures. The default is 250 eigenpairs, unless the descriptor sets a number.
+        cache_dir: directory of the cache; the user's cache directory if None. A cache key consists of the content of
+            the file, the load options, all parameters, and the version of the algorithm. A cached Signature with more
+            eigenpairs or attributes is used as well.
+        descriptor: a descriptor or its name; the Signatures meet its requirements.
+        labels: class names of the given paths.
+        classes: rule for the class of a body, see `ClassRule`; "folder" if None.
+        reading: options for reading files.
+        attributes: additional attributes of the samples by name. Values of an `AttributeSource` or a function `(body,
+            points)` are cached separately from the Signatures. A function of points, from (P, 3) in coordinates of the
+            file to (P,) or (P, C), is called at each access.
+        pre_transform: transform of every Signature before it is cached; its `cache_tag` is part of the cache key.
+        transform: transform of a Signature at each access; see `igps.data.transforms`.
 
     Attributes:
-        bodies: files, names, classes, and further columns of the table of labels.
-        pipeline: how a body becomes a Signature, by `config` and `reading`.
-        classes: all names of classes, in the order of their numbers.
+        bodies: files, names, classes, and further columns of `labels.csv`.
+        pipeline: computes Signatures with `config` and `reading`.
+        classes: class names in the order of their indices.
 
     Raises:
-        FileNotFoundError: no such folder, or no body in it.
-        ValueError: the configuration has less than the descriptor requires.
+        FileNotFoundError: the folder does not exist, or has no bodies.
+        ValueError: the configuration does not meet the requirements of the descriptor.
     """
 
     def __init__(
@@ -83,38 +84,38 @@ class SignatureDataset(Dataset[LabelledSignature]):
         pre_transform: PreTransform | None = None,
         transform: Callable[[Signature], Signature] | None = None,
     ) -> None:
-        config, reading, given = config or SignatureConfig(), reading or LoadOptions(), dict(attributes or {})
+        config, reading, attributes = config or SignatureConfig(), reading or LoadOptions(), attributes or {}
         if descriptor is not None:
             requirements = requirements_of(descriptor)
-            config, given = requirements.apply_to(config), {**requirements.sources, **given}
-        sources, self._functions = split_attributes(given)
+            config, attributes = requirements.apply_to(config), {**requirements.sources, **attributes}
+        sources, self._functions = split_attributes(attributes)
         meshes: Mapping[BodyRef, Mesh | MeshError] = {}
         if isinstance(root_or_paths, Mapping):
             (root_or_paths, meshes), labels = bodies_in_memory(root_or_paths, labels, reading, config), None
         self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).with_classes(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and self._functions:
-            raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
+            raise ValueError("pre_transform: expected attributes with a cache_tag, got a function of points.")
         directory = Path(cache_dir or default_cache_dir())
         self.config, self.reading = config.resolved(), reading
         self.pipeline = SignaturePipeline(self.config, reading, directory, sources, pre_transform, meshes)
         self.transform = transform
-        # The cache entries that `precompute` found; Signatures outside of the cache, and each body's number among them
+        # Cache entries that `precompute` found; Signatures that replace the cache, and the index of each body in them
         self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)
         self._loaded: CollectionFile | list[Signature] | None = None
-        self._numbers: tuple[int, ...] = tuple(range(len(self.bodies)))
+        self._loaded_indices: tuple[int, ...] = tuple(range(len(self.bodies)))
 
     @property
     def labels(self) -> Tensor:
-        """(N,) int64 index of each body's class in `classes`, −1 where unknown."""
+        """(N,) int64 index of the class of each body in `classes`, −1 if unknown."""
         index = {name: i for i, name in enumerate(self.classes)}
-        known = None if self.bodies.labels is None else [index[name] for name in self.bodies.labels]
-        return torch.tensor(known or [-1] * len(self), dtype=torch.int64, device="cpu")
+        labels = None if self.bodies.labels is None else [index[name] for name in self.bodies.labels]
+        return torch.tensor(labels or [-1] * len(self), dtype=torch.int64, device="cpu")
 
     @property
     def sizes(self) -> Tensor:
-        """(N,) int64 interior samples of each body, for `BucketBatchSampler`. Each Signature is looked at for it."""
-        return torch.tensor([len(one.interior) for one in self.signatures()], dtype=torch.int64, device="cpu")
+        """(N,) int64 number of interior samples of each body, for `BucketBatchSampler`; reads all Signatures."""
+        return torch.tensor([len(s.interior) for s in self.signatures()], dtype=torch.int64, device="cpu")
 
     def __len__(self) -> int:
         return len(self.bodies)
@@ -127,131 +128,133 @@ class SignatureDataset(Dataset[LabelledSignature]):
     @overload
     def __getitem__(self, index: Indices) -> Self: ...
     def __getitem__(self, index: int | str | Indices) -> LabelledSignature | Self:
-        """An item by number or name; the dataset of some of the bodies by slice, numbers, names, or mask."""
+        """Return an item for an integer or a name, or a dataset for a slice, integers, names, or a mask."""
         if isinstance(index, str):
             index = self.bodies.number(index)
         index = scalar_index(index)
         if isinstance(index, int | np.integer):
             return self._item(range(len(self))[index])
         if not isinstance(index, slice | Tensor):
-            index = [self.bodies.number(one) if isinstance(one, str) else one for one in index]
+            index = [self.bodies.number(x) if isinstance(x, str) else x for x in index]
         return self.subset(resolve_indices(index, len(self)))
 
     def _item(self, i: int) -> LabelledSignature:
         label = -1 if self.bodies.labels is None else self.classes.index(self.bodies.labels[i])
         signature = self._signature(i)
-        changed = signature if self.transform is None else self.transform(signature)
-        return LabelledSignature(changed, label, self.bodies.names[i])
+        signature = signature if self.transform is None else self.transform(signature)
+        return LabelledSignature(signature, label, self.bodies.names[i])
 
     def _signature(self, i: int) -> Signature:
-        """Without the transform."""
+        """Return a Signature before `transform`."""
         name = self.bodies.names[i]
         if self._loaded is not None:
-            return replace(self._loaded[self._numbers[i]], name=name)
-        found = None if (hit := self._hits[i]) is None else self.pipeline.read(hit)
-        signature = replace(found or self.pipeline.signature(self.bodies[i]), name=name)
+            return replace(self._loaded[self._loaded_indices[i]], name=name)
+        cached = None if (hit := self._hits[i]) is None else self.pipeline.read(hit)
+        signature = replace(cached or self.pipeline.signature(self.bodies[i]), name=name)
         for attribute, function in self._functions.items():
             values = {kind: function(getattr(signature, kind).points) for kind in SAMPLE_KINDS}
             signature = with_attribute(signature, attribute, values)
         return signature
 
     def signatures(self) -> Iterator[Signature]:
-        """All Signatures, as they are before `transform`; those not cached are computed."""
+        """Iterate over the Signatures before `transform`, which are computed if they are not cached."""
         return map(self._signature, range(len(self)))
 
     def mesh(self, index: int) -> Mesh:
-        """The mesh itself, read and checked as for its Signature; a MeshError where it cannot be used."""
+        """Return a mesh, read and checked as for its Signature; raise a MeshError if it cannot be used."""
         if isinstance(self._loaded, CollectionFile):
             name, file = self.bodies.names[index], self._loaded.path
-            raise MeshError(f"{name}: {file} holds signatures and no meshes. Make the dataset of the folder of meshes.")
+            raise MeshError(f"{name}: {file} holds signatures and no meshes. Use a dataset of the folder of meshes.")
         return self.pipeline.mesh(self.bodies[index])
 
     def key(self, index: int) -> str:
-        """The name of a Signature in the cache, by all that it depends on; a MeshError if its file cannot be read."""
+        """Return the cache key of a Signature; raise a MeshError if its file cannot be read."""
         hit = self._hits[index] if isinstance(self._loaded, CollectionFile) else None
         return self.pipeline.key(self.bodies[index]) if hit is None else hit.key
 
     def cached_keys(self) -> list[str | None]:
-        """What in the cache serves each body, None where nothing does, or a change at each reading."""
+        """Return the key of each cached Signature with its attributes; None if not cached, or changed at access."""
         if self._functions or self.transform is not None:
             return [None] * len(self)
-        return [None if hit is None else hit.whole_key for hit in self._found()]
+        return [None if hit is None else hit.whole_key for hit in self._find_hits()]
 
     def notes(self, index: int) -> tuple[str, ...]:
-        """What was done to a mesh on its way to its cached Signature, in words."""
+        """Return the notes on how a mesh was changed before its cached Signature was computed."""
         return self.subset([index]).all_notes()[0]
 
     def all_notes(self) -> list[tuple[str, ...]]:
-        """The notes of all meshes; of files that are known from `precompute` without reading them again."""
-        return [() if hit is None else hit.notes for hit in self._found()]
+        """Return the notes of all meshes. After `precompute`, files are not read again."""
+        return [() if hit is None else hit.notes for hit in self._find_hits()]
 
     def units(self) -> list[str | None]:
-        """The unit of length of each body, as cached Signatures tell; None where its file tells none."""
+        """Return the unit of length of each body; None if it is unknown, or there is no cached Signature."""
         if self._loaded is not None:
-            return [self._loaded[number].unit for number in self._numbers]
+            return [self._loaded[i].unit for i in self._loaded_indices]
         cache = SignatureCache(self.pipeline.cache_dir)
-        return [None if hit is None else cache.unit(hit.key) for hit in self._found()]
+        return [None if hit is None else cache.unit(hit.key) for hit in self._find_hits()]
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
-        """Some of the items as a batch."""
+        """Return a batch of some of the items, optionally with their meshes."""
         return collate([self[i] for i in indices], [self.mesh(i) for i in indices] if meshes else None)
 
     def subset(self, indices: Sequence[int]) -> Self:
-        """The dataset of some of the bodies; `classes` keeps all names, so that labels keep their numbers."""
+        """Return a dataset of some of the bodies, with the same `classes`, so that labels are unchanged."""
         chosen = copy.copy(self)
         chosen.bodies = self.bodies.subset(indices)
         chosen._hits = tuple(self._hits[i] for i in indices)
-        chosen._numbers = tuple(self._numbers[i] for i in indices)
-        if isinstance(self._loaded, list):  # no more goes to a worker than it needs
-            chosen._loaded = [self._loaded[number] for number in chosen._numbers]
-            chosen._numbers = tuple(range(len(chosen)))
+        chosen._loaded_indices = tuple(self._loaded_indices[i] for i in indices)
+        if isinstance(self._loaded, list):  # copies for workers should hold no other Signatures
+            chosen._loaded = [self._loaded[i] for i in chosen._loaded_indices]
+            chosen._loaded_indices = tuple(range(len(chosen)))
         return chosen
 
     def usable(self, failures: Sequence[Failure]) -> Self:
-        """The dataset without the bodies that failed."""
+        """Return a dataset without the bodies that failed."""
         failed = {failure.id for failure in failures}
         return self.subset([i for i, name in enumerate(self.bodies.names) if name not in failed])
 
     def to_memory(self, change: Callable[[Signature], Signature] | None = None) -> Self:
-        """The same with all Signatures in memory, as they are before `transform`; those not cached are computed.
+        """Return a dataset with all Signatures, before `transform`, in memory.
 
-        Each is kept as `change` makes it, such as `FewerSamples`, of which more fit.
+        Signatures that are not cached are computed. If given, `change` is applied to each; `FewerSamples` saves memory.
         """
         chosen = copy.copy(self)
-        chosen._loaded = [copy.deepcopy(one if change is None else change(one)) for one in self.signatures()]
-        if change is not None:  # no description of what is in the cache
+        chosen._loaded = [copy.deepcopy(s if change is None else change(s)) for s in self.signatures()]
+        if change is not None:  # the cache entries no longer belong to the Signatures
             chosen._hits = (None,) * len(self)
-        chosen._numbers = tuple(range(len(self)))
+        chosen._loaded_indices = tuple(range(len(self)))
         return chosen
 
     def to_file(self, path: str | Path) -> None:
-        """Write all Signatures, as they are before `transform`, to one file that `from_file` reads without the meshes.
+        """Write all Signatures, before `transform`, to a file that `from_file` reads without the meshes.
 
-        Names, classes and parameters go with them; paths do not. Those not cached are computed; a MeshError of a body
-        that cannot be used, see `usable`.
+        The file includes names, classes and parameters, but no paths. Signatures that are not cached are computed. A
+        body that cannot be used raises a MeshError, see `usable`.
         """
-        whole = copy.copy(self)
+        dataset = copy.copy(self)
         hits = [hit or self.pipeline.hit(body) for hit, body in zip(self._hits, self.bodies, strict=True)]
-        whole._hits = tuple(hits)
+        dataset._hits = tuple(hits)
         about = Contents(self.bodies, self.classes, tuple(hit.whole_key for hit in hits), self.reading, self.config)
-        write_collection(Path(path), about, whole._signature)
+        write_collection(Path(path), about, dataset._signature)
 
     @classmethod
     def from_file(
         cls, path: str | Path, *, descriptor: AnyDescriptor | None = None, cache_dir: Path | None = None
     ) -> Self:
-        """The Signatures of a file that `to_file` wrote; it is read by memory map, and runs no code.
+        """Open a file that `to_file` wrote. It is memory-mapped, and reading it runs no code.
 
-        Descriptions are kept in `cache_dir`. For `descriptor` see `SignatureDataset`.
+        Args:
+            descriptor: see `SignatureDataset`.
+            cache_dir: directory for cached descriptions.
 
         Raises:
-            FileNotFoundError: no such file.
-            ValueError: it is no such file, or has less than the descriptor requires.
+            FileNotFoundError: there is no such file.
+            ValueError: the file has another format, or does not meet the requirements of the descriptor.
         """
         file = CollectionFile(path)
         about = file.about
         if descriptor is not None:
-            file.check_serves(requirements_of(descriptor))
+            file.check_requirements(requirements_of(descriptor))
         dataset = cls.__new__(cls)
         SignatureDataset.__init__(dataset, about.bodies, about.config, cache_dir, reading=about.reading)
         dataset.classes, dataset._loaded = about.classes, file
@@ -267,20 +270,21 @@ class SignatureDataset(Dataset[LabelledSignature]):
         progress: bool = True,
         limits: Limits | None = None,
     ) -> list[Failure]:
-        """Fill the cache, skipping what is there, and list the bodies that cannot be used.
+        """Compute the Signatures that are not cached, and return the bodies that cannot be used.
 
-        Afterwards this dataset, and those that are made from it, read Signatures from the cache without a look at the
-        files: call it again if files have changed.
+        Afterwards, this dataset and its subsets do not read the files. Call it again if files have changed.
 
         Args:
             executor: any `concurrent.futures.Executor`, such as that of a cluster, whose workers must see the files and
-                the cache by the same paths; `n_workers` processes of ours, or as many as cores, if None.
-            strict: raise at the first bad body instead of listing it.
-            limits: time and memory of one body; one that needs more is bad.
+                the cache under the same paths; own processes if None.
+            n_workers: number of own processes; the number of cores if None.
+            strict: raise an error for the first body that cannot be used.
+            progress: show a progress bar.
+            limits: limits of time and memory for each body; a body that exceeds them fails.
 
         Raises:
-            MeshError: a bad body, if `strict`.
-            MachineError: the disk is full, or the like; what is done is kept.
+            MeshError: a body cannot be used, if `strict`.
+            MachineError: the machine is at fault, for example its disk is full. Finished Signatures are kept.
         """
         if self._loaded is not None:
             return []
@@ -288,9 +292,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         self._hits = tuple(hits)
         return failures
 
-    def _found(self) -> list[CacheHit | None]:
-        """The cache entry of each body, None where there is none."""
+    def _find_hits(self) -> list[CacheHit | None]:
+        """Return the cache entry of each body, None if there is none."""
         if self._loaded is not None or None not in self._hits:
             return list(self._hits)
-        found = find_cached(self.pipeline, self.bodies)
-        return [known or hit for known, hit in zip(self._hits, found, strict=True)]
+        current = find_cached(self.pipeline, self.bodies)
+        return [known or hit for known, hit in zip(self._hits, current, strict=True)]

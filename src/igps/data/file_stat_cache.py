@@ -1,4 +1,4 @@
-"""Which Signature in a cache serves a body, remembered, so that files that did not change are not read again."""
+"""Cache of the keys of Signatures by file, so that unchanged files are not read again to find their Signatures."""
 
 import contextlib
 import hashlib
@@ -20,9 +20,8 @@ from igps.mesh.mesh import MeshError
 logger = logging.getLogger(__name__)
 
 _FILE = "known_files.sqlite"
-# A writer holds it for milliseconds.
-_PATIENCE = 30.0
-# A file may change again before its clock moves on: one that is younger than this is not remembered.
+_LOCK_TIMEOUT = 30.0  # seconds; a writer holds the lock of the database for milliseconds
+# Nanoseconds. Younger files are not recorded, because they may change again without a change of their time stamps
 _YOUNG = 2 * 10**9
 _TABLE = (
     "CREATE TABLE IF NOT EXISTS body (pipeline TEXT, path TEXT, part TEXT, size INTEGER, mtime INTEGER, ctime INTEGER, "
@@ -31,73 +30,73 @@ _TABLE = (
 
 
 class FileStatCache:
-    """The bodies of one pipeline, by path, part, size and times of change, in a small database beside its cache.
+    """Records of the bodies of one pipeline by path, part, size and times of change, in a database in its cache.
 
-    It may be removed at any time, and nothing fails where it cannot be read or written.
+    The database may be removed at any time. If it cannot be read or written, a warning is logged and nothing fails.
     """
 
     def __init__(self, pipeline: SignaturePipeline) -> None:
         self._pipeline = pipeline
         self._path = pipeline.cache_dir / _FILE
-        changed = pipeline.pre_transform.cache_tag if pipeline.pre_transform else None
-        words = [pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION, changed]
-        words += [pipeline.reading.names] if pipeline.reading.names else []  # another table may have the same time
-        self._name = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:32]
-        # What attributes depend on may change while the file does not, and a transform may depend on them.
-        self._is_useful = not (pipeline.attributes and pipeline.pre_transform)
+        tag = pipeline.pre_transform.cache_tag if pipeline.pre_transform else None
+        fields = [pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION, tag]
+        fields += [pipeline.reading.names] if pipeline.reading.names else []  # another table may have the same stamp
+        self._pipeline_id = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:32]
+        # A transform may depend on attributes, whose sources can change while the file of the body does not
+        self._is_enabled = not (pipeline.attributes and pipeline.pre_transform)
 
     def ready(self, bodies: Iterable[BodyRef]) -> dict[BodyRef, CacheHit]:
-        """The bodies whose files have not changed since, and whose Signatures are complete in the cache."""
-        found: dict[BodyRef, CacheHit] = {}
-        if not self._path.exists() or not self._is_useful:
-            return found
+        """Return the cache entries of the bodies whose files are unchanged and whose Signatures are in the cache."""
+        hits: dict[BodyRef, CacheHit] = {}
+        if not self._path.exists() or not self._is_enabled:
+            return hits
         cache = SignatureCache(self._pipeline.cache_dir)
-        stamp_now = lru_cache(maxsize=1)(lambda path: stamp_of(*files_read(path, self._pipeline.reading)))
-        with self._tolerating_faults(), contextlib.closing(self._database()) as database:
+        current_stamp = lru_cache(maxsize=1)(lambda path: stamp_of(*files_read(path, self._pipeline.reading)))
+        with self._tolerate_database_errors(), contextlib.closing(self._database()) as database:
             for body in bodies:
                 row = database.execute(
                     "SELECT size, mtime, ctime, key, bytes, notes FROM body "
                     "WHERE pipeline = ? AND path = ? AND part = ?",
-                    (self._name, *_row_key(body)),
+                    (self._pipeline_id, *_row_key(body)),
                 ).fetchone()
                 if row is None:
                     continue
                 *stamp, key, n_bytes, notes = row
                 with contextlib.suppress(OSError, MeshError):
-                    same = stamp_now(body.path) == tuple(stamp)
-                    if same and os.stat(cache.path(key)).st_size == n_bytes:
+                    is_unchanged = current_stamp(body.path) == tuple(stamp)
+                    if is_unchanged and os.stat(cache.path(key)).st_size == n_bytes:
                         hit = CacheHit(key, n_bytes, tuple(json.loads(notes)), tuple(stamp))
-                        if (whole := self._pipeline.with_attributes(body, hit)) is not None:
-                            found[body] = whole
-        return found
+                        if (complete := self._pipeline.with_attributes(body, hit)) is not None:
+                            hits[body] = complete
+        return hits
 
     def remember(self, hits: Mapping[BodyRef, CacheHit]) -> None:
-        """Keep what serves these bodies, but for files that changed just now."""
+        """Record the cache entries of bodies, except for files that changed just now."""
         now = time.time_ns()
         rows = [
-            (self._name, *_row_key(body), *hit.stamp, hit.key, hit.n_bytes, json.dumps(hit.notes))
+            (self._pipeline_id, *_row_key(body), *hit.stamp, hit.key, hit.n_bytes, json.dumps(hit.notes))
             for body, hit in hits.items()
             if now - max(hit.stamp[1:]) > _YOUNG
         ]
-        if rows and self._is_useful:
-            with self._tolerating_faults(), contextlib.closing(self._database()) as database, database:
+        if rows and self._is_enabled:
+            with self._tolerate_database_errors(), contextlib.closing(self._database()) as database, database:
                 database.executemany("INSERT OR REPLACE INTO body VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
 
     def _database(self) -> sqlite3.Connection:
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        database = sqlite3.connect(self._path, timeout=_PATIENCE)
+        database = sqlite3.connect(self._path, timeout=_LOCK_TIMEOUT)
         database.execute(_TABLE)
         return database
 
     @contextlib.contextmanager
-    def _tolerating_faults(self) -> Generator[None, None, None]:
-        """A fault of the database is logged, and costs no more than the database would have saved."""
+    def _tolerate_database_errors(self) -> Generator[None, None, None]:
+        """Log errors of the database, which only cost time, and remove a corrupt database."""
         try:
             yield
         except (sqlite3.Error, OSError) as error:
-            logger.warning("%s: not usable (%s); files are read again where it would save that", self._path, error)
+            logger.warning("%s: not usable (%s); unchanged files may be read again", self._path, error)
             if isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.OperationalError):
-                with contextlib.suppress(OSError):  # no database any more: the next run makes another
+                with contextlib.suppress(OSError):
                     self._path.unlink()
 
 

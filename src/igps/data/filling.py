@@ -1,4 +1,4 @@
-"""Fill the cache: what it lacks of many bodies is computed by processes, here or elsewhere."""
+"""Computation of the Signatures that are missing in a cache, by processes on this machine or a cluster."""
 
 from __future__ import annotations
 
@@ -23,16 +23,15 @@ from igps.mesh.mesh import MeshError
 
 logger = logging.getLogger(__name__)
 
-_REMEMBERED_AT_ONCE = 1000
-# Bodies of one file that are computed before any of them is reported; the file is read again for the next
-_REPORTED_AT_ONCE = 64
-# Seconds within which a shared file system shows a file that another machine wrote.
-_SHARED_WITHIN = 60.0
+_RECORDS_PER_WRITE = 1000  # to the database of `FileStatCache`
+# Bodies of one job. The file is read again for each job, and the results of a job arrive together
+_MAX_BODIES_PER_JOB = 64
+_SHARED_WITHIN = 60.0  # seconds until a shared file system shows a file that another machine wrote
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A body that could not be used, and why."""
+    """A body that could not be used, and the reason."""
 
     id: str
     path: Path
@@ -40,7 +39,7 @@ class Failure:
 
     @staticmethod
     def of(bodies: Bodies, i: int, reason: str) -> Failure:
-        """What failed of a body, in a sentence that names its file."""
+        """Return the failure of a body by its index, with its file named in the error."""
         path = bodies.paths[i]
         return Failure(bodies.names[i], path, reason if reason.startswith(str(path)) else f"{bodies[i]}: {reason}")
 
@@ -49,18 +48,18 @@ def fill(
     pipeline: SignaturePipeline, bodies: Bodies, executor: Executor | None, n_workers: int | None, strict: bool,
     progress: bool, limits: Limits | None,
 ) -> tuple[list[CacheHit | None], list[Failure]]:  # fmt: skip
-    """What serves each body, after computing what was missing; and what failed, see `SignatureDataset.precompute`."""
-    try:  # once here, or every body would be reported as a failure
+    """Compute missing Signatures; return all cache entries, and failures. See `SignatureDataset.precompute`."""
+    try:  # here, so that it is reported once and not for every body
         pipeline.cache_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        told = f"cache_dir: {pipeline.cache_dir} cannot be made ({error.strerror})"
-        raise MachineError(f"{told}. Choose a folder that can be written and run again.") from error
+        cause = f"cache_dir: {pipeline.cache_dir} cannot be created ({error.strerror})"
+        raise MachineError(f"{cause}. Choose a writable folder and run again.") from error
     SignatureCache(pipeline.cache_dir).remove_abandoned()
-    known = FileStatCache(pipeline)
-    found = find_cached(pipeline, bodies, look=executor is None)
+    records = FileStatCache(pipeline)
+    hits = find_cached(pipeline, bodies, read_files=executor is None)
     failures: dict[int, Failure] = {}
     new: dict[BodyRef, CacheHit] = {}
-    missing = [i for i, hit in enumerate(found) if hit is None]
+    missing = [i for i, hit in enumerate(hits) if hit is None]
     outcomes = compute(pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits())
     bar = tqdm(total=len(bodies), initial=len(bodies) - len(missing), desc="signatures", disable=not progress)
     with bar, contextlib.closing(outcomes):
@@ -75,91 +74,89 @@ def fill(
                     continue
                 if not new:
                     wait_until_visible(pipeline, outcome)
-                new[bodies[i]] = found[i] = outcome
-                if len(new) >= _REMEMBERED_AT_ONCE:
-                    known.remember(new)
+                new[bodies[i]] = hits[i] = outcome
+                if len(new) >= _RECORDS_PER_WRITE:
+                    records.remember(new)
                     new.clear()
         finally:
-            known.remember(new)
-    return found, [failures[i] for i in sorted(failures)]
+            records.remember(new)
+    return hits, [failures[i] for i in sorted(failures)]
 
 
-def find_cached(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True) -> list[CacheHit | None]:
-    """What in the cache serves each body, None where nothing does.
+def find_cached(pipeline: SignaturePipeline, bodies: Bodies, read_files: bool = True) -> list[CacheHit | None]:
+    """Return the cache entry of each body, None where there is none.
 
-    Files that are not known or have changed are read only if `look`; otherwise nothing serves their bodies.
+    Files that are new or have changed since the last run are read to compute their keys. If not `read_files`, their
+    bodies have no entry.
     """
-    known = FileStatCache(pipeline)
-    ready = known.ready(bodies)
-    found = [ready.get(body) for body in bodies]
+    records = FileStatCache(pipeline)
+    ready = records.ready(bodies)
+    hits = [ready.get(body) for body in bodies]
     new: dict[BodyRef, CacheHit] = {}
-    for group in group_by_file(bodies, (i for i, hit in enumerate(found) if hit is None and look)):
-        with contextlib.suppress(MeshError):  # computing it will say why
+    for group in group_by_file(bodies, (i for i, hit in enumerate(hits) if hit is None and read_files)):
+        with contextlib.suppress(MeshError):  # which the computation reports
             for i, hit in zip(group, pipeline.lookup([bodies[i] for i in group]), strict=True):
                 if hit is not None:
-                    found[i] = new[bodies[i]] = hit
-    known.remember(new)
-    return found
+                    hits[i] = new[bodies[i]] = hit
+    records.remember(new)
+    return hits
 
 
 def compute(
     pipeline: SignaturePipeline,
     bodies: Bodies,
-    numbers: Sequence[int],
+    indices: Sequence[int],
     *,
     n_workers: int | None,
     executor: Executor | None,
     limits: Limits,
-    at_once: int | None = None,
+    max_per_job: int | None = None,
 ) -> Generator[tuple[int, CacheHit | Failed], None, None]:
-    """Compute Signatures into the cache, and yield of each body, by number, its cache entry, or why it failed.
+    """Compute Signatures into the cache, and yield the index and the cache entry or failure of each body.
 
-    The bodies of one file are computed in chunks, for each of which it is read once. Where one of a chunk loses its
-    process, each of the chunk is tried again alone. With limits, which are of one body, every body is. A chunk has at
-    most `at_once` bodies; if None 64, or fewer so that every worker has one. See `igps._parallel.run` for the rest.
+    A job computes several bodies of one file, which it reads once. If the process of a job dies, each of its bodies is
+    tried again in a job of its own. With limits, which are those of one body, each job has one body. `max_per_job` is
+    64 if None, or less so that all workers have a job. See `igps._parallel.run` for the other arguments.
     """
-    shared = min(-(-len(numbers) // (n_workers or n_cores())), _REPORTED_AT_ONCE)
-    most = 1 if limits != Limits() else at_once or max(1, shared)
-    jobs = group_by_file(bodies, numbers, most)
-    work: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
-    given = [[bodies[i] for i in job] for job in jobs]
-    if executor is not None:  # whose workers run in another folder
-        there = replace(pipeline, cache_dir=pipeline.cache_dir.absolute())
-        work = partial(fill_elsewhere, there.fill, version())
-        known = pipeline.meshes  # these are in no file
-        given = [[b if b in known else replace(b, path=b.path.absolute()) for b in job] for job in given]
+    per_worker = -(-len(indices) // (n_workers or n_cores()))
+    max_per_job = 1 if limits != Limits() else max_per_job or max(1, min(per_worker, _MAX_BODIES_PER_JOB))
+    groups = group_by_file(bodies, indices, max_per_job)
+    jobs = [[bodies[i] for i in group] for group in groups]
+    function: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
+    if executor is not None:  # its workers may run in another folder, so all paths must be absolute
+        function = partial(fill_elsewhere, replace(pipeline, cache_dir=pipeline.cache_dir.absolute()).fill, version())
+        in_memory = pipeline.meshes  # bodies without a file
+        jobs = [[b if b in in_memory else replace(b, path=b.path.absolute()) for b in job] for job in jobs]
     lost: list[int] = []
-    results = run(work, given, n_workers=n_workers, executor=executor, limits=limits)
+    results = run(function, jobs, n_workers=n_workers, executor=executor, limits=limits)
     with contextlib.closing(results):
-        for number, outcome in results:
-            job = jobs[number]
+        for job_index, outcome in results:
+            group = groups[job_index]
             if not isinstance(outcome, Failed):
-                yield from zip(job, outcome, strict=True)
-            elif len(job) > 1:
-                lost += job
+                yield from zip(group, outcome, strict=True)
+            elif len(group) > 1:
+                lost += group
             else:
-                yield job[0], outcome
+                yield group[0], outcome
     if lost:
-        yield from compute(pipeline, bodies, lost, n_workers=n_workers, executor=executor, limits=limits, at_once=1)
+        yield from compute(pipeline, bodies, lost, n_workers=n_workers, executor=executor, limits=limits, max_per_job=1)
 
 
 def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
-    """Raise a MachineError if what a worker put into the cache does not appear there."""
+    """Wait until the file that a worker wrote appears in the cache; raise a MachineError if it does not."""
     path = SignatureCache(pipeline.cache_dir).path(hit.key)
     deadline = time.monotonic() + _SHARED_WITHIN
     while not path.exists():
         if time.monotonic() > deadline:
-            raise MachineError(
-                f"{pipeline.cache_dir}: the workers' signatures do not appear there. Choose a cache_dir that this "
-                "machine and all workers share, by the same path."
-            )
+            cause = f"{pipeline.cache_dir}: the workers' signatures do not appear there"
+            raise MachineError(f"{cause}. Choose a cache_dir that this machine and all workers share by the same path.")
         time.sleep(0.1)
 
 
-def group_by_file(bodies: Bodies, numbers: Iterable[int], most: int | None = None) -> list[list[int]]:
-    """The numbers of bodies in groups of one file each, at most so many in a group."""
+def group_by_file(bodies: Bodies, indices: Iterable[int], max_size: int | None = None) -> list[list[int]]:
+    """Group the indices of bodies by file, with at most `max_size` indices in a group."""
     groups: dict[Path, list[int]] = {}
-    for i in numbers:
+    for i in indices:
         groups.setdefault(bodies.paths[i], []).append(i)
-    most = most or len(bodies)
-    return [group[start : start + most] for group in groups.values() for start in range(0, len(group), most)]
+    step = max_size or len(bodies)
+    return [group[start : start + step] for group in groups.values() for start in range(0, len(group), step)]

@@ -1,4 +1,4 @@
-"""Signatures for PyTorch Geometric."""
+"""Conversion of Signatures for PyTorch Geometric."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 
 def to_pyg(signature: Signature, samples: SampleKind = "surface", label: int = -1) -> Data:
-    """The samples of a body as `torch_geometric.data.Data`: P nodes without edges, which its loaders batch.
+    """Convert the samples of a body to `torch_geometric.data.Data` with P nodes and no edges.
 
-    They are copies, which transforms may change in place.
+    The tensors are copies, so transforms may change them in place.
 
     Returns:
-        `pos` (P, 3); `eigenfunctions` (P, K); `mass` (P,), the share of the surface's area, or of the volume, of each
-        sample; the attributes of the samples under their names; `eigenvalues` (1, K), `area` and `volume` (1,), which
-        are batched by body; `y` (1,).
+        `pos` (P, 3); `eigenfunctions` (P, K); `mass` (P,), the share of each sample in the area of the surface or in
+        the volume; the attributes of the samples under their names; `eigenvalues` (1, K), `area` and `volume` (1,),
+        which are batched by body; `y` (1,), the label.
 
     Raises:
         ImportError: PyTorch Geometric is not installed.
@@ -29,15 +29,15 @@ def to_pyg(signature: Signature, samples: SampleKind = "surface", label: int = -
         from torch_geometric.data import Data
     except ImportError as error:
         raise ImportError('to_pyg: needs PyTorch Geometric: pip install "interior-gps[geometric]".') from error
-    found = getattr(signature, samples)
+    chosen = getattr(signature, samples)
     measure = signature.area if samples == "surface" else signature.volume
     return Data(
-        pos=torch.tensor(found.points, dtype=torch.float32),
-        eigenfunctions=torch.tensor(found.eigenfunctions),
-        mass=torch.full((len(found),), measure / len(found)),
+        pos=torch.tensor(chosen.points, dtype=torch.float32),
+        eigenfunctions=torch.tensor(chosen.eigenfunctions),
+        mass=torch.full((len(chosen),), measure / len(chosen)),
         eigenvalues=torch.from_numpy(signature.eigenvalues).float()[None],
         area=torch.tensor([signature.area]),
         volume=torch.tensor([signature.volume]),
         y=torch.tensor([label]),
-        **{name: torch.tensor(values) for name, values in found.attributes.items()},
+        **{name: torch.tensor(values) for name, values in chosen.attributes.items()},
     )

@@ -1,4 +1,4 @@
-"""Bodies in memory, as those of files."""
+"""Bodies of objects in memory."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,23 +13,23 @@ from igps.signature.signature import SignatureConfig
 
 
 def bodies_in_memory(
-    given: Mapping[str, Any], labels: Sequence[str] | None, options: LoadOptions, config: SignatureConfig
+    objects: Mapping[str, Any], labels: Sequence[str] | None, options: LoadOptions, config: SignatureConfig
 ) -> tuple[Bodies, dict[BodyRef, Mesh | MeshError]]:
-    """The bodies of objects by name, see `bodies_of_object`, and the mesh of each, or what is wrong with it."""
-    if labels is not None and len(labels) != len(given):
-        raise ValueError(f"labels: expected one for each of {len(given)} bodies, got {len(labels)}.")
-    if not given:
+    """Return the bodies of objects by name, see `bodies_of_object`, and the mesh or the error of each body."""
+    if labels is not None and len(labels) != len(objects):
+        raise ValueError(f"labels: expected one for each of {len(objects)} bodies, got {len(labels)}.")
+    if not objects:
         raise ValueError("bodies: expected at least one, got none.")
-    least_vertices = config.resolved().n_vertices_read
+    min_vertices = config.resolved().n_vertices_read
     meshes: dict[BodyRef, Mesh | MeshError] = {}
     classes: list[str] = []
-    for i, (name, thing) in enumerate(given.items()):
+    for i, (name, value) in enumerate(objects.items()):
         n_before = len(meshes)
         try:
-            for raw in bodies_of_object(thing, name, options):
+            for raw in bodies_of_object(value, name, options):
                 ref = BodyRef(Path(name), raw.part)
                 try:
-                    meshes[ref] = surface_body(raw.made(), ref, options, least_vertices=least_vertices)
+                    meshes[ref] = surface_body(raw.made(), ref, options, least_vertices=min_vertices)
                 except MeshError as error:
                     meshes[ref] = error
         except MeshError as error:

@@ -1,4 +1,4 @@
-"""What chooses some of a batch or a dataset."""
+"""Indices of batches and datasets."""
 
 import operator
 from collections.abc import Sequence
@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Indices = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
-"""Some of a batch or dataset: a slice, numbers, a mask, and of a dataset names."""
+"""Index of several items: a slice, integers, or a mask, and for datasets also names."""
 
 
 def scalar_index(index: Any) -> Any:
-    """The number in an array without dimensions, as permutations give them one by one; any other index as it is."""
+    """Return the integer in an array without dimensions, such as an element of a permutation, or else the index."""
     return operator.index(index) if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 else index
 
 
 def resolve_indices(index: Indices, n: int) -> list[int]:
-    """The numbers that a slice, numbers, or a mask choose among n; an IndexError where they do not fit."""
+    """Return the indices of n items that a slice, integers, or a mask select; raise an IndexError if out of range."""
     if isinstance(index, slice):
         return list(range(n))[index]
-    given = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(np.asarray(index), device="cpu")
-    if given.dtype == torch.bool and given.shape != (n,):
-        raise IndexError(f"mask: expected {n} entries, got an array of shape {tuple(given.shape)}.")
-    found: list[int] = torch.arange(n, device="cpu")[given if given.numel() else given.long()].tolist()
-    return found
+    array = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(np.asarray(index), device="cpu")
+    if array.dtype == torch.bool and array.shape != (n,):
+        raise IndexError(f"mask: expected {n} entries, got an array of shape {tuple(array.shape)}.")
+    indices: list[int] = torch.arange(n, device="cpu")[array if array.numel() else array.long()].tolist()
+    return indices

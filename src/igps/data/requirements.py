@@ -1,4 +1,4 @@
-"""What a descriptor needs of a body."""
+"""Requirements of descriptors."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from igps.signature.signature import SignatureConfig
 
 @dataclass(frozen=True)
 class Requirements:
-    """What a descriptor needs of a body, beside its samples, area and volume."""
+    """Requirements of a descriptor for a body, besides samples, area and volume."""
 
-    n_eigenpairs: int = 0  # at least so many; with fewer it would be another descriptor
+    n_eigenpairs: int = 0  # minimum number; fewer would give another descriptor
     attributes: tuple[AttributeName, ...] = ()  # of the samples, see `SignatureConfig`
-    mesh: bool = False  # whether the surface itself
-    whole_spectrum: bool = False  # whether all eigenpairs that there are: with more it would be another descriptor
-    # Of further attributes of the samples, by name; those that a Dataset is given itself come first
+    mesh: bool = False  # whether the mesh is needed
+    whole_spectrum: bool = False  # whether all eigenpairs are used, so that more would give another descriptor
+    # Sources of additional attributes by name, which the `attributes` of a SignatureDataset override
     sources: Mapping[str, AttributeSource] = field(default_factory=dict, hash=False)
 
     def __or__(self, other: Requirements) -> Requirements:
-        """What both need."""
+        """Return requirements that meet those of both."""
         return Requirements(
             max(self.n_eigenpairs, other.n_eigenpairs),
             tuple(dict.fromkeys((*self.attributes, *other.attributes))),
@@ -37,25 +37,25 @@ class Requirements:
         )
 
     def apply_to(self, config: SignatureConfig) -> SignatureConfig:
-        """The configuration with the attributes that are needed, and as many eigenpairs if it names no number.
+        """Return the configuration with the required attributes, and the required number of eigenpairs if it has none.
 
-        A descriptor of the whole spectrum gets the usual number, if that is enough; a ValueError of too few eigenpairs.
+        For a whole spectrum, the number is at least the default. A ValueError is raised if the configuration has fewer.
         """
-        usual = SignatureConfig.DEFAULT_EIGENPAIRS if self.whole_spectrum else 0
-        config = config.with_eigenpairs(max(usual, self.n_eigenpairs))
+        default = SignatureConfig.DEFAULT_EIGENPAIRS if self.whole_spectrum else 0
+        config = config.with_eigenpairs(max(default, self.n_eigenpairs))
         self._check_eigenpairs(config.n_kept)
         return replace(config, attributes=tuple(dict.fromkeys((*config.attributes, *self.attributes))))
 
     def check_config(self, config: SignatureConfig) -> None:
-        """Raise a ValueError that names what Signatures of this configuration lack, if they lack anything."""
+        """Raise a ValueError if Signatures of a configuration do not meet the requirements."""
         self._check_eigenpairs(config.n_kept)
         self._check_attributes((*config.attributes, *self.sources))
 
     def check(self, batch: SignatureBatch) -> None:
-        """Raise a ValueError that names what the batch lacks, if it lacks anything."""
+        """Raise a ValueError if a batch does not meet the requirements."""
         if not batch.area.shape[0]:
             raise ValueError("batch: expected at least one shape, got none.")
-        if self.n_eigenpairs and not torch.compiler.is_compiling():  # what is traced cannot look at numbers
+        if self.n_eigenpairs and not torch.compiler.is_compiling():  # tracing cannot read values of tensors
             self._check_eigenpairs(int(torch.isfinite(batch.eigenvalues).sum(dim=1).min()))
         self._check_attributes({*batch.interior.attributes, *batch.surface.attributes})
         if self.mesh and batch.meshes is None:
@@ -64,48 +64,48 @@ class Requirements:
                 "meshes=True), or by collate(signatures, meshes)."
             )
 
-    def _check_attributes(self, found: Collection[str]) -> None:
-        if missing := [name for name in (*self.attributes, *self.sources) if name not in found]:
+    def _check_attributes(self, names: Collection[str]) -> None:
+        if missing := [name for name in (*self.attributes, *self.sources) if name not in names]:
             raise ValueError(
-                f"attributes: this descriptor needs signatures with {', '.join(missing)}, got {sorted(found)}. Compute "
+                f"attributes: this descriptor needs signatures with {', '.join(missing)}, got {sorted(names)}. Compute "
                 "them with SignatureDataset(..., descriptor=...), or with SignatureConfig(attributes=...)."
             )
 
-    def _check_eigenpairs(self, found: int) -> None:
-        if found < self.n_eigenpairs:
+    def _check_eigenpairs(self, n: int) -> None:
+        if n < self.n_eigenpairs:
             raise ValueError(
-                f"n_eigenpairs: this descriptor needs signatures of at least {self.n_eigenpairs}, got {found}. "
+                f"n_eigenpairs: this descriptor needs signatures of at least {self.n_eigenpairs}, got {n}. "
                 "Raise SignatureConfig(n_eigenpairs=...), or choose another descriptor."
             )
 
 
 def embedding_requirements(embedding: nn.Module) -> Requirements:
-    """What an embedding needs: the eigenpairs that it says it uses, or all."""
+    """Return the requirements of an embedding: its `n_eigenpairs`, or the whole spectrum if it has none."""
     n_eigenpairs = getattr(embedding, "n_eigenpairs", None)
     return Requirements(n_eigenpairs) if isinstance(n_eigenpairs, int) else Requirements(whole_spectrum=True)
 
 
-class Requiring(Protocol):
-    """What a Dataset has to know of a descriptor."""
+class HasRequirements(Protocol):
+    """The part of a descriptor that a Dataset uses."""
 
     @property
     def requirements(self) -> Requirements:
-        """What it needs of a body."""
+        """Requirements of the descriptor."""
 
 
-AnyDescriptor = str | Requiring | Requirements
-"""A descriptor's name, itself, or its requirements."""
+AnyDescriptor = str | HasRequirements | Requirements
+"""A descriptor, its name, or its requirements."""
 
-_by_name: list[Callable[[str], Requiring]] = []
+_find_by_name: list[Callable[[str], HasRequirements]] = []
 
 
-def register_descriptors(by_name: Callable[[str], Requiring]) -> None:
-    """Set how a descriptor is found by its name: this room may not import those above it, so the package tells it."""
-    _by_name[:] = [by_name]
+def register_descriptors(find_by_name: Callable[[str], HasRequirements]) -> None:
+    """Set the function that finds a descriptor by its name, because `igps.data` may not import `igps.descriptors`."""
+    _find_by_name[:] = [find_by_name]
 
 
 def requirements_of(descriptor: AnyDescriptor) -> Requirements:
-    """What a descriptor needs of a body."""
+    """Return the requirements of a descriptor."""
     if isinstance(descriptor, Requirements):
         return descriptor
-    return (_by_name[0](descriptor) if isinstance(descriptor, str) else descriptor).requirements
+    return (_find_by_name[0](descriptor) if isinstance(descriptor, str) else descriptor).requirements

@@ -1,4 +1,4 @@
-"""Batches of shapes of like size, so that padding costs little."""
+"""Batch sampler that reduces padding."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,14 +8,14 @@ from torch.utils.data import Sampler
 
 from igps._parameters import check_at_least
 
-_BATCHES_IN_A_BUCKET = 20
+_BATCHES_PER_BUCKET = 20
 
 
 class BucketBatchSampler(Sampler[list[int]]):
-    """Random batches of shapes of like size: the `batch_sampler` of a `DataLoader`.
+    """Sampler of random batches of shapes of similar size, for the `batch_sampler` of a `DataLoader`.
 
-    The shapes are shuffled, sorted by size within buckets of twenty batches, and cut into batches, which come in random
-    order. Each shape comes once an epoch.
+    The shapes are shuffled, sorted by size within buckets of twenty batches, and cut into batches, which are yielded in
+    random order. Each shape occurs once per epoch.
 
     Example:
         >>> sizes = [900, 1000, 2000, 950, 2100, 1900]
@@ -24,10 +24,10 @@ class BucketBatchSampler(Sampler[list[int]]):
         [[900, 950, 1000], [1900, 2000, 2100]]
 
     Args:
-        sizes: (N,) of the shapes, see `SignatureDataset.sizes`.
-        batch_size: shapes in a batch; the last batch of the last bucket has what is left.
-        drop_last: leave out the batch with fewer.
-        generator: of the order; PyTorch's global one if None.
+        sizes: (N,) sizes of the shapes, see `SignatureDataset.sizes`.
+        batch_size: number of shapes in a batch; one batch may be smaller.
+        drop_last: leave out the smaller batch.
+        generator: generator of the random order; PyTorch's global generator if None.
     """
 
     def __init__(
@@ -45,17 +45,17 @@ class BucketBatchSampler(Sampler[list[int]]):
         self.generator = generator
 
     def __len__(self) -> int:
-        whole, rest = divmod(len(self.sizes), self.batch_size)
-        return whole + (rest > 0 and not self.drop_last)
+        n_full, n_left = divmod(len(self.sizes), self.batch_size)
+        return n_full + (n_left > 0 and not self.drop_last)
 
     def __iter__(self) -> Iterator[list[int]]:
         order = torch.randperm(len(self.sizes), generator=self.generator)
         batches: list[list[int]] = []
-        for bucket in order.split(_BATCHES_IN_A_BUCKET * self.batch_size):
-            # By size; shapes of one size stay in the order in which they were shuffled.
+        for bucket in order.split(_BATCHES_PER_BUCKET * self.batch_size):
+            # A stable sort keeps shapes of equal size in their random order
             by_size = bucket[torch.sort(self.sizes[bucket], stable=True).indices]
             batches += [batch.tolist() for batch in by_size.split(self.batch_size)]
-        least = self.batch_size if self.drop_last else 1
-        batches = [batch for batch in batches if len(batch) >= least]
+        min_size = self.batch_size if self.drop_last else 1
+        batches = [batch for batch in batches if len(batch) >= min_size]
         for i in torch.randperm(len(batches), generator=self.generator).tolist():
             yield batches[i]

@@ -1,4 +1,4 @@
-"""Where bodies and their classes come from."""
+"""Sources of bodies and their classes: folders, tables of labels, lists of files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from igps.data.attributes import AttributeSource, FromFiles
+from igps.data.attributes import AttributeSource, FileSource
 from igps.mesh.formats import is_searched, searched_suffixes
 from igps.mesh.loading import BodyRef, list_bodies
 from igps.mesh.mesh import MeshError
@@ -23,25 +23,25 @@ logger = logging.getLogger(__name__)
 LABELS_FILE = "labels.csv"
 
 ClassRule = Literal["folder", "body", "file"]
-"""What the class of a body is: what its folder or `labels.csv` says, the name of its part, or its file."""
+"""Rule for the class of a body: from its folder or `labels.csv`, from the name of its part, or from its file."""
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """Bodies in files, and what is known of them."""
+    """Bodies in files, with names, classes and further columns."""
 
-    paths: tuple[Path, ...]  # the file of each
-    names: tuple[str, ...]  # distinct: the path of the file relative to the folder it was found in, and `#part`
-    labels: tuple[str, ...] | None = None  # the class of each, or None where no classes are known
-    parts: tuple[str | None, ...] = ()  # which body of its file each is; None in a file that is one body
-    # Further columns of the table of labels by name, a value for each body; None where it is missing
+    paths: tuple[Path, ...]  # file of each body
+    names: tuple[str, ...]  # unique: path of the file relative to the searched folder, and `#part` if it has a part
+    labels: tuple[str, ...] | None = None  # class of each body; None if there are no classes
+    parts: tuple[str | None, ...] = ()  # name of each body in its file; None if the file is one body
+    # Further columns of `labels.csv` by name, with one value for each body; None if a value is missing
     columns: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if not self.parts:
             object.__setattr__(self, "parts", (None,) * len(self.paths))
-        given = (("names", self.names), ("labels", self.labels), ("parts", self.parts), *self.columns.items())
-        for name, values in given:
+        fields = (("names", self.names), ("labels", self.labels), ("parts", self.parts), *self.columns.items())
+        for name, values in fields:
             if values is not None and len(values) != len(self.paths):
                 raise ValueError(f"{name}: expected one for each of {len(self.paths)} files, got {len(values)}.")
 
@@ -55,13 +55,13 @@ class Bodies:
         return map(BodyRef, self.paths, self.parts)
 
     def number(self, name: str) -> int:
-        """Of the body of a name; a KeyError where none is called so."""
+        """Return the index of a body by its name; raise a KeyError if there is no such body."""
         if name not in self.names:
             raise KeyError(f"no body is called {name!r}; the first is called {self.names[:1]}")
         return self.names.index(name)
 
     def subset(self, indices: Sequence[int]) -> Bodies:
-        """Some of the bodies, in the given order."""
+        """Return the bodies with these indices, in this order."""
         return Bodies(
             tuple(self.paths[i] for i in indices),
             tuple(self.names[i] for i in indices),
@@ -71,21 +71,19 @@ class Bodies:
         )
 
     def column(self, name: str) -> tuple[str, ...]:
-        """The values of a column that every body has, such as of "scanner"; a ValueError where one has none."""
+        """Return the values of a column such as "scanner"; raise a ValueError if a body has no value."""
         if name not in self.columns:
-            known = ", ".join(self.columns) or "none"
-            raise ValueError(f"{name}: no such column of {LABELS_FILE}; further columns: {known}. Choose one of them.")
+            names = ", ".join(self.columns) or "none"
+            raise ValueError(f"{name}: no such column of {LABELS_FILE}; further columns: {names}. Choose one of them.")
         values = self.columns[name]
         missing = [body for body, value in zip(self.names, values, strict=True) if value is None]
         if missing:
-            raise ValueError(
-                f"{name}: {len(missing)} of {len(self)} bodies have no value, such as {missing[0]}. Fill the column of "
-                f"{LABELS_FILE}, or leave these bodies out."
-            )
+            cause = f"{name}: {len(missing)} of {len(self)} bodies have no value, such as {missing[0]}"
+            raise ValueError(f"{cause}. Fill the column of {LABELS_FILE}, or leave these bodies out.")
         return tuple(str(value) for value in values)
 
     def numbers(self, name: str) -> list[float]:
-        """The values of a column of numbers, such as of "age"; a ValueError of what is no finite number."""
+        """Return the values of a column such as "age" as numbers; raise a ValueError if one is not a finite number."""
         values = self.column(name)
         for body, value in zip(self.names, values, strict=True):
             if not is_number(value):
@@ -93,7 +91,7 @@ class Bodies:
         return [float(value) for value in values]
 
     def with_classes(self, rule: ClassRule) -> Bodies:
-        """The same bodies with the classes that a rule gives them; "folder" leaves them as they are."""
+        """Return the bodies with classes by a rule; "folder" keeps the classes."""
         if rule not in get_args(ClassRule):
             raise ValueError(f"classes: expected 'folder', 'body' or 'file', got {rule!r}.")
         if rule == "folder":
@@ -102,9 +100,9 @@ class Bodies:
             return replace(self, labels=tuple(map(file_name_of, self.names, self.parts)))
         if all(part is None for part in self.parts):
             raise ValueError(f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body.")
-        # A file that cannot be read, such as an empty mask, has no parts; and costs the others nothing
-        words = [path.name.partition(".")[0] for path in self.paths]
-        return replace(self, labels=tuple(part or word for part, word in zip(self.parts, words, strict=True)))
+        # Files without parts, for example because they cannot be read, have classes by their own names
+        stems = [path.name.partition(".")[0] for path in self.paths]
+        return replace(self, labels=tuple(part or stem for part, stem in zip(self.parts, stems, strict=True)))
 
 
 def find_bodies(
@@ -115,104 +113,103 @@ def find_bodies(
     attributes: Iterable[AttributeSource] = (),
     labelled: bool = False,
 ) -> Bodies:
-    """The bodies below a folder, with their classes if it tells them.
+    """Find the bodies below a folder, with their classes if the folder has classes.
 
-    Three layouts are known: files and a `labels.csv` with the columns `file,label` (paths relative to the folder), or
-    `file,body,label`, where an empty `body` stands for every body of the file; one folder per class; files alone,
-    without classes. The first that fits is taken. Further columns of `labels.csv`, such as `scanner` or `age`, become
-    `Bodies.columns`; beside them, `label` may be missing where the folder tells no classes.
+    The first layout that fits is used: a `labels.csv` with the columns `file,label` (paths relative to the folder) or
+    `file,body,label` (an empty `body` stands for all bodies of the file); one folder per class; files without classes.
+    Further columns of `labels.csv`, such as `age`, become `Bodies.columns`; beside them, `label` is optional.
 
     Args:
-        options: how files are read, which says what bodies there are in one.
-        attributes: values inside the bodies; their files are not taken as bodies.
-        labelled: whether it must tell classes.
+        options: options for reading files, which determine the bodies of a file.
+        classes: rule for the class of a body.
+        attributes: attribute sources, whose files are not used as bodies.
+        labelled: whether classes are required.
 
     Raises:
-        FileNotFoundError: the folder does not exist, or holds no file that may be a body.
-        ValueError: `labels.csv` cannot be understood, or it has no classes where they are needed.
+        FileNotFoundError: the folder does not exist, or has no file that may be a body.
+        ValueError: `labels.csv` is invalid, or there are no classes although they are required.
     """
     root, options = Path(root), options or LoadOptions()
     if not _is_utf8(root.absolute()):
-        raise ValueError(f"{os.fsencode(root)!r}: a name in UTF-8 expected. Rename the folder.")
+        raise ValueError(f"{os.fsencode(root)!r}: expected a name in UTF-8. Rename the folder.")
     if not root.is_dir():
-        raise FileNotFoundError(f"{root}: {'a file; a folder expected' if root.exists() else 'no such folder'}.")
-    table = (root / LABELS_FILE).is_file()
-    bodies = _from_labels_file(root, options) if table else _from_folder(root, options, attributes)
+        raise FileNotFoundError(f"{root}: {'expected a folder, got a file' if root.exists() else 'no such folder'}.")
+    has_table = (root / LABELS_FILE).is_file()
+    bodies = _from_labels_file(root, options) if has_table else _from_folder(root, options, attributes)
     bodies = bodies.with_classes(classes)
     if labelled and bodies.labels is None:
-        other = f" Or call one of {', '.join(bodies.columns)} label." if bodies.columns else ""
-        expected = f"Expected one folder per class, or a {LABELS_FILE} (file,label)."
-        raise ValueError(f"{root}: no classes found. {expected}{other}")
+        other = f" Or rename one of the columns {', '.join(bodies.columns)} to label." if bodies.columns else ""
+        raise ValueError(f"{root}: no classes found. Expected a folder per class or {LABELS_FILE} (file,label).{other}")
     return bodies
 
 
 def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[AttributeSource]) -> Bodies:
-    linked = [path for path in root.iterdir() if path.is_symlink() and path.is_dir() and not path.name.startswith(".")]
-    files = sorted(path for folder in (root, *linked) for path in _files_in(folder))
-    beside = {file for one in attributes if isinstance(one, FromFiles) for file in one.files(files)}
-    alone = [path for path in files if path.parent == root and path not in beside]
-    nested = [path for path in files if path.parent != root and path not in beside]
-    if alone and nested:
-        told = f"{len(alone)} files beside the folders of classes are left out, such as {alone[0].name}"
-        logger.warning("%s: %s. Put them into a folder, or list all in a %s.", root, told, LABELS_FILE)
-    found = [(path, path.relative_to(root)) for path in nested or alone]
-    if not found:
+    links = [path for path in root.iterdir() if path.is_symlink() and path.is_dir() and not path.name.startswith(".")]
+    files = sorted(path for folder in (root, *links) for path in _files_in(folder))
+    excluded = {file for source in attributes if isinstance(source, FileSource) for file in source.files(files)}
+    at_root = [path for path in files if path.parent == root and path not in excluded]
+    nested = [path for path in files if path.parent != root and path not in excluded]
+    if at_root and nested:
+        ignored = f"{len(at_root)} files beside the folders of classes are ignored, such as {at_root[0].name}"
+        logger.warning("%s: %s. Put them into a folder, or list all in a %s.", root, ignored, LABELS_FILE)
+    names = [(path, path.relative_to(root)) for path in nested or at_root]
+    if not names:
         raise FileNotFoundError(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
             f"in one of the formats {', '.join(searched_suffixes())}."
         )
-    rows = [(path, name.as_posix(), name.parts[0] if nested else None, None) for path, name in found]
-    return _expanded(rows, options)
+    rows = [(path, name.as_posix(), name.parts[0] if nested else None, None) for path, name in names]
+    return _bodies_in_files(rows, options)
 
 
-def given_bodies(
+def bodies_of_files(
     paths: Sequence[str | Path], labels: Sequence[str] | None = None, options: LoadOptions | None = None
 ) -> Bodies:
-    """The bodies of the given files, in the given order, with the classes given to the files.
-
-    ``FILE#PART`` names one body of a file of several.
-    """
+    """Return the bodies of files in their order. ``FILE#PART`` selects one body of a file. Labels are given by file."""
     files = [file_and_part(Path(path)) for path in paths]
     if not files:
         raise ValueError("paths: expected at least one mesh file, got none.")
-    if unknown := [file for file, _ in files if not _is_utf8(file.absolute())]:
-        raise ValueError(f"paths: expected names in UTF-8, got {os.fsencode(unknown[0])!r}. Rename the file.")
+    if invalid := [file for file, _ in files if not _is_utf8(file.absolute())]:
+        raise ValueError(f"paths: expected names in UTF-8, got {os.fsencode(invalid[0])!r}. Rename the file.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
     classes: Sequence[str | None] = [None] * len(files) if labels is None else list(labels)
     rows = [(file, str(file), label, part) for (file, part), label in zip(files, classes, strict=True)]
-    return _expanded(rows, options or LoadOptions())
+    return _bodies_in_files(rows, options or LoadOptions())
 
 
 def bodies_of(
-    given: str | Path | Sequence[str | Path] | Bodies,
+    source: str | Path | Sequence[str | Path] | Bodies,
     labels: Sequence[str] | None = None,
     options: LoadOptions | None = None,
     attributes: Iterable[AttributeSource] = (),
 ) -> Bodies:
-    """`find_bodies` of a folder, `given_bodies` of files, and bodies as they are; a FileNotFoundError of neither."""
-    if labels is not None and (isinstance(given, Bodies) or (isinstance(given, str | Path) and Path(given).is_dir())):
-        raise ValueError(f"labels: expected None beside a folder or bodies, which tell theirs, got {len(labels)}.")
-    if isinstance(given, Bodies):
-        return given
-    if isinstance(given, str | Path) and not file_and_part(Path(given))[0].exists():
-        raise FileNotFoundError(f"{given}: no such file or folder. Check the path.")
-    if isinstance(given, str | Path) and Path(given).is_dir():
-        return find_bodies(given, options, attributes=attributes)
-    return given_bodies([given] if isinstance(given, str | Path) else given, labels, options)
+    """Return the bodies of a folder or of files, see `find_bodies` and `bodies_of_files`; return `Bodies` unchanged."""
+    has_labels = isinstance(source, Bodies) or (isinstance(source, str | Path) and Path(source).is_dir())
+    if labels is not None and has_labels:
+        raise ValueError(f"labels: expected None with a folder or bodies, which have labels, got {len(labels)}.")
+    if isinstance(source, Bodies):
+        return source
+    if not isinstance(source, str | Path):
+        return bodies_of_files(source, labels, options)
+    if Path(source).is_dir():
+        return find_bodies(source, options, attributes=attributes)
+    if not file_and_part(Path(source))[0].exists():
+        raise FileNotFoundError(f"{source}: no such file or folder. Check the path.")
+    return bodies_of_files([source], labels, options)
 
 
 def file_and_part(path: Path) -> tuple[Path, str | None]:
-    """The file and the part of ``FILE#PART``; no part where a file has this name, or none has what stands before."""
+    """Split ``FILE#PART``; the part is None if the whole path exists, or if no file precedes a "#"."""
     name = str(path)
-    for at in [] if os.path.exists(path) else [i for i, letter in enumerate(name) if letter == "#"]:
-        if name[at + 1 :] and (file := Path(name[:at])).is_file():
-            return file, name[at + 1 :]
+    for i in [] if os.path.exists(path) else [j for j, letter in enumerate(name) if letter == "#"]:
+        if name[i + 1 :] and (file := Path(name[:i])).is_file():
+            return file, name[i + 1 :]
     return path, None
 
 
 def is_number(value: str | float | None) -> bool:
-    """Whether a value is missing or a finite number; 01_02, a number to Python, is a word."""
+    """Return whether a value is missing or a finite number. 01_02, which Python reads as a number, is none."""
     try:
         return value is None or ("_" not in str(value) and math.isfinite(float(value)))
     except ValueError:
@@ -220,12 +217,12 @@ def is_number(value: str | float | None) -> bool:
 
 
 def file_name_of(name: str, part: str | None) -> str:
-    """The name of the file of a body, by the name of the body."""
+    """Return the name of the file of a body, for the name and the part of the body."""
     return name if part is None else name.removesuffix(f"#{part}")
 
 
 def _parts(path: Path, options: LoadOptions) -> Sequence[str | None]:
-    """The bodies of a file by name; None where it is one body, or cannot be read, which is told when it is computed."""
+    """Return the parts of a file; [None] if it is one body, or if it is unreadable, which the computation reports."""
     try:
         return [body.part for body in list_bodies(path, options)] or [None]
     except MeshError:
@@ -242,57 +239,58 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{file}: not readable as a table ({error}). Save it as CSV in UTF-8.") from error
         header = [name for name in reader.fieldnames if name]
-        further = [name for name in header if name not in ("file", "body", "label")]
-        if "file" not in header or not ("label" in header or further):
+        further_columns = [name for name in header if name not in ("file", "body", "label")]
+        if "file" not in header or not ("label" in header or further_columns):
             expected = "expected the columns file,label in the first line, separated by commas"
             raise ValueError(f"{file}: {expected}, got {reader.fieldnames}.")
         if len(set(header)) < len(header):
             raise ValueError(f"{file}: a column is named twice in {header}. Give each column a name of its own.")
-    if longer := [line for line, row in rows if row.get(None)]:  # under which stands what has no column
-        raise ValueError(f"{file}: line {longer[0]} has more values than columns. Put a value with a comma in quotes.")
-    empty = [line for line, row in rows if any("\0" in (row.get(one) or "\0") for one in {"file", "label"} & {*header})]
-    if not rows or empty:
-        where = f"line {empty[0]} lacks the name of a file, or a label" if empty else "no rows"
-        raise ValueError(f"{file}: {where}. Each line names a mesh file and its class.")
-    columns = {name: [row.get(name) or None for _, row in rows] for name in further}
-    found = [(root / row["file"], row["file"], row.get("label"), row.get("body") or None) for _, row in rows]
-    bodies = _expanded(found, options, columns)
-    counts = Counter(places := [(os.path.abspath(body.path), body.part) for body in bodies])  # ./1.off is 1.off
-    if twice := sorted(name for name, place in zip(bodies.names, places, strict=True) if counts[place] > 1):
-        raise ValueError(f"{file}: {twice[0]} is listed twice. List each body once.")
+    if long := [line for line, row in rows if row.get(None)]:  # the key of values without a column
+        raise ValueError(f"{file}: line {long[0]} has more values than columns. Put a value with a comma in quotes.")
+    required = {"file", "label"} & {*header}
+    invalid = [line for line, row in rows if any("\0" in (row.get(name) or "\0") for name in required)]
+    if not rows or invalid:
+        cause = f"line {invalid[0]} lacks the name of a file, or a label" if invalid else "no rows"
+        raise ValueError(f"{file}: {cause}. Each line names a mesh file and its class.")
+    columns = {name: [row.get(name) or None for _, row in rows] for name in further_columns}
+    files = [(root / row["file"], row["file"], row.get("label"), row.get("body") or None) for _, row in rows]
+    bodies = _bodies_in_files(files, options, columns)
+    counts = Counter(keys := [(os.path.abspath(body.path), body.part) for body in bodies])  # ./1.off is 1.off
+    if duplicates := sorted(name for name, key in zip(bodies.names, keys, strict=True) if counts[key] > 1):
+        raise ValueError(f"{file}: {duplicates[0]} is listed twice. List each body once.")
     return bodies
 
 
-def _expanded(
+def _bodies_in_files(
     rows: Sequence[tuple[Path, str, str | None, str | None]],
     options: LoadOptions,
     columns: Mapping[str, Sequence[str | None]] | None = None,
 ) -> Bodies:
-    """The bodies of files, each with its name, class and part; of a file without a part, all that it holds."""
-    found = [
+    """Return the bodies of files, given by path, name, label and part; without a part, all bodies of the file."""
+    entries = [
         (i, path, name if part is None else f"{name}#{part}", label, part)
-        for i, (path, name, label, given) in enumerate(rows)
-        for part in ([given] if given is not None else _parts(path, options))
+        for i, (path, name, label, chosen_part) in enumerate(rows)
+        for part in (_parts(path, options) if chosen_part is None else [chosen_part])
     ]
-    numbers, paths, names, labels, parts = zip(*found, strict=True)
-    of_bodies = {name: tuple(values[i] for i in numbers) for name, values in (columns or {}).items()}
-    return Bodies(paths, names, None if None in labels else labels, parts, of_bodies)
+    indices, paths, names, labels, parts = zip(*entries, strict=True)
+    body_columns = {name: tuple(values[i] for i in indices) for name, values in (columns or {}).items()}
+    return Bodies(paths, names, None if None in labels else labels, parts, body_columns)
 
 
 def _files_in(folder: Path) -> list[Path]:
-    """Files that may be bodies, without hidden ones; links that lead nowhere stay, to be told when they are read."""
-    refused = "%s: left out with all that is in it (%s). Ask for the right to read it."
-    found = []
-    for place, folders, names in os.walk(folder, onerror=lambda e: logger.warning(refused, e.filename, e.strerror)):
+    """Find files that may be bodies, except for hidden ones. Broken links are included, and fail when they are read."""
+    message = "%s: this folder is left out (%s). Ask for the right to read it."
+    files = []
+    for parent, folders, names in os.walk(folder, onerror=lambda e: logger.warning(message, e.filename, e.strerror)):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        for path in (Path(place, name) for name in names if not name.startswith(".") and is_searched(name)):
+        for path in (Path(parent, name) for name in names if not name.startswith(".") and is_searched(name)):
             if not _is_utf8(path):
                 logger.warning("%s: left out, its name is not UTF-8. Rename it.", os.fsencode(path))
-            elif os.path.isfile(path) or not os.path.exists(path):  # reading a pipe might never end
-                found.append(path)
-    return found
+            elif os.path.isfile(path) or not os.path.exists(path):  # not a pipe, whose reading might never end
+                files.append(path)
+    return files
 
 
 def _is_utf8(path: Path) -> bool:
-    """Whether the name of a file is text: names from other systems may be bytes that are not UTF-8."""
+    """Return whether the name of a file is valid UTF-8. Names from other systems may be arbitrary bytes."""
     return str(path).encode(errors="ignore").decode() == str(path)

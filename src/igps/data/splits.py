@@ -1,4 +1,4 @@
-"""Seeded splits of a labelled collection into training, validation and test parts."""
+"""Seeded splits of a labelled collection into training, validation and test."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -7,30 +7,29 @@ import torch
 from torch import Tensor
 
 SplitProtocol = Literal["seen", "unseen"]
-"""Whether the classes of the test part are seen in training (each class is split) or not (the classes are split)."""
+"""Whether test classes are seen in training: "seen" splits the shapes of each class, "unseen" splits the classes."""
 
 
 @dataclass(frozen=True)
 class Split:
-    """Indices of the shapes of each part; no shape is in two of them."""
+    """Indices of the shapes of the three disjoint parts."""
 
-    train: tuple[int, ...]  # to fit parameters to
-    validation: tuple[int, ...]  # taken from the training part, to choose between models; may be empty
-    test: tuple[int, ...]  # to be looked at once
+    train: tuple[int, ...]  # to fit parameters
+    validation: tuple[int, ...]  # to choose between models; may be empty
+    test: tuple[int, ...]  # for the final evaluation
 
 
 def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed: int = 0) -> Split:
-    """Every class in every part: `n_train` shapes of each train, the others test.
+    """Split the shapes of each class, so that every class is in every part.
 
     Args:
         labels: (N,) integer classes.
-        n_train: shapes of each class in training and validation together; below 1 a share of them,
-            three or more, which leaves two.
-        n_validation: how many of those validate; below 1 a share, two or more, which leaves one to train on.
+        n_train: number of shapes of each class in training and validation together; below 1 a share, which gives at
+            least 3 shapes and leaves at least 2.
+        n_validation: how many of these are for validation; below 1 a share, which gives at least 2 and leaves 1.
 
     Raises:
-        ValueError: a class has no more than `n_train` shapes, or for a share fewer than five; or `n_validation`
-            leaves none to train on.
+        ValueError: a class has at most `n_train` shapes, or fewer than 5 for a share; or none are left for training.
     """
     _check(n_validation, n_train)
     generator = torch.Generator().manual_seed(seed)
@@ -42,10 +41,11 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
             raise ValueError(f"n_train: a share expects at least 5 shapes of a class, got {len(members)} of {label}.")
         if len(members) <= n_fit:
             raise ValueError(f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}.")
-        n_held = _count(n_validation, n_fit, 2)
-        drawn = members[torch.randperm(len(members), generator=generator)].tolist()
-        for part, chosen in zip(parts, (drawn[n_held:n_fit], drawn[:n_held], drawn[n_fit:]), strict=True):
-            part.extend(chosen)
+        n_held_out = _count(n_validation, n_fit, 2)
+        shuffled = members[torch.randperm(len(members), generator=generator)].tolist()
+        chosen = shuffled[n_held_out:n_fit], shuffled[:n_held_out], shuffled[n_fit:]
+        for part, indices in zip(parts, chosen, strict=True):
+            part.extend(indices)
     train, validation, test = (tuple(sorted(part)) for part in parts)
     return Split(train, validation, test)
 
@@ -53,44 +53,47 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
 def split_unseen(
     labels: Tensor, n_train: float, *, n_validation: float = 0, n_test: int | None = None, seed: int = 0
 ) -> Split:
-    """No class in two parts: `n_train` classes train, others test.
+    """Split the classes, so that no class is in two parts.
 
-    With the same seed and `n_test` the test classes stay the same whatever `n_train`, and the training classes of a
-    smaller `n_train` are among those of a larger.
+    With the same seed and `n_test`, the test classes do not depend on `n_train`, and a larger `n_train` adds training
+    classes without removing any.
 
     Args:
         labels: (N,) integer classes.
-        n_train: classes in training and validation together; below 1 a share of them, which leaves one.
-        n_validation: how many of those validate; below 1 a share, which leaves one to train on.
-        n_test: classes to test; all others if None.
+        n_train: number of classes in training and validation together; below 1 a share, which leaves at least 1.
+        n_validation: how many of these are for validation; below 1 a share, which leaves at least 1.
+        n_test: number of test classes; all other classes if None.
 
     Raises:
-        ValueError: not so many classes, or `n_validation` leaves none to train on.
+        ValueError: there are too few classes, or none are left for training.
     """
     classes = labels.unique()
     _check(n_validation, n_train)
     n_fit = _count(n_train, len(classes), 1)
-    n_held = _count(n_validation, n_fit, 1)
+    n_held_out = _count(n_validation, n_fit, 1)
     n_test = len(classes) - n_fit if n_test is None else n_test
     if n_test < 1 or n_fit + n_test > len(classes):
         raise ValueError(f"n_train, n_test: expected at most {len(classes)} classes together, got {n_train}, {n_test}.")
-    drawn = classes[torch.randperm(len(classes), generator=torch.Generator().manual_seed(seed))]
+    shuffled = classes[torch.randperm(len(classes), generator=torch.Generator().manual_seed(seed))]
 
     def members(chosen: Tensor) -> tuple[int, ...]:
         return tuple(torch.nonzero(torch.isin(labels, chosen)).flatten().tolist())
 
-    fit = drawn[:n_fit]
-    return Split(members(fit[n_held:]), members(fit[:n_held]), members(drawn[len(drawn) - n_test :]))
+    test = shuffled[len(shuffled) - n_test :]
+    return Split(members(shuffled[n_held_out:n_fit]), members(shuffled[:n_held_out]), members(test))
 
 
-def _count(wanted: float, n: int, least: int, rest: int = 1) -> int:
-    """A whole number as it is; a share below 1 of n as a number, at least `least`, which leaves at least `rest`."""
-    return min(max(round(wanted * n), least), n - rest) if 0 < wanted < 1 else int(wanted)
+def _count(amount: float, n: int, min_count: int, min_left: int = 1) -> int:
+    """Return a whole number unchanged, or a share of n as a number of at least `min_count` that leaves `min_left`."""
+    return min(max(round(amount * n), min_count), n - min_left) if 0 < amount < 1 else int(amount)
 
 
 def _check(n_validation: float, n_train: float) -> None:
     for name, value in (("n_train", n_train), ("n_validation", n_validation)):
         if not (0 <= value < 1 or value == int(value)):
             raise ValueError(f"{name}: expected a whole number, or a share below 1, got {value}.")
-    if not 0 <= n_validation < max(n_train, 1 if n_train > 0 else 0):
-        raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")
+    if n_train <= 0:
+        raise ValueError(f"n_train: expected a number above 0, got {n_train}.")
+    if not 0 <= n_validation < max(n_train, 1):
+        expected = f"0 to n_train - 1 = {n_train - 1}" if n_train >= 1 else "a share below 1, as n_train is a share"
+        raise ValueError(f"n_validation: expected {expected}, got {n_validation}.")

@@ -1,8 +1,8 @@
-"""Changes of a Signature: as a Dataset's `transform` at each reading, as its `pre_transform` once, before it is cached.
+"""Transforms of Signatures, for the `transform` of a Dataset (at each access) or its `pre_transform` (before caching).
 
-Each takes a seed. With one, a Signature is changed alike at every reading, by seed and name alone (before it is cached,
-by its key in place of the name, which copies of a file share); without, by numbers that PyTorch's global generator
-draws, which a DataLoader seeds anew in every worker.
+With a seed, the random numbers of a transform depend only on the seed and the name of the Signature, so they are the
+same at every access. A `pre_transform` uses the cache key instead of the name, which copies of a file share. Without a
+seed, they depend on PyTorch's global generator, which a DataLoader seeds differently in every worker.
 """
 
 import zlib
@@ -18,19 +18,19 @@ from igps.signature.signature import Samples, Signature
 
 @dataclass(frozen=True, kw_only=True)
 class Transform(ABC):
-    """A change of a Signature; written down, and so named in a cache, by its class and parameters."""
+    """Base class of transforms. Class and parameters identify a transform in cache keys."""
 
     seed: int | None = None
 
     @property
     def cache_tag(self) -> str:
-        """The transform in words; a ValueError without a seed, as no two Signatures would be alike."""
+        """Class and parameters as text; raises a ValueError without a seed."""
         if self.seed is None:
-            raise ValueError(f"pre_transform: expected a seed, got {self!r}. What is kept must come out alike again.")
+            raise ValueError(f"pre_transform: expected a seed, got {self!r}. Cached results must be reproducible.")
         return repr(self)
 
     def __call__(self, signature: Signature) -> Signature:
-        """The changed Signature; the given one stays as it is."""
+        """Return the transformed Signature, without changing the argument."""
         seed = int(torch.randint(2**31, ())) if self.seed is None else self.seed
         return self._changed(signature, np.random.default_rng([seed, zlib.crc32(signature.name.encode())]))
 
@@ -39,26 +39,25 @@ class Transform(ABC):
 
 
 class Compose:
-    """Several changes, one after the other: callables from Signature to Signature."""
+    """Composition of several transforms, which are callables from Signature to Signature."""
 
     def __init__(self, *transforms: Callable[[Signature], Signature]) -> None:
         self.transforms = transforms
 
     @property
     def cache_tag(self) -> str:
-        """The tags of all changes."""
-        return "; ".join(one.cache_tag for one in self.transforms)  # type: ignore[attr-defined]
+        """Tags of all transforms."""
+        return "; ".join(transform.cache_tag for transform in self.transforms)  # type: ignore[attr-defined]
 
     def __call__(self, signature: Signature) -> Signature:
-        """The changed Signature; the given one stays as it is."""
-        for one in self.transforms:
-            signature = one(signature)
+        for transform in self.transforms:
+            signature = transform(signature)
         return signature
 
 
 @dataclass(frozen=True, kw_only=True)
 class FewerSamples(Transform):
-    """A random subset of the samples, in their order, at most so many interior and surface ones; None keeps all."""
+    """Random subset of at most `n_interior` and `n_surface` samples in their order; None keeps all."""
 
     n_interior: int | None = None
     n_surface: int | None = None
@@ -67,9 +66,9 @@ class FewerSamples(Transform):
         def fewer(samples: Samples, n: int | None) -> Samples:
             if n is None or n >= len(samples):
                 return samples
-            kept = np.sort(generator.permutation(len(samples))[:n])
-            attributes = {name: values[kept] for name, values in samples.attributes.items()}
-            return Samples(samples.points[kept], samples.eigenfunctions[kept], attributes)
+            chosen = np.sort(generator.permutation(len(samples))[:n])
+            attributes = {name: values[chosen] for name, values in samples.attributes.items()}
+            return Samples(samples.points[chosen], samples.eigenfunctions[chosen], attributes)
 
         interior, surface = fewer(signature.interior, self.n_interior), fewer(signature.surface, self.n_surface)
         return replace(signature, interior=interior, surface=surface)
@@ -77,22 +76,22 @@ class FewerSamples(Transform):
 
 @dataclass(frozen=True, kw_only=True)
 class FewerEigenpairs(Transform):
-    """A random subset of the eigenpairs, ascending. A descriptor that needs more of them refuses the Signature."""
+    """Random subset of the eigenpairs in their order. Descriptors that need more eigenpairs raise an error."""
 
     n_eigenpairs: int = 50
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
-        kept = np.sort(generator.permutation(len(signature.eigenvalues))[: self.n_eigenpairs])
-        fewer = signature.map_samples(lambda one: replace(one, eigenfunctions=one.eigenfunctions[:, kept]))
-        return replace(fewer, eigenvalues=signature.eigenvalues[kept])
+        chosen = np.sort(generator.permutation(len(signature.eigenvalues))[: self.n_eigenpairs])
+        fewer = signature.map_samples(lambda s: replace(s, eigenfunctions=s.eigenfunctions[:, chosen]))
+        return replace(fewer, eigenvalues=signature.eigenvalues[chosen])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Noise(Transform):
     """Gaussian noise on positions and on eigenfunctions."""
 
-    points: float = 0.0  # its standard deviation over √area
-    eigenfunctions: float = 0.0  # its standard deviation times √area; an eigenfunction's mean square is 1/area
+    points: float = 0.0  # standard deviation of the noise, divided by √area
+    eigenfunctions: float = 0.0  # standard deviation times √area; the mean square of an eigenfunction is 1/area
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         length = np.sqrt(signature.area)
@@ -111,7 +110,7 @@ class Noise(Transform):
 
 @dataclass(frozen=True, kw_only=True)
 class Scale(Transform):
-    """The Signature of the body scaled by a random factor between two, whose logarithm is uniform."""
+    """Scale of the body by a random factor between `smallest` and `largest`, with a uniform logarithm."""
 
     smallest: float = 0.8
     largest: float = 1.25
@@ -128,14 +127,14 @@ class Scale(Transform):
             return replace(samples, points=samples.points * factor, eigenfunctions=values)
 
         area, volume = signature.area * factor**2, signature.volume * factor**3
-        whole = replace(signature, eigenvalues=signature.eigenvalues / factor**2, area=area, volume=volume)
-        return whole.map_samples(scaled)
+        rescaled = replace(signature, eigenvalues=signature.eigenvalues / factor**2, area=area, volume=volume)
+        return rescaled.map_samples(scaled)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlipSigns(Transform):
-    """Every eigenfunction times −1 or 1: what no description may depend on, and a network has to learn."""
+    """Random signs of the eigenfunctions, on which no description may depend."""
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         signs = generator.choice(np.array([-1, 1], np.float32), len(signature.eigenvalues))
-        return signature.map_samples(lambda one: replace(one, eigenfunctions=one.eigenfunctions * signs))
+        return signature.map_samples(lambda s: replace(s, eigenfunctions=s.eigenfunctions * signs))

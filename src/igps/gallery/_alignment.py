@@ -1,4 +1,4 @@
-"""How far apart two surfaces are once one is laid onto the other: moved, turned, mirrored and scaled."""
+"""The distance of two surfaces after alignment by a motion, a reflection and a scale."""
 
 from __future__ import annotations
 
@@ -17,36 +17,33 @@ from scipy.spatial.transform import Rotation
 from igps._arrays import Floats, Integers
 from igps.mesh.surface import area_vectors, unit
 
-# In units of √area. Of two points of a thin sheet, those whose normals agree are the near ones: a normal counts as so
-# long a step.
-_NORMAL = 0.1
-# Steps between neighbouring samples within which another sample of the same surface is looked for.
+# Lengths are over √area.
+# Weight of normals in the search for the nearest sample, so that the two sides of a thin sheet are not confused
+_NORMAL_WEIGHT = 0.1
+# Distance within which the nearest sample may lie aside of a sample, in steps between neighbouring samples
 _GAP = 2.5
-# Principal axes whose extents differ by a smaller factor are ambiguous: other starts are tried even where those from
-# the axes are hopeless
-_AMBIGUOUS = 1.1
+# Principal axes whose extents differ by a smaller factor are ambiguous: starts from other rotations are tried as well
+_AMBIGUITY = 1.1
 _N_ROTATIONS = 300
-_N_SCORED, _N_FITTED = 60, 250
-_N_TRIED, _COARSE_STEPS, _FINE_STEPS, _LAST_STEPS = 12, 6, 4, 10
-# Placings that samples tell no better from each other than by this factor are laid onto the surface
-_ALIKE = 1.5
-# After the fine steps, what is farther than the hopeless distance over this is hopeless. With 0.03 for that, 99 % of
-# copies of generated bodies are within 0.006 then, well below 0.02; the others are found from other starts.
-_FINER = 1.5
-# Over √area: the last steps bring patches nearer by less; those of copies of generated bodies by up to 0.0001.
+_N_SCORED, _N_FITTED = 60, 250  # samples
+_N_STARTS, _N_COARSE_STEPS, _N_FINE_STEPS, _N_LAST_STEPS = 12, 6, 4, 10
+# Poses that fit up to this factor worse than the best by samples alone are fitted to the surface itself
+_CLOSE_FIT = 1.5
+# After the fine steps the limit for hopeless distances is divided by this. If it was 0.03, 99 % of copies of generated
+# bodies are within 0.006 then, well below 0.02; the others are found from other starts.
+_FINE_FACTOR = 1.5
+# Upper bound of what the last steps gain; they brought copies of generated bodies nearer by up to 0.0001
 _LAST_GAIN = 0.004
-# Neighbouring samples whose offsets are averaged.
-_PATCH = 10
+_PATCH_SIZE = 10  # neighbouring samples whose offsets are averaged
 MOST_SCALED = math.log(1.1)
-"""How much one is scaled at most beside the other: the logarithm of the factor."""
+"""Largest logarithm of the scale of an alignment."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Points (P, 3) spread evenly over a surface, about their mean and over √area, and unit outward normals (P, 3).
+    """Points (P, 3) spread evenly over a surface, centred and over √area, with unit outward normals (P, 3).
 
-    `surface` gives the surface itself, about the same origin and in the same unit; it is asked for where others are
-    near.
+    `surface` returns the surface itself in the same coordinates. It is called only if another surface is near.
     """
 
     points: Floats
@@ -55,7 +52,7 @@ class SurfaceSamples:
 
     @classmethod
     def of(cls, points: Floats, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
-        """Those of points (P, 3), length, and outward normals (P, 3) of a surface of an area, length²."""
+        """Normalise points (P, 3), a length, with outward normals (P, 3), by the area of the surface, a length²."""
         if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
             raise ValueError(
                 f"points, normals: expected both (P, 3) with P ≥ 4, got {tuple(points.shape)} and "
@@ -65,27 +62,27 @@ class SurfaceSamples:
 
     @cached_property
     def tree(self) -> KDTree:
-        """Finds the nearest of them."""
-        return KDTree(_with_normals(self), leafsize=50)  # in six dimensions twice as fast as the default
+        """Tree of the samples, with positions and weighted normals as six coordinates."""
+        return KDTree(_with_normals(self), leafsize=50)  # twice as fast as the default in six dimensions
 
     @cached_property
     def extents(self) -> Floats:
-        """(3,) standard deviations along the principal axes, ascending, without unit."""
+        """Standard deviations (3,) along the principal axes, ascending."""
         return np.sqrt(np.linalg.eigvalsh(np.cov(self.points.T)))
 
     @property
     def gap(self) -> float:
-        """How far apart neighbours are, about."""
+        """Typical distance of neighbouring samples."""
         return 1 / math.sqrt(len(self.points))
 
     def nearest(self, samples: SurfaceSamples) -> tuple[Floats, Floats]:
-        """(P, 3) and (P, 3) the nearest of them to each of other samples, whose normal agrees, and its normal."""
-        found = self.tree.query(_with_normals(samples))[1]
-        return self.points[found], self.normals[found]
+        """Return the nearest of these samples to each of other samples (P), with similar normals: points, normals."""
+        nearest = self.tree.query(_with_normals(samples))[1]
+        return self.points[nearest], self.normals[nearest]
 
 
 class TriangleSurface:
-    """A surface to find nearest points of: vertices (V, 3) over √area, and faces (F, 3)."""
+    """A triangle mesh for searches of nearest points: vertices (V, 3) over √area, and faces (F, 3)."""
 
     gap = 0.0
 
@@ -98,77 +95,86 @@ class TriangleSurface:
         self._tree.init(*self._triangles)
 
     def nearest(self, samples: SurfaceSamples) -> tuple[Floats, Floats]:
-        """(P, 3) and (P, 3) the nearest point of it to each of some samples, and the normal there."""
+        """Return the nearest point of the surface to each of the samples (P), and the normal there."""
         _, face, points = self._tree.squared_distance(*self._triangles, np.ascontiguousarray(samples.points))
         return np.asarray(points), self._normals[np.asarray(face).ravel()]
 
 
 def surface_distance(
     one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, hopeless: float = math.inf,
-    most: float = math.inf, patch: int = _PATCH,
+    most: float = math.inf, patch: int = _PATCH_SIZE,
 ) -> float:  # fmt: skip
-    """How far apart two surfaces laid onto each other stay, over √area: root mean square of patches, of both ways.
+    """Return the distance of two surfaces after alignment, over √area: root mean square over patches, both ways.
 
-    One is moved, turned, perhaps mirrored, and scaled by up to a tenth (their areas are equal already), from many
-    starts, by iterated closest points to tangent planes (Chen and Medioni 1992; Besl and McKay 1992). The offset of a
-    sample is that to the other surface; where that is not at hand, that to the plane of its nearest sample whose normal
-    agrees, and beside it what it lies off to the side of that sample, beyond the gaps between samples. Offsets are
-    averaged over patches of ten neighbours, a twentieth of √area across: relief that a coarser mesh has lost, and the
-    roughness of triangles, go in and out and cancel, where another shape or pose moves whole patches.
+    The first surface is moved, rotated, possibly reflected, and scaled by up to a tenth (areas are equal already) by
+    iterated closest points with tangent planes (Chen and Medioni 1992; Besl and McKay 1992), from many starts. The
+    offset of a sample leads to the nearest point of the other surface. Without that surface, it leads to the tangent
+    plane of the nearest sample with a similar normal; a lateral offset counts only beyond the gaps between samples.
+    Offsets are averaged over patches of ten neighbours, a twentieth of √area across. Relief that a coarse mesh lacks,
+    and the roughness of triangles, have offsets of either sign and cancel; another shape or pose moves whole patches.
 
-    The search ends at a distance that is `enough`. Beyond `hopeless` it matters no more how far apart they are: where
-    few samples are farther after some steps, the other surface itself is not asked for; nor are all samples laid onto
-    that, where few are farther from it than two thirds of it. What is farther than `most` is told to be, not how far:
-    one way may do. With a `patch` of 1 instead of ten neighbours, for two that are known to be the same, lost relief
-    counts, and the farthest sample instead of the mean. The result is symmetric but for where the search ends.
+    The result is symmetric except for where the search stops.
+
+    Args:
+        one: samples of the surface that is moved.
+        other: samples of the other surface.
+        enough: distance at which the search stops.
+        hopeless: distance beyond which the result need not be precise. If a subset of the samples is farther after the
+            coarse steps, the other surface itself is not loaded; if the subset is farther than two thirds of
+            `hopeless` after the fine steps, the remaining samples are not used.
+        most: distance beyond which the result is only a lower bound, for which one direction may be enough.
+        patch: samples in a patch. With 1, for surfaces known to be the same, lost relief counts, and the largest offset
+            is returned instead of the root mean square.
     """
     best = math.inf
-    is_ambiguous = min(_least_step(one), _least_step(other)) < _AMBIGUOUS
+    is_ambiguous = min(_min_extent_ratio(one), _min_extent_ratio(other)) < _AMBIGUITY
     samples = _subset(one, _N_FITTED)
     for starts in (_principal_starts(one, other), _uniform_starts()):
-        order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")[:_N_TRIED]
-        coarse = [_fitted(samples, other, _Placing(starts[i]), _COARSE_STEPS) for i in order]
-        far = min(apart for apart, _ in coarse)
-        if far <= hopeless:
-            # Of a spring's turns samples tell no more than how far apart they lie: the surface itself decides
+        order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")[:_N_STARTS]
+        coarse = [_fit(samples, other, _Alignment(starts[i]), _N_COARSE_STEPS) for i in order]
+        distance = min(coarse, key=itemgetter(0))[0]
+        if distance <= hopeless:
+            # Samples alone cannot tell which turn of a spring fits another turn: the surface itself decides
             finest = other if other.surface is None else other.surface()
-            fine = [
-                _fitted(samples, finest, placing, _FINE_STEPS) for apart, placing in coarse if apart <= _ALIKE * far
-            ]
-            far, placing = min(fine, key=itemgetter(0))
-            if far <= hopeless / _FINER:
-                far = _apart(one, other, placing, patch, most)
-        best = min(best, far)
-        # A body may be nearly its own mirror image: near is not yet the nearest; but of two that are known to be the
-        # same, clear axes tell which of their starts is
+            close = [alignment for error, alignment in coarse if error <= _CLOSE_FIT * distance]
+            fine = [_fit(samples, finest, alignment, _N_FINE_STEPS) for alignment in close]
+            distance, alignment = min(fine, key=itemgetter(0))
+            if distance <= hopeless / _FINE_FACTOR:
+                distance = _two_way_distance(one, other, alignment, patch, most)
+        best = min(best, distance)
+        # A body may nearly be its own mirror image, so a small distance need not be the smallest. For surfaces known to
+        # be the same, unambiguous axes are enough.
         if best <= enough or ((best > hopeless or patch == 1) and not is_ambiguous):
             break
     return best
 
 
 def offset_in_place(samples: SurfaceSamples, surface: TriangleSurface) -> float:
-    """Root mean square of the patches of samples, as in `surface_distance`, to a surface in its place."""
+    """Return the root mean square over patches, as in `surface_distance`, without alignment."""
     return math.sqrt(_mean_square(samples, surface))
 
 
-def _apart(one: SurfaceSamples, other: SurfaceSamples, placing: _Placing, patch: int, most: float) -> float:
-    """Root mean square of the patches of either, each laid onto all that is known of the other; or at least `most`."""
+def _two_way_distance(
+    one: SurfaceSamples, other: SurfaceSamples, alignment: _Alignment, patch: int, most: float
+) -> float:
+    """Return the root mean square over the patches of both surfaces, or a lower bound of it above `most`."""
     squares = []
-    for samples, target, way in ((one, other, placing), (other, one, placing.inverse())):
+    for samples, target, initial in ((one, other, alignment), (other, one, alignment.inverse())):
         finest = target if target.surface is None else target.surface()
         if most < math.inf:
-            at_least = math.sqrt(_mean_square(way(samples), finest, patch) / way.scale) - _LAST_GAIN
-            if at_least > most:
-                return at_least
-        _, fitted = _fitted(samples, finest, way, _LAST_STEPS)
-        # In units of the mean of both, so that neither is favoured.
+            bound = math.sqrt(_mean_square(initial(samples), finest, patch) / initial.scale) - _LAST_GAIN
+            if bound > most:
+                return bound
+        _, fitted = _fit(samples, finest, initial, _N_LAST_STEPS)
+        # In the unit of the geometric mean of both, so that neither is favoured
         squares.append(_mean_square(fitted(samples), finest, patch) / fitted.scale)
         if sum(squares) / 2 > most**2:
             break
     return math.sqrt(sum(squares) / 2)
 
 
-def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch: int = _PATCH) -> float:
+def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch: int = _PATCH_SIZE) -> float:
+    """Return the mean square offset of patches, or the largest square offset if a patch is one sample."""
     among = np.arange(1, min(patch, len(samples.points)) + 1)
     neighbours = samples.tree.query(_with_normals(samples), k=among)[1]
     means = _offsets(samples, target)[neighbours].mean(axis=1)
@@ -177,92 +183,94 @@ def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurfa
 
 
 def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) -> Floats:
-    """(P, 3) from each sample to the surface of the target."""
+    """Return the offsets (P, 3) from samples to the surface of the target."""
     nearest, normals = target.nearest(samples)
     steps = nearest - samples.points
-    across = np.einsum("ni,ni->n", steps, normals)[:, None] * normals
-    aside = steps - across
-    length = np.linalg.norm(aside, axis=1, keepdims=True)
-    return across + aside * np.maximum(1 - _GAP * target.gap / np.maximum(length, 1e-12), 0)
+    normal_part = np.einsum("ni,ni->n", steps, normals)[:, None] * normals
+    lateral = steps - normal_part
+    length = np.linalg.norm(lateral, axis=1, keepdims=True)
+    return normal_part + lateral * np.maximum(1 - _GAP * target.gap / np.maximum(length, 1e-12), 0)
 
 
 def _scores(samples: SurfaceSamples, target: SurfaceSamples, starts: Floats) -> Floats:
-    """(S,) how badly each of the starts (S, 3, 3) lays the samples."""
-    points, normals = (np.einsum("sij,nj->sni", starts, one) for one in (samples.points, samples.normals))
-    placed = SurfaceSamples(points.reshape(-1, 3), normals.reshape(-1, 3))
-    far, _ = target.tree.query(_with_normals(placed), eps=0.5)  # starts are put in nearly the same order
-    return np.asarray(np.square(far).reshape(len(starts), -1).mean(axis=1))
+    """Return the mean square distance (S,) of the samples from the target after each of the rotations (S, 3, 3)."""
+    points, normals = (np.einsum("sij,nj->sni", starts, array) for array in (samples.points, samples.normals))
+    rotated = SurfaceSamples(points.reshape(-1, 3), normals.reshape(-1, 3))
+    distances, _ = target.tree.query(_with_normals(rotated), eps=0.5)  # precise enough to order the starts
+    return np.asarray(np.square(distances).reshape(len(starts), -1).mean(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
-class _Placing:
-    """How a surface is laid: scale · turn · x + shift; `turn` may mirror."""
+class _Alignment:
+    """The map x ↦ scale · rotation · x + shift; `rotation` may contain a reflection."""
 
-    turn: Floats
+    rotation: Floats
     shift: Floats | float = 0.0
     scale: float = 1.0
 
     def __call__(self, samples: SurfaceSamples) -> SurfaceSamples:
-        return SurfaceSamples(self.scale * samples.points @ self.turn.T + self.shift, samples.normals @ self.turn.T)
+        points = self.scale * samples.points @ self.rotation.T + self.shift
+        return SurfaceSamples(points, samples.normals @ self.rotation.T)
 
-    def inverse(self) -> _Placing:
-        return _Placing(self.turn.T, -self.turn.T @ np.broadcast_to(self.shift, 3) / self.scale, 1 / self.scale)
+    def inverse(self) -> _Alignment:
+        shift = -self.rotation.T @ np.broadcast_to(self.shift, 3) / self.scale
+        return _Alignment(self.rotation.T, shift, 1 / self.scale)
 
-    def then(self, step: Floats) -> _Placing:
-        """After a further small rotation vector, shift and logarithm of a scale, (7,)."""
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    def then(self, step: Floats) -> _Alignment:
+        """Compose with a small step (7,): a rotation vector, a shift, and the logarithm of a scale."""
+        rotation = Rotation.from_rotvec(step[:3]).as_matrix()
         log_scale = np.clip(math.log(self.scale) + step[6], -MOST_SCALED, MOST_SCALED)
         factor = math.exp(log_scale) / self.scale
-        shift = factor * turn @ np.broadcast_to(self.shift, 3) + step[3:6]
-        return _Placing(turn @ self.turn, shift, math.exp(log_scale))
+        shift = factor * rotation @ np.broadcast_to(self.shift, 3) + step[3:6]
+        return _Alignment(rotation @ self.rotation, shift, math.exp(log_scale))
 
 
-def _fitted(
-    samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, placing: _Placing, n_steps: int
-) -> tuple[float, _Placing]:
-    """Root mean square of the offsets, and the placing that the steps end at."""
+def _fit(
+    samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, alignment: _Alignment, n_steps: int
+) -> tuple[float, _Alignment]:
+    """Improve an alignment, and return the root mean square of the offsets with the last alignment."""
     for _ in range(n_steps):
-        placed = placing(samples)
-        nearest, normals = target.nearest(placed)
-        across = np.einsum("ni,ni->n", nearest - placed.points, normals)
-        along = np.einsum("ni,ni->n", placed.points, normals)
-        columns = np.column_stack([np.cross(placed.points, normals), normals, along])
-        square = columns.T @ columns
-        # What the surface leaves free, as a sphere its rotations, stays as it is.
-        square[np.diag_indices(7)] += 1e-4 * np.trace(square) / 7
-        step = np.linalg.solve(square, columns.T @ across)
-        placing = placing.then(step)
+        moved = alignment(samples)
+        nearest, normals = target.nearest(moved)
+        residuals = np.einsum("ni,ni->n", nearest - moved.points, normals)
+        along_normals = np.einsum("ni,ni->n", moved.points, normals)
+        jacobian = np.column_stack([np.cross(moved.points, normals), normals, along_normals])
+        normal_matrix = jacobian.T @ jacobian
+        # Directions that the surface does not determine, such as rotations of a sphere, get no step
+        normal_matrix[np.diag_indices(7)] += 1e-4 * np.trace(normal_matrix) / 7
+        step = np.linalg.solve(normal_matrix, jacobian.T @ residuals)
+        alignment = alignment.then(step)
         if np.abs(step).max() < 1e-5:
             break
-    offsets = _offsets(placing(samples), target)
-    return float(np.sqrt(np.einsum("ni,ni->n", offsets, offsets).mean())), placing
+    offsets = _offsets(alignment(samples), target)
+    return float(np.sqrt(np.einsum("ni,ni->n", offsets, offsets).mean())), alignment
 
 
 def _with_normals(samples: SurfaceSamples) -> Floats:
-    return np.hstack([samples.points, _NORMAL * samples.normals])
+    return np.hstack([samples.points, _NORMAL_WEIGHT * samples.normals])
 
 
 def _subset(samples: SurfaceSamples, n: int) -> SurfaceSamples:
-    """About n of the samples, at equal steps."""
+    """Return about n of the samples, at equal steps."""
     chosen = np.linspace(0, len(samples.points) - 1, min(n, len(samples.points))).round().astype(np.int64)
     return SurfaceSamples(samples.points[chosen], samples.normals[chosen])
 
 
 def _principal_starts(one: SurfaceSamples, other: SurfaceSamples) -> Floats:
-    """(8, 3, 3): principal axes onto principal axes, each with either sign."""
-    of_one, of_other = (np.linalg.eigh(np.cov(samples.points.T))[1] for samples in (one, other))
-    return np.stack([of_other @ np.diag(signs) @ of_one.T for signs in product((1.0, -1.0), repeat=3)])
+    """Return the maps (8, 3, 3) of principal axes onto principal axes, with every choice of signs."""
+    axes, other_axes = (np.linalg.eigh(np.cov(samples.points.T))[1] for samples in (one, other))
+    return np.stack([other_axes @ np.diag(signs) @ axes.T for signs in product((1.0, -1.0), repeat=3)])
 
 
-def _least_step(samples: SurfaceSamples) -> float:
-    """The smallest factor from one extent to the next."""
+def _min_extent_ratio(samples: SurfaceSamples) -> float:
+    """Return the smallest ratio of an extent to the next smaller one."""
     extents = np.maximum(samples.extents, 1e-9)
     return float((extents[1:] / extents[:-1]).min())
 
 
 @cache
 def _uniform_starts() -> Floats:
-    """(2 · _N_ROTATIONS, 3, 3) rotations, spread evenly, and their mirror images (super-Fibonacci, Alexa 2022)."""
+    """Return rotations (600, 3, 3) spread evenly, half of them with a reflection (super-Fibonacci, Alexa 2022)."""
     s = np.arange(_N_ROTATIONS) + 0.5
     phi, psi = math.sqrt(2), 1.533751168755204288118041
     r, big_r = np.sqrt(s / _N_ROTATIONS), np.sqrt(1 - s / _N_ROTATIONS)

@@ -1,8 +1,8 @@
-"""How far apart two surfaces are at least, as moments of the volumes inside them tell, however one is laid.
+"""A lower bound of the distance of two surfaces in any alignment, from moments of the enclosed volumes.
 
-Where a surface moves outwards by u, a moment of its body changes by the mean of h · u, to first order, where h is known
-on the surface. So moments that differ by δ take a root mean square of u of at least √(δᵀ G⁻¹ δ), G the mean of h hᵀ
-(Cauchy and Schwarz). Triangles give moments exactly, so that copies differ only by what triangles cut off.
+If a surface moves outwards by u, a moment of its body changes by the mean of h · u to first order, where h is a known
+function on the surface. So a difference δ of moments requires a root mean square of u of at least √(δᵀ G⁻¹ δ), where G
+is the mean of h hᵀ (Cauchy and Schwarz). Moments of a mesh are exact, so copies differ only by what triangles cut off.
 """
 
 import numpy as np
@@ -13,34 +13,35 @@ from igps._arrays import Floats, Integers
 from igps.gallery._alignment import MOST_SCALED
 from igps.mesh.surface import area_vectors, directed_edges, face_areas
 
-# A rule of six points that integrates polynomials of fourth degree over a triangle (Dunavant 1985)
+# Quadrature with six nodes, exact for polynomials of degree four on a triangle (Dunavant 1985)
 _INNER, _OUTER = 0.445948490915965, 0.091576213509771
-_CORNERS = np.concatenate([np.full((3, 3), one) + np.eye(3) * (1 - 3 * one) for one in (_INNER, _OUTER)])
-_SHARES = np.repeat([0.223381589678011, 0.109951743655322], 3)
-# What the first order leaves out, as a part of it: a move of a hundredth of √area on what is curved by a third
+_NODES = np.concatenate([np.full((3, 3), x) + np.eye(3) * (1 - 3 * x) for x in (_INNER, _OUTER)])  # barycentric
+_WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
+# Second-order terms over first-order terms: a move of √area / 100 where the radius of curvature is √area / 3
 _SECOND_ORDER = 0.03
 
 
 def moments(vertices: Floats, faces: Integers, most: float) -> Floats:
-    """(7, 6) six numbers of a body in units of √area, and a map of their differences to how far it moved at least.
+    """Return six moments of a body, in units of √area, and the map from their differences to a distance: (7, 6).
 
-    They are the logarithms of the volume V, of the second moments along principal axes and of ∫ |x|⁴ dV, about the
-    middle, which grow evenly with a scale or a thickness, and the length of ∫ x |x|² dV as a part of
-    (∫ |x|² dV)^(3/2) / √V. Holes of an open surface are closed by cones over the middle of it. Moves are up to `most`;
-    beside them, scaling by a tenth counts as much as such a move. The map is zero where the moments are none of a body.
+    The first row has the logarithms of the volume V, of the second central moments along the principal axes, and of
+    ∫ |x|⁴ dV, which all grow with scale or thickness, and |∫ x |x|² dV| / ((∫ |x|² dV)^(3/2) / √V). The other rows are
+    the map. It holds for moves up to `most`, and ignores a scaling by up to a tenth. It is zero, and the bound with it,
+    if the moments are not those of a solid. Holes of an open surface are closed by cones over its centroid.
     """
     start, end = directed_edges(faces)
-    is_free = ~np.isin(start * len(vertices) + end, end * len(vertices) + start)
-    if is_free.any():
-        middle = np.average(vertices[faces].mean(axis=1), axis=0, weights=face_areas(vertices, faces))
-        cones = np.column_stack([end[is_free], start[is_free], np.full(is_free.sum(), len(vertices))])
-        vertices, faces = np.vstack([vertices, middle]), np.vstack([faces, cones])
+    is_open = ~np.isin(start * len(vertices) + end, end * len(vertices) + start)
+    if is_open.any():
+        centroid = np.average(vertices[faces].mean(axis=1), axis=0, weights=face_areas(vertices, faces))
+        cones = np.column_stack([end[is_open], start[is_open], np.full(is_open.sum(), len(vertices))])
+        vertices, faces = np.vstack([vertices, centroid]), np.vstack([faces, cones])
     vectors = area_vectors(vertices, faces)
-    x = np.einsum("qk,fkd->fqd", _CORNERS, vertices[faces])
-    flux = np.einsum("fqd,fd,q->fq", x, vectors, _SHARES)  # of x; by the divergence theorem that of x·f gives ∫ f dV
+    x = np.einsum("qk,fkd->fqd", _NODES, vertices[faces])
+    # Flux of x through each node's part of the surface. The flux of x f gives ∫ f dV by the divergence theorem.
+    flux = np.einsum("fqd,fd,q->fq", x, vectors, _WEIGHTS)
     volume = flux.sum() / 3
     x = (x - np.einsum("fq,fqd->d", flux, x) / 4 / volume).reshape(-1, 3)
-    flux = np.einsum("fqd,fd,q->fq", x.reshape(-1, 6, 3), vectors, _SHARES).ravel()
+    flux = np.einsum("fqd,fd,q->fq", x.reshape(-1, 6, 3), vectors, _WEIGHTS).ravel()
     second = np.einsum("p,pi,pj->ij", flux, x, x) / 5
     along, axes = np.linalg.eigh(second)
     square, total = np.einsum("pi,pi->p", x, x), along.sum()
@@ -48,26 +49,27 @@ def moments(vertices: Floats, faces: Integers, most: float) -> Floats:
     even = np.array([volume, *along, fourth])
     if not even.min() > 0:
         return np.zeros((7, 6))
-    # How much each grows where the surface moves; the middle moves, too
-    of_even = np.column_stack([np.ones(len(x)), (x @ axes) ** 2, square**2 - 4 * x @ third / volume]) / even
-    skewed = x * square[:, None] - x @ (total * np.eye(3) + 2 * second) / volume
-    length, part = max(float(np.linalg.norm(third)), 1e-9), volume**0.5 / total**1.5
-    of_length = part * (skewed @ third / length + length * (of_even[:, 0] / 2 - 1.5 * square / total))
-    grows = np.column_stack([of_even, of_length])
-    weights = np.outer(np.linalg.norm(vectors, axis=1), _SHARES).ravel()
-    gram = (weights[:, None] * grows).T @ grows
+    # The functions h of the moments; the centroid moves with the surface, too
+    h_even = np.column_stack([np.ones(len(x)), (x @ axes) ** 2, square**2 - 4 * x @ third / volume]) / even
+    h_third = x * square[:, None] - x @ (total * np.eye(3) + 2 * second) / volume
+    length, scale = max(float(np.linalg.norm(third)), 1e-9), volume**0.5 / total**1.5
+    h_length = scale * (h_third @ third / length + length * (h_even[:, 0] / 2 - 1.5 * square / total))
+    h = np.column_stack([h_even, h_length])
+    weights = np.outer(np.linalg.norm(vectors, axis=1), _WEIGHTS).ravel()
+    gram = (weights[:, None] * h).T @ h
     gram[np.diag_indices(6)] *= 1 + _SECOND_ORDER**2
-    scaled = np.array([3, 5, 5, 5, 7, 0]) * MOST_SCALED / most
-    to_moves = np.linalg.inv(np.linalg.cholesky(gram + np.outer(scaled, scaled)))
-    return np.vstack([[*np.log(even), part * length], to_moves])
+    scaling = np.array([3, 5, 5, 5, 7, 0]) * MOST_SCALED / most
+    to_moves = np.linalg.inv(np.linalg.cholesky(gram + np.outer(scaling, scaling)))
+    return np.vstack([[*np.log(even), scale * length], to_moves])
 
 
 def least_distances(one: Tensor, other: Tensor) -> Tensor:
-    """(M, N) how far apart the surfaces of bodies are at least, over √area, of `moments` (M, 7, 6) and (N, 7, 6)."""
+    """Return lower bounds (M, N) of the distances of surfaces, over √area, from `moments` (M, 7, 6) and (N, 7, 6)."""
 
-    def of_each(some: Tensor, others: Tensor) -> Tensor:
-        found, maps = some[:, 0], some[:, 1:].movedim(1, 0)
-        return sum(((to @ others[:, 0].T) - (to * found).sum(1, keepdim=True)).square() for to in maps).sqrt()
+    def bounds(own: Tensor, others: Tensor) -> Tensor:
+        """Return the bounds by the maps of the first bodies."""
+        own_moments, maps = own[:, 0], own[:, 1:].movedim(1, 0)
+        return sum(((row @ others[:, 0].T) - (row * own_moments).sum(1, keepdim=True)).square() for row in maps).sqrt()
 
-    # Of two third moments the longer one's direction tells how much longer it may be
-    return torch.minimum(of_each(one, other), of_each(other, one).T)
+    # The derivative of |∫ x |x|² dV| depends on the direction of the vector, which is uncertain for a short one
+    return torch.minimum(bounds(one, other), bounds(other, one).T)

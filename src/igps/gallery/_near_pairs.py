@@ -1,4 +1,4 @@
-"""Pairs of bodies that are near by their descriptions, among all or in a gallery, and how far they are."""
+"""Pairs of bodies with near descriptions, in a dataset or in a gallery."""
 
 import math
 from collections.abc import Iterator
@@ -13,18 +13,16 @@ from igps.gallery.gallery import Gallery
 from igps.mesh.mesh import millimetres
 from igps.retrieval.distances import Distance
 
-# Rows of distances in memory at once.
-_ROWS = 256
-# Pairs as near as copies are asked for among so many of a gallery, then among ever more.
-_FIRST_TOP = 32
-# Of the logarithm of √area; a level of detail of a body takes up to half of it
-_ONE_SIZE = 0.05
+_ROWS = 256  # of the matrix of distances in memory at once
+_FIRST_TOP = 32  # neighbours in a gallery that are searched first; four times as many if all are near
+# Bodies of one size differ by less in the logarithm of √area; levels of detail of a body differ by up to half of this
+_SIZE_TOLERANCE = 0.05
 
 NearPairs = Iterator[tuple[int, int, float]]
 
 
 def near_pairs(descriptions: Tensor, distance: Distance, limit: float, progress: bool) -> NearPairs:
-    """Pairs i < j of descriptions that are no farther apart, and how far."""
+    """Yield the pairs i < j of descriptions whose distance is at most the limit, with the distance."""
     with tqdm(desc="compared", total=len(descriptions), disable=not progress) as bar:
         for start in range(0, len(descriptions), _ROWS):
             rows = descriptions[start : start + _ROWS]
@@ -37,11 +35,11 @@ def near_pairs(descriptions: Tensor, distance: Distance, limit: float, progress:
 
 
 def near_in_gallery(gallery: Gallery, limit: float, progress: bool) -> NearPairs:
-    """The same of the bodies of a gallery, numbered in order of their ids."""
+    """Yield such pairs of the bodies of a gallery, numbered in order of their ids."""
     numbers = {name: i for i, name in enumerate(sorted(row["id"] for row in gallery.rows("id")))}
     with tqdm(desc="compared", total=len(gallery), disable=not progress) as bar:
-        for some in gallery.table.batches():
-            for description, row in zip(*gallery.table.decoded(some), strict=True):
+        for batch in gallery.table.batches():
+            for description, row in zip(*gallery.table.decoded(batch), strict=True):
                 top = min(_FIRST_TOP, len(gallery))
                 found, distances, _ = gallery.search(description[None], top=top)
                 while float(distances[-1]) <= limit and top < len(gallery):
@@ -54,11 +52,11 @@ def near_in_gallery(gallery: Gallery, limit: float, progress: bool) -> NearPairs
 
 
 def of_one_size(near: NearPairs, dataset: SignatureDataset) -> NearPairs:
-    """Those of the pairs that are of one size."""
+    """Yield the pairs whose bodies have the same size."""
 
     @cache
     def log_length(i: int) -> float:
         signature = dataset[i].signature
         return math.log(signature.area) / 2 + math.log(millimetres(signature.unit))
 
-    return (pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _ONE_SIZE)
+    return (pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _SIZE_TOLERANCE)

@@ -1,4 +1,4 @@
-"""What a gallery records: of each body, and how its descriptions were made, so that others are not compared."""
+"""Metadata of a gallery: the columns of each body, and how descriptions were made, so that only like is compared."""
 
 import contextlib
 import json
@@ -17,24 +17,24 @@ from igps.mesh.options import LoadOptions
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
 
-# Where in the engine's sources a fault was found
-_SOURCE = re.compile(r", /\S+\.rs:.*")
+# Place in LanceDB's source code, at the end of its error messages
+_SOURCE_LOCATION = re.compile(r", /\S+\.rs:.*")
 
 KNOWN: dict[str, type] = {"id": str, "name": str, "class": str, "file": str, "part": str, "checksum": str,
                           "bytes": int, "modified": int, "area": float, "volume": float, "unit": str,
                           "thumbnail": bytes}  # fmt: skip
-"""What every row tells beside its description, and of which type."""
+"""Names and types of the columns that every gallery has, beside the description."""
 
 MANIFEST = "manifest.json"
-"""What an index of 0.2.0 has."""
+"""File by which an index of version 0.2.0 is recognised."""
 
 Row = Mapping[str, Any]
 Batch = tuple[Tensor, Sequence[Row]]
-"""Descriptions (N, ...) and what is known of each: `KNOWN`, and further columns, of text or numbers."""
+"""Descriptions (N, ...) and their rows: the columns `KNOWN`, and further ones of text or numbers."""
 
 
 def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | Descriptor) -> dict[str, Any]:
-    """Name and checksum of the descriptor, and all parameters of the Signatures and of how files are read."""
+    """Return the name and checksum of a descriptor, the parameters of the Signatures and the options of reading."""
     signature = {**asdict(config), "algorithm_version": SignatureConfig.ALGORITHM_VERSION}
     return {
         "descriptor": name_of(descriptor),
@@ -46,18 +46,18 @@ def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | De
 
 
 def check_alike(path: str | Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise a ValueError that names the first difference between a gallery's record and what is expected of it."""
+    """Raise a ValueError that names the first difference between the metadata of a gallery and those expected."""
     known = _flat(found)
     for name, value in _flat(json.loads(json.dumps(dict(wanted)))).items():
         if known.get(name) != value:
             raise ValueError(
                 f"{path}: the gallery is of another {name}: it has {_short(known.get(name))}, not {_short(value)}. "
-                "Ask it with its own, or build another."
+                "Query it with its own, or build another."
             )
 
 
 def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
-    """By name, and what has names within by both."""
+    """Flatten nested dictionaries; keys are joined by a dot."""
     inner = {f"{name}.{k}": v for name, value in about.items() if isinstance(value, dict) for k, v in value.items()}
     return {**{name: value for name, value in about.items() if not isinstance(value, dict)}, **inner}
 
@@ -69,28 +69,28 @@ def _short(value: Any) -> str:
 
 @contextlib.contextmanager
 def engine_errors_as(sentence: str) -> Iterator[None]:
-    """A sentence, and the first line of what the engine raises."""
+    """Raise errors of LanceDB as a ValueError with a sentence, followed by the first line of the original message."""
     try:
         yield
     except (ValueError, RuntimeError, OSError, KeyError, TypeError, IndexError) as error:
-        words = _SOURCE.sub("", str(error).splitlines()[0])[:200] if str(error) else type(error).__name__
-        raise ValueError(f"{sentence} ({words}).") from error
+        reason = _SOURCE_LOCATION.sub("", str(error).splitlines()[0])[:200] if str(error) else type(error).__name__
+        raise ValueError(f"{sentence} ({reason}).") from error
 
 
 def is_gallery(path: str | Path) -> bool:
-    """Whether a folder is a gallery, or an index of 0.2.0, which is refused in words."""
+    """Whether a folder is a gallery, or an index of version 0.2.0, which `open_table` refuses."""
     return any((Path(path) / name).exists() for name in ("bodies.lance", MANIFEST))
 
 
 def tables() -> Any:
-    """The module that needs LanceDB."""
+    """Import the module that needs LanceDB."""
     from igps.gallery import _table
 
     return _table
 
 
 def open_table(path: str | Path, version: int | None = None) -> Any:
-    """The table of a gallery; a ValueError for an index of 0.2.0, whose Signatures are others."""
+    """Open the table of a gallery. Raise a ValueError for an index of version 0.2.0, which has other Signatures."""
     if not tables().exists(Path(path)) and (Path(path) / MANIFEST).exists():
         raise ValueError(f"{path}: an index of version 0.2.0, of other signatures. Build a gallery in a new folder.")
     return tables().BodyTable(path, version)

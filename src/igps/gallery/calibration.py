@@ -1,4 +1,4 @@
-"""What distances mean: how far apart pairs of generated bodies are, by how much they have in common."""
+"""The meaning of distances: distributions over pairs of generated bodies, and thresholds for copies and poses."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -22,113 +22,112 @@ KINDS = {
     "bodies": "bodies of one class",
     "classes": "pairs of different classes",
 }
-"""The pairs, from those that have most in common to those that have least, in words."""
+"""Kinds of pairs in words, from the most alike to the least."""
 
 LEVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, *(i / 10 for i in range(1, 10)),
           0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 1.0)  # fmt: skip
-"""Shares of pairs whose greatest distance is kept."""
+"""Levels of the quantiles of distances that are stored."""
 
 FINEST = 1e-5
-"""A smaller coarseness counts as this, of √area: 2,000 samples may miss what little is not flat."""
+"""Lower bound of a coarseness, over √area: 2,000 samples may miss the little of a surface that is not flat."""
 
-_DEPENDS_ON = ("algorithm_version", "resolution", "min_samples", "n_surface_samples")
+# Parameters of the Signatures that distances depend on
+_SIGNATURE_PARAMS = ("algorithm_version", "resolution", "min_samples", "n_surface_samples")
 
 
 @dataclass(frozen=True)
 class Threshold:
-    """A distance up to which two files are called the same, and how often that was wrong and right."""
+    """A distance up to which two files are called the same, with counts of its errors."""
 
     distance: float
-    n_other: int  # pairs that are not the same, on which it was counted
-    n_false: int  # those of them that it takes for the same
-    n_same: int  # pairs that are
-    n_found: int  # those of them that it finds
+    n_other: int  # pairs that are not the same
+    n_false: int  # of these, pairs within the distance
+    n_same: int  # pairs that are the same
+    n_found: int  # of these, pairs within the distance
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Distances between generated bodies, by a descriptor and by their surfaces laid onto each other."""
+    """Distances between generated bodies, by a descriptor and by their aligned surfaces."""
 
-    descriptor: str  # its name
-    model: str  # its `fingerprint`
-    signatures: Mapping[str, int]  # version of the Signatures, and those of their parameters that distances depend on
-    made_of: str  # what was measured, in words
-    distances: Mapping[str, Sequence[float]]  # of each of `KINDS` the quantiles at `LEVELS`, by the descriptor
-    n_pairs: Mapping[str, int]  # of each of `KINDS`, how many pairs
-    near: float  # the descriptor's distance beyond which no pair is looked at: twice the largest between copies
-    same: Threshold  # of `surface_distance`: up to it two files may show the same body in the same shape
-    # Of the same over the larger of the two `coarseness`, which leaves open what a surface's level of detail has lost:
-    # up to it they do
-    detail: Threshold
-    pose: Threshold  # of the descriptor's distance: up to it they show poses of one body
+    descriptor: str  # name
+    model: str  # `fingerprint` of the descriptor
+    signatures: Mapping[str, int]  # version of the Signatures, and the parameters that distances depend on
+    made_of: str  # the bodies that were measured, in words
+    distances: Mapping[str, Sequence[float]]  # quantiles at `LEVELS` of the descriptor's distance, for each of `KINDS`
+    n_pairs: Mapping[str, int]  # for each of `KINDS`
+    near: float  # descriptor's distance of candidates for copies: twice the largest between copies
+    same: Threshold  # largest `surface_distance` of copies at any level of detail
+    detail: Threshold  # largest ratio of `surface_distance` to the larger `coarseness` of two copies
+    pose: Threshold  # largest descriptor's distance of poses of one body
 
     def share_closer(self, kind: str, distance: float) -> float:
-        """Which share of the pairs of a kind is closer than a distance, interpolated between the quantiles."""
+        """Return the share of the pairs of a kind that are closer than a distance, interpolated between quantiles."""
         quantiles = np.asarray(self.distances[kind])
         if distance < quantiles[0]:
             return 0.0
-        # Of equal quantiles the last: what is as far as they are is farther than none of them.
+        # Of equal quantiles the last level is returned: pairs at just this distance count as closer
         return float(np.interp(distance, np.maximum.accumulate(quantiles), LEVELS))
 
     def words(self, distance: float) -> str:
-        """What a distance of the descriptor means: "closer than 99.8 % of pairs of different classes, ..."."""
-        told = []
-        for kind, words in reversed(KINDS.items()):
+        """Describe a distance of the descriptor: "closer than 99.8 % of pairs of different classes, ..."."""
+        phrases = []
+        for kind, pairs in reversed(KINDS.items()):
             closer = self.share_closer(kind, distance)
             side, share = ("closer", 1 - closer) if closer < 0.5 else ("farther", closer)
-            told.append(f"{side} than {_percent(share)} {words}")
-        return ", ".join(told)
+            phrases.append(f"{side} than {_percent(share)} {pairs}")
+        return ", ".join(phrases)
 
     def limit(self, coarseness: float) -> float:
-        """The `surface_distance` up to which two files show the same body in the same shape.
+        """Return the `surface_distance` up to which two bodies are copies, given the larger coarseness of the two.
 
-        It depends on the larger of the two `igps.gallery.surfaces.Surfaces.coarseness`.
+        See `igps.gallery.surfaces.Surfaces.coarseness`.
         """
         return min(self.same.distance, self.detail.distance * max(coarseness, FINEST))
 
     def check(self, descriptor: str | Descriptor, module: Descriptor, config: SignatureConfig) -> None:
-        """Raise a ValueError unless it belongs to a descriptor (its name, and the module) and to such Signatures."""
+        """Raise a ValueError unless the calibration belongs to a descriptor and to Signatures of a configuration."""
         name = name_of(descriptor)
         if name != self.descriptor:
-            calibrated = f"expected {self.descriptor}, whose distances are calibrated, got {name}"
-            raise ValueError(f"descriptor: {calibrated}. A gallery is of it if it is built with --size ignore.")
+            expected = f"expected {self.descriptor}, whose distances are calibrated, got {name}"
+            raise ValueError(f"descriptor: {expected}. For a gallery, build it with --size ignore.")
         if fingerprint(module) != self.model:
             raise ValueError(
-                f"{self.descriptor}: its calibration was made for other parameters of it. Make one by "
+                f"{self.descriptor}: its calibration was made for other parameters. Make a new one with "
                 "training/calibrate.py."
             )
-        found = calibration_params(config)
-        for parameter, value in self.signatures.items():
-            if found[parameter] != value:
+        params = calibration_params(config)
+        for name, value in self.signatures.items():
+            if params[name] != value:
                 raise ValueError(
-                    f"{parameter}: expected {value}, as of the signatures that {self.descriptor} is calibrated for, "
-                    f"got {found[parameter]}. Leave it as it is, or make a calibration by training/calibrate.py."
+                    f"{name}: expected {value}, for which {self.descriptor} is calibrated, got {params[name]}. Use the "
+                    "default, or make a new calibration with training/calibrate.py."
                 )
 
     def save(self, path: str | Path) -> None:
-        """Write it as JSON."""
+        """Write the calibration as JSON."""
         Path(path).write_text(json.dumps(asdict(self), indent=1) + "\n")
 
     @classmethod
     def load(cls, path: str | Path = CALIBRATION) -> Self:
-        """What `save` wrote; a ValueError if it is no calibration."""
+        """Read a calibration that `save` wrote. Raise a ValueError if the file holds none."""
         try:
-            found: dict[str, Any] = json.loads(Path(path).read_text())
-            one = cls(**found | {name: Threshold(**found[name]) for name in ("same", "detail", "pose")})
-            if any(len(one.distances[kind]) != len(LEVELS) for kind in KINDS):
+            fields: dict[str, Any] = json.loads(Path(path).read_text())
+            calibration = cls(**fields | {name: Threshold(**fields[name]) for name in ("same", "detail", "pose")})
+            if any(len(calibration.distances[kind]) != len(LEVELS) for kind in KINDS):
                 raise ValueError("other quantiles")
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: expected a calibration as training/calibrate.py writes it ({error}).") from error
-        return one
+        return calibration
 
 
 def calibration_params(config: SignatureConfig) -> dict[str, int]:
-    """What a calibration keeps of the Signatures that it was made with."""
-    return {name: config.as_dict()[name] for name in _DEPENDS_ON}
+    """Return the parameters of the Signatures that distances depend on."""
+    return {name: config.as_dict()[name] for name in _SIGNATURE_PARAMS}
 
 
 def _percent(share: float) -> str:
-    """With as many digits as there are quantiles for, and never rounded up: 60 % of, 99.8 % of, all."""
+    """Format a share with the digits that the quantiles support, rounded down: "60 % of", "99.8 % of", "all"."""
     if share >= 1:
         return "all"
     digits = 1 if share > 0.99 else 0

@@ -1,8 +1,8 @@
 """Files that show the same body, whatever its scale, mirror image, triangulation, level of detail or file format.
 
-Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling, see
-`igps.gallery.surfaces`. Only those are laid whose moments allow that they are near, or in a gallery, whose
-descriptions are. And no file joins two that are not the same as each other.
+Two surfaces are aligned. The distance that remains tells the same shape from another pose and from a similar body (see
+`igps.gallery.surfaces`). Only candidate pairs are aligned: those whose moments allow a small distance or, in a gallery,
+those with near descriptions.
 """
 
 import math
@@ -30,11 +30,10 @@ from igps.gallery.surfaces import Grade, Surfaces
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 
-# Pairs whose surfaces are compared at once.
-_PAIRS = 256
-# `least_distances` knows the first order alone, and a distance averages over what thin wires lose all around: of
-# copies that are found the former is up to 1.3 times the most that the latter may be.
-_LEAST = 2.0
+_BATCH_SIZE = 256  # pairs that are aligned at once
+# Candidates are pairs whose `least_distances` are below this many times the limit. The bound holds to first order only,
+# and details that cancel in a distance of surfaces do not cancel in moments: copies reached 1.3 times the limit.
+_CANDIDATE_FACTOR = 2.0
 
 _Pairs = dict[tuple[int, int], float]
 
@@ -43,29 +42,29 @@ _Pairs = dict[tuple[int, int], float]
 class Duplicates:
     """Groups of files that show the same body."""
 
-    # Names of at least two files each, in order; each is the same as some other of its group, by preference the finest
+    # Sorted names of at least two files each. Every file is a copy of another file of its group, preferably the finest
     groups: tuple[tuple[str, ...], ...]
-    paths: dict[str, Path]  # of the files of the groups, by name
-    # Those that make the groups, and how far apart: their surfaces over √area, or for poses their descriptions
+    paths: dict[str, Path]  # of the files in groups, by name
+    # The pairs that form the groups, with the distance of their surfaces over √area, or of their descriptions for poses
     pairs: dict[tuple[str, str], float]
-    grades: dict[tuple[str, str], Grade]  # of these pairs; none where poses are asked for
-    # Of these pairs, how far the farthest sample of one surface is from the other: over √area, as a length, and its
-    # unit if that is known
+    grades: dict[tuple[str, str], Grade]  # of these pairs; empty for poses
+    # Largest deviation of these pairs, from a sample of one surface to the other: over √area, as a length, and the unit
+    # of the length if known
     largest: dict[tuple[str, str], tuple[float, float, str | None]]
-    nearly: dict[tuple[str, str], float]  # those that are not the same, but as near as was tolerated, over √area
-    n_files: int  # among which they were looked for
+    nearly: dict[tuple[str, str], float]  # distances over √area of pairs that are not copies, but within the tolerance
+    n_files: int  # that were compared
     failures: tuple[Failure, ...]  # files that could not be compared
 
 
 @dataclass(frozen=True)
 class BodyDistance:
-    """How far two bodies are from each other, and what that means."""
+    """The distance between two bodies, and its meaning."""
 
     distance: float  # by the descriptor
-    surfaces: float  # of their surfaces laid onto each other, root mean square over √area
-    limit: float  # up to which they are of one shape, at their levels of detail; 0 as of `Surfaces.limit`
-    meaning: str  # of the distance, in words
-    same: bool  # whether they are the same body in the same shape
+    surfaces: float  # of the aligned surfaces: root mean square over √area
+    limit: float  # of that distance, below which the bodies have the same shape, see `Surfaces.limit`
+    meaning: str  # of the descriptor's distance, in words
+    same: bool  # whether the bodies have the same shape
 
 
 def duplicates(
@@ -80,23 +79,24 @@ def duplicates(
     n_workers: int | None = None,
     progress: bool = False,
 ) -> Duplicates:
-    """Groups of files that show the same body in the same shape.
+    """Find groups of files that show the same body in the same shape.
 
     Args:
-        source: the files; or a gallery of them, whose near pairs are found without comparing all, and of which only the
-            files of these are read again, if their Signatures are not cached.
-        descriptor: a calibrated one; for a gallery its own.
-        poses: whether other poses of a body count as the same; then nothing tells them from siblings but the distance
-            of descriptions, and false pairs are more.
-        size: whether files that differ in size are different, too, see `keeps_size`.
-        tolerance: over √area, up to 0.02; pairs that are not the same and no farther apart are told as nearly so. In a
-            gallery, of those whose descriptions are near.
-        cache_dir: of Signatures, for a gallery; the user's cache directory if None.
-        calibration: of the descriptor; the one that is shipped if None.
+        source: the files, or a gallery of them. A gallery finds candidate pairs without comparing all pairs, and only
+            the files of candidates are read again, unless their Signatures are cached.
+        descriptor: a calibrated descriptor; ignored for a gallery, which has its own.
+        poses: whether other poses of a body count as the same body. Then only descriptions are compared, which finds
+            more false pairs.
+        size: whether files of different size are different, see `keeps_size`.
+        tolerance: distance over √area, up to 0.02. Pairs of different bodies within it are returned as `nearly`; in a
+            gallery only those with near descriptions.
+        cache_dir: cache of Signatures for a gallery; the user's cache directory if None.
+        calibration: calibration of the descriptor; the built-in calibration if None.
         n_workers: threads; all cores if None.
+        progress: show progress bars.
 
     Raises:
-        ValueError: the calibration is of another descriptor, or the tolerance is out of range.
+        ValueError: the calibration belongs to another descriptor, or the tolerance is out of range.
         MeshError: none of the meshes can be described.
     """
     calibration = calibration or Calibration.load()
@@ -112,9 +112,9 @@ def duplicates(
             descriptions = describe(source, chosen, failures=failures, n_workers=n_workers, progress=progress)
             near = near_pairs(descriptions, chosen.distances, calibration.pose.distance, progress)
         else:
-            most = max(calibration.same.distance, tolerance)
-            moments, failures = Surfaces(source).moments(most, n_workers, progress)
-            near = near_pairs(moments, least_distances, _LEAST * most, progress)
+            limit = max(calibration.same.distance, tolerance)
+            moments, failures = Surfaces(source).moments(limit, n_workers, progress)
+            near = near_pairs(moments, least_distances, _CANDIDATE_FACTOR * limit, progress)
         dataset = source.usable(failures)
     if keeps_size(size, dataset.units())[0]:
         near = of_one_size(near, dataset)
@@ -128,17 +128,17 @@ def duplicates(
     largest: dict[tuple[str, str], tuple[float, float, str | None]] = {}
     nearly: dict[tuple[str, str], float] = {}
     if surfaces is not None:
-        found = on_threads(lambda pair: surfaces.grade(*pair), list(joined), n_workers)
-        for (i, j), (grade, apart) in zip(joined, found, strict=True):
+        graded = on_threads(lambda pair: surfaces.grade(*pair), list(joined), n_workers)
+        for (i, j), (grade, deviation) in zip(joined, graded, strict=True):
             length, unit = surfaces.length(i)
-            grades[names[i], names[j]], largest[names[i], names[j]] = grade, (apart, apart * length, unit)
-        together = {i: number for number, one in enumerate(groups) for i in one}
-        for (i, j), apart in sorted(surfaces.nearly.items()):
-            if together.get(i, -1 - i) != together.get(j, -1 - j):
-                nearly[names[i], names[j]] = apart
+            grades[names[i], names[j]], largest[names[i], names[j]] = grade, (deviation, deviation * length, unit)
+        group_of = {i: number for number, group in enumerate(groups) for i in group}
+        for (i, j), distance in sorted(surfaces.nearly.items()):
+            if group_of.get(i, -1 - i) != group_of.get(j, -1 - j):
+                nearly[names[i], names[j]] = distance
     return Duplicates(
-        tuple(tuple(names[i] for i in one) for one in groups),
-        {names[i]: dataset.bodies.paths[i] for one in groups for i in one},
+        tuple(tuple(names[i] for i in group) for group in groups),
+        {names[i]: dataset.bodies.paths[i] for group in groups for i in group},
         {(names[i], names[j]): distance for (i, j), distance in joined.items()},
         grades,
         largest,
@@ -151,20 +151,22 @@ def duplicates(
 def _joined(
     near: NearPairs, surfaces: Surfaces | None, calibration: Calibration, n_workers: int | None, progress: bool
 ) -> _Pairs:
-    """Those of near pairs that are the same, none of two that others have joined, by their surfaces if there are."""
+    """Return the candidate pairs that are the same, as a spanning forest: pairs of one group already are skipped.
+
+    Pairs are compared by their surfaces; without `surfaces`, all candidates count as the same.
+    """
     group = DisjointSet()
     joined: _Pairs = {}
-    while some := list(islice(near, _PAIRS)):
-        for i, j, _ in some:
+    while batch := list(islice(near, _BATCH_SIZE)):
+        for i, j, _ in batch:
             group.add(i)
             group.add(j)
-        open_pairs = [(i, j, distance) for i, j, distance in some if not group.connected(i, j)]
+        open_pairs = [(i, j, distance) for i, j, distance in batch if not group.connected(i, j)]
         if surfaces is None:
             distances = iter([distance for _, _, distance in open_pairs])
         else:
-            laid = on_threads(lambda pair: surfaces.distance(*pair[:2], calibration), open_pairs, n_workers)
-            distances = iter(tqdm(laid, desc="laid onto each other", total=len(open_pairs), leave=False,
-                                  disable=not progress))  # fmt: skip
+            aligned = on_threads(lambda pair: surfaces.distance(*pair[:2], calibration), open_pairs, n_workers)
+            distances = iter(tqdm(aligned, desc="aligned", total=len(open_pairs), leave=False, disable=not progress))
         for (i, j, _), distance in zip(open_pairs, distances, strict=True):
             if distance < math.inf and group.merge(i, j):
                 joined[i, j] = distance
@@ -174,39 +176,38 @@ def _joined(
 def _around_the_finest(
     joined: _Pairs, surfaces: Surfaces, calibration: Calibration, n_workers: int | None, progress: bool
 ) -> _Pairs:
-    """The pairs that make the groups, and how far apart; groups may fall apart.
+    """Split groups that a coarse file has merged, and return the pairs that form the new groups, with distances.
 
-    A file that is too coarse to tell joins bodies that differ in a detail. So the files of a group come again, the
-    finest first: each belongs to the nearest of those that lead a group; or where it is the same as none of them, to
-    the nearest other file before it; or it leads a group itself. None joins two.
+    A file that is too coarse to show a detail is the same as two bodies that differ in the detail. So the files of a
+    group are assigned again, finest first: each joins the nearest leader of a group that is the same; otherwise the
+    nearest other file that is the same; otherwise it is the leader of a new group. No file joins two groups.
     """
 
     def pairs_of(members: list[int]) -> _Pairs:
-        leading: list[int] = []
-        following: list[int] = []
-        found: _Pairs = {}
-        for i in sorted(members, key=lambda one: (surfaces.coarseness(one), one)):
-            for finer in (leading, following):
-                apart = [surfaces.distance(one, i, calibration) for one in finer]
-                if min(apart, default=math.inf) < math.inf:
-                    found[finer[int(np.argmin(apart))], i] = min(apart)
-                    following.append(i)
+        leaders: list[int] = []
+        followers: list[int] = []
+        pairs: _Pairs = {}
+        for i in sorted(members, key=lambda member: (surfaces.coarseness(member), member)):
+            for finer in (leaders, followers):
+                distances = [surfaces.distance(j, i, calibration) for j in finer]
+                if min(distances, default=math.inf) < math.inf:
+                    pairs[finer[int(np.argmin(distances))], i] = min(distances)
+                    followers.append(i)
                     break
             else:
-                leading.append(i)
-        return found
+                leaders.append(i)
+        return pairs
 
     large = [members for members in _groups(joined) if len(members) > 2]
-    again = {i for members in large for i in members}
-    kept = {pair: distance for pair, distance in joined.items() if again.isdisjoint(pair)}
-    found = on_threads(pairs_of, large, n_workers)
-    for pairs in tqdm(found, desc="groups", total=len(large), disable=not progress):
-        kept |= pairs
-    return kept
+    reassigned = {i for members in large for i in members}
+    final = {pair: distance for pair, distance in joined.items() if reassigned.isdisjoint(pair)}
+    for pairs in tqdm(on_threads(pairs_of, large, n_workers), desc="groups", total=len(large), disable=not progress):
+        final |= pairs
+    return final
 
 
 def _groups(joined: _Pairs) -> list[list[int]]:
-    """What pairs join, in order."""
+    """Return the sorted connected components of the pairs."""
     group = DisjointSet({i for pair in joined for i in pair})
     for i, j in joined:
         group.merge(i, j)
@@ -220,16 +221,16 @@ def body_distance(
     calibration: Calibration | None = None,
     progress: bool = False,
 ) -> BodyDistance:
-    """How far the two meshes of a dataset are from each other, and what that means; arguments as of `duplicates`.
+    """Return the distance between the two bodies of a dataset, and its meaning. For the arguments see `duplicates`.
 
     Raises:
-        ValueError: not two files, or the calibration is of another descriptor.
-        MeshError: a mesh that cannot be used.
+        ValueError: the dataset has not two bodies, or the calibration belongs to another descriptor.
+        MeshError: a mesh cannot be used.
     """
     if len(dataset) != 2:
-        told = ", ".join(dataset.bodies.names[:4])
+        names = ", ".join(dataset.bodies.names[:4])
         raise ValueError(
-            f"dataset: expected two meshes to compare, got {len(dataset)}: {told}. Name one of a file as FILE#PART."
+            f"dataset: expected two meshes to compare, got {len(dataset)}: {names}. Name a part of a file as FILE#PART."
         )
     calibration, chosen = calibration or Calibration.load(), descriptor_of(descriptor)
     calibration.check(descriptor, chosen, dataset.config)
@@ -237,15 +238,15 @@ def body_distance(
     with torch.inference_mode():
         distance = float(chosen.distances(descriptions[:1], descriptions[1:]))
     surfaces = Surfaces(dataset)
-    apart, limit = surface_distance(*map(surfaces.samples, range(2))), surfaces.limit(0, 1, calibration)
-    return BodyDistance(distance, apart, limit, calibration.words(distance), apart <= limit)
+    between, limit = surface_distance(*map(surfaces.samples, range(2))), surfaces.limit(0, 1, calibration)
+    return BodyDistance(distance, between, limit, calibration.words(distance), between <= limit)
 
 
 def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDataset:
-    """The files that a gallery was made of, in order of their ids."""
+    """Return the bodies of a gallery as a dataset, sorted by id."""
     rows = sorted(gallery.rows("id", "name", "file", "part"), key=itemgetter("id"))
-    names = tuple(one["name"] for one in rows)
-    if len(set(names)) < len(names):  # of several folders
-        names = tuple(one["id"] for one in rows)
-    files = Bodies(tuple(Path(one["file"]) for one in rows), names, None, tuple(one["part"] for one in rows))
+    names = tuple(row["name"] for row in rows)
+    if len(set(names)) < len(names):  # from several folders
+        names = tuple(row["id"] for row in rows)
+    files = Bodies(tuple(Path(row["file"]) for row in rows), names, None, tuple(row["part"] for row in rows))
     return SignatureDataset(files, gallery.config, cache_dir, reading=gallery.reading)

@@ -1,4 +1,4 @@
-"""The bodies of a collection in a database, with the descriptor that they were described by."""
+"""A gallery: a database of described bodies, with the descriptor that described them."""
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +17,7 @@ from igps.data.sources import is_number
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.registry import is_file
+from igps.gallery._search import nearest_rows
 from igps.gallery.about import KNOWN, Batch, about_of, check_alike, open_table, tables
 from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
@@ -27,10 +28,10 @@ from igps.retrieval.reranking import N_RERANKED, rerank_found
 from igps.signature.signature import SignatureConfig
 
 Found = tuple[list[dict[str, Any]], Tensor, Tensor]
-"""Rows, their distances (M,) and descriptions (M, ...), the closest first."""
+"""Rows with their distances (M,) and descriptions (M, ...), closest first."""
 
 CANDIDATES = 640
-"""Bodies whose short vectors are the nearest, which are ranked again by the distance itself."""
+"""Number of bodies, nearest by their short vectors, that are ranked by the descriptor's own distance."""
 
 
 @dataclass(frozen=True)
@@ -38,24 +39,25 @@ class Match:
     """A body that a query found."""
 
     name: str  # in its collection
-    label: str | None  # its class, if it is known
-    path: Path  # its file when it was described, which may have been moved since
-    distance: float  # from the query, by the descriptor's own distance; or re-ranked, without unit
-    # All that the gallery tells of it, by column
+    label: str | None  # its class, if known
+    path: Path  # its file at the time of description
+    distance: float  # from the query, by the descriptor's own distance; without unit after re-ranking
+    # All columns of its row in the gallery
     row: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
 
 class Gallery:
-    """Described bodies, opened for queries, which need neither their files nor their Signatures.
+    """A database of described bodies. Queries need neither the files of the bodies nor their Signatures.
 
     Args:
-        path: its folder.
-        descriptor: the one that it was built with. It may be left out if the gallery knows it by its name.
-        version: an earlier one of its `versions`; the last if None.
+        path: folder of the gallery.
+        descriptor: the descriptor that the gallery was built with; not needed if that is a named one.
+        version: number of an earlier version, see `versions`; the last version if None.
 
     Raises:
-        FileNotFoundError: there is no gallery.
-        ValueError: it is damaged, or of another descriptor, another version of it, or another version of Signatures.
+        FileNotFoundError: there is no gallery in the folder.
+        ValueError: the gallery is damaged, or was built with another descriptor, other parameters of it, or another
+            version of the Signatures.
         ImportError: LanceDB is not installed.
     """
 
@@ -72,8 +74,8 @@ class Gallery:
         here = SignatureConfig.ALGORITHM_VERSION
         if about["signature"]["algorithm_version"] != here:
             raise ValueError(
-                f"{path}: the gallery is of version {about['signature']['algorithm_version']} of the signatures, not "
-                f"{here} as here. Build it again."
+                f"{path}: the gallery is of version {about['signature']['algorithm_version']} of the signatures, this "
+                f"library computes version {here}. Build it again."
             )
         parameters = {name: value for name, value in about["signature"].items() if name != "algorithm_version"}
         self.config = SignatureConfig(**{**parameters, "attributes": tuple(parameters["attributes"])})
@@ -81,12 +83,12 @@ class Gallery:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What it records of how its descriptions were made."""
+        """How the descriptions were made: descriptor, parameters of the Signatures, options of reading."""
         return self.table.about
 
     @property
     def columns(self) -> dict[str, type]:
-        """What it tells of each body, and of which type."""
+        """Names and types of the columns."""
         return self.table.columns
 
     def __len__(self) -> int:
@@ -96,19 +98,19 @@ class Gallery:
         self, mesh: str | Path, *, top: int = 10, cache_dir: str | Path | None = None, exact: bool = False,
         rerank: bool = False, where: str | None = None,
     ) -> list[Match]:  # fmt: skip
-        """The bodies closest to that of a file, closest first.
+        """Return the bodies closest to the body in a file, closest first.
 
         Args:
-            mesh: a file, read as those of the gallery were.
-            top: how many; all if there are fewer.
-            cache_dir: of Signatures; the user's cache directory if None.
-            exact: compare with all, which takes long in a large gallery.
-            rerank: put the nearest in order by what neighbours they have in common, see `rerank_found`.
-            where: only among those that satisfy this condition, such as "class = 'femur' AND volume > 2e5".
+            mesh: a file, read with the options of the gallery.
+            top: largest number of bodies.
+            cache_dir: cache of Signatures; the user's cache directory if None.
+            exact: compare the query with all bodies, which is slow in a large gallery.
+            rerank: order the nearest bodies by the neighbours that they share, see `rerank_found`.
+            where: condition on the columns, such as "class = 'femur' AND volume > 2e5"; other bodies are left out.
 
         Raises:
             MeshError: the mesh cannot be used.
-            ValueError: a condition that cannot be understood.
+            ValueError: the condition cannot be parsed.
         """
         dataset = SignatureDataset([mesh], self.config, cache_dir, descriptor=self.descriptor, reading=self.reading)
         descriptions = describe(dataset, self.descriptor, n_workers=1)
@@ -123,7 +125,7 @@ class Gallery:
         rerank: bool = False,
         where: str | None = None,
     ) -> list[list[Match]]:
-        """For each of the descriptions (Q, ...) the bodies closest to it, closest first; options as of `query`."""
+        """Return the bodies closest to each description (Q, ...), closest first. For the options see `query`."""
         check_at_least(1, top=top)
         matches = []
         for query in descriptions:
@@ -131,10 +133,10 @@ class Gallery:
             rows, distances, near = self.search(query[None], top=n_near, exact=exact, where=where)
             order = list(range(len(rows)))
             if rerank and rows:
-                whole, n = SearchResult(torch.arange(len(rows))[None], distances[None]), min(top, len(rows))
+                ranking, n = SearchResult(torch.arange(len(rows))[None], distances[None]), min(top, len(rows))
                 with torch.inference_mode():
-                    found = rerank_found(query[None], whole, near.__getitem__, self.descriptor.distances, top=n)
-                order, distances = found.indices[0].tolist(), found.distances[0]
+                    reranked = rerank_found(query[None], ranking, near.__getitem__, self.descriptor.distances, top=n)
+                order, distances = reranked.indices[0].tolist(), reranked.distances[0]
             matches.append([
                 Match(rows[i]["name"], rows[i]["class"], Path(rows[i]["file"]), distance, rows[i])
                 for i, distance in zip(order, distances.tolist(), strict=True)
@@ -142,11 +144,12 @@ class Gallery:
         return matches
 
     def search(self, query: Tensor, *, top: int, exact: bool = False, where: str | None = None) -> Found:
-        """Rows, distances and descriptions of the bodies closest to a description (1, ...)."""
-        # More are ranked under a head, whose distance may be only near the cosine's.
+        """Return the rows, distances and descriptions of the bodies closest to a description (1, ...)."""
+        # The cosine distance, which finds the candidates, only approximates the distance of a head
         n = 4 * CANDIDATES if isinstance(self.descriptor, EmbeddedDescriptor) else CANDIDATES
         with torch.inference_mode():
-            return self.table.search(query, self.descriptor.distances, top=top, exact=exact, candidates=n, where=where)
+            distances = self.descriptor.distances
+            return nearest_rows(self.table, query, distances, top=top, exact=exact, candidates=n, where=where)
 
     @classmethod
     def build(
@@ -159,19 +162,23 @@ class Gallery:
         strict: bool = False,
         progress: bool = False,
     ) -> tuple[Self, list[Failure]]:
-        """Describe the bodies of a dataset into a gallery; also returns those that failed.
+        """Describe the bodies of a dataset and write a gallery. Return the gallery and the bodies that failed.
 
-        A gallery that is there keeps its state until the new one is complete, and becomes an earlier version of it.
-        Signatures that are not cached are computed on the way; `dataset.precompute()` does that on all cores.
+        A gallery that exists at `path` is unchanged until the new one is complete; then it is an earlier version of it.
+        Signatures that are not cached are computed one by one; `dataset.precompute()` computes them on all cores.
 
         Args:
-            descriptor: a name, which the gallery keeps, or a descriptor, which then is given whenever it is opened.
+            path: folder of the gallery.
+            dataset: the bodies.
+            descriptor: a name, which the gallery stores, or a descriptor, which has to be passed whenever the gallery
+                is opened.
             n_workers: threads or processes that describe; all cores if None.
             strict: raise at the first body that cannot be described.
+            progress: show a progress bar.
         """
         chosen, failures = descriptor_of(descriptor), list[Failure]()
         check_centres(chosen)
-        # In any order, as short vectors are fitted to the first
+        # Shuffled, because the encoder of short vectors is fitted to the first rows
         mixed = dataset.subset(np.random.default_rng(0).permutation(len(dataset)).tolist())
         kinds = further_columns(dataset.bodies)
         batches = described_rows(mixed, chosen, kinds, {}, failures, n_workers, strict, progress)
@@ -181,26 +188,26 @@ class Gallery:
         except ValueError as error:
             if len(failures) < len(dataset):
                 raise
-            told = f"none of {len(failures)} bodies could be described; the first: {failures[0].error}"
-            raise ValueError(f"{path}: {told}") from error
+            reason = f"none of {len(failures)} bodies could be described; the first: {failures[0].error}"
+            raise ValueError(f"{path}: {reason}") from error
         return cls(path, descriptor), failures
 
     def add(
         self, dataset: SignatureDataset, *, n_workers: int | None = None, strict: bool = False, progress: bool = False
     ) -> list[Failure]:
-        """Add the bodies of a dataset; returns those that failed. Arguments as of `build`.
+        """Add the bodies of a dataset. Return the bodies that failed. For the arguments see `build`.
 
-        Bodies that it has already are passed over, and replaced where their content has changed.
+        Bodies that the gallery has already are skipped, or replaced if their content has changed.
 
         Raises:
-            ValueError: the gallery is of other Signatures.
+            ValueError: the gallery was built with other parameters of the Signatures or other options of reading.
         """
-        wanted = about_of(dataset.config, dataset.reading, self.descriptor)
-        check_alike(self.path, self.about, {name: wanted[name] for name in ("signature", "reading")})
-        known = {one["id"]: one["checksum"] for one in self.rows("id", "checksum")}
+        expected = about_of(dataset.config, dataset.reading, self.descriptor)
+        check_alike(self.path, self.about, {name: expected[name] for name in ("signature", "reading")})
+        known = {row["id"]: row["checksum"] for row in self.rows("id", "checksum")}
         failures, further = list[Failure](), further_columns(dataset.bodies, self.columns)
-        for some in described_rows(dataset, self.descriptor, further, known, failures, n_workers, strict, progress):
-            self.table.add(*some, further)
+        for batch in described_rows(dataset, self.descriptor, further, known, failures, n_workers, strict, progress):
+            self.table.add(*batch, further)
         return failures
 
     @classmethod
@@ -212,54 +219,56 @@ class Gallery:
         *,
         progress: bool = False,
     ) -> Self:
-        """A gallery of the bodies of others, which stay as they are, added to that at `path`, if there is one.
+        """Add the bodies of other galleries to the gallery at `path`, which is created if it does not exist.
+
+        The other galleries stay as they are.
 
         Raises:
-            ValueError: they are of different descriptors or Signatures, or none is given.
+            ValueError: the galleries have different descriptors or Signatures, or `others` is empty.
         """
-        opened = [open_table(other) for other in others]
-        if not opened:
+        sources = [open_table(other) for other in others]
+        if not sources:
             raise ValueError("others: expected at least one gallery, got none.")
         with contextlib.suppress(FileNotFoundError):
-            opened.insert(0, open_table(path))
-        first, is_new = opened[0], len(opened) == len(others)
-        for one in opened:
-            check_alike(one.path, one.about, {**first.about, "names": one.about.get("names")})
-        owners = {name: one for one in reversed(opened) for name in one.columns}  # the first to have a column
-        for one in opened:
-            for name, kind in one.columns.items():
+            sources.insert(0, open_table(path))
+        first, is_new = sources[0], len(sources) == len(others)
+        for table in sources:
+            check_alike(table.path, table.about, {**first.about, "names": table.about.get("names")})
+        owners = {name: table for table in reversed(sources) for name in table.columns}  # the first to have a column
+        for table in sources:
+            for name, kind in table.columns.items():
                 owners[name].check_kinds({name: kind})
-        with tqdm(total=sum(map(len, opened[not is_new :])), desc="entries", disable=not progress) as bar:
+        with tqdm(total=sum(map(len, sources[not is_new :])), desc="entries", disable=not progress) as bar:
 
             def batches(table: Any) -> Iterator[Batch]:
-                for some in table.batches():
-                    yield table.decoded(some)
-                    bar.update(len(some))
+                for rows in table.batches():
+                    yield table.decoded(rows)
+                    bar.update(len(rows))
 
-            further = [{name: one.columns[name] for name in one.columns.keys() - KNOWN.keys()} for one in opened]
+            further = [{name: table.columns[name] for name in table.columns.keys() - KNOWN.keys()} for table in sources]
             if is_new:
                 tables().write(Path(path), first.about, first.head["searched_by"], batches(first), further[0])
-            into = open_table(path)
-            for one, kinds in zip(opened[1:], further[1:], strict=True):
-                for some in batches(one):
-                    into.add(*some, kinds)
+            target = open_table(path)
+            for table, kinds in zip(sources[1:], further[1:], strict=True):
+                for batch in batches(table):
+                    target.add(*batch, kinds)
         return cls(path, descriptor)
 
     def remove(self, where: str) -> int:
-        """Remove the bodies that satisfy a condition; how many."""
+        """Remove the bodies that satisfy a condition, and return their number."""
         with self.table.changing(where) as table:
             return int(table.delete(where).num_deleted_rows)
 
     def update(self, where: str, values: Mapping[str, str | float | None]) -> int:
-        """Set columns of the bodies that satisfy a condition, such as {"class": "femur"}; of how many."""
-        ours = ("id", "checksum", "bytes", "modified", "thumbnail")
-        kinds = {name: kind for name, kind in self.columns.items() if name not in ours}
+        """Set columns, such as {"class": "femur"}, of the bodies that satisfy a condition. Return their number."""
+        read_only = ("id", "checksum", "bytes", "modified", "thumbnail")
+        kinds = {name: kind for name, kind in self.columns.items() if name not in read_only}
         if not values:
             raise ValueError("values: expected at least one column, got none.")
         if wrong := values.keys() - kinds.keys():
             raise ValueError(f"{min(wrong)}: expected one of the columns {', '.join(kinds)}.")
         if empty := [name for name in ("name", "file") if values.get(name, name) is None]:
-            raise ValueError(f"{empty[0]}: expected a value, got none; every body has one, by which it is told.")
+            raise ValueError(f"{empty[0]}: expected a value, got none; it identifies the body.")
         if bad := [name for name, value in values.items() if kinds[name] is float and not is_number(value)]:
             raise ValueError(f"values: expected numbers in columns of numbers, got {values[bad[0]]!r} for {bad[0]}.")
         typed = {name: None if value is None else kinds[name](value) for name, value in values.items()}
@@ -267,7 +276,7 @@ class Gallery:
             return int(table.update(where=where, values=typed).rows_updated)
 
     def versions(self) -> list[dict[str, Any]]:
-        """Number, time and bodies of each version, the oldest first; those of the last month are kept."""
+        """Number, time and count of bodies of each version, oldest first. Versions are kept for a month."""
         return [
             {"version": one["version"], "time": f"{one['timestamp']:%Y-%m-%d %H:%M:%S}",
              "bodies": int(one["metadata"]["total_rows"])}
@@ -275,12 +284,12 @@ class Gallery:
         ]  # fmt: skip
 
     def restore(self, version: int) -> None:
-        """Make an earlier version the last; those between stay."""
+        """Return to an earlier version, as a new version with its content."""
         open_table(self.path, version)
         with self.table.changing() as table:
             table.restore(version)
 
     def rows(self, *columns: str) -> Iterator[dict[str, Any]]:
-        """Some of what it tells of each body, always in the same order."""
-        for some in self.table.batches(columns=columns):
-            yield from some.to_pylist()
+        """Yield some columns of each row, always in the same order."""
+        for batch in self.table.batches(columns=columns):
+            yield from batch.to_pylist()

@@ -1,4 +1,4 @@
-"""Bodies become rows of a gallery: described, and with what is known of them."""
+"""Rows of a gallery: the description of each body with its metadata."""
 
 import io
 import os
@@ -22,47 +22,49 @@ from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import Signature
 
-# So many descriptions are in memory at once; pixels of a side of a thumbnail, which shows the samples of the surface.
-_AT_ONCE, _PIXELS = 256, 40
-# A file that was changed so few nanoseconds ago may change again at what the clock calls the same time.
-_YOUNG = 2 * 10**9
+_BATCH_SIZE = 256  # descriptions in memory at once
+_THUMBNAIL_SIZE = 40  # pixels
+# A file that was changed less than this many nanoseconds ago may change again without a new time stamp
+_CLOCK_RESOLUTION = 2 * 10**9
 
 
 def described_rows(
     dataset: SignatureDataset, descriptor: Descriptor, kinds: Mapping[str, type], known: Mapping[str, str],
     failures: list[Failure], n_workers: int | None, strict: bool, progress: bool,
 ) -> Iterator[Batch]:  # fmt: skip
-    """Descriptions and rows of the bodies that are not known by their checksums; failures are added to the list."""
+    """Yield descriptions and rows of the bodies whose checksums are not `known`; append failures to the list."""
     dataset = each_body_once(dataset)
     bodies = dataset.bodies
     with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
-        for start in range(0, len(dataset), _AT_ONCE):
-            numbers = range(start, min(start + _AT_ONCE, len(dataset)))
-            # Before files are read: one that changes meanwhile is described again next time
-            of_each = known_rows(bodies.subset(numbers), kinds, dataset.reading)
-            told = dict(zip(numbers, of_each, strict=True))
-            keys = {i: checksum_of(dataset, i) for i in numbers}
-            new = [i for i in numbers if not keys[i] or known.get(told[i]["id"]) != keys[i]]
+        for start in range(0, len(dataset), _BATCH_SIZE):
+            numbers = range(start, min(start + _BATCH_SIZE, len(dataset)))
+            # Time stamps are taken before files are read: a file that changes meanwhile is described again next time
+            metadata = dict(zip(numbers, known_rows(bodies.subset(numbers), kinds, dataset.reading), strict=True))
+            checksums = {i: checksum_of(dataset, i) for i in numbers}
+            new = [i for i in numbers if not checksums[i] or known.get(metadata[i]["id"]) != checksums[i]]
             failed: list[Failure] = []
             descriptions = _described(dataset.subset(new), descriptor, None if strict else failed, n_workers)
-            lost = {failure.id for failure in failed}
-            left = [i for i in new if bodies.names[i] not in lost]
-            if left:
-                yield descriptions, [{**told[i], **_measured(dataset, i), "checksum": keys[i]} for i in left]
+            failed_names = {failure.id for failure in failed}
+            described = [i for i in new if bodies.names[i] not in failed_names]
+            if described:
+                rows = [{**metadata[i], **_measured(dataset, i), "checksum": checksums[i]} for i in described]
+                yield descriptions, rows
             failures += failed
             bar.update(len(numbers))
 
 
 def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[str, type]:
-    """Further columns of the table of labels, and of which type: numbers where all values are, unless text is there.
+    """Return the names and types of the further columns of the table of labels.
+
+    A column is of numbers if all of its values are numbers and the gallery does not have it as text already.
 
     Raises:
-        ValueError: one has the name of a column that every gallery has, or a name that none can have.
+        ValueError: a name that the gallery uses itself, or that is not allowed.
     """
-    # One called _rowid would make the gallery unreadable, and a dot means a field within a column
-    if wrong := [name for name in bodies.columns if name.startswith("_") or "." in name]:
-        told = f"a gallery takes no column whose name has a dot, or begins with an underscore, got {wrong[0]!r}"
-        raise ValueError(f"{LABELS_FILE}: {told}. Rename it.")
+    # LanceDB has a column _rowid itself, and reads a dot as a field within a column
+    if invalid := [name for name in bodies.columns if name.startswith("_") or "." in name]:
+        expected = "expected column names without dots that do not begin with an underscore"
+        raise ValueError(f"{LABELS_FILE}: {expected}, got {invalid[0]!r}. Rename the column.")
     if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
         raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
     texts = {
@@ -72,26 +74,26 @@ def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[s
 
 
 def known_rows(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> list[dict[str, Any]]:
-    """What is known of bodies without reading their files, which are read by the options."""
+    """Return the metadata of bodies that are known without reading their files."""
     files = _files(bodies)
     labels = bodies.labels or [None] * len(bodies)
     stamps = {file: _stamp(Path(file), reading) for file in set(files)}
-    told: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     for file, part, name, label in zip(files, bodies.parts, bodies.names, labels, strict=True):
         id_ = file if part is None else f"{file}#{part}"
-        told.append({"id": id_, "name": name, "class": label, "file": file, "part": part, **stamps[file]})
+        rows.append({"id": id_, "name": name, "class": label, "file": file, "part": part, **stamps[file]})
     for column, values in bodies.columns.items():
-        for row, value in zip(told, values, strict=True):
+        for row, value in zip(rows, values, strict=True):
             row[column] = None if value is None else kinds[column](value)
-    return told
+    return rows
 
 
 def each_body_once(dataset: SignatureDataset) -> SignatureDataset:
-    """Without what a link to a folder shows again: of the names of a body the first in order stays."""
+    """Drop bodies that are listed twice because of a symbolic link to a folder; the alphabetically first name stays."""
     bodies = dataset.bodies
     files = list(zip(_files(bodies), bodies.parts, strict=True))
-    kept = {files[i]: i for i in sorted(range(len(bodies)), key=bodies.names.__getitem__, reverse=True)}
-    return dataset if len(kept) == len(bodies) else dataset.subset(sorted(kept.values()))
+    first = {files[i]: i for i in sorted(range(len(bodies)), key=bodies.names.__getitem__, reverse=True)}
+    return dataset if len(first) == len(bodies) else dataset.subset(sorted(first.values()))
 
 
 def _files(bodies: Bodies) -> list[str]:
@@ -100,35 +102,35 @@ def _files(bodies: Bodies) -> list[str]:
 
 
 def _stamp(file: Path, reading: LoadOptions) -> dict[str, int]:
-    """Size and time of the last change of all that is read; −1 where it may change again within a clock's grain."""
+    """Return the size and the modification time of the files that are read; time −1 if it is not reliable yet."""
     try:
         n_bytes, *times = stamp_of(*files_read(file, reading))
-    except (OSError, MeshError):  # describing it will say why
+    except (OSError, MeshError):  # the description will fail with the reason
         return {"bytes": -1, "modified": -1}
-    changed = max(times)
-    return {"bytes": n_bytes, "modified": changed if time.time_ns() - changed > _YOUNG else -1}
+    modified = max(times)
+    return {"bytes": n_bytes, "modified": modified if time.time_ns() - modified > _CLOCK_RESOLUTION else -1}
 
 
 def checksum_of(dataset: SignatureDataset, i: int) -> str:
-    """A checksum of a body and of all that its Signature depends on; "" where it cannot be read."""
+    """Return a checksum of a body and of all parameters of its Signature, or "" if the body cannot be read."""
     try:
         return dataset.key(i)
-    except MeshError:  # describing it will say why
+    except MeshError:  # the description will fail with the reason
         return ""
 
 
 def thumbnail(signature: Signature) -> bytes:
-    """A PNG of a body: how near the samples of its surface are, seen along its shortest axis."""
+    """Return a PNG of the surface samples of a body, seen along its shortest axis; near samples are brighter."""
     from matplotlib.image import imsave
 
     points = np.asarray(signature.surface.points if len(signature.surface) else signature.interior.points, np.float64)
     centred = points - points.mean(axis=0)
-    seen = centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
-    span, depth = np.abs(seen[:, :2]).max(initial=1e-300), np.abs(seen[:, 2]).max(initial=1e-300)
-    columns, rows = np.rint((seen[:, :2] / span + 1) * (_PIXELS - 1) / 2).astype(int).T
-    picture, file = np.zeros((_PIXELS, _PIXELS)), io.BytesIO()
-    np.maximum.at(picture, (rows, columns), 0.6 + 0.4 * seen[:, 2] / depth)
-    imsave(file, picture, cmap="gray", vmin=0, vmax=1, origin="lower", format="png")
+    along_axes = centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
+    width, depth = np.abs(along_axes[:, :2]).max(initial=1e-300), np.abs(along_axes[:, 2]).max(initial=1e-300)
+    columns, rows = np.rint((along_axes[:, :2] / width + 1) * (_THUMBNAIL_SIZE - 1) / 2).astype(int).T
+    image, file = np.zeros((_THUMBNAIL_SIZE, _THUMBNAIL_SIZE)), io.BytesIO()
+    np.maximum.at(image, (rows, columns), 0.6 + 0.4 * along_axes[:, 2] / depth)
+    imsave(file, image, cmap="gray", vmin=0, vmax=1, origin="lower", format="png")
     return file.getvalue()
 
 
@@ -141,7 +143,7 @@ def _measured(dataset: SignatureDataset, i: int) -> dict[str, Any]:
 def _described(
     dataset: SignatureDataset, descriptor: Descriptor, failures: list[Failure] | None, n_workers: int | None
 ) -> Tensor:
-    """Descriptions of those of the bodies that can be described, which may be none."""
+    """Return the descriptions of the bodies that can be described; there may be none."""
     try:
         if len(dataset):
             return describe(dataset, descriptor, failures=failures, n_workers=n_workers)

@@ -1,4 +1,4 @@
-"""A gallery brought up to a folder, in the time that the changes take."""
+"""Synchronisation of a gallery with a folder."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -10,8 +10,7 @@ from igps.gallery.about import KNOWN
 from igps.gallery.gallery import Gallery
 from igps.gallery.rows import checksum_of, each_body_once, further_columns, known_rows
 
-# Rows that are removed, or changed, in one commit.
-_AT_ONCE = 1000
+_ROWS_PER_COMMIT = 1000
 
 
 def sync(
@@ -23,56 +22,59 @@ def sync(
     strict: bool = False,
     progress: bool = False,
 ) -> tuple[int, int, list[Failure]]:
-    """Describe new and changed files of a folder, take classes and columns over, and remove deleted files.
+    """Bring a gallery up to date with a folder: describe new and changed files, remove deleted ones, update columns.
 
-    Files of the same size and time of change as before are not read.
+    Files whose size and modification time have not changed are not read. If the description of a body fails, its old
+    row stays, as do the rows of files in folders without read permission and of files outside the folder.
 
     Args:
-        dataset: of all bodies below the folder; Signatures that are missing are computed.
-        root: the folder. Rows of files elsewhere stay.
-        n_workers, strict, progress: see `Gallery.build`.
+        gallery: the gallery to change.
+        dataset: all bodies below the folder; missing Signatures are computed.
+        root: the folder.
+        n_workers: see `Gallery.build`.
+        strict: see `Gallery.build`.
+        progress: see `Gallery.build`.
 
     Returns:
-        How many bodies were described, how many removed, and those that failed, of which the old row stays; as does
-        that of a file in a folder that may not be read.
+        The number of bodies that were described, the number that were removed, and the bodies that failed.
     """
     dataset = each_body_once(dataset)
     kinds = further_columns(dataset.bodies, gallery.columns)
-    empty = dict.fromkeys(gallery.columns.keys() - KNOWN.keys())  # what the folder tells no more
-    now = [{**empty, **row} for row in known_rows(dataset.bodies, kinds, dataset.reading)]
-    asked = [name for name in ("checksum", *now[0]) if name in gallery.columns]
-    known = {one["id"]: one for one in gallery.rows(*asked)}
+    cleared = dict.fromkeys(gallery.columns.keys() - KNOWN.keys())  # columns that the folder no longer has
+    current = [{**cleared, **row} for row in known_rows(dataset.bodies, kinds, dataset.reading)]
+    columns = [name for name in ("checksum", *current[0]) if name in gallery.columns]
+    known = {row["id"]: row for row in gallery.rows(*columns)}
     new: list[int] = []
-    told: dict[str, dict[str, Any]] = {}
-    for i, row in enumerate(now):
+    changed: dict[str, dict[str, Any]] = {}  # rows of the same content with other metadata, such as a class
+    for i, row in enumerate(current):
         before = known.get(row["id"], {})
-        differs = [name for name, value in row.items() if before.get(name) != value]
-        is_known = row["modified"] >= 0 and not {"bytes", "modified"} & set(differs)
-        if not is_known and before.get("checksum") != checksum_of(dataset, i):
+        differences = {name for name, value in row.items() if before.get(name) != value}
+        is_unmodified = row["modified"] >= 0 and not {"bytes", "modified"} & differences
+        if not is_unmodified and before.get("checksum") != checksum_of(dataset, i):
             new.append(i)
-        elif differs:
-            told[row["id"]] = row
-    for where in _where_id(sorted(told)):  # of the same content, with another class
-        for some in gallery.table.batches(where):
-            descriptions, rows = gallery.table.decoded(some)
-            gallery.table.add(descriptions, [{**row, **told[row["id"]]} for row in rows], kinds)
+        elif differences:
+            changed[row["id"]] = row
+    for where in _where_id(sorted(changed)):
+        for batch in gallery.table.batches(where):
+            descriptions, rows = gallery.table.decoded(batch)
+            gallery.table.add(descriptions, [{**row, **changed[row["id"]]} for row in rows], kinds)
     failures: list[Failure] = []
     if new:
-        chosen = dataset.subset(new)
-        failures = chosen.precompute(n_workers=n_workers, strict=strict, progress=progress)
-        failures += gallery.add(chosen.usable(failures), n_workers=n_workers, strict=strict, progress=progress)
-    here = f"{Path(root).resolve()}{os.sep}"
-    gone = [name for name in known.keys() - {row["id"] for row in now} if name.startswith(here)]
-    lost = {failure.id for failure in failures}
-    unread = {row["file"] for row in now if row["part"] is None and row["name"] in lost}  # whose parts are not known
-    gone = [name for name in gone if known[name]["file"] not in unread and not _is_out_of_reach(known[name]["file"])]
+        subset = dataset.subset(new)
+        failures = subset.precompute(n_workers=n_workers, strict=strict, progress=progress)
+        failures += gallery.add(subset.usable(failures), n_workers=n_workers, strict=strict, progress=progress)
+    prefix = f"{Path(root).resolve()}{os.sep}"
+    gone = [name for name in known.keys() - {row["id"] for row in current} if name.startswith(prefix)]
+    failed = {failure.id for failure in failures}
+    unread = {row["file"] for row in current if row["part"] is None and row["name"] in failed}  # their parts may exist
+    gone = [name for name in gone if known[name]["file"] not in unread and not _is_hidden(known[name]["file"])]
     for where in _where_id(gone):
         gallery.remove(where)
     return len(new) - len(failures), len(gone), failures
 
 
-def _is_out_of_reach(file: str) -> bool:
-    """Whether a file may be there that is not seen, as in a folder that this user may not read."""
+def _is_hidden(file: str) -> bool:
+    """Whether a file may exist in a folder that this user may not read."""
     try:
         os.lstat(file)
     except OSError as error:
@@ -81,7 +83,7 @@ def _is_out_of_reach(file: str) -> bool:
 
 
 def _where_id(ids: Sequence[str]) -> Iterator[str]:
-    """Conditions that some of the ids satisfy, together all."""
-    for start in range(0, len(ids), _AT_ONCE):
-        quoted = ("'" + name.replace("'", "''") + "'" for name in ids[start : start + _AT_ONCE])
+    """Yield conditions that select the rows with some ids, in groups."""
+    for start in range(0, len(ids), _ROWS_PER_COMMIT):
+        quoted = ("'" + name.replace("'", "''") + "'" for name in ids[start : start + _ROWS_PER_COMMIT])
         yield f"id IN ({', '.join(quoted)})"
