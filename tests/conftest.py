@@ -110,8 +110,8 @@ def surface_genus(mesh: Mesh) -> int:
 def approximate_small_meshes() -> Iterator[None]:
     """Else small meshes are evaluated more accurately, without clusters. It outlives a test's `monkeypatch.undo`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(coordinates, "_FEW_VERTICES", 0)
-        patch.setattr(coordinates, "_CLUSTERED", 0)
+        patch.setattr(coordinates, "_MIN_FINE_VERTICES", 0)
+        patch.setattr(coordinates, "_MIN_CLUSTER_VERTICES", 0)
         yield
 
 

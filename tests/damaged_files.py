@@ -70,9 +70,9 @@ def write_unusable(folder: Path) -> dict[str, str]:
         "empty.off": "the file is empty (0 bytes). Export it again.",
         "empty.stl": "the file is empty (0 bytes). Export it again.",
         "nothing.off": "the file is empty: no vertices and no faces. Export it again.",
-        "triangle.off": "a single triangle is no body. Check that the export is complete.",
+        "triangle.off": "expected a closed surface, got a single triangle. Export it again.",
         "line.obj": "no triangle has an area; a surface was expected. If the file holds lines, give them thickness.",
-        "five.xyz": "a cloud of 5 points; at least 10 are needed for a surface. "
+        "five.xyz": "expected at least 10 points for a surface, got 5. "
         "Check that the file holds faces, or scan more points.",
         "part.dae": "COLLADA, 3DXML or XAML needs a module that is not installed (No module named 'collada'). "
         'Install it: pip install "interior-gps[formats]"; or convert the file to OFF, OBJ, PLY or STL.',

@@ -1,1 +1,1 @@
-"""Generated shapes, the training of the library's metric, and studies of the library; thin scripts on top."""
+"""Generated shapes, training of the metric of the library, studies of the library, and scripts that run them."""

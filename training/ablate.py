@@ -1,9 +1,9 @@
-"""What each learned part gives: bins, spectral filter, dimensions and head, over several seeded splits.
+"""Measure what each learned part contributes: bins, spectral filter, dimensions and head, over seeded splits.
 
     python -m training.ablate DATA
 
-Bins and filter are trained on the training part through a `WhitenedHead`; then heads are fitted to its histograms, and
-the test part is scored once.
+Bins and filter are trained on the training part through a `WhitenedHead`. Then heads are fitted to the histograms of
+that part, and the test part is scored once.
 """
 
 from jsonargparse import auto_cli

@@ -2,10 +2,11 @@
 
     python -m training.calibrate
 
-makes the calibration that the package ships: how far apart copies of a body are (other triangles, half of them, scaled,
-mirrored and turned, another file format, and all of that), poses of a body, bodies of a class, and classes; and from
-which distance on two files are not the same. To tell a part from one that is a little longer, bodies are lengthened by
-2 % of the root of their area too. The bodies are those of another seed than pretrain.py's.
+makes the calibration that the package ships: the distances between copies of a body (remeshed, simplified to half,
+scaled, mirrored and moved, in another file format, and all of these at once), between poses of a body, between bodies
+of a class and between classes, and the thresholds up to which two files are the same. Copies lengthened by 2 % of √area
+count as different, so that the thresholds separate parts of slightly different lengths. The seed of the bodies differs
+from that of pretrain.py.
 """
 
 from jsonargparse import auto_cli

@@ -1,9 +1,10 @@
-"""Classification accuracy over several seeded splits, on fixed or on trained histograms.
+"""Measure classification accuracy over several seeded splits, on fixed or on trained histograms.
 
     python -m training.classify DATA --descriptor rich
     python -m training.classify DATA --checkpoint build/training/checkpoints/last.ckpt
 
-With a checkpoint the features are the histograms of its learned bins and filter, on the checkpoint's own split.
+With a checkpoint, the features are the histograms of its learned bins and filter, and the split is that of the
+checkpoint.
 """
 
 from jsonargparse import auto_cli

@@ -1,11 +1,11 @@
-"""Retrieval scores over several seeded splits, and of a trained checkpoint.
+"""Measure retrieval scores over several seeded splits, or of a trained checkpoint.
 
     python -m training.evaluate splits DATA --descriptor rich --protocol unseen
     python -m training.evaluate fitted DATA --first_seed 200
     python -m training.evaluate checkpoint build/training/checkpoints/last.ckpt
 
-Nothing is chosen here: the heads are fitted to the training part with fixed parameters, the test part is scored once.
-Of a descriptor with a metric, such as `pretrained`, that is the heads' prior.
+No parameter is tuned: heads with fixed parameters are fitted to the training part, and the test part is scored once.
+If a descriptor has a metric, as `pretrained` has, the metric is the prior of the heads.
 """
 
 from jsonargparse import auto_cli

@@ -1,10 +1,11 @@
-"""Fit the metric of the descriptor `pretrained` to generated shapes, and measure it where it was not fitted.
+"""Fit the metric of the descriptor `pretrained` to generated shapes, and score it on held-out shapes.
 
     python -m training.pretrain --config configs/pretrain.yaml
     python -m training.pretrain --config configs/pretrain.yaml --data DATA
 
-The first makes the file that the package ships; its only check is on held-out families of generated classes, beside the
-plain descriptors. The second scores that metric on a labelled collection too, alone and with a few labels of it.
+The first command makes the file that the package ships. It scores the metric on held-out families of generated classes
+only, beside the plain descriptors. The second command also scores the metric on a labelled collection, alone and with a
+few labels of the collection.
 """
 
 from jsonargparse import auto_cli

@@ -1,4 +1,4 @@
-"""Write a table of the documentation from results: `python -m training.record NAME KIND RESULTS "COMMAND"`."""
+"""Write results into a table of the documentation: `python -m training.record NAME KIND RESULTS "COMMAND"`."""
 
 from jsonargparse import auto_cli
 

@@ -1,4 +1,4 @@
-"""A run of training: a few values in one YAML, a curve, an early end, and going on after an interruption."""
+"""Training runs: configuration by YAML, learning curve, early stopping, and resumption."""
 
 import csv
 from pathlib import Path
@@ -19,14 +19,15 @@ _SHORT = {"root": ("data", "root"), "out": ("trainer", "default_root_dir"), "epo
 
 
 class Run(LightningCLI):
-    """The command line of training/train.py: what a file leaves out is that of configs/default.yaml.
+    """The command line of training/train.py; configs/default.yaml holds the defaults of all options.
 
-    In the folder of the run are `checkpoints/last.ckpt` and `best.ckpt` (by the validation's FT), `curve.csv`,
-    `curve.svg`, and `config.yaml`. A run that was interrupted and resumed ends with the weights of one that was not.
+    The folder of the run contains `checkpoints/last.ckpt`, `checkpoints/best.ckpt` (by FT of the validation part),
+    `curve.csv`, `curve.svg` and `config.yaml`. An interrupted and resumed run ends with the same weights as an
+    uninterrupted one.
     """
 
     def __init__(self) -> None:
-        often = ModelCheckpoint(filename="last", save_on_train_epoch_end=True, enable_version_counter=False)
+        last = ModelCheckpoint(filename="last", save_on_train_epoch_end=True, enable_version_counter=False)
         best = ModelCheckpoint(
             filename="best", monitor="val_ft", mode="max", save_on_train_epoch_end=False, enable_version_counter=False
         )
@@ -37,15 +38,15 @@ class Run(LightningCLI):
             seed_everything_default=0,
             save_config_kwargs={"overwrite": True},
             parser_kwargs=dict.fromkeys(("fit", "validate", "test", "predict"), files),
-            trainer_defaults={"callbacks": [SeededEpochs(), TrainingCurve(), often, best]},
+            trainer_defaults={"callbacks": [SeededEpochs(), TrainingCurve(), last, best]},
         )
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Short names of what every run sets, resuming, and when to stop."""
-        parser.add_argument("--root", type=str | None, help="for data.root: the folder of labelled meshes")
-        parser.add_argument("--out", type=str | None, help="for trainer.default_root_dir: the folder of the run")
-        parser.add_argument("--epochs", type=int | None, help="for trainer.max_epochs")
-        parser.add_argument("--resume", type=str | None, help="a checkpoint to go on from, or 'last'")
+        """Add short names of frequent options, resumption and early stopping."""
+        parser.add_argument("--root", type=str | None, help="short for data.root: the folder of labelled meshes")
+        parser.add_argument("--out", type=str | None, help="short for trainer.default_root_dir: the folder of the run")
+        parser.add_argument("--epochs", type=int | None, help="short for trainer.max_epochs")
+        parser.add_argument("--resume", type=str | None, help="checkpoint to resume from, or 'last'")
         parser.add_lightning_class_args(EarlyStopping, "early_stopping")
         parser.set_defaults(
             {f"early_stopping.{key}": value for key, value in
@@ -53,7 +54,7 @@ class Run(LightningCLI):
         )  # fmt: skip
 
     def before_instantiate_classes(self) -> None:
-        """Put the short names where they belong."""
+        """Copy the values of short names to the options they stand for."""
         config = self.config[self.subcommand]
         for name, (group, key) in _SHORT.items():
             if config[name] is not None:
@@ -62,58 +63,60 @@ class Run(LightningCLI):
         if self.subcommand == "fit" and config.resume is not None:
             config.ckpt_path = str(last) if config.resume == "last" else config.resume
         elif self.subcommand == "fit" and config.ckpt_path is None and last.exists():
-            raise FileExistsError(f"out: {last} is of another run. Give --resume last, or another folder.")
+            raise FileExistsError(f"out: {last} exists, of an earlier run. Give --resume last, or another folder.")
         if config.ckpt_path not in (None, "best", "last", "hpc") and not Path(config.ckpt_path).exists():
-            raise FileNotFoundError(f"resume, ckpt_path: expected a checkpoint, there is no {config.ckpt_path}.")
+            raise FileNotFoundError(
+                f"resume, ckpt_path: expected a checkpoint, got {config.ckpt_path}, which does not exist."
+            )
 
     def before_fit(self) -> None:
-        """Checkpoints lie in the folder of the run, whatever the logger."""
+        """Put checkpoints into the folder of the run, whatever the logger."""
         for callback in self.trainer.checkpoint_callbacks:
             if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
                 callback.dirpath = str(Path(self.trainer.default_root_dir) / "checkpoints")
 
 
 class SeededEpochs(Callback):
-    """Random numbers of each epoch begin anew, from the run's seed and the epoch: those of a resumed run are the same.
+    """Seed each epoch by the seed of the run and the epoch, so that a resumed run draws the same random numbers.
 
-    Once before its shapes are drawn, and once before its first step, as opening a loader draws numbers too. The loader
-    is to be made anew for each epoch, or its sampler would remember. Processes that load (`n_loading_workers`) draw
-    ahead: with them a resumed run goes on with other batches.
+    Numbers are seeded before the shapes of an epoch are drawn, and again before its first step, because opening a
+    loader draws numbers, too. The loader must be created for each epoch, as its sampler has a state. Loading processes
+    (`n_loading_workers`) draw in advance: with them, a resumed run continues with other batches.
     """
 
     def __init__(self) -> None:
         self.state = {"seed": -1, "epoch": 0}
 
     def state_dict(self) -> dict[str, Any]:
-        """The run's seed, and the epoch that comes next."""
+        """Return the seed of the run and the next epoch."""
         return self.state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Those of the run that goes on."""
+        """Restore the seed and the epoch of the resumed run."""
         self.state = dict(state_dict)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take over the seed of the run."""
+        """Store the seed of a new run, and seed the first epoch."""
         if self.state["seed"] < 0:
             self.state["seed"] = torch.initial_seed() % 2**31
-        self._begin()
+        self._seed()
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """For what is drawn in the steps."""
+        """Seed the steps of an epoch."""
         if batch_idx == 0:
-            self._begin()
+            self._seed()
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """For the shapes of the next."""
+        """Seed the shapes of the next epoch."""
         self.state = {**self.state, "epoch": trainer.current_epoch + 1}
-        self._begin()
+        self._seed()
 
-    def _begin(self) -> None:
+    def _seed(self) -> None:
         seed_everything(sum(self.state.values()), verbose=False)
 
 
 class TrainingCurve(Callback):
-    """Mean loss of each epoch and the scores of its validation, as `curve.csv` and `curve.svg` in the run's folder."""
+    """Write mean loss and validation scores of each epoch to `curve.csv` and `curve.svg` in the folder of the run."""
 
     def __init__(self) -> None:
         self.rows: list[dict[str, float]] = []
@@ -121,36 +124,36 @@ class TrainingCurve(Callback):
         self._scores: dict[str, float] = {}
 
     def state_dict(self) -> dict[str, Any]:
-        """The rows so far."""
+        """Return the rows of the epochs so far."""
         return {"rows": self.rows}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from those of a checkpoint."""
+        """Restore the rows of a checkpoint."""
         self.rows = list(state_dict["rows"])
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """An interrupted epoch begins anew."""
+        """Discard the values of an interrupted epoch."""
         self._losses, self._scores = [], {}
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Collect the loss."""
+        """Collect the loss of a step."""
         self._losses.append(float(outputs["loss"]))
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Collect the scores."""
-        found = trainer.callback_metrics.items()
-        self._scores = {name: float(value) for name, value in found if name.startswith("val_")}
+        """Collect the validation scores."""
+        metrics = trainer.callback_metrics.items()
+        self._scores = {name: float(value) for name, value in metrics if name.startswith("val_")}
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """A row, and the picture."""
+        """Add the row of the epoch, and write the files."""
         self.rows.append({"epoch": trainer.current_epoch, "train_loss": mean(self._losses), **self._scores})
         if trainer.is_global_zero:
             self.write(Path(trainer.default_root_dir))
 
     def write(self, folder: Path) -> None:
-        """Write both files."""
+        """Write the table and the plot."""
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "curve.csv").open("w", newline="") as file:
             names = {name: None for row in self.rows for name in row}

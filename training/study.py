@@ -1,4 +1,4 @@
-"""Studies of the library: `python -m training.study` and the name of one, `--help` for each."""
+"""Studies of the library: `python -m training.study NAME`, with `--help` for each."""
 
 from igps.cli import Commands
 from igps.cli import main as run
@@ -24,7 +24,7 @@ COMMANDS: Commands = {
 
 
 def main() -> None:
-    """Run the study that the words of the command line name."""
+    """Run the study named on the command line."""
     run(COMMANDS, "python -m training.study", dict.fromkeys((pose, potential, topology), (".png",)))
 
 

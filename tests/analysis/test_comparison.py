@@ -150,7 +150,7 @@ def test_signatures_without_what_a_descriptor_needs_are_refused_before_work(data
 
 def test_two_of_one_name_are_refused(dataset: SignatureDataset) -> None:
     """They would be one row of a table, and one file."""
-    with pytest.raises(ValueError, match=r"descriptors: expected one of each name, got several of d2"):
+    with pytest.raises(ValueError, match=r"descriptors: expected different names, got d2 more than once"):
         next(compare(dataset, [D2(), Height(), D2(n_bins=8)], progress=False))
 
 

@@ -140,7 +140,7 @@ def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path: Path) 
     assert cube.notes == ("dropped 1 small piece apart of 1 voxels, 0.1% of the label",)
     assert (cube.error, plate.error, plate.fault, plate.steps) == (None, None, None, ())
     assert line.error == f"{tmp_path / 'x.nii.gz'}#line: " + (
-        "7 voxels, at least 8 expected: they tell no shape. Leave it out, or label it on a finer grid."
+        "expected at least 8 voxels, got 7, which have no shape. Leave out the label, or segment it on a finer grid."
     )
     table = findings_table(list(found.values())).splitlines()
     assert table[0].split()[:4] == ["voxels", "pieces", "thinnest", "vertices"]

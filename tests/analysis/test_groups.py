@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from igps.analysis.groups import GroupTest, group_test, squared_distances, with_discovery_rates
+from igps.analysis.groups import GroupTest, group_test, squared_distances, with_q_values
 
 PAIR = ["a"] * 12 + ["b"] * 12
 
@@ -207,7 +207,7 @@ def test_a_probability_is_that_of_all_arrangements() -> None:
         ({"groups": ["a"] * 21 + ["b"] * 3}, "b has 3"),
         ({"groups": ["a"] * 24}, "expected two groups, got a alone"),
         ({"strata": PAIR}, "within strata the groups can be arranged in only 1 ways"),
-        ({"covariates": np.repeat([[0.0], [1.0]], 12, axis=0)}, "tell the groups apart by themselves"),
+        ({"covariates": np.repeat([[0.0], [1.0]], 12, axis=0)}, "covariates or strata determine the groups"),
         ({"vectors": np.ones((24, 3))}, "do not differ"),
         ({"covariates": np.random.default_rng(0).normal(size=(24, 21))}, "too few"),
     ],
@@ -224,11 +224,11 @@ def test_what_makes_no_sense_is_refused(given: dict[str, object], why: str) -> N
 def test_discovery_rates_are_over_what_was_tested() -> None:
     tests = [GroupTest(str(i), {}, permanova_p=p, kernel_p=p) for i, p in enumerate((0.01, 0.04, 0.03))]
     refused = GroupTest("no", {}, refused="too few")
-    found = with_discovery_rates([tests[0], refused, *tests[1:]])
+    found = with_q_values([tests[0], refused, *tests[1:]])
     assert found[1] is refused
     assert [one.permanova_q for one in found] == pytest.approx([0.03, None, 0.04, 0.04])
-    assert with_discovery_rates([refused]) == [refused]
-    same = with_discovery_rates([replace(one, body="all") for one in tests])
+    assert with_q_values([refused]) == [refused]
+    same = with_q_values([replace(one, body="all") for one in tests])
     assert [one.permanova_p for one in same] == [0.01, 0.04, 0.03]
 
 

@@ -35,14 +35,14 @@ def test_what_is_usual_is_no_outlier() -> None:
 
 def test_a_body_alone_in_its_class_is_told_not_to_be_judged() -> None:
     found = outliers(squared_distances(usual()) ** 0.5, ["alone", *LABELS[1:]])
-    assert [one.label for one in found if one.reason == "alone in its class, its shape is not judged"] == ["alone"]
+    assert [one.label for one in found if one.reason == "shape not assessed: the only body of its class"] == ["alone"]
 
 
 def test_a_body_of_another_shape_comes_first() -> None:
     vectors = usual()
     vectors[3, 0] += 14
     first = found_of(vectors)[0]
-    assert (first.body, first.reason) == (3, "its shape is unlike its class")
+    assert (first.body, first.reason) == (3, "its shape is unusual for its class")
     assert first.score > LIMIT
 
 
@@ -79,20 +79,20 @@ def test_a_wrong_label_is_told() -> None:
     vectors[20] = vectors[:12].mean(axis=0)
     first = found_of(vectors)[0]
     assert (first.body, first.lies_among) == (20, "a")
-    assert first.reason.endswith("labelled b, lies among a")
+    assert first.reason.endswith("labelled b, but nearer to a")
 
 
 @pytest.mark.parametrize(
     ("name", "value", "told"),
     [
         ("volume", np.log(2), "its volume is 1.99 times"),
-        ("spacing", np.log(2), "it is 1.99 times as coarse"),
-        ("handles", 3.0, "it has 3 handles, where 0 are usual"),
-        ("flat", 0.3, "30% of its surface lie in one plane"),
-        ("stray", 0.2, "4.0% of it lie apart"),
-        ("cavity", 0.2, "it has cavities of 4.0% of its voxels"),
-        ("hole", 0.1, "it has holes of 1.0% of its voxels in slices, where 0.0% are usual"),
-        ("gap", 0.3, "it has gaps of 9% of its voxels, where 0% are usual"),
+        ("spacing", np.log(2), "its resolution is 1.99 times as coarse"),
+        ("handles", 3.0, "it has 3 handles (0 usual)"),
+        ("flat", 0.3, "30% of its surface lies in one plane"),
+        ("stray", 0.2, "4.0% of its voxels are detached"),
+        ("cavity", 0.2, "its cavities have 4.0% of its volume"),
+        ("hole", 0.1, "holes in its slices have 1.0% of its volume (0.0% usual)"),
+        ("gap", 0.3, "its gaps have 9% of its volume (0% usual)"),
         ("cut", 9.0, "its last slice is as large as those before it"),
     ],
 )
@@ -108,7 +108,7 @@ def test_a_leak_lies_in_another_class() -> None:
     overlap = np.zeros((24, 24))
     overlap[2, 20] = 0.08
     first, second = found_of(usual(), measures={"overlap": overlap})[:2]
-    assert (first.body, first.reason) == (2, "8% of it lie in a body of another class")
+    assert (first.body, first.reason) == (2, "8% of its voxels lie in a body of another class")
     assert second.scores["overlap"] == 0
 
 

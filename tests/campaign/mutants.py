@@ -70,14 +70,14 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             'solver = "randomized" if not n_components < min(features.shape) else "full"',
         ),
         # An empirical constant that is off by one: numbers of directions, bytes of a line for an estimate of sizes.
-        ("src/igps/mesh/_union.py", "_DIRECTIONS, _PLACES_PER_PATCH = 99, 30"),
+        ("src/igps/mesh/_union.py", "_N_DIRECTIONS, _SAMPLES_PER_PATCH = 99, 30"),
         ("src/igps/mesh/limits.py", "_OBJ_BYTES, _TEXT_STL_BYTES = 34, 200"),
         (
             "src/igps/nn/heads/closed_form.py",
             "n_directions: int = 59,",
         ),
         # The order of the points affects only the time.
-        ("src/igps/nn/_kernels/count_by_loops.py", "key = key * layout.n_classes - torch.where(own > 0, classes, 0)"),
+        ("src/igps/nn/_kernels/count_by_loops.py", "key = key * layout.n_classes - torch.where(share > 0, classes, 0)"),
         # No resolution is above the finest: larger arguments are refused before, and increments are clipped.
         ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == finest:"),
         # No code compares two instances.

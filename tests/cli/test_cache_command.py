@@ -49,13 +49,13 @@ def test_the_file_stands_for_the_folder(
         for option in (["--mend", "never"], ["--attribute", "ct={file}.nii"]):
             with pytest.raises(SystemExit, match="1"):
                 call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, *option)
-            assert "expected no reading options beside a file of signatures" in capsys.readouterr().err
+            assert "expected no reading options with a file of signatures" in capsys.readouterr().err
         call(monkeypatch, "extract", out, "--out", tmp_path / "rows.npz", "--descriptor", INTERIOR, *cache)
         names = np.load(tmp_path / "rows.npz")["names"].tolist()
         assert names == ["flat/0.off", "flat/1.off", "long/0.off", "long/1.off"]
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, "explain", out, "--level", 0.5, "--descriptor", INTERIOR, *cache)
-        assert "holds signatures and no meshes" in capsys.readouterr().err
+        assert "expected meshes, got a file of signatures" in capsys.readouterr().err
     else:
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, "retrieve", out, "--descriptor", INTERIOR, *cache)
@@ -83,9 +83,9 @@ def test_lists_of_files_may_be_one_file_of_signatures_and_what_needs_meshes_says
     call(monkeypatch, "classify", out, "--model", model, *cache, "--json")
     assert json.loads(capsys.readouterr().out) == expected
     for command, message in (
-        (["outliers", out, *rich, *cache], "holds signatures and no meshes"),
-        (["explain", out, *rich, *cache], "holds signatures and no meshes"),
-        (["duplicates", out, *cache], "holds signatures and no meshes"),
+        (["outliers", out, *rich, *cache], "expected meshes, got a file of signatures"),
+        (["explain", out, *rich, *cache], "expected meshes, got a file of signatures"),
+        (["duplicates", out, *cache], "expected meshes, got a file of signatures"),
         (["doctor", out], "expected a folder, got a file"),
     ):
         with pytest.raises(SystemExit, match="1"):

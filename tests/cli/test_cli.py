@@ -417,7 +417,7 @@ def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setattr(cli, "COMMANDS", {"wait": wait})
     with pytest.raises(SystemExit, match="130"):
         igps(monkeypatch, "wait")
-    assert capsys.readouterr().err == "igps: interrupted. Run again to go on: what is done is kept.\n"
+    assert capsys.readouterr().err == "igps: interrupted. Run again to continue: finished results are kept.\n"
 
 
 def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
@@ -575,15 +575,17 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
     monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
     (tmp_path / "file").touch()
     assert told(tmp_path / "file" / name) == (
-        f"igps: out: expected a folder, {tmp_path / 'file'} is a file. Name another place."
+        f"igps: out: expected a folder, {tmp_path / 'file'} is a file. Choose another path."
     )
     (tmp_path / name).touch() if endings is None else (tmp_path / name).mkdir()
     kind, other = ("folder", "file") if endings is None else ("file", "folder")
-    assert told(tmp_path / name) == f"igps: out: expected a {kind}, {tmp_path / name} is a {other}. Name another place."
+    assert (
+        told(tmp_path / name) == f"igps: out: expected a {kind}, {tmp_path / name} is a {other}. Choose another path."
+    )
     if endings:
         assert told(tmp_path / "there.zip").startswith("igps: out: expected a file ending in ")
     monkeypatch.setattr("os.access", lambda *_: False)
-    assert told(tmp_path / "new" / name).startswith(f"igps: out: {tmp_path} may not be written to.")
+    assert told(tmp_path / "new" / name).startswith(f"igps: out: no permission to write to {tmp_path}.")
 
 
 @pytest.mark.parametrize(
@@ -592,8 +594,11 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["retrieve", "ROOT", "--descriptor", "d2", "--with", "ct"], "attributes: expected 'ct' of each body"),
         (["explain", "ROOT", "--level", "2"], "level: expected a number between 0 and 1, got 2.0"),
         (["groups", "ROOT", "--n_permutations", "0"], "n_permutations: expected at least 1, got 0"),
-        (["retrieve", "ROOT", "--classes", "file"], "root: expected a class of two bodies or more, got 6 of one."),
-        (["fit", "ROOT", "--out", "ROOT"], "out: expected a new folder, or that of a model, ROOT holds "),
+        (
+            ["retrieve", "ROOT", "--classes", "file"],
+            "root: expected a class of two bodies or more, got 6 classes of one.",
+        ),
+        (["fit", "ROOT", "--out", "ROOT"], "out: expected a new or empty folder, or a model's, ROOT holds "),
         (["report", "TWO", "--meshes", "none"], "meshes: none: no such folder."),
         (["demo", "--n_workers", "0"], "n_workers: expected at least 1, got 0."),
         (["retrieve", "ROOT", "--descriptor", ":"], "descriptor: expected package.module:NAME to be importable"),
@@ -602,7 +607,7 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["retrieve", "ROOT", "--memory_limit", "1e400"], "memory_limit: expected a positive number, got inf."),
         (["explain", "BALL"], "meshes: expected two files, or a folder of two classes, got 1 files."),
         (["explain", "BALL", "BALL", "BALL"], "meshes: expected two files, or a folder of two classes, got 3 files."),
-        (["explain", "ROOT", "ROOT"], "ROOT: a folder; a file expected."),
+        (["explain", "ROOT", "ROOT"], "ROOT: expected a file, got a folder."),
         (["distance", "BALL", "none.off"], "none.off: no such file."),
         (["query", "none.off", "--gallery", "ROOT"], "none.off: no such file."),
         (["clusters", "ROOT", "--n_clusters", "7"], "n_clusters: expected 1 to 6, the bodies of the folder, got 7."),
@@ -647,7 +652,7 @@ def test_a_list_of_failures_is_no_folder(
     monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, "precompute", root, "--failures", tmp_path)
-    assert capsys.readouterr().err == f"igps: failures: expected a file, {tmp_path} is a folder. Name another place.\n"
+    assert capsys.readouterr().err == f"igps: failures: expected a file, {tmp_path} is a folder. Choose another path.\n"
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])

@@ -37,9 +37,9 @@ def test_table_and_file_of_a_folder_that_can_be_used(
     write_box(root / "b" / "box.off")
     igps(monkeypatch, "doctor", root, "--out", out, *FEW)  # no status: nothing is raised
     header, *lines, total, written = capsys.readouterr().out.splitlines()
-    assert header.split() == ["vertices", "after", "seconds", "MB", "what", "is", "done"]
+    assert header.split() == ["vertices", "after", "seconds", "MB", "steps"]
     cells = {line.split()[0]: line.split()[1:] for line in lines}
-    assert cells["a/clean.off"][:2] + cells["a/clean.off"][4:] == [str(N_VERTICES), str(N_VERTICES), "nothing"]
+    assert cells["a/clean.off"][:2] + cells["a/clean.off"][4:] == [str(N_VERTICES), str(N_VERTICES), "none"]
     assert cells["a/soup.off"][:2] + cells["a/soup.off"][4:] == [str(3 * N_FACES), str(N_VERTICES), "welded"]
     assert cells["b/box.off"][0] == "8"
     assert cells["b/box.off"][4:] == ["subdivided"]

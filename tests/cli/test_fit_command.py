@@ -150,7 +150,7 @@ def test_what_is_unlike_everything_is_said(
     box.export(tmp_path / "rod.off")
     call(monkeypatch, root, "classify", tmp_path / "rod.off", root / "eggs" / "flat" / "1.off", "--model", model)
     lines = capsys.readouterr().out.splitlines()
-    assert "unlike everything known" in next(line for line in lines if "rod.off" in line)
+    assert "unlike every known class" in next(line for line in lines if "rod.off" in line)
     assert next(line for line in lines if "1.off" in line).endswith("flat")
 
 

@@ -151,7 +151,7 @@ def test_every_command_that_reads_meshes_has_the_choice(
         igps(monkeypatch, *command, "--help")
     text = capsys.readouterr().out
     assert "--mend {auto,never,always}" in text
-    assert '"auto" does the least that makes a body of' in " ".join(text.split())
+    assert '"auto" makes as few repairs as possible' in " ".join(text.split())
 
 
 @pytest.mark.parametrize("command", ["retrieve", "extract"])

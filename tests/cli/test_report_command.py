@@ -168,7 +168,7 @@ def test_only_one_descriptor_is_explained(
     igps(monkeypatch, "compare", root, "--descriptors", INTERIOR, "d2", *options(out))
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, "report", out, "--explain", "--n_workers", "1")
-    assert "explain: expected results of `igps retrieve`" in capsys.readouterr().err
+    assert "explain: expected a folder that `igps retrieve` wrote" in capsys.readouterr().err
 
 
 def test_columns_of_the_labels_reach_the_page(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

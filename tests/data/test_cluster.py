@@ -130,7 +130,7 @@ def test_the_command_and_what_it_says_of_no_scheduler(
     )
     main()
     assert capsys.readouterr().out == "12 of 12 signatures are in the cache; 0 failed\n"
-    monkeypatch.setattr(sys.modules[dask_executor.__module__], "_ANSWERS_WITHIN", 1)
+    monkeypatch.setattr(sys.modules[dask_executor.__module__], "_SCHEDULER_TIMEOUT", 1)
     monkeypatch.setattr(sys, "argv", [*words, "--cluster", f"tcp://127.0.0.1:{free_port()}"])
     with pytest.raises(SystemExit, match="2"):
         main()

@@ -151,7 +151,7 @@ def test_tensors_are_made_on_the_device_of_the_bodies(
 ) -> None:
     """Of the device "meta" are then those that are made without saying where: they have no numbers to go on with."""
     if not compiled:  # as on a GPU
-        monkeypatch.setattr(blocks, "in_loops", lambda _: False)
+        monkeypatch.setattr(blocks, "uses_loops", lambda _: False)
     found = with_individuals(name)
     with torch.inference_mode():
         expected = found(body("rod"))
@@ -185,7 +185,7 @@ def test_a_batch_on_a_device_is_described_at_once(name: str, monkeypatch: pytest
     pair = SignatureBatch.concatenate([fewer_samples(body("rod"), 200), fewer_samples(body("other"), 150)])
     with torch.inference_mode():
         expected = torch.cat([found(pair[:1]), found(pair[1:])] * 3)
-    monkeypatch.setattr(blocks, "in_loops", lambda _: False)
+    monkeypatch.setattr(blocks, "uses_loops", lambda _: False)
     for module, block in ((blocks, "BLOCK"), (count_by_torch, "_BLOCK")):  # all fit
         monkeypatch.setattr(module, block, 2**40)
     counts = []

@@ -128,7 +128,7 @@ def test_it_has_a_name_but_is_not_for_any_body() -> None:
     assert descriptor("molecular").name == "molecular"
     assert "molecular" not in NAMES
     bare = replace(signature(0, 0.0), interior=replace(signature(0, 0.0).interior, attributes={}))
-    with pytest.raises(ValueError, match="attributes: expected 'residue_shares' among those"):
+    with pytest.raises(ValueError, match="attributes: expected the interior samples to have 'residue_shares'"):
         described(bare)
 
 

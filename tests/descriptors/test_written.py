@@ -115,7 +115,7 @@ def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tm
     heights = {"height": lambda points: points[:, 2]}
     files = [tmp_path / f"{i}.off" for i in range(2)]
     dataset = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=own, attributes=heights)
-    with pytest.raises(ValueError, match="height: expected centres, got 4 quantiles of no collection"):
+    with pytest.raises(ValueError, match="height: expected centres, got 4 quantiles that are not fitted"):
         own(dataset.batch([0]))
     assert fit_centres(own, dataset)
     values = np.concatenate([one.interior.attributes["height"][:500] for one in dataset.signatures()])

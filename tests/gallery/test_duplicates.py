@@ -342,7 +342,7 @@ def test_the_commands(
     command(monkeypatch, "duplicates", root, "--out", tmp_path / "out" / "groups.csv", *options)
     lines = capsys.readouterr().out.splitlines()
     assert lines[-3:-1] == ["group 1: bar.obj  bar.off  bar.ply", "group 2: lump.off  lump.stl"]
-    assert lines[-1].startswith("5 of 7 files in 2 groups; of generated bodies, ")
+    assert lines[-1].startswith("5 of 7 files in 2 groups; on generated bodies, this finds ")
     rows = (tmp_path / "out" / "groups.csv").read_text().splitlines()
     assert rows[0] == "group,name,path"
     assert rows[5] == f"2,lump.stl,{root / 'lump.stl'}"
@@ -350,10 +350,10 @@ def test_the_commands(
     *_, by_descriptor, by_surfaces, by_lengths = capsys.readouterr().out.splitlines()
     assert float(by_lengths.split()[5]) == pytest.approx(0.2, rel=0.01)
     assert "pairs of different classes" in by_descriptor
-    assert ", the same shape (at their level of detail, the same up to " in by_surfaces
+    assert ", the same shape (at their level of detail, distances up to " in by_surfaces
     command(monkeypatch, "distance", root / "bar.off", root / "bent.off", *options)
     # Neither has a handle; their vertices are numbered alike
-    assert "not the same shape (other handles or vertices)" in capsys.readouterr().out
+    assert "not the same shape (their handles or vertices differ)" in capsys.readouterr().out
 
 
 def test_the_page_runs(tmp_path: Path) -> None:

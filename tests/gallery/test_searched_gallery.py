@@ -191,7 +191,7 @@ def test_commands(
     command(monkeypatch, "query", wanted, "--gallery", index, "--top", 4, *cache)
     out = capsys.readouterr().out
     assert out.startswith(expected)
-    assert out.splitlines()[-1] == "1 of these 4 files are no longer where they were when they were described."
+    assert out.splitlines()[-1] == "1 of these 4 files were moved or deleted since they were described."
 
 
 def test_what_does_not_fit_is_refused_in_a_sentence(
@@ -531,7 +531,7 @@ def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
     assert "expected a gallery or a new folder, got a folder with ball" in told
     with_attribute = ["--out", tmp_path / "g", "--attribute", "ct=ct/{file}.nii.gz", "--with", "ct"]
     told = error_of(monkeypatch, capsys, *words, *with_attribute)
-    assert "ct: expected centres, got 8 quantiles of no collection" in told
+    assert "ct: expected centres, got 8 quantiles that are not fitted" in told
 
 
 def test_a_gallery_remembers_the_table_of_names(

@@ -155,7 +155,7 @@ def test_several_bodies_and_unknown_parts_are_told_with_the_names_there_are(tmp_
     with pytest.raises(MeshError, match=r"has no body 'lid'; there are: 'part', 'part \(2\)'"):
         load_mesh(path, OBJECTS, part="lid")
     trimesh.creation.box().export(tmp_path / "box.off")
-    with pytest.raises(MeshError, match=r"box\.off: is one body, and has none called 'lid'\. Leave that name out\."):
+    with pytest.raises(MeshError, match=r"box\.off: is a single body, and has no body 'lid'\. Leave out the name\."):
         load_mesh(tmp_path / "box.off", part="lid")
     with pytest.raises(ValueError, match="bodies: expected one of whole, labels"):
         LoadOptions(bodies="organs")  # type: ignore[arg-type]
@@ -193,7 +193,7 @@ def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path
     assert parts(path, options) == ["left", "right", "speck"]
     outcomes = {ref.part: body for ref, body in each_body(path, options)}
     assert isinstance(outcomes["speck"], MeshError)
-    assert str(outcomes["speck"]).startswith(f"{path}#speck: 7 voxels")
+    assert str(outcomes["speck"]).startswith(f"{path}#speck: expected at least 8 voxels, got 7")
     for name in ("left", "right"):
         body = load_mesh(path, options, part=name)
         assert body.volume == pytest.approx(6 * 12 * 16, rel=1e-6)

@@ -78,7 +78,7 @@ def test_loose_triangles_are_welded_before() -> None:
     ids=["turned outwards", "outside", "across", "in another"],
 )  # fmt: skip
 def test_what_is_no_cavity_is_refused(other: Surface) -> None:
-    with pytest.raises(MeshError, match=r"closed surfaces is no cavity .*--mend auto, or without cavities"):
+    with pytest.raises(MeshError, match=r"closed surfaces bounds no cavity: .*--mend auto, or without cavities"):
         Mesh(*joined(ball(1), other), cavities=True)
     with pytest.raises(MeshError, match="connected components"):
         Mesh(*joined(ball(1), other))
@@ -207,5 +207,5 @@ def test_of_two_cavities_that_meet_at_a_vertex_both_are_turned_inwards() -> None
 
     volume = (1 - 0.25**3 - 0.2**3) * BALL.volume
     assert hollow(BALL.faces).volume == pytest.approx(volume, rel=1e-12)  # the mirror has turned them
-    with pytest.raises(MeshError, match="is no cavity of the body: it is turned outwards"):
+    with pytest.raises(MeshError, match="bounds no cavity: it is oriented outward"):
         hollow(inwards)

@@ -8,7 +8,7 @@ import trimesh
 from training.studies.disturbances import noise
 
 from igps.mesh import denoising
-from igps.mesh.denoising import Neighbours, denoised, is_noisy, noise_and_edge
+from igps.mesh.denoising import Neighbours, is_noisy, noise_and_edge, remove_noise
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors
@@ -50,7 +50,7 @@ def test_the_rough_half_of_a_body_stays(sphere: Mesh) -> None:
 def test_area_and_volume_come_back(sphere: Mesh) -> None:
     noisy = noise(sphere, 0.004, 1)
     assert noisy.area > 1.05 * sphere.area
-    smooth = Mesh(denoised(noisy.vertices, noisy.faces), noisy.faces)
+    smooth = Mesh(remove_noise(noisy.vertices, noisy.faces), noisy.faces)
     assert smooth.area == pytest.approx(sphere.area, rel=0.01)
     assert smooth.volume == pytest.approx(sphere.volume, rel=0.01)
     assert (
@@ -70,7 +70,7 @@ def test_passes_follow_the_noise(ratio: float, subdivisions: int) -> None:
     # The noise makes the edges longer.
     assert _noise_over_edge(noisy, faces) == pytest.approx(ratio / np.sqrt(1 + 2 * ratio**2), rel=0.08)
     assert is_noisy(noisy, faces)
-    smooth = Mesh(denoised(noisy, faces), faces)
+    smooth = Mesh(remove_noise(noisy, faces), faces)
     assert smooth.area == pytest.approx(ball.area, rel=0.008)
     assert smooth.volume == pytest.approx(ball.volume, rel=0.006)
     # In degrees; of the noisy surface from 10 upward.
@@ -92,7 +92,7 @@ def test_turned_parts_of_thin_triangles_come_back(steps: int, sections: int) -> 
     rough = noise(part, 0.002, seed=steps)
     assert not is_noisy(part.vertices, part.faces)
     assert is_noisy(rough.vertices, rough.faces)
-    smooth = Mesh(denoised(rough.vertices, rough.faces), part.faces)
+    smooth = Mesh(remove_noise(rough.vertices, rough.faces), part.faces)
     assert abs(smooth.area - part.area) < 0.25 * (rough.area - part.area)
     assert smooth.volume == pytest.approx(part.volume, rel=0.01)
     # Steps between rims stay sharp: no corner has moved farther than the noise moved it.
@@ -107,7 +107,7 @@ def test_edges_of_a_box_stay_sharp(amplitude: float) -> None:
     part = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
     rough = noise(part, amplitude, seed=2)
     assert is_noisy(rough.vertices, rough.faces)
-    smooth = Mesh(denoised(rough.vertices, rough.faces), part.faces)
+    smooth = Mesh(remove_noise(rough.vertices, rough.faces), part.faces)
     expected, found = (_unit(area_vectors(mesh.vertices, part.faces)) for mesh in (part, smooth))
     off = np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", expected, found), -1, 1)))
     assert off.mean() < 2
@@ -137,7 +137,7 @@ def test_plates_with_holes_keep_their_volume(seed: int, longest_edge: float | No
     part = plate_with_holes(seed, longest_edge)
     rough = noise(part, 0.002, seed)
     assert is_noisy(rough.vertices, rough.faces)
-    smooth = Mesh(denoised(rough.vertices, rough.faces), part.faces)
+    smooth = Mesh(remove_noise(rough.vertices, rough.faces), part.faces)
     assert smooth.volume == pytest.approx(part.volume, rel=0.03)
     assert abs(smooth.area - part.area) < 0.5 * (rough.area - part.area)
 
@@ -152,16 +152,16 @@ def test_a_fan_of_thousands_of_slivers_does_not_fold_up() -> None:
     part = Mesh(np.asarray(drawn.vert_properties)[:, :3].copy(), np.asarray(drawn.tri_verts).astype(np.int64))
     assert np.bincount(part.faces.ravel()).max() > 3000
     rough = noise(part, 0.002, seed=0)
-    smooth = Mesh(denoised(rough.vertices, rough.faces), part.faces)
+    smooth = Mesh(remove_noise(rough.vertices, rough.faces), part.faces)
     assert smooth.area < rough.area
     assert smooth.volume == pytest.approx(part.volume, rel=0.005)
 
 
 def test_many_faces_are_filtered_as_few_are(sphere: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     rough = noise(sphere, 0.004, 2).vertices
-    expected = denoised(rough, sphere.faces)
+    expected = remove_noise(rough, sphere.faces)
     monkeypatch.setattr(denoising, "_FACES_AT_ONCE", 100)
-    np.testing.assert_allclose(denoised(rough, sphere.faces), expected, rtol=1e-12)
+    np.testing.assert_allclose(remove_noise(rough, sphere.faces), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])
@@ -171,7 +171,9 @@ def test_the_unit_of_length_does_not_matter(scale: float) -> None:
     rough = noise(part, 0.002, seed=1)
     assert not is_noisy(scale * part.vertices, part.faces)
     assert is_noisy(scale * rough.vertices, part.faces)
-    assert denoised(scale * rough.vertices, part.faces) / scale == pytest.approx(denoised(rough.vertices, part.faces))
+    assert remove_noise(scale * rough.vertices, part.faces) / scale == pytest.approx(
+        remove_noise(rough.vertices, part.faces)
+    )
 
 
 def test_a_knurled_knob_is_no_noise() -> None:
@@ -219,7 +221,7 @@ def test_what_is_full_of_holes_is_no_surface_to_look_over(sphere: Mesh, share: f
 def test_boundaries_stay(sphere: Mesh) -> None:
     faces = sphere.faces[sphere.vertices[sphere.faces].mean(axis=1)[:, 2] < 0.5]
     noisy = noise(sphere, 0.004, 1).vertices
-    smooth = denoised(noisy, faces)
+    smooth = remove_noise(noisy, faces)
     sides = np.sort(np.stack([faces, np.roll(faces, 1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     edges, count = np.unique(sides, axis=0, return_counts=True)
     rim = np.unique(edges[count == 1])
@@ -232,4 +234,4 @@ def test_mending_smooths_noise_only(sphere: Mesh) -> None:
     mesh = mend(noisy.vertices, noisy.faces)
     assert repair_steps(mesh.notes) == ("smoothed",)
     np.testing.assert_array_equal(mesh.faces, sphere.faces)
-    np.testing.assert_array_equal(mesh.vertices, denoised(noisy.vertices, noisy.faces))
+    np.testing.assert_array_equal(mesh.vertices, remove_noise(noisy.vertices, noisy.faces))

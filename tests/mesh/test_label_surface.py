@@ -238,7 +238,7 @@ def test_a_label_that_is_mostly_small_pieces_is_refused(more: int, lost: str) ->
     for corner in np.ndindex(5, 6, 4):
         x, y, z = 9 * np.array(corner) + (9, 0, 0)
         mask[x : x + 4, y : y + 4, z : z + 4] = 1
-    with pytest.raises(MeshError, match=rf"lesions: {lost} pieces apart, each below 2% .* --bodies pieces; or"):
+    with pytest.raises(MeshError, match=rf"lesions: {lost} separate pieces, each below 2% .* --bodies pieces; or"):
         voxel_surface(mask, joins=True, name="lesions")
     pieces = label_bodies(LabelVolume((mask,), np.eye(4)), LoadOptions(bodies="pieces"))
     assert len(pieces) == 121
@@ -305,7 +305,7 @@ def test_holes_inside_are_filled() -> None:
 def test_what_is_no_body_is_refused_with_its_count() -> None:
     mask = np.zeros((9, 9, 9), dtype=bool)
     mask[2:9, 4, 4] = True
-    with pytest.raises(MeshError, match="liver: 7 voxels, at least 8 expected"):
+    with pytest.raises(MeshError, match="liver: expected at least 8 voxels, got 7"):
         voxel_surface(mask, name="liver")
     with pytest.raises(MeshError, match="singular"):
         voxel_surface(np.ones((9, 9, 9)), np.diag([1.0, 1, 0, 1]))

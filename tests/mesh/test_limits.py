@@ -101,23 +101,23 @@ def group(folder: Path, version: int, most: object, used: int, cached: int) -> N
 def test_the_groups_around_a_process_bound_its_memory(tmp_path: Path) -> None:
     own, root = tmp_path / "own", tmp_path / "groups"
     own.write_text("0::/job/step\n")
-    assert limits._of_group(root, own) is None
+    assert limits._memory_in_groups(root, own) is None
     group(root / "job" / "step", 2, "max", 300, 0)
-    assert limits._of_group(root, own) is None
+    assert limits._memory_in_groups(root, own) is None
     group(root / "job", 2, 1000, 400, 150)  # of all steps together; files that were read can go
-    assert limits._of_group(root, own) == 1000 - 400 + 150
+    assert limits._memory_in_groups(root, own) == 1000 - 400 + 150
     group(root / "job" / "step", 2, 500, 300, 0)
-    assert limits._of_group(root, own) == 200
+    assert limits._memory_in_groups(root, own) == 200
 
 
 def test_a_container_has_its_group_as_the_root(tmp_path: Path) -> None:
     own, root = tmp_path / "own", tmp_path / "groups"
     own.write_text("9:name=systemd:/\n4:cpu,memory:/docker/0815\n")
     group(root / "memory", 1, 2000, 1500, 100)
-    assert limits._of_group(root, own) == 600
+    assert limits._memory_in_groups(root, own) == 600
     group(root / "memory" / "docker" / "0815", 1, 1000, 900, 0)
-    assert limits._of_group(root, own) == 100
-    assert limits._of_group(tmp_path / "nowhere", tmp_path / "nothing") is None
+    assert limits._memory_in_groups(root, own) == 100
+    assert limits._memory_in_groups(tmp_path / "nowhere", tmp_path / "nothing") is None
 
 
 def test_the_limits_of_the_process_bound_its_memory() -> None:

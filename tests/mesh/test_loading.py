@@ -25,7 +25,7 @@ def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
 def test_missing_and_unreadable_files(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"nowhere\.off: no such file"):
         load_mesh(tmp_path / "nowhere.off")
-    with pytest.raises(MeshError, match="a folder; a file expected"):
+    with pytest.raises(MeshError, match="expected a file, got a folder"):
         load_mesh(tmp_path)
     for name, text in (("blank.off", "\n"), ("words.off", "hello"), ("cut.ply", "ply\nformat ascii 1.0\n")):
         (tmp_path / name).write_text(text)

@@ -153,12 +153,12 @@ def test_voxels_of_one_label_are_a_mesh() -> None:
         sides = 1 if unit is None else 2
         assert mesh.volume == pytest.approx(sides * ball.sum(), rel=1e-3)
         assert (mesh.name, mesh.unit) == ("volume", unit)
-    with pytest.raises(MeshError, match=r"one label expected, got 1, 3\. Choose one, as labels == 1"):
+    with pytest.raises(MeshError, match=r"expected one label, got 1, 3\. Select one, such as labels == 1"):
         Mesh.of(ball + 2 * (ball & (np.arange(20) < 9)))
     with pytest.raises(MeshError, match=r"three sides of a voxel, got .*spacing \(1, 2\)"):
         Mesh.of(ball, (1, 2))
 
 
 def test_an_image_without_a_surface_is_none() -> None:
-    with pytest.raises(TypeError, match="holds no surface"):
+    with pytest.raises(TypeError, match="expected a GIFTI image of a surface"):
         Mesh.of(nibabel.gifti.GiftiImage())

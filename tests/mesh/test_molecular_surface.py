@@ -139,7 +139,7 @@ def test_a_simplified_surface_keeps_the_volume() -> None:
 
 
 def test_stray_atoms_are_named_with_the_remedy() -> None:
-    with pytest.raises(MeshError, match=r"balls: a grid of .* Raise the spacing, or remove stray atoms"):
+    with pytest.raises(MeshError, match=r"balls: expected a grid of .* Raise the spacing, or remove stray atoms"):
         molecular_surface(molecule([[0, 0, 0], [9999, 9999, 9999]], [1.7, 1.7]))
 
 

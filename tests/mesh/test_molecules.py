@@ -132,7 +132,7 @@ def test_long_numbers_of_a_pqr_file_leave_no_blank_before_them(tmp_path: Path) -
     assert [one.name[-7:], one.residue_names, one.radii.round(2).tolist()] == ["chain A", ("ALA",), [1.85]]
     assert [other.name[-7:], other.residue_names, other.radii.round(2).tolist()] == ["chain B", ("ALA",), [1.9]]
     fused = written(tmp_path, "ATOM 1 HG11VAL A 1 0.0 0.0 0.0 -0.30 1.85\n", "fused.pqr")
-    with pytest.raises(MeshError, match=r"fused\.pqr: line 1 is no atom .* write it again, with blanks between fields"):
+    with pytest.raises(MeshError, match=r"fused\.pqr: line 1 is no atom .* Write it again, with blanks between fields"):
         read_molecule(fused)
 
 
@@ -181,7 +181,7 @@ def test_an_assembly_is_built_by_its_operators(tmp_path: Path) -> None:
     one = molecule.positions[:5]
     np.testing.assert_allclose(molecule.positions[5:], one * [-1, -1, 1] + [0, 0, 50], atol=1e-4)
     (alone,) = read_molecule(written(tmp_path, residue(1)), "assembly")
-    assert alone.notes == ("the file names no assembly: the model was taken as it is",)
+    assert alone.notes == ("the file defines no assembly: the model was used",)
 
 
 def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_hydrogens_are_left_out_unless_asked_for(tmp_path: Path) -> None:
 def test_a_backbone_gets_balls_of_its_side_chains(tmp_path: Path) -> None:
     text = residue(1, "LEU", backbone()) + residue(2, "GLY", backbone()) + residue(3, "LYS", backbone())
     (molecule,) = read_molecule(written(tmp_path, text))
-    assert molecule.notes == ("2 residues without side chain: balls of the side chain's volume stand for them",)
+    assert molecule.notes == ("2 residues without a side chain: a ball of its volume was used",)
     assert np.bincount(molecule.residue_of).tolist() == [5, 4, 5]
     leucine = molecule.positions[0], molecule.radii[0]
     assert 4 / 3 * np.pi * leucine[1] ** 3 == pytest.approx(VOLUMES["LEU"] - VOLUMES["GLY"])
@@ -256,7 +256,7 @@ def test_a_backbone_gets_balls_of_its_side_chains(tmp_path: Path) -> None:
 def test_a_trace_has_balls_of_its_residues(tmp_path: Path) -> None:
     text = "".join(residue(i, "ASP", ALANINE[1:2]) for i in range(1, 9))
     (molecule,) = read_molecule(written(tmp_path, text))
-    assert molecule.notes == ("8 residues of Cα alone: balls of the residue's volume stand for them",)
+    assert molecule.notes == ("8 residues of Cα alone: a ball of the residue's volume was used",)
     np.testing.assert_allclose(4 / 3 * np.pi * molecule.radii**3, VOLUMES["ASP"])
     assert molecule.charges.tolist() == [-1.0] * 8
     assert molecular_surface(molecule).volume > 6 * VOLUMES["ASP"]
@@ -271,7 +271,7 @@ def test_of_alternatives_the_most_occupied_is_taken(tmp_path: Path) -> None:
     (molecule,) = read_molecule(written(tmp_path, residue(1, atoms=backbone()) + "".join(atoms) + kinds))
     assert molecule.positions[4, 1] == pytest.approx(-0.9)
     assert molecule.residue_names == ("ALA", "THR")
-    assert molecule.notes == ("2 alternative locations: that of the highest occupancy was taken",)
+    assert molecule.notes == ("2 alternative locations: the one of the highest occupancy was used",)
 
 
 def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path: Path) -> None:
@@ -288,8 +288,8 @@ def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path: Path) -> N
     np.testing.assert_allclose(molecule.radii[5:], [1.55, 1.70, 1.70, 1.52, 1.70, 1.70], atol=1e-6)
     assert molecule.residue_names == ("QQQ", "ALA")
     assert molecule.notes == (
-        "5 atoms without an element: their names tell it",
-        "1 atoms of an unknown element: a radius of 1.7 Å was taken",
+        "5 atoms without an element: it was inferred from their names",
+        "1 atoms of an unknown element: a radius of 1.7 Å was used",
         "1 residues of an unknown name",
     )
 

@@ -1,7 +1,7 @@
 import numpy as np
 import trimesh
 
-from igps.mesh._union import united, without_walls
+from igps.mesh._union import drop_inner_walls, unite_parts
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import face_patches
@@ -35,7 +35,7 @@ def test_parts_that_do_not_touch_or_are_open_are_left_to_the_grid():
     opened = together(box([0, 0, 0], [1, 1, 1]), (vertices, faces[len(faces) // 2 :]))
     for surface in (apart, opened):
         notes = []
-        assert united(*surface, notes)[1] is surface[1]
+        assert unite_parts(*surface, notes)[1] is surface[1]
         assert notes == []
 
 
@@ -71,7 +71,7 @@ def test_a_patch_that_closes_the_surface_stays():
     """Half of the wall is missing: it hangs on the surface, and is dropped by what drops fins; a floor is not."""
     vertices, faces = box([0, 0, 0], [1, 1, 1])
     notes = []
-    assert without_walls(vertices, faces, notes)[1] is faces
+    assert drop_inner_walls(vertices, faces, notes)[1] is faces
     assert notes == []
 
 

@@ -155,14 +155,14 @@ def test_faces_between_solids_are_left_out_of_the_winding_numbers() -> None:
     outer, core = ball(subdivisions=4), ball(0.3)
     wall = trimesh.creation.box((1.2, 1.2, 0.02))
     vertices, faces = arrays(outer, core, wall)
-    bare = OrientedSurface(20 * vertices, faces, False)._without_hidden()
+    bare = OrientedSurface(20 * vertices, faces, False)._drop_hidden_faces()
     np.testing.assert_array_equal(bare.faces, faces[: len(outer.faces)])
     assert bare.is_nearly_closed
     np.testing.assert_allclose(bare.winding(20 * np.array([[0, 0, 0.005], [0, 0.1, 0], [0, 0, 0.9], [0, 0, 1.1]])),
                                [1, 1, 1, 0], atol=5e-3)  # fmt: skip
     # An open cup hides nothing: it is asked with all of its faces.
     cup_vertices, cup_faces = cut_ball(0.3)
-    cup = OrientedSurface(20 * cup_vertices, cup_faces, False)._without_hidden()
+    cup = OrientedSurface(20 * cup_vertices, cup_faces, False)._drop_hidden_faces()
     np.testing.assert_array_equal(cup.faces, cup_faces)
     assert not cup.is_nearly_closed
 
@@ -264,7 +264,7 @@ def test_follows_the_surface_when_it_is_moved_and_scaled() -> None:
 
 
 def test_many_triangles_are_rounded_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_MANY_FACES", 1000)
+    monkeypatch.setattr(module, "_MAX_FACES", 1000)
     body = watertight(*arrays(ball(subdivisions=5)), resolution=64)
     assert np.abs(np.linalg.norm(body.vertices, axis=1) - 1).max() < 0.5 * 2 / 64
     assert body.volume == pytest.approx(BALL, rel=0.01)
@@ -281,7 +281,7 @@ def test_inputs_stay_as_they_are() -> None:
 def test_what_is_no_surface_is_refused() -> None:
     with pytest.raises(MeshError, match=r"line\.obj: no triangle has an area"):
         watertight(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), name="line.obj")
-    with pytest.raises(MeshError, match=r"five\.xyz: a cloud of 5 points"):
+    with pytest.raises(MeshError, match=r"five\.xyz: expected at least 10 points for a surface, got 5"):
         watertight(np.random.default_rng(0).random((5, 3)), name="five.xyz")
     with pytest.raises(MeshError, match="finite"):
         watertight(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
@@ -290,7 +290,7 @@ def test_what_is_no_surface_is_refused() -> None:
 
 
 def test_a_body_between_the_points_of_the_grid_is_refused_by_name() -> None:
-    with pytest.raises(MeshError, match=r"wire\.off: no point of the grid lies in the body"):
+    with pytest.raises(MeshError, match=r"wire\.off: no grid point lies inside the body"):
         level_surface(np.ones((4, 4, 4), dtype=np.float32), "wire.off")
 
 

@@ -301,7 +301,7 @@ def test_where_descriptions_cannot_be_kept_they_are_made(
     (fresh.pipeline.cache_dir / "descriptions").write_text("in the way")
     for _ in range(2):
         assert asked(fresh)[0] == ["0", "1", "2"]
-    assert caplog.text.count("descriptions are not kept") == 2
+    assert caplog.text.count("descriptions are not cached") == 2
 
 
 def test_failures_are_not_kept(fresh: SignatureDataset) -> None:

@@ -229,7 +229,7 @@ def test_needs_are_those_of_all_histograms(batch: SignatureBatch) -> None:
     with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 9, got 7"):
         descriptor(batch)
     bare = replace(batch, interior=replace(batch.interior, attributes={}))
-    with pytest.raises(ValueError, match="expected 'surface_direction' among those of the interior samples"):
+    with pytest.raises(ValueError, match="expected the interior samples to have 'surface_direction'"):
         oriented()(bare)
     barest = replace(bare, surface=replace(batch.surface, attributes={}))
     with pytest.raises(ValueError, match="attributes: this descriptor needs signatures with surface_direction"):

@@ -125,7 +125,7 @@ def test_what_was_changed_since_it_was_made_is_not_saved_as_it_was(tmp_path: Pat
     for change, said in ((named, "name"), (fewer, r"histograms\.0\.n_samples"), (replaced, r"histograms\.1\.axes\.0")):
         descriptor = learnable()
         change(descriptor)
-        with pytest.raises(ValueError, match=f"^{said}: expected as it was made"):
+        with pytest.raises(ValueError, match=f"^{said}: expected its initial value, got another"):
             descriptor.save(tmp_path / "mine.safetensors")
         assert not (tmp_path / "mine.safetensors").exists()
 

@@ -51,7 +51,7 @@ def test_ranked_results_show_each_class_with_hits_and_misses(
 def test_turned_body_is_drawn_alike() -> None:
     body = trimesh.creation.cone(radius=0.4, height=2.0, sections=24)
     turned = body.vertices @ trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3].T
-    straight, back = drawing.seen_from_the_front(body.vertices), drawing.seen_from_the_front(turned)
+    straight, back = drawing.front_view(body.vertices), drawing.front_view(turned)
     np.testing.assert_allclose(np.ptp(back, axis=0)[1], np.ptp(straight, axis=0)[1], rtol=1e-6)
     for view in (straight, back):
         tip = view[np.argmax(np.linalg.norm(view - view.mean(axis=0), axis=1))]
@@ -60,5 +60,5 @@ def test_turned_body_is_drawn_alike() -> None:
 
 def test_view_is_no_mirror_image() -> None:
     points = np.random.default_rng(0).random((50, 3)) * [1, 2, 3]
-    frame = np.linalg.lstsq(points, drawing.seen_from_the_front(points), rcond=None)[0]
+    frame = np.linalg.lstsq(points, drawing.front_view(points), rcond=None)[0]
     assert np.linalg.det(frame) == pytest.approx(1)

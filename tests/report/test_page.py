@@ -201,5 +201,5 @@ def test_what_is_no_folder_of_results_is_told(tmp_path: Path) -> None:
         read_results(tmp_path)
     retrieval_folder(tmp_path)
     np.savez(tmp_path / "distances.npz", distances=np.zeros((2, 2)), names=np.array(["a", "b", "c"]))
-    with pytest.raises(ValueError, match="between 3 meshes"):
+    with pytest.raises(ValueError, match=r"expected distances and labels \(or no labels\) of 3 meshes"):
         read_results(tmp_path)

@@ -313,7 +313,7 @@ def test_leaves_of_the_tree_have_the_colours_of_the_map(answers: Visit) -> None:
     ("colour", "legend"),
     [
         ("class", [f"{EVIL} 3", "alone 1", "egg 3"]),
-        ("column age", ["50 1", "51 1", "52 1", "53 1", "54 1", "55 1", "not known 1"]),
+        ("column age", ["50 1", "51 1", "52 1", "53 1", "54 1", "55 1", "unknown 1"]),
         (f"column {EVIL}", ["x 4", "y 3"]),
         ("cluster", None),
     ],
@@ -450,7 +450,7 @@ def test_repairs_are_told(retrieval: Visit) -> None:
     retrieval.page.locator("#repaired a").click()
     retrieval.wait_until(lambda: retrieval.name() == NAMES[2])
     retrieval.page.locator("#close").click()
-    assert "nothing had to be done" in retrieval.open(0).locator("#facts").inner_text()
+    assert "no repair was needed" in retrieval.open(0).locator("#facts").inner_text()
 
 
 def test_search_and_filter(retrieval: Visit) -> None:

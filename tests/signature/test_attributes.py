@@ -101,5 +101,5 @@ def test_attributes_do_not_change_with_scale_or_place(box: Mesh, points: np.ndar
 
 @pytest.mark.parametrize("names", [("height",), ("depth", "depth")])
 def test_unknown_or_repeated_names_are_refused(names: tuple[str, ...]) -> None:
-    with pytest.raises(ValueError, match="attributes: expected different ones of depth, electrostatic_potential"):
+    with pytest.raises(ValueError, match="attributes: expected distinct names among depth, electrostatic_potential"):
         SignatureConfig(attributes=names)  # type: ignore[arg-type]

@@ -63,7 +63,7 @@ def test_approximation_tends_to_the_exact_result() -> None:
 def all_weights(surface: HatSurface, x: np.ndarray, ratio: float) -> np.ndarray:
     """(V, n) at points (3, n): series with a ratio of 0, the closed form with an infinite one."""
     weights = np.empty((len(surface.hats), x.shape[1]))
-    surface.weights(x, np.arange(len(weights)), ratio, weights)
+    surface.fill_weights(x, np.arange(len(weights)), ratio, weights)
     return weights
 
 
@@ -90,8 +90,8 @@ def test_far_rule_error_falls_with_the_third_power_in_a_flat_hat_and_the_second_
 @pytest.fixture
 def small_clusters(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that neighbours of a hat near a point are often in a cluster."""
-    monkeypatch.setattr(coordinates, "_GROUP", 4)
-    monkeypatch.setattr(far_field, "_LEAF", 2)
+    monkeypatch.setattr(coordinates, "_GROUP_SIZE", 4)
+    monkeypatch.setattr(far_field, "_LEAF_SIZE", 2)
 
 
 @pytest.mark.usefixtures("small_clusters")
@@ -164,8 +164,8 @@ def scaled_surface(mesh: Mesh) -> tuple[HatSurface, np.ndarray]:
 def test_a_box_sees_each_hat_once_and_none_that_is_near_in_a_cluster(ratio: float) -> None:
     surface, vertices = scaled_surface(torus(160, 60))
     n_hats = len(vertices)
-    tree = HatClusters.of(surface.hats, vertices)
-    sizes = [32 * 4**level for level in range(len(tree.first) - 1)]
+    tree = HatClusters.from_hats(surface.hats, vertices)
+    sizes = [32 * 4**level for level in range(len(tree.level_starts) - 1)]
     members = [np.arange(n_hats)[i : i + size] for size in sizes for i in range(0, n_hats, size)]
     assert len(sizes) > 2
     assert len(members) == len(tree.centres) == len(tree.radii) == len(tree.sums)
@@ -176,7 +176,7 @@ def test_a_box_sees_each_hat_once_and_none_that_is_near_in_a_cluster(ratio: floa
     n_clusters = 0
     points = np.random.default_rng(0).uniform(-0.7, 0.7, (12, 1, 3))
     for x in points + np.random.default_rng(1).uniform(-0.1, 0.1, (12, 32, 3)):
-        clusters, hats = tree.seen_from(x.T, ratio)
+        clusters, hats = tree.far_clusters(x.T, ratio)
         np.testing.assert_array_equal(hats, np.sort(hats))
         seen = np.concatenate([hats, *(members[cluster] for cluster in clusters)])
         np.testing.assert_array_equal(np.sort(seen), np.arange(n_hats))
@@ -220,7 +220,7 @@ def test_clusters_of_point_elements_leave_an_error_of_third_order() -> None:
         axis=1,
     )  # fmt: skip
     functions = rng.normal(size=(50, 3))
-    tree = HatClusters.of(hats, functions)
+    tree = HatClusters.from_hats(hats, functions)
     clusters = np.arange(2)
     errors = []
     for distance in (200.0, 400.0, 800.0):
@@ -241,8 +241,8 @@ def test_cluster_error_falls_with_the_third_power() -> None:
     """All clusters of one level together, seen from ever farther away, against the closed form of all faces."""
     surface, vertices = scaled_surface(bumpy_sphere(3))
     functions = smooth_functions(vertices)
-    tree = HatClusters.of(surface.hats, functions)
-    clusters = np.arange(tree.first[1])
+    tree = HatClusters.from_hats(surface.hats, functions)
+    clusters = np.arange(tree.level_starts[1])
     errors = []
     for distance in (2.0, 4.0, 8.0, 16.0):
         x = distance * surface.axes.T @ [[0.3], [-0.5], [-0.8]] / np.sqrt(0.98)

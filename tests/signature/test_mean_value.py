@@ -187,12 +187,12 @@ def test_weights_stay_within_their_memory(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(coordinates, "_BLOCK_BYTES", 7 * 8 * len(mesh[0]))
     sizes = []
 
-    def weights(surface: HatSurface, x: np.ndarray, hats: np.ndarray, ratio: float, out: np.ndarray) -> None:
+    def fill_weights(surface: HatSurface, x: np.ndarray, hats: np.ndarray, ratio: float, out: np.ndarray) -> None:
         sizes.append(out.shape)
         original(surface, x, hats, ratio, out)
 
-    original = HatSurface.weights
-    monkeypatch.setattr(HatSurface, "weights", weights)
+    original = HatSurface.fill_weights
+    monkeypatch.setattr(HatSurface, "fill_weights", fill_weights)
     mean_value_coordinates(*mesh, interior_points(mesh, 40))
     assert sizes == [(162, 7)] * 5 + [(162, 5)]
 
@@ -295,7 +295,7 @@ def test_finite_functions_may_sum_to_infinity() -> None:
 def test_weights_without_a_sum_raise() -> None:
     """A point in the plane of a single triangle sees nothing of it."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    with pytest.raises(ValueError, match="points: expected mean value weights with a sum"):
+    with pytest.raises(ValueError, match="points: expected mean value weights with a non-zero sum"):
         extend(vertices, np.array([[0, 1, 2]]), np.ones((3, 1)), np.array([[2.0, 2, 0]]))
 
 
@@ -305,7 +305,7 @@ def test_coarse_meshes_are_evaluated_more_accurately(monkeypatch: pytest.MonkeyP
     exact = extend(*mesh, functions, points)
 
     def error(few_vertices: int) -> float:
-        monkeypatch.setattr(coordinates, "_FEW_VERTICES", few_vertices)
+        monkeypatch.setattr(coordinates, "_MIN_FINE_VERTICES", few_vertices)
         return float(np.abs(extend(*mesh, functions, points, accuracy=1e-3, dtype=np.float64) - exact).max())
 
     assert 0 < error(643) < error(642) / 2

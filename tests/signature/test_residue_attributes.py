@@ -122,7 +122,7 @@ def test_many_points_in_blocks_are_as_few_at_once(monkeypatch: pytest.MonkeyPatc
     molecule = peptide("ASP", "ALA", "LYS", "TRP")
     values = np.arange(8.0).reshape(4, 2)
     whole = residue_means(molecule, points(50), values), screened_potential(molecule, points(50))
-    monkeypatch.setattr(module, "_BLOCK", 12)
+    monkeypatch.setattr(module, "_BLOCK_SIZE", 12)
     np.testing.assert_allclose(residue_means(molecule, points(50), values), whole[0])
     np.testing.assert_allclose(screened_potential(molecule, points(50)), whole[1])
 
@@ -133,7 +133,7 @@ def test_each_attribute_is_known_by_its_name() -> None:
         values = residue_attribute(molecule, points(), name)
         assert values.shape == ((7, len(RESIDUE_KINDS)) if name == "residue_shares" else (7,))
         assert np.isfinite(values).all()
-    with pytest.raises(ValueError, match=r"attributes: expected some of charge, .*, got 'colour'"):
+    with pytest.raises(ValueError, match=r"attributes: expected names among charge, .*, got 'colour'"):
         residue_attribute(molecule, points(), "colour")
 
 

@@ -178,7 +178,7 @@ def test_other_matrices_serve_where_the_cotangent_ones_fail(needles: Mesh, monke
     assert plain.notes == ()
     # What rounding leaves of the cotangent matrices' eigenpairs, by any solver, is far from that of the others'.
     limit = plain.residual / 10
-    monkeypatch.setattr("igps.signature.signature._RESIDUAL", limit)
+    monkeypatch.setattr("igps.signature.signature._MAX_RESIDUAL", limit)
     monkeypatch.setattr("igps.spectra.eigensolver.RESIDUAL_LIMIT", limit)
     signature = compute_signature(needles, CONFIG)
     (note,) = signature.notes
@@ -191,7 +191,7 @@ def test_other_matrices_serve_where_the_cotangent_ones_fail(needles: Mesh, monke
 
 
 def test_a_mesh_that_no_matrices_serve_is_refused(needles: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("igps.signature.signature._RESIDUAL", 1e-18)
+    monkeypatch.setattr("igps.signature.signature._MAX_RESIDUAL", 1e-18)
     monkeypatch.setattr("igps.spectra.eigensolver.RESIDUAL_LIMIT", 1e-18)
     with pytest.raises(ConvergenceError, match=r"needles: .* cotangent matrices .* intrinsic-Delaunay ones .*remesh"):
         compute_signature(needles, CONFIG)
@@ -222,7 +222,9 @@ def test_attributes_are_added_to_samples_and_nothing_else_changes(signature: Sig
 
 
 def test_too_few_vertices_say_so(blob: Mesh) -> None:
-    with pytest.raises(MeshError, match=r"blob: 642 vertices are too few for 641 eigenpairs.*lower n_eigenpairs"):
+    with pytest.raises(
+        MeshError, match=r"blob: expected at least 643 vertices for 641 eigenpairs, got 642.*lower n_eigenpairs"
+    ):
         compute_signature(blob, replace(CONFIG, n_eigenpairs=641))
 
 

@@ -114,8 +114,16 @@ def test_min_samples_refines_the_grid(blob: Mesh) -> None:
 def test_body_too_thin_for_the_grid() -> None:
     sheet = trimesh.creation.box((1, 1, 1e-3))
     sheet.vertices = sheet.vertices @ trimesh.transformations.rotation_matrix(0.4, [1, 2, 0])[:3, :3].T
-    with pytest.raises(MeshError, match="min_samples"):
+    with pytest.raises(MeshError, match="set min_samples to refine it"):
         interior_samples(as_mesh(sheet, "sheet"), resolution=2)
+
+
+def test_limits_of_the_grid_are_named(blob: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(voxels, "_MAX_RESOLUTION", 8)
+    with pytest.raises(MeshError, match=r"at least 1000 cells inside, got \d+ in a grid of 8 .*lower min_samples"):
+        interior_samples(blob, 4, min_samples=1000)
+    with pytest.raises(MeshError, match=r"resolution of at most 8 \(8 cells along the longest side, .* got 9\."):
+        interior_samples(blob, 9)
 
 
 @pytest.mark.parametrize("axis", range(3))

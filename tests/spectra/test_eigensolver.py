@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -120,8 +121,8 @@ def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     sphere.vertices *= 1, 0.8, 0.6
     stiffness, mass, positions = cotangent_problem(sphere)
     monkeypatch.setattr(threads, "n_cores", lambda: 8)
-    monkeypatch.setattr(lanczos, "TEAM_RESULT", 0)
-    monkeypatch.setattr(krylov, "COLUMNS_AT_ONCE", 100)
+    monkeypatch.setattr(lanczos, "MIN_TEAM_RESULT", 0)
+    monkeypatch.setattr(krylov, "PIECE_COLUMNS", 100)
     teams: list[int] = []
 
     class Watched(threads.Team):
@@ -151,7 +152,7 @@ def filled(vectors: np.ndarray, steps: list[Callable[[], None]]) -> np.ndarray:
 @pytest.mark.usefixtures("either_processor")
 def test_krylov_basis_keeps_its_promises(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """Orthonormal rows, a projection that is the operator's, residuals that are the vectors'; also when widened."""
-    monkeypatch.setattr(krylov, "COLUMNS_AT_ONCE", 100)  # the eigenvectors take many steps
+    monkeypatch.setattr(krylov, "PIECE_COLUMNS", 100)  # the eigenvectors take many steps
     stiffness, mass, positions = torus_problem
     matrix = sparse.csr_array(stiffness * mass.sum() / np.sqrt(mass)[:, None] / np.sqrt(mass))
     factors = analyse(matrix, positions).factorize(matrix, 300.0)
@@ -215,8 +216,8 @@ def test_a_large_basis_gives_its_place_to_the_eigenvectors(
     torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stiffness, mass, positions = torus_problem
-    monkeypatch.setattr(basis, "MOST_SINGLE_ENTRIES", 1000)
-    monkeypatch.setattr(krylov, "COLUMNS_AT_ONCE", 100)
+    monkeypatch.setattr(basis, "MAX_SINGLE_ENTRIES", 1000)
+    monkeypatch.setattr(krylov, "PIECE_COLUMNS", 100)
     monkeypatch.delattr(krylov.Krylov, "eigenvectors")  # which would need memory beside the basis
     spectrum = eigenpairs(stiffness, mass, 130, positions=positions)
     np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:131], rtol=1e-10)
@@ -297,7 +298,7 @@ def test_a_missed_pair_is_noticed_by_inertia(
         spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
     np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:81], rtol=1e-10)
     assert len(calls) >= 3
-    assert "eigenvalues found below" in caplog.text
+    assert re.search(r"found \d+ of \d+ eigenvalues below", caplog.text)
 
 
 def fail(*arguments: object) -> None:
@@ -328,7 +329,7 @@ def test_a_shift_below_the_spectrum_takes_over(
         spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
     np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:81], rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
-    assert "falling back to a shift below 0: on purpose" in caplog.text
+    assert "falling back to a shift below the spectrum: on purpose" in caplog.text
     assert "ARPACK" not in caplog.text
 
 
@@ -413,7 +414,7 @@ def test_two_components_are_counted_at_any_scale() -> None:
     two = trimesh.util.concatenate([one, one.copy().apply_translation([3, 0, 0])])
     for scale in (1e-6, 1, 1e6):
         stiffness, mass, _ = cotangent_problem(two)
-        with pytest.raises(ValueError, match="2 connected components"):
+        with pytest.raises(ValueError, match="expected 1 connected component, got 2"):
             eigenpairs(stiffness, mass * scale**2, 10)
 
 
@@ -421,7 +422,7 @@ def test_components_tied_by_rounding_alone_are_counted() -> None:
     stiffness, mass, _ = cotangent_problem(trimesh.creation.icosphere(subdivisions=1))
     both = sparse.lil_array(sparse.block_diag([stiffness, stiffness]))
     both[0, len(mass)] = both[len(mass), 0] = -1e-17
-    with pytest.raises(ValueError, match="2 connected components"):
+    with pytest.raises(ValueError, match="expected 1 connected component, got 2"):
         eigenpairs(sparse.csr_array(both), np.r_[mass, mass], 10)
 
 
@@ -440,26 +441,26 @@ def test_what_is_refused(torus_problem: Problem) -> None:
         eigenpairs(stiffness, mass, 0)
     with pytest.raises(ValueError, match=r"n_eigenpairs: expected a whole number, got 2\.5\."):
         eigenpairs(stiffness, mass, 2.5)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="ask for fewer eigenpairs"):
+    with pytest.raises(ValueError, match="Compute fewer eigenpairs"):
         eigenpairs(stiffness, mass, n_vertices - 1)
-    with pytest.raises(ValueError, match="stiffness has entries that are not finite"):
+    with pytest.raises(ValueError, match="stiffness: expected finite entries"):
         eigenpairs(broken, mass, 5)
     for bad in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match="mass must be finite and positive"):
+        with pytest.raises(ValueError, match="mass: expected finite positive entries"):
             eigenpairs(stiffness, changed(bad), 5)
-    with pytest.raises(ValueError, match="symmetric"):
+    with pytest.raises(ValueError, match="stiffness: expected a symmetric matrix"):
         eigenpairs(lopsided, mass, 5)
     with pytest.raises(ValueError, match="sum to zero"):
         eigenpairs(stiffness + sparse.diags_array(mass), mass, 5)
     with pytest.raises(ValueError, match="scipy sparse"):
         eigenpairs(stiffness.toarray(), mass, 5)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"mass \(V,\)"):
+    with pytest.raises(ValueError, match=r"expected \(V, V\) and \(V,\), got"):
         eigenpairs(stiffness, mass[1:], 5)
     with pytest.raises(ValueError, match="positions"):
         eigenpairs(stiffness, mass, 5, positions=positions[1:])
-    with pytest.raises(ValueError, match="pass -stiffness"):
+    with pytest.raises(ValueError, match="Pass -stiffness"):
         eigenpairs(-stiffness, mass, 5)
-    with pytest.raises(ValueError, match="not diagonal: lump it"):
+    with pytest.raises(ValueError, match=r"not diagonal\. Lump it"):
         eigenpairs(stiffness, abs(stiffness), 5)
     with pytest.raises(ValueError, match="not diagonal"):
         eigenpairs(stiffness, sparse.diags_array(mass).tocsr()[:, :-1], 5)

@@ -67,7 +67,7 @@ def eliminations(factors: Factors) -> list[np.ndarray]:
     """E of every node that has one."""
     structure, found = factors.tree.structure, []
     starts = structure.block_start
-    for node, n_own in enumerate(np.diff(structure.first)):
+    for node, n_own in enumerate(np.diff(structure.own_start)):
         block = factors.blocks[starts[node] : starts[node + 1]]
         found.append(block.reshape(n_own, -1)[:, n_own:] if n_own else block)
     return [elimination for elimination in found if elimination.size]
@@ -145,7 +145,7 @@ def test_subtrees_solved_side_by_side() -> None:
 @pytest.mark.parametrize("at_once", [50, 256])
 def test_subtrees_eliminated_side_by_side(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The five-point Laplacian of as large a grid, its inertia from its eigenvalues: a team changes no bit."""
-    monkeypatch.setattr(multifrontal, "AT_ONCE", at_once)
+    monkeypatch.setattr(multifrontal, "PIECE_SIZE", at_once)
     line = sparse.diags_array([[-1.0] * 142, [2.0] * 143, [-1.0] * 142], offsets=[-1, 0, 1])
     one = sparse.eye_array(143)
     matrix = sparse.csr_array(sparse.kron(line, one) + sparse.kron(one, line))
@@ -181,7 +181,7 @@ def test_coinciding_places_are_allowed() -> None:
 def test_a_separator_keeps_blocks_small() -> None:
     """On an n × n grid the root needs about n unknowns; a cut through the wrong place would need many more."""
     matrix, places = grid_matrix(40)
-    assert np.diff(analyse(matrix, places).structure.first)[-1] <= 1.5 * 40
+    assert np.diff(analyse(matrix, places).structure.own_start)[-1] <= 1.5 * 40
 
 
 def test_one_dissection_serves_other_values() -> None:
@@ -192,7 +192,7 @@ def test_one_dissection_serves_other_values() -> None:
     right = torch.ones(225, 1, dtype=torch.float64)
     thrice = structure.factorize(other, 0.3).solve(right)
     torch.testing.assert_close(thrice, structure.factorize(matrix, 0.1).solve(right) / 3, rtol=1e-9, atol=1e-12)
-    with pytest.raises(ValueError, match="dissect it anew"):
+    with pytest.raises(ValueError, match="Analyse it anew"):
         structure.factorize(grid_matrix(16)[0])
 
 
@@ -212,7 +212,7 @@ def test_arguments_are_left_alone() -> None:
 
 def test_what_is_refused() -> None:
     matrix, places = grid_matrix(6)
-    with pytest.raises(ValueError, match="must store entry"):
+    with pytest.raises(ValueError, match="got an asymmetric pattern"):
         analyse(sparse.csr_array(sparse.triu(matrix)), places)
     with pytest.raises(ValueError, match="diagonal"):
         analyse(sparse.csr_array(matrix - sparse.diags_array(matrix.diagonal())), places)

@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from igps.spectra._pivots import AT_ONCE, Scratch, invert_front
+from igps.spectra._pivots import STEP, Scratch, invert_front
 
 
 def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:
     """What the loops say of a pivot block: its negative eigenvalues, and its inverse."""
     n = len(matrix)
-    width = -(-n // AT_ONCE) * AT_ONCE
+    width = -(-n // STEP) * STEP
     front = np.full((n, n + 3), np.nan)
     front[:, :n] = np.triu(matrix)
     squares = [np.full(n * width, np.nan) for _ in range(3)]
-    strips = [np.full(AT_ONCE * (width + AT_ONCE), np.nan) for _ in range(2)]
+    strips = [np.full(STEP * (width + STEP), np.nan) for _ in range(2)]
     scratch = Scratch(np.empty(0, dtype=np.int64), front.ravel(), *squares, *strips)
-    return invert_front(scratch, n, n + 3, width), scratch.pivot.reshape(n, width)[:, :n]
+    return invert_front(scratch, n, n + 3, width), scratch.inverse.reshape(n, width)[:, :n]
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 8, 9, 26, 63, 120])

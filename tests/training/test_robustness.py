@@ -136,7 +136,7 @@ def test_too_little_is_refused(tmp_path: Path) -> None:
     meshes = [write_egg(tmp_path / name, 1.5, 2) for name in ("a.off", "b.off")]
     with pytest.raises(ValueError, match=r"dataset: expected at least two meshes, .* or a gallery"):
         run(tmp_path, meshes[:1], Root())
-    with pytest.raises(ValueError, match="descriptors: expected one of each name, got several of root"):
+    with pytest.raises(ValueError, match="descriptors: expected different names, got root more than once"):
         run(tmp_path, meshes, Root(), Root())
     with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 20"):
         run(tmp_path, meshes, descriptor("interior"))

@@ -106,8 +106,14 @@ def test_training_stops_when_validation_no_longer_improves(root: Path, tmp_path:
     [
         ("evaluate checkpoint none.ckpt", "No such file or directory: 'none.ckpt'"),
         ("evaluate checkpoint text.ckpt", "text.ckpt: expected a checkpoint, got another or a damaged file."),
-        ("train test --root ROOT --ckpt_path none.ckpt", "ckpt_path: expected a checkpoint, there is no none.ckpt."),
-        ("train fit --root ROOT --ckpt_path none.ckpt", "ckpt_path: expected a checkpoint, there is no none.ckpt."),
+        (
+            "train test --root ROOT --ckpt_path none.ckpt",
+            "ckpt_path: expected a checkpoint, got none.ckpt, which does not exist.",
+        ),
+        (
+            "train fit --root ROOT --ckpt_path none.ckpt",
+            "ckpt_path: expected a checkpoint, got none.ckpt, which does not exist.",
+        ),
         ("classify ROOT --checkpoint none.ckpt", "No such file or directory: 'none.ckpt'"),
     ],
 )

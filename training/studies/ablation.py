@@ -1,4 +1,4 @@
-"""What each learned part gives: bins, spectral filter, dimensions and head, over several seeded splits."""
+"""Ablation of the learned parts: bins, spectral filter, dimensions and head, over several seeded splits."""
 
 import logging
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from igps.nn.learner import RetrievalLearner
 from training.studies.learning import Row, score
 
 HEADS: tuple[Row, ...] = ("none", "whitened", "kernel")
-# Dimensions, and whether bins and spectral filter are learned.
+# Dimensions, whether bins are learned, and whether the spectral filter is learned.
 ROWS = (
     ("interior", False, False),
     ("interior", True, False),
@@ -44,17 +44,17 @@ def ablate(
     cache_dir: Path | None = None,
     dimensions: Sequence[str] = ("interior", "euclidean", "oriented"),
 ) -> None:
-    """FT of each head on each descriptor, trained or not: mean ± standard deviation over splits.
+    """Print FT of each head on each descriptor, trained or not: mean ± standard deviation over splits.
 
     Args:
         root: labelled collection; every class is split.
         n_train: shapes of each class to train on.
-        n_splits: how many splits, with the seeds from `first_seed` on.
-        first_seed: see n_splits.
-        n_epochs: of training bins and filters.
-        n_training_samples: of each shape in training, drawn anew at each step.
+        n_splits: number of splits, with consecutive seeds.
+        first_seed: seed of the first split.
+        n_epochs: epochs of training of bins and filters.
+        n_training_samples: samples of each shape in training, drawn at each step.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
-        dimensions: which rows, by their first word.
+        dimensions: rows of the table, by their first word.
     """
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
     config = layout("oriented", False, False, n_training_samples).requirements.apply_to(igps.SignatureConfig())
@@ -62,7 +62,7 @@ def ablate(
     for name, bins, spectrum in ROWS:
         if name not in dimensions:
             continue
-        found: dict[str, list[float]] = {head: [] for head in HEADS}
+        ft: dict[str, list[float]] = {head: [] for head in HEADS}
         for seed in range(first_seed, first_seed + n_splits):
             seed_everything(seed, verbose=False)
             data = SignatureDataModule(root, "seen", n_train, 0, split_seed=seed, config=config, cache_dir=cache_dir)
@@ -73,14 +73,20 @@ def ablate(
             histograms = describe(data.dataset, descriptor.eval()).flatten(1)
             for head in HEADS:
                 scores = score(histograms, data.dataset.labels, data.split, head, descriptor.part_cells)
-                found[head].append(100 * scores["ft"])
-        learned = " + ".join(part for part, on in (("bins", bins), ("spectrum", spectrum)) if on) or "nothing"
-        cells = "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in found.values())
+                ft[head].append(100 * scores["ft"])
+        learned = (
+            " + ".join(part for part, is_learned in (("bins", bins), ("spectrum", spectrum)) if is_learned) or "nothing"
+        )
+        cells = "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in ft.values())
         print(f"{name:<14}{learned:<16}{cells}", flush=True)
 
 
 def layout(dimensions: str, bins: bool, spectrum: bool, n_training_samples: int) -> HistogramDescriptor:
-    """Interior distance and potential alone; with Euclidean distance; and with how samples lie to the surface too."""
+    """Return the descriptor of a row.
+
+    "interior" has interior distance and potential, "euclidean" adds Euclidean distance, and "oriented" adds angles to
+    the surface, too.
+    """
 
     def histogram(*axes: Any) -> PairHistogram:
         embedding = SpectralEmbedding(n_eigenpairs=50, n_knots=12 if spectrum else 0)

@@ -1,4 +1,4 @@
-"""Descriptions of meshes to which something was done before, on many processes."""
+"""Descriptions of altered meshes, on many processes."""
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
@@ -16,10 +16,10 @@ from igps.nn.descriptor import Descriptor
 from igps.signature.signature import compute_signature
 
 Way = Callable[[Mesh], Mesh]
-"""Does something to a mesh; picklable."""
+"""Alters a mesh; picklable."""
 
 Answer = Singles | str
-"""What a descriptor says of a body, or why it says nothing."""
+"""The description of a body, or the reason why there is none."""
 
 
 def describe_altered(
@@ -29,39 +29,37 @@ def describe_altered(
     *,
     n_workers: int | None = None,
 ) -> list[dict[str, dict[str, Answer]]]:
-    """Of each mesh, by each way, what each descriptor says.
-
-    What fails of one costs no other its answer.
+    """Describe each mesh after each alteration by each descriptor; failures do not affect other descriptions.
 
     Args:
-        dataset: N meshes, their signatures with all that the descriptors need.
-        ways: by name; None leaves the mesh as it is and takes its signature from the cache.
-        descriptors: by whose names the answers are called.
-        n_workers: processes; all cores if None.
+        dataset: N meshes, with signatures that meet the requirements of the descriptors.
+        ways: alterations by name; None leaves the mesh unchanged and takes its signature from the cache.
+        descriptors: descriptors with distinct names.
+        n_workers: number of processes; all cores if None.
 
     Returns:
-        N dicts: by way, by descriptor, the description or the reason why there is none.
+        N dicts: by alteration and by name of the descriptor, the description or the reason why there is none.
     """
     jobs = [(dataset.subset([i]), way, descriptors) for i in range(len(dataset)) for way in ways.values()]
-    places = [(i, name) for i in range(len(dataset)) for name in ways]
-    found: list[dict[str, dict[str, Answer]]] = [{} for _ in range(len(dataset))]
+    keys = [(i, name) for i in range(len(dataset)) for name in ways]
+    answers: list[dict[str, dict[str, Answer]]] = [{} for _ in range(len(dataset))]
     outcomes = run(_describe, jobs, n_workers=n_workers)
     with tqdm(total=len(jobs), desc="altered meshes") as bar, contextlib.closing(outcomes):
         for number, outcome in outcomes:
             bar.update()
-            i, name = places[number]
+            i, name = keys[number]
             if isinstance(outcome, Failed):
-                found[i][name] = dict.fromkeys((one.name for one in descriptors), outcome.reason)
+                answers[i][name] = dict.fromkeys((x.name for x in descriptors), outcome.reason)
             else:
-                found[i][name] = outcome
-    return found
+                answers[i][name] = outcome
+    return answers
 
 
 def _describe(job: tuple[SignatureDataset, Way | None, Sequence[Descriptor]]) -> dict[str, Answer]:
-    """What descriptors say of the one mesh of a dataset, after something was done to it."""
+    """Describe the only mesh of a dataset after an alteration."""
     dataset, way, descriptors = job
     if way is None:
-        batch = dataset.batch([0], meshes=any(one.requirements.mesh for one in descriptors))
+        batch = dataset.batch([0], meshes=any(x.requirements.mesh for x in descriptors))
     else:
         mesh = way(dataset.mesh(0))
         batch = collate([compute_signature(mesh, dataset.config)], [mesh])
@@ -70,10 +68,10 @@ def _describe(job: tuple[SignatureDataset, Way | None, Sequence[Descriptor]]) ->
         try:
             with one_thread(), torch.inference_mode():
                 description = descriptor(batch)[0].numpy()
-            finite = bool(np.isfinite(description).all())
-            answers[descriptor.name] = description if finite else "the description has entries that are not finite."
+            is_finite = bool(np.isfinite(description).all())
+            answers[descriptor.name] = description if is_finite else "the description has entries that are not finite."
         except ValueError as error:
             answers[descriptor.name] = str(error)
-        except Exception as error:  # of one descriptor, that must not stop the others
+        except Exception as error:  # one descriptor must not stop the others
             answers[descriptor.name] = f"{type(error).__name__}: {error}"
     return answers

@@ -1,4 +1,4 @@
-"""Measure what the distances of `pretrained` mean, on generated bodies that it was not fitted to."""
+"""Calibrate the distances of `pretrained` on generated bodies to which it was not fitted."""
 
 import math
 from dataclasses import replace
@@ -29,10 +29,10 @@ from training.studies.individuals import generated
 from training.studies.thresholds import quantiles, threshold_at, threshold_between
 
 SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj", "longer": ".off"}
-"""Of the files: what was done to the body, and the format. What was made longer is no copy."""
+"""Suffixes of the files by alteration. Lengthened bodies are not copies."""
 
 LENGTHENED = 0.02
-"""By how much of √area."""
+"""Length by which bodies are lengthened, as a share of √area."""
 
 
 def calibrate(
@@ -52,13 +52,13 @@ def calibrate(
 
     Args:
         root: folder of the generated meshes.
-        copies: folder of the copies that are made of them; those that are there stay.
-        n_classes, seed: of `GradedShapes`, four bodies of a class and four poses of a body.
+        copies: folder of their copies; existing files are kept.
+        n_classes, seed: arguments of `GradedShapes`, with four bodies of a class and four poses of a body.
         n_copied: bodies of each class to copy.
-        rate: of false pairs among poses of bending bodies and bodies of one class, at most.
-        pose_rate: of false pairs among bodies of one class where poses are the same, at most.
-        model: the parameters of `pretrained`.
-        out: the calibration.
+        rate: largest rate of false pairs among poses of bending bodies and bodies of one class.
+        pose_rate: largest rate of false pairs among bodies of one class if poses count as the same.
+        model: file with the parameters of `pretrained`.
+        out: file of the calibration.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
         n_workers: processes; all cores if not given.
     """
@@ -67,7 +67,7 @@ def calibrate(
     shapes = generated(bodies_in_poses, root, descriptor, cache_dir, n_workers)
     bodies = np.array([body_of(name) for name in shapes.bodies.names])
     classes = np.array(shapes.bodies.labels)
-    is_rigid = np.isin(classes, _still(bodies_in_poses))
+    is_rigid = np.isin(classes, _rigid_classes(bodies_in_poses))
 
     made = _copies(shapes, copies, n_copied, seed)
     copied = igps.SignatureDataset([path for _, _, path in made], shapes.config, cache_dir)
@@ -75,11 +75,11 @@ def calibrate(
     for failure in failures:
         print(failure.error)
     failed = {failure.path for failure in failures}
-    made = [one for one in made if one[2] not in failed]
+    made = [copy for copy in made if copy[2] not in failed]
     copied, originals = copied.usable(failures), [i for i, _, _ in made]
     is_copy = np.array([way != "longer" for _, way, _ in made])
 
-    described, of_copies = (describe(one, descriptor, n_workers=n_workers) for one in (shapes, copied))
+    described, of_copies = (describe(data, descriptor, n_workers=n_workers) for data in (shapes, copied))
     with torch.inference_mode():
         distances = descriptor.distances(described, described).numpy()
         to_copies = descriptor.distances(described[originals], of_copies).diagonal().numpy()[is_copy]
@@ -92,18 +92,19 @@ def calibrate(
     by_kind |= {kind: distances[pairs] for kind, pairs in of_kind.items()}
     near = 2 * float(by_kind["copies"].max())
 
-    surfaces, surfaces_of_copies = (_Measured(one, n_workers) for one in (shapes, copied))
+    surfaces, surfaces_of_copies = (_Measured(data, n_workers) for data in (shapes, copied))
 
-    def among(chosen: Booleans) -> list[_Pair]:
+    def pairs_of_shapes(chosen: Booleans) -> list[_Pair]:
         return [(surfaces, i[k], surfaces, j[k]) for k in np.flatnonzero(chosen)]
 
-    def of_made(chosen: Booleans) -> list[_Pair]:
+    def pairs_with_copies(chosen: Booleans) -> list[_Pair]:
         return [(surfaces, originals[n], surfaces_of_copies, n) for n in np.flatnonzero(chosen).tolist()]
 
-    # The hard ones tell the rate: other poses of bodies that bend, and other bodies of the class.
-    others = among(of_kind["poses"] | of_kind["bodies"])
-    pairs = of_made(is_copy) + among(rigid_poses), others, of_made(~is_copy)
-    of_same, of_others, of_longer = (_apart(some, n_workers) for some in pairs)
+    # The rate of false pairs is that of the hard ones: other poses of bending bodies, and other bodies of the class
+    same = pairs_with_copies(is_copy) + pairs_of_shapes(rigid_poses)
+    others = pairs_of_shapes(of_kind["poses"] | of_kind["bodies"])
+    longer = pairs_with_copies(~is_copy)
+    of_same, of_others, of_longer = (_surface_distances(pairs, n_workers) for pairs in (same, others, longer))
     of_different = np.concatenate([of_others, of_longer])
 
     calibration = Calibration(
@@ -123,20 +124,21 @@ def calibrate(
     _print(calibration, of_same, of_others, of_longer, [way for _, way, _ in made if way != "longer"], to_copies)
 
 
-def _still(shapes: GradedShapes) -> list[str]:
-    """The classes whose bodies do not bend: in the first pose of the first nothing has moved."""
-    found = []
+def _rigid_classes(shapes: GradedShapes) -> list[str]:
+    """Return the classes whose bodies do not bend: the first pose of the first body is its shape at rest."""
+    rigid = []
     for number, name in enumerate(shapes.class_names):
         pose = shapes.pose(number * shapes.n_bodies * shapes.n_poses)
         if np.abs(pose.bent - pose.rest).max() < 1e-6 * np.ptp(pose.rest, axis=0).max():
-            found.append(name)
-    return found
+            rigid.append(name)
+    return rigid
 
 
 def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: int) -> list[tuple[int, str, Path]]:
-    """Of the first pose of bodies, one copy by all ways at once, one by one of them, and what is longer.
+    """Copy the first pose of bodies: by all alterations at once, by one of them, and lengthened.
 
-    Which shape, way and file.
+    Returns:
+        The index of the shape, the alteration and the file of each copy.
     """
     first: dict[str, int] = {}
     for i, name in enumerate(shapes.bodies.names):
@@ -168,7 +170,7 @@ def _copy(mesh: Mesh, way: str, seed: int) -> Mesh:
 
 
 def _lengthened(mesh: Mesh, seed: int) -> Mesh:
-    """What lies beyond a plane across it moves away from the plane; what the plane cuts is stretched."""
+    """Move the part beyond a random plane away from it; triangles that the plane cuts are stretched."""
     random = np.random.default_rng(seed)
     normal = random.normal(size=3)
     normal /= np.linalg.norm(normal)
@@ -178,7 +180,7 @@ def _lengthened(mesh: Mesh, seed: int) -> Mesh:
 
 
 class _Measured:
-    """Samples and coarseness of surfaces, each taken once."""
+    """Samples and coarseness of surfaces, computed once."""
 
     def __init__(self, dataset: igps.SignatureDataset, n_workers: int | None) -> None:
         surfaces = Surfaces(dataset)
@@ -189,15 +191,15 @@ class _Measured:
 _Pair = tuple[_Measured, int, _Measured, int]
 
 
-def _apart(pairs: list[_Pair], n_workers: int | None) -> Floats:
-    """(N, 2) how far apart the surfaces of pairs are; and that over what their levels of detail leave open."""
+def _surface_distances(pairs: list[_Pair], n_workers: int | None) -> Floats:
+    """Return distances between the surfaces of pairs, and the same over the larger coarseness, (N, 2)."""
 
-    def one(pair: _Pair) -> tuple[float, float]:
+    def measure(pair: _Pair) -> tuple[float, float]:
         first, i, second, j = pair
-        apart = distance_if_alike(first.samples[i], second.samples[j])
-        return apart, apart / max(first.coarseness[i], second.coarseness[j], FINEST)
+        distance = distance_if_alike(first.samples[i], second.samples[j])
+        return distance, distance / max(first.coarseness[i], second.coarseness[j], FINEST)
 
-    return np.array(list(on_threads(one, pairs, n_workers)))
+    return np.array(list(on_threads(measure, pairs, n_workers)))
 
 
 def _print(
@@ -210,18 +212,18 @@ def _print(
 ) -> None:
     print(calibration.made_of)
     for way in SUFFIXES:
-        rows = np.array([k for k, of in enumerate(ways) if of == way], dtype=np.int64)
+        rows = np.array([k for k, name in enumerate(ways) if name == way], dtype=np.int64)
         if len(rows):
             surfaces, detail = same[rows].max(axis=0)
             largest = (
                 f"distance ≤ {to_copies[rows].max():.4f}, surfaces ≤ {surfaces:.2%}, {detail:.1f} times coarseness"
             )
             print(f"{way:>10}: {len(rows)} copies, {largest}")
-    for name, found in (("poses of rigid bodies", same[len(ways) :]), ("others", others), ("longer", longer)):
+    for name, distances in (("poses of rigid bodies", same[len(ways) :]), ("others", others), ("longer", longer)):
         for column, unit in enumerate(("of √area", "times coarseness")):
             levels = 0, 0.001, 0.01, 0.1, 0.5, 0.99, 1
-            few = ", ".join(f"{one:.4g}" for one in np.quantile(found[:, column], levels, method="higher"))
-            print(f"{name}: {len(found)}, {unit}: least, 0.1 %, 1 %, 10 %, 50 %, 99 %, largest: {few}")
+            row = ", ".join(f"{x:.4g}" for x in np.quantile(distances[:, column], levels, method="higher"))
+            print(f"{name}: {len(distances)}, {unit}: smallest, 0.1 %, 1 %, 10 %, 50 %, 99 %, largest: {row}")
     for kind in KINDS:
         print(f"{kind:>10}: {calibration.n_pairs[kind]} pairs, median {calibration.distances[kind][11]:.4f}")
     print(f"near {calibration.near:.4f}\nsame {calibration.same}\ndetail {calibration.detail}\npose {calibration.pose}")

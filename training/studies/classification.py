@@ -27,17 +27,17 @@ def classify(
     first_seed: int = 100,
     cache_dir: Path | None = None,
 ) -> None:
-    """Share of test shapes whose class is found by a `KernelHead`, mean ± standard deviation over splits.
+    """Print the accuracy of a `KernelHead` on test shapes, mean ± standard deviation over splits.
 
-    Of a descriptor with a metric, such as `pretrained`, that is the head's prior.
+    If the descriptor has a metric, as `pretrained` has, the metric is the prior of the head.
 
     Args:
         root: labelled collection.
-        descriptor: the features.
-        checkpoint: of train.py with protocol seen; its learned histograms are the features.
+        descriptor: name of the descriptor that gives the features.
+        checkpoint: checkpoint of train.py with protocol seen, whose learned histograms are the features.
         n_train: shapes of each class to train on.
-        n_splits: how many splits, with the seeds from `first_seed` on.
-        first_seed: see n_splits.
+        n_splits: number of splits, with consecutive seeds.
+        first_seed: seed of the first split.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
     prior: Head | None = None
@@ -47,7 +47,7 @@ def classify(
         dataset.precompute(strict=True)
         histograms, part_cells = describe(dataset, module, progress=True), part_cells_of(module)
         seeds = range(first_seed, first_seed + n_splits)
-        found = [split_seen(dataset.labels, n_train, seed=seed) for seed in seeds]
+        splits = [split_seen(dataset.labels, n_train, seed=seed) for seed in seeds]
         labels = dataset.labels
     else:
         learner = RetrievalLearner.load_from_checkpoint(checkpoint)
@@ -55,9 +55,9 @@ def classify(
         data.prepare_data()
         histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
         part_cells = learner.part_cells
-        # The validation part chose nothing here.
-        found = [Split(data.split.train + data.split.validation, (), data.split.test)]
-    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split, part_cells, prior) for split in found]
+        # The validation part was not used to choose anything here
+        splits = [Split(data.split.train + data.split.validation, (), data.split.test)]
+    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split, part_cells, prior) for split in splits]
     spread = stdev(accuracy) if len(accuracy) > 1 else 0.0
     print(f"accuracy {mean(accuracy):.1f} ± {spread:.1f} percent over {len(accuracy)} splits")
 

@@ -12,19 +12,21 @@ from training.graded import GradedShape, GradedShapes
 
 
 def contact_sheet(shapes: ArticulatedShapes | GradedShapes, path: str | Path, n_shown: int = 1) -> None:
-    """Save a picture of the first shapes of every class, all turned the same way.
+    """Save a picture of the first shapes of every class, all in the same orientation.
 
     Args:
         shapes: the generated benchmark.
         path: the PNG file.
-        n_shown: shapes of each class.
+        n_shown: number of shapes of each class.
 
     Raises:
         ValueError: `n_shown` is out of range.
     """
     n_per_class = len(shapes) // shapes.n_classes
     if not 1 <= n_shown <= n_per_class:
-        raise ValueError(f"n_shown: expected 1 to {n_per_class}, the shapes of a class, got {n_shown}. Ask for fewer.")
+        raise ValueError(
+            f"n_shown: expected 1 to {n_per_class}, the shapes of a class, got {n_shown}. Choose another number."
+        )
     chosen = [c * n_per_class + i for c in range(shapes.n_classes) for i in range(n_shown)]
     columns = min(len(chosen), max(4, math.ceil(math.sqrt(1.6 * len(chosen)))))
     rows = math.ceil(len(chosen) / columns)
@@ -34,7 +36,7 @@ def contact_sheet(shapes: ArticulatedShapes | GradedShapes, path: str | Path, n_
         shape = shapes[index]
         motion = shape.motion if isinstance(shape, GradedShape) else shape.rotation
         axis = figure.add_subplot(rows, columns, place)
-        # What mirrors a body turns its faces inside out
+        # A motion that mirrors turns the faces inside out
         faces = shape.faces if np.linalg.det(motion) > 0 else shape.faces[:, ::-1]
         paint(axis, shape.vertices @ motion @ view.T, faces, (0.55, 0.72, 0.95))
         axis.set_axis_off()

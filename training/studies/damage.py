@@ -1,4 +1,4 @@
-"""What damaged files cost: damaged meshes as queries against the gallery of their clean twins."""
+"""Retrieval with damaged files: damaged meshes as queries against the gallery of clean meshes."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -27,26 +27,26 @@ _CLEAN = "clean"
 
 @dataclass(frozen=True)
 class DamageResult:
-    """What one damage costs one descriptor."""
+    """The loss of one descriptor by one damage."""
 
-    n_given: int  # meshes that were damaged
-    # Means over the damaged meshes that could be described, each as a query of the clean others, fractions; none where
-    # no two of them are of one class
+    n_given: int  # number of damaged meshes
+    # Mean scores of the described damaged meshes, each as a query of the other clean meshes, from 0 to 1; empty if no
+    # two of them have the same class
     scores: Mapping[str, float]
-    clean: Mapping[str, float]  # the same of their clean twins
-    notes: Mapping[str, str]  # why others could not be described, by name
+    clean: Mapping[str, float]  # scores of the same meshes before the damage
+    notes: Mapping[str, str]  # why the other meshes could not be described, by name
 
     @property
     def usable(self) -> float:
-        """Share of the damaged meshes that could be described."""
+        """The share of the damaged meshes that could be described."""
         return 1 - len(self.notes) / self.n_given
 
     def loss(self, score: str) -> float:
-        """By how much a mean score is lower than that of the clean twins; NaN without scores."""
+        """Return the decrease of a mean score by the damage; NaN without scores."""
         return self.clean.get(score, np.nan) - self.scores.get(score, np.nan)
 
     def as_dict(self) -> dict[str, Any]:
-        """For a JSON file."""
+        """Return a dict for a JSON file."""
         return {
             "n_given": self.n_given,
             "usable": self.usable,
@@ -65,43 +65,42 @@ def damage(
     seed: int = 0,
     n_workers: int | None = None,
 ) -> dict[str, dict[str, DamageResult]]:
-    """Damage every mesh in every way of `DAMAGES`, mend it as a file would be, and query the clean others with it.
+    """Damage each mesh in each way, mend it as a file is mended, and query the other clean meshes with it.
 
     Args:
-        dataset: labelled clean meshes, their signatures with all that the descriptors need.
-        descriptors: to be measured.
-        damages: names; all if None.
+        dataset: labelled clean meshes, with signatures that meet the requirements of the descriptors.
+        descriptors: descriptors to measure.
+        damages: names in `DAMAGES`; all if None.
         mending: see `LoadOptions`.
-        seed: of the damages.
-        n_workers: processes; all cores if None.
+        seed: seed of the damages.
+        n_workers: number of processes; all cores if None.
 
     Returns:
-        By descriptor, by damage.
+        Results by name of the descriptor, then by damage.
 
     Raises:
-        ValueError: no classes, or an unknown damage.
+        ValueError: the dataset has no classes, or a damage is unknown.
     """
     if dataset.bodies.labels is None:
         raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
     names = list(damages or DAMAGES)
     if unknown := [name for name in names if name not in DAMAGES]:
         raise ValueError(f"damages: expected some of {', '.join(DAMAGES)}, got {unknown[0]!r}.")
-    least = dataset.config.n_vertices_read
-    ways: dict[str, Way | None] = {name: partial(damaged, name, seed, mending, least) for name in names}
-    found = describe_altered(dataset, {_CLEAN: None, **ways}, descriptors, n_workers=n_workers)
-    clean = [of[_CLEAN] for of in found]
-    spoiled = {name: [of[name] for of in found] for name in names}
+    least_vertices = dataset.config.n_vertices_read
+    ways: dict[str, Way | None] = {name: partial(damaged, name, seed, mending, least_vertices) for name in names}
+    answers = describe_altered(dataset, {_CLEAN: None, **ways}, descriptors, n_workers=n_workers)
+    clean = [row[_CLEAN] for row in answers]
     return {
-        one.name: {name: _result(one, dataset, clean, answers) for name, answers in spoiled.items()}
-        for one in descriptors
+        descriptor.name: {name: _result(descriptor, dataset, clean, [row[name] for row in answers]) for name in names}
+        for descriptor in descriptors
     }
 
 
 def damaged(name: str, seed: int, mending: Mending, least_vertices: int, mesh: Mesh) -> Mesh:
-    """The mesh damaged and mended again.
+    """Damage a mesh and mend it.
 
     Raises:
-        MeshError: it could not be mended.
+        MeshError: the damaged mesh cannot be mended.
     """
     vertices, faces = DAMAGES[name].apply(mesh, seed)
     return mend(vertices, faces, how=mending, least_vertices=least_vertices, name=f"{mesh.name} ({name})")
@@ -111,31 +110,30 @@ def _result(
     descriptor: Descriptor,
     dataset: SignatureDataset,
     clean: Sequence[Mapping[str, Answer]],
-    spoiled: Sequence[Mapping[str, Answer]],
+    altered: Sequence[Mapping[str, Answer]],
 ) -> DamageResult:
     labels = dataset.bodies.labels or ()
-    before, after = ([of[descriptor.name] for of in answers] for answers in (clean, spoiled))
+    before, after = ([row[descriptor.name] for row in answers] for answers in (clean, altered))
     notes = {
-        name: one if isinstance(one, str) else str(other)
-        for name, one, other in zip(dataset.bodies.names, before, after, strict=True)
-        if isinstance(one, str) or isinstance(other, str)
+        name: first if isinstance(first, str) else str(second)
+        for name, first, second in zip(dataset.bodies.names, before, after, strict=True)
+        if isinstance(first, str) or isinstance(second, str)
     }
-    kept = [i for i, name in enumerate(dataset.bodies.names) if name not in notes]
-    if len({labels[i] for i in kept}) == len(kept):
-        # Nothing is left, or nothing that could be found.
+    usable = [i for i, name in enumerate(dataset.bodies.names) if name not in notes]
+    if len({labels[i] for i in usable}) == len(usable):  # no query has a relevant mesh
         return DamageResult(len(dataset), {}, {}, notes)
-    gallery, queries = (torch.from_numpy(np.stack([answers[i] for i in kept])) for answers in (before, after))
+    gallery, queries = (torch.from_numpy(np.stack([answers[i] for i in usable])) for answers in (before, after))
     scores = []
-    for one in (queries, gallery):
+    for descriptions in (queries, gallery):
         with torch.inference_mode(), one_thread():
-            distances = torch.cat([descriptor.distances(row[None], gallery) for row in one])
-        # Square: each query leaves out its own twin.
-        scores.append(retrieval_scores(distances, [labels[i] for i in kept]).mean())
+            distances = torch.cat([descriptor.distances(row[None], gallery) for row in descriptions])
+        # A square matrix: each query leaves out the mesh of its own index
+        scores.append(retrieval_scores(distances, [labels[i] for i in usable]).mean())
     return DamageResult(len(dataset), scores[0], scores[1], notes)
 
 
 def damage_table(results: Mapping[str, Mapping[str, DamageResult]]) -> str:
-    """One line a damage, of each descriptor the share of meshes described and the loss of NN and FT in points."""
+    """Format a table: the share of described meshes and the loss of NN and FT in points, by damage and descriptor."""
     names = list(results)
     damages = list(next(iter(results.values())))
     width = max(len(name) for name in damages)
@@ -143,15 +141,15 @@ def damage_table(results: Mapping[str, Mapping[str, DamageResult]]) -> str:
     lines.append(" " * width + "".join(f"{'used':>10}{'NN':>7}{'FT':>7}" for _ in names))
     notes = []
     for way in damages:
-        found = [results[name][way] for name in names]
-        cells = [f"{100 * one.usable:>9.0f}%{100 * one.loss('nn'):>7.1f}{100 * one.loss('ft'):>7.1f}" for one in found]
+        row = [results[name][way] for name in names]
+        cells = [f"{100 * x.usable:>9.0f}%{100 * x.loss('nn'):>7.1f}{100 * x.loss('ft'):>7.1f}" for x in row]
         lines.append(f"{way:<{width}}" + "".join(cells))
-        for name, one in zip(names, found, strict=True):
-            if one.notes:
-                first = next(iter(one.notes.values()))
-                notes.append(f"{name}, {way}: {len(one.notes)} of {one.n_given} missing; {first}")
+        for name, result in zip(names, row, strict=True):
+            if result.notes:
+                first = next(iter(result.notes.values()))
+                notes.append(f"{name}, {way}: {len(result.notes)} of {result.n_given} missing; {first}")
     lines.append(
-        "used: share of the damaged meshes that could be described; NN, FT: points lost against the clean twins"
+        "used: share of the damaged meshes that could be described; NN, FT: points lost against the clean meshes"
     )
     lines += [f"  {way}: {DAMAGES[way].description}" for way in damages]
     return "\n".join(lines + notes)
@@ -170,18 +168,18 @@ def damage_command(
 ) -> dict[str, Any]:
     """Damage clean meshes as scanners, modelling programs and converters do, and measure what that costs retrieval.
 
-    Every damaged mesh, mended as a file would be, queries the clean meshes but its own twin. The table tells the share
-    that could be described, and the loss of NN and FT against the clean twins in points of percent.
+    Each damaged mesh, mended as a file is mended, queries the clean meshes except its own. The table shows the share of
+    meshes that could be described, and how many points of percent NN and FT lose against queries with clean meshes.
 
     Args:
         root: labelled folder of clean meshes.
         descriptors: names, or package.module:NAME of your own.
-        damages: which of them; all if not given.
+        damages: names of damages; all if not given.
         mend_by: how the damaged meshes are mended.
-        every: take every so many of the meshes.
-        seed: of the damages.
+        every: use every n-th mesh only.
+        seed: seed of the damages.
         out: folder for damage.json.
-        n_workers: processes that compute; all cores if not given.
+        n_workers: number of processes; all cores if not given.
     """
     if every < 1:
         raise ValueError(f"every: expected at least 1, got {every}.")
@@ -189,13 +187,13 @@ def damage_command(
     files = find_bodies(root, labelled=True)
     files = files.subset(range(0, len(files), every))
     dataset, failures = signatures(files, chosen, n_workers=n_workers, **reading)
-    found = damage(dataset, chosen, damages=damages, mending=mend_by, seed=seed, n_workers=n_workers)
-    print(damage_table(found))
+    results = damage(dataset, chosen, damages=damages, mending=mend_by, seed=seed, n_workers=n_workers)
+    print(damage_table(results))
     for failure in failures:
         print(f"not used: {failure.error}")
     summary = {
-        "damages": {name: one.description for name, one in DAMAGES.items()},
-        "results": {name: {way: one.as_dict() for way, one in of.items()} for name, of in found.items()},
+        "damages": {name: kind.description for name, kind in DAMAGES.items()},
+        "results": {name: {way: x.as_dict() for way, x in row.items()} for name, row in results.items()},
         "config": dataset.config.as_dict(),
     }
     if out is not None:

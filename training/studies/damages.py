@@ -1,7 +1,7 @@
-"""What scanners, modelling programs and converters do to a surface: raw triangles that are no `Mesh` any more.
+"""Damages of surfaces by scanners, modelling programs and converters.
 
-Unlike the disturbances, which lead from body to body, these are for what reads and mends files. `DAMAGES` lists them
-with their usual strength.
+Disturbances turn a valid `Mesh` into another. Damages yield raw triangles that are not valid, to test the reading and
+mending of files. `DAMAGES` lists them with their usual strength.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,52 +18,53 @@ from igps.mesh.surface import area_vectors, compact, diagonal, face_areas, undir
 from igps.signature.voxels import interior_samples
 from training.studies import disturbances
 
-# Shares of the area that is missing and of the faces that are turned or doubled; over the diagonal, by how much halves
-# overlap, and the standard deviation of noise
+# Shares of the area that is missing, of faces that are turned, and of faces that are doubled; relative to the diagonal,
+# the overlap of halves and the standard deviation of noise
 _MISSING, _TURNED, _DOUBLED, _OVERLAP, _NOISE = 0.02, 1 / 3, 0.01, 0.02, 0.002
 _N_PATCHES, _N_FINS = 3, 30
 
 
 @dataclass(frozen=True)
 class Damage:
-    """Something that a surface may suffer."""
+    """A damage of a surface."""
 
-    description: str  # what is done, and how much of it
-    apply: Callable[[Mesh, int], Surface]  # does it to a mesh, given a seed
+    description: str  # kind and strength of the damage
+    apply: Callable[[Mesh, int], Surface]  # damages a mesh, given a seed
 
 
 def holes(mesh: Mesh, seed: int = 0) -> Surface:
-    """Without a share of the area, in round patches of one size about random places."""
+    """Remove a share of the area, in round patches of equal size around random places."""
     return _with_holes(mesh.vertices, mesh.faces, np.random.default_rng(seed))
 
 
 def soup(mesh: Mesh, seed: int = 0) -> Surface:
-    """Every triangle with corners of its own, in single precision, in random order, as in an STL file."""
+    """Give each triangle separate corners, in single precision and in random order, as in an STL file."""
     return _as_soup(mesh.vertices, mesh.faces, np.random.default_rng(seed))
 
 
 def turned(mesh: Mesh, seed: int = 0) -> Surface:
-    """A random share of the faces inside out."""
+    """Turn a random share of the faces inside out."""
     return mesh.vertices.copy(), _with_turned(mesh.faces, np.random.default_rng(seed))
 
 
 def fins(mesh: Mesh, seed: int = 0) -> Surface:
-    """Triangles that stand on edges of the surface by a hundredth of the diagonal, and a share of the faces twice."""
+    """Add triangles that stand on edges, as high as a hundredth of the diagonal, and double a share of the faces."""
     return _with_fins(mesh.vertices, mesh.faces, np.random.default_rng(seed))
 
 
 def parts(mesh: Mesh, seed: int = 0) -> Surface:
-    """With a ball that floats where the body is thickest, half as wide as fits, and a speck outside.
+    """Add a floating ball inside, where the body is thickest, with half the radius that fits, and a speck outside.
 
-    The speck is a ball of a thousandth of the area, a tenth of the diagonal away from the bounding box.
+    The speck is a ball with a thousandth of the area, at 0.6 diagonals from the centre of the bounding box.
     """
     return _with_parts(mesh.vertices, mesh.faces, np.random.default_rng(seed), mesh)
 
 
 def halves(mesh: Mesh, seed: int = 0) -> Surface:
-    """Two closed halves that overlap, cut across the longest extent of the body at its centre, whatever the seed.
+    """Cut the body across its longest extent into two closed, overlapping halves; the seed is not used.
 
-    A MeshError where manifold3d does not take the mesh.
+    Raises:
+        MeshError: manifold3d does not accept the mesh.
     """
     import manifold3d
 
@@ -81,13 +82,13 @@ def halves(mesh: Mesh, seed: int = 0) -> Surface:
 
 
 def noise(mesh: Mesh, seed: int = 0) -> Surface:
-    """Every vertex moved along its normal by a random length."""
+    """Move each vertex along its normal by a random length."""
     noisy = disturbances.noise(mesh, _NOISE, seed)
     return noisy.vertices.copy(), noisy.faces.copy()
 
 
 def everything(mesh: Mesh, seed: int = 0) -> Surface:
-    """All of the above at once; a MeshError where manifold3d does not take the mesh."""
+    """Apply all of the above; a MeshError if manifold3d does not accept the mesh."""
     generator = np.random.default_rng(seed)
     vertices, faces = halves(disturbances.noise(mesh, _NOISE, seed))
     vertices, faces = _with_holes(vertices, faces, generator)
@@ -115,13 +116,13 @@ def _with_holes(vertices: Floats, faces: Integers, generator: np.random.Generato
     pairs, _ = undirected_edges(faces, len(vertices))
     length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
     graph = sparse.csr_array((np.maximum(length, 1e-300), tuple(pairs.T.astype(np.int32))), shape=(len(vertices),) * 2)
-    left = np.ones(len(faces), dtype=bool)
+    is_kept = np.ones(len(faces), dtype=bool)
     for _ in range(_N_PATCHES):
-        middle = generator.choice(len(area), p=area * left / (area * left).sum())
+        middle = generator.choice(len(area), p=area * is_kept / (area * is_kept).sum())
         away = dijkstra(graph, directed=False, indices=faces[middle]).mean(axis=0)[faces].mean(axis=1)
-        order = np.argsort(np.where(left, away, np.inf), kind="stable")
-        left[order[: max(int((np.cumsum(area[order]) <= per_patch).sum()), 1)]] = False
-    return compact(vertices, faces[left])
+        order = np.argsort(np.where(is_kept, away, np.inf), kind="stable")
+        is_kept[order[: max(int((np.cumsum(area[order]) <= per_patch).sum()), 1)]] = False
+    return compact(vertices, faces[is_kept])
 
 
 def _as_soup(vertices: Floats, faces: Integers, generator: np.random.Generator) -> Surface:
@@ -165,7 +166,7 @@ def _with_parts(vertices: Floats, faces: Integers, generator: np.random.Generato
 
 
 def _deepest_ball(mesh: Mesh) -> tuple[Floats, float]:
-    """The interior sample farthest from the surface's vertices and middles of faces, and half that distance."""
+    """Return the interior sample farthest from vertices and face centres, and half that distance."""
     points = interior_samples(mesh, min_samples=1)
     surface = np.vstack([mesh.vertices, mesh.vertices[mesh.faces].mean(axis=1)])
     away, _ = cKDTree(surface).query(points)

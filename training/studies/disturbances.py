@@ -1,7 +1,7 @@
-"""What may happen to a mesh on its way to a descriptor: noise, resampling, welds, holes, lost limbs, scale and motion.
+"""Disturbances of meshes: noise, resampling, welds, holes, lost limbs, scale and motion.
 
-Each function returns a new, checked `Mesh` and says in its notes what was done. `DISTURBANCES` lists those that
-descriptors are tried against, with the strength that is usual here.
+Each function returns a new, checked `Mesh` whose notes state the change. `DISTURBANCES` lists those of the study of
+robustness, with their usual strength.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,17 +24,17 @@ from training.studies.weld import weld_gap
 class Disturbance:
     """A change of the mesh that should change a description little."""
 
-    description: str  # what is done, and how much of it
-    apply: Callable[[Mesh], Mesh]  # does it
+    description: str  # kind and strength of the change
+    apply: Callable[[Mesh], Mesh]
 
 
 def noise(mesh: Mesh, amplitude: float = 0.005, seed: int = 0) -> Mesh:
-    """Move every vertex along its normal by a normal random length.
+    """Move each vertex along its normal by a normally distributed length.
 
     Args:
         mesh: the body.
         amplitude: standard deviation of that length over the diagonal of the bounding box.
-        seed: of the lengths.
+        seed: seed of the lengths.
 
     Raises:
         ValueError: `amplitude` is not positive.
@@ -48,7 +48,7 @@ def noise(mesh: Mesh, amplitude: float = 0.005, seed: int = 0) -> Mesh:
 
 
 def simplified(mesh: Mesh, share: float) -> Mesh:
-    """`simplify` to a share of the vertices.
+    """Simplify a mesh to a share of its vertices, see `simplify`.
 
     Raises:
         MeshError: the share cannot be reached.
@@ -58,14 +58,14 @@ def simplified(mesh: Mesh, share: float) -> Mesh:
 
 
 def remesh(mesh: Mesh) -> Mesh:
-    """The surface with other triangles, as many as before and of more even size.
+    """Replace the triangles by as many others, of more even size.
 
-    Every triangle is cut into four at the middles of its sides; then the shortest edge is replaced by its middle until
-    the number of faces is the old one; then the vertices are put back onto the old surface, each to the nearest point.
-    No step changes the topology.
+    Each triangle is cut into four at the midpoints of its sides. Then the shortest edges are collapsed to their
+    midpoints, one by one, until the number of faces is the old one. Finally, vertices are projected to the nearest
+    points of the old surface. No step changes the topology.
 
     Raises:
-        MeshError: the old number of faces is out of reach.
+        MeshError: the old number of faces cannot be reached.
     """
     import igl
 
@@ -75,8 +75,8 @@ def remesh(mesh: Mesh) -> Mesh:
     )
     if len(faces) > len(mesh.faces):
         raise MeshError(
-            f"{mesh.name}: could not be remeshed with {len(mesh.faces)} faces without changing its topology "
-            f"({len(faces)} were reached)."
+            f"{mesh.name}: could not be remeshed with {len(mesh.faces)} faces without a change of topology "
+            f"(got {len(faces)})."
         )
     _, _, vertices = igl.point_mesh_squared_distance(
         np.asfortranarray(vertices), np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces)
@@ -85,18 +85,18 @@ def remesh(mesh: Mesh) -> Mesh:
 
 
 def hole(mesh: Mesh, share: float = 0.01, seed: int = 0) -> Mesh:
-    """Take a patch out of the surface: the faces nearest along the surface to a random one.
+    """Remove a patch from the surface: the faces geodesically nearest to a random face.
 
     Args:
         mesh: the body.
-        share: of the area, at most; halved until the patch does not cut the surface in two.
-        seed: of the middle of the patch.
+        share: largest share of the area; halved until the patch does not cut the surface in two.
+        seed: seed of the random face.
 
     Returns:
         An open mesh.
 
     Raises:
-        ValueError: `share` out of range.
+        ValueError: `share` is out of range.
     """
     _check_share(share)
     area = face_areas(mesh.vertices, mesh.faces)
@@ -117,18 +117,18 @@ def hole(mesh: Mesh, share: float = 0.01, seed: int = 0) -> Mesh:
 
 
 def clip(mesh: Mesh, share: float = 0.1) -> Mesh:
-    """Cut off the end that is farthest from the middle, and close the cut with a flat cap.
+    """Cut off the end that is farthest from the centroid, and close the cut with a flat cap.
 
-    The plane is perpendicular to the direction from the centroid of the surface to the vertex farthest from it. Of
-    several pieces that remain, the one of the largest volume is kept. Cut and cap by manifold3d.
+    The plane is perpendicular to the direction from the centroid of the surface to the vertex farthest from it. If
+    several pieces remain, the one of the largest volume is kept. Manifold3d makes the cut and the cap.
 
     Args:
         mesh: a closed body.
-        share: of the body's extent in that direction.
+        share: share of the extent of the body in that direction.
 
     Raises:
-        ValueError: `share` out of range.
-        MeshError: manifold3d does not take the mesh, or leaves nothing.
+        ValueError: `share` is out of range.
+        MeshError: manifold3d does not accept the mesh, or nothing remains.
     """
     _check_share(share)
     import manifold3d
@@ -146,7 +146,7 @@ def clip(mesh: Mesh, share: float = 0.1) -> Mesh:
     pieces = body.trim_by_plane(-direction, -float(cut)).decompose()
     if not pieces:
         raise MeshError(f"{mesh.name}: nothing remains when the farthest {share:.0%} are cut off.")
-    piece = max(pieces, key=lambda one: one.volume()).to_mesh64()
+    piece = max(pieces, key=lambda x: x.volume()).to_mesh64()
     faces = np.asarray(piece.tri_verts, dtype=np.int64)
     result = _changed(mesh, np.asarray(piece.vert_properties)[:, :3] + centre, faces, "clipped")
     lost = 1 - result.volume / mesh.volume
@@ -155,22 +155,22 @@ def clip(mesh: Mesh, share: float = 0.1) -> Mesh:
 
 
 def scale(mesh: Mesh, factor: float) -> Mesh:
-    """All lengths times a positive factor."""
+    """Multiply all lengths by a positive factor."""
     if not 0 < factor < np.inf:
         raise ValueError(f"factor: expected a positive number, got {factor}.")
     return _changed(mesh, mesh.vertices * factor, mesh.faces, f"scaled by {factor:g}")
 
 
 def move(mesh: Mesh, seed: int = 0) -> Mesh:
-    """Turn the mesh about its centre by a uniformly random rotation, and move it by twice its diagonal.
+    """Rotate the mesh around its centre by a uniformly random rotation, and move it by twice its diagonal.
 
-    Rotations are uniform by normalised normal quaternions (Shoemake 1992).
+    Rotations are uniform: normalised quaternions of normal random numbers (Shoemake 1992).
     """
     generator = np.random.default_rng(seed)
     rotation = Rotation.from_quat(generator.standard_normal(4))
-    way = generator.standard_normal(3)
+    direction = generator.standard_normal(3)
     centre = mesh.vertices.mean(axis=0)
-    offset = 2 * mesh.diagonal * way / np.linalg.norm(way)
+    offset = 2 * mesh.diagonal * direction / np.linalg.norm(direction)
     return _changed(mesh, rotation.apply(mesh.vertices - centre) + centre + offset, mesh.faces, "turned and moved")
 
 

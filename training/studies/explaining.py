@@ -1,4 +1,4 @@
-"""Whether an explanation lies where two bodies differ: generated pairs in other poses, altered in one place."""
+"""Localisation by explanations: pairs of generated poses of a body, one of them altered in one place."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -20,7 +20,7 @@ from igps.signature.signature import SAMPLE_KINDS, SignatureConfig, compute_sign
 from training.graded.shapes import GradedShapes
 
 ALTERATIONS = ("bump", "dent", "limb", "hole")
-# Of √area: what an alteration reaches, at least, and how large it is
+# As shares of √area: the least radius of an alteration, and the range of its size
 _REACH, _SIZES = 0.1, (0.005, 0.05)
 
 
@@ -30,18 +30,18 @@ def explaining(
     n_bodies: int = 50,
     seed: int = 0,
 ) -> None:
-    """Areas under the curve of the painted difference on the altered body against the true place.
+    """Print the area under the ROC curve of the explained difference against the true place of the alteration.
 
     Args:
         out: folder for explaining.csv and explaining.json.
-        descriptors: names.
-        n_bodies: each is altered in each way.
-        seed: of the bodies; other seeds give other bodies.
+        descriptors: names of descriptors.
+        n_bodies: number of bodies; each is altered in each way.
+        seed: seed of the bodies and alterations.
     """
     from sklearn.metrics import roc_auc_score
 
     chosen = {name: descriptor_of(name) for name in descriptors}
-    config = reduce(or_, (one.requirements for one in chosen.values())).apply_to(SignatureConfig())
+    config = reduce(or_, (x.requirements for x in chosen.values())).apply_to(SignatureConfig())
     shapes, rows = GradedShapes(24, -(-n_bodies // 24), 2, seed=seed), list[dict[str, Any]]()
     random = np.random.default_rng(seed)
     places = random.permutation(len(shapes) // 2)[:n_bodies].tolist()
@@ -62,32 +62,33 @@ def explaining(
             continue
         batches = [collate([signature]) for signature in signatures]
         for name, descriptor in chosen.items():
-            found = explain(descriptor, *batches)
+            explanation = explain(descriptor, *batches)
             by_samples, by_place = (
                 float(roc_auc_score(true, on_surface(shares[1], samples, points)))
-                for shares in (found.samples, found.places or found.samples)
+                for shares in (explanation.samples, explanation.places or explanation.samples)
             )
             rows.append({
                 "body": drawn[1].name, "alteration": how, "size": round(size, 4), "descriptor": name,
-                "distance": found.distance, "auc": by_place, "auc_of_pairs": by_samples, "told": found.summary(),
+                "distance": explanation.distance, "auc": by_place, "auc_of_pairs": by_samples,
+                "told": explanation.summary(),
             })  # fmt: skip
             print(rows[-1], flush=True)
         write_answer(out, "explaining", rows)
     for name in descriptors:
         for how in ("all", *ALTERATIONS):
             own = [row for row in rows if row["descriptor"] == name and how in ("all", row["alteration"])]
-            some, pairs = ([row[column] for row in own] for column in ("auc", "auc_of_pairs"))
-            print(f"{name} {how}: {np.mean(some):.3f} of {len(some)}, by pairs alone {np.mean(pairs):.3f}")
+            auc, auc_of_pairs = ([row[column] for row in own] for column in ("auc", "auc_of_pairs"))
+            print(f"{name} {how}: {np.mean(auc):.3f} of {len(auc)}, by pairs alone {np.mean(auc_of_pairs):.3f}")
 
 
 def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tuple[Mesh, Floats, float]:
-    """A mesh altered in one place, the centre of that place, and its radius.
+    """Alter a mesh in one place; return it with the centre and the radius of the place.
 
     Args:
-        mesh: a body.
+        mesh: the body.
         how: one of the `ALTERATIONS`.
-        size: of it, over √area: how far the surface moves, or the radius of the hole.
-        random: where.
+        size: how far the surface moves, or the radius of the hole, as a share of √area.
+        random: draws the place.
     """
     vertices, unit = mesh.vertices, np.sqrt(mesh.area)
     away = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1)
@@ -111,7 +112,7 @@ def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tup
 
 
 def _along(direction: Floats, centre: Floats) -> Floats:
-    """The motion of z onto a direction through a place."""
+    """Return the motion (4, 4) of the z axis to a direction through a centre."""
     import trimesh
 
     motion: Floats = trimesh.geometry.align_vectors([0, 0, 1], direction)

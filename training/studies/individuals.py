@@ -1,4 +1,4 @@
-"""The level of individuals of the descriptor `pretrained`: its check on held-out families, and its fit."""
+"""The level of individuals of the descriptor `pretrained`: its evaluation on held-out families, and its fit."""
 
 import random
 from collections.abc import Sequence
@@ -29,12 +29,12 @@ def fit_individuals(
     cache_dir: Path | None,
     n_workers: int | None,
 ) -> TwoLevelHead:
-    """The head with a level of individuals, after a check of that level on families that it was not fitted to.
+    """Score a level of individuals on held-out families, fit it to all families, and return the head with it.
 
     Args:
-        head: of classes and bodies.
-        descriptor: of what it describes.
-        counts: classes, bodies of each, individuals of each, and poses of each.
+        head: head with the levels of classes and bodies.
+        descriptor: descriptor of the histograms.
+        counts: numbers of classes, bodies of a class, individuals of a body, and poses of an individual.
         root: folder of the meshes.
         n_parts, seed, plain, cache_dir, n_workers: see `pretrain`.
     """
@@ -52,15 +52,15 @@ def fit_individuals(
     parts = [torch.isin(data.labels, part) for part in dealt([family_of(name) for name in data.classes], n_parts, seed)]
 
     def score(name: str, distances: Sequence[Tensor]) -> None:
-        """Of each part, the distances."""
+        """Print the scores of the distances of each part."""
         levels = [(individuals[part], bodies[part], data.labels[part]) for part in parts]
-        level_scores(name, [(one, *labels) for one, labels in zip(distances, levels, strict=True)])
+        level_scores(name, [(matrix, *labels) for matrix, labels in zip(distances, levels, strict=True)])
 
     print(f"{n_parts} parts of the families, each scored by a level of individuals that was fitted to the others:")
     everything = torch.ones(len(data), dtype=torch.bool)
     for name, heads in (("pretrained", [fitted(~part) for part in parts]), ("two levels", [head] * n_parts)):
-        vectors = [one(histograms[part]) for one, part in zip(heads, parts, strict=True)]
-        score(name, [one.distances(vector, vector) for one, vector in zip(heads, vectors, strict=True)])
+        vectors = [fitted_head(histograms[part]) for fitted_head, part in zip(heads, parts, strict=True)]
+        score(name, [fitted_head.distances(x, x) for fitted_head, x in zip(heads, vectors, strict=True)])
     for name in plain:
         other = igps.descriptor(name)
         described = describe(usable(root, other, cache_dir, n_workers), other, n_workers=n_workers)
@@ -72,10 +72,10 @@ def fit_individuals(
 def generated(
     shapes: GradedShapes, root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None
 ) -> igps.SignatureDataset:
-    """The dataset of generated shapes, which are written to a folder where they are not there yet, see `usable`."""
+    """Write generated shapes to a folder, unless they exist, and return their dataset; see `usable`."""
     try:
         shapes.write(root, progress=True, n_workers=n_workers)
-    except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
+    except ValueError as error:  # no grid resolves the thin parts of a body; the other shapes were written
         print(error)
     return usable(root, descriptor, cache_dir, n_workers)
 
@@ -83,7 +83,7 @@ def generated(
 def usable(
     root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, some: list[int] | None = None
 ) -> igps.SignatureDataset:
-    """The dataset of the meshes, or some of them, whose signatures could be computed; those that could not are told."""
+    """Return the dataset of meshes, or of `some` of them, whose signatures can be computed; print the failures."""
     data = igps.SignatureDataset(root, descriptor=descriptor, cache_dir=cache_dir)
     if some is not None:
         data = data.subset(some)
@@ -94,7 +94,7 @@ def usable(
 
 
 def dealt(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
-    """Numbers of the classes in each part, whole families at a time."""
+    """Deal whole families into parts; return the indices of the classes of each part."""
     names = sorted(set(families))
     random.Random(seed).shuffle(names)
     return [
@@ -103,5 +103,6 @@ def dealt(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
 
 
 def numbers(names: Sequence[str]) -> Tensor:
+    """Number distinct names in sorted order; return the number of each name."""
     number = {name: i for i, name in enumerate(sorted(set(names)))}
     return torch.tensor([number[name] for name in names])

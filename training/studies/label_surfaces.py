@@ -1,6 +1,6 @@
-"""Closed forms as voxels: what surfaces of labels make of them, in volume, area and description.
+"""Errors of surfaces of voxelised solids in volume, area and description.
 
-Balls, ellipsoids, tori, capsules, rods and plates are turned and moved at random and sampled at the centres of voxels.
+Balls, ellipsoids, tori, capsules, rods and plates are rotated and moved at random and sampled at the centres of voxels.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,17 +29,17 @@ RING = 2.5  # of a torus, over the radius of its tube
 
 @dataclass(frozen=True)
 class Solid:
-    """A body about the origin: which points (..., 3) it holds, half its box, its volume, area and handles."""
+    """A solid around the origin, in closed form."""
 
-    holds: Callable[[Floats], Booleans]
-    half: Floats
+    holds: Callable[[Floats], Booleans]  # whether points (..., 3) lie inside
+    half: Floats  # (3,) half the sides of its box
     volume: float
     area: float
     genus: int = 0
 
 
 def solid(kind: str, thickness: float) -> Solid:
-    """The solid of a kind that is so thick where it is thinnest; rods are four times as long, capsules three times."""
+    """Return a solid of a kind by its least thickness; rods are four times as long as thick, capsules three times."""
     r = thickness / 2
     if kind in ("ball", "ellipsoid"):
         axes = r * (AXES if kind == "ellipsoid" else np.ones(3))
@@ -68,7 +68,7 @@ def solid(kind: str, thickness: float) -> Solid:
 
 
 def exact_mesh(kind: str, thickness: float) -> Mesh:
-    """The surface of a solid in a few thousand triangles."""
+    """Return the surface of a solid as a few thousand triangles."""
     r = thickness / 2
     if kind == "torus":
         surface = trimesh.creation.torus(RING * r, r, major_sections=120, minor_sections=40)
@@ -90,7 +90,7 @@ def exact_mesh(kind: str, thickness: float) -> Mesh:
 
 
 def voxels(body: Solid, matrix: Floats, rng: np.random.Generator) -> tuple[Booleans, Floats]:
-    """The body, turned and moved at random, at the centres of voxels: (X, Y, Z), and the affine (4, 4)."""
+    """Sample a randomly rotated and moved solid at the centres of voxels; return (X, Y, Z) and the affine (4, 4)."""
     turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
     size = np.linalg.norm(body.half)
     reach = np.ceil(np.linalg.norm(np.linalg.inv(matrix), axis=1) * size).astype(int) + 1
@@ -105,15 +105,14 @@ def voxels(body: Solid, matrix: Floats, rng: np.random.Generator) -> tuple[Boole
 
 @dataclass(frozen=True)
 class Measured:
-    """Of the surface of a voxelised solid: relative errors of volume and area, signed, and how far each description is
-    from that of the exact mesh, over the median distance between exact meshes of two kinds."""
+    """Errors of the surface of a voxelised solid."""
 
     kind: str
-    n_voxels: int
-    length: float
-    volume: float
-    area: float
-    distances: dict[str, float]
+    n_voxels: int  # thickness in the longest side of the voxels
+    length: float  # longest side of the voxels
+    volume: float  # relative error, signed
+    area: float  # relative error, signed
+    distances: dict[str, float]  # to the description of the exact mesh, over the median distance between two kinds
 
 
 def measure(
@@ -127,13 +126,13 @@ def measure(
 
     Args:
         n_voxels: thicknesses, in the longest side of the voxels.
-        lengths: the longest side of the voxels; the others are 1.
-        descriptors: names of those that describe the surfaces.
-        n_turns: orientations and places of each.
-        seed: of these.
+        lengths: longest sides of the voxels; the others are 1.
+        descriptors: names of the descriptors of the surfaces.
+        n_turns: number of random rotations and positions of each solid.
+        seed: seed of rotations and positions.
     """
     modules = {name: descriptor(name) for name in descriptors}
-    config = reduce(or_, (one.requirements for one in modules.values()), Requirements()).apply_to(SignatureConfig())
+    config = reduce(or_, (x.requirements for x in modules.values()), Requirements()).apply_to(SignatureConfig())
 
     def described(mesh: Mesh) -> dict[str, torch.Tensor]:
         batch = collate([compute_signature(mesh, config)])
@@ -143,11 +142,11 @@ def measure(
     exact = {kind: described(exact_mesh(kind, 1.0)) for kind in KINDS} if modules else {}
     between = {
         name: float(
-            np.median([float(one.distances(exact[a][name], exact[b][name])) for a, b in combinations(KINDS, 2)])
+            np.median([float(module.distances(exact[a][name], exact[b][name])) for a, b in combinations(KINDS, 2)])
         )
-        for name, one in modules.items()
+        for name, module in modules.items()
     }
-    rng, found = np.random.default_rng(seed), []
+    rng, results = np.random.default_rng(seed), []
     for kind in KINDS:
         for size in n_voxels:
             for length in lengths:
@@ -155,34 +154,34 @@ def measure(
                     body = solid(kind, size * length)
                     mask, affine = voxels(body, np.diag(rng.permutation([1, 1, length])).astype(float), rng)
                     mesh = Mesh(*voxel_surface(mask, affine)[:2], name=kind)
-                    away = described(mesh) if modules else {}
+                    descriptions = described(mesh) if modules else {}
                     distances = {
-                        name: float(module.distances(away[name], exact[kind][name])) / between[name]
+                        name: float(module.distances(descriptions[name], exact[kind][name])) / between[name]
                         for name, module in modules.items()
                     }
                     volume, area = mesh.volume / body.volume - 1, mesh.area / body.area - 1
-                    found.append(Measured(kind, size, length, volume, area, distances))
-    return found
+                    results.append(Measured(kind, size, length, volume, area, distances))
+    return results
 
 
 def surfaces(n_turns: int = 1, descriptors: list[str] | None = None) -> None:
-    """Print how far surfaces of voxelised solids are from these, medians of each kind, in percent.
+    """Print the median errors of surfaces of voxelised solids by kind, in percent.
 
     Args:
-        n_turns: orientations and places of each solid.
-        descriptors: names of those that describe the solids of 16 voxels; pretrained and interior if None.
+        n_turns: number of random rotations and positions of each solid.
+        descriptors: names of the descriptors of solids 16 voxels thick; pretrained and interior if not given.
     """
     names = ["pretrained", "interior"] if descriptors is None else descriptors
     for n_voxels in ((4,), (8, 12), (16,)):
-        found = measure(n_voxels, descriptors=names if n_voxels == (16,) else (), n_turns=n_turns)
+        results = measure(n_voxels, descriptors=names if n_voxels == (16,) else (), n_turns=n_turns)
         sizes = " and ".join(map(str, n_voxels))
         for kind in (*KINDS, "all"):
-            rows = [one for one in found if kind in (one.kind, "all")]
-            told = [
-                f"{name} {100 * np.median([abs(getattr(one, name)) for one in rows]):.2f}"
+            rows = [row for row in results if kind in (row.kind, "all")]
+            columns = [
+                f"{name} {100 * np.median([abs(getattr(row, name)) for row in rows]):.2f}"
                 for name in ("volume", "area")
             ]
-            told += [
-                f"{name} {100 * np.median([one.distances[name] for one in rows]):.1f}" for name in rows[0].distances
+            columns += [
+                f"{name} {100 * np.median([row.distances[name] for row in rows]):.1f}" for name in rows[0].distances
             ]
-            print(f"{sizes} voxels, {kind}: {', '.join(told)}", flush=True)
+            print(f"{sizes} voxels, {kind}: {', '.join(columns)}", flush=True)

@@ -1,4 +1,4 @@
-"""What a descriptor has learned, against where it started."""
+"""Pictures of the learned parameters of a descriptor, compared with their initial values."""
 
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,13 @@ from igps.report.drawing import new_figure
 
 
 def learned_layout(descriptor: HistogramDescriptor, path: str | Path) -> None:
-    """Save a picture of the bin and class centres and of the spectral filter g(λ·area), learned and as they started.
+    """Save a picture of bin centres, class centres and the spectral filter g(λ·area), as learned and as initialised.
 
     Args:
-        descriptor: its histograms of pairs are drawn one a row; others learn nothing.
-        path: of the picture, such as layout.png.
+        descriptor: descriptor whose histograms of pairs are drawn, one in a row; other histograms learn nothing.
+        path: path of the picture, such as layout.png.
     """
-    histograms = [one for part in descriptor.parts for one in part if isinstance(one, PairHistogram)]
+    histograms = [x for part in descriptor.parts for x in part if isinstance(x, PairHistogram)]
     rows = [(histogram.embedding, _centres(histogram)) for histogram in histograms]
     n_columns = 1 + max(len(centres) for _, centres in rows)
     figure = new_figure(4 * n_columns, 3.2 * len(rows))
@@ -50,7 +50,7 @@ def _filter(panel: Any, embedding: SpectralEmbedding) -> None:
 
 
 def _centres(histogram: PairHistogram) -> dict[str, OrderedCentres]:
-    """The centres along each axis of a histogram, by what they are centres of."""
+    """Return the centres along the axes of a histogram, by the names of axis and parameter."""
     return {
         f"{type(axis).__name__}: {name}": module
         for axis in histogram.axes

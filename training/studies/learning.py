@@ -39,15 +39,15 @@ def splits(
     cache_dir: Path | None = None,
     out: Path | None = None,
 ) -> None:
-    """Scores of the plain chi-square distance and of the heads: mean ± standard deviation over splits.
+    """Print the scores of the plain chi-square distance and of the heads: mean ± standard deviation over splits.
 
     Args:
         root: labelled collection.
-        descriptor: what is compared.
-        protocol: seen splits every class, unseen splits the classes.
+        descriptor: name of the descriptor.
+        protocol: seen splits the shapes of every class, unseen splits the classes.
         n_train: shapes of each class (seen) or classes (unseen) to fit to.
-        n_splits: how many splits, with the seeds from `first_seed` on.
-        first_seed: see n_splits.
+        n_splits: number of splits, with consecutive seeds.
+        first_seed: seed of the first split.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
         out: a JSON file to which the rows are added.
     """
@@ -66,10 +66,10 @@ def splits(
         for seed in range(first_seed, first_seed + n_splits):
             split = (split_seen if protocol == "seen" else split_unseen)(labels, n_train, seed=seed)
             results.append(score(histograms, labels, split, head, cells, prior))
-        values = {name: [one[name] for one in results] for name in COLUMNS}
-        found = {name: {"mean": mean(v), "stdev": stdev(v) if n_splits > 1 else 0.0} for name, v in values.items()}
-        print(f"{head:<10}" + "".join(f"{100 * v['mean']:>8.1f} ± {100 * v['stdev']:>3.1f}" for v in found.values()))
-        rows.append({"descriptor": descriptor, "protocol": protocol, "head": head, **found})
+        values = {name: [result[name] for result in results] for name in COLUMNS}
+        columns = {name: {"mean": mean(v), "stdev": stdev(v) if n_splits > 1 else 0.0} for name, v in values.items()}
+        print(f"{head:<10}" + "".join(f"{100 * v['mean']:>8.1f} ± {100 * v['stdev']:>3.1f}" for v in columns.values()))
+        rows.append({"descriptor": descriptor, "protocol": protocol, "head": head, **columns})
     if out is not None:
         earlier = json.loads(out.read_text()) if out.exists() else []
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -84,7 +84,7 @@ def score(
     part_cells: Sequence[int] | None,
     prior: Head | None = None,
 ) -> dict[str, float]:
-    """Scores of the test part, each shape against the others."""
+    """Return the mean scores of the test part, each shape against the others."""
     train, test = torch.tensor(split.train), torch.tensor(split.test)
     chosen = prior if head == "prior" else None
     if head in FITTED:
@@ -102,18 +102,17 @@ def fitted(
     first_seed: int = 100,
     cache_dir: Path | None = None,
 ) -> None:
-    """What `igps fit` makes of the training part of several splits, on their test parts, in percent.
+    """Print the scores of models that `igps fit` fits to the training part of several splits, in percent.
 
-    Of known classes also as a classifier: the share that is classified correctly, the expected calibration error, and
-    the area under the curve by which the bodies of a class that is left out of the fit are told from all others, mean
-    over the classes.
+    Models of known classes are also scored as classifiers: by accuracy, by the expected calibration error, and by the
+    area under the ROC curve for bodies of a class that is left out of the fit against all others, mean over classes.
 
     Args:
         root: labelled collection.
-        descriptor: what is fitted.
+        descriptor: name of the descriptor.
         n_train: shapes of each class (known) or classes (new) to fit to.
-        n_splits: how many splits, with the seeds from `first_seed` on.
-        first_seed: see n_splits.
+        n_splits: number of splits, with consecutive seeds.
+        first_seed: seed of the first split.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
     dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=descriptor)
@@ -132,19 +131,19 @@ def _fitted(dataset: igps.SignatureDataset, descriptor: str, goal: Goal, n_train
     model = fit(train, descriptor, goal=goal)
     described = describe(test, model, cache_tag=cache_tag(model))
     scores = retrieval_scores(model.distances(described, described), test.labels).mean()
-    found = {name: scores[name] for name in ("ft", "nn", "dcg")}
+    result = {name: scores[name] for name in ("ft", "nn", "dcg")}
     if goal == "new":
-        return found
-    told, labels = classify(test, model), test.labels
-    found["accuracy"] = float((told.probabilities.argmax(dim=1) == labels).float().mean())
-    n_classes = told.probabilities.shape[1]
-    found["calibration_error"] = float(multiclass_calibration_error(told.probabilities, labels, n_classes, 10))
+        return result
+    probabilities, labels = classify(test, model).probabilities, test.labels
+    result["accuracy"] = float((probabilities.argmax(dim=1) == labels).float().mean())
+    n_classes = probabilities.shape[1]
+    result["calibration_error"] = float(multiclass_calibration_error(probabilities, labels, n_classes, 10))
     areas = []
     for label in labels.unique():
-        rest = train.subset(torch.nonzero(train.labels != label).flatten().tolist())
-        strange = classify(test, _classifier(rest, descriptor)).strangeness
-        areas.append(float(binary_auroc(strange, (labels == label).long())))
-    return {**found, "unknown_auc": mean(areas)}
+        others = train.subset(torch.nonzero(train.labels != label).flatten().tolist())
+        strangeness = classify(test, _classifier(others, descriptor)).strangeness
+        areas.append(float(binary_auroc(strangeness, (labels == label).long())))
+    return {**result, "unknown_auc": mean(areas)}
 
 
 def _classifier(dataset: igps.SignatureDataset, descriptor: str) -> EmbeddedDescriptor:
@@ -155,19 +154,19 @@ def _classifier(dataset: igps.SignatureDataset, descriptor: str) -> EmbeddedDesc
 
 
 def part_cells_of(descriptor: Descriptor) -> tuple[int, ...] | None:
-    """Cells of each part of a descriptor of histograms, None of others."""
+    """Return the numbers of cells of the parts of a histogram descriptor, None for other descriptors."""
     return descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
 
 
 def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:
-    """Scores of a checkpoint on the test part of its own split; and what it has learned.
+    """Print the scores of a checkpoint on the test part of its split, and draw what it has learned.
 
-    "plain" is the distance of its histograms without the head, "learned" the whole; "whitened" and "kernel" are heads
-    fitted to the same histograms of its training and validation parts.
+    "plain" is the distance of its histograms without the head, and "learned" that with the head. "whitened" and
+    "kernel" are heads fitted to the histograms of its training and validation parts.
 
     Args:
-        path: the checkpoint.
-        out: folder for layout.png, the learned bins and filter against their start.
+        path: path of the checkpoint.
+        out: folder for layout.png, a picture of the learned bins and filter beside the initial ones.
     """
     learner = RetrievalLearner.load_from_checkpoint(path).eval()
     data = SignatureDataModule.load_from_checkpoint(path)
@@ -175,15 +174,15 @@ def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:
     histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
     test = torch.tensor(data.split.test)
     part = histograms[test]
-    found = {"plain": retrieval_scores(learner.distance.plain(part, part), labels[test]).mean()}
+    results = {"plain": retrieval_scores(learner.distance.plain(part, part), labels[test]).mean()}
     with torch.inference_mode():
-        found["learned"] = retrieval_scores(learner.distances(part, part), labels[test]).mean()
-    # The validation part has chosen nothing that these heads depend on.
+        results["learned"] = retrieval_scores(learner.distances(part, part), labels[test]).mean()
+    # The validation part was not used to choose anything on which these heads depend
     split = Split(data.split.train + data.split.validation, (), data.split.test)
     for head in ("whitened", "kernel"):
-        found[head] = score(histograms.flatten(1), labels, split, head, learner.part_cells)
+        results[head] = score(histograms.flatten(1), labels, split, head, learner.part_cells)
     print(f"{'':<10}" + "".join(f"{title:>8}" for title in COLUMNS.values()))
-    for name, scores in found.items():
+    for name, scores in results.items():
         print(f"{name:<10}" + "".join(f"{100 * scores[column]:>8.1f}" for column in COLUMNS))
     if isinstance(learner.descriptor, HistogramDescriptor):
         out.mkdir(parents=True, exist_ok=True)

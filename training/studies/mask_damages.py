@@ -1,4 +1,4 @@
-"""Masks damaged as segmentations are: in the six ways that the figures are of, and in others to choose measures on."""
+"""Typical damages of segmentation masks: those of the published figures, and others for the choice of measures."""
 
 from collections.abc import Callable
 
@@ -13,15 +13,18 @@ VARIED = ("slices", "tunnel", "cavity", "leak", "island", "label", "blocks")
 def damaged(
     whole: Booleans, spacing: Floats, how: str, random: np.random.Generator, others: Booleans
 ) -> tuple[Booleans, Floats]:
-    """A mask and its spacing after one of the `DAMAGES`; "label" leaves both. Others are what it may leak into."""
+    """Apply one of the `DAMAGES` to a mask and its spacing.
+
+    "label" leaves both unchanged: the caller changes the label. `others` are the voxels into which the mask may leak.
+    """
     from scipy.ndimage import binary_dilation, distance_transform_edt
 
     if how in ("label", "half"):
         return (whole, spacing) if how == "label" else (whole[::2, ::2, ::2], spacing * 2)
     box, mask, grid, ball = _surroundings(whole, spacing)
-    places, radius = grid[mask], _radius(mask, spacing)
+    positions, radius = grid[mask], _radius(mask, spacing)
     if how == "slices":
-        lowest, highest = places[:, 2].min(), places[:, 2].max()
+        lowest, highest = positions[:, 2].min(), positions[:, 2].max()
         mask = mask & (grid[..., 2] <= highest - 0.25 * (highest - lowest))
     if how == "hole":
         deepest = np.argwhere((depth := distance_transform_edt(mask, spacing)) == depth.max())[0] * spacing
@@ -40,14 +43,14 @@ def damaged(
 def varied(
     whole: Booleans, spacing: Floats, how: str, random: np.random.Generator, others: Booleans
 ) -> tuple[Booleans, Floats]:
-    """As `damaged`, in one of the ways `VARIED`: for choosing measures on other damages than those of the report."""
+    """Apply one of the damages `VARIED`, as `damaged` does; measures are chosen on these and not on the `DAMAGES`."""
     from scipy.ndimage import binary_dilation, distance_transform_edt
 
     if how == "label":
         return whole, spacing
-    if how == "blocks":  # to a grid twice as coarse and back
+    if how == "blocks":  # resampled to a grid twice as coarse and back
         first = [(np.arange(n) + k) // 2 * 2 - k for n, k in zip(whole.shape, random.integers(0, 2, 3), strict=True)]
-        return whole[np.ix_(*(np.maximum(one, 0) for one in first))], spacing
+        return whole[np.ix_(*(np.maximum(index, 0) for index in first))], spacing
     box, mask, grid, ball = _surroundings(whole, spacing)
     depth = distance_transform_edt(mask, spacing)
     deep = grid[depth >= 0.6 * depth.max()]
@@ -62,7 +65,7 @@ def varied(
         mask = mask & (across > max(size * _radius(mask, spacing), 1.01 * spacing.max()))
     if how == "cavity":
         mask = mask & ~(ball(middle, size) & (depth > 1.01 * spacing.min()))
-    if how == "leak":  # three balls in a heap
+    if how == "leak":  # a cluster of three balls
         nearby = others[box] if random.random() < 0.5 else np.zeros_like(mask)
         middle, radius = _on_skin(mask, spacing, random, nearby), _radius(mask, spacing)
         for _ in range(3):
@@ -76,16 +79,19 @@ def varied(
 
 
 def _radius(mask: Booleans, spacing: Floats) -> float:
-    """Of the ball of the same volume."""
+    """Return the radius of a ball with the volume of the mask."""
     return float(np.cbrt(3 / (4 * np.pi) * mask.sum() * spacing.prod()))
 
 
 def _surroundings(
     whole: Booleans, spacing: Floats
 ) -> tuple[tuple[slice, ...], Booleans, Floats, Callable[[Floats, float], Booleans]]:
-    """A box about a body, the body in it, where its voxels are, and balls of a radius over its."""
-    found = np.argwhere(whole)
-    low, high = np.maximum(found.min(axis=0) - 8, 0), found.max(axis=0) + 9
+    """Return a box around the mask, the mask in the box, positions of its voxels, and a function that makes balls.
+
+    The function takes a centre and a radius relative to that of the mask.
+    """
+    voxels = np.argwhere(whole)
+    low, high = np.maximum(voxels.min(axis=0) - 8, 0), voxels.max(axis=0) + 9
     box = tuple(map(slice, low, high))
     mask = whole[box]
     radius = _radius(mask, spacing)
@@ -99,13 +105,13 @@ def _surroundings(
 
 
 def _on_skin(mask: Booleans, spacing: Floats, random: np.random.Generator, others: Booleans) -> Floats:
-    """A voxel of the border, near another body if any is."""
+    """Return the position of a random border voxel, if possible near another body."""
     from scipy.ndimage import binary_erosion, distance_transform_edt
 
     skin = mask & ~binary_erosion(mask)
     if others.any():
         near = skin & (distance_transform_edt(~others, spacing) <= 0.3 * _radius(mask, spacing))
         skin = near if near.any() else skin
-    places = np.argwhere(skin) * spacing
-    chosen: Floats = places[random.integers(len(places))]
+    positions = np.argwhere(skin) * spacing
+    chosen: Floats = positions[random.integers(len(positions))]
     return chosen

@@ -1,4 +1,4 @@
-"""Whether damaged segmentations are found: the outlier scores of given masks and of the same damaged in six ways."""
+"""Detection of damaged segmentations: outlier scores of masks, and of the same masks after damages."""
 
 import json
 import re
@@ -17,7 +17,7 @@ from igps.nn.description import describe
 from igps.report.answers import write_answer
 from training.studies.mask_damages import DAMAGES, VARIED, damaged, varied
 
-_LEAST_VOXELS = 50
+_MIN_VOXELS = 50
 
 
 def outlying(
@@ -27,16 +27,16 @@ def outlying(
     seed: int = 0,
     vary: bool = False,
 ) -> None:
-    """Score masks as they are, and each with one damage in its place; the area under the curve tells them apart.
+    """Score masks before and after one damage each, and print the area under the ROC curve that separates them.
 
     Args:
         volumes: folder with organs/*.nii.gz and prostate/*.nii.gz; generated bodies if not given.
         out: folder for the masks, outlying.csv and outlying.json.
-        cache_dir: of the signatures.
-        seed: of the damages, and of the generated bodies.
-        vary: damages are of other kinds, and of random sizes, places and directions, see `varied`.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
+        seed: seed of the damages and of the generated bodies.
+        vary: use other kinds of damages, with random sizes, places and directions, see `varied`.
     """
-    masks = generated(seed) if volumes is None else _given(volumes)
+    masks = generated(seed) if volumes is None else _read_masks(volumes)
     names = sorted(masks)
     labels = [name.split("/")[0] for name in names]
     random = np.random.default_rng(seed)
@@ -51,53 +51,51 @@ def outlying(
                 others |= near
         paths.append(_write(out / f"{i}_damaged.nii.gz", *damage_of(mask, spacing, damage, random, others)))
     chosen = descriptor_of("pretrained")
-    whole = SignatureDataset(paths, descriptor=chosen, cache_dir=cache_dir, labels=2 * labels)
-    failures = whole.precompute()
-    gone = {failure.id for failure in failures}
-    dataset = whole.usable(failures)
-    place = {
-        path: i
-        for i, path in enumerate(p for p, name in zip(paths, whole.bodies.names, strict=True) if name not in gone)
-    }
+    all_masks = SignatureDataset(paths, descriptor=chosen, cache_dir=cache_dir, labels=2 * labels)
+    failures = all_masks.precompute()
+    failed = {failure.id for failure in failures}
+    dataset = all_masks.usable(failures)
+    usable = [path for path, name in zip(paths, all_masks.bodies.names, strict=True) if name not in failed]
+    index = {path: i for i, path in enumerate(usable)}
     described = describe(dataset, chosen, progress=True)
     distances = squared_distances(chosen.coordinates(described).double().numpy()) ** 0.5
     measures, notes = measures_of(dataset), dataset.all_notes()
 
     def scored(chosen_paths: Sequence[Path], classes: Sequence[str]) -> list[Outlier]:
-        rows = [place[path] for path in chosen_paths]
+        rows = [index[path] for path in chosen_paths]
         own = {name: values[np.ix_(*values.ndim * [rows])] for name, values in measures.items()}
-        found = outliers(distances[np.ix_(rows, rows)], classes, own, [notes[row] for row in rows])
-        return sorted(found, key=lambda one: one.body)
+        ranked = outliers(distances[np.ix_(rows, rows)], classes, own, [notes[row] for row in rows])
+        return sorted(ranked, key=lambda outlier: outlier.body)
 
-    kept = [i for i in range(len(names)) if paths[i] in place]
-    files, classes = [paths[i] for i in kept], [labels[i] for i in kept]
+    undamaged = [i for i in range(len(names)) if paths[i] in index]
+    files, classes = [paths[i] for i in undamaged], [labels[i] for i in undamaged]
     rows = [
-        {"mask": names[i], "damage": "none", "score": one.score, "reason": one.reason}
-        for i, one in zip(kept, scored(files, classes), strict=True)
+        {"mask": names[i], "damage": "none", "score": outlier.score, "reason": outlier.reason}
+        for i, outlier in zip(undamaged, scored(files, classes), strict=True)
     ]
-    for n, i in enumerate(kept):
+    for n, i in enumerate(undamaged):
         path = paths[len(names) + i]
-        if path not in place:
+        if path not in index:
             rows.append({"mask": names[i], "damage": damages[i], "score": 99.0, "reason": "refused by the reader"})
             continue
-        mine = classes[n]
+        label = classes[n]
         if damages[i] == "label":
-            mine = str(random.choice([one for one in sorted(set(classes)) if one != mine and classes.count(one) > 1]))
-        one = scored([*files[:n], path, *files[n + 1 :]], [*classes[:n], mine, *classes[n + 1 :]])[n]
-        rows.append({"mask": names[i], "damage": damages[i], "score": one.score, "reason": one.reason})
+            label = str(random.choice([x for x in sorted(set(classes)) if x != label and classes.count(x) > 1]))
+        outlier = scored([*files[:n], path, *files[n + 1 :]], [*classes[:n], label, *classes[n + 1 :]])[n]
+        rows.append({"mask": names[i], "damage": damages[i], "score": outlier.score, "reason": outlier.reason})
     write_answer(out, "outlying", rows)
     print(json.dumps(areas(rows), indent=2))
 
 
 def areas(rows: Sequence[dict[str, object]]) -> dict[str, float]:
-    """Areas under the curve, of all damages and of each against all that are not damaged."""
+    """Return the area under the ROC curve of undamaged masks against all damages, and against each damage."""
     from sklearn.metrics import roc_auc_score
 
-    found = {}
+    result = {}
     for damage in ("all", *sorted({str(row["damage"]) for row in rows} - {"none"})):
-        some = [row for row in rows if damage == "all" or row["damage"] in ("none", damage)]
-        found[damage] = float(roc_auc_score([row["damage"] != "none" for row in some], [row["score"] for row in some]))
-    return found
+        own = [row for row in rows if damage == "all" or row["damage"] in ("none", damage)]
+        result[damage] = float(roc_auc_score([row["damage"] != "none" for row in own], [row["score"] for row in own]))
+    return result
 
 
 def _write(path: Path, mask: Booleans, spacing: Floats) -> Path:
@@ -108,31 +106,32 @@ def _write(path: Path, mask: Booleans, spacing: Floats) -> Path:
     return path
 
 
-def _given(volumes: Path) -> dict[str, tuple[Booleans, Floats]]:
-    """The masks of at least fifty voxels, by class and name; the classes are the names without side and number."""
+def _read_masks(volumes: Path) -> dict[str, tuple[Booleans, Floats]]:
+    """Read the masks of at least 50 voxels, by class and name; classes are names without side and number."""
     import nibabel
 
-    found = {}
+    masks = {}
     for path in sorted(volumes.glob("*/*.nii.gz")):
         image: Any = nibabel.load(path)
         mask = np.asarray(image.dataobj) > 0
-        if mask.sum() < _LEAST_VOXELS:
+        if mask.sum() < _MIN_VOXELS:
             continue
         name = path.name.removesuffix(".nii.gz")
         kind = re.sub(r"_(left|right)|_?[CTL]?\d+$", "", name)
-        found[f"{kind}/{name}"] = (mask.squeeze(), np.array(image.header.get_zooms()[:3], dtype=float))
-    return found
+        masks[f"{kind}/{name}"] = (mask.squeeze(), np.array(image.header.get_zooms()[:3], dtype=float))
+    return masks
 
 
 def generated(seed: int = 0) -> dict[str, tuple[Booleans, Floats]]:
-    """One subject in a grid, and a body of many subjects, each in a grid of its own with thick slices.
+    """Generate the bodies of one subject in a common grid, and one body of many subjects in separate grids.
 
-    Bodies touch, none overlaps, and the border of the grid cuts some: single ones, pairs of sides, a series of thin
-    arcs, and a series of blocks with a ring and a spine.
+    The bodies of the subject are single ones, pairs of sides, a series of thin arcs, and a series of blocks with a ring
+    and a spine. They touch but do not overlap, and the border of the grid cuts some of them. The separate grids have
+    thick slices.
     """
     random = np.random.default_rng(seed + 100)
     spacing, room = np.full(3, 3.0), np.array([110, 90, 110]) * 3.0
-    found = dict[str, tuple[Booleans, Floats]]()
+    masks = dict[str, tuple[Booleans, Floats]]()
     taken = np.zeros((110, 90, 110), dtype=bool)
     drawn: list[tuple[str, Floats, Floats]] = []
     for level in range(6):
@@ -162,20 +161,20 @@ def generated(seed: int = 0) -> dict[str, tuple[Booleans, Floats]]:
     for name, curve, radii in drawn:
         mask = _tube(curve, radii, spacing, random, ~taken)
         taken |= mask
-        if mask.sum() >= _LEAST_VOXELS:
-            found[name] = (mask, spacing)
+        if mask.sum() >= _MIN_VOXELS:
+            masks[name] = (mask, spacing)
     curve, radii = _curve(random)
     curve, radii = curve * 0.3, np.full(len(radii), 16.0)
     for number in range(16):
         own = _jittered(curve * random.normal(1, 0.2, 3), random) + 36
         flat = np.array([1.2, 1.2, 4.0])
         free = np.ones((60, 60, 18), dtype=bool)
-        found[f"many/many{number}"] = (_tube(own, radii * random.normal(1, 0.12), flat, random, free), flat)
-    return found
+        masks[f"many/many{number}"] = (_tube(own, radii * random.normal(1, 0.12), flat, random, free), flat)
+    return masks
 
 
 def _curve(random: np.random.Generator) -> tuple[Floats, Floats]:
-    """A smooth curve of random length about the origin, and the radii of balls along it."""
+    """Draw a smooth curve of random length around the origin, and the radii of balls along it."""
     t, size = np.linspace(0, 1, 60), np.exp(random.uniform(np.log(25), np.log(170)))
     waves = sum(random.normal(0, 0.5 / k**2, (3, 1)) * np.cos(np.pi * k * t + random.uniform(0, 6)) for k in (1, 2, 3))
     radius = size * np.exp(random.uniform(np.log(0.08), np.log(0.4))) * (1 + 0.3 * np.sin(6 * t + random.uniform(0, 6)))
@@ -183,13 +182,13 @@ def _curve(random: np.random.Generator) -> tuple[Floats, Floats]:
 
 
 def _jittered(points: Floats, random: np.random.Generator) -> Floats:
-    """Moved by smooth noise along each axis."""
+    """Move points by smooth noise along each axis."""
     moved: Floats = points + 1.5 * np.sin(points[:, ::-1] / 25 + random.uniform(0, 6, 3))
     return moved
 
 
 def _tube(curve: Floats, radii: Floats, spacing: Floats, random: np.random.Generator, free: Booleans) -> Booleans:
-    """Free voxels in balls along a curve, with a border as rough as that of segmentations; the largest piece."""
+    """Return the largest piece of free voxels in balls along a curve, with a border as rough as in segmentations."""
     from scipy.ndimage import gaussian_filter, label
 
     reach = radii.max() + 2 * spacing.max()

@@ -1,4 +1,4 @@
-"""Tables of the documentation: each is written from a file of results, which says by what and when it was measured."""
+"""Tables of the documentation, written from files of results that record command, versions, date and processor."""
 
 import datetime
 import json
@@ -23,7 +23,7 @@ Table = tuple[list[str], list[list[str]]]
 
 
 def scores(source: Path) -> Table:
-    """Of `igps compare --out`: a row a descriptor, scores in percent."""
+    """Read the results of `igps compare --out`: a row for each descriptor, scores in percent."""
     shown = ("nn", "ft", "st", "dcg", "adr_self", "map")
     rows = [
         [f"`{row['descriptor']}`", *(_percent(row[name]) for name in shown), f"{row['seconds_per_mesh']:.2f}"]
@@ -33,35 +33,35 @@ def scores(source: Path) -> Table:
 
 
 def splits(source: Path) -> Table:
-    """Of `python -m training.evaluate splits --out`: a row a head, mean and standard deviation over splits."""
-    found = _read(source, "splits.json")
+    """Read the results of `python -m training.evaluate splits --out`: a row for each head, mean and deviation."""
+    results = _read(source, "splits.json")
     rows = [
         [f"{row['descriptor']}, {row['protocol']}", row["head"], *(_spread(row[name]) for name in ("ft", "nn", "dcg"))]
-        for row in found
+        for row in results
     ]
     return ["descriptor, classes", "head", "FT", "NN", "DCG"], rows
 
 
 KINDS: Mapping[str, Callable[[Path], Table]] = {"scores": scores, "splits": splits}
-"""What a table can be made of, by name."""
+"""Readers of results by the kind of table."""
 
 
 def record(name: str, kind: str, source: Path, command: str) -> None:
-    """Keep a table with the versions, the date and the processor, and write it into the pages that show it.
+    """Save a table with command, versions, date and processor, and write it into the pages that show it.
 
     Args:
-        name: of the table, as pages name it.
+        name: name of the table in the pages.
         kind: scores or splits.
-        source: the folder or file of results.
-        command: what was run.
+        source: folder or file of results.
+        command: command that produced the results.
 
     Raises:
-        ValueError: there is no such kind.
+        ValueError: the kind is unknown.
     """
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}.")
     columns, rows = KINDS[kind](source)
-    kept = {
+    results = {
         "command": command,
         "version": version("interior-gps"),
         "signatures": SignatureConfig.ALGORITHM_VERSION,
@@ -71,7 +71,7 @@ def record(name: str, kind: str, source: Path, command: str) -> None:
         "rows": rows,
     }
     RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / f"{name}.json").write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (RESULTS / f"{name}.json").write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     write_pages()
 
 
@@ -85,27 +85,29 @@ def write_pages() -> None:
 
 
 def with_tables(text: str) -> str:
-    """A page whose places for results, `<!-- results: NAME -->`, hold the tables that are kept under these names."""
+    """Fill the places for results in a page, `<!-- results: NAME -->`, with the saved tables of these names."""
     return _PLACE.sub(lambda place: f"{place[1]}\n{markdown(place[2])}\n{place[3]}", text)
 
 
 def shown(text: str) -> list[str]:
-    """The names of the results that a page shows."""
+    """Return the names of the tables that a page shows."""
     return [place[2] for place in _PLACE.finditer(text)]
 
 
 def kept(name: str) -> dict[str, Any]:
-    """The results of a name, see `record`."""
-    found: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
-    return found
+    """Load the results saved under a name, see `record`."""
+    results: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    return results
 
 
 def markdown(name: str) -> str:
-    """The table of a name, and a line that says what measured it."""
+    """Format the table of a name, followed by a line about its origin."""
     results = kept(name)
     lines = [_row(results["columns"]), _row(["---"] * len(results["columns"])), *map(_row, results["rows"])]
-    by = f"version {results['version']}, signatures {results['signatures']}, {results['date']}, {results['processor']}"
-    return "\n".join([*lines, "", *wrap(f"`{results['command']}`: {by}.", _WIDTH)]) + "\n"
+    origin = (
+        f"version {results['version']}, signatures {results['signatures']}, {results['date']}, {results['processor']}"
+    )
+    return "\n".join([*lines, "", *wrap(f"`{results['command']}`: {origin}.", _WIDTH)]) + "\n"
 
 
 def _row(cells: Sequence[str]) -> str:
@@ -116,8 +118,8 @@ def _percent(share: float | None) -> str:
     return "–" if share is None else f"{100 * share:.1f}"
 
 
-def _spread(of: Mapping[str, float]) -> str:
-    return f"{100 * of['mean']:.1f} ± {100 * of['stdev']:.1f}"
+def _spread(values: Mapping[str, float]) -> str:
+    return f"{100 * values['mean']:.1f} ± {100 * values['stdev']:.1f}"
 
 
 def _read(source: Path, name: str) -> Any:
@@ -126,7 +128,7 @@ def _read(source: Path, name: str) -> Any:
 
 def _processor() -> str:
     try:
-        told = re.findall(r"^model name\s*:\s*(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        names = re.findall(r"^model name\s*:\s*(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     except OSError:
-        told = []
-    return f"{len(told)} cores of {told[0]}" if told else platform.processor() or platform.machine()
+        names = []
+    return f"{len(names)} cores of {names[0]}" if names else platform.processor() or platform.machine()

@@ -1,4 +1,4 @@
-"""What the figures of Rustamov 2010 show: poses, a change of topology, and the potential on a slice."""
+"""The data of the figures of Rustamov 2010: poses, a change of topology, and the potential on a slice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,29 +26,27 @@ from igps.signature.voxels import grid_axes, inside_grid, interior_samples
 from igps.spectra import Spectrum, eigenpairs
 from training.studies.weld import facing_vertices, weld
 
-# Cells along the longest side of a slice: finer than a picture can show.
-_SLICE_RESOLUTION = 300
-# In which it is computed, so that a bar moves
-_SLICE_PARTS = 4
+_SLICE_RESOLUTION = 300  # cells along the longest side of a slice: finer than the picture shows
+_SLICE_PARTS = 4  # in which a slice is computed, to update the progress bar
 
 
 @dataclass(frozen=True, eq=False)
 class PoseCurves:
-    """The distribution of interior distances of every mesh of some classes (figure 1)."""
+    """Distributions of interior distances of meshes by class (figure 1)."""
 
     curves: dict[str, Singles]  # by class, (N, B) histograms of one potential class
-    centres: Singles  # (B,) of the bins
-    within: dict[str, Singles]  # by class, the χ² distances between two of its meshes
-    to_others: dict[str, Singles]  # by class, those from its meshes to the meshes of the other classes
+    centres: Singles  # (B,) centres of the bins
+    within: dict[str, Singles]  # by class, χ² distances between its meshes
+    to_others: dict[str, Singles]  # by class, χ² distances from its meshes to those of other classes
 
 
 def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int = 64) -> PoseCurves:
-    """Rustamov 2010, figure 1: one potential class, 64 bins.
+    """Compute figure 1 of Rustamov 2010: histograms of one potential class and 64 bins.
 
     Args:
-        dataset: labelled meshes, of these classes alone.
-        classes: in the order of the result; those without a mesh are left out.
-        n_bins: B.
+        dataset: labelled meshes of these classes only.
+        classes: names of classes, in the order of the result; classes without meshes are left out.
+        n_bins: number of bins B.
     """
     axis = InteriorDistance(n_bins)
     histogram = PairHistogram([axis], SpectralEmbedding(n_eigenpairs=dataset.config.n_eigenpairs))
@@ -66,12 +64,12 @@ def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int =
 
 @dataclass(frozen=True, eq=False)
 class WeldChange:
-    """What a weld does to a body (figure 2)."""
+    """The change of a body by a weld (figure 2)."""
 
     before: Mesh
     after: Mesh  # with the weld
     n_samples: int  # interior samples, the same in both
-    change: Floats  # of each pair of them, the relative change of its interior distance
+    change: Floats  # relative changes of the interior distances between pairs of samples
     eigenvalues: tuple[Floats, Floats]  # (K,) before and after, 1/length²
 
 
@@ -84,14 +82,14 @@ def weld_change(
     *,
     progress: bool = False,
 ) -> WeldChange:
-    """Rustamov 2010, figure 2: interior distances before and after two places are joined by a triangular tube.
+    """Compute figure 2 of Rustamov 2010: interior distances before and after a triangular tube joins two places.
 
     Args:
-        body: to be welded.
-        ends: vertices of the weld; two that face each other across a narrow gap if None, see `facing_vertices`.
-        n_eigenpairs: of the embedding.
-        resolution: voxels along the longest side, one sample each.
-        progress: show a bar.
+        body: body to weld.
+        ends: vertices of the weld; if None, two that face each other across a narrow gap, see `facing_vertices`.
+        n_eigenpairs: number of eigenpairs of the embedding.
+        resolution: voxels along the longest side, with one sample each.
+        progress: show a progress bar.
 
     Raises:
         ValueError: fewer than two samples.
@@ -102,13 +100,13 @@ def weld_change(
         points = interior_samples(body, resolution)
         bar.update()
         if len(points) < 2:
-            raise ValueError(f"resolution: one interior sample of {body.name} makes no pair. Raise it.")
+            raise ValueError(f"resolution: expected two interior samples of {body.name}, got {len(points)}. Raise it.")
         eigenvalues, distances = [], []
-        for one in (body, after):
-            spectrum = _spectrum(one, n_eigenpairs)
+        for mesh in (body, after):
+            spectrum = _spectrum(mesh, n_eigenpairs)
             eigenvalues.append(spectrum.eigenvalues)
             bar.update()
-            distances.append(pdist(_embedding(one, spectrum)(points)))
+            distances.append(pdist(_embedding(mesh, spectrum)(points)))
             bar.update()
     change = np.abs(distances[1] / distances[0] - 1)
     return WeldChange(body, after, len(points), change, (eigenvalues[0], eigenvalues[1]))
@@ -121,36 +119,36 @@ class PotentialSlice:
     axes: tuple[Floats, Floats]  # (X,) and (Y,) of the slice, length
     values: Floats  # (X, Y) potential, NaN outside the body
     section: Floats  # (S, 2, 2) segments in which the plane cuts the surface
-    barycentroid: Floats  # (2,) on the slice
+    barycentroid: Floats  # (2,) position on the slice
     least: float  # potential at the barycentroid
-    largest: float  # potential at the samples
-    n_samples: int  # interior samples, near the best of which the barycentroid was searched
+    largest: float  # largest potential at the samples
+    n_samples: int  # number of interior samples
 
 
 @one_thread()
 def potential_slice(
     body: Mesh, n_eigenpairs: int = 250, resolution: int = 32, *, progress: bool = False
 ) -> PotentialSlice:
-    """The potential on the horizontal plane through the barycentroid of a body.
+    """Compute the potential on the horizontal plane through the barycentroid of a body.
 
     Args:
-        body: turned as it is to be cut.
-        n_eigenpairs: of the embedding.
-        resolution: voxels along the longest side, near the best of which the barycentroid is searched.
-        progress: show a bar.
+        body: body in the orientation in which it is cut.
+        n_eigenpairs: number of eigenpairs of the embedding.
+        resolution: voxels along the longest side; the barycentroid is searched near the best of them.
+        progress: show a progress bar.
     """
     with tqdm(total=3 + _SLICE_PARTS, desc="steps", disable=not progress) as bar:
         samples = interior_samples(body, resolution)
         x, y, _ = grid_axes(body, _SLICE_RESOLUTION)
         embedding = _embedding(body, _spectrum(body, n_eigenpairs))
         bar.update()
-        of_samples = np.linalg.norm(embedding(samples), axis=1)
+        sample_potentials = np.linalg.norm(embedding(samples), axis=1)
         bar.update()
-        coarse = samples[int(np.argmin(of_samples))]
-        around = _around(body, coarse, longest_side(body.vertices) / resolution)
-        of_around = np.linalg.norm(embedding(around), axis=1)
+        best_sample = samples[int(np.argmin(sample_potentials))]
+        candidates = _grid_around(body, best_sample, longest_side(body.vertices) / resolution)
+        potentials = np.linalg.norm(embedding(candidates), axis=1)
         bar.update()
-        centre = around[int(np.argmin(of_around))]
+        centre = candidates[int(np.argmin(potentials))]
         inside = inside_grid(body, (x, y, centre[2:]))[:, :, 0]
         i, j = np.nonzero(inside)
         points = np.stack([x[i], y[j], np.full(len(i), centre[2])], axis=1)
@@ -163,8 +161,8 @@ def potential_slice(
         values=values,
         section=_section(body, centre[2]),
         barycentroid=centre[:2],
-        least=float(of_around.min()),
-        largest=float(of_samples.max()),
+        least=float(potentials.min()),
+        largest=float(sample_potentials.max()),
         n_samples=len(samples),
     )
 
@@ -174,20 +172,20 @@ def _spectrum(mesh: Mesh, n_eigenpairs: int) -> Spectrum:
 
 
 def _embedding(mesh: Mesh, spectrum: Spectrum) -> Extension:
-    """Of points (P, 3) in the body: their commute-time embedding (P, K)."""
+    """Return the commute-time embedding: a function from points (P, 3) in the body to (P, K)."""
     roots = np.sqrt(spectrum.eigenvalues)
     return Extension(mesh.vertices, mesh.faces, spectrum.eigenfunctions, divisors=roots, accuracy=1e-3)
 
 
-def _around(mesh: Mesh, point: Floats, reach: float) -> Floats:
-    """Points of a fine cubic grid around a point in the body, those inside: (P, 3), with the point itself."""
+def _grid_around(mesh: Mesh, point: Floats, reach: float) -> Floats:
+    """Return the points (P, 3) inside the body of a fine cubic grid around a point, including the point."""
     x, y, z = point[:, None] + reach * np.linspace(-1, 1, 9)
     index = np.nonzero(inside_grid(mesh, (x, y, z)))
     return np.stack([axis[i] for axis, i in zip((x, y, z), index, strict=True)], axis=1)
 
 
 def _section(mesh: Mesh, height: float) -> Floats:
-    """(S, 2, 2) segments in which the plane z = height cuts the surface."""
+    """Return the segments (S, 2, 2) in which the plane z = height cuts the surface."""
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     segments = trimesh.intersections.mesh_plane(surface, plane_normal=[0, 0, 1], plane_origin=[0, 0, height])
     return np.asarray(segments)[:, :, :2]

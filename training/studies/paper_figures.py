@@ -1,4 +1,4 @@
-"""The figures of Rustamov 2010: histograms of poses, a weld, and the barycentroid potential on a slice."""
+"""Drawings of the figures of Rustamov 2010: histograms of poses, a weld, and the barycentroid potential on a slice."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 _STYLES = ("-", "--", "-.", ":")
 _ORANGE = (0.84, 0.37, 0.0)
 _DPI = 100
-# What Rustamov 2010 reports for Homer with welded feet: percent of change, and the share of pairs that change less.
+# Reported by Rustamov 2010 for Homer with welded feet: change in percent, and the share of pairs that change less.
 _REPORTED = ((3, "99.6 %"), (14, "all"))
 
 
 def draw_pose_curves(histograms: Mapping[str, NDArray[np.floating]], centres: NDArray[np.floating], out: Path) -> None:
-    """Draw the distribution of the interior distances of bodies, one curve each, those of a class in one colour.
+    """Draw the distributions of interior distances: a curve for each body, a colour for each class.
 
     Args:
-        histograms: of each class, (N, B), each body's of sum 1.
-        centres: (B,) ascending, of the bins; the last bin counts what lies beyond, too.
+        histograms: by class, (N, B) histograms of its bodies, each of sum 1.
+        centres: (B,) ascending centres of the bins; the last bin also counts larger distances.
         out: the PNG file.
     """
     figure = new_figure(7.5, 4.2)
@@ -56,9 +56,9 @@ def draw_weld_change(mesh: Mesh, welded: Mesh, change: NDArray[np.floating], out
     """Draw how a weld changes the interior distances, and where the weld is.
 
     Args:
-        mesh: the body before.
-        welded: by `training.studies.weld.weld`, with the tube as its last faces.
-        change: (pairs,) relative change of each distance.
+        mesh: the body before the weld.
+        welded: the body after `training.studies.weld.weld`, with the tube as its last faces.
+        change: (pairs,) relative changes of distances.
         out: the PNG file.
     """
     figure = new_figure(9.4, 3.9)
@@ -78,11 +78,11 @@ def draw_weld_change(mesh: Mesh, welded: Mesh, change: NDArray[np.floating], out
     left.set_title(f"{len(percent):,} pairs, largest change {percent.max():.0f} %")
     figure.legend(loc="outside lower left", frameon=False, fontsize=8)
     tube = welded.faces[-TUBE_FACES:]
-    place = np.unique(tube)
+    ends = np.unique(tube)
 
-    seen = upright(mesh.vertices)
-    paint(middle, seen, mesh.faces, GREY)
-    middle.plot(*seen[place, :2].mean(axis=0), "o", markersize=16, markerfacecolor="none", color=_ORANGE, mew=1.6)
+    vertices = upright(mesh.vertices)
+    paint(middle, vertices, mesh.faces, GREY)
+    middle.plot(*vertices[ends, :2].mean(axis=0), "o", markersize=16, markerfacecolor="none", color=_ORANGE, mew=1.6)
     middle.set_title("the body; circled: the weld", fontsize=9)
 
     _zoom(right, welded, tube)
@@ -104,8 +104,8 @@ def draw_potential_slice(
     Args:
         axes_of_slice: (X,) and (Y,) coordinates of the grid, length.
         potential: (X, Y), no unit; NaN outside the body.
-        outline: (S, 2, 2) the ends of the segments in which the plane cuts the surface.
-        barycentroid: (2,) where the potential is least.
+        outline: (S, 2, 2) ends of the segments in which the plane cuts the surface.
+        barycentroid: (2,) position of the least potential.
         out: the PNG file.
     """
     from matplotlib.collections import LineCollection
@@ -133,14 +133,14 @@ def draw_potential_slice(
 
 
 def upright(vertices: Floats) -> Floats:
-    """(V, 3) turned: the longest principal axis up, the next to the right, each as its largest component points."""
+    """Rotate vertices (V, 3): the longest principal axis up, the next right, their largest components positive."""
     axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     up, right = (axis * np.sign(axis[np.argmax(np.abs(axis))]) for axis in axes[:2])
     return vertices @ np.stack([right, up, np.cross(right, up)], axis=1)
 
 
 def _zoom(axis: Axes, welded: Mesh, tube: Integers) -> None:
-    """Draw the surroundings of the tube, which lies across the picture, as seen from outside the body."""
+    """Draw the surroundings of the tube as seen from outside the body; the tube lies across the picture."""
     a, b = welded.vertices[tube[:, 0]].mean(axis=0), welded.vertices[tube[:, 2]].mean(axis=0)
     middle = (a + b) / 2
     across = (b - a) / np.linalg.norm(b - a)

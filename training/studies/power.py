@@ -1,4 +1,4 @@
-"""How small a difference in one proportion the tests of groups find, beside the spectra of LaPy's ShapeDNA."""
+"""Power of the tests of groups for small differences in one proportion, compared with ShapeDNA of LaPy."""
 
 from collections.abc import Mapping, Sequence
 from functools import reduce
@@ -18,8 +18,7 @@ from igps.report.answers import write_answer
 from igps.signature.signature import SignatureConfig, compute_signature
 
 PROPORTIONS = ("width", "depth", "height", "waist")
-# Of each, as a share
-_SCATTER = 0.02
+_SCATTER = 0.02  # standard deviation of each proportion, as a share of its mean
 _N_EIGENVALUES = 30
 _LAPY = "ShapeDNA (LaPy)"
 
@@ -33,42 +32,43 @@ def power(
     n_draws: int = 400,
     seed: int = 0,
 ) -> None:
-    """The share of draws in which the tests reject at 5 %.
+    """Print the share of draws in which the tests reject at 5 %.
 
-    Subjects are eggs with a waist, whose width, depth, height and waist each scatter by 2 %. Groups differ in the mean
-    of one of them, or in none. The spectrum is LaPy's, of the same surfaces, divided by the first eigenvalue, the size.
+    Subjects are eggs with a waist. Their width, depth, height and waist each have a standard deviation of 2 %. Two
+    groups differ in the mean of one of these proportions, or in none. ShapeDNA is LaPy's spectrum of the same surfaces,
+    divided by the first eigenvalue, which removes the size.
 
     Args:
         out: folder for power.csv and power.json.
-        descriptors: names.
-        differences: of the mean of each proportion, as shares.
-        n_pool: subjects of each mean; the groups without a difference are drawn from two pools, too.
-        n_each: of a group in a draw. Draws share no subject until the pools are used up; then they are mixed anew.
-        n_draws: of two groups, for each difference.
-        seed: of all.
+        descriptors: names of descriptors.
+        differences: differences between the means of a proportion, as shares.
+        n_pool: subjects in the pool of each mean; groups without a difference are drawn from two pools, too.
+        n_each: subjects of a group. Draws share no subjects until the pools are exhausted and shuffled again.
+        n_draws: draws of two groups, for each difference.
+        seed: seed of subjects and draws.
     """
     first = pool(PROPORTIONS[0], 0, n_pool, descriptors, np.random.default_rng([seed, 0]))
     rows: list[dict[str, Any]] = []
     compared = [(PROPORTIONS[0], 0.0), *product(PROPORTIONS, differences)]
     for number, (proportion, difference) in enumerate(compared, start=1):
         second = pool(proportion, difference, n_pool, descriptors, np.random.default_rng([seed, number]))
-        told = {"proportion": proportion if difference else "none", "difference": difference}
-        print(told, flush=True)
-        rows += [{**told, **row} for row in shares(first, second, n_each, n_draws, seed)]
+        setting = {"proportion": proportion if difference else "none", "difference": difference}
+        print(setting, flush=True)
+        rows += [{**setting, **row} for row in shares(first, second, n_each, n_draws, seed)]
     write_answer(out, "power", rows)
 
 
 def shares(
     first: Mapping[str, Floats], second: Mapping[str, Floats], n_each: int, n_draws: int, seed: int
 ) -> list[dict[str, Any]]:
-    """Of draws from two pools of vectors by descriptor, in which each test rejects."""
+    """Return, by descriptor, the shares of draws from two pools of vectors in which each test rejects."""
     rows: list[dict[str, Any]] = []
     for name in first:
         random, orders = np.random.default_rng(seed), list[list[Integers]]()
         while len(orders) < n_draws:
-            mixed = [random.permutation(len(side[name])) for side in (first, second)]
-            count = min(map(len, mixed)) // n_each
-            orders += [[one[i * n_each : (i + 1) * n_each] for one in mixed] for i in range(count)]
+            shuffled = [random.permutation(len(side[name])) for side in (first, second)]
+            n_groups = min(map(len, shuffled)) // n_each
+            orders += [[order[i * n_each : (i + 1) * n_each] for order in shuffled] for i in range(n_groups)]
         tests = [
             group_test(
                 np.vstack([first[name][a], second[name][b]]), ["a"] * n_each + ["b"] * n_each,
@@ -77,8 +77,8 @@ def shares(
             for draw, (a, b) in enumerate(orders[:n_draws])
         ]  # fmt: skip
         rejected = {
-            what: float(np.mean([getattr(one, f"{what}_p") <= 0.05 for one in tests]))
-            for what in ("permanova", "kernel")
+            name_of_test: float(np.mean([getattr(test, f"{name_of_test}_p") <= 0.05 for test in tests]))
+            for name_of_test in ("permanova", "kernel")
         }
         rows.append({"descriptor": name, **rejected})
         print(rows[-1], flush=True)
@@ -88,29 +88,30 @@ def shares(
 def pool(
     proportion: str, difference: float, n_pool: int, descriptors: Sequence[str], random: np.random.Generator
 ) -> dict[str, Floats]:
-    """Vectors (n_pool, D) of subjects, by descriptor, and LaPy's."""
+    """Draw subjects, and return their vectors (n_pool, D) by descriptor, including ShapeDNA of LaPy."""
     from lapy import TriaMesh, shapedna  # the extra `studies`
 
     chosen = [descriptor_of(name) for name in descriptors]
-    config = reduce(or_, [one.requirements for one in chosen]).apply_to(SignatureConfig())
-    found: dict[str, list[Floats]] = {name: [] for name in (*descriptors, _LAPY)}
+    config = reduce(or_, [x.requirements for x in chosen]).apply_to(SignatureConfig())
+    vectors: dict[str, list[Floats]] = {name: [] for name in (*descriptors, _LAPY)}
     for _ in range(n_pool):
         mesh = subject(proportion, difference, random)
         batch = collate([compute_signature(mesh, config)])
-        for name, one in zip(descriptors, chosen, strict=True):
-            found[name].append(one.coordinates(one(batch).detach(), of_one_kind=True)[0].double().numpy())
+        for name, descriptor in zip(descriptors, chosen, strict=True):
+            coordinates = descriptor.coordinates(descriptor(batch).detach(), of_one_kind=True)
+            vectors[name].append(coordinates[0].double().numpy())
         values = shapedna.compute_shapedna(TriaMesh(mesh.vertices, mesh.faces), k=_N_EIGENVALUES)["Eigenvalues"][1:]
-        found[_LAPY].append(np.log(values / values[0])[1:])
-    return {name: np.array(rows) for name, rows in found.items()}
+        vectors[_LAPY].append(np.log(values / values[0])[1:])
+    return {name: np.array(rows) for name, rows in vectors.items()}
 
 
 def subject(proportion: str, difference: float, random: np.random.Generator) -> Mesh:
-    """One of a group in which the mean of a proportion is larger by a share."""
+    """Draw a subject of a group in which the mean of one proportion is larger by a share."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=3)
-    larger = difference * np.eye(len(PROPORTIONS))[PROPORTIONS.index(proportion)]
-    width, depth, height, waist = 1 + larger + _SCATTER * random.normal(size=len(PROPORTIONS))
+    shift = difference * np.eye(len(PROPORTIONS))[PROPORTIONS.index(proportion)]
+    width, depth, height, waist = 1 + shift + _SCATTER * random.normal(size=len(PROPORTIONS))
     x, y, z = ball.vertices.T
     narrow = 1 - 0.35 * waist * np.exp(-8 * (z - 0.1) ** 2)
     vertices = np.stack([0.8 * width * narrow * x, 0.6 * depth * narrow * y, 1.6 * height * z], axis=1)

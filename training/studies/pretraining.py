@@ -1,4 +1,4 @@
-"""Fit the metric of the descriptor `pretrained` to generated shapes, and measure it where it was not fitted."""
+"""Fit the metric of the descriptor `pretrained` to generated shapes, and score it on held-out shapes."""
 
 import random
 from collections.abc import Sequence
@@ -17,8 +17,8 @@ from training.graded import GradedShapes, body_of, family_of, looks_alike
 from training.studies.individuals import dealt, fit_individuals, generated, numbers, usable
 from training.studies.transfer import few_labels, level_scores, report
 
-# Of two classes each part has a single direction, and its vectors are signs, which may cancel.
-_FEWEST = 3
+# With two classes, each part has a single direction, and its vectors are signs, which may cancel.
+_MIN_CLASSES = 3
 
 
 def pretrain(
@@ -37,27 +37,29 @@ def pretrain(
     data: Path | None = None,
     n_workers: int | None = None,
 ) -> None:
-    """Generate shapes, check the metric on families that it was not fitted to, fit it to all, and save it.
+    """Generate shapes, score the metric on held-out families, fit it to all, and save it.
 
     Args:
-        root: folder of the generated meshes; those of individuals lie beside it, in ``ROOT-individuals``.
-        n_classes, n_bodies, n_poses, seed: of `GradedShapes`.
-        n_parts: into how many parts the families are dealt, by the seed. A class of a family that was fitted to is much
-            easier to tell than what a user has, so that whole families are held out.
-        n_scored: classes of each part to score, drawn by the seed.
-        individuals: classes, bodies of each, individuals of each and poses of each, for the level of individuals.
-        keep: parameters whose levels of classes and bodies stay: only that of individuals is checked and fitted.
-        out: the file of parameters.
+        root: folder of the generated meshes; those of individuals are written to ``ROOT-individuals``.
+        n_classes, n_bodies, n_poses, seed: arguments of `GradedShapes`.
+        n_parts: number of parts into which the families are dealt, by the seed. Whole families are held out, because
+            classes of a fitted family are much easier to separate than the classes of users.
+        n_scored: number of classes to score in each part, drawn by the seed.
+        individuals: for the level of individuals, the numbers of classes, bodies of a class, individuals of a body, and
+            poses of an individual.
+        keep: file of parameters whose levels of classes and bodies are reused; only that of individuals is scored and
+            fitted.
+        out: file of the parameters.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
-        plain: descriptors to score on the same classes beside the metric.
-        data: a labelled collection to measure the transfer on.
+        plain: descriptors to score on the same classes for comparison.
+        data: labelled collection on which to score the metric, too.
         n_workers: processes; all cores if not given.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     descriptor = pretrained_parts().eval()
 
     def save(head: TwoLevelHead) -> TwoLevelHead:
-        """The head with a level of individuals, as it is saved."""
+        """Add the level of individuals to a head, save it and return it."""
         beside = root.with_name(f"{root.name}-individuals")
         whole = fit_individuals(head, descriptor, individuals, beside, n_parts, seed, plain, cache_dir, n_workers)
         save_pretrained(EmbeddedDescriptor(descriptor, whole), out)
@@ -65,11 +67,11 @@ def pretrain(
         return whole
 
     if keep is not None:
-        kept = EmbeddedDescriptor(descriptor, pretrained_head(individuals=False))
-        names = kept.state_dict()
-        kept.load_state_dict({name: tensor.float() for name, tensor in load_file(keep).items() if name in names})
-        assert isinstance(kept.head, TwoLevelHead)
-        save(kept.head)
+        earlier = EmbeddedDescriptor(descriptor, pretrained_head(individuals=False))
+        names = earlier.state_dict()
+        earlier.load_state_dict({name: tensor.float() for name, tensor in load_file(keep).items() if name in names})
+        assert isinstance(earlier.head, TwoLevelHead)
+        save(earlier.head)
         return
 
     shapes = generated(GradedShapes(n_classes, n_bodies, n_poses, seed), root, descriptor, cache_dir, n_workers)
@@ -78,7 +80,7 @@ def pretrain(
     parts = dealt([family_of(name) for name in shapes.classes], n_parts, seed)
 
     def fit(n: int, seed: int, among: Tensor) -> TwoLevelHead:
-        """The metric, of n classes drawn by the seed."""
+        """Fit the metric to n classes drawn by the seed."""
         chosen = torch.isin(labels, torch.tensor(_drawn(among.tolist(), n, seed)))
         return pretrained_head(individuals=False).fit(
             histograms[chosen], labels[chosen], descriptor.part_cells, bodies=bodies[chosen]
@@ -91,25 +93,26 @@ def pretrain(
         level_scores(name, [(d, bodies[chosen], labels[chosen]) for d, chosen in zip(distances, scored, strict=True)])
 
     print(f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:")
-    alike = torch.tensor([looks_alike(name) for name in shapes.classes])
-    strangers = [among[~alike[among]] for among in others]
+    # Classes that resemble some of SHREC'07
+    is_look_alike = torch.tensor([looks_alike(name) for name in shapes.classes])
+    without = [among[~is_look_alike[among]] for among in others]
     ways = [("pretrained", others, others)]
-    if min(len(among) for among in strangers) >= _FEWEST:
-        ways += [("without look-alikes", strangers, strangers), ("as many, with them", others, strangers)]
-    for name, chosen, like in ways:
-        heads = [fit(len(other), seed, one) for one, other in zip(chosen, like, strict=True)]
-        score(name, [_distances(head, histograms[where]) for head, where in zip(heads, scored, strict=True)])
+    if min(len(among) for among in without) >= _MIN_CLASSES:
+        ways += [("without look-alikes", without, without), ("as many, with them", others, without)]
+    for name, pools, counted in ways:
+        heads = [fit(len(classes), seed, pool) for pool, classes in zip(pools, counted, strict=True)]
+        score(name, [_distances(head, histograms[part]) for head, part in zip(heads, scored, strict=True)])
     for name in plain:
         other = igps.descriptor(name)
         described = [
             describe(
-                usable(root, other, cache_dir, n_workers, torch.nonzero(where).flatten().tolist()),
+                usable(root, other, cache_dir, n_workers, torch.nonzero(part).flatten().tolist()),
                 other,
                 n_workers=n_workers,
             )
-            for where in scored
+            for part in scored
         ]
-        score(name, [other.distances(one, one) for one in described])
+        score(name, [other.distances(x, x) for x in described])
 
     everything = torch.arange(len(shapes.classes))
     head = fit(len(everything), seed, everything)
@@ -119,20 +122,20 @@ def pretrain(
         return
 
     real = usable(data, descriptor, cache_dir, n_workers)
-    found, classes = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
-    report(str(data), found, classes, head)
-    unlike = everything[~alike]
-    both = (("without look-alikes", unlike), ("of all kinds", everything)) if len(unlike) >= _FEWEST else ()
-    for name, among in both:
+    real_histograms, labels_of_real = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
+    report(str(data), real_histograms, labels_of_real, head)
+    unlike = everything[~is_look_alike]
+    choices = (("without look-alikes", unlike), ("of all kinds", everything)) if len(unlike) >= _MIN_CLASSES else ()
+    for name, among in choices:
         title = f"{data}, fitted to {len(unlike)} classes {name}"
-        report(title, found, classes, fit(len(unlike), seed, among))
-    # Two of each class are left to find each other.
-    for n in (n for n in (1, 3, 5) if n + 2 <= int(classes.bincount().min())):
-        few_labels(n, found, classes, head, descriptor.part_cells)
+        report(title, real_histograms, labels_of_real, fit(len(unlike), seed, among))
+    # At least two shapes of each class remain to be scored against each other
+    for n in (n for n in (1, 3, 5) if n + 2 <= int(labels_of_real.bincount().min())):
+        few_labels(n, real_histograms, labels_of_real, head, descriptor.part_cells)
 
 
 def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
-    """Write a fitted `pretrained_parts` under `pretrained_head` to a safetensors file, the head in half precision."""
+    """Save `pretrained_parts` with a fitted `pretrained_head` as safetensors, the head in half precision."""
     state = {
         name: (tensor.half() if name.startswith("head.") and tensor.is_floating_point() else tensor).contiguous()
         for name, tensor in module.state_dict().items()

@@ -1,8 +1,9 @@
-"""How far descriptions move when a mesh is disturbed, or a body takes another pose."""
+"""Movement of descriptions when a mesh is disturbed, or when a body takes another pose."""
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -25,33 +26,33 @@ from training.studies.altered import Answer, Way, describe_altered
 from training.studies.disturbances import DISTURBANCES
 
 POSE = "pose"
-"""The column of the movement between poses of one body."""
+"""Name of the column of the movement between poses of one body."""
 
-_AS_IT_IS = "as it is"
+_UNCHANGED = "unchanged"
 
 
 @dataclass(frozen=True)
 class Movement:
-    """How far a description moves."""
+    """Movements of the descriptions of meshes."""
 
-    distances: Mapping[str, float]  # of each mesh or pair by name, over the median distance between classes
-    notes: Mapping[str, str]  # why others are missing, by name
+    distances: Mapping[str, float]  # by mesh or pair, over the median distance between classes
+    notes: Mapping[str, str]  # why other meshes or pairs are missing, by name
 
     @property
     def mean(self) -> float | None:
-        """Mean of the distances; None if there are none."""
+        """The mean of the distances; None if there are none."""
         return float(np.mean(list(self.distances.values()))) if self.distances else None
 
 
 @dataclass(frozen=True)
 class Robustness:
-    """How far each descriptor moves."""
+    """Movements by descriptor."""
 
     movements: Mapping[str, Mapping[str, Movement]]  # by descriptor, then by disturbance or `POSE`
-    units: Mapping[str, float]  # the median distance between classes of each descriptor; NaN where there is none
+    units: Mapping[str, float]  # median distance between classes by descriptor; NaN if unknown
 
     def as_dict(self) -> dict[str, Any]:
-        """For a JSON file."""
+        """Return a dict for a JSON file."""
         return {
             "disturbances": {name: disturbance.description for name, disturbance in DISTURBANCES.items()},
             "median_between_classes": {name: unit if unit > 0 else None for name, unit in self.units.items()},
@@ -79,27 +80,28 @@ def robustness(
     distance between meshes of different classes.
 
     Args:
-        dataset: the meshes to disturb, their signatures with all that the descriptors need.
-        descriptors: to be measured.
-        gallery: labelled meshes that tell the distance between classes; if None, each of the meshes is a class.
-        poses: meshes whose classes are bodies, for the movement between any two of one body; without classes they are
-            all one body.
-        n_workers: processes; all cores if None.
+        dataset: meshes to disturb, with signatures that meet the requirements of the descriptors.
+        descriptors: descriptors to measure.
+        gallery: labelled meshes by which the distance between classes is measured; if None, each mesh of `dataset` is a
+            class.
+        poses: meshes for the movement between poses, with bodies as classes; without classes, all are poses of one
+            body.
+        n_workers: number of processes; all cores if None.
 
     Raises:
-        ValueError: fewer than two meshes and no gallery, two descriptors of one name, or signatures that
-            lack what one needs.
+        ValueError: fewer than two meshes without a gallery, two descriptors of the same name, or signatures that do not
+            meet the requirements of a descriptor.
     """
     check_descriptors(descriptors, dataset)
     if gallery is None and len(dataset) < 2:
         raise ValueError("dataset: expected at least two meshes, each its own class, or a gallery. Give one of them.")
-    ways: dict[str, Way | None] = {_AS_IT_IS: None, **{name: one.apply for name, one in DISTURBANCES.items()}}
-    found = describe_altered(dataset, ways, descriptors, n_workers=n_workers)
+    ways: dict[str, Way | None] = {_UNCHANGED: None, **{name: kind.apply for name, kind in DISTURBANCES.items()}}
+    answers = describe_altered(dataset, ways, descriptors, n_workers=n_workers)
     if gallery is None:
-        units = {one.name: _between_meshes(one, [of[_AS_IT_IS][one.name] for of in found]) for one in descriptors}
+        units = {x.name: _between_meshes(x, [row[_UNCHANGED][x.name] for row in answers]) for x in descriptors}
     else:
         units = _between_classes(gallery, descriptors, n_workers)
-    table = {one.name: _movements(one, dataset.bodies.names, found, units[one.name]) for one in descriptors}
+    table = {x.name: _movements(x, dataset.bodies.names, answers, units[x.name]) for x in descriptors}
     if poses is not None:
         for name, movement in _between_poses(poses, descriptors, units, n_workers).items():
             table[name][POSE] = movement
@@ -109,16 +111,16 @@ def robustness(
 def _movements(
     descriptor: Descriptor,
     names: Sequence[str],
-    found: Sequence[Mapping[str, Mapping[str, Answer]]],
+    answers: Sequence[Mapping[str, Mapping[str, Answer]]],
     unit: float,
 ) -> dict[str, Movement]:
-    """The movement by each disturbance."""
+    """Return the movement of a descriptor by each disturbance."""
     result = {}
     for way in DISTURBANCES:
         distances: dict[str, float] = {}
         notes: dict[str, str] = {}
-        for mesh, descriptions in zip(names, found, strict=True):
-            before, after = descriptions[_AS_IT_IS][descriptor.name], descriptions[way][descriptor.name]
+        for mesh, descriptions in zip(names, answers, strict=True):
+            before, after = descriptions[_UNCHANGED][descriptor.name], descriptions[way][descriptor.name]
             if isinstance(before, str) or isinstance(after, str):
                 notes[mesh] = before if isinstance(before, str) else str(after)
             else:
@@ -127,35 +129,35 @@ def _movements(
     return result
 
 
-def _distance(descriptor: Descriptor, one: Singles, other: Singles) -> float:
+def _distance(descriptor: Descriptor, first: Singles, second: Singles) -> float:
     with torch.inference_mode():
-        return float(descriptor.distances(torch.from_numpy(one)[None], torch.from_numpy(other)[None]))
+        return float(descriptor.distances(torch.from_numpy(first)[None], torch.from_numpy(second)[None]))
 
 
 def _between_meshes(descriptor: Descriptor, descriptions: Sequence[Answer]) -> float:
-    """Median distance between any two of the descriptions that are there; NaN without two."""
-    there = [description for description in descriptions if not isinstance(description, str)]
-    pairs = [_distance(descriptor, one, other) for i, one in enumerate(there) for other in there[i + 1 :]]
-    return float(np.median(pairs)) if pairs else np.nan
+    """Return the median distance between descriptions; NaN if fewer than two meshes could be described."""
+    described = [description for description in descriptions if not isinstance(description, str)]
+    distances = [_distance(descriptor, first, second) for first, second in combinations(described, 2)]
+    return float(np.median(distances)) if distances else np.nan
 
 
 def _between_classes(
     gallery: SignatureDataset, descriptors: Sequence[Descriptor], n_workers: int | None
 ) -> dict[str, float]:
-    """Median distance of each descriptor between meshes of different classes; NaN where there is none."""
+    """Return the median distance of each descriptor between meshes of different classes; NaN if there is none."""
     units = {}
     for result in compare(gallery, descriptors, n_workers=n_workers):
         labels = np.array(result.labels)
-        other = labels[:, None] != labels[None, :]
-        there = result.distances is not None and other.any()
-        units[result.descriptor.name] = float(np.median(np.asarray(result.distances)[other])) if there else np.nan
+        differs = labels[:, None] != labels[None, :]
+        is_known = result.distances is not None and differs.any()
+        units[result.descriptor.name] = float(np.median(np.asarray(result.distances)[differs])) if is_known else np.nan
     return units
 
 
 def _between_poses(
     poses: SignatureDataset, descriptors: Sequence[Descriptor], units: Mapping[str, float], n_workers: int | None
 ) -> dict[str, Movement]:
-    """The movement of each descriptor between any two meshes of one body."""
+    """Return the movement of each descriptor between any two meshes of the same body."""
     movements = {}
     for result in compare(poses, descriptors, n_workers=n_workers):
         notes = {failure.id: failure.error for failure in result.failures}
@@ -170,7 +172,7 @@ def _between_poses(
 
 
 def _movement(distances: Mapping[str, float], notes: Mapping[str, str], unit: float) -> Movement:
-    """The distances over their unit."""
+    """Divide distances by their unit."""
     if not unit > 0:
         reason = "there is no distance between classes to compare with."
         return Movement({}, {**dict.fromkeys(distances, reason), **notes})
@@ -178,7 +180,7 @@ def _movement(distances: Mapping[str, float], notes: Mapping[str, str], unit: fl
 
 
 def robustness_table(table: Mapping[str, Mapping[str, Movement]]) -> str:
-    """The mean movements in percent, one line a descriptor and one column a disturbance, and what the columns mean."""
+    """Format the mean movements in percent, by descriptor and disturbance, followed by the meaning of the columns."""
     columns = list(next(iter(table.values())))
     width = max(len(name) for name in table)
     lines = [" " * width + "".join(f"{column:>9}" for column in columns)]
@@ -212,18 +214,18 @@ def robustness_command(
     """Measure how far the description of each descriptor moves when a mesh is disturbed, and print a table.
 
     A movement is the distance between the descriptions of a mesh before and after, in percent of the descriptor's
-    median distance between meshes of different classes. It is 0 for what the descriptor does not notice, and 100 where
-    a mesh ends as far away as a typical mesh of another class.
+    median distance between meshes of different classes. It is 0 if the descriptor is invariant, and 100 if the mesh
+    moves as far as to a typical mesh of another class.
 
     Args:
         meshes: the mesh files to disturb.
         descriptors: names, or package.module:NAME of your own.
-        gallery: labelled folder that tells the distance between classes; if not given, each of the meshes is a class.
-        poses: folder with meshes of one body, for the movement between any two of them.
-        out: folder for robustness.json, meshes.json that tells where the meshes lie, notes.csv of what was done to
-            which mesh, and failures.csv if a mesh could not be used.
+        gallery: labelled folder by which the distance between classes is measured; if not given, each mesh is a class.
+        poses: folder with meshes of one body in several poses.
+        out: folder for robustness.json, meshes.json with the paths of the meshes, notes.csv with the changes made to
+            them, and failures.csv with the meshes that could not be used.
         report: make a page of the results in that folder, report.html, see `igps report`
-        n_workers: processes that compute; all cores if not given.
+        n_workers: number of processes; all cores if not given.
     """
     check_report(report, out)
     chosen = [descriptor_of(name) for name in descriptors]
@@ -237,11 +239,11 @@ def robustness_command(
         bodies = Bodies(files.paths, files.names, files.labels or ("body",) * len(files))
         of_poses, unread = signatures(bodies, chosen, **reading)
         failures = [*failures, *unread]
-    found = robustness(dataset, chosen, gallery=between, poses=of_poses, n_workers=n_workers)
-    print(robustness_table(found.movements))
+    result = robustness(dataset, chosen, gallery=between, poses=of_poses, n_workers=n_workers)
+    print(robustness_table(result.movements))
     for failure in failures:
         print(f"not used: {failure.error}")
-    summary = {**found.as_dict(), "config": dataset.config.as_dict()}
+    summary = {**result.as_dict(), "config": dataset.config.as_dict()}
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "robustness.json").write_text(json.dumps(summary, indent=2) + "\n")

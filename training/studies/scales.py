@@ -1,4 +1,4 @@
-"""The scale of each descriptor: the median of its distances between generated bodies of one class."""
+"""Scales of descriptors: the median distance between generated bodies of the same class."""
 
 from functools import reduce
 from operator import or_
@@ -19,16 +19,17 @@ def scales(
     """Print the scales of descriptors, for `igps.descriptors.individual.SCALES`.
 
     Args:
-        descriptors: names; all of the library if not given.
-        n_classes: classes of generated bodies.
-        n_bodies: bodies of each class, in one pose.
-        seed: of the bodies.
-        n_individuals: of each body; if there are some, the medians are those between them.
+        descriptors: names of descriptors; all of the library if not given.
+        n_classes: number of classes of generated bodies.
+        n_bodies: number of bodies of each class, in one pose.
+        seed: seed of the bodies.
+        n_individuals: number of individuals of each body; if positive, distances are measured between individuals of
+            the same body.
     """
     generated = GradedShapes(n_classes, n_bodies, 1, seed=seed, n_vertices=(1800, 2600), n_individuals=n_individuals)
     shapes = [generated[i] for i in range(len(generated))]
     labels = [shape.body if n_individuals else shape.label for shape in shapes]
-    same = torch.tensor([[one == other for one in labels] for other in labels]).triu(1)
+    same = torch.tensor([[first == second for first in labels] for second in labels]).triu(1)
     modules = [descriptor_of(name) for name in descriptors or NAMES]
     config = reduce(or_, (module.requirements for module in modules)).apply_to(SignatureConfig(n_eigenpairs=250))
     meshes = [Mesh(shape.vertices, shape.faces) for shape in shapes]

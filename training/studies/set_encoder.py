@@ -1,9 +1,9 @@
-"""A network on the set of a body's samples, beside histograms of them and with them, on families that it has not seen.
+"""A network on sets of samples, compared and combined with histograms of the samples, on held-out families.
 
     python -m training.studies.set_encoder ROOT
 
 ROOT holds generated shapes (`GradedShapes(...).write(ROOT)`). Each split trains on the classes of half of the families
-and scores those of the others. The whitened head of the histograms is fitted to the same classes.
+and scores the classes of the other half. The whitened head of the histograms is fitted to the same classes.
 """
 
 from pathlib import Path
@@ -28,9 +28,9 @@ N_SAMPLES = 256
 
 
 class SetEncoder(nn.Module):
-    """Samples (N, P, D) to embeddings (N, 128) of length 1, whatever their order.
+    """Map samples (N, P, D), in any order, to embeddings (N, 128) of length 1.
 
-    Deep sets (Zaheer et al. 2017) whose sum is weighted by seeds (Lee et al. 2019).
+    The network is a deep set (Zaheer et al. 2017) with pooling by seeds (Lee et al. 2019).
     """
 
     def __init__(self, n_features: int, n_seeds: int = 8) -> None:
@@ -42,14 +42,14 @@ class SetEncoder(nn.Module):
         self.whole = nn.Sequential(nn.LayerNorm(256 * n_seeds), nn.Dropout(0.2), nn.Linear(256 * n_seeds, 128))
 
     def forward(self, samples: Tensor) -> Tensor:
-        """See the class."""
-        found = self.each(samples)
-        pooled = self.attention(found).softmax(dim=1).transpose(1, 2) @ found
+        """Return the embeddings of samples."""
+        encoded = self.each(samples)
+        pooled = self.attention(encoded).softmax(dim=1).transpose(1, 2) @ encoded
         return functional.normalize(self.whole(pooled.flatten(1)), dim=1)
 
 
 def features(batch: SignatureBatch) -> Tensor:
-    """(1, 2P, D) of a body's interior and surface samples: potentials, radii of balls on both sides, which kind."""
+    """Return features (1, 2P, D) of interior and surface samples: potentials, radii of balls on both sides, kind."""
     surface = batch.surface
     points = surface.points / batch.area.sqrt().float()[:, None, None]
     radii = ball_radii(points, surface.attributes["surface_direction"], surface.mask).log()
@@ -57,19 +57,19 @@ def features(batch: SignatureBatch) -> Tensor:
     for kind, samples in enumerate((batch.interior, surface)):
         potentials = [potential(samples, batch, n) for n in SCALES]
         own = radii if kind else torch.zeros(*samples.mask.shape, 2)
-        found = torch.cat([torch.stack(potentials, dim=2), own, torch.full_like(own[..., :1], kind)], dim=2)
-        rows.append(found[:, torch.linspace(0, found.shape[1] - 1, N_SAMPLES).long()])
+        columns = torch.cat([torch.stack(potentials, dim=2), own, torch.full_like(own[..., :1], kind)], dim=2)
+        rows.append(columns[:, torch.linspace(0, columns.shape[1] - 1, N_SAMPLES).long()])
     return torch.cat(rows, dim=1)
 
 
 def potential(samples: SampleBatch, batch: SignatureBatch, n_eigenpairs: int) -> Tensor:
-    """(1, P) logarithms of the potential."""
+    """Return the logarithms (1, P) of the potential at samples."""
     embedded = spectral_embedding(samples.eigenfunctions, batch.eigenvalues, batch.area, n_eigenpairs=n_eigenpairs)
     return barycentroid_potential(embedded).clamp_min(1e-6).log()
 
 
 def trained(sets: Tensor, labels: Tensor, n_epochs: int, seed: int) -> SetEncoder:
-    """An encoder of sets, by the supervised contrastive loss (Khosla et al. 2020) of batches of 8 of 8 classes."""
+    """Train an encoder by the supervised contrastive loss (Khosla et al. 2020), on batches of 8 shapes of 8 classes."""
     torch.manual_seed(seed)
     encoder = SetEncoder(sets.shape[2])
     optimizer = torch.optim.AdamW(encoder.parameters(), lr=1e-3, weight_decay=0.05)
@@ -80,9 +80,9 @@ def trained(sets: Tensor, labels: Tensor, n_epochs: int, seed: int) -> SetEncode
         batch = torch.cat(
             [(labels == c).nonzero().flatten()[torch.randperm(int((labels == c).sum()))[:8]] for c in drawn]
         )
-        kept = torch.randperm(sets.shape[1])[:N_SAMPLES]  # half of the samples
-        found = encoder(sets[batch][:, kept])
-        logits = (found @ found.T / 0.1).fill_diagonal_(-1e9)
+        subset = torch.randperm(sets.shape[1])[:N_SAMPLES]  # half of the samples
+        embedded = encoder(sets[batch][:, subset])
+        logits = (embedded @ embedded.T / 0.1).fill_diagonal_(-1e9)
         same = (labels[batch, None] == labels[None, batch]).float().fill_diagonal_(0)
         loss = -((logits.log_softmax(dim=1) * same).sum(dim=1) / same.sum(dim=1)).mean()
         optimizer.zero_grad()
@@ -95,14 +95,14 @@ def trained(sets: Tensor, labels: Tensor, n_epochs: int, seed: int) -> SetEncode
 def study(
     root: Path, cache_dir: Path | None = None, n_splits: int = 5, n_epochs: int = 40, first_seed: int = 0
 ) -> None:
-    """FT of classes of held-out families, mean ± standard deviation over splits of the families.
+    """Print FT on classes of held-out families, mean ± standard deviation over splits of the families.
 
     Args:
         root: folder of generated shapes.
-        cache_dir: of signatures; the user's cache directory if None.
-        n_splits: with the seeds from `first_seed` on.
-        n_epochs: of the encoder.
-        first_seed: see n_splits.
+        cache_dir: folder of cached signatures; the user's cache directory if None.
+        n_splits: number of splits, with consecutive seeds.
+        n_epochs: epochs of training of the encoder.
+        first_seed: seed of the first split.
     """
     descriptor = pretrained_parts().eval()
     dataset = igps.SignatureDataset(root, descriptor=descriptor, cache_dir=cache_dir)
@@ -122,16 +122,16 @@ def study(
         with torch.no_grad():
             embedded, whitened = encoder(scaled[~seen]), head(histograms[~seen])
         plain = descriptor.distances(histograms[~seen], histograms[~seen])
-        by_set, by_head = ((1 - one @ one.T).clamp_min(0) for one in (embedded, whitened))
+        by_set, by_head = ((1 - x @ x.T).clamp_min(0) for x in (embedded, whitened))
         both = by_set / by_set.median() + by_head / by_head.median()
         rows = {"histograms": plain, "whitened": by_head, "set encoder": by_set, "whitened and set encoder": both}
         for name, distances in rows.items():
             scores.setdefault(name, []).append(100 * retrieval_scores(distances, labels[~seen]).mean()["ft"])
-        print(seed, {name: round(found[-1], 1) for name, found in scores.items()}, flush=True)
+        print(seed, {name: round(values[-1], 1) for name, values in scores.items()}, flush=True)
     n_weights = sum(parameter.numel() for parameter in encoder.parameters())
     print(f"{len(dataset)} shapes of {len(dataset.classes)} classes, encoder of {n_weights} weights, FT:")
-    for name, found in scores.items():
-        print(f"{name:<26}{mean(found):>6.1f} ± {stdev(found):.1f}")
+    for name, values in scores.items():
+        print(f"{name:<26}{mean(values):>6.1f} ± {stdev(values):.1f}")
 
 
 if __name__ == "__main__":

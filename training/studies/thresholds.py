@@ -1,4 +1,4 @@
-"""Quantiles of distances, and thresholds between pairs that are the same and others."""
+"""Quantiles of distances, and thresholds between pairs of the same body and other pairs."""
 
 import math
 
@@ -9,27 +9,27 @@ from igps.gallery.calibration import LEVELS, Threshold
 
 
 def quantiles(distances: ArrayLike) -> list[float]:
-    """Those of distances at `LEVELS`."""
+    """Return the quantiles of distances at `LEVELS`, with five digits."""
     return [float(f"{value:.5g}") for value in np.quantile(np.asarray(distances, dtype=np.float64), LEVELS)]
 
 
 def threshold_between(same: ArrayLike, other: ArrayLike, rate: float) -> Threshold:
-    """The threshold between distances of pairs that are the same and of others.
+    """Return the threshold between distances of same pairs and of other pairs.
 
-    Where the two do not overlap, the geometric mean of the largest of the ones and the smallest of the others; else as
-    large as the rate of false pairs allows.
+    If the distances do not overlap, the threshold is the geometric mean of the largest distance of same pairs and the
+    smallest of other pairs. Otherwise it is as large as the rate of false pairs allows.
 
     Args:
-        same: distances of pairs that are the same.
-        other: of pairs that are not.
-        rate: of false pairs, at most.
+        same: distances of same pairs.
+        other: distances of other pairs.
+        rate: largest rate of false pairs.
     """
     largest, refused = float(np.max(same)), _first_refused(other, rate)
     return _counted(math.sqrt(largest * refused) if largest < refused else math.nextafter(refused, 0), same, other)
 
 
 def threshold_at(same: ArrayLike, other: ArrayLike, rate: float) -> Threshold:
-    """As large a threshold as the rate of false pairs allows; arguments as for `threshold_between`."""
+    """Return the largest threshold that the rate of false pairs allows; arguments are those of `threshold_between`."""
     return _counted(math.nextafter(_first_refused(other, rate), 0), same, other)
 
 

@@ -1,4 +1,4 @@
-"""How a metric that was fitted to generated shapes does on others: what pretrain.py prints."""
+"""Scores of a metric on shapes to which it was not fitted, as printed by pretrain.py."""
 
 from collections.abc import Sequence
 from statistics import mean, stdev
@@ -18,19 +18,19 @@ def report(title: str, histograms: Tensor, labels: Tensor, head: Head) -> None:
     """Print the scores of the plain distance and of the head."""
     print(f"{title}\n{'':<12}" + "".join(f"{name.upper():>7}" for name in COLUMNS))
     plain = retrieval_scores(chi_square(histograms, histograms), labels).mean()
-    for name, found in (("plain", plain), ("pretrained", scores(head, histograms, labels))):
-        print(f"{name:<12}" + "".join(f"{100 * found[column]:>7.1f}" for column in COLUMNS))
+    for name, row in (("plain", plain), ("pretrained", scores(head, histograms, labels))):
+        print(f"{name:<12}" + "".join(f"{100 * row[column]:>7.1f}" for column in COLUMNS))
 
 
 def scores(head: Head, histograms: Tensor, labels: Tensor) -> dict[str, float]:
-    """Leave-one-out scores of a head's distance."""
+    """Return the leave-one-out scores of the distance of a head."""
     vectors = head(histograms)
     return retrieval_scores(head.distances(vectors, vectors), labels).mean()
 
 
 def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: Head, part_cells: Sequence[int]) -> None:
     """Print FT of heads fitted to n shapes of each class, on the pretrained metric and from scratch."""
-    found: dict[str, list[float]] = {"pretrained, no labels": [], "from pretrained": [], "from scratch": []}
+    ft: dict[str, list[float]] = {"pretrained, no labels": [], "from pretrained": [], "from scratch": []}
     for seed in range(100, 105):
         split = split_seen(labels, n, seed=seed)
         train, test = torch.tensor(split.train), torch.tensor(split.test)
@@ -41,22 +41,24 @@ def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: Head, par
         for head in fitted.values():
             head.fit(histograms[train], labels[train], part_cells)
         for name, other in {"pretrained, no labels": pretrained, **fitted}.items():
-            found[name].append(100 * scores(other, histograms[test], labels[test])["ft"])
-    rows = ", ".join(f"{name} FT {mean(values):.1f} ± {stdev(values):.1f}" for name, values in found.items())
+            ft[name].append(100 * scores(other, histograms[test], labels[test])["ft"])
+    rows = ", ".join(f"{name} FT {mean(values):.1f} ± {stdev(values):.1f}" for name, values in ft.items())
     print(f"{n} labels a class: {rows}")
 
 
 def level_scores(name: str, parts: Sequence[tuple[Tensor, ...]]) -> None:
-    """Print the mean scores of parts, each its distances, then the labels of each level: individuals, bodies, classes.
+    """Print the mean scores of parts by level, and the standard deviation of the first tier over parts.
 
-    The last levels are given, of two the bodies and classes. Beside the first tier stands how far the parts differ, as
-    a standard deviation.
+    Args:
+        name: name of the row.
+        parts: of each part, the distances, then the labels of each level: individuals, bodies and classes, or only
+            bodies and classes.
     """
     rows = []
     names = ("individual", "body", "class")[4 - len(parts[0]) :]
     for place, level in enumerate(names, 1):
-        found = [retrieval_scores(part[0], part[place]).mean() for part in parts]
-        words = [f"{key.upper()} {100 * mean(one[key] for one in found):.1f}" for key in ("nn", "ft", "dcg")]
-        words[1] += f" ± {100 * stdev(one['ft'] for one in found):.1f}"
+        results = [retrieval_scores(part[0], part[place]).mean() for part in parts]
+        words = [f"{key.upper()} {100 * mean(row[key] for row in results):.1f}" for key in ("nn", "ft", "dcg")]
+        words[1] += f" ± {100 * stdev(row['ft'] for row in results):.1f}"
         rows.append(f"{level} " + " ".join(words))
     print(f"{name:<28}" + " | ".join(rows), flush=True)

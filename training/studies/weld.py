@@ -1,4 +1,4 @@
-"""A tube between two places of a body that face each other across a gap: what touching parts do to a scan."""
+"""Welds: a tube between two places of a body that face each other across a gap, as touching parts cause in scans."""
 
 import heapq
 from collections.abc import Iterator
@@ -15,22 +15,22 @@ from igps.mesh.surface import vertex_normals
 from igps.mesh.winding import winding_number
 
 TUBE_FACES = 6
-"""Faces of the tube of a weld, the last ones of the welded mesh."""
+"""Number of faces of the tube, which are the last faces of the welded mesh."""
 
-# Widths of a gap that a weld may bridge, as shares of the bounding box's diagonal, the narrowest first.
+# Largest widths of gaps that are searched one after the other, as shares of the diagonal of the bounding box.
 _GAPS = (1 / 64, 1 / 32, 1 / 16)
-# Places are far apart along the surface from this share of the diagonal on.
+# Least path along the surface between places that count as far apart, as a share of the diagonal.
 _FAR = 1 / 4
 # Least cosine between the normal of a vertex and the direction to the vertex that it faces.
-_FACING = 0.5
+_MIN_COSINE = 0.5
 _N_LANDMARKS = 32
 
 
 def weld(mesh: Mesh, a: int, b: int) -> Mesh:
     """Join two places of a surface by a triangular tube, which adds one to its genus.
 
-    One triangle at each of the two vertices is taken out, and the sides of a prism, six triangles, join the two rims.
-    Of the triangles there, and the ways to turn the prism, those are taken that make the edges of the tube shortest.
+    One triangle at each of the two vertices is removed, and the sides of a prism, six triangles, join the two rims. The
+    two triangles and the rotation of the prism are those that make the edges of the tube shortest.
 
     Args:
         mesh: the body.
@@ -40,7 +40,7 @@ def weld(mesh: Mesh, a: int, b: int) -> Mesh:
         The mesh with the tube as its last `TUBE_FACES` faces; the vertices are the same.
 
     Raises:
-        ValueError: no such vertices, or none of their triangles are apart by two edges.
+        ValueError: a vertex does not exist, or no triangles at the two vertices are at least two edges apart.
     """
     for name, vertex in (("a", a), ("b", b)):
         if not 0 <= vertex < len(mesh.vertices):
@@ -53,9 +53,9 @@ def weld(mesh: Mesh, a: int, b: int) -> Mesh:
         beside = np.union1d(rim, neighbours[rim].indices)
         for j in faces_b:
             if np.isin(mesh.faces[j], beside).any():
-                continue  # the tube would meet an edge that two faces share already
+                continue  # the tube would join an edge that already has two faces
             for turn in range(3):
-                other = mesh.faces[j][[turn, turn - 1, turn - 2]]  # backwards: the two rims face each other
+                other = mesh.faces[j][[turn, turn - 1, turn - 2]]  # reversed, as the rims face each other
                 length = float(np.linalg.norm(mesh.vertices[rim] - mesh.vertices[other], axis=1).sum())
                 if best is None or length < best[0]:
                     best = length, int(i), int(j), other
@@ -78,14 +78,14 @@ def weld(mesh: Mesh, a: int, b: int) -> Mesh:
 
 
 def facing_vertices(mesh: Mesh) -> tuple[int, int]:
-    """Two vertices that face each other across a narrow gap outside the body, but are far apart along its surface.
+    """Find two vertices that face each other across a narrow gap outside the body, but are far apart on its surface.
 
-    Of the pairs at most 1/64 of the bounding box's diagonal apart, the one with the largest ratio of the shortest path
-    along the edges to the gap, if that path is at least a quarter of the diagonal; otherwise the same with 1/32 and
-    1/16; otherwise, of the pairs at most 1/16 apart, the one with the longest path.
+    Among pairs at most 1/64 of the diagonal of the bounding box apart, whose shortest path along edges is at least a
+    quarter of the diagonal, the pair with the largest ratio of path to gap is chosen. If there is none, gaps of 1/32
+    and 1/16 are tried. If there is still none, the pair with the longest path among those at most 1/16 apart is chosen.
 
     Raises:
-        MeshError: nothing faces anything across a gap, as on every convex body.
+        MeshError: no two vertices face each other across a gap, as on convex bodies.
     """
     search = _GapSearch(mesh)
     for gap in _GAPS:
@@ -102,12 +102,12 @@ def facing_vertices(mesh: Mesh) -> tuple[int, int]:
 
 
 def weld_gap(mesh: Mesh) -> Mesh:
-    """`weld` at the `facing_vertices`."""
+    """Weld a mesh at its `facing_vertices`."""
     return weld(mesh, *facing_vertices(mesh))
 
 
 class _GapSearch:
-    """Pairs of vertices that face each other, best first."""
+    """Search for pairs of vertices that face each other, the best first."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
@@ -117,12 +117,12 @@ class _GapSearch:
         self._landmarks = farthest_points(mesh, min(_N_LANDMARKS, len(mesh.vertices)), points_per_edge=0).distances
 
     def pairs(self, largest_gap: float, least_path: float | None = None) -> Iterator[tuple[int, int]]:
-        """The pairs at most `largest_gap` apart, in descending order of the shortest path along edges between them.
+        """Yield the pairs at most `largest_gap` apart, in descending order of the shortest path along edges.
 
-        With `least_path` only those whose path is at least so long, in descending order of path over gap.
+        With `least_path`, yield only pairs whose path is at least as long, in descending order of path over gap.
         """
         pair, gap = self._facing(largest_gap)
-        # A path over a landmark bounds the shortest one from above, so that few have to be searched for.
+        # A path over a landmark is an upper bound of the shortest path, so that few exact paths are needed
         upper = (self._landmarks[:, pair[:, 0]] + self._landmarks[:, pair[:, 1]]).min(axis=0)
         far = upper >= (least_path or 0)
         pair, gap, upper = pair[far], gap[far], upper[far]
@@ -133,11 +133,11 @@ class _GapSearch:
         for i, a in enumerate(pair[:, 0].tolist()):
             of_source.setdefault(a, []).append(i)
         while queue:
-            _, i, exact = heapq.heappop(queue)
+            _, i, is_exact = heapq.heappop(queue)
             a, b = pair[i].tolist()
-            if exact:
+            if is_exact:
                 yield a, b
-            elif a in of_source:  # otherwise the pairs of this vertex are in the queue with their exact paths
+            elif a in of_source:  # otherwise the queue holds the pairs of this vertex with their exact paths
                 path = dijkstra(self._graph, indices=a)
                 for k in of_source.pop(a):
                     length = float(path[pair[k, 1]])
@@ -145,16 +145,16 @@ class _GapSearch:
                         heapq.heappush(queue, (-length / float(unit[k]), k, True))
 
     def is_clear(self, a: int, b: int) -> bool:
-        """Whether the straight line between two vertices runs outside the body."""
+        """Return whether the straight line between two vertices lies outside the body."""
         along = np.array([[0.25], [0.5], [0.75]])
         points = (1 - along) * self._mesh.vertices[a] + along * self._mesh.vertices[b]
         return bool((winding_number(self._mesh.vertices, self._mesh.faces, points) < 0.5).all())
 
     def _facing(self, largest_gap: float) -> tuple[Integers, Floats]:
         pair = self._tree.query_pairs(largest_gap, output_type="ndarray").astype(np.int64).reshape(-1, 2)
-        way = self._mesh.vertices[pair[:, 1]] - self._mesh.vertices[pair[:, 0]]
-        gap = np.linalg.norm(way, axis=1)
-        cosines = [np.einsum("ij,ij->i", sign * self._normals[pair[:, k]], way) for k, sign in ((0, 1), (1, -1))]
-        # A gap of no width is a flaw of the mesh, which no tube can bridge.
-        kept = (np.minimum(*cosines) > _FACING * gap) & (gap > 1e-6 * largest_gap)
-        return pair[kept], gap[kept]
+        step = self._mesh.vertices[pair[:, 1]] - self._mesh.vertices[pair[:, 0]]
+        gap = np.linalg.norm(step, axis=1)
+        cosines = [np.einsum("ij,ij->i", sign * self._normals[pair[:, k]], step) for k, sign in ((0, 1), (1, -1))]
+        # A gap of zero width is a defect of the mesh, which no tube can bridge
+        is_facing = (np.minimum(*cosines) > _MIN_COSINE * gap) & (gap > 1e-6 * largest_gap)
+        return pair[is_facing], gap[is_facing]

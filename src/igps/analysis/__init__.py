@@ -1,1 +1,1 @@
-"""Answers about a collection, as functions that return data."""
+"""Statistical analyses of a collection, as functions that return data."""

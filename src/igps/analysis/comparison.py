@@ -1,4 +1,4 @@
-"""Descriptors side by side on a labelled collection: what each can describe, what that costs, and how it retrieves."""
+"""Comparison of descriptors on a labelled collection: bodies described, computing time, and retrieval scores."""
 
 import contextlib
 import logging
@@ -22,27 +22,26 @@ from igps.retrieval.scores import SCORE_NAMES, RetrievalScores, retrieval_scores
 
 logger = logging.getLogger(__name__)
 
-# A description (1, ...), and the seconds that it took
-_Description = tuple[Singles, float]
-# Entries of the triples (query, gallery, entry of a description) that one block of distances may hold at once.
+_Description = tuple[Singles, float]  # a description (1, ...), and the seconds that it took
+# Size of a block of distances: queries × bodies × entries of a description, which some descriptors hold in memory
 _BLOCK_ENTRIES = 2**26
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """How one descriptor did on a collection."""
+    """Results of one descriptor on a collection."""
 
     descriptor: Descriptor
-    names: tuple[str, ...]  # the N meshes that it described, in the order of the collection
-    labels: tuple[str, ...]  # their classes
-    distances: Tensor | None  # (N, N), row by row from a mesh as the query; None where they could not be computed
-    scores: RetrievalScores | None  # leave-one-out; None without distances, and where no two meshes share a class
-    seconds_per_mesh: float | None  # mean processor time, without that of the signature; None where N is 0
-    failures: tuple[Failure, ...]  # the meshes that it could not describe
-    error: str | None  # why there are no scores; None if there are
+    names: tuple[str, ...]  # the N meshes that the descriptor could describe, in the order of the collection
+    labels: tuple[str, ...]  # classes of these meshes
+    distances: Tensor | None  # (N, N), rows are queries; None if they could not be computed
+    scores: RetrievalScores | None  # leave-one-out; None without distances, or if no two meshes share a class
+    seconds_per_mesh: float | None  # mean processor time without that of the signature; None if N is 0
+    failures: tuple[Failure, ...]  # meshes that the descriptor could not describe
+    error: str | None  # reason for missing scores
 
     def row(self) -> dict[str, Any]:
-        """The line of a table: mean scores as fractions, None where there are none, and what they cost."""
+        """Return a row of the comparison table: mean scores as fractions, None if missing, time, and counts."""
         scores: dict[str, Any] = dict.fromkeys(SCORE_NAMES) if self.scores is None else self.scores.mean()
         return {
             "descriptor": self.descriptor.name,
@@ -61,20 +60,23 @@ def compare(
     strict: bool = False,
     progress: bool = True,
 ) -> Iterator[Result]:
-    """Run descriptors over a labelled collection, and yield the result of each as soon as it is there.
+    """Run descriptors on a labelled collection, and yield the result of each descriptor as soon as it is complete.
 
-    A mesh that a descriptor cannot describe is listed in its failures, and its scores are among the other meshes.
-    Descriptions are timed mesh by mesh, one core each, from the cached signature on: with the reading of the mesh file
-    for those that need it, without the signature itself. Fill the cache first (`dataset.precompute`).
+    A mesh that a descriptor cannot describe is listed in the failures of the result, whose scores are computed among
+    the other meshes. The time of a description is measured mesh by mesh on one core. It excludes the computation of the
+    signature and includes reading the mesh file, if the descriptor needs the mesh. Fill the cache first
+    (`dataset.precompute`).
 
     Args:
-        dataset: N meshes with classes, their signatures with all that the descriptors need.
-        n_workers: processes that describe; all cores if None.
-        strict: raise at the first mesh that cannot be described instead of listing it.
+        dataset: N meshes with classes, whose signatures meet the requirements of all descriptors.
+        descriptors: the descriptors, each with a different name.
+        n_workers: number of worker processes; all cores if None.
+        strict: raise for the first mesh that cannot be described instead of listing it.
 
     Raises:
-        ValueError: the meshes have no classes, two descriptors one name, or the signatures lack what one needs.
-        MeshError: a mesh that cannot be described, if `strict`.
+        ValueError: the meshes have no classes, two descriptors have the same name, or the signatures do not meet the
+            requirements of a descriptor.
+        MeshError: a mesh cannot be described, if `strict`.
     """
     if dataset.bodies.labels is None:
         raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
@@ -82,7 +84,7 @@ def compare(
     n = len(dataset)
     cpu = torch.device("cpu")
     jobs = [(descriptor, dataset.subset([i]), cpu) for descriptor in descriptors for i in range(n)]
-    found: dict[int, _Description | Failure] = {}
+    pending: dict[int, _Description | Failure] = {}  # outcomes of descriptors that are not complete, by job
     n_done = 0
     with (
         tqdm(total=len(jobs), desc="descriptions", disable=not progress) as bar,
@@ -91,32 +93,32 @@ def compare(
         for number, outcome in outcomes:
             bar.update()
             if isinstance(outcome, Failed):
-                found[number] = failure = Failure.of(dataset.bodies, number % n, outcome.reason)
-                named = f"{descriptors[number // n].name}: {failure.error}"
+                pending[number] = failure = Failure.of(dataset.bodies, number % n, outcome.reason)
+                message = f"{descriptors[number // n].name}: {failure.error}"
                 if strict:
-                    raise MeshError(named)
-                logger.warning("skipped: %s", named)
+                    raise MeshError(message)
+                logger.warning("skipped: %s", message)
             else:
-                found[number] = outcome
-            while n_done < len(descriptors) and all(n_done * n + i in found for i in range(n)):
-                mine = [found.pop(n_done * n + i) for i in range(n)]
-                yield _result(descriptors[n_done], dataset, mine, progress)
+                pending[number] = outcome
+            while n_done < len(descriptors) and all(n_done * n + i in pending for i in range(n)):
+                complete = [pending.pop(n_done * n + i) for i in range(n)]
+                yield _result(descriptors[n_done], dataset, complete, progress)
                 n_done += 1
 
 
 def check_descriptors(descriptors: Sequence[Descriptor], dataset: SignatureDataset) -> None:
-    """Raise a ValueError where two have one name, which identifies results, or the signatures lack something."""
-    check_names([one.name for one in descriptors])
+    """Raise a ValueError if names repeat, or the signatures do not meet the requirements of a descriptor."""
+    check_names([descriptor.name for descriptor in descriptors])
     for descriptor in descriptors:
         descriptor.requirements.check_config(dataset.config)
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise a ValueError where two descriptors have one name."""
+    """Raise a ValueError if two descriptors have the same name, because results are identified by names."""
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(
-            f"descriptors: expected one of each name, got several of {', '.join(repeated)}. Name each once, and "
-            "give those of your own another `name`."
+            f"descriptors: expected different names, got {', '.join(repeated)} more than once. List each descriptor "
+            "once, and give your own descriptors another `name`."
         )
 
 
@@ -126,23 +128,23 @@ def _result(
     failures = tuple(outcome for outcome in outcomes if isinstance(outcome, Failure))
     bodies = dataset.usable(failures).bodies
     labels = bodies.labels or ()
-    found = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
+    described = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
     distances, scores, error = None, None, None
     try:
-        if not found:
+        if not described:
             raise ValueError("no mesh could be described.")
-        values = torch.from_numpy(np.stack([one[0] for one, _ in found]))
-        distances = pair_distances(descriptor, values, progress=progress)
+        descriptions = torch.from_numpy(np.stack([description[0] for description, _ in described]))
+        distances = pair_distances(descriptor, descriptions, progress=progress)
         scores = retrieval_scores(distances, labels)
-    except Exception as reason:  # the other descriptors go on
+    except Exception as reason:  # must not stop the comparison of the other descriptors
         error = f"{type(reason).__name__}: {reason}"
         logger.warning("%s: no scores: %s", descriptor.name, error)
-    seconds = fmean(one for _, one in found) if found else None
+    seconds = fmean(seconds for _, seconds in described) if described else None
     return Result(descriptor, bodies.names, labels, distances, scores, seconds, failures, error)
 
 
 def pair_distances(descriptor: Descriptor, descriptions: Tensor, *, progress: bool = False) -> Tensor:
-    """(N, N) distances of (N, ...) descriptions, by blocks of queries: some need memory for every entry of a pair."""
+    """Return the distances (N, N) of descriptions (N, ...), computed in blocks of queries to limit memory."""
     rows = max(1, _BLOCK_ENTRIES // max(1, descriptions.numel()))
     blocks = []
     bar = tqdm(total=len(descriptions), desc=f"distances by {descriptor.name}", disable=not progress)

@@ -1,4 +1,4 @@
-"""How unlike the places of a body are to those of another body that correspond to them, whatever the poses."""
+"""Local differences between corresponding places of two bodies, independent of their poses."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -6,55 +6,60 @@ from scipy.spatial import cKDTree
 from igps._arrays import Floats
 from igps.data.batch import SignatureBatch
 
-# Times of the heat kernel, over the area: the coarse tell which place this is, the fine what the surface is like there
-_COARSE, _FINE = 0.01 * 2.0 ** np.arange(6), 0.0008 * 2.0 ** np.arange(5)
-# Samples of the other body that correspond to one, and the nearest of which the distance counts
-_CORRESPONDING, _NEAREST = 10, 4
-# Least scatter at a place, over that of the whole body
-_LEAST = 0.1
-# Of the root of the area, over which dissimilarity is averaged
-_REACH = 0.06
+# Times of the heat kernel over the area. The kernel of large times identifies the place on the body, the kernel of
+# small times depends on the surface around it
+_LARGE_TIMES, _SMALL_TIMES = 0.01 * 2.0 ** np.arange(6), 0.0008 * 2.0 ** np.arange(5)
+_N_CORRESPONDING = 10  # samples of the other body that correspond to a sample
+_N_NEAREST = 4  # samples of the other body whose distance counts
+_MIN_DEVIATION = 0.1  # smallest standard deviation at a place, as a fraction of that of the whole body
+_SMOOTHING = 0.06  # standard deviation of the smoothing kernel, over the square root of the area
 
 
 def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
-    """(P,) positive numbers of the surface samples of a body: how unlike they are to what corresponds to them.
+    """Return how much each surface sample of a body differs from the corresponding samples of another body.
 
-    Samples of the surface correspond where heat flows alike (Sun, Ovsjanikov and Guibas 2009) over large times, which
-    does not depend on the pose. A sample is unlike by as many standard deviations as its heat kernel of small times is
-    away from those of the ten that correspond to it; and by how far the nearest are by all times. Both are averaged
-    over the surface around and standardised; the result is the exponential of their sum. Each batch is of one body.
+    Samples correspond where their heat kernels (Sun, Ovsjanikov and Guibas 2009) at large times, which do not depend on
+    the pose, are nearest. Two measures are combined: the squared deviation of the heat kernel at small times from that
+    of the ten corresponding samples, over their variance; and the mean distance to the four samples that are nearest by
+    the kernels at all times. The logarithm of each is smoothed on the surface and standardised.
+
+    Args:
+        body, other: batches of one body each.
+
+    Returns:
+        (P,) the exponential of the sum of both measures, positive.
     """
-    coarse, fine = zip(*(_heat_kernels(one) for one in (body, other)), strict=True)
-    scale = coarse[1].std(axis=0) + 1e-9
-    _, near = cKDTree(coarse[1] / scale).query(coarse[0] / scale, min(_CORRESPONDING, len(coarse[1])))
-    alike = fine[1][near.reshape(len(coarse[0]), -1)]
-    variance = alike.var(axis=1) + np.square(_LEAST * fine[1].std(axis=0)) + 1e-18
-    away = np.square(fine[0] - alike.mean(axis=1)) / variance
-    whole = [np.hstack(both) for both in zip(coarse, fine, strict=True)]
-    scale = whole[1].std(axis=0) + 1e-9
-    novel, _ = cKDTree(whole[1] / scale).query(whole[0] / scale, min(_NEAREST, len(whole[1])))
+    large, small = zip(*(_heat_kernels(batch) for batch in (body, other)), strict=True)
+    scale = large[1].std(axis=0) + 1e-9
+    _, indices = cKDTree(large[1] / scale).query(large[0] / scale, min(_N_CORRESPONDING, len(large[1])))
+    corresponding = small[1][indices.reshape(len(large[0]), -1)]
+    variance = corresponding.var(axis=1) + np.square(_MIN_DEVIATION * small[1].std(axis=0)) + 1e-18
+    deviations = np.square(small[0] - corresponding.mean(axis=1)) / variance
+    kernels = [np.hstack(both) for both in zip(large, small, strict=True)]
+    scale = kernels[1].std(axis=0) + 1e-9
+    distances, _ = cKDTree(kernels[1] / scale).query(kernels[0] / scale, min(_N_NEAREST, len(kernels[1])))
     points = body.surface.points[0][body.surface.mask[0]].double().numpy()
-    reach = _REACH * float(body.area[0]) ** 0.5
-    found = np.zeros(len(points))
-    for values in (np.log1p(away.mean(axis=1)), np.log(novel.reshape(len(points), -1).mean(axis=1) + 1e-6)):
-        around = _averaged(values, points, reach)
-        found += (around - around.mean()) / (around.std() + 1e-12)
-    return np.exp(found)
+    width = _SMOOTHING * float(body.area[0]) ** 0.5
+    total = np.zeros(len(points))
+    for values in (np.log1p(deviations.mean(axis=1)), np.log(distances.reshape(len(points), -1).mean(axis=1) + 1e-6)):
+        smoothed = _smoothed(values, points, width)
+        total += (smoothed - smoothed.mean()) / (smoothed.std() + 1e-12)
+    return np.exp(total)
 
 
 def _heat_kernels(body: SignatureBatch) -> tuple[Floats, Floats]:
-    """(P, times) logarithms of the heat that stays at each sample of the surface, over that of the whole."""
-    area, real = float(body.area[0]), body.surface.mask[0]
-    squares = body.surface.eigenfunctions[0][real].double().square().numpy() * area
+    """Return log(heat kernel · area) at each surface sample, (P, times), for large and for small times."""
+    area, is_sample = float(body.area[0]), body.surface.mask[0]
+    squares = body.surface.eigenfunctions[0][is_sample].double().square().numpy() * area
     values = body.eigenvalues[0].double().numpy() * area
-    coarse, fine = (np.log1p(squares @ np.exp(-np.outer(values, times))) for times in (_COARSE, _FINE))
-    return coarse, fine
+    large, small = (np.log1p(squares @ np.exp(-np.outer(values, times))) for times in (_LARGE_TIMES, _SMALL_TIMES))
+    return large, small
 
 
-def _averaged(values: Floats, points: Floats, reach: float) -> Floats:
-    """Means with Gaussian weights of the points around each, no further than twice the reach."""
+def _smoothed(values: Floats, points: Floats, width: float) -> Floats:
+    """Return Gaussian means of the values at the points within two widths of each point."""
     tree = cKDTree(points)
-    pairs = tree.sparse_distance_matrix(tree, 2 * reach, output_type="coo_matrix")
-    weights = np.exp(-np.square(pairs.data / reach) / 2)
+    pairs = tree.sparse_distance_matrix(tree, 2 * width, output_type="coo_matrix")
+    weights = np.exp(-np.square(pairs.data / width) / 2)
     sums = np.bincount(pairs.row, weights * values[pairs.col], len(points))
     return sums / np.bincount(pairs.row, weights, len(points))

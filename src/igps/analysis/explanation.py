@@ -1,4 +1,4 @@
-"""Where two bodies differ: their distance, shared out among the parts of the description and the samples of each."""
+"""Explanation of the distance of two bodies: shares of the parts of their descriptions and of their samples."""
 
 import copy
 import math
@@ -20,113 +20,115 @@ from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescript
 from igps.nn.histograms.base import DescriptionPart, SampleHistogram
 from igps.signature.signature import SAMPLE_KINDS, SampleKind
 
-# Nodes of the integral along the line between two descriptions, and of what share of the distance it may miss
-_NODES, _MISSED = (16, 64, 256, 1024), 1e-8
-# Samples that a point of the surface takes its value from
-_NEIGHBOURS = 12
+# Nodes of the quadrature along the line between two descriptions, tried in order until its relative error is small
+_N_NODES, _TOLERANCE = (16, 64, 256, 1024), 1e-8
+_N_NEIGHBOURS = 12  # samples whose mean is the value of a point of the surface
 
 Shares = Mapping[SampleKind, Floats]
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A distance, shared out. Shares may be negative: what makes the bodies alike."""
+    """Shares of a distance. A negative share comes from a property that makes the bodies more similar."""
 
     distance: float  # by the descriptor
-    parts: Mapping[str, float]  # of each histogram, by what it counts, its share; they sum to the distance
-    # Of the one and the other body, of each kind of samples (P,) their shares; all together sum to the distance
+    parts: Mapping[str, float]  # share of each histogram, by the quantity that it counts; they sum to the distance
+    # Shares (P,) of the samples of each kind in the first and in the second body; all together sum to the distance
     samples: tuple[Shares, Shares]
-    # The same distance shared out among the samples of the surfaces by where the bodies are unlike, see
-    # `igps.analysis.correspondence`; none is negative. None of two groups
+    # As `samples`, but non-negative and by local dissimilarity, see `igps.analysis.correspondence`; None for groups
     places: tuple[Shares, Shares] | None = None
 
     def summary(self) -> str:
-        """The three largest shares in words."""
-        if self.distance < 1e-12:  # but for rounding
+        """Return the three largest shares of histograms as text."""
+        if self.distance < 1e-12:  # zero up to rounding
             return "no difference"
-        largest = sorted(self.parts.items(), key=lambda one: -abs(one[1]))[:3]
+        largest = sorted(self.parts.items(), key=lambda item: -abs(item[1]))[:3]
         return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)
 
 
 def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) -> Explanation:
-    """Share the distance of two bodies out among the histograms, and among the samples of both.
+    """Divide the distance of two bodies among the histograms, and among the samples of both bodies.
 
-    A cell's share is that of Aumann and Shapley (1974): its derivative of the distance, in mean along the straight line
-    on which the square roots of both descriptions come apart from their midpoint, times how far the cell's root comes.
-    Of χ² this is the cell's own term, of a squared Euclidean distance behind a linear head the product of its two
-    factors; and of a nonlinear head, as that of `pretrained`, too, the shares sum to the distance. A cell's share, over
-    the difference of the two bodies in it, is what a unit of its contents counts, positive in one body and negative in
-    the other. So it goes to the pairs in the cell, from each pair to its two samples in halves, and from a limb, a
-    piece or an eigenvalue to the samples that make it.
+    The share of a histogram cell is its value by Aumann and Shapley (1974): the derivative of the distance with respect
+    to the square root of the cell, averaged along the straight line on which the square roots of both descriptions move
+    apart from their midpoint, times the difference of the two roots. The shares sum to the distance, also under a
+    nonlinear head such as that of `pretrained`. For the χ² distance, the share is the term of the cell; for a squared
+    Euclidean distance under a linear head, it is the product of its two factors.
 
-    In other poses most pairs move a little, and what they share lies everywhere. `places` tells better where a small
-    part is other: half of the distance goes to each body, and there to each sample of the surface in proportion to how
-    unlike it is to those of the other body that correspond to it.
+    The share of a cell divided by the difference of its two contents is the share of one unit of content, positive in
+    the one body and negative in the other. It is passed on to the pairs of samples in the cell, half to each sample of
+    a pair, and from a limb, a piece or an eigenvalue to the samples that it is computed from.
+
+    Between poses, most pairs change a little, and these shares spread over the whole body. The field `places` locates
+    small differences better: each body has half of the distance, divided among its surface samples in proportion to
+    their dissimilarity to the corresponding samples of the other body.
 
     Args:
-        descriptor: of histograms, such as interior or rich, alone or under a head, such as pretrained; with side or
-            size, or without.
+        descriptor: histograms, such as interior or rich, or histograms under a head, such as pretrained; with or
+            without side and size.
+        one, other: batches of one body each.
 
     Raises:
-        ValueError: a descriptor of another kind, or not one body each.
+        ValueError: another kind of descriptor, or a batch of several bodies.
     """
     if len(one) != 1 or len(other) != 1:
         raise ValueError(f"one, other: expected a body each, got {len(one)} and {len(other)}.")
     descriptor = copy.deepcopy(descriptor).double().eval()
-    contents, pair = contents_of(descriptor), (_doubled(one), _doubled(other))
-    first, second = torch.cat([contents(batch).detach().flatten(1) for batch in pair])
+    headless, pair = without_head(descriptor), (_with_weights(one), _with_weights(other))
+    first, second = torch.cat([headless(batch).detach().flatten(1) for batch in pair])
     units, distance = unit_shares(descriptor, first, second)
     shares = units * (first - second)
-    samples = _of_samples(descriptor, pair, units, shares)
-    places = _placed(one, other, samples[0], distance), _placed(other, one, samples[1], distance)
-    return Explanation(distance, _of_parts(descriptor, shares), samples, places)
+    samples = _sample_shares(descriptor, pair, units, shares)
+    places = _place_shares(one, other, samples[0], distance), _place_shares(other, one, samples[1], distance)
+    return Explanation(distance, _part_shares(descriptor, shares), samples, places)
 
 
-def _placed(body: SignatureBatch, other: SignatureBatch, samples: Shares, distance: float) -> Shares:
-    """Half of the distance, shared out among the surface samples of a body."""
+def _place_shares(body: SignatureBatch, other: SignatureBatch, samples: Shares, distance: float) -> Shares:
+    """Divide half of the distance among the surface samples of a body, by their dissimilarity to the other body."""
     weights = dissimilarity(body, other)
     return {"interior": np.zeros(len(samples["interior"])), "surface": distance / 2 * weights / weights.sum()}
 
 
-def contents_of(descriptor: Descriptor) -> Descriptor:
-    """What describes the cells of a descriptor, and behind them its numbers of side and size; without its head."""
+def without_head(descriptor: Descriptor) -> Descriptor:
+    """Return the descriptor without its head: it describes the histogram cells, followed by side and size, if any."""
     histograms = _histograms(descriptor)
     return descriptor.wrap(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
 
 
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:
-    """The share of a unit of each cell's contents in the distance, positive in the first body, and the distance itself.
+    """Return the shares of one unit of each content in the distance of two bodies, and the distance.
 
-    The descriptor is in double precision, see `explain`; its contents are (cells,), see `contents_of`, whose numbers of
-    side and size come apart as they are and not as roots.
+    Args:
+        descriptor: see `explain`, in double precision.
+        one, other: (cells,) contents, see `without_head`. Side and size vary linearly on the line of `explain`.
+
+    Returns:
+        (cells,) shares of a unit in the first body (negated: in the second), and the distance.
     """
-    n, form = _n_cells(descriptor), descriptor
-    if isinstance(descriptor, IndividualDescriptor):
-        form = descriptor.descriptor
-    ends = torch.stack([one, other]).double()
-    roots = torch.cat([ends[:, :n].sqrt(), ends[:, n:]], dim=1)
-    middle, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
+    n = _n_cells(descriptor)
+    inner = descriptor.descriptor if isinstance(descriptor, IndividualDescriptor) else descriptor
+    contents = torch.stack([one, other]).double()
+    roots = torch.cat([contents[:, :n].sqrt(), contents[:, n:]], dim=1)
+    midpoint, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
 
     def distances(ends: Tensor) -> Tensor:
-        cells = (one[:, :n].square() for one in ends)
-        if isinstance(form, EmbeddedDescriptor):
-            cells = (form.head(one) for one in cells)
-        rows = (torch.cat([own, one[:, n:]], dim=1) for own, one in zip(cells, ends, strict=True))
+        cells = (end[:, :n].square() for end in ends)
+        if isinstance(inner, EmbeddedDescriptor):
+            cells = (inner.head(histograms) for histograms in cells)
+        rows = (torch.cat([own, end[:, n:]], dim=1) for own, end in zip(cells, ends, strict=True))
         return descriptor.distances(*rows).diagonal()
 
-    with torch.no_grad():
-        distance = float(distances(roots[:, None]))
-    gradient = torch.zeros_like(middle)
-    for n_nodes in _NODES if distance else ():
+    distance = float(distances(roots[:, None]).detach())
+    gradient = torch.zeros_like(midpoint)
+    for n_nodes in _N_NODES if distance else ():
         gradient.zero_()
         nodes, weights = np.polynomial.legendre.leggauss(n_nodes)
-        steps = zip(torch.tensor(nodes).split(16), torch.tensor(weights).split(16), strict=True)
-        for places, parts in steps:
-            away = (places[:, None] + 1) / 2 * half
-            ends = torch.stack([middle + away, middle - away]).requires_grad_()
-            (found,) = torch.autograd.grad(distances(ends) @ (parts / 2), ends)
-            gradient += (found[0] - found[1]).sum(dim=0) / 2
-        if abs(float(gradient @ half) * 2 - distance) <= _MISSED * distance:
+        for x, w in zip(torch.tensor(nodes).split(16), torch.tensor(weights).split(16), strict=True):
+            step = (x[:, None] + 1) / 2 * half
+            ends = torch.stack([midpoint + step, midpoint - step]).requires_grad_()
+            (derivative,) = torch.autograd.grad(distances(ends) @ (w / 2), ends)
+            gradient += (derivative[0] - derivative[1]).sum(dim=0) / 2
+        if abs(float(gradient @ half) * 2 - distance) <= _TOLERANCE * distance:
             break
     total = roots[:, :n].sum(dim=0)
     units = torch.where(total > 0, gradient[:n] / total.clamp_min(torch.finfo(total.dtype).tiny), 0)
@@ -134,48 +136,53 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
 
 
 def on_surface(shares: Shares, samples: Mapping[SampleKind, Floats], points: Floats) -> Any:
-    """(V,) what the body has of the difference about each point: 1 where it is as everywhere, if the sum were 1.
+    """Return the density of shares at points near the samples.
 
-    Of the samples of each kind, shares (P,) and places (P, 3); and points (V, 3), such as vertices.
+    Args:
+        shares, samples: shares (P,) and positions (P, 3) of the samples of each kind.
+        points: (V, 3) points, such as vertices.
+
+    Returns:
+        (V,) mean share of the nearest samples times the number of samples, added over both kinds: 1 everywhere if all
+        shares of one kind are equal and sum to 1.
     """
-    found = np.zeros(len(points))
+    density = np.zeros(len(points))
     for kind, values in shares.items():
         if np.any(values):
-            _, nearest = cKDTree(samples[kind]).query(points, min(_NEIGHBOURS, len(values)))
-            found += len(values) * values[nearest].reshape(len(points), -1).mean(axis=1)
-    return found
+            _, nearest = cKDTree(samples[kind]).query(points, min(_N_NEIGHBOURS, len(values)))
+            density += len(values) * values[nearest].reshape(len(points), -1).mean(axis=1)
+    return density
 
 
 def _histograms(descriptor: Descriptor) -> HistogramDescriptor:
-    found = descriptor.descriptor if isinstance(descriptor, IndividualDescriptor) else descriptor
-    found = found.descriptor if isinstance(found, EmbeddedDescriptor) else found
-    if not isinstance(found, HistogramDescriptor):
+    inner = descriptor.descriptor if isinstance(descriptor, IndividualDescriptor) else descriptor
+    inner = inner.descriptor if isinstance(inner, EmbeddedDescriptor) else inner
+    if not isinstance(inner, HistogramDescriptor):
         raise ValueError(
-            f"descriptor: expected histograms of samples, such as interior, rich or pretrained, whose cells know their "
-            f"samples, got {descriptor.name!r}."
+            f"descriptor: expected histograms of samples (interior, rich, pretrained, ...), got {descriptor.name!r}."
         )
-    return found
+    return inner
 
 
 def _n_cells(descriptor: Descriptor) -> int:
     return sum(_histograms(descriptor).part_cells)
 
 
-def _of_parts(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
-    """The share of each histogram in the distance, and of side and size where these are kept, from those of cells."""
+def _part_shares(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
+    """Sum shares of cells to shares of histograms, and of side and size if the descriptor keeps these."""
     parts = [part for group in _histograms(descriptor).parts for part in group]
-    own, found = shares[: _n_cells(descriptor)].split([part.n_cells for part in parts]), dict[str, float]()
-    for part, values in zip(parts, own, strict=True):
-        found[part_name(part)] = found.get(part_name(part), 0.0) + float(values.sum())
+    cells, sums = shares[: _n_cells(descriptor)].split([part.n_cells for part in parts]), dict[str, float]()
+    for part, values in zip(parts, cells, strict=True):
+        sums[part_name(part)] = sums.get(part_name(part), 0.0) + float(values.sum())
     form, side, size = (shares[None], *shares.new_empty(2, 1, 0))
     if isinstance(descriptor, IndividualDescriptor):
         form, side, size = descriptor.split(shares[None])
-    told = {"side": side, "size": torch.cat([form[:, _n_cells(descriptor) :], size], dim=1)}
-    return found | {name: float(values.sum()) for name, values in told.items() if values.numel()}
+    others = {"side": side, "size": torch.cat([form[:, _n_cells(descriptor) :], size], dim=1)}
+    return sums | {name: float(values.sum()) for name, values in others.items() if values.numel()}
 
 
-def _doubled(batch: SignatureBatch) -> SignatureBatch:
-    """In double precision, and with weights of the samples that have a gradient."""
+def _with_weights(batch: SignatureBatch) -> SignatureBatch:
+    """Return a batch in double precision whose samples have weights 1 that require gradients."""
 
     def weighted(samples: SampleBatch) -> SampleBatch:
         weights = torch.ones_like(samples.points[..., 0]).requires_grad_()
@@ -185,30 +192,29 @@ def _doubled(batch: SignatureBatch) -> SignatureBatch:
     return replace(batch, interior=weighted(batch.interior), surface=weighted(batch.surface))
 
 
-def _of_samples(
+def _sample_shares(
     descriptor: Descriptor, pair: Sequence[SignatureBatch], units: Tensor, shares: Tensor
 ) -> tuple[Shares, Shares]:
-    """The share of each sample of two bodies in the distance, from those of the units and of all contents."""
-    # Those of side and size: half in each body, of that half in each kind of samples
-    everywhere = float(shares[_n_cells(descriptor) :].sum()) / 4
-    histograms, found = _histograms(descriptor), list[Shares]()
+    """Divide the distance among the samples of two bodies, given the unit shares and the shares of all contents."""
+    # Side and size are divided equally among both bodies and both kinds of samples
+    uniform = float(shares[_n_cells(descriptor) :].sum()) / 4
+    histograms, shares_of_bodies = _histograms(descriptor), list[Shares]()
     for batch, signed in zip(pair, (units, -units), strict=True):
         weights = [getattr(batch, kind).attributes[WEIGHT] for kind in SAMPLE_KINDS]
         features, total, first = BatchFeatures(batch, False), units.new_zeros(()), 0
         for group in histograms.parts:
             for part in group:
                 cells = part.of_features(features).flatten() / (len(histograms.parts) * len(group))
-                values = cells @ signed[first : first + part.n_cells]
+                value = cells @ signed[first : first + part.n_cells]
                 first += part.n_cells
-                if not values.requires_grad:
-                    raise ValueError(
-                        f"descriptor: {type(part).__name__} does not heed weights of samples, see DescriptionPart."
-                    )
-                total = total + values / part.degree
+                if not value.requires_grad:
+                    name = type(part).__name__
+                    raise ValueError(f"descriptor: {name} does not use the weights of samples, see DescriptionPart.")
+                total = total + value / part.degree
         gradients = torch.autograd.grad(total, weights, allow_unused=True, materialize_grads=True)
-        own = zip(SAMPLE_KINDS, (one[0].numpy() for one in gradients), strict=True)
-        found.append({kind: values + everywhere / len(values) for kind, values in own})
-    return found[0], found[1]
+        by_kind = zip(SAMPLE_KINDS, (gradient[0].numpy() for gradient in gradients), strict=True)
+        shares_of_bodies.append({kind: values + uniform / len(values) for kind, values in by_kind})
+    return shares_of_bodies[0], shares_of_bodies[1]
 
 
 _AXES = {
@@ -221,68 +227,74 @@ _AXES = {
 
 
 def part_name(part: DescriptionPart) -> str:
-    """What a part of a description counts, in words."""
+    """Return what a part of a description counts, as text."""
     axes = [type(axis).__name__ for axis in getattr(part, "axes", [part])]
     words = list(dict.fromkeys(_AXES.get(name, name) for name in axes if name != "Potential" or len(axes) == 1))
-    place = f" ({part.samples})" if isinstance(part, SampleHistogram) else ""
-    return " and ".join(words) + place
+    samples = f" ({part.samples})" if isinstance(part, SampleHistogram) else ""
+    return " and ".join(words) + samples
 
 
 def significant_cells(
     one: Tensor, other: Tensor, *, level: float = 0.05, n_permutations: int = 1000, seed: int = 0
 ) -> Tensor:
-    """(cells,) in which the means of two groups differ by more than chance, any false one with probability `level`.
+    """Test in which cells the means of two groups differ significantly.
 
-    A permutation test of the largest difference in standard deviations (Westfall and Young 1993).
+    This is a permutation test of the largest standardised difference of means (Westfall and Young 1993).
 
     Args:
         one, other: (N, cells) square roots of histograms of two groups.
-        level: of the family of all cells.
-        n_permutations: of the bodies between the groups.
-        seed: of these.
+        level: family-wise error rate.
+        n_permutations: number of random assignments of the bodies to the groups.
+        seed: seed of the permutations.
+
+    Returns:
+        (cells,) whether the means differ significantly.
     """
     rows, n = torch.cat([one, other]).double(), len(one)
     rows = rows - rows.mean(dim=0)
     scale = rows.std(dim=0)
     rows = torch.where(scale > 1e-12, rows / scale.clamp_min(1e-12), 0)
-    signs = torch.full((n_permutations + 1, len(rows)), -1 / len(other), dtype=torch.float64)
+    contrasts = torch.full((n_permutations + 1, len(rows)), -1 / len(other), dtype=torch.float64)
     random = torch.Generator().manual_seed(seed)
     for i in range(n_permutations + 1):
-        signs[i, torch.arange(n) if i == 0 else torch.randperm(len(rows), generator=random)[:n]] = 1 / n
-    differences = (signs @ rows).abs()
+        contrasts[i, torch.arange(n) if i == 0 else torch.randperm(len(rows), generator=random)[:n]] = 1 / n
+    differences = (contrasts @ rows).abs()
     return differences[0] > differences.max(dim=1).values.quantile(1 - level)
 
 
 def explain_groups(
     descriptor: Descriptor, one: Tensor, other: Tensor, batches: Sequence[SignatureBatch], **test: Any
 ) -> tuple[Explanation, Tensor]:
-    """Share the distance of two groups' mean descriptions out, on a body of each, by cells that a test holds alone.
+    """Divide the distance of the mean descriptions of two groups among histograms, and among samples of two bodies.
 
-    The distance is what is left of it in those cells, see `significant_cells`; the two bodies' shares sum to it where
-    their own descriptions are the means.
+    Only cells that differ significantly have shares, see `significant_cells`; the distance is the sum of these shares.
+    The shares of the samples sum to it only if the descriptions of both bodies are the means of their groups.
 
     Args:
         descriptor: see `explain`.
-        one, other: (N, ...) contents, see `contents_of`.
-        batches: two bodies to be painted, one of each group.
-        test: options of `significant_cells`, whose result comes behind the explanation.
+        one, other: (N, ...) contents of the bodies of each group, see `without_head`.
+        batches: two bodies whose samples receive shares, one of each group.
+        test: options of `significant_cells`.
+
+    Returns:
+        The explanation, and (cells,) whether the means differ significantly.
 
     Raises:
         ValueError: too few bodies for a test.
     """
     level, (n, m) = test.get("level", 0.05), (len(one), len(other))
-    ways = math.comb(n + m, n) // (1 + (n == m))  # of equal groups two are the same difference
-    if ways * level <= 1:
+    n_ways = math.comb(n + m, n) // (1 + (n == m))  # exchanging groups of equal size changes no difference
+    if n_ways * level <= 1:
         raise ValueError(
-            f"one, other: {n} and {m} bodies can be arranged in only {ways} ways, too few to tell anything from "
-            f"chance at a level of {level}. Add bodies, or explain one of each."
+            f"one, other: {n} and {m} bodies can be arranged in only {n_ways} ways, too few for a test at the level "
+            f"{level}. Add bodies, or explain one of each."
         )
     descriptor = copy.deepcopy(descriptor).double().eval()
     rows, n = [group.double().flatten(1) for group in (one, other)], _n_cells(descriptor)
-    kept = significant_cells(*(torch.cat([group[:, :n].sqrt(), group[:, n:]], dim=1) for group in rows), **test)
+    is_significant = significant_cells(*(torch.cat([x[:, :n].sqrt(), x[:, n:]], dim=1) for x in rows), **test)
     means = [group.mean(dim=0) for group in rows]
-    units = torch.where(kept, unit_shares(descriptor, *means)[0], 0)
+    units = torch.where(is_significant, unit_shares(descriptor, *means)[0], 0)
     shares = units * (means[0] - means[1])
-    parts = _of_parts(descriptor, shares)
-    samples = _of_samples(descriptor, [_doubled(batch) for batch in batches], units, shares)
-    return Explanation(sum(parts.values()), parts, samples), kept
+    parts = _part_shares(descriptor, shares)
+    samples = _sample_shares(descriptor, [_with_weights(batch) for batch in batches], units, shares)
+    return Explanation(sum(parts.values()), parts, samples), is_significant

@@ -1,4 +1,4 @@
-"""From a labelled collection to a metric or a classifier, and its answers."""
+"""Fitting of metrics and classifiers to a labelled collection, and classification with them."""
 
 import copy
 import importlib.metadata
@@ -26,38 +26,38 @@ from igps.retrieval import chi_square, retrieval_scores
 
 Goal = Literal["known", "new"]
 HeadName = Literal["auto", "classifier", "whitened", "as_is"]
-# Which heads a goal chooses from
+# Heads that "auto" chooses from, by the goal
 _CANDIDATES: Mapping[Goal, tuple[HeadName, ...]] = {"known": ("classifier", "whitened"), "new": ("whitened", "as_is")}
-# Of the prior beside a WhitenedHead for classes that come up later
-_PRIOR_SHARE = 0.5
-_N_FOLDS, _N_INNER_FOLDS = 5, 3
-_N_BINS = 10
-# Bodies between which distances are measured for their scale
-_MOST_MEASURED = 1000
+# Weights of the prior beside a WhitenedHead: equal for new classes, smaller for classes that the head is fitted to
+_PRIOR_SHARES: Mapping[Goal, float] = {"new": 0.5, "known": 1 / 3}
+_N_FOLDS, _N_INNER_FOLDS = 5, 3  # for the held-out scores, and within them for the choice of the head
+_N_BINS = 10  # of the expected calibration error
+_MAX_SCALE_BODIES = 1000  # bodies whose distances determine the scale
 
 
 @dataclass(frozen=True, eq=False)
 class Classification:
-    """What N bodies are taken for."""
+    """Classes of N bodies by a classifier of C classes."""
 
     names: tuple[str, ...]  # of the bodies
-    classes: tuple[str, ...]  # C names
+    classes: tuple[str, ...]  # of the classifier
     probabilities: Tensor  # (N, C), calibrated
-    strangeness: Tensor  # (N,), larger for what is like no class
-    unknown: Tensor  # (N,) whether a body is unlike everything that the classifier knows
+    strangeness: Tensor  # (N,), larger for bodies that are less like every class
+    unknown: Tensor  # (N,) whether a body is unlike every class
 
     @property
     def predicted(self) -> list[str | None]:
-        """The most probable class of each body; None of what is unknown."""
+        """The most probable class of each body; None for an unknown body."""
         best = self.probabilities.argmax(dim=1).tolist()
-        return [None if new else self.classes[i] for i, new in zip(best, self.unknown.tolist(), strict=True)]
+        unknown = self.unknown.tolist()
+        return [None if is_unknown else self.classes[i] for i, is_unknown in zip(best, unknown, strict=True)]
 
 
 def histograms_and_prior(which: str | Descriptor) -> tuple[Descriptor, Head | None]:
-    """The descriptor whose histograms heads are fitted to, and the metric of these that it has already, if any."""
-    found = descriptor_of(which)
-    found = found.without_size() if isinstance(found, SizedHistograms) else found
-    return (found.descriptor, found.head) if isinstance(found, EmbeddedDescriptor) else (found, None)
+    """Return the histograms of a descriptor, to which heads are fitted, and its own head, if any."""
+    module = descriptor_of(which)
+    module = module.without_size() if isinstance(module, SizedHistograms) else module
+    return (module.descriptor, module.head) if isinstance(module, EmbeddedDescriptor) else (module, None)
 
 
 def fit(
@@ -71,10 +71,10 @@ def fit(
     n_workers: int | None = None,
     progress: bool = False,
 ) -> Descriptor:
-    """The descriptor under a head that is fitted to the classes of a dataset, with its held-out scores in its `card`.
+    """Fit a head to the classes of a dataset, and return the descriptor under this head.
 
-    Held-out scores are of folds that neither the fit nor the choice of the head has seen; the head that is returned is
-    fitted to all bodies.
+    The `card` of the result holds scores on folds that neither the fit nor the choice of the head has seen. The
+    returned head is fitted to all bodies.
 
     Example:
         >>> import tempfile
@@ -88,61 +88,69 @@ def fit(
 
     Args:
         dataset: labelled bodies.
-        descriptor: of histograms; or one with a metric, which is the prior.
-        goal: known for classes of the dataset, whose other bodies are held out in turn; new for a metric of classes
-            that come up later, where whole classes are held out.
-        head: classifier (`ClassifierHead`), whitened (`WhitenedHead`), as_is for the descriptor itself; auto takes the
-            one that is best on held-out bodies, by FT.
-        prior: whether the descriptor's own metric counts beside the new head.
-        failures: a list to which bodies that cannot be described are added; None to raise at the first.
-        n_workers: threads that describe; all cores if None.
+        descriptor: histograms, or histograms under a head, which is then the prior.
+        goal: "known" to recognise the classes of the dataset, scored by holding out bodies of each class; "new" for a
+            metric that also serves other classes, scored by holding out whole classes.
+        head: "classifier" (`ClassifierHead`), "whitened" (`WhitenedHead`), or "as_is" for the descriptor itself; "auto"
+            takes the head with the largest FT score on held-out bodies.
+        prior: whether the descriptor's own head is used beside the new head.
+        failures: list to which bodies that cannot be described are appended; None raises for the first such body.
+        n_workers: number of threads that describe bodies; all cores if None.
+        progress: whether to show a progress bar.
 
     Raises:
-        ValueError: no labels, too few of them, or a descriptor without histograms.
+        ValueError: no labels, too few bodies or classes, or a descriptor without histograms.
     """
     check_one_of(get_args(Goal), goal=goal)
     check_one_of(get_args(HeadName), head=head)
-    which = descriptor_of(descriptor)
-    kept = {"size": isinstance(which, SizedHistograms), "side": False}  # they stay beside the head
-    if isinstance(which, IndividualDescriptor):
-        kept, which = {"size": which.keeps_size, "side": which.twists is not None}, which.descriptor
-    base, metric = histograms_and_prior(which)
+    module = descriptor_of(descriptor)
+    individual = {"size": isinstance(module, SizedHistograms), "side": False}  # numbers that bypass the head
+    if isinstance(module, IndividualDescriptor):
+        individual = {"size": module.keeps_size, "side": module.twists is not None}
+        module = module.descriptor
+    base, metric = histograms_and_prior(module)
     check_centres(base)
     check_classes(dataset.bodies, goal)
-    base, metric = copy.deepcopy(base), metric if prior else None  # the given one stays as it is
+    base, metric = copy.deepcopy(base), metric if prior else None  # the caller's descriptor stays unchanged
     histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
-    check_classes(dataset.bodies, goal)  # those that are left
+    check_classes(dataset.bodies, goal)  # without the bodies that could not be described
     labels, counts = dataset.labels, Counter(dataset.bodies.labels)
     names = tuple(dataset.classes[int(i)] for i in labels.unique())
     cells = base.part_cells if isinstance(base, HistogramDescriptor) else None
 
-    def fitted(name: HeadName, x: Tensor, y: Tensor, calibrate: bool = True) -> Head | None:
+    def fit_head(name: HeadName, x: Tensor, y: Tensor, calibrate: bool = True) -> Head | None:
         if name == "classifier":
             return ClassifierHead(metric, names=names).fit(x, y, cells, calibrate=calibrate)
-        share = _PRIOR_SHARE if goal == "new" else 1 / 3
-        return WhitenedHead(prior=metric, prior_share=share).fit(x, y, cells) if name == "whitened" else metric
+        if name == "whitened":
+            return WhitenedHead(prior=metric, prior_share=_PRIOR_SHARES[goal]).fit(x, y, cells)
+        return metric
 
-    def chosen(x: Tensor, y: Tensor) -> HeadName:
+    def choose_head(x: Tensor, y: Tensor) -> HeadName:
         if head != "auto":
             return head
-        of_each = _held_out(y, goal, _N_INNER_FOLDS)
-        held_out = [out for out in of_each if _has_pair(y[out]) and _has_pair(y[~out])]
+        masks = [out for out in _held_out(y, goal, _N_INNER_FOLDS) if _has_pair(y[out]) and _has_pair(y[~out])]
 
-        def tier(name: HeadName) -> float:
-            return fmean(_retrieved(fitted(name, x[~out], y[~out], False), x[out], y[out])["ft"] for out in held_out)
+        def mean_ft(name: HeadName) -> float:
+            heads = (fit_head(name, x[~out], y[~out], False) for out in masks)
+            return fmean(
+                _retrieval_means(fitted, x[out], y[out])["ft"] for fitted, out in zip(heads, masks, strict=True)
+            )
 
-        return max(_CANDIDATES[goal], key=tier) if held_out else _CANDIDATES[goal][0]
+        return max(_CANDIDATES[goal], key=mean_ft) if masks else _CANDIDATES[goal][0]
 
-    scores = _scores(histograms, labels, goal, chosen, fitted)
-    name = chosen(histograms, labels)
-    made = fitted(name, histograms, labels)
-    model: Descriptor = base if made is None else EmbeddedDescriptor(base, made, name=f"{base.name}_{name}").eval()
-    vectors = histograms[:_MOST_MEASURED] if made is None else made(histograms[:_MOST_MEASURED])
-    apart = labels[:_MOST_MEASURED, None] != labels[None, :_MOST_MEASURED]
-    # Bodies of one class that the head has seen are nearer than others will be
-    scale = float(model.distances(vectors, vectors)[apart].median()) / 5
-    if any(kept.values()):
-        model = IndividualDescriptor(model, scale=scale, **kept).eval()
+    scores = _held_out_scores(histograms, labels, goal, choose_head, fit_head)
+    name = choose_head(histograms, labels)
+    new_head = fit_head(name, histograms, labels)
+    model: Descriptor = base
+    if new_head is not None:
+        model = EmbeddedDescriptor(base, new_head, name=f"{base.name}_{name}").eval()
+    first, first_labels = histograms[:_MAX_SCALE_BODIES], labels[:_MAX_SCALE_BODIES]
+    vectors = first if new_head is None else new_head(first)
+    # Only pairs of different classes, because the fit draws bodies of its classes closer together than later bodies
+    is_measured = first_labels[:, None] != first_labels
+    scale = float(model.distances(vectors, vectors)[is_measured].median()) / 5
+    if any(individual.values()):
+        model = IndividualDescriptor(model, scale=scale, **individual).eval()
     model.scale = scale
     model.card = {
         "scale": scale,
@@ -160,10 +168,10 @@ def fit(
 
 
 def check_classes(bodies: Bodies, goal: Goal) -> None:
-    """Raise a ValueError where there are too few to fit to."""
-    counts, least = Counter(bodies.labels), 2 if goal == "known" else 4
-    if len(counts) < least or max(counts.values()) < 2:
-        raise ValueError(f"classes: expected at least {least}, one of them of two bodies, got {dict(counts)}.")
+    """Raise a ValueError if there are too few classes, or no class of two bodies."""
+    counts, min_classes = Counter(bodies.labels), 2 if goal == "known" else 4
+    if len(counts) < min_classes or max(counts.values()) < 2:
+        raise ValueError(f"classes: expected at least {min_classes}, one of them of two bodies, got {dict(counts)}.")
 
 
 def classify(
@@ -174,11 +182,11 @@ def classify(
     n_workers: int | None = None,
     progress: bool = False,
 ) -> Classification:
-    """The classes of the bodies of a dataset by a model that `fit` made.
+    """Classify the bodies of a dataset by a model with a classifier, see `fit`.
 
     Args:
         dataset: bodies, labelled or not.
-        model: a file, or the model.
+        model: the model, or its file.
         failures, n_workers, progress: see `fit`.
 
     Raises:
@@ -196,25 +204,26 @@ def classify(
 
 
 def classifier_of(model: str | Descriptor) -> tuple[Descriptor, ClassifierHead]:
-    """The classifier of a model, and the descriptor that it classifies by; a ValueError where there is none."""
-    found = descriptor_of(model)
-    found = found.descriptor if isinstance(found, IndividualDescriptor) else found
-    if not isinstance(found, EmbeddedDescriptor) or not isinstance(found.head, ClassifierHead):
-        raise ValueError(f"model: expected one with a classifier, got {found.name}. Fit one with head='classifier'.")
-    return found.descriptor, found.head
+    """Return the descriptor of a model and its classifier; raise a ValueError if it has no classifier."""
+    module = descriptor_of(model)
+    module = module.descriptor if isinstance(module, IndividualDescriptor) else module
+    if not isinstance(module, EmbeddedDescriptor) or not isinstance(module.head, ClassifierHead):
+        raise ValueError(f"model: expected one with a classifier, got {module.name}. Fit one with head='classifier'.")
+    return module.descriptor, module.head
 
 
 def _histograms(
     dataset: SignatureDataset, base: Descriptor, failures: list[Failure] | None, n_workers: int | None, progress: bool
 ) -> tuple[Tensor, SignatureDataset]:
-    tag, found_before = cache_tag(base), len(failures or ())
-    found = describe(dataset, base, failures=failures, cache_tag=tag, n_workers=n_workers, progress=progress)
-    return found.flatten(1), dataset.usable((failures or [])[found_before:])
+    """Return the histograms (M, cells) of the M bodies that can be described, and a dataset of these bodies."""
+    tag, n_earlier = cache_tag(base), len(failures or ())
+    histograms = describe(dataset, base, failures=failures, cache_tag=tag, n_workers=n_workers, progress=progress)
+    return histograms.flatten(1), dataset.usable((failures or [])[n_earlier:])
 
 
 def _held_out(labels: Tensor, goal: Goal, n_folds: int) -> Iterator[Tensor]:
-    """(N,) masks: of known classes folds of their bodies, of new ones random halves of the classes."""
-    if goal == "known":  # of a class of four two at a time, so that they find each other
+    """Yield masks (N,) of held-out bodies: folds for known classes, random halves of the classes for new classes."""
+    if goal == "known":  # at least two bodies of the largest class are held out together, as needed for retrieval
         largest = int(labels.unique(return_counts=True)[1].max())
         yield from folds(labels, max(2, min(n_folds, largest // 2)))
         return
@@ -228,54 +237,52 @@ def _has_pair(labels: Tensor) -> bool:
     return len(labels.unique()) < len(labels)
 
 
-def _retrieved(head: Head | None, histograms: Tensor, labels: Tensor) -> dict[str, float]:
-    """Retrieval scores among some bodies, without those that are alone in their class."""
+def _retrieval_means(head: Head | None, histograms: Tensor, labels: Tensor) -> dict[str, float]:
+    """Return the mean retrieval scores among held-out bodies; bodies alone in their class are no queries."""
     vectors = histograms if head is None else head(histograms)
     distances = (chi_square if head is None else head.distances)(vectors, vectors)
     return retrieval_scores(distances, labels.tolist()).mean()
 
 
-def _scores(
+def _held_out_scores(
     histograms: Tensor,
     labels: Tensor,
     goal: Goal,
-    chosen: Callable[[Tensor, Tensor], HeadName],
-    fitted: Callable[..., Head | None],
+    choose_head: Callable[[Tensor, Tensor], HeadName],
+    fit_head: Callable[..., Head | None],
 ) -> dict[str, float]:
-    """Means over held-out folds: scores of retrieval, and of classification if the head is a classifier."""
+    """Return means over held-out folds of the retrieval scores, and of classification scores for a classifier."""
     from torchmetrics.functional.classification import binary_auroc, multiclass_calibration_error
 
-    found: list[dict[str, float]] = []
-    said, truth, known, strange = [], [], [], []
+    retrieval: list[dict[str, float]] = []
+    probabilities_of_folds, targets_of_folds, unknown_aucs = [], [], []
     classes = labels.unique()
     for number, out in enumerate(_held_out(labels, goal, _N_FOLDS)):
         x, y = histograms[~out], labels[~out]
-        name = chosen(x, y)
-        if name == "whitened" and not _has_pair(y):  # nothing to fit it to
+        name = choose_head(x, y)
+        if name == "whitened" and not _has_pair(y):  # a WhitenedHead is fitted to pairs of one class
             continue
-        head = fitted(name, x, y)
+        head = fit_head(name, x, y)
         if _has_pair(labels[out]):
-            scores = _retrieved(head, histograms[out], labels[out])
-            found.append({one: scores[one] for one in ("nn", "ft", "dcg")})
+            scores = _retrieval_means(head, histograms[out], labels[out])
+            retrieval.append({score: scores[score] for score in ("nn", "ft", "dcg")})
         if isinstance(head, ClassifierHead):
-            said.append(head.probabilities(histograms[out]))
-            truth.append(torch.searchsorted(head.classes, labels[out]))
-            left_out = torch.isin(labels, classes[number::_N_FOLDS])
-            new, old = out & left_out, out & ~left_out
-            if bool(new.any() and old.any()) and len(labels[~out & ~left_out].unique()) > 1:
-                less = fitted(name, histograms[~out & ~left_out], labels[~out & ~left_out], False)
-                assert isinstance(less, ClassifierHead)
-                known.append(less.strangeness(histograms[old]))
-                strange.append(less.strangeness(histograms[new]))
-    means = {one: fmean(scores[one] for scores in found) for one in (found[0] if found else ())}
-    if said:
-        probabilities, right = torch.cat(said), torch.cat(truth)
-        means["accuracy"] = float((probabilities.argmax(dim=1) == right).float().mean())
+            probabilities_of_folds.append(head.probabilities(histograms[out]))
+            targets_of_folds.append(torch.searchsorted(head.classes, labels[out]))
+            is_new = torch.isin(labels, classes[number::_N_FOLDS])  # classes that a second classifier is not fitted to
+            unknown, known, fit_to = out & is_new, out & ~is_new, ~out & ~is_new
+            if bool(unknown.any() and known.any()) and len(labels[fit_to].unique()) > 1:
+                partial = fit_head(name, histograms[fit_to], labels[fit_to], False)
+                assert isinstance(partial, ClassifierHead)
+                strangeness = [partial.strangeness(histograms[mask]) for mask in (unknown, known)]
+                targets = torch.cat([torch.ones(len(strangeness[0])), torch.zeros(len(strangeness[1]))]).long()
+                unknown_aucs.append(float(binary_auroc(torch.cat(strangeness), targets)))
+    means = {score: fmean(scores[score] for scores in retrieval) for score in (retrieval[0] if retrieval else ())}
+    if probabilities_of_folds:
+        probabilities, targets = torch.cat(probabilities_of_folds), torch.cat(targets_of_folds)
+        means["accuracy"] = float((probabilities.argmax(dim=1) == targets).float().mean())
         n_classes = probabilities.shape[1]
-        means["calibration_error"] = float(multiclass_calibration_error(probabilities, right, n_classes, _N_BINS))
-    if strange:
-        means["unknown_auc"] = fmean(
-            float(binary_auroc(torch.cat([new, old]), torch.cat([torch.ones(len(new)), torch.zeros(len(old))]).long()))
-            for new, old in zip(strange, known, strict=True)
-        )
+        means["calibration_error"] = float(multiclass_calibration_error(probabilities, targets, n_classes, _N_BINS))
+    if unknown_aucs:
+        means["unknown_auc"] = fmean(unknown_aucs)
     return means

@@ -1,4 +1,4 @@
-"""Bodies as points in the plane, as far from each other as their distances are, as well as that goes."""
+"""Maps of bodies: points in the plane whose distances approximate those of the bodies."""
 
 import warnings
 from dataclasses import dataclass
@@ -14,65 +14,68 @@ from igps._parameters import check_one_of
 
 Layout = Literal["mds", "umap"]
 
-# Entries of distance matrices that the improvement of a map may go through in all
-_MOST_ENTRIES, _MOST_ROUNDS = 10**9, 300
+# Limits of SMACOF: entries of distance matrices, summed over the iterations, which keeps it to seconds; and iterations
+_MAX_ENTRIES, _MAX_ITERATIONS = 10**9, 300
 
 
 @dataclass(frozen=True, eq=False)
 class BodyMap:
-    """Where bodies lie."""
+    """Map of N bodies."""
 
-    points: Floats  # (N, 2), in units of the distances for "mds", in none for "umap"
-    # Root of the squared errors of all distances over their squares (Kruskal 1964), after the best scaling: 0 where the
-    # map keeps every distance, above 0.2 it distorts much
+    points: Floats  # (N, 2), in units of the distances for "mds", without unit for "umap"
+    # Root of the sum of squared errors of the distances over the sum of their squares (Kruskal 1964), after the best
+    # scaling: 0 means exact distances, above 0.2 strong distortion
     stress: float
 
 
 def checked_distances(distances: Floats) -> Floats:
-    """(N, N) symmetric, zero on the diagonal: the mean of both directions; a ValueError of another shape, or NaN."""
-    found = np.asarray(distances, dtype=float)
-    if found.ndim != 2 or len(found) != found.shape[-1] or len(found) < 3:
-        raise ValueError(f"distances: expected (N, N) between three bodies or more, got {found.shape}.")
-    if not np.isfinite(found).all():
+    """Return symmetric distances (N, N) with a zero diagonal; raise a ValueError for another shape, N < 3, or NaN."""
+    square = np.asarray(distances, dtype=float)
+    if square.ndim != 2 or len(square) != square.shape[-1] or len(square) < 3:
+        raise ValueError(f"distances: expected (N, N) between three bodies or more, got {square.shape}.")
+    if not np.isfinite(square).all():
         raise ValueError("distances: expected finite numbers. Leave out bodies that cannot be compared.")
-    found = np.maximum((found + found.T) / 2, 0)
-    np.fill_diagonal(found, 0)
-    return found
+    square = np.maximum((square + square.T) / 2, 0)
+    np.fill_diagonal(square, 0)
+    return square
 
 
 def body_map(distances: Floats, layout: Layout = "mds", *, seed: int = 0) -> BodyMap:
     """Lay bodies out in the plane.
 
-    Metric multidimensional scaling: the classical solution (Torgerson 1952), improved by SMACOF (de Leeuw 1977), as far
-    as time allows for thousands of bodies. UMAP (McInnes et al. 2018) keeps neighbours together and lets go of large
-    distances; it needs umap-learn. Axes are principal, with the longer tail on the positive side.
+    The layout "mds" is metric multidimensional scaling: the classical solution (Torgerson 1952), improved by SMACOF (de
+    Leeuw 1977) with fewer iterations for thousands of bodies. The layout "umap" (McInnes et al. 2018) preserves
+    neighbours rather than large distances, and needs umap-learn. The axes are the principal axes, with the longer tail
+    on the positive side.
 
     Args:
-        distances: (N, N).
-        seed: of UMAP.
+        distances: (N, N) distances.
+        layout: "mds" or "umap".
+        seed: seed of UMAP.
 
     Raises:
-        ValueError: distances of which no map can be drawn, or another layout.
+        ValueError: invalid distances, or an unknown layout.
         ImportError: umap-learn is not installed.
     """
     check_one_of(get_args(Layout), layout=layout)
-    wanted = checked_distances(distances)
-    points = _classical(wanted) if layout == "mds" else _umap(wanted, seed)
-    if layout == "mds" and (rounds := min(_MOST_ROUNDS, _MOST_ENTRIES // wanted.size)) and wanted.any():
+    square = checked_distances(distances)
+    points = _classical_mds(square) if layout == "mds" else _umap(square, seed)
+    if layout == "mds" and (n_iterations := min(_MAX_ITERATIONS, _MAX_ENTRIES // square.size)) and square.any():
         from sklearn.manifold import smacof
 
-        points = smacof(wanted, init=points, n_init=1, max_iter=rounds, eps=1e-6, normalized_stress=False)[0]
+        points = smacof(square, init=points, n_init=1, max_iter=n_iterations, eps=1e-6, normalized_stress=False)[0]
     centred = points - points.mean(axis=0)
-    turned = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
-    turned *= np.where((turned**3).sum(axis=0) < 0, -1, 1)
-    return BodyMap(turned, _stress(wanted, turned))
+    rotated = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
+    rotated *= np.where((rotated**3).sum(axis=0) < 0, -1, 1)
+    return BodyMap(rotated, _stress(square, rotated))
 
 
-def _classical(distances: Floats) -> Floats:
+def _classical_mds(distances: Floats) -> Floats:
     squares, n = distances**2, len(distances)
     means = squares.mean(axis=0)
     products = (means[:, None] + means - means.mean() - squares) / 2
-    if n < 500 or not products.any():  # ARPACK starts anew at random where few axes hold all, or none does
+    # ARPACK restarts from a random vector if the matrix has low rank or is zero
+    if n < 500 or not products.any():
         values, axes = eigh(products, subset_by_index=(n - 2, n - 1))
     else:
         values, axes = eigsh(products, 2, which="LA", v0=np.sin(np.arange(n) + 1.0))
@@ -80,25 +83,25 @@ def _classical(distances: Floats) -> Floats:
 
 
 def import_umap() -> Any:
-    """The class of umap-learn; an ImportError that names it."""
+    """Return the class UMAP of umap-learn; raise an ImportError with a remedy if it is not installed."""
     try:
         from umap import UMAP
     except ImportError as error:
-        raise ImportError("layout: umap needs umap-learn. Install it, or take mds.") from error
+        raise ImportError("layout: umap needs umap-learn. Install it, or use mds.") from error
     return UMAP
 
 
 def _umap(distances: Floats, seed: int) -> Floats:
     UMAP = import_umap()
-    with warnings.catch_warnings():  # of what precomputed distances cannot do afterwards
+    with warnings.catch_warnings():  # UMAP warns that a fit to precomputed distances cannot transform new points
         warnings.simplefilter("ignore", UserWarning)
-        chosen = UMAP(n_neighbors=min(15, len(distances) - 1), metric="precomputed", random_state=seed, n_jobs=1)
-        return chosen.fit_transform(distances).astype(float)
+        umap = UMAP(n_neighbors=min(15, len(distances) - 1), metric="precomputed", random_state=seed, n_jobs=1)
+        return umap.fit_transform(distances).astype(float)
 
 
-def _stress(wanted: Floats, points: Floats) -> float:
-    one, other = squareform(wanted, checks=False), pdist(points)
-    if not one.any():
+def _stress(distances: Floats, points: Floats) -> float:
+    expected, mapped = squareform(distances, checks=False), pdist(points)
+    if not expected.any():
         return 0.0
-    other = other * ((one @ other) / max(float(other @ other), 1e-300))
-    return float(np.sqrt(np.square(one - other).sum() / np.square(one).sum()))
+    mapped = mapped * ((expected @ mapped) / max(float(mapped @ mapped), 1e-300))
+    return float(np.sqrt(np.square(expected - mapped).sum() / np.square(expected).sum()))

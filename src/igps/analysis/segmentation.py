@@ -1,7 +1,7 @@
-"""What goes wrong in masks of voxels: pieces apart, cavities, holes, gaps, slices that were cut off, and overlaps.
+"""Defects of voxel masks: detached pieces, cavities, holes, gaps, cut ends, and overlaps.
 
-What is a share of the voxels comes as its square root, whose scatter is about the same for small shares and large ones
-(Bartlett 1936), so that a speck in one body of many weighs little and a piece in a body of one much.
+Shares of voxels are returned as their square roots, whose scatter hardly depends on the size of the share (Bartlett
+1936), so that large and small shares can be compared by their standard deviations.
 """
 
 from collections import defaultdict
@@ -15,59 +15,64 @@ from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers
 
-# Of the depth of a body, the radius of the ball that closes it: what is narrower than the body is thick is a gap
-_CLOSING = 0.8
-# Larger boxes are closed on a grid twice as coarse, which shows gaps of that width all the same
-_MOST_VOXELS = 1 << 20
+# Radius of the ball that closes a body, over that of its largest inscribed ball: gaps are narrower than the body
+_CLOSING_RADIUS = 0.8
+# Larger boxes are closed on a grid twice as coarse, which still resolves gaps of that width
+_MAX_VOXELS = 1 << 20
 
 
 def stray_root(mask: Booleans) -> float:
-    """The root of the share of the voxels that are connected to the largest piece by no face, edge or corner."""
+    """Return the root of the share of voxels that no face, edge or corner connects to the largest piece."""
     pieces, _ = ndimage.label(mask, np.ones((3, 3, 3)))
     return float(np.sqrt(1 - np.bincount(pieces[mask]).max() / np.count_nonzero(mask)))
 
 
 def cavity_root(mask: Booleans) -> float:
-    """The root of the voxels that the body surrounds, over its own."""
+    """Return the root of the number of voxels in enclosed cavities, over that of the body."""
     filled = ndimage.binary_fill_holes(np.pad(mask, 1))
     return float(np.sqrt(np.count_nonzero(filled) / np.count_nonzero(mask) - 1))
 
 
 def hole_root(mask: Booleans) -> float:
-    """The root of the voxels that the body surrounds in a slice across any axis of the grid, over its own."""
+    """Return the root of the number of voxels in holes of slices across any axis of the grid, over that of the body."""
     padded, holes = np.pad(mask, 1), np.zeros_like(mask)
     for axis in range(3):
         neighbours = ndimage.generate_binary_structure(3, 1)
         np.moveaxis(neighbours, axis, 0)[[0, 2]] = False
         pieces, n_pieces = ndimage.label(~padded, neighbours)
-        surrounded = np.arange(n_pieces + 1) > 0
-        surrounded[np.take(pieces, 0, axis=axis - 1)] = False  # the padding, which goes all around a slice
-        holes |= surrounded[pieces][1:-1, 1:-1, 1:-1]
+        is_hole = np.arange(n_pieces + 1) > 0
+        is_hole[np.take(pieces, 0, axis=axis - 1)] = False  # the outside, which contains the padding of the slice
+        holes |= is_hole[pieces][1:-1, 1:-1, 1:-1]
     return float(np.sqrt(np.count_nonzero(holes) / np.count_nonzero(mask)))
 
 
 def gap_root(mask: Booleans, sides: Floats) -> float:
-    """The root of the voxels that closing adds, over those of the body: its tunnels, notches and clefts.
+    """Return the root of the number of voxels in gaps (tunnels, notches and clefts), over that of the body.
 
-    Closing (Matheron 1975) keeps outside what a ball outside of the body reaches. Its radius is four fifths of that of
-    the largest ball inside. A voxel has sides (3,), length.
+    Gaps are the voxels that morphological closing (Matheron 1975) adds: no ball outside the body reaches them. The
+    radius of the ball is 0.8 times that of the largest ball inside the body. Voxels have side lengths `sides` (3,).
     """
-    while mask.size > _MOST_VOXELS:
+    while mask.size > _MAX_VOXELS:
         mask = np.pad(mask, [(0, n % 2) for n in mask.shape])
-        halves = mask.reshape(*(m for n in mask.shape for m in (n // 2, 2))).mean(axis=(1, 3, 5))
-        mask, sides = halves >= 0.5, 2 * sides
+        halved = mask.reshape(*(m for n in mask.shape for m in (n // 2, 2))).mean(axis=(1, 3, 5))
+        mask, sides = halved >= 0.5, 2 * sides
     depth = ndimage.distance_transform_edt(np.pad(mask, 1), sides).max()
-    radius = max(_CLOSING * depth, 1.01 * sides.min())
+    radius = max(_CLOSING_RADIUS * depth, 1.01 * sides.min())
     padded = np.pad(mask, [2 * (int(radius / side) + 2,) for side in sides])
-    reached = ndimage.distance_transform_edt(ndimage.distance_transform_edt(~padded, sides) <= radius, sides) <= radius
-    return float(np.sqrt(np.count_nonzero(~reached & ~padded) / np.count_nonzero(mask)))
+    dilated = ndimage.distance_transform_edt(~padded, sides) <= radius
+    outside = ndimage.distance_transform_edt(dilated, sides) <= radius
+    return float(np.sqrt(np.count_nonzero(~outside & ~padded) / np.count_nonzero(mask)))
 
 
 def cut_end(mask: Booleans, at_border: Booleans) -> float:
-    """How flat an end of a body is along an axis of the grid, as if slices were cut off; 0 if all are at the border.
+    """Return how flat the flattest end of a body is along an axis of the grid, as if slices were cut off.
 
-    The root of the voxels of its last slice beyond that of two fifths of those of the two slices before it, which is
-    what ends that are round have. The mask is no larger than the body; (3, 2) ends are at the border of the volume.
+    The flatness of an end is the root of the number of voxels in its last slice, minus the root of two fifths of the
+    mean number in the two slices before it, which is typical of a round end; at least 0.
+
+    Args:
+        mask: voxels of the body, in its bounding box.
+        at_border: (3, 2) whether each end lies at the border of the volume; such ends do not count.
     """
     flattest = 0.0
     for axis, end in np.argwhere(~at_border):
@@ -79,31 +84,34 @@ def cut_end(mask: Booleans, at_border: Booleans) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """The voxels of a label: the folder and the grid in which they lie, and a box of it in bits."""
+    """The voxels of a label in its grid."""
 
-    grid: tuple[object, ...]
-    low: Integers
-    shape: tuple[int, ...]
+    grid: tuple[object, ...]  # key of the grid: only labels with the same key can overlap
+    low: Integers  # (3,) first corner of the bounding box
+    shape: tuple[int, ...]  # of the bounding box
     n_voxels: int
-    bits: NDArray[np.uint8]
+    bits: NDArray[np.uint8]  # voxels of the bounding box, packed
 
     def mask(self, low: Integers, high: Integers) -> NDArray[np.uint8]:
-        """From one corner of the grid to another."""
-        whole = np.unpackbits(self.bits, count=int(np.prod(self.shape))).reshape(self.shape)
-        return whole[tuple(map(slice, low - self.low, high - self.low))]
+        """Return the voxels between two corners of the grid."""
+        box = np.unpackbits(self.bits, count=int(np.prod(self.shape))).reshape(self.shape)
+        return box[tuple(map(slice, low - self.low, high - self.low))]
 
 
 def overlaps(places: Sequence[Place | None], labels: Sequence[str] | None = None) -> Floats:
-    """(N, N) shares of the voxels of each that lie in each other one; 0 of one class, which may be many subjects."""
-    found = np.zeros((len(places), len(places)))
+    """Return the shares (N, N) of the voxels of each label (row) that lie in each other label (column).
+
+    The share is 0 between labels of one class, which may belong to different subjects.
+    """
+    shares = np.zeros((len(places), len(places)))
     grids = defaultdict[tuple[object, ...], list[tuple[int, Place]]](list)
     for i, place in enumerate(places):
         if place is not None:
             grids[place.grid].append((i, place))
-    for own in grids.values():
-        for (i, one), (j, other) in combinations(own, 2):
+    for same_grid in grids.values():
+        for (i, one), (j, other) in combinations(same_grid, 2):
             low, high = np.maximum(one.low, other.low), np.minimum(one.low + one.shape, other.low + other.shape)
             if (low < high).all() and (labels is None or labels[i] != labels[j]):
-                shared = np.count_nonzero(one.mask(low, high) & other.mask(low, high))
-                found[i, j], found[j, i] = shared / one.n_voxels, shared / other.n_voxels
-    return found
+                n_shared = np.count_nonzero(one.mask(low, high) & other.mask(low, high))
+                shares[i, j], shares[j, i] = n_shared / one.n_voxels, n_shared / other.n_voxels
+    return shares

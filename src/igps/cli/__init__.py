@@ -1,4 +1,4 @@
-"""The command line: what follows `igps` is a function by name."""
+"""The command line: every subcommand of `igps` is a function, whose signature and docstring define its options."""
 
 import contextlib
 import inspect
@@ -38,9 +38,9 @@ JSON = "json"
 
 
 def completion(shell: Literal["bash", "zsh", "tcsh"]) -> None:
-    """Print a script by which a shell completes commands, options and their choices.
+    """Print a shell script that completes commands, options and their choices.
 
-    Where to keep it: igps completion bash > /etc/bash_completion.d/igps, or any file that your shell reads.
+    To install it: igps completion bash > /etc/bash_completion.d/igps, or write it to any file that your shell reads.
 
     Args:
         shell: bash, zsh or tcsh.
@@ -52,24 +52,24 @@ def completion(shell: Literal["bash", "zsh", "tcsh"]) -> None:
     print(command_parser().get_completion_script(f"shtab-{shell}"))
 
 
-def _named(*commands: Command) -> dict[str, Command]:
+def _by_name(*commands: Command) -> dict[str, Command]:
     return {command.__name__: command for command in commands}
 
 
 COMMANDS: Commands = {
-    **_named(retrieve, extract, query, fit, classify, precompute),
+    **_by_name(retrieve, extract, query, fit, classify, precompute),
     "cache": {"export": cache_export},
-    "gallery": _named(
+    "gallery": _by_name(
         gallery.build, gallery.add, gallery.sync, gallery.remove, gallery.update, gallery.merge, query, gallery.info,
         gallery.versions, gallery.restore,
     ),
-    **_named(duplicates, distance, demo, compare, doctor, groups, explain, outliers, clusters),
-    "figure": {"map": map_bodies, **_named(clusters, groups, explain, outliers)},
-    **_named(report, completion),
+    **_by_name(duplicates, distance, demo, compare, doctor, groups, explain, outliers, clusters),
+    "figure": {"map": map_bodies, **_by_name(clusters, groups, explain, outliers)},
+    **_by_name(report, completion),
 }  # fmt: skip
-"""What follows `igps`: a function, or the commands of a group by name.
+"""The commands by name: a function, or a mapping for a group of commands.
 
-A command that prints a table returns what it tells, for `--json`. Those of `figure` write to `figures` if not told.
+A command that prints a table returns the same data, for `--json`. Commands of `figure` write to `figures` by default.
 """
 
 
@@ -77,57 +77,57 @@ ENDINGS: Mapping[Command, Sequence[str]] = {
     extract: (*SUFFIXES, ".npz"), fit: (".safetensors", ""), cache_export: (".igps",), classify: (".csv",),
     duplicates: (".csv",), doctor: (), report: (),
 }  # fmt: skip
-"""Of the files that commands write as `out`, none where any will do; "" is a folder, as `out` of the others."""
+"""Suffixes that `out` of a command may have: () allows any file, and "" a folder. Elsewhere `out` is a folder."""
 
 
 @contextlib.contextmanager
 def faults_in_a_sentence() -> Iterator[None]:
-    """Say what is expected of bad input without a traceback, which would bury it, and exit as `main` does."""
+    """Print an expected error as one sentence without its traceback, and exit with the status described in `main`."""
     try:
         yield
     except MemoryError as error:
         print(f"igps: out of memory ({error}). Ask for less, or set a memory limit for each body.", file=sys.stderr)
         sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
-        full = isinstance(error, OSError) and is_machine_error(error)
-        print(f"igps: {machine_error_text(error) if full else error}", file=sys.stderr)  # type: ignore[arg-type]
-        sys.exit(2 if full or isinstance(error, MachineError) else 1)
+        is_system = isinstance(error, OSError) and is_machine_error(error)
+        print(f"igps: {machine_error_text(error) if is_system else error}", file=sys.stderr)  # type: ignore[arg-type]
+        sys.exit(2 if is_system or isinstance(error, MachineError) else 1)
     except KeyboardInterrupt:
-        print("igps: interrupted. Run again to go on: what is done is kept.", file=sys.stderr)
-        sys.exit(130)  # as shells say it
+        print("igps: interrupted. Run again to continue: finished results are kept.", file=sys.stderr)
+        sys.exit(130)  # the convention of shells: 128 + SIGINT
 
 
 def main(
     commands: Commands | None = None, program: str = "igps", endings: Mapping[Command, Sequence[str]] = ENDINGS
 ) -> None:
-    """Run the command that the words of the command line name: status 1 if the input is at fault, 2 if the machine is.
+    """Run the command of the command line; exit with status 1 for wrong input, or 2 for a fault of the system.
 
     Args:
-        commands: by name; those of `igps` if not given.
-        program: what the commands follow on the command line.
-        endings: see `ENDINGS`.
+        commands: commands by name; those of `igps` if None.
+        program: name of the program, for its help.
+        endings: suffixes that `out` of a command may have, see `ENDINGS`.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     commands = COMMANDS if commands is None else commands
     with faults_in_a_sentence():
         parser = command_parser(commands, program)
         parsed = parser.instantiate(parser.parse_args())
-        command, options = _chosen(parsed, commands)
+        command, options = _selected(parsed, commands)
         as_json = options.pop(JSON, False)
         if parsed.subcommand == "figure" and options.get("out", ...) is None:
             options["out"] = Path("figures")
-        if taken_in := "".join(f"+{word}" for word in options.pop("with", None) or ()):
+        if suffix := "".join(f"+{attribute}" for attribute in options.pop("with", None) or ()):
             if "descriptors" in options:
-                options["descriptors"] = [one + taken_in for one in options["descriptors"]]
+                options["descriptors"] = [name + suffix for name in options["descriptors"]]
             else:
-                options["descriptor"] = (options["descriptor"] or "pretrained") + taken_in
+                options["descriptor"] = (options["descriptor"] or "pretrained") + suffix
         check_at_least(1, n_workers=options.get("n_workers"))
         check_place("out", options.get("out"), endings.get(command))
         check_place("failures", options.get("failures"), ())
-        # With --json, text for readers goes to standard error
+        # With --json, standard output holds the JSON alone
         with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
-            found = command(**options)
-    verdict = found if isinstance(found, Verdict) else Verdict(found, True)
+            result = command(**options)
+    verdict = result if isinstance(result, Verdict) else Verdict(result, True)
     if as_json:
         print(json.dumps(finite(verdict.result), indent=2))
     if not verdict.is_good:
@@ -135,87 +135,90 @@ def main(
 
 
 def check_place(name: str, place: Path | None, endings: Sequence[str] | None) -> None:
-    """Raise a ValueError where a file of these endings, or a folder if None, could not be written."""
+    """Raise a ValueError if a file with one of the suffixes (see `ENDINGS`), or a folder if None, cannot be written."""
     if place is None:
         return
     if endings and place.suffix.lower() not in endings:
-        told = ", ".join(filter(None, endings)) + ", or a folder" * ("" in endings)
-        raise ValueError(f"{name}: expected a file ending in {told}, got {place}.")
+        allowed = ", ".join(filter(None, endings)) + ", or a folder" * ("" in endings)
+        raise ValueError(f"{name}: expected a file ending in {allowed}, got {place}.")
     is_file = endings is not None and (place.suffix != "" or "" not in endings)
     place = place.absolute()
-    there = next(one for one in (place, *place.parents) if one.exists())
-    if there.is_dir() == (there == place and is_file):
-        kind, other = ("file", "folder") if there.is_dir() else ("folder", "file")
-        raise ValueError(f"{name}: expected a {kind}, {there} is a {other}. Name another place.")
-    if not os.access(there, os.W_OK):
-        raise ValueError(f"{name}: {there} may not be written to. Name another place, or ask for the right.")
+    existing = next(path for path in (place, *place.parents) if path.exists())
+    if existing.is_dir() == (existing == place and is_file):
+        kind, other = ("file", "folder") if existing.is_dir() else ("folder", "file")
+        raise ValueError(f"{name}: expected a {kind}, {existing} is a {other}. Choose another path.")
+    if not os.access(existing, os.W_OK):
+        raise ValueError(f"{name}: no permission to write to {existing}. Choose another path, or grant the permission.")
 
 
 def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:
-    """The parser of all commands; for the arguments see `main`."""
+    """Return the parser of all commands; for the arguments see `main`."""
     parser = ArgumentParser(prog=program, description="Volumetric shape retrieval by interior Global Point Signatures.")
-    parser.add_argument("--version", action="version", version=f"%(prog)s {version()}", help="show it and exit")
+    parser.add_argument(
+        "--version", action="version", version=f"%(prog)s {version()}", help="show the version and exit"
+    )
     _add_commands(parser, COMMANDS if commands is None else commands)
     return parser
 
 
-def _chosen(arguments: Namespace, commands: Commands) -> tuple[Command, dict[str, Any]]:
+def _selected(arguments: Namespace, commands: Commands) -> tuple[Command, dict[str, Any]]:
+    """Return the command that the parsed arguments name, with its options."""
     name: str = arguments.subcommand
     command, options = commands[name], arguments[name]
-    return (command, options.as_dict()) if callable(command) else _chosen(options, command)
+    return (command, options.as_dict()) if callable(command) else _selected(options, command)
 
 
 def _add_commands(parser: ArgumentParser, commands: Commands) -> None:
-    added = parser.add_subcommands(required=True)
+    subcommands = parser.add_subcommands(required=True)
     for name, command in commands.items():
         if callable(command):
-            summary, _, rest = (inspect.getdoc(command) or "").partition("\n")
-            one = ArgumentParser(description=summary + "\n" + rest.partition("Args:")[0])
-            _add_options(one, command)
-            added.add_subcommand(name, one, help=summary)
+            summary, _, details = (inspect.getdoc(command) or "").partition("\n")
+            subparser = ArgumentParser(description=summary + "\n" + details.partition("Args:")[0])
+            _add_options(subparser, command)
+            subcommands.add_subcommand(name, subparser, help=summary)
         else:
             group = ArgumentParser(description=f"One of {', '.join(command)}.")
-            added.add_subcommand(name, group, help=", ".join(command))
-            _add_commands(group, command)  # a group takes commands only after it was added itself
+            subcommands.add_subcommand(name, group, help=", ".join(command))
+            _add_commands(group, command)  # jsonargparse accepts subcommands of a group only after adding the group
 
 
 def _add_options(parser: ArgumentParser, command: Command) -> None:
-    """Options from the signature and docstring of a command, written as a shell user expects them.
+    """Add the options of a command, from its signature and docstring.
 
-    A first parameter without default is positional. A list takes several words, and a truth value is a switch.
+    A first parameter without default is positional. A list takes several values, and a boolean is a switch.
     """
-    kinds = get_type_hints(command)
+    types = get_type_hints(command)
     documented = {parameter.arg_name: parameter.description for parameter in parse(command.__doc__ or "").params}
     meanings = {**MEANINGS, **documented}
     parameters = inspect.signature(command).parameters
-    switches = {name: meanings.get(name) for name in parameters if kinds[name] is bool}
+    switches = {name: meanings.get(name) for name in parameters if types[name] is bool}
     if "reading" in parameters:
         switches = {**FLAGS, **switches}
-        for several, told in LISTS.items():
-            if several != "with" or {"descriptor", "descriptors"} & set(parameters):
-                parser.add_argument(f"--{several}", nargs="+", action="extend", help=told)
-    if kinds["return"] is not type(None):
+        for name, help_text in LISTS.items():
+            if name != "with" or {"descriptor", "descriptors"} & set(parameters):
+                parser.add_argument(f"--{name}", nargs="+", action="extend", help=help_text)
+    if types["return"] is not type(None):
         switches[JSON] = "print the table as JSON, and everything else to standard error"
-    by_hand: set[str | int] = {*switches, *LISTS}
-    for place, (name, parameter) in enumerate(parameters.items()):
-        positional = place == 0 and parameter.default is parameter.empty
-        item = _list_item(kinds[name])
-        if positional or item is not None:
-            option, how = (name, {}) if positional else (f"--{name}", {"default": parameter.default})
-            if not positional and parameter.default is parameter.empty:
-                how = {"required": True}
-            if item is not None and how.get("default") is None:
-                how["action"] = "extend"  # what is named again comes beside the first
-            parser.add_argument(option, nargs=item and "+", type=item or kinds[name], help=meanings[name], **how)
-            by_hand.add(name)
-    parser.add_function_arguments(command, skip=by_hand)
+    custom: set[str | int] = {*switches, *LISTS}  # jsonargparse would write these in another way
+    for position, (name, parameter) in enumerate(parameters.items()):
+        is_positional = position == 0 and parameter.default is parameter.empty
+        item = _list_item(types[name])
+        if is_positional or item is not None:
+            option, settings = (name, {}) if is_positional else (f"--{name}", {"default": parameter.default})
+            if not is_positional and parameter.default is parameter.empty:
+                settings = {"required": True}
+            if item is not None and settings.get("default") is None:
+                settings["action"] = "extend"  # a repeated option adds to the list
+            parser.add_argument(option, nargs=item and "+", type=item or types[name], help=meanings[name], **settings)
+            custom.add(name)
+    parser.add_function_arguments(command, skip=custom)
     for action in parser._actions:
         action.help = action.help or meanings.get(action.dest)
     for name, meaning in switches.items():
         parser.add_argument(f"--{name}", action="store_true", help=meaning)
 
 
-def _list_item(kind: Any) -> Any:
-    """What a list, or an optional list, is of; None for everything else."""
-    lists = [one for one in (kind, *get_args(kind)) if get_origin(one) is list]
+def _list_item(hint: Any) -> Any:
+    """Return the item type of a list or of an optional list; None for every other type."""
+    lists = [kind for kind in (hint, *get_args(hint)) if get_origin(kind) is list]
     return get_args(lists[0])[0] if lists else None

@@ -1,4 +1,4 @@
-"""`python -m igps.cli` is `igps`."""
+"""Entry point of `python -m igps.cli`, which is the same as `igps`."""
 
 from igps.cli import main
 

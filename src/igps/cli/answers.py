@@ -1,4 +1,4 @@
-"""`igps groups`, `igps outliers` and `igps explain`."""
+"""The commands `igps groups`, `igps outliers` and `igps explain`."""
 
 import re
 from dataclasses import asdict
@@ -9,12 +9,12 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._parameters import check_at_least, check_share
-from igps.analysis.explanation import Explanation, contents_of, explain_groups, on_surface
+from igps.analysis.explanation import Explanation, explain_groups, on_surface, without_head
 from igps.analysis.explanation import explain as explain_pair
-from igps.analysis.groups import group_test, squared_distances, with_discovery_rates
+from igps.analysis.groups import group_test, squared_distances, with_q_values
 from igps.analysis.outliers import LIMIT, measures_of
 from igps.analysis.outliers import outliers as find_outliers
-from igps.cli.reading import Folder, check_files, described, files_or_folder, is_called_by_file, print_failures
+from igps.cli.reading import Folder, check_files, described, files_or_folder, is_named_after_file, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
@@ -40,20 +40,20 @@ def groups(
     seed: int = 0,
     **reading: Any,
 ) -> list[dict[str, Any]]:
-    """Test whether groups of bodies differ in shape: each named body of the files, such as an organ, by itself.
+    """Test whether groups of bodies differ in shape, separately for each named body of the files, such as an organ.
 
-    Two tests by permutation, PERMANOVA and a kernel two-sample test; how large the difference is, with its interval;
-    the area under the curve of a classifier by cross-validation; and false discovery rates over the bodies.
+    Two permutation tests are run, PERMANOVA and a kernel two-sample test. Also reported are the effect size with a 95 %
+    interval, the cross-validated area under the curve of a classifier, and false discovery rates over the bodies.
 
     Args:
         root: folder with one subfolder per group, or with files and a labels.csv (columns file,label and more).
-        group: a column of labels.csv that tells the groups; the class if not given.
-        strata: a column within whose values bodies are permuted, such as scanner.
-        covariate: columns that are regressed out first: numbers, such as age, or words, such as sex.
-        size: also test the size, the logarithm of the volume, in lines of its own
+        group: column of labels.csv that holds the groups; the class if not given.
+        strata: column of labels.csv, such as scanner; bodies are permuted only among those with the same value.
+        covariate: columns that are regressed out first: numeric, such as age, or categorical, such as sex.
+        size: also test the size (the logarithm of the volume), in separate lines
         out: folder for groups.csv, groups.json, and the effects as groups.svg and groups.png.
         n_permutations: number of random permutations.
-        seed: of the permutations and all else that is random.
+        seed: seed of the permutations, bootstraps and folds.
     """
 
     check_at_least(1, n_permutations=n_permutations)
@@ -61,91 +61,95 @@ def groups(
 
     def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
         labels = np.array(bodies.labels if group is None else bodies.column(group))
-        of_strata = None if strata is None else np.array(bodies.column(strata))
-        return labels, of_strata, np.hstack([_numbers(bodies, name) for name in covariate]) if covariate else None
+        stratum = None if strata is None else np.array(bodies.column(strata))
+        return labels, stratum, np.hstack([_design(bodies, name) for name in covariate]) if covariate else None
 
     folder = Folder(root, labelled=group is None, check=columns)
-    how: Size = "ignore" if "scale" in descriptor_of(descriptor).invariant_to else "auto"  # as its name says
-    found = described(folder, descriptor, size=how, **reading)
-    bodies = found.dataset.bodies
-    labels, of_strata, of_covariates = columns(bodies)
-    vectors = {"": found.coordinates(of_one_kind=True)}
+    # Size counts only where the descriptor's name says so
+    size_option: Size = "ignore" if "scale" in descriptor_of(descriptor).invariant_to else "auto"
+    result = described(folder, descriptor, size=size_option, **reading)
+    bodies = result.dataset.bodies
+    labels, stratum, covariates = columns(bodies)
+    vectors = {"": result.coordinates(of_one_kind=True)}
     if size:
-        if told := keeps_size("keep", found.dataset.units())[1]:
-            print(told)
-        vectors[", size"] = np.log([[one.volume * millimetres(one.unit) ** 3] for one in found.dataset.signatures()])
+        if warning := keeps_size("keep", result.dataset.units())[1]:
+            print(warning)
+        vectors[", size"] = np.log([[s.volume * millimetres(s.unit) ** 3] for s in result.dataset.signatures()])
     members: dict[str, list[int]] = {}
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
     n_pairs = len(set(zip(bodies.parts, labels, strict=True)))
-    by_file = n_pairs == len(bodies) and all(map(is_called_by_file, bodies.names, bodies.parts))
-    if by_file or n_pairs == len(members) in (len(set(labels)), len(bodies)):
-        # Names are those of the groups, or of the files of single masks, which may come again in each group
+    is_named_by_file = n_pairs == len(bodies) and all(map(is_named_after_file, bodies.names, bodies.parts))
+    if is_named_by_file or n_pairs == len(members) in (len(set(labels)), len(bodies)):
+        # These names do not tell organs apart: they are the groups, or the file names of single masks, which may repeat
+        # in each group
         members = {"all": list(range(len(bodies)))}
-    jobs = [(body + what, places, rows[places]) for body, places in members.items() for what, rows in vectors.items()]
-    tests = with_discovery_rates([
+    jobs = [(body + suffix, own, rows[own]) for body, own in members.items() for suffix, rows in vectors.items()]
+    tests = with_q_values([
         group_test(
-            rows, labels[places].tolist(), body=body, n_permutations=n_permutations, seed=seed,
-            strata=None if of_strata is None else of_strata[places].tolist(),
-            covariates=None if of_covariates is None else of_covariates[places],
+            rows, labels[own].tolist(), body=body, n_permutations=n_permutations, seed=seed,
+            strata=None if stratum is None else stratum[own].tolist(),
+            covariates=None if covariates is None else covariates[own],
         )
-        for body, places, rows in tqdm(jobs, desc="tests")
+        for body, own, rows in tqdm(jobs, desc="tests")
     ])  # fmt: skip
     print(groups_table(tests))
-    print_failures(found.failures, len(bodies))
+    print_failures(result.failures, len(bodies))
     if out is not None:
-        rows = [asdict(one) for one in tests]
+        rows = [asdict(test) for test in tests]
         for row in rows:
             row["sizes"] = " ".join(f"{name}:{count}" for name, count in row["sizes"].items())
         write_answer(out, "groups", rows, groups_figure(tests))
         print(f"written to {out}")
-    return [asdict(one) for one in tests]
+    return [asdict(test) for test in tests]
 
 
-def _numbers(bodies: Bodies, name: str) -> Any:
-    """(N, k) the numbers of a column; of one of words alone, which of them each body has."""
+def _design(bodies: Bodies, name: str) -> Any:
+    """Return a column as numbers (N, k): as they are, or one indicator per category where no value is a number."""
     words = bodies.column(name)
     if any(re.match(r"[-+.\d]|(nan|inf|infinity)$", word, re.IGNORECASE) for word in words):
         return np.array(bodies.numbers(name))[:, None]
-    return np.array([[word == one for one in sorted(set(words))] for word in words], dtype=float)
+    return np.array([[word == category for category in sorted(set(words))] for word in words], dtype=float)
 
 
 def outliers(
     root: Path, descriptor: str = "pretrained", top: int = 20, out: Path | None = None, **reading: Any
 ) -> list[dict[str, Any]]:
-    """List the bodies that are most unlike their class, to look at before the collection is trusted.
+    """List the bodies that are most unlike their class, to review before the collection is used.
 
-    Each is compared with the others of its class: shape, volume, how coarse it is; of meshes handles, flat sides and
-    repairs; of labels what lies apart, cavities, holes, gaps, cut ends, and overlap with other labels. A score is a
-    number of robust standard deviations; a body above 3.5 is an outlier. A body that is nearer to another class than
-    to its own is reported.
+    Each body is compared with the others of its class by its shape, volume and resolution; a mesh also by its handles,
+    flat sides and repairs; a label also by detached pieces, cavities, holes, gaps, cut ends, and overlap with other
+    labels. A score counts robust standard deviations; a body with a score above 3.5 is an outlier. The list also tells
+    where a body is nearer to another class than to its own.
 
     Args:
         root: folder with one subfolder per class, or with files and a labels.csv (columns file,label).
-        top: how many to list.
-        out: folder for outliers.csv and outliers.json with all, and pictures of the first as outliers.svg and .png.
+        top: number of bodies to list.
+        out: folder for outliers.csv and outliers.json with all bodies, and outliers.svg and outliers.png with pictures
+            of the first.
     """
     check_at_least(0, top=top)
-    bodies = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **reading)
-    dataset = bodies.dataset
-    distances = squared_distances(bodies.coordinates()) ** 0.5
+    result = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **reading)
+    dataset = result.dataset
+    distances = squared_distances(result.coordinates()) ** 0.5
     measures = measures_of(dataset, n_workers=reading.get("n_workers"))
     files = dataset.bodies.paths
-    subjects = files if len(set(files)) < len(files) else [file.parent for file in files]  # a mask for each organ
-    found = find_outliers(distances, dataset.bodies.labels or (), measures, dataset.all_notes(), subjects)
+    # Where each file holds one mask, a folder holds the organs of one subject
+    subjects = files if len(set(files)) < len(files) else [file.parent for file in files]
+    ranked = find_outliers(distances, dataset.bodies.labels or (), measures, dataset.all_notes(), subjects)
     rows: list[dict[str, Any]] = [
-        {"name": dataset.bodies.names[one.body], "class": one.label, "score": round(one.score, 3), "reason": one.reason,
-         **{f"score_{name}": round(value, 3) for name, value in one.scores.items()}}
-        for one in found
+        {"name": dataset.bodies.names[o.body], "class": o.label, "score": round(o.score, 3), "reason": o.reason,
+         **{f"score_{name}": round(value, 3) for name, value in o.scores.items()}}
+        for o in ranked
     ]  # fmt: skip
     width = max((len(row["name"]) for row in rows[:top]), default=4)
-    print(f"{'score':>7}  {'body':<{width}}  class: why")
+    print(f"{'score':>7}  {'body':<{width}}  class: reason")
     for row in rows[:top]:
         print(f"{row['score']:>7.1f}  {row['name']:<{width}}  {row['class']}: {row['reason']}")
-    print(f"{sum(one.is_outlier for one in found)} of {len(rows)} bodies are outliers, with a score above {LIMIT}")
-    print_failures(bodies.failures, len(dataset))
+    print(f"{sum(o.is_outlier for o in ranked)} of {len(rows)} bodies are outliers, with a score above {LIMIT}")
+    print_failures(result.failures, len(dataset))
     if out is not None:
-        pictured = [(one, dataset.bodies.names[one.body], dataset.mesh(one.body)) for one in found[: min(top, 12)]]
+        pictured = [(o, dataset.bodies.names[o.body], dataset.mesh(o.body)) for o in ranked[: min(top, 12)]]
         write_answer(out, "outliers", rows, outliers_figure(pictured) if pictured else None)
         print(f"written to {out}")
     return rows
@@ -154,15 +158,14 @@ def outliers(
 def explain(
     meshes: list[Path], descriptor: str = "pretrained", level: float = 0.05, out: Path | None = None, **reading: Any
 ) -> dict[str, Any]:
-    """Tell where two bodies differ, or two groups of bodies: their distance, shared out and painted on both.
+    """Show where two bodies or two groups of bodies differ, by the share of each part in their distance.
 
     Args:
         meshes: two files, or a folder with two classes.
-        descriptor: of histograms, such as interior, rich or pretrained.
-        level: of two groups, only cells of the histograms count whose means differ significantly, at this family-wise
-            error rate.
-        out: folder for explain.csv, the shares of the histograms; explain_samples.csv, those of the samples; and both
-            bodies painted from two sides as explain.svg and explain.png.
+        descriptor: a descriptor made of histograms, such as interior, rich or pretrained.
+        level: family-wise error rate, for two groups: only histogram cells whose means differ significantly count.
+        out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and both
+            bodies painted with their shares, from the front and from behind, as explain.svg and explain.png.
     """
     check_share(level=level)
     source = files_or_folder(meshes)
@@ -170,39 +173,40 @@ def explain(
         if len(source) != 2:
             raise ValueError(f"meshes: expected two files, or a folder of two classes, got {len(source)} files.")
         check_files(source)
-    contents_of(descriptor_of(descriptor))  # refuses others before anything is computed
+    without_head(descriptor_of(descriptor))  # raises for other descriptors before anything is computed
     if isinstance(source, Folder):
         folder = Folder(source.root, labelled=True, needs_meshes=True, check=_check_two_classes)
-        bodies = described(folder, descriptor, **reading)
-        _check_two_classes(bodies.dataset.bodies)  # those that are left
-        dataset, module, labels = bodies.dataset, bodies.descriptor, np.array(bodies.dataset.bodies.labels)
-        inner, n_workers = contents_of(module), reading.get("n_workers")
+        result = described(folder, descriptor, **reading)
+        _check_two_classes(result.dataset.bodies)  # without the bodies that could not be used
+        dataset, module, labels = result.dataset, result.descriptor, np.array(result.dataset.bodies.labels)
+        inner, n_workers = without_head(module), reading.get("n_workers")
         descriptions = describe(dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True)
-        classes = sorted(set(labels))
-        members = [np.flatnonzero(labels == name) for name in classes]
+        members = [np.flatnonzero(labels == name) for name in sorted(set(labels))]
         squares = squared_distances(inner.coordinates(descriptions).double().numpy())
-        chosen = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]  # the medoids
-        batches = [dataset.batch([i]) for i in chosen]
-        found, kept = explain_groups(module, descriptions[members[0]], descriptions[members[1]], batches, level=level)
-        print(f"{int(kept.sum())} of {len(kept)} cells differ by more than chance; painted: the middle of each group")
+        pair = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]  # the medoids
+        batches = [dataset.batch([i]) for i in pair]
+        first, second = (descriptions[own] for own in members)
+        explanation, is_significant = explain_groups(module, first, second, batches, level=level)
+        n_cells = f"{int(is_significant.sum())} of {len(is_significant)}"
+        print(f"{n_cells} cells differ significantly; painted: the medoid of each group")
     else:
-        bodies, chosen = described(source, descriptor, **{**reading, "strict": True}), [0, 1]
-        dataset, module = bodies.dataset, bodies.descriptor
+        result, pair = described(source, descriptor, **{**reading, "strict": True}), [0, 1]
+        dataset, module = result.dataset, result.descriptor
         if len(dataset) != 2:
-            told = ", ".join(dataset.bodies.names[:4])
-            raise ValueError(f"meshes: expected two bodies, got {len(dataset)}: {told}. Name each as FILE#PART.")
-        found = explain_pair(module, *(dataset.batch([i]) for i in chosen))
-    names = [dataset.bodies.names[i] for i in chosen]
-    print(f"{' and '.join(names)}: {found.distance:.4g} by {module.name}: {found.summary()}")
-    painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
+            listed = ", ".join(dataset.bodies.names[:4])
+            raise ValueError(f"meshes: expected two bodies, got {len(dataset)}: {listed}. Name each as FILE#PART.")
+        explanation = explain_pair(module, *(dataset.batch([i]) for i in pair))
+    names = [dataset.bodies.names[i] for i in pair]
+    print(f"{' and '.join(names)}: {explanation.distance:.4g} by {module.name}: {explanation.summary()}")
+    painted = [_painted(dataset, i, explanation, side) for side, i in enumerate(pair)]
     for name, mesh, values in painted:
         print(f"{name}: {_extent(values, face_areas(mesh.vertices, mesh.faces))}")
-    parts = [{"histogram": name, "share": share} for name, share in found.parts.items()]
+    parts = [{"histogram": name, "share": share} for name, share in explanation.parts.items()]
     if out is not None:
-        write_answer(out, "explain_samples", _sample_rows(dataset, chosen, found))
+        write_answer(out, "explain_samples", _sample_rows(dataset, pair, explanation))
         write_answer(out, "explain", parts, explanation_figure(painted))
         print(f"written to {out}")
-    return {"bodies": names, "distance": found.distance, "shares": parts}
+    return {"bodies": names, "distance": explanation.distance, "shares": parts}
 
 
 def _check_two_classes(bodies: Bodies) -> None:
@@ -210,29 +214,31 @@ def _check_two_classes(bodies: Bodies) -> None:
         raise ValueError(f"meshes: expected a folder of two classes, got {n}.")
 
 
-def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) -> tuple[str, Mesh, Any]:
-    """A body's name and mesh, and what each of its faces has of the difference."""
+def _painted(dataset: SignatureDataset, i: int, explanation: Explanation, side: int) -> tuple[str, Mesh, Any]:
+    """Return the name and mesh of a body, and the shares of its faces (F,) in the distance; `side` is 0 or 1."""
     mesh, signature = dataset.mesh(i), dataset[i].signature
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     samples = {kind: getattr(signature, kind).points for kind in SAMPLE_KINDS}
-    return dataset.bodies.names[i], mesh, on_surface((found.places or found.samples)[place], samples, centres)
+    shares = (explanation.places or explanation.samples)[side]
+    return dataset.bodies.names[i], mesh, on_surface(shares, samples, centres)
 
 
 def _extent(values: Any, areas: Any) -> str:
-    """The smallest share of the surface that holds half of all that is positive, of (F,) faces, in words."""
+    """Say how small a part of the surface holds half of the positive shares, given shares and areas (F,) of faces."""
     order = np.argsort(-values)
-    held = np.cumsum(np.maximum(values, 0)[order] * areas[order])
-    if not held[-1]:
+    cumulative = np.cumsum(np.maximum(values, 0)[order] * areas[order])
+    if not cumulative[-1]:
         return "none of the difference lies on its surface"
-    half = (np.cumsum(areas[order]) / areas.sum())[np.searchsorted(held, held[-1] / 2)]
+    half = (np.cumsum(areas[order]) / areas.sum())[np.searchsorted(cumulative, cumulative[-1] / 2)]
     return f"half of its share lies on {100 * half:.2g}% of its surface"
 
 
-def _sample_rows(dataset: SignatureDataset, chosen: list[int], found: Explanation) -> list[dict[str, Any]]:
+def _sample_rows(dataset: SignatureDataset, pair: list[int], explanation: Explanation) -> list[dict[str, Any]]:
+    by_place = explanation.places or explanation.samples
     return [
         {"name": dataset.bodies.names[i], "samples": kind, **dict(zip("xyz", point, strict=True)),
          "share": float(share), "share_by_place": float(placed)}
-        for i, shares, places in zip(chosen, found.samples, found.places or found.samples, strict=True)
+        for i, shares, places in zip(pair, explanation.samples, by_place, strict=True)
         for kind in SAMPLE_KINDS
         for point, share, placed in zip(
             getattr(dataset[i].signature, kind).points.tolist(), shares[kind], places[kind], strict=True

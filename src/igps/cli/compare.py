@@ -1,4 +1,4 @@
-"""`igps compare`."""
+"""The command `igps compare`."""
 
 import json
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import numpy as np
 
 from igps.analysis.comparison import Result, check_names
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import Folder, MirrorOption, signatures, sized, with_side, write_notes
+from igps.cli.reading import Folder, MirrorOption, signatures, with_side, with_size, write_notes
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
@@ -34,33 +34,33 @@ def compare(
     strict: bool = False,
     **reading: Any,
 ) -> list[dict[str, Any]]:
-    """Compare descriptors on a labelled collection and print a table of their scores.
+    """Compare descriptors on a labelled collection and print a table of their retrieval scores.
 
     Every mesh is compared with all others (leave-one-out) by the distance of each descriptor. A mesh that a descriptor
-    cannot describe is left out of its scores; the table tells how many it describes.
+    cannot describe does not count for its scores; the table lists how many meshes each descriptor describes.
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
-        descriptors: names, or package.module:NAME of your own; where one ends in +size, --size auto leaves the others
-            as they are named.
-        out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json that tells where the meshes
-            lie, and failures.csv if there are any.
-        report: make a page of the results in that folder, report.html, see `igps report`
+        descriptors: names, or package.module:NAME of your own descriptors; if a name ends in +size, --size auto adds
+            +size to no other name.
+        out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json with the paths of the
+            meshes, and failures.csv if there are failures.
+        report: also write a page of results to the folder of --out, report.html, see igps report
     """
     check_report(report, out)
-    wanted = [with_side(name, mirror, size) for name in descriptors]
-    chosen = [descriptor_of(name) for name in wanted]
-    if size == "auto" and any(SIZE in one.name for one in chosen):
+    names = [with_side(name, mirror, size) for name in descriptors]
+    modules = [descriptor_of(name) for name in names]
+    if size == "auto" and any(SIZE in module.name for module in modules):
         size = "ignore"
-    check_names([one.name.replace(SIZE, "") if size == "keep" else one.name for one in chosen])
-    dataset, failures = signatures(Folder(root, labelled=True), chosen, n_workers=n_workers, strict=strict, **reading)
-    chosen = [descriptor_of(sized(name, size, dataset)) for name in wanted]
-    for one in chosen:
-        fit_centres(one, dataset)
+    check_names([module.name.replace(SIZE, "") if size == "keep" else module.name for module in modules])
+    dataset, failures = signatures(Folder(root, labelled=True), modules, n_workers=n_workers, strict=strict, **reading)
+    modules = [descriptor_of(with_size(name, size, dataset)) for name in names]
+    for module in modules:
+        fit_centres(module, dataset)
     results: list[Result] = []
-    for result in compare_descriptors(dataset, chosen, n_workers=n_workers, strict=strict):
+    for result in compare_descriptors(dataset, modules, n_workers=n_workers, strict=strict):
         results.append(result)
-        if out is not None:  # after each descriptor, so that a run that is stopped leaves what it has
+        if out is not None:  # after each descriptor, so that an interrupted run keeps its results so far
             _write(out, results, failures)
     print(comparison_table(results))
     if n_failed := len(failures) + sum(len(result.failures) for result in results):
@@ -82,7 +82,7 @@ def compare(
 
 
 def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) -> None:
-    """All rows and failures so far, and the distances of the last descriptor."""
+    """Write the rows and failures of all results, and the distances of the last one."""
     (out / "distances").mkdir(parents=True, exist_ok=True)
     (out / "compare.json").write_text(json.dumps([result.row() for result in results], indent=2) + "\n")
     last = results[-1]

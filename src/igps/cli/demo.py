@@ -1,4 +1,4 @@
-"""`igps demo`."""
+"""The command `igps demo`."""
 
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,10 @@ from igps.shapes import ArticulatedShapes
 
 
 def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[str, Any]:
-    """Make a small benchmark of articulated shapes, run the retrieval on it, and save a figure and a page of results.
+    """Generate a small benchmark of articulated shapes, run retrieval on it, and save a figure and a page of results.
 
     Args:
-        out: folder for the meshes, the results of `igps retrieve`, ranked.png and report.html.
+        out: folder for the meshes, the results of igps retrieve, ranked.png and report.html.
     """
     from igps.report.drawing import ranked_results
 

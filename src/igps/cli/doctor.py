@@ -1,4 +1,4 @@
-"""`igps doctor`."""
+"""The command `igps doctor`."""
 
 from dataclasses import asdict, astuple
 from pathlib import Path
@@ -24,25 +24,25 @@ def doctor(
     attribute: list[str] | None = None,
     **options: Any,
 ) -> Verdict:
-    """Tell what is wrong with each body of a folder, what will be done about it, and what that will cost.
+    """Check each body of a folder: list its defects, how they are mended, and the expected cost of its signature.
 
-    Of labels of volumes it tells the number of voxels and of pieces, and how many voxels thick the thinnest part is, up
-    to ten. Nothing is computed but the mending. The exit status is 1 if a body cannot be used.
+    For labels of volumes, also list the number of voxels and of pieces, and the thickness of the thinnest part in
+    voxels, up to ten. Bodies are mended, but no signature is computed. The exit status is 1 if a body cannot be used.
 
     Args:
-        out: a CSV file for the findings, with all notes.
-        signature: parameters of the signatures to come.
-        attribute: values inside the bodies, such as ct=images/{stem}.nii.gz; these files are not taken as bodies.
+        out: CSV file for the findings, with all notes.
+        signature: parameters of the signatures, for the expected cost.
+        attribute: values inside the bodies, such as ct=images/{stem}.nii.gz; these files do not count as bodies.
     """
     reading, limits = LoadOptions(allow_open=allow_open, **options), limits_of(time_limit, memory_limit)
     bodies = find_bodies(root, reading, attributes=attribute_sources(attribute or (), root).values())
-    found = examine(bodies, reading, signature, n_workers=n_workers, limits=limits)
-    print(findings_table(found))
+    findings = examine(bodies, reading, signature, n_workers=n_workers, limits=limits)
+    print(findings_table(findings))
     if out is not None:
-        rows = [_row(finding) for finding in found]
+        rows = [_row(finding) for finding in findings]
         write_rows(out, rows[0], [row.values() for row in rows])
         print(f"written to {out}")
-    return Verdict([asdict(finding) for finding in found], all(finding.error is None for finding in found))
+    return Verdict([asdict(finding) for finding in findings], all(finding.error is None for finding in findings))
 
 
 def _row(finding: Finding) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Descriptions as a table, for statistics packages: a row for each body, or for each file."""
+"""Tables of descriptions, for statistics packages: one row per body, or one row per file."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
@@ -6,75 +6,78 @@ from typing import Any
 
 import numpy as np
 
-from igps.cli.reading import is_called_by_file
+from igps.cli.reading import is_named_after_file
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import LABELS_FILE, file_name_of, is_number
 from igps.report.tables import write_rows
 
 SUFFIXES = (".csv", ".parquet")
-_WORDS = ("file", "folder", "part", "name", "class", "unit")
+_TEXT_COLUMNS = ("file", "folder", "part", "name", "class", "unit")
 Table = Mapping[str, Sequence[Any]]
-"""Columns by name, all of one length; None where a value is missing."""
+"""Columns of equal length by name; None for a missing value."""
 
 
 def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Table, Table]:
-    """What is known of each body, and what was measured of it.
+    """Return the metadata and the measured values of bodies as two tables with one row per body.
 
     Args:
         dataset: N bodies, their Signatures cached.
         features: (N, ...) descriptions.
 
     Returns:
-        `file`, `part`, `name`, `class`, further columns of the table of labels, and the `unit` of length; and `volume`,
-        `area`, and the description as `v0`, `v1` and so on. A further column of one of these names, or `folder`, is
-        `NAME of labels.csv`.
+        The metadata: `file`, `part`, `name`, `class`, further columns of labels.csv, and the `unit` of length. A column
+        of labels.csv whose name is in use already, or is `folder`, is called `NAME of labels.csv`.
+        The measured values: `volume`, `area`, and the description as `v0`, `v1` and so on.
     """
     bodies = dataset.bodies
-    units, volumes, areas = zip(*((one.unit, one.volume, one.area) for one in dataset.signatures()), strict=True)
+    units, volumes, areas = zip(*((s.unit, s.volume, s.area) for s in dataset.signatures()), strict=True)
     files = list(map(file_name_of, bodies.names, bodies.parts))
     own = {"file": files, "part": bodies.parts, "name": bodies.names, "class": bodies.labels or [None] * len(bodies)}
     vectors = features.reshape(len(features), -1)
     measured = {"volume": volumes, "area": areas, **{f"v{i}": list(column) for i, column in enumerate(vectors.T)}}
-    taken = {*own, "folder", "unit", *measured}
-    further = {f"{name} of {LABELS_FILE}" * (name in taken) or name: bodies.columns[name] for name in bodies.columns}
+    reserved = {*own, "folder", "unit", *measured}
+    further = {f"{name} of {LABELS_FILE}" * (name in reserved) or name: bodies.columns[name] for name in bodies.columns}
     return {**own, **further, "unit": units}, measured
 
 
-def wide_table(known: Table, measured: Table) -> Table:
-    """A row for each file: what its bodies share, and `PART.volume`, `PART.v0` and so on; see `feature_table`.
+def wide_table(metadata: Table, measured: Table) -> Table:
+    """Return a table with one row per file, from the two tables of `feature_table`.
 
-    Masks of one organ each, called by their files or with names that come again in other folders, have a row for each
-    folder, unless they are only numbered. A body that a file or folder lacks, or that could not be used, has no values.
+    Metadata that all bodies of each file share is one column; everything else is a column per body: `PART.volume`,
+    `PART.v0` and so on. A body that is missing in a file, or could not be used, has no values.
+
+    Where each file is the mask of one organ, a row is a folder of such files instead: if the bodies have the names of
+    their files, or their names repeat in several folders. Files that are only numbered stay one row each.
     """
-    folders = [PurePath(file).parent.as_posix() for file in known["file"]]
-    n, parts = len(folders), set(known["part"])
-    one_each = len(set(known["file"])) == n == len(set(zip(folders, known["part"], strict=True)))
-    called = all(map(is_called_by_file, known["name"], known["part"]))
-    if called and all(part and part.isdigit() for part in parts):
-        known = {**known, "part": [None] * n}
-    elif one_each and len(parts) > 1 and (n > len(parts) or called):
-        known = {"folder": folders, **{name: known[name] for name in known if name != "file"}}
+    folders = [PurePath(file).parent.as_posix() for file in metadata["file"]]
+    n, parts = len(folders), set(metadata["part"])
+    has_one_body_per_file = len(set(metadata["file"])) == n == len(set(zip(folders, metadata["part"], strict=True)))
+    is_named_by_file = all(map(is_named_after_file, metadata["name"], metadata["part"]))
+    if is_named_by_file and all(part and part.isdigit() for part in parts):
+        metadata = {**metadata, "part": [None] * n}
+    elif has_one_body_per_file and len(parts) > 1 and (n > len(parts) or is_named_by_file):
+        metadata = {"folder": folders, **{name: metadata[name] for name in metadata if name != "file"}}
     rows: dict[str, dict[str | None, int]] = {}
-    for i, (file, part) in enumerate(zip(next(iter(known.values())), known["part"], strict=True)):
+    for i, (file, part) in enumerate(zip(next(iter(metadata.values())), metadata["part"], strict=True)):
         rows.setdefault(file, {})[part] = i
     table: dict[str, Sequence[Any]] = {}
-    apart: dict[str, Sequence[Any]] = {}
-    for name in [name for name in known if name not in ("part", "name")]:
-        per_file = [{known[name][i] for i in bodies.values()} for bodies in rows.values()]
-        if all(len(found) == 1 for found in per_file):
-            table[name] = [found.pop() for found in per_file]
+    per_body: dict[str, Sequence[Any]] = {}
+    for name in [name for name in metadata if name not in ("part", "name")]:
+        values_of_rows = [{metadata[name][i] for i in bodies.values()} for bodies in rows.values()]
+        if all(len(values) == 1 for values in values_of_rows):
+            table[name] = [values.pop() for values in values_of_rows]
         else:
-            apart[name] = known[name]
-    for part in dict.fromkeys(known["part"]):
-        places = [bodies.get(part) for bodies in rows.values()]
-        for name, values in {**apart, **measured}.items():
-            column = name if part is None else f"{part}.{name}"
-            table[column] = [None if i is None else values[i] for i in places]
+            per_body[name] = metadata[name]
+    for part in dict.fromkeys(metadata["part"]):
+        indices = [bodies.get(part) for bodies in rows.values()]
+        for name, column in {**per_body, **measured}.items():
+            title = name if part is None else f"{part}.{name}"
+            table[title] = [None if i is None else column[i] for i in indices]
     return table
 
 
 def write_table(path: Path, table: Table) -> None:
-    """Write a table as CSV or Parquet, by the suffix; the latter needs pyarrow."""
+    """Write a table as Parquet, which needs pyarrow, if the suffix is .parquet, otherwise as CSV."""
     if path.suffix.lower() == ".parquet":
         try:
             import pyarrow.parquet
@@ -87,7 +90,7 @@ def write_table(path: Path, table: Table) -> None:
 
 
 def _typed(column: str, values: Sequence[Any]) -> list[Any]:
-    """Numbers of a further column, which labels.csv has as words; names stay words, though they may be digits."""
-    if column.rpartition(".")[2] not in _WORDS and all(map(is_number, values)):
-        return [None if one is None else float(one) for one in values]
+    """Return a column of labels.csv as floats if all values are numbers; names stay strings even if they are digits."""
+    if column.rpartition(".")[2] not in _TEXT_COLUMNS and all(map(is_number, values)):
+        return [None if value is None else float(value) for value in values]
     return list(values)

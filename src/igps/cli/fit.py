@@ -1,4 +1,4 @@
-"""`igps fit` and `igps classify`."""
+"""The commands `igps fit` and `igps classify`."""
 
 import json
 from functools import partial
@@ -23,7 +23,7 @@ _TITLES = {
     "dcg": "DCG",
     "accuracy": "classified correctly",
     "calibration_error": "expected calibration error",
-    "unknown_auc": "a class left out called unknown, AUC",
+    "unknown_auc": "recognising a class that was left out as unknown, AUC",
 }
 
 
@@ -38,84 +38,85 @@ def fit(
     strict: bool = False,
     **reading: Any,
 ) -> dict[str, Any]:
-    """Fit a metric or a classifier to a labelled folder, for igps classify and the --descriptor of commands.
+    """Fit a metric or a classifier to a labelled folder, for igps classify and for --descriptor of other commands.
 
-    A card of it, with scores on bodies that were held out, is written beside it, or into its folder, in Markdown.
+    A model card in Markdown, with scores on held-out bodies, is written beside the model file, or into the model's
+    folder.
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
-        out: the model, a file ending in .safetensors, or a folder to share.
-        descriptor: a name (a wrong one lists all), a file, or package.module:NAME of one of your own.
-        goal: known for the classes of the folder; new for a metric of classes that come up later.
+        out: file for the model, ending in .safetensors, or a folder to share.
+        descriptor: a name (a wrong name lists all), a file, or package.module:NAME of your own descriptor.
+        goal: known to recognise the classes of the folder; new for a metric that also serves other classes.
         head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
         no_prior: ignore the descriptor's own metric, and fit to its histograms alone
     """
-    if out.is_dir() and not (out / IN_FOLDER).is_file() and (found := next(out.iterdir(), None)):
-        raise ValueError(f"out: expected a new folder, or that of a model, {out} holds {found.name}. Name another.")
-    chosen = descriptor_of(descriptor)
-    specification(chosen)  # refuses what no file can hold before anything is computed
-    check_centres(chosen)
+    if out.is_dir() and not (out / IN_FOLDER).is_file() and (file := next(out.iterdir(), None)):
+        raise ValueError(f"out: expected a new or empty folder, or a model's, {out} holds {file.name}. Choose another.")
+    base = descriptor_of(descriptor)
+    specification(base)  # raises for a descriptor that cannot be saved, before anything is computed
+    check_centres(base)
     folder = Folder(root, labelled=True, check=partial(check_classes, goal=goal))
-    dataset, unread = signatures(folder, [chosen], n_workers=n_workers, strict=strict, **reading)
+    dataset, unread = signatures(folder, [base], n_workers=n_workers, strict=strict, **reading)
     failures: list[Failure] | None = None if strict else []
     model = fit_head(
-        dataset, chosen, goal=goal, head=head, prior=not no_prior, failures=failures, n_workers=n_workers, progress=True
+        dataset, base, goal=goal, head=head, prior=not no_prior, failures=failures, n_workers=n_workers, progress=True
     )
     model.save(out, {**model.card, "descriptor": descriptor})
     card = _card(model, out)
-    if out.suffix:  # a folder has one
+    if out.suffix:  # `save` writes a card into a folder
         out.with_suffix(".md").write_text(card, encoding="utf-8")
     print(card.partition("\n\n")[2])
-    refused = [*unread, *(failures or ())]
-    print_failures(refused, len(dataset) - len(failures or ()))
+    skipped = [*unread, *(failures or ())]
+    print_failures(skipped, len(dataset) - len(failures or ()))
     print(f"written to {out}")
-    return {**model.card, "n_refused": len(refused)}
+    return {**model.card, "n_refused": len(skipped)}
 
 
 def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading: Any) -> list[dict[str, Any]]:
-    """Classify meshes: the most probable class of each, its probability, and which meshes fit none.
+    """Classify meshes: print the most probable class of each, its probability, and the meshes that fit no class.
 
     Args:
         meshes: mesh files, or one folder.
         model: a file that igps fit wrote.
-        out: a table with the probabilities of all classes, a file ending in .csv; class is empty where none fits.
+        out: CSV file for the probabilities of all classes; the column class is empty for a mesh that fits no class.
     """
-    chosen = load(model)
-    classifier_of(chosen)  # refuses others before anything is computed
-    dataset, failures = signatures(files_or_folder(meshes), [chosen], **reading)
-    found = classify_bodies(
-        dataset, chosen, failures=None if reading.get("strict") else failures, n_workers=reading.get("n_workers")
+    module = load(model)
+    classifier_of(module)  # raises for other models before anything is computed
+    dataset, failures = signatures(files_or_folder(meshes), [module], **reading)
+    result = classify_bodies(
+        dataset, module, failures=None if reading.get("strict") else failures, n_workers=reading.get("n_workers")
     )
-    width = max(map(len, found.names))
+    width = max(map(len, result.names))
     print(f"{'mesh':<{width}}  {'probability':>11}  class")
     rows = []
-    best = found.probabilities.max(dim=1)
-    columns = (found.names, found.predicted, best.values.tolist(), best.indices.tolist())
+    best = result.probabilities.max(dim=1)
+    columns = (result.names, result.predicted, best.values.tolist(), best.indices.tolist())
     for name, predicted, value, likely in zip(*columns, strict=True):
-        told = f"unlike everything known, most like {found.classes[likely]}" if predicted is None else predicted
-        print(f"{name:<{width}}  {value:>11.1%}  {told}")
-        rows.append({"name": name, "class": predicted, "most_like": found.classes[likely], "probability": value})
+        shown = f"unlike every known class, most like {result.classes[likely]}" if predicted is None else predicted
+        print(f"{name:<{width}}  {value:>11.1%}  {shown}")
+        rows.append({"name": name, "class": predicted, "most_like": result.classes[likely], "probability": value})
     print_failures(failures, len(rows))
     if out is not None:
-        values = zip(rows, found.probabilities.tolist(), strict=True)
         table = [
-            (row["name"], row["class"], row["most_like"], *(f"{p:.6f}" for p in of_each)) for row, of_each in values
+            (row["name"], row["class"], row["most_like"], *(f"{p:.6f}" for p in probabilities))
+            for row, probabilities in zip(rows, result.probabilities.tolist(), strict=True)
         ]
-        write_rows(out, ("name", "class", "most_like", *found.classes), table)
+        write_rows(out, ("name", "class", "most_like", *result.classes), table)
     return rows
 
 
 def _card(model: Descriptor, path: Path) -> str:
-    """A page on a fitted model."""
+    """Return the model card of a fitted model, in Markdown."""
     card = model.card
     scores = "\n".join(f"| {_TITLES[name]} | {100 * value:.1f} |" for name, value in card["held_out_scores"].items())
     scores = scores or "| none: no class is large enough to hold bodies out | |"
     classes = ", ".join(f"{name} ({n})" for name, n in card["classes"].items())
-    what = {"known": "bodies of its classes", "new": "bodies of classes that it was not fitted to"}[card["goal"]]
+    use = {"known": "bodies of its classes", "new": "bodies of classes that it was not fitted to"}[card["goal"]]
     return f"""# {path.name}
 
-`{card["descriptor"]}` under the head `{card["head"]}`, {"beside" if card["prior"] else "without"} a prior metric,
-for {what}. Held out, in percent, mean over folds that neither the fit nor the choice of the head has seen:
+`{card["descriptor"]}` under the head `{card["head"]}`, {"with" if card["prior"] else "without"} a prior metric,
+for {use}. Scores in percent, means over held-out folds that neither the fit nor the choice of the head has seen:
 
 | | |
 |---|---|

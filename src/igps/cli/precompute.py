@@ -1,4 +1,4 @@
-"""`igps precompute` and `igps cache`."""
+"""The commands `igps precompute` and `igps cache export`."""
 
 import contextlib
 import logging
@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from igps._parallel import MachineError
-from igps.cli.reading import Folder, chosen_dataset, limits_of, print_failures, signatures
+from igps.cli.reading import Folder, dataset_from_options, limits_of, print_failures, signatures
 from igps.data.pipeline import version
 from igps.data.requirements import Requirements
 from igps.descriptors import descriptor as descriptor_of
 from igps.report.tables import write_rows
 
-# Seconds until a scheduler that does not answer is taken for missing.
-_ANSWERS_WITHIN = 15
+_SCHEDULER_TIMEOUT = 15  # seconds
 
 
 def precompute(
@@ -33,19 +32,19 @@ def precompute(
     memory_limit: float | None = None,
     **reading: Any,
 ) -> None:
-    """Compute the signatures of a folder of meshes into the cache, here or on a cluster.
+    """Compute the signatures of a folder of meshes and store them in the cache, on this machine or on a cluster.
 
-    What is there already is not computed again, so that a run that was stopped is finished by another.
+    Signatures in the cache are not computed again, so a second run completes one that was interrupted.
 
     Args:
-        descriptors: compute what these require.
-        cluster: address of a Dask scheduler, such as tcp://scheduler:8786, whose workers see folder and cache by the
-            same paths as this machine.
-        shard: such as 3/64, the third of 64 parts of the meshes, for as many jobs of a batch system.
-        failures: a CSV file for the meshes that cannot be used.
+        descriptors: descriptors whose requirements the signatures must meet.
+        cluster: address of a Dask scheduler, such as tcp://scheduler:8786; its workers must see the folder and the
+            cache under the same paths as this machine.
+        shard: part of the meshes for one job of a batch system, such as 3/64, the third of 64 parts.
+        failures: CSV file for the meshes that cannot be used.
     """
-    needs = reduce(or_, (descriptor_of(name).requirements for name in descriptors), Requirements())
-    dataset = chosen_dataset(Folder(root), needs, **reading)
+    requirements = reduce(or_, (descriptor_of(name).requirements for name in descriptors), Requirements())
+    dataset = dataset_from_options(Folder(root), requirements, **reading)
     dataset = dataset.subset(of_shard(len(dataset), shard))
     if not len(dataset):
         print(f"{root}: no mesh in shard {shard}")
@@ -63,17 +62,17 @@ def precompute(
 
 
 def cache_export(root: Path, out: Path, descriptors: list[str] = ["pretrained"], **reading: Any) -> None:  # noqa: B006
-    """Write the signatures of a folder to one file, which commands take in place of the folder.
+    """Write the signatures of a folder to a single file, which other commands accept in place of the folder.
 
-    The file is read by memory map, runs no code, and holds no path: meshes that cannot be used are left out. Commands
-    that look at the meshes themselves need the folder: doctor, duplicates, explain and outliers.
+    The file is memory-mapped when read, contains no code and no paths, and leaves out meshes that cannot be used. The
+    commands doctor, duplicates, explain and outliers need the meshes themselves, and thus the folder.
 
     Args:
-        out: the file, its name ending in .igps.
-        descriptors: compute what these require.
+        out: the file, ending in .igps.
+        descriptors: descriptors whose requirements the signatures must meet.
     """
-    chosen = [descriptor_of(name) for name in descriptors]
-    dataset, failures = signatures(Folder(root), chosen, **reading)
+    modules = [descriptor_of(name) for name in descriptors]
+    dataset, failures = signatures(Folder(root), modules, **reading)
     out.parent.mkdir(parents=True, exist_ok=True)
     dataset.to_file(out)
     print(f"{len(dataset)} signatures written to {out}")
@@ -81,38 +80,42 @@ def cache_export(root: Path, out: Path, descriptors: list[str] = ["pretrained"],
 
 
 def of_shard(n_bodies: int, shard: str | None) -> range:
-    """Which bodies a shard has, all if None: every n-th, so that the shards 1/n to n/n have all, each once."""
+    """Return the indices of the bodies of a shard k/n: every n-th body, from the k-th on; all bodies if None."""
     if shard is None:
         return range(n_bodies)
-    found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
-    if found is None or int(found[1]) > int(found[2]):
+    match = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
+    if match is None or int(match[1]) > int(match[2]):
         raise ValueError(f"shard: expected a part such as 3/64, from 1/64 to 64/64, got {shard!r}.")
-    return range(int(found[1]) - 1, n_bodies, int(found[2]))
+    return range(int(match[1]) - 1, n_bodies, int(match[2]))
 
 
 @contextlib.contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler; a MachineError where none answers, or one has another version of the library."""
+    """Yield an executor on the workers of a Dask scheduler.
+
+    Raises:
+        MachineError: no scheduler answers, or a worker has another version of the library.
+    """
     try:
         from distributed import Client
     except ImportError as error:
         raise ImportError('cluster: needs Dask: pip install "interior-gps[cluster]".') from error
-    # A lost scheduler is one sentence here; Dask would add tracebacks of its attempts to reconnect.
+    # A lost scheduler is reported in one sentence; Dask would log tracebacks of its attempts to reconnect
     for name in ("distributed", "distributed.client", "tornado.application"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
-        client = Client(address, timeout=_ANSWERS_WITHIN, set_as_default=False)
+        client = Client(address, timeout=_SCHEDULER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:  # a TimeoutError is an OSError
         raise MachineError(
-            f"cluster: no Dask scheduler answers at {address}. Start one by `dask scheduler`, and workers by `dask "
-            "worker` with its address."
+            f"cluster: no Dask scheduler answers at {address}. Start one with `dask scheduler`, and workers with `dask "
+            "worker` and its address."
         ) from error
     with client:
-        for worker, theirs in client.run(version, on_error="return").items():
-            if theirs != version():
-                told = theirs if isinstance(theirs, str) else f"of another version ({type(theirs).__name__})"
+        for worker, found in client.run(version, on_error="return").items():
+            if found != version():
+                shown = found if isinstance(found, str) else f"of another version ({type(found).__name__})"
                 raise MachineError(
-                    f"cluster: the worker at {worker} has igps {told}, where {version()} is asked for. Install one "
-                    "version everywhere and run again."
+                    f"cluster: expected igps {version()} on every worker, the one at {worker} has igps {shown}. "
+                    "Install one version everywhere and run again."
                 )
         yield client.get_executor()

@@ -1,4 +1,4 @@
-"""How commands read meshes: the options they share, and the signatures these give."""
+"""The options by which commands read meshes, and the signatures and descriptions that result."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -33,42 +33,42 @@ from igps.signature.signature import SignatureConfig
 MirrorOption = Literal["auto", Mirror]
 
 FLAGS = {
-    "paper": "use the parameters of Rustamov 2010: as the defaults, but the grid is never refined",
+    "paper": "use the parameters of Rustamov 2010: the defaults, except that the grid is never refined",
     "allow_open": "accept surfaces with holes",
     "strict": "stop at the first mesh that cannot be used instead of skipping it",
 }
-"""Switches of every command that passes its `**reading` on to `signatures`, and what they do."""
+"""Help of the switches that every command has which passes its `**reading` on to `signatures`."""
 
 LISTS = {
-    "attribute": "values inside the bodies, such as ct=images/{stem}.nii.gz: an image, a grid, values at vertices or "
-    "in tetrahedra, below the folder; {stem}, {file} and {part} stand for the body's",
-    "with": "attributes that join the descriptor, such as ct, or ct=0.5 with half the weight of shape",
+    "attribute": "values inside the bodies, such as ct=images/{stem}.nii.gz: a file below the folder with an image, a "
+    "grid, or values at vertices or in tetrahedra; {stem}, {file} and {part} are replaced by those of each body",
+    "with": "attributes to combine with the descriptor, such as ct, or ct=0.5 for half the weight of shape",
 }
-"""Options of several words, of the same commands."""
+"""Help of further options of the same commands, which take several values."""
 
 MEANINGS = {
     **FLAGS,
     "root": "folder of meshes, with or without classes",
-    "descriptor": "a name (a wrong one lists all), or package.module:NAME of one of your own",
-    "gallery": "the gallery",
-    "size": "keep lets differences in size count, ignore does not; auto keeps it where all files have a unit of length",
-    "mirror": "distinct tells a body from its mirror image, same does not; auto is as the descriptor's name says",
-    "n_workers": "processes that compute; all cores if not given",
-    "time_limit": "seconds that one body may take; no limit if not given",
-    "memory_limit": "gigabytes of memory that one body may take; no limit if not given",
-    "cache_dir": "folder where computed signatures are kept; the user's cache directory if not given",
+    "descriptor": "a name (a wrong name lists all), or package.module:NAME of your own descriptor",
+    "gallery": "folder of the gallery",
+    "size": "keep or ignore differences in size; auto keeps them if all files have a unit of length",
+    "mirror": "treat mirror images as distinct or the same; auto is the same, unless the descriptor's name has +side",
+    "n_workers": "number of worker processes; default: all cores",
+    "time_limit": "seconds that one body may take; default: no limit",
+    "memory_limit": "gigabytes of memory that one body may take; default: no limit",
+    "cache_dir": "folder of the cache of signatures; default: the user's cache directory",
 }
-"""The help of options that the docstring of a command leaves out."""
+"""Help of options that are not in the docstring of their command."""
 
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder whose bodies are found as the options say, or a file that `igps cache export` wrote of one."""
+    """Source of bodies: a folder, searched according to the options, or a file that `igps cache export` wrote."""
 
     root: Path
-    labelled: bool = False  # whether it must tell classes
-    needs_meshes: bool = False  # whether signatures alone are not enough
-    check: Callable[[Bodies], object] | None = None  # raises what is wrong with its bodies before any is computed
+    labelled: bool = False  # whether classes are required
+    needs_meshes: bool = False  # whether the meshes are required, besides their signatures
+    check: Callable[[Bodies], object] | None = None  # called before any computation; raises for unsuitable bodies
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,12 @@ class Described:
     dataset: SignatureDataset  # the N bodies that could be used
     descriptions: Tensor  # (N, ...)
     failures: list[Failure]  # the other bodies
-    descriptor: Descriptor  # that described them
-    name: str | None  # by which it can be loaded again; None where its centres were fitted to the collection
+    descriptor: Descriptor
+    name: str | None  # name that loads the descriptor; None where its centres were fitted to the collection
 
     def coordinates(self, *, of_one_kind: bool = False) -> Floats:
-        """(N, D) for statistics, see `Descriptor.coordinates`."""
-        found: Floats = self.descriptor.coordinates(self.descriptions, of_one_kind=of_one_kind).double().numpy()
-        return found
+        """Return vectors (N, D) for statistics, see `Descriptor.coordinates`."""
+        return self.descriptor.coordinates(self.descriptions, of_one_kind=of_one_kind).double().numpy()
 
 
 def signatures(
@@ -104,23 +103,33 @@ def signatures(
     memory_limit: float | None = None,
     **reading: Any,
 ) -> tuple[SignatureDataset, list[Failure]]:
-    """The bodies whose signatures are in the cache, after computing what was missing; and those that failed.
+    """Compute the signatures that are missing in the cache.
 
-    They satisfy the descriptors' requirements; a ValueError where no body could be used. The other parameters, and
-    those of `chosen_dataset`, are options of every command that reads bodies, see `MEANINGS`.
+    Args:
+        source: bodies.
+        descriptors: descriptors whose requirements the signatures must meet.
+        strict, n_workers, time_limit, memory_limit, reading: options of every command that reads bodies, see
+            `MEANINGS` and `dataset_from_options`.
+
+    Returns:
+        The bodies whose signatures are in the cache, and the failures of the others.
+
+    Raises:
+        ValueError: no body could be used.
     """
-    needs = reduce(or_, (one.requirements for one in descriptors), Requirements()) if descriptors else None
-    dataset = chosen_dataset(source, needs, **reading)
-    for one in descriptors if not isinstance(source, Folder) or source.root.is_dir() else ():  # a file is checked
-        check_attributes(one, {*dataset.config.attributes, *dataset.pipeline.attributes})
+    requirements = reduce(or_, (d.requirements for d in descriptors), Requirements()) if descriptors else None
+    dataset = dataset_from_options(source, requirements, **reading)
+    is_file = isinstance(source, Folder) and not source.root.is_dir()  # `from_file` has checked its attributes
+    for descriptor in () if is_file else descriptors:
+        check_attributes(descriptor, {*dataset.config.attributes, *dataset.pipeline.attributes})
     failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits_of(time_limit, memory_limit))
     if len(failures) == len(dataset):
         raise ValueError(f"none of {len(dataset)} meshes could be used; the first: {failures[0].error}")
     usable = dataset.usable(failures)
     if summary := mending_summary(usable, len(dataset)):
         print(summary)
-    for one in descriptors:
-        tell_reading(one, usable)
+    for descriptor in descriptors:
+        print_reading_warning(descriptor, usable)
     return usable, failures
 
 
@@ -133,103 +142,103 @@ def described(
     mirror: MirrorOption = "auto",
     **reading: Any,
 ) -> Described:
-    """The bodies whose signatures are in the cache, and their descriptions; see `signatures`.
+    """Describe bodies, after computing the signatures that are missing in the cache; see `signatures`.
 
-    Size and mirror are added to a descriptor's name; a descriptor itself stays as it is.
+    The options `size` and `mirror` extend the name of a descriptor; they do not change a `Descriptor`.
     """
     if isinstance(descriptor, str):
         descriptor = with_side(descriptor, mirror, size)
     dataset, failures = signatures(source, [descriptor_of(descriptor)], strict, n_workers, **reading)
     if isinstance(descriptor, str):
-        descriptor = sized(descriptor, size, dataset)
+        descriptor = with_size(descriptor, size, dataset)
     module = descriptor_of(descriptor)
     name = None if fit_centres(module, dataset) else name_of(descriptor)
     undescribed: list[Failure] | None = None if strict else []
-    found = describe(
+    descriptions = describe(
         dataset, module, failures=undescribed, cache_tag=cache_tag(module), n_workers=n_workers, progress=True
     )
-    return Described(dataset.usable(undescribed or ()), found, [*failures, *(undescribed or ())], module, name)
+    return Described(dataset.usable(undescribed or ()), descriptions, [*failures, *(undescribed or ())], module, name)
 
 
 def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:
-    """What a list of words names: files, or one folder or file of signatures."""
-    is_one = len(meshes) == 1 and (meshes[0].is_dir() or is_collection(meshes[0]))
-    return Folder(meshes[0]) if is_one else meshes
+    """Return a `Folder` if the only path is a folder or a file of signatures, otherwise the paths."""
+    is_folder = len(meshes) == 1 and (meshes[0].is_dir() or is_collection(meshes[0]))
+    return Folder(meshes[0]) if is_folder else meshes
 
 
 def check_files(paths: Sequence[Path]) -> None:
-    """Raise a FileNotFoundError of the first that is no file, where nothing is to be computed without it."""
+    """Raise a FileNotFoundError for the first path that is no file, before anything is computed."""
     for path in paths:
         if not file_and_part(path)[0].is_file():
-            told = "a folder; a file expected" if path.is_dir() else "no such file. Check the path"
-            raise FileNotFoundError(f"{path}: {told}.")
+            reason = "expected a file, got a folder" if path.is_dir() else "no such file. Check the path"
+            raise FileNotFoundError(f"{path}: {reason}.")
 
 
-def is_called_by_file(name: str, part: str | None) -> bool:
-    """Whether a body of this name has that of its file, as a mask without names has."""
+def is_named_after_file(name: str, part: str | None) -> bool:
+    """Return whether the part of a body is named after its file, as in a mask without label names."""
     return Path(file_name_of(name, part)).name.startswith(f"{part}.")
 
 
 def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
-    """Of one body; a ValueError that names the option of a number that is none."""
-    given = {"time_limit": seconds, "memory_limit": gigabytes}
-    check_positive(**{name: value for name, value in given.items() if value is not None})
+    """Return the limits of one body; raise a ValueError that names the option if a number is not positive."""
+    options = {"time_limit": seconds, "memory_limit": gigabytes}
+    check_positive(**{name: value for name, value in options.items() if value is not None})
     return Limits(seconds, None if gigabytes is None else int(gigabytes * 1e9))
 
 
 def print_failures(failures: Sequence[Failure], n_used: int) -> None:
-    """How many bodies could not be used, if there are any."""
+    """Print how many bodies could not be used, and the reason of the first; print nothing if there are none."""
     if failures:
-        n_given = n_used + len(failures)
-        print(f"{len(failures)} of {n_given} meshes could not be used. The first: {failures[0].error}")
+        n_total = n_used + len(failures)
+        print(f"{len(failures)} of {n_total} meshes could not be used. The first: {failures[0].error}")
 
 
 def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
-    """The name with +side where mirror images are to be told apart; a ValueError where it contradicts the options."""
-    for option, value, refused, mark in (("size", size, "ignore", SIZE), ("mirror", mirror, "same", SIDE)):
-        if value == refused and mark in (name := descriptor_of(descriptor).name):
-            raise ValueError(f"{option}: expected no {value!r} beside {name}, which is {mark}. Leave one of them out.")
+    """Return the name, with +side if `mirror` is "distinct"; raise a ValueError if name and options contradict."""
+    for option, value, excluded, suffix in (("size", size, "ignore", SIZE), ("mirror", mirror, "same", SIDE)):
+        if value == excluded and suffix in (name := descriptor_of(descriptor).name):
+            raise ValueError(f"{option}: expected no {value!r} with {name}, which has {suffix}. Leave one of them out.")
     if mirror != "distinct" or SIDE in descriptor:
         return descriptor
     return descriptor.replace(SIZE, "") + SIDE + SIZE * (SIZE in descriptor)
 
 
-def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
-    """The name with or without +size, as the option and the units of the bodies say; prints what they leave open."""
+def with_size(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
+    """Return the name, with +size if size counts by the option and the units; print a warning if that is unclear."""
     module = descriptor_of(descriptor)
     if SIZE in module.name or "scale" not in module.invariant_to:
         if size != "auto" and SIZE not in module.name:
-            print(f"size is left to {descriptor}, which does not say of itself that it ignores size (invariant_to)")
+            print(f"--size {size} has no effect: {descriptor} does not declare that it ignores size (invariant_to)")
         return descriptor
-    is_kept, told = keeps_size(size, () if size == "ignore" else dataset.units())
+    is_kept, warning = keeps_size(size, () if size == "ignore" else dataset.units())
     if is_kept and size == "auto" and scale_of(module) is None:
-        is_kept, told = False, f"size is ignored: set the attribute `scale` of {descriptor} to keep it"
-    if told:
-        print(told)
+        is_kept, warning = False, f"size is ignored: set the attribute `scale` of {descriptor} to keep it"
+    if warning:
+        print(warning)
     return descriptor + SIZE * is_kept
 
 
-def tell_units(descriptor: Descriptor, dataset: SignatureDataset) -> None:
-    """Say how many bodies count as in millimetres because their files tell no unit, where size is kept."""
+def print_unit_warning(descriptor: Descriptor, dataset: SignatureDataset) -> None:
+    """Print how many bodies have no unit and count as in millimetres, if the descriptor keeps size."""
     n_unknown = sum(unit not in MILLIMETRES for unit in dataset.units()) if SIZE in descriptor.name else 0
     if n_unknown:
         print(f"size is kept: {n_unknown} of {len(dataset)} bodies have no unit; their numbers count as millimetres")
 
 
-def tell_reading(descriptor: Descriptor, dataset: SignatureDataset) -> None:
-    """Say how the bodies that a model was fitted to were read, where these are read otherwise."""
+def print_reading_warning(descriptor: Descriptor, dataset: SignatureDataset) -> None:
+    """Print a warning if a fitted model was fitted to bodies that were read with other options."""
     fitted = descriptor.card.get("reading")
-    if not isinstance(fitted, Mapping):  # it was not fitted, or before cards told
+    if not isinstance(fitted, Mapping):  # not a fitted model, or its card is of an earlier version
         return
     then, now = ({**asdict(LoadOptions()), **options} for options in (fitted, dataset.reading.as_dict()))
     names = ("mend", "component", "allow_open", "cavities")
-    if others := [f"--{name} {then[name]}, not {now[name]}" for name in names if then[name] != now[name]]:
-        print(f"{descriptor.name} was fitted to bodies read with {', '.join(others)}: its answers may be wrong")
+    if changed := [f"--{name} {then[name]}, not {now[name]}" for name in names if then[name] != now[name]]:
+        print(f"{descriptor.name} was fitted to bodies read with {', '.join(changed)}: its results may be wrong")
 
 
-def chosen_dataset(
+def dataset_from_options(
     source: Folder | Sequence[Path] | Bodies,
-    needs: Requirements | None,
+    requirements: Requirements | None,
     cache_dir: Path | None = None,
     signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
     paper: bool = False,
@@ -237,24 +246,25 @@ def chosen_dataset(
     attribute: list[str] | None = None,
     **options: Any,
 ) -> SignatureDataset:
-    """The dataset that the options select; nothing is computed.
+    """Return the dataset that the options select, without computing anything.
 
     Args:
         signature: parameters of the signatures.
-        classes: what the class of a body is: folder (or labels.csv), body (its name in its file), or file.
+        classes: class of a body: its folder or an entry in labels.csv ("folder", the default), its name in its file
+            ("body"), or its file ("file").
 
     Raises:
-        ValueError: `paper` beside other parameters of the signatures, or no classes where they are needed.
+        ValueError: options that contradict each other or the source, or no classes where they are required.
     """
     if paper and signature != SignatureConfig():
-        raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
+        raise ValueError("paper: expected no other parameters of the signatures with it. Leave one of them out.")
     config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**options)
     if isinstance(source, Folder) and source.root.is_file() and not is_searched(source.root.name):
         if config != SignatureConfig() or reading != LoadOptions() or classes is not None or attribute:
-            raise ValueError(f"{source.root}: expected no reading options beside a file of signatures. Leave them out.")
+            raise ValueError(f"{source.root}: expected no reading options with a file of signatures. Leave them out.")
         if source.needs_meshes:
-            raise ValueError(f"{source.root}: holds signatures and no meshes, which are needed. Give their folder.")
-        dataset = SignatureDataset.from_file(source.root, descriptor=needs, cache_dir=cache_dir)
+            raise ValueError(f"{source.root}: expected meshes, got a file of signatures. Give the folder of meshes.")
+        dataset = SignatureDataset.from_file(source.root, descriptor=requirements, cache_dir=cache_dir)
         if source.labelled and dataset.bodies.labels is None:
             raise ValueError(f"{source.root}: expected signatures with classes. Export those of a labelled folder.")
         if source.check is not None:
@@ -262,29 +272,29 @@ def chosen_dataset(
         return dataset
     attributes = attribute_sources(attribute or (), source.root if isinstance(source, Folder) else None)
     if isinstance(source, Folder):
-        how: dict[str, Any] = {"classes": classes or "folder", "attributes": attributes.values()}
-        bodies = find_bodies(source.root, reading, labelled=source.labelled, **how)
+        bodies = find_bodies(
+            source.root, reading, labelled=source.labelled, classes=classes or "folder", attributes=attributes.values()
+        )
         if source.check is not None:
             source.check(bodies)
         source = bodies
     return SignatureDataset(
-        source, config, cache_dir, descriptor=needs, classes=classes, reading=reading, attributes=attributes
+        source, config, cache_dir, descriptor=requirements, classes=classes, reading=reading, attributes=attributes
     )
 
 
-def mending_summary(dataset: SignatureDataset, n_given: int) -> str:
-    """How many meshes were mended and by what, in one line; nothing where none was."""
+def mending_summary(dataset: SignatureDataset, n_total: int) -> str:
+    """Return a line on how many meshes were mended and by which steps; empty if none was."""
     steps = [repair_steps(notes) for notes in dataset.all_notes()]
-    counts = Counter(step for taken in steps for step in taken)
+    counts = Counter(step for steps_of_mesh in steps for step in steps_of_mesh)
     if not counts:
         return ""
-    n_mended = sum(bool(taken) for taken in steps)
     words = {"watertight": "made watertight"}
-    told = ", ".join(f"{count} {words.get(step, step)}" for step, count in counts.most_common())
-    return f"{n_mended} of {n_given} meshes were mended: {told}"
+    listed = ", ".join(f"{count} {words.get(step, step)}" for step, count in counts.most_common())
+    return f"{sum(map(bool, steps))} of {n_total} meshes were mended: {listed}"
 
 
 def write_notes(path: Path, dataset: SignatureDataset) -> None:
-    """Write a table of what was done to which mesh."""
-    notes = zip(dataset.bodies.names, dataset.all_notes(), strict=True)
-    write_rows(path, ("name", "note"), [(name, note) for name, told in notes for note in told])
+    """Write the notes on how each mesh was mended, as a table."""
+    notes_of_meshes = zip(dataset.bodies.names, dataset.all_notes(), strict=True)
+    write_rows(path, ("name", "note"), [(name, note) for name, notes in notes_of_meshes for note in notes])

@@ -1,4 +1,4 @@
-"""A file becomes bodies: reading, mending, watertight surfaces, denoising, simplification. Deterministic, float64.
+"""Read files as bodies: formats, mending, watertight surfaces, denoising, simplification. Deterministic, float64.
 
-Formats lie in `formats`, one module each; to add one, see there.
+Each file format is a module of `formats`, whose docstring tells how to add one.
 """

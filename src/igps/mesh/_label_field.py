@@ -1,12 +1,12 @@
-"""A smooth function on a grid of voxels that is negative where most of a voxel lies in the body.
+"""Compute a smooth function on a grid of voxels that is negative at the voxels of a body.
 
-Voxels tell where a body is by their centres, or by the share of each that it fills. Of all functions whose signs agree
-with that, one is taken that bends little: no stairs are left, since the zero level is free between the last voxels
-inside and the first outside; and nothing thin is lost, since no voxel changes sides. (Whitaker 2000 and Gibson 1998
-hold surfaces by the same constraint; Lempitsky 2010 takes second derivatives, which shrink nothing, in place of area.)
-Where it bends more than around, at edges, it is solved again with less weight on bending (creases: Blake and
-Zisserman 1987).
-The level is moved as a whole to give the voxels' volume: if it were moved nearby, that would write their stairs back.
+A voxel belongs to the body if the body covers its centre or, for shares, at least half of it. Among all functions with
+the right sign at every voxel, the one with small second derivatives is computed. It has no stairs, because its zero
+level is free between the last voxel inside and the first outside. It loses nothing thin, because no voxel changes
+sides. (Whitaker 2000 and Gibson 1998 use the same constraint; Lempitsky 2010 replaces area by second derivatives, which
+do not shrink the surface.) Where the solution bends more than its surroundings, at edges, the function is solved again
+with less weight on bending (creases: Blake and Zisserman 1987).
+The zero level is later shifted as a whole to match the volume of the voxels: local shifts would restore the stairs.
 """
 
 import math
@@ -17,47 +17,46 @@ from scipy import ndimage
 from igps._arrays import Booleans, Floats, Integers, Singles
 from igps._compiled import SUMS, compiled
 
-# Least absolute value of a voxel that is wholly inside or outside, in shortest sides (half would be the most that all
-# bodies allow), and weight of second derivatives: of smooth places and of edges. Those of smooth places leave round
-# bodies smooth, those of edges let faces run on to them.
-_MARGINS, _STIFFNESS = (0.05, 0.3), (1.0, 0.1)
-# How much more than around it the Laplacian of a first solution is in smooth places, at most, and at edges, at least.
-# An edge bends more than the faces beside it; a thin round body bends everywhere.
-_BENDS = (0.05, 0.2)
-# Standard deviations of the windows of the Laplacian and of what is around, in voxels.
+# Minimal absolute value of the function at voxels wholly inside or outside, in shortest sides (0.5 is the largest that
+# all bodies allow), and weight of the second derivatives; each in smooth places and at edges. The values for smooth
+# places keep round bodies smooth, those for edges let faces run on to their edges.
+_MIN_ABS_VALUES, _STIFFNESS = (0.05, 0.3), (1.0, 0.1)
+# Excess of the first solution's Laplacian over its surroundings: up to the first value a place is smooth, from the
+# second on it is an edge. An edge bends more than the faces beside it; a thin round body bends everywhere.
+_BEND_LIMITS = (0.05, 0.2)
+# Standard deviations of the Gaussian windows of the Laplacian and of its surroundings, in voxels.
 _WINDOW, _WIDE_WINDOW = 0.7, 3.0
-# Weight of the distance to the voxels of the other side, beside that of the second derivatives.
-_NEARNESS = 0.01
+# Weight of the deviation from a signed distance to the voxels of the other side; the second derivatives have weight 1.
+_DISTANCE_WEIGHT = 0.01
 _RELAXATION = 1.4
-# Of the first solution, and of the second: with 15 and 10 a ball keeps bumps that descriptors see.
+# Sweeps of either solution. With 15 and 10, a ball keeps bumps that affect descriptors.
 _N_SWEEPS = 20
-# Voxels from the border within which the function is free.
-_BAND = 2
+_BAND = 2  # voxels from the border within which the function is free
 
 PAD = _BAND + 2
 """Empty voxels that the grid must have on every side."""
 
-# Grids of more voxels, such as those around thin vessels, are solved block by block, each with so many voxels around.
-_WHOLE, _BLOCK, _AROUND = 1 << 22, 48, 12
+# Larger grids, such as those of thin vessels, are solved in blocks of this side, each with an overlap, in voxels.
+_MAX_VOXELS_AT_ONCE, _BLOCK, _OVERLAP = 1 << 22, 48, 12
 
 
 def smooth_field(share: Singles, sides: Floats) -> Floats | Singles:
-    """The function at the centres of the voxels, in shortest sides, about the distance to the surface nearby.
+    """Return the function at the centres of the voxels, near the surface about the signed distance, in shortest sides.
 
-    Shares (X, Y, Z) of each voxel that lies in the body, 0 to 1, have `PAD` empty layers around; those of a mask are 0
-    or 1 and tell whether the centre is in the body. The sides (3,) of a voxel have 1 as the shortest.
+    The shares (X, Y, Z) of the voxels that lie in the body, 0 to 1, have `PAD` empty layers around. For a mask they are
+    0 or 1, depending on the centre of the voxel. The sides (3,) of a voxel are in units of the shortest side.
     """
-    if share.size <= _WHOLE:
-        return _solved(share, sides)
+    if share.size <= _MAX_VOXELS_AT_ONCE:
+        return _solve(share, sides)
     far = (PAD - 0.5) * float(sides.max())
     margin = np.ceil(PAD * sides.max() / sides).astype(np.int64)
-    around = np.maximum(margin, _AROUND)
+    overlap = np.maximum(margin, _OVERLAP)
     field = np.full(share.shape, far, dtype=np.float32)
     for corner in np.ndindex(*(math.ceil(n / _BLOCK) for n in share.shape)):
         low = _BLOCK * np.array(corner)
         high = np.minimum(low + _BLOCK, share.shape)
-        start = np.maximum(low - around, 0)
-        inside = share[tuple(map(slice, start, high + around))] >= 0.5
+        start = np.maximum(low - overlap, 0)
+        inside = share[tuple(map(slice, start, high + overlap))] >= 0.5
         if not inside.any():
             continue
         if inside.all():
@@ -65,19 +64,19 @@ def smooth_field(share: Singles, sides: Floats) -> Floats | Singles:
             continue
         (box,) = ndimage.find_objects(inside.view(np.uint8))
         first, last = (start + [getattr(side, end) for side in box] for end in ("start", "stop"))
-        least, most = np.maximum(first - margin, start), np.minimum(last + margin, start + inside.shape)
-        missing = list(zip(margin - (first - least), margin - (most - last), strict=True))
-        solved = _solved(np.pad(share[tuple(map(slice, least, most))], missing), sides)
-        origin = first - margin  # of what was solved, in the grid
-        a, b = np.maximum(low, least), np.minimum(high, most)
+        box_low, box_high = np.maximum(first - margin, start), np.minimum(last + margin, start + inside.shape)
+        padding = list(zip(margin - (first - box_low), margin - (box_high - last), strict=True))
+        solution = _solve(np.pad(share[tuple(map(slice, box_low, box_high))], padding), sides)
+        origin = first - margin  # of the solution, in the grid
+        a, b = np.maximum(low, box_low), np.minimum(high, box_high)
         if (a < b).all():
-            own = solved[tuple(map(slice, a - origin, b - origin))]
-            field[tuple(map(slice, a, b))] = np.clip(own, -far, far)
+            block = solution[tuple(map(slice, a - origin, b - origin))]
+            field[tuple(map(slice, a, b))] = np.clip(block, -far, far)
     return field
 
 
-def _solved(share: Singles, sides: Floats) -> Floats:
-    """The function on a grid as a whole."""
+def _solve(share: Singles, sides: Floats) -> Floats:
+    """Solve for the function on a whole grid at once."""
     inside = share >= 0.5
     distance = ndimage.distance_transform_edt(inside, sampling=sides)
     distance += ndimage.distance_transform_edt(~inside, sampling=sides)
@@ -85,68 +84,69 @@ def _solved(share: Singles, sides: Floats) -> Floats:
     border = ndimage.maximum_filter(inside, 2 * _BAND + 1) & ~ndimage.minimum_filter(inside, 2 * _BAND + 1)
     nodes = np.flatnonzero(border)
     target = field.reshape(-1)[nodes]
-    second = np.array([-1.0, 2, -1])
+    stencil = np.array([-1.0, 2, -1])
     laplacian = np.zeros_like(field)
     for axis, side in enumerate(sides):
-        laplacian += ndimage.correlate1d(field, second / side**2, axis)
+        laplacian += ndimage.correlate1d(field, stencil / side**2, axis)
     steps = np.array(field.strides) // field.itemsize
-    certain = np.abs(2 * share - 1).reshape(-1)[nodes]
+    certainty = np.abs(2 * share - 1).reshape(-1)[nodes]
 
     def relax(sharpness: Floats) -> None:
-        margin = np.interp(sharpness.reshape(-1)[nodes], (0, 1), _MARGINS)
+        min_abs = certainty * np.interp(sharpness.reshape(-1)[nodes], (0, 1), _MIN_ABS_VALUES)
         _relax(
             field.reshape(-1), laplacian.reshape(-1), nodes, np.concatenate([[0], steps, -steps]),
             np.concatenate([[2 * (sides**-2).sum()], -(sides**-2), -(sides**-2)]),
-            np.interp(sharpness, (0, 1), _STIFFNESS).reshape(-1), target, inside.reshape(-1)[nodes], margin * certain,
+            np.interp(sharpness, (0, 1), _STIFFNESS).reshape(-1), target, inside.reshape(-1)[nodes], min_abs,
         )  # fmt: skip
 
     relax(np.zeros_like(field))
-    # Over long voxels edges are blunter.
+    # Edges are blunter across long voxels.
     bend = np.abs(ndimage.gaussian_filter(laplacian, _WINDOW, truncate=3)) * np.sqrt(sides.max())
     around, weight = (
         ndimage.gaussian_filter(values, _WIDE_WINDOW, truncate=3) for values in (bend * border, border.astype(float))
     )
-    relax(np.interp(bend - around / np.maximum(weight, 1e-3), _BENDS, (0, 1)))
+    relax(np.interp(bend - around / np.maximum(weight, 1e-3), _BEND_LIMITS, (0, 1)))
     return field
 
 
-def filled_share(field: Floats | Singles, reach: float) -> tuple[float, float]:
-    """How many voxels the part fills on which the field is negative, and how fast that grows as the level does.
+def filled_volume(field: Floats | Singles, reach: float) -> tuple[float, float]:
+    """Return the volume in voxels where the field is negative, and its derivative with respect to the level.
 
-    Of a voxel with a value beyond the reach all is on one side.
+    Voxels with values beyond `reach` lie wholly on one side.
     """
     near = np.nonzero(np.abs(field[1:-1, 1:-1, 1:-1]) < reach)
     at = np.ravel_multi_index(tuple(index + 1 for index in near), field.shape)
     values, width = field.reshape(-1), np.full(len(at), 1e-3)
-    for step in np.cumprod([1, *field.shape[:0:-1]]).tolist():  # strides are others: splines turn the axes
+    for step in np.cumprod([1, *field.shape[:0:-1]]).tolist():  # not its strides: splines permute the axes in memory
         width += np.abs(values[at + step] - values[at - step]) / 2
     share = 0.5 - values[at] / width
-    full = np.count_nonzero(field < 0) - np.count_nonzero(values[at] < 0)
-    part = (share > 0) & (share < 1)
-    return float(np.clip(share, 0, 1).sum()) + full, float((1 / width[part]).sum())
+    n_full = np.count_nonzero(field < 0) - np.count_nonzero(values[at] < 0)
+    is_cut = (share > 0) & (share < 1)
+    return float(np.clip(share, 0, 1).sum()) + n_full, float((1 / width[is_cut]).sum())
 
 
 @compiled(fastmath=SUMS)
 def _relax(
     field: Floats, laplacian: Floats, nodes: Integers, steps: Integers, weights: Floats, stiffness: Floats,
-    target: Floats, inside: Booleans, margin: Floats,
+    target: Floats, inside: Booleans, min_abs: Floats,
 ) -> None:  # fmt: skip
-    """Projected Gauss-Seidel sweeps, forwards and backwards in turn, of weighted squared Laplacians, in place.
+    """Minimise the weighted squares of the Laplacian in place, by projected Gauss-Seidel sweeps.
 
-    The negative Laplacian, of these steps and weights, is kept up to date.
+    Sweeps run forwards and backwards in turn. The array `laplacian` holds the negative Laplacian, whose stencil has the
+    offsets `steps` and the coefficients `weights`, and is updated with the field.
     """
     n = len(nodes)
     for sweep in range(_N_SWEEPS):
         for count in range(n):
             at = count if sweep % 2 == 0 else n - 1 - count
             node = nodes[at]
-            total, centre = _NEARNESS * (target[at] - field[node]), _NEARNESS
+            total, centre = _DISTANCE_WEIGHT * (target[at] - field[node]), _DISTANCE_WEIGHT
             for k in range(len(steps)):
                 weight = weights[k] * stiffness[node + steps[k]]
                 total -= weight * laplacian[node + steps[k]]
                 centre += weight * weights[k]
             value = field[node] + _RELAXATION * total / centre
-            value = min(value, -margin[at]) if inside[at] else max(value, margin[at])
+            value = min(value, -min_abs[at]) if inside[at] else max(value, min_abs[at])
             change = value - field[node]
             field[node] = value
             for k in range(len(steps)):

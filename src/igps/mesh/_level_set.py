@@ -1,6 +1,6 @@
-"""A function on a grid that is negative in one body, and zero on its surface. Lengths are in cells.
+"""Compute a function on a grid that is negative inside one body and zero on its surface. Lengths are in cells.
 
-It is made of the exact distances of the grid's points to the triangles.
+The function is made of the exact distances of the grid points to the triangles.
 """
 
 import math
@@ -15,33 +15,30 @@ from igps._arrays import Booleans, Floats, Integers, Singles, Surface
 from igps.mesh._outside import MARGIN, WALL, OrientedSurface
 from igps.mesh.surface import face_areas, sums
 
-# How far from the surface exact distances are needed: marching cubes ask for both ends of the edges that cross it.
+# Maximal exact distance: marching cubes need distances at both ends of the grid edges that cross the surface.
 _BAND = 1.1
-# Half the thickness that a sheet gets. More than half a cell, because a sheet may lie in the middle between two layers.
+# Half the thickness of a sheet. Above half a cell, because a sheet may lie midway between two layers of grid points.
 _HALF_SHEET = 0.55
-# No value is closer to zero: marching cubes would make triangles without area.
-LEAST = 0.02
-# Least radius of the bars between pieces.
-_BAR = 0.9
-# Pieces of less than this share of the volume are specks.
-SPECK_VOLUME = 2e-3
+MIN_ABS_VALUE = 0.02  # closer to zero, marching cubes would make triangles without area
+_MIN_BAR_RADIUS = 0.9
+SPECK_VOLUME = 2e-3  # pieces of less than this share of the volume are specks
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Grid points at whole numbers of cells from the origin."""
+    """Regular grid of points."""
 
-    origin: Floats
-    cell: float
+    origin: Floats  # (3,) first grid point
+    cell: float  # distance between grid points
     shape: tuple[int, int, int]
 
     @classmethod
     def around(cls, vertices: Floats, faces: Integers, cell: float) -> Self:
         low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
-        counts = np.ceil((high - low) / cell).astype(int) + 1 + 2 * MARGIN
-        # The body in the middle, so that moving it moves the grid.
-        origin = (low + high) / 2 - (counts - 1) / 2 * cell
-        return cls(origin, cell, (int(counts[0]), int(counts[1]), int(counts[2])))
+        shape = np.ceil((high - low) / cell).astype(int) + 1 + 2 * MARGIN
+        # The grid is centred on the body, so that it moves with the body.
+        origin = (low + high) / 2 - (shape - 1) / 2 * cell
+        return cls(origin, cell, (int(shape[0]), int(shape[1]), int(shape[2])))
 
     def to_cells(self, points: Floats) -> Floats:
         return (points - self.origin) / self.cell
@@ -51,37 +48,37 @@ class Grid:
 
 
 def cell_sizes(vertices: Floats, faces: Integers, resolution: int, spacing: float) -> tuple[float, float]:
-    """The usual size of a cell, and the least, with as many cells as a cube, and about as many on the surface.
+    """Return the default and the minimal size of a cell, which differ only for long bodies.
 
-    The least is smaller for long bodies alone: the usual grid has twice `resolution` along the longest side at most.
+    With the minimal size the grid has about as many cells, in all and on the surface, as a cube of side `resolution`.
+    With the default size it has at most 2 * `resolution` cells along the longest side.
     """
     corners = vertices[faces]
     sides = np.ptp(corners.reshape(-1, 3), axis=0)
     longest, area = float(sides.max()), float(face_areas(vertices, faces).sum())
     by_volume = float(np.prod(np.maximum(sides, longest / 1000)) ** (1 / 3)) / resolution
     by_area = float(np.sqrt(area / (6 * resolution**2)))
-    least = max(min(max(by_volume, by_area), longest / (0.8 * resolution)), spacing)
-    return max(least, longest / (2 * resolution)), least
+    min_size = max(min(max(by_volume, by_area), longest / (0.8 * resolution)), spacing)
+    return max(min_size, longest / (2 * resolution)), min_size
 
 
-def rounded(vertices: Floats, faces: Integers) -> Surface:
-    """Vertices put together within quarters of a cell, and the different triangles that remain."""
+def merge_near_vertices(vertices: Floats, faces: Integers) -> Surface:
+    """Merge the vertices of each quarter of a cell, and drop degenerate and duplicate triangles."""
     lattice = np.round(vertices * 4).astype(np.int64)
     _, index, count = np.unique(lattice, axis=0, return_inverse=True, return_counts=True)
     index = index.ravel()
-    # The mean of those put together: vertices of the lattice would shift the surface.
+    # The mean of merged vertices, because lattice points would shift the surface.
     mean = sums(index, vertices, len(count)) / count[:, None]
     faces = np.sort(index[faces], axis=1)
     return mean, np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
 
 
 def distances(vertices: Floats, faces: Integers, shape: tuple[int, int, int]) -> tuple[Singles, Singles]:
-    """(X, Y, Z) distances of the grid points in the band around the surface, infinite elsewhere, and the nearest places
-    (X, Y, Z, 3). Blocks of eight cells are halved where the surface may be near."""
+    """Return the distances (X, Y, Z), infinite beyond the band, and the nearest surface points (X, Y, Z, 3)."""
     import igl
 
     vertices, faces = np.asfortranarray(vertices), np.asfortranarray(faces)
-    size = 8
+    size = 8  # blocks that may be near the surface are halved until they are single grid points
     blocks = np.stack(np.meshgrid(*(np.arange(0, n, size) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
     while size > 1:
         centre = np.asfortranarray(blocks + (size - 1) / 2)
@@ -94,93 +91,94 @@ def distances(vertices: Floats, faces: Integers, shape: tuple[int, int, int]) ->
     squared, _, point = igl.point_mesh_squared_distance(np.asfortranarray(blocks.astype(np.float64)), vertices, faces)
     distance = np.full(shape, np.inf, dtype=np.float32)
     nearest = np.zeros((*shape, 3), dtype=np.float32)
-    inside = squared <= _BAND**2
-    at = tuple(blocks[inside].T)
-    distance[at], nearest[at] = np.sqrt(squared[inside]), point[inside]
+    in_band = squared <= _BAND**2
+    at = tuple(blocks[in_band].T)
+    distance[at], nearest[at] = np.sqrt(squared[in_band]), point[in_band]
     return distance, nearest
 
 
 def level_set(distance: Singles, nearest: Singles, outside: Booleans, surface: OrientedSurface) -> Singles:
-    """The signed distance of solids and, for what has no inside, the distance to a sheet of a cell's thickness."""
+    """Return the signed distance to the surface; sheets, which enclose nothing, get about a cell of thickness."""
     from skimage.segmentation import watershed
 
     band = np.isfinite(distance)
     wall = distance <= WALL
     at = np.nonzero(band)
-    foot, away = nearest[at], distance[at]
-    way = (np.stack(at, axis=1) - foot) / np.maximum(away, 1e-6)[:, None]
-    # A point of the wall belongs to the side that lies beyond it, away from the surface, or that of its deepest
-    # neighbours where all beyond is wall.
+    foot, height = nearest[at], distance[at]
+    normal = (np.stack(at, axis=1) - foot) / np.maximum(height, 1e-6)[:, None]
+    # A wall point belongs to the side beyond it, away from the surface; if only wall lies beyond, to the side of its
+    # deepest neighbours.
     markers = np.where(wall, 0, np.where(outside, 1, 2)).astype(np.int32)
-    doubtful = np.nonzero(away <= WALL)[0]
+    undecided = np.nonzero(height <= WALL)[0]
     for step in (0.75, 1.0, 1.25):
-        beyond = _at(markers, foot[doubtful] + step * way[doubtful])
-        sided = doubtful[beyond > 0]
-        markers[tuple(index[sided] for index in at)] = beyond[beyond > 0]
-        doubtful = doubtful[beyond == 0]
+        side = _nearest_values(markers, foot[undecided] + step * normal[undecided])
+        decided = undecided[side > 0]
+        markers[tuple(index[decided] for index in at)] = side[side > 0]
+        undecided = undecided[side == 0]
     markers = watershed(-np.where(band, distance, _BAND), markers, connectivity=3)
     inside = markers == 2
-    solid = _has_inside(inside, at, foot, way)
-    if surface.is_nearly_closed and not solid.all():
-        # Walls too thin for the flood.
-        thin = np.stack([index[~solid] for index in at], axis=1)
+    is_solid = _is_solid(inside, at, foot, normal)
+    if surface.is_nearly_closed and not is_solid.all():
+        # A flood cannot find the inside of walls that are thinner than a cell; the winding number can.
+        thin = np.stack([index[~is_solid] for index in at], axis=1)
         inside[tuple(thin[surface.winding(thin) > 0.5].T)] = True
-        solid = _has_inside(inside, at, foot, way)
-    field = np.where(inside, -1, 1) * np.clip(distance, np.float32(LEAST), np.float32(_BAND))  # zero has no sign
-    sheet = tuple(index[~solid] for index in at)
+        is_solid = _is_solid(inside, at, foot, normal)
+    # At least MIN_ABS_VALUE, because zero would have no sign.
+    field = np.where(inside, -1, 1) * np.clip(distance, np.float32(MIN_ABS_VALUE), np.float32(_BAND))
+    sheet = tuple(index[~is_solid] for index in at)
     field[sheet] = distance[sheet] - _HALF_SHEET
-    field = np.where(np.abs(field) < LEAST, np.where(field < 0, -LEAST, LEAST), field)
-    return without_bubbles(field.astype(np.float32))
+    field = np.where(np.abs(field) < MIN_ABS_VALUE, np.where(field < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE), field)
+    return fill_bubbles(field.astype(np.float32))
 
 
-def _has_inside(inside: Booleans, at: tuple[Integers, ...], foot: NDArray[Any], way: NDArray[Any]) -> Booleans:
-    """Whether a point is inside or sees an inside when it looks through the surface where that is nearest."""
-    solid = inside[at]
+def _is_solid(inside: Booleans, at: tuple[Integers, ...], foot: NDArray[Any], normal: NDArray[Any]) -> Booleans:
+    """Return whether each grid point is inside, or has an inside behind its nearest surface point."""
+    is_solid = inside[at]
     for step in (0.25, 0.5, 0.75, 1.0):
-        solid |= _at(inside, foot - step * way)
-    return np.asarray(solid)
+        is_solid |= _nearest_values(inside, foot - step * normal)
+    return np.asarray(is_solid)
 
 
-def _at(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
-    """The values at the grid points nearest to `points`."""
+def _nearest_values(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
+    """Return the values at the grid points nearest to `points`."""
     index = np.clip(np.round(points).astype(np.int64), 0, np.array(values.shape) - 1)
     return np.asarray(values[tuple(index.T)])
 
 
-def without_bubbles(field: Singles) -> Singles:
-    """The field with everything filled that the outside does not reach."""
+def fill_bubbles(field: Singles) -> Singles:
+    """Make everything part of the body, in place, that is not connected with the outside."""
     label, count = ndimage.label(field > 0)
     if count > 1:
-        field[(field > 0) & (label != label[0, 0, 0])] = -LEAST
+        field[(field > 0) & (label != label[0, 0, 0])] = -MIN_ABS_VALUE
     return field
 
 
-def joined(field: Singles, notes: list[str], radius: float = 0.0) -> Singles:
-    """The field of one piece: small ones dropped, the others joined by bars where the gaps are narrowest."""
+def join_pieces(field: Singles, notes: list[str], radius: float = 0.0) -> Singles:
+    """Drop small pieces, in place, and join the others by bars where the gaps are narrowest."""
     label, count = ndimage.label(field < 0)
     if count < 2:
         return field
     volume = np.bincount(label.ravel(), minlength=count + 1)
     volume[0] = 0
-    small = volume < SPECK_VOLUME * volume.sum()
-    dropped = np.nonzero(small)[0][1:]
-    if len(dropped) and volume[dropped].sum() < 0.05 * volume.sum():
-        gone = np.isin(label, dropped)
-        field[gone] = -field[gone]
-        label[gone] = 0
+    specks = np.nonzero(volume < SPECK_VOLUME * volume.sum())[0][1:]
+    if len(specks) and volume[specks].sum() < 0.05 * volume.sum():
+        is_dropped = np.isin(label, specks)
+        field[is_dropped] = -field[is_dropped]
+        label[is_dropped] = 0
     pieces = np.unique(label)[1:]
     if len(pieces) < 2:
         return field
-    away, index = ndimage.distance_transform_edt(label == 0, return_indices=True)
+    # The width of a gap is measured where the regions touch that are nearest to either piece.
+    distance, index = ndimage.distance_transform_edt(label == 0, return_indices=True)
     owner = label[tuple(index)]
-    neighbours = []
+    contacts = []
     positions = np.arange(field.size).reshape(field.shape)
     for axis in range(3):
         a = tuple(slice(None, -1) if i == axis else slice(None) for i in range(3))
         b = tuple(slice(1, None) if i == axis else slice(None) for i in range(3))
-        found = (owner[a], owner[b], away[a] + away[b] + 1, positions[a], positions[b])
-        neighbours.append([values[owner[a] != owner[b]] for values in found])
-    i, j, width, p, q = (np.concatenate(values) for values in zip(*neighbours, strict=True))
+        pairs = (owner[a], owner[b], distance[a] + distance[b] + 1, positions[a], positions[b])
+        contacts.append([values[owner[a] != owner[b]] for values in pairs])
+    i, j, width, p, q = (np.concatenate(values) for values in zip(*contacts, strict=True))
     order = np.argsort(width, kind="stable")
     pair = np.minimum(i, j).astype(np.int64) * (count + 1) + np.maximum(i, j)
     _, narrowest = np.unique(pair[order], return_index=True)
@@ -190,10 +188,10 @@ def joined(field: Singles, notes: list[str], radius: float = 0.0) -> Singles:
     lookup = {(int(i[k]), int(j[k])): k for k in chosen}
     for row, column in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
         k = lookup[row, column]
-        a, b = (index.reshape(3, -1)[:, place].astype(np.float64) for place in (p[k], q[k]))
-        _add_bar(field, a, b, max(radius, _BAR))
+        a, b = (index.reshape(3, -1)[:, position].astype(np.float64) for position in (p[k], q[k]))
+        _add_bar(field, a, b, max(radius, _MIN_BAR_RADIUS))
     notes.append(f"joined {len(pieces)} pieces by bars")
-    return without_bubbles(field)
+    return fill_bubbles(field)
 
 
 def _add_bar(field: Singles, a: Floats, b: Floats, radius: float) -> None:

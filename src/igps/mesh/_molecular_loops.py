@@ -1,4 +1,4 @@
-"""Loops over the balls of a molecule: where a probe may be, and how far each point of a grid is from there."""
+"""Compiled loops over the balls of a molecule: where a probe fits, and how far each grid point is from there."""
 
 import math
 
@@ -13,18 +13,18 @@ _TURN = 2 * math.pi
 
 @compiled()
 def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: Integers) -> tuple[Floats, Integers]:
-    """The arcs in which two spheres meet outside all other balls, and (A,) 1 for balls that have one or meet no other.
+    """Return the arcs in which two spheres intersect outside all other balls, and which balls (A,) are exposed.
 
-    No ball (A, 3), (A,) lies in another; those that meet ball i are `neighbours[first[i]:first[i + 1]]`. Of an arc
-    (N, 12) these are the centre of its circle, first axis, normal, radius, angle of the start from the first axis, and
-    angle from start to end, up to 2π.
+    No ball lies inside another. The neighbours of ball i, which intersect it, are `neighbours[first[i]:first[i + 1]]`.
+    Columns of the arcs (N, 12): centre of the circle (3), first axis (3), normal (3), radius, angle of the start from
+    the first axis, and angle from start to end, up to 2π. Exposed balls (1, else 0) have an arc or no neighbours.
     """
-    room = 256
-    found = np.empty((room, 12))
-    n_found = 0
+    capacity = 256
+    arcs = np.empty((capacity, 12))
+    n_arcs = 0
     exposed = np.zeros(len(radii), np.int64)
-    most = 2 * np.max(np.diff(first))  # an interval may come in two pieces
-    starts, ends = np.empty(most), np.empty(most)
+    max_intervals = 2 * np.max(np.diff(first))  # an interval may be split in two
+    starts, ends = np.empty(max_intervals), np.empty(max_intervals)
     for i in range(len(radii)):
         if first[i] == first[i + 1]:
             exposed[i] = 1
@@ -60,15 +60,15 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
                 if square > (radius + radii[k]) ** 2:
                     continue
                 a, b = wx * ax + wy * ay + wz * az, wx * bx + wy * by + wz * bz
-                most = math.sqrt(a * a + b * b)
-                least = (radii[k] ** 2 - square - radius * radius) / (2 * radius)
-                if least >= most:
+                across = math.sqrt(a * a + b * b)
+                bound = (radii[k] ** 2 - square - radius * radius) / (2 * radius)
+                if bound >= across:
                     buried = True
                     break
-                if least <= -most:
+                if bound <= -across:
                     continue
-                # Within this angle of the direction away from the ball the circle is outside it.
-                half = math.acos(least / most)
+                # The circle is outside the ball within this angle of the direction away from its centre.
+                half = math.acos(bound / across)
                 start = math.atan2(b, a) + half
                 start -= _TURN * math.floor(start / _TURN)
                 end = start + _TURN - 2 * half
@@ -80,30 +80,32 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
             if buried:
                 continue
             order = np.argsort(starts[:n_covered])
-            reached = 0.0
+            covered_to = 0.0
             for position in range(n_covered + 1):
                 start = _TURN if position == n_covered else starts[order[position]]
                 start = min(start, _TURN)
-                if start > reached:
-                    if n_found == room:
-                        room *= 2
-                        more = np.empty((room, 12))
-                        more[:n_found] = found
-                        found = more
-                    found[n_found] = (mx, my, mz, ax, ay, az, ux, uy, uz, radius, reached, start - reached)
-                    n_found += 1
+                if start > covered_to:
+                    if n_arcs == capacity:
+                        capacity *= 2
+                        larger = np.empty((capacity, 12))
+                        larger[:n_arcs] = arcs
+                        arcs = larger
+                    arcs[n_arcs] = (mx, my, mz, ax, ay, az, ux, uy, uz, radius, covered_to, start - covered_to)
+                    n_arcs += 1
                     exposed[i] = exposed[j] = 1
                 if position < n_covered:
-                    reached = max(reached, ends[order[position]])
-    return found[:n_found], exposed
+                    covered_to = max(covered_to, ends[order[position]])
+    return arcs[:n_arcs], exposed
 
 
 @compiled()
 def depths(
     centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, margin: float
 ) -> tuple[Singles, NDArray[np.int32]]:
-    """How deep each grid point lies in the ball in which it lies deepest, at least `-margin` (outside of all, it is
-    negative), and in which that is, -1 where there is none within `margin`. The first grid point is the origin."""
+    """Return the largest depth of each grid point in any ball, at least `-margin`, and that ball, or -1 for none.
+
+    Depths are negative outside all balls. The first grid point is at the origin.
+    """
     depth = np.full(shape, -margin, np.float32)
     owner = np.full(shape, -1, np.int32)
     for i in range(len(radii)):
@@ -114,10 +116,10 @@ def depths(
             dx = x * spacing - centres[i, 0]
             for y in range(y0, y1):
                 dy = y * spacing - centres[i, 1]
-                rest = reach * reach - dx * dx - dy * dy
-                if rest <= 0:
+                square = reach * reach - dx * dx - dy * dy
+                if square <= 0:
                     continue
-                half = math.sqrt(rest)
+                half = math.sqrt(square)
                 z0, z1 = _span(centres[i, 2] - half, centres[i, 2] + half, spacing, shape[2])
                 for z in range(z0, z1):
                     dz = z * spacing - centres[i, 2]
@@ -133,17 +135,17 @@ def distances_outside(
     depth: Singles, owner: NDArray[np.int32], centres: Floats, radii: Floats, first: Integers,
     neighbours: Integers, exposed: Integers, arcs: Floats, spacing: float, reach: float,
 ) -> Singles:  # fmt: skip
-    """The distance of each grid point in the balls from what is outside of all of them.
+    """Return the distance of each grid point inside the balls from the space outside all balls.
 
-    The nearest place outside lies on a sphere, on an arc of two, or at the end of an arc. On a sphere it can only be
-    that of the ball in which the point lies deepest: all others end further out.
+    The nearest point of that space lies on a sphere, on an arc of two, or at the end of an arc. If it lies on a sphere,
+    this is the sphere of the ball in which the grid point is deepest: all others end further out.
 
-    For the arguments see `depths` and `exposed_arcs`. Distances are cut at `reach`; outside of the balls
-    they are `depth`, which is negative.
+    For the arguments see `depths` and `exposed_arcs`. Distances are cut at `reach`; outside the balls they are `depth`,
+    which is negative.
     """
     shape = depth.shape
     distance = np.minimum(depth, np.float32(reach))
-    # Points whose distance comes from arcs.
+    # Grid points whose distance comes from arcs.
     waiting = np.zeros(shape, np.bool_)
     for x in range(shape[0]):
         for y in range(shape[1]):
@@ -170,7 +172,7 @@ def distances_outside(
     for n in range(len(arcs)):
         mx, my, mz, ax, ay, az, ux, uy, uz, radius, start, angle = arcs[n]
         bx, by, bz = uy * az - uz * ay, uz * ax - ux * az, ux * ay - uy * ax
-        # Pieces of at most 60°, each in a box of its own.
+        # Pieces of at most 60°, each with a bounding box of its own.
         n_pieces = math.ceil(angle / (math.pi / 3))
         step = angle / n_pieces
         for piece in range(n_pieces):
@@ -209,13 +211,13 @@ def distances_outside(
 
 @compiled()
 def _span(low: float, high: float, spacing: float, size: int) -> tuple[int, int]:
-    """The grid points from `low` to `high`, as a range."""
+    """Return the range of grid points from `low` to `high`."""
     return max(math.ceil(low / spacing), 0), min(math.floor(high / spacing) + 1, size)
 
 
 @compiled()
 def cubic_values(field: Singles, points: Floats) -> Floats:
-    """A function on a grid and its gradient, (P, 4), at points (P, 3) in cells, by cubic convolution (Keys 1981).
+    """Return the values and gradients (P, 4) of a function at points (P, 3) in cells, by cubic convolution (Keys 1981).
 
     The grid has at least four points along each axis.
     """

@@ -1,14 +1,15 @@
-"""Which points of a grid lie outside a surface that may have holes; lengths are in cells.
+"""Find the grid points outside a surface that may have holes. Lengths are in cells.
 
-**A hole, or a cup?** Where a surface is nearly closed, the winding number says what is inside (Jacobson et al. 2013).
-It is if the winding numbers beside its faces are on average within 1/20 of whole numbers: bodies with 2 % missing have
-0.01 to 0.03, a cup as deep as wide has 0.10. Of overlapping solids the faces hidden between them are left out first, or
-thin bodies would have up to 0.10, too.
+**A hole, or the mouth of a cup?** If a surface is nearly closed, the winding number tells inside from outside (Jacobson
+et al. 2013). A surface is nearly closed if the winding numbers beside its faces deviate on average by less than 1/20
+from whole numbers: bodies with 2 % missing have 0.01 to 0.03, a cup as deep as wide has 0.10. The hidden faces of
+overlapping solids are left out first; otherwise thin bodies would reach 0.10, too.
 
-Anywhere else an opening is a hole, and what lies behind it inside, if a ball that passes through it has less than half
-the radius of the largest ball behind it. Anything wider is the mouth of a cup, a trouser leg or a bell, and stays open,
-with about a cell of wall. A wall with two sides, as of a vase that was modelled as a solid, stays open whatever the
-width of its mouth, since the winding number behind is near zero. Openings narrower than a cell are always closed.
+In any other surface, an opening is a hole if the largest ball that passes through it has less than half the radius of
+the largest ball behind it; the space behind a hole is inside. A wider opening is the mouth of a cup, a trouser leg or a
+bell. It stays open, and the wall gets about a cell of thickness. A vase modelled as a solid, with two sides of its
+wall, stays open at any width of the mouth: the winding number behind is near zero. Openings narrower than a cell are
+always closed.
 """
 
 from dataclasses import dataclass, replace
@@ -21,29 +22,25 @@ from scipy import ndimage
 from igps._arrays import Booleans, Floats, Integers, Singles
 from igps.mesh.surface import area_vectors, face_areas, signed_volume, unit
 
-# Cells around the surface's bounding box.
-MARGIN = 3
-# Grid points so close to a triangle are its wall, through which the flood does not pass: a grid line that crosses a
-# triangle has a point at most half a cell from it on either side.
+MARGIN = 3  # cells around the bounding box of the surface
+# Grid points this close to a triangle are wall, which the flood does not enter. A grid line that crosses a triangle has
+# a point at most half a cell away from it, on one side or the other.
 WALL = 0.5 + 1e-6
-# A mouth is wider than this share of the largest ball behind it.
-_MOUTH = 0.5
-# A wall has two sides where the winding number behind the opening is below this.
-_TWO_SIDED = 0.25
-# The winding numbers of a surface with small holes are so near to whole numbers, on average over so many places.
-_NEARLY_CLOSED, _PROBES = 0.05, 1500
-# So many parts of at least this share of the area may be turned to find the best orientation.
-_TURNED, _SMALL_PART = 8, 0.01
-# Faces with the inside on both sides are looked for where there are more than this share, if there are not too many
-# faces to ask each.
-_HIDDEN, _MANY_FACES = 0.02, 200_000
-# Places times faces, up to which winding numbers are exact.
-_FEW_PAIRS = 10**7
+_MOUTH = 0.5  # minimal radius of a mouth, over that of the largest ball behind it
+_TWO_SIDED = 0.25  # a wall has two sides if the winding number behind the opening is below this
+# A surface is nearly closed below this mean deviation of winding numbers from whole numbers, beside this many faces.
+_NEARLY_CLOSED, _N_PROBES = 0.05, 1500
+# Number of parts that may be reversed to find the best orientation, and their minimal share of the area.
+_MAX_REVERSED, _MIN_REVERSED_AREA = 8, 0.01
+# Hidden faces, with the inside on both sides, are removed if they are at least this share and the faces not too many.
+_MIN_HIDDEN, _MAX_FACES_FOR_HIDDEN = 0.02, 200_000
+# Winding numbers are exact up to this number of points times faces, and approximate beyond.
+_MAX_EXACT_PAIRS = 10**7
 
 
 @dataclass(frozen=True)
 class OrientedSurface:
-    """The surface with each connected part turned outward as a whole, for its winding numbers."""
+    """Surface whose connected parts are each oriented outward, for winding numbers."""
 
     vertices: Floats
     faces: Integers
@@ -61,65 +58,66 @@ class OrientedSurface:
         faces, part = igl.bfs_orient(faces)
         faces, _ = igl.orient_outward(vertices, faces, part[:, None])
         faces = np.asarray(faces, dtype=np.int64)
-        points = _beside(vertices, faces)
-        # Outward is a guess where a part is bent. Turning one negates its share of the winding numbers: those of the
-        # largest are turned that bring these closer to whole numbers.
+        points = _probe_points(vertices, faces)
+        # The outward side of an open part is a guess. Reversing a part negates its share of the winding numbers: parts
+        # are reversed, one by one, as long as that brings the winding numbers closer to whole numbers.
         area = np.bincount(part, weights=face_areas(vertices, faces))
-        large = [k for k in np.argsort(-area)[:_TURNED].tolist() if area[k] > _SMALL_PART * area.sum()]
+        large = [k for k in np.argsort(-area)[:_MAX_REVERSED].tolist() if area[k] > _MIN_REVERSED_AREA * area.sum()]
         shares = [cls(vertices, faces[part == k], False).winding(points) for k in large]
-        rest = cls(vertices, faces[~np.isin(part, large)], False).winding(points)
-        total = np.sum([rest, *shares], axis=0)
-        for _ in range(_TURNED if len(large) > 1 else 0):
-            turned = [total - 2 * share for share in shares]
-            best = min(range(len(large)), key=lambda i: _defect(turned[i]))
-            if _defect(turned[best]) >= _defect(total) - 1e-3:
+        share_of_small = cls(vertices, faces[~np.isin(part, large)], False).winding(points)
+        total = np.sum([share_of_small, *shares], axis=0)
+        for _ in range(_MAX_REVERSED if len(large) > 1 else 0):
+            reversed_totals = [total - 2 * share for share in shares]
+            best = min(range(len(large)), key=lambda i: _defect(reversed_totals[i]))
+            if _defect(reversed_totals[best]) >= _defect(total) - 1e-3:
                 break
-            total, shares[best] = turned[best], -shares[best]
+            total, shares[best] = reversed_totals[best], -shares[best]
             faces = np.where((part == large[best])[:, None], faces[:, ::-1], faces)
         if signed_volume(vertices, faces) < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
         surface = cls(vertices, faces, _defect(total) < _NEARLY_CLOSED)
-        hidden = total.reshape(2, -1).min(axis=0) > 0.5
-        if surface.is_nearly_closed or hidden.mean() < _HIDDEN or len(faces) > _MANY_FACES:
+        is_hidden = total.reshape(2, -1).min(axis=0) > 0.5
+        if surface.is_nearly_closed or is_hidden.mean() < _MIN_HIDDEN or len(faces) > _MAX_FACES_FOR_HIDDEN:
             return surface
-        bare = surface._without_hidden()
-        return bare if bare.is_nearly_closed else surface
+        visible = surface._drop_hidden_faces()
+        return visible if visible.is_nearly_closed else surface
 
     @property
     def thickness(self) -> float:
-        """Volume over area, cells: half of a plate's thickness, half of a rod's radius, a third of a ball's."""
+        """Volume over area, cells: half of a plate's thickness, half of a rod's radius, a third of a ball's radius."""
         return signed_volume(self.vertices, self.faces) / float(face_areas(self.vertices, self.faces).sum())
 
     def winding(self, points: NDArray[Any]) -> Floats:
+        """Return the winding numbers (P,) about points (P, 3)."""
         if not len(points) or not len(self.faces):
             return np.zeros(len(points))
         import igl
 
-        # The fast ones are off by a tenth near triangles that are much longer than wide.
-        few = len(points) * len(self.faces) <= _FEW_PAIRS
-        number = igl.winding_number if few else igl.fast_winding_number
+        # The fast method is off by a tenth near triangles that are much longer than wide.
+        is_exact = len(points) * len(self.faces) <= _MAX_EXACT_PAIRS
+        number = igl.winding_number if is_exact else igl.fast_winding_number
         return np.asarray(number(self.vertices, self.faces, points.astype(np.float64)))
 
-    def _without_hidden(self) -> Self:
-        """Without the faces that have the inside on both sides, such as walls between solids put together.
+    def _drop_hidden_faces(self) -> Self:
+        """Drop the faces with the inside on both sides, such as walls between solids that were put together.
 
-        Solids that share some of their outer surface are each open there, which spoils the winding numbers around.
+        Where solids share some of their outer surface, each of them is open, which distorts the winding numbers around.
         """
         normals, middle = unit(area_vectors(self.vertices, self.faces)), self.vertices[self.faces].mean(axis=1)
-        least = np.minimum(*(self.winding(middle + side * normals) for side in (0.25, -0.25)))
-        faces = self.faces[least <= 0.5]
+        lower = np.minimum(*(self.winding(middle + side * normals) for side in (0.25, -0.25)))
+        faces = self.faces[lower <= 0.5]
         if not len(faces):
             return self
-        bare = replace(self, faces=faces)
-        defect = _defect(bare.winding(_beside(self.vertices, faces)))
-        return replace(bare, is_nearly_closed=defect < _NEARLY_CLOSED)
+        visible = replace(self, faces=faces)
+        defect = _defect(visible.winding(_probe_points(self.vertices, faces)))
+        return replace(visible, is_nearly_closed=defect < _NEARLY_CLOSED)
 
 
-def _beside(vertices: Floats, faces: Integers) -> Floats:
-    """Points outside, then inside of the middles of faces, chosen evenly by area from the first to the last."""
+def _probe_points(vertices: Floats, faces: Integers) -> Floats:
+    """Return points on the outer, then on the inner side of the centroids of faces chosen evenly by area."""
     normals = area_vectors(vertices, faces)
     area = np.linalg.norm(normals, axis=1)
-    at = (np.arange(_PROBES) + 0.5) / _PROBES * area.sum()
+    at = (np.arange(_N_PROBES) + 0.5) / _N_PROBES * area.sum()
     face = np.minimum(np.searchsorted(np.cumsum(area), at), len(area) - 1)
     face = face[area[face] > 0]
     middle, step = vertices[faces[face]].mean(axis=1), 0.25 * (normals[face] / area[face, None])
@@ -127,12 +125,12 @@ def _beside(vertices: Floats, faces: Integers) -> Floats:
 
 
 def _defect(winding: Floats) -> float:
-    """Mean distance to 0, 1, 2, ...: zero beside closed surfaces that are turned outward."""
+    """Return the mean distance to the nearest of 0, 1, 2, ...: zero beside closed, outward oriented surfaces."""
     return float(np.abs(winding - np.maximum(np.round(winding), 0)).mean())
 
 
-def outside_of(distance: Singles, surface: OrientedSurface) -> tuple[Booleans, int]:
-    """Which grid points the flood reaches, walls excepted, and how many openings were closed to it."""
+def find_outside(distance: Singles, surface: OrientedSurface) -> tuple[Booleans, int]:
+    """Return which grid points outside the walls a flood from outside reaches, and the number of closed openings."""
     label, _ = ndimage.label(distance > WALL)
     outside = label == label[0, 0, 0]
     if surface.is_nearly_closed:
@@ -143,7 +141,7 @@ def outside_of(distance: Singles, surface: OrientedSurface) -> tuple[Booleans, i
     _, count = ndimage.label(cavities)
     from skimage.segmentation import watershed
 
-    # Both sides spread in the order of the distance to the wall, so that they meet in the narrowest place.
+    # Both sides spread in the order of the distance to the wall, so that they meet at the narrowest place.
     depth = ndimage.distance_transform_edt(outside)
     markers = np.ones(outside.shape, dtype=np.int64)
     markers[1:-1, 1:-1, 1:-1] = np.where(cavities, 2, 0)[1:-1, 1:-1, 1:-1]
@@ -152,17 +150,17 @@ def outside_of(distance: Singles, surface: OrientedSurface) -> tuple[Booleans, i
 
 def _outside_by_winding(outside: Booleans, distance: Singles, surface: OrientedSurface) -> tuple[Booleans, int]:
     near = np.argwhere(outside & np.isfinite(distance))
-    # A third of the points beside the surface, in all directions, shows whether the flood went in anywhere.
+    # A third of the points beside the surface suffices to see whether the flood entered anywhere.
     probe = near[near.sum(axis=1) % 3 == 0]
     leaked = probe[surface.winding(probe) > 0.5]
     if not len(leaked):
         return outside, 0
-    # If it did, every point that it reached near these leaks is looked at.
+    # Check every flooded point near the leaks.
     low, high = np.maximum(leaked.min(axis=0) - 4, 0), np.minimum(leaked.max(axis=0) + 5, outside.shape)
     box = tuple(map(slice, low, high))
     points = np.argwhere(outside[box]) + low
     inside = np.zeros_like(outside)
-    # No body reaches beyond its bounding box, as the winding number does where a base is missing.
+    # Where a base is missing, winding numbers are large beyond the bounding box, too, but no body reaches there.
     points = points[((points >= MARGIN) & (points < np.array(outside.shape) - MARGIN)).all(axis=1)]
     inside[tuple(points[surface.winding(points) > 0.5].T)] = True
     _, count = ndimage.label(inside, structure=np.ones((3, 3, 3)))
@@ -170,22 +168,24 @@ def _outside_by_winding(outside: Booleans, distance: Singles, surface: OrientedS
 
 
 def _cavities(outside: Booleans, surface: OrientedSurface) -> Booleans:
-    """The middles of what lies behind holes: what only passages of less than half its width, measured by balls of a
-    growing radius, connect with the outside."""
+    """Return the cores of the spaces behind holes, found by balls of growing radius.
+
+    A space lies behind a hole if only passages of less than half its width connect it with the outside.
+    """
     depth = ndimage.distance_transform_edt(outside)
-    found = np.zeros_like(outside)
+    cavities = np.zeros_like(outside)
     radius = 1.0
     while radius < depth.max() * _MOUTH:
-        # Around the grid everything is outside.
+        # Everything around the grid is outside.
         label, count = ndimage.label(np.pad(depth > radius, 1, constant_values=True))
         if count > 1:
-            reached, label = label[0, 0, 0], label[1:-1, 1:-1, 1:-1]
+            open_label, label = label[0, 0, 0], label[1:-1, 1:-1, 1:-1]
             peak = ndimage.maximum(depth, label, np.arange(count + 1))
             for k in np.nonzero(peak * _MOUTH >= radius)[0]:
-                if k not in (0, reached):
+                if k not in (0, open_label):
                     core = label == k
                     middle = np.argwhere(core & (depth >= peak[k] - 1e-9))[:8]
                     if np.median(surface.winding(middle)) >= _TWO_SIDED:
-                        found |= core
+                        cavities |= core
         radius *= 1.3
-    return found
+    return cavities

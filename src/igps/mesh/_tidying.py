@@ -1,4 +1,4 @@
-"""The triangles of a surface tidied up: welded, turned alike, without fins, specks, small holes, and what is hidden."""
+"""Tidy the triangles of a surface: weld, orient, drop fins, specks and hidden parts, fill small holes; take notes."""
 
 from collections import defaultdict
 
@@ -13,30 +13,28 @@ from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import compact, diagonal, directed_edges, face_areas, face_parts, signed_volume, undirected_edges
 from igps.mesh.winding import winding_number
 
-# Vertices closer than this share of the bounding box's diagonal are one.
-_WELD = 1e-8
-# How near the sides of a crack are: their corners, in single precision, differ in the last digits.
+_WELD = 1e-8  # vertices closer than this share of the bounding box's diagonal are welded
+# Width of a crack, in diagonals: in single precision the corners on its two sides differ in the last digits.
 _CRACK = 1e-6
-# With more vertices so near to each, on average, the surface is tiny in its bounding box, and they are no cracks.
-_MOST_NEAR = 50
+# With more such neighbours per vertex on average, the surface is tiny in its bounding box, and there are no cracks.
+_MAX_CRACK_NEIGHBOURS = 50
 # Parts of less than this share of the area are specks, unless all of them together have ten times as much.
 SPECK = 2e-3
-# Fins may have this share of the area.
-_FINS = 0.05
+_MAX_FINS = 0.05  # fins are dropped if all of them together have at most this share of the area
 # A hole is small if a circle as long as its rim has at most this share of the area of its part of the surface.
 _SMALL_HOLE = 0.03
 
 
-def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
-    """Coincident vertices made one, degenerate and doubled faces and unused vertices dropped, neighbours turned alike.
+def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
+    """Merge coincident vertices, drop degenerate and duplicate faces and unused vertices, and orient neighbours alike.
 
-    Vertices and faces that stay keep their order. What was done is added to `notes`.
+    The remaining vertices and faces keep their order.
     """
-    n_given = len(vertices)
-    vertices, faces = compact(vertices, faces)  # far from the others an unused one makes coincident all that are near
-    unused = n_given - len(vertices)
+    n_before = len(vertices)
+    vertices, faces = compact(vertices, faces)  # the tolerance must not depend on unused vertices far away
+    n_unused = n_before - len(vertices)
     place = places(vertices)
-    place = _without_cracks(vertices, place[faces])[place]
+    place = _close_cracks(vertices, place[faces])[place]
     n_places = len(np.unique(place))
     if n_places < len(vertices):
         notes.append(f"welded {len(vertices) - n_places} coincident vertices")
@@ -45,37 +43,37 @@ def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     if is_degenerate.any():
         notes.append(f"dropped {int(is_degenerate.sum())} degenerate faces")
         faces = faces[~is_degenerate]
-    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    if len(once) < len(faces):
-        notes.append(f"dropped {len(faces) - len(once)} duplicate faces")
-        faces = faces[np.sort(once)]
-    unused += n_places - len(np.unique(faces))
-    if unused:
-        notes.append(f"dropped {unused} unreferenced vertices")
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    if len(first) < len(faces):
+        notes.append(f"dropped {len(faces) - len(first)} duplicate faces")
+        faces = faces[np.sort(first)]
+    n_unused += n_places - len(np.unique(faces))
+    if n_unused:
+        notes.append(f"dropped {n_unused} unreferenced vertices")
     vertices, faces = compact(vertices, faces)
-    return vertices, oriented(faces, notes)
+    return vertices, orient(faces, notes)
 
 
 def places(vertices: Floats) -> Integers:
-    """(V,) of each vertex the first that is in the same place, on a lattice in units of the bounding box."""
+    """Return, for each vertex (V,), the index of the first vertex at the same place, up to a tolerance."""
     lattice = np.round((vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny)))
     _, first, index = np.unique(lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[index.ravel()])
 
 
-def joined_at_free_edges(vertices: Floats, faces: Integers) -> Integers:
-    """The faces (F, 3), where vertices at free edges are made one if they are in one place."""
-    free, index = _at_free_edges(vertices, faces), np.arange(len(vertices))
-    if len(free):
-        index[free] = free[places(vertices[free])]
+def weld_boundaries(vertices: Floats, faces: Integers) -> Integers:
+    """Return the faces (F, 3) with coincident boundary vertices merged."""
+    boundary, index = _boundary_vertices(vertices, faces), np.arange(len(vertices))
+    if len(boundary):
+        index[boundary] = boundary[places(vertices[boundary])]
     return index[faces]
 
 
-def _without_cracks(vertices: Floats, faces: Integers) -> Integers:
-    """(V,) which vertex each becomes: sides of a crack that are nearer than single precision can tell are made one."""
-    free, index = _at_free_edges(vertices, faces), np.arange(len(vertices))
+def _close_cracks(vertices: Floats, faces: Integers) -> Integers:
+    """Return, for each vertex (V,), the vertex that it becomes when cracks as narrow as single precision are closed."""
+    free, index = _boundary_vertices(vertices, faces), np.arange(len(vertices))
     tree, near = cKDTree(vertices[free]), _CRACK * diagonal(vertices)
-    if tree.count_neighbors(tree, near) > _MOST_NEAR * len(free):
+    if tree.count_neighbors(tree, near) > _MAX_CRACK_NEIGHBOURS * len(free):
         return index
     pairs = tree.query_pairs(near, output_type="ndarray")
     graph = sparse.coo_array((np.ones(len(pairs), dtype=np.int8), tuple(pairs.T)), shape=(len(free), len(free)))
@@ -84,68 +82,68 @@ def _without_cracks(vertices: Floats, faces: Integers) -> Integers:
     return index
 
 
-def _at_free_edges(vertices: Floats, faces: Integers) -> Integers:
-    ends, edge_of_side = undirected_edges(faces, len(vertices))
-    return np.unique(ends[np.bincount(edge_of_side, minlength=len(ends)) == 1])
+def _boundary_vertices(vertices: Floats, faces: Integers) -> Integers:
+    edges, edge_of_side = undirected_edges(faces, len(vertices))
+    return np.unique(edges[np.bincount(edge_of_side, minlength=len(edges)) == 1])
 
 
 def are_specks(areas: Floats) -> Booleans:
-    """Which of the parts with these areas are specks; none if all specks together have much area."""
-    specks = areas < SPECK * areas.sum()
-    return specks & (areas[specks].sum() < 10 * SPECK * areas.sum())
+    """Return which parts are specks, given their areas; none are if all of them together have much area."""
+    is_speck = areas < SPECK * areas.sum()
+    return is_speck & (areas[is_speck].sum() < 10 * SPECK * areas.sum())
 
 
-def oriented(faces: Integers, notes: list[str]) -> Integers:
-    """The faces turned so that neighbours agree, as far as the surface can be oriented; the smaller side is turned."""
+def orient(faces: Integers, notes: list[str]) -> Integers:
+    """Orient neighbouring faces alike, as far as the surface is orientable, by reversing as few faces as possible."""
     if not len(faces):
         return faces
     import igl
 
-    agreeing, part = igl.bfs_orient(faces)
-    turn = (agreeing != faces).any(axis=1)
-    turn ^= (np.bincount(part, weights=turn) > np.bincount(part) / 2)[part]
-    if turn.any():
-        notes.append(f"turned {int(turn.sum())} faces to orient the surface")
-        faces = np.where(turn[:, None], faces[:, ::-1], faces)
+    aligned, part = igl.bfs_orient(faces)
+    is_reversed = (aligned != faces).any(axis=1)
+    is_reversed ^= (np.bincount(part, weights=is_reversed) > np.bincount(part) / 2)[part]
+    if is_reversed.any():
+        notes.append(f"turned {int(is_reversed.sum())} faces to orient the surface")
+        faces = np.where(is_reversed[:, None], faces[:, ::-1], faces)
     return faces
 
 
-def tidied(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
-    """Without fins and specks, and turned alike once it is plain which faces are neighbours."""
-    kept = _without_fins(vertices, faces)
-    if len(kept) < len(faces):
-        notes.append(f"dropped {len(faces) - len(kept)} faces of fins")
-        faces = kept
+def tidy(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
+    """Drop fins and specks, then orient neighbours alike, which fins may have prevented."""
+    without_fins = _drop_fins(vertices, faces)
+    if len(without_fins) < len(faces):
+        notes.append(f"dropped {len(faces) - len(without_fins)} faces of fins")
+        faces = without_fins
     part, areas = face_parts(vertices, faces)
-    specks = are_specks(areas)
-    if specks.any():
-        notes.append(f"dropped {int(specks.sum())} specks")
-        faces = faces[~specks[part]]
+    is_speck = are_specks(areas)
+    if is_speck.any():
+        notes.append(f"dropped {int(is_speck.sum())} specks")
+        faces = faces[~is_speck[part]]
     vertices, faces = compact(vertices, faces)
-    return vertices, oriented(faces, notes)
+    return vertices, orient(faces, notes)
 
 
-def _without_fins(vertices: Floats, faces: Integers) -> Integers:
-    """The faces but for fins, which have a free edge and one that two others share; all, if fins have much area.
+def _drop_fins(vertices: Floats, faces: Integers) -> Integers:
+    """Drop fins: faces with a boundary edge and an edge that two other faces share. Keep all if fins have much area.
 
-    What may be left of a larger fin shares no edge with two other faces, and does no harm.
+    A part of a larger fin may remain; it shares no edge with two other faces, and does no harm.
     """
-    kept = faces
-    while len(kept):
-        _, edge_of_side = undirected_edges(kept, len(vertices))
+    remaining = faces
+    while len(remaining):
+        _, edge_of_side = undirected_edges(remaining, len(vertices))
         count = np.bincount(edge_of_side)[edge_of_side].reshape(-1, 3)
-        fin = (count == 1).any(axis=1) & (count > 2).any(axis=1)
-        if not fin.any():
+        is_fin = (count == 1).any(axis=1) & (count > 2).any(axis=1)
+        if not is_fin.any():
             break
-        kept = kept[~fin]
-    left = face_areas(vertices, kept).sum()
-    return kept if left >= (1 - _FINS) * face_areas(vertices, faces).sum() else faces
+        remaining = remaining[~is_fin]
+    area = face_areas(vertices, remaining).sum()
+    return remaining if area >= (1 - _MAX_FINS) * face_areas(vertices, faces).sum() else faces
 
 
-def without_hidden(vertices: Floats, faces: Integers, notes: list[str], *, cavities: bool = False) -> Surface:
-    """Without the parts that lie inside the largest, if that is closed.
+def drop_hidden_parts(vertices: Floats, faces: Integers, notes: list[str], *, cavities: bool = False) -> Surface:
+    """Drop the parts that lie inside the largest one, if that is closed.
 
-    With `cavities` those of them stay that are closed and lie in no other, turned so that they bound hollows.
+    With `cavities`, closed parts inside that lie in no other cavity are kept and oriented inward, to bound hollows.
     """
     part, areas = face_parts(vertices, faces)
     if len(areas) < 2:
@@ -156,87 +154,86 @@ def without_hidden(vertices: Floats, faces: Integers, notes: list[str], *, cavit
     except MeshError:
         return vertices, faces
     others = np.unique(faces[part != largest])
-    within = np.zeros(len(vertices), dtype=bool)
-    within[others] = winding_number(body.vertices, body.faces, vertices[others]) > 0.5
-    hidden = np.bincount(part, weights=~within[faces].all(axis=1), minlength=len(areas)) == 0
-    if not hidden.any():
+    is_inside = np.zeros(len(vertices), dtype=bool)
+    is_inside[others] = winding_number(body.vertices, body.faces, vertices[others]) > 0.5
+    is_hidden = np.bincount(part, weights=~is_inside[faces].all(axis=1), minlength=len(areas)) == 0
+    if not is_hidden.any():
         return vertices, faces
     if cavities:
         faces = faces.copy()
         kept: list[Mesh] = []
-        for k in sorted(np.flatnonzero(hidden), key=lambda k: -areas[k]):
-            own = part == k
-            surface = compact(vertices, faces[own])
+        for k in sorted(np.flatnonzero(is_hidden), key=lambda k: -areas[k]):
+            surface = compact(vertices, faces[part == k])
             try:
                 cavity = Mesh(*surface)
             except MeshError:
                 continue
-            if any((winding_number(one.vertices, one.faces, cavity.vertices) > 0.5).any() for one in kept):
+            if any((winding_number(other.vertices, other.faces, cavity.vertices) > 0.5).any() for other in kept):
                 continue
             kept.append(cavity)
-            hidden[k] = False
-            if signed_volume(*surface) * signed_volume(vertices, faces[part == largest]) > 0:  # which may be inside out
+            is_hidden[k] = False
+            # Compare signs, because the largest part may be inside out itself.
+            if signed_volume(*surface) * signed_volume(vertices, faces[part == largest]) > 0:
                 notes.append("turned the surface of a cavity towards the inside")
-                faces[own] = faces[own][:, ::-1]
-    if hidden.any():
-        notes.append(f"dropped {int(hidden.sum())} parts hidden inside")
-    return compact(vertices, faces[~hidden[part]])
+                faces[part == k] = faces[part == k][:, ::-1]
+    if is_hidden.any():
+        notes.append(f"dropped {int(is_hidden.sum())} parts hidden inside")
+    return compact(vertices, faces[~is_hidden[part]])
 
 
-def with_small_holes_filled(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
-    """With patches in the small holes."""
+def fill_small_holes(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     part, areas = face_parts(vertices, faces)
     part_of_vertex = np.zeros(len(vertices), dtype=np.int64)
     part_of_vertex[faces] = part[:, None]
     n_filled = 0
-    for loop in _loops(faces):
+    for loop in _boundary_loops(faces):
         length = np.linalg.norm(vertices[loop] - np.roll(vertices[loop], -1, axis=0), axis=1).sum()
         if length**2 / (4 * np.pi) <= _SMALL_HOLE * areas[part_of_vertex[loop[0]]]:
-            vertices, faces = _with_patch(vertices, faces, loop)
+            vertices, faces = _fill_hole(vertices, faces, loop)
             n_filled += 1
     if n_filled:
         notes.append(f"filled {n_filled} small holes")
     return vertices, faces
 
 
-def _loops(faces: Integers) -> list[Integers]:
-    """The rims of holes, as the faces that would close them run along them; no loop meets itself.
+def _boundary_loops(faces: Integers) -> list[Integers]:
+    """Return the rims of holes, in the direction of the faces that would fill them; no loop meets itself.
 
-    Where several rims meet in a vertex, or faces do not agree, free edges still make loops; those that make none are
-    left out.
+    Loops are also found where several rims meet in a vertex or the orientation of faces is inconsistent. Boundary edges
+    that form no loop are left out.
     """
     end, start = directed_edges(faces)
     _, edge_of_side = undirected_edges(faces, int(faces.max(initial=-1)) + 1)
     free = np.nonzero(np.bincount(edge_of_side)[edge_of_side] == 1)[0]
-    onward, backward = defaultdict(list), defaultdict(list)
+    forward, backward = defaultdict(list), defaultdict(list)
     for edge, a, b in zip(free.tolist(), start[free].tolist(), end[free].tolist(), strict=True):
-        onward[a].append((edge, b))
+        forward[a].append((edge, b))
         backward[b].append((edge, a))
-    walked: set[int] = set()
+    visited: set[int] = set()
     loops = []
     for first in start[free].tolist():
-        path, place = [first], {first: 0}
+        path, position = [first], {first: 0}
         while path:
-            here = [*onward[path[-1]], *backward[path[-1]]]
-            edge, vertex = next((step for step in here if step[0] not in walked), (-1, -1))
-            if edge < 0:  # home again, or at an end that leads nowhere
+            steps = [*forward[path[-1]], *backward[path[-1]]]
+            edge, vertex = next((step for step in steps if step[0] not in visited), (-1, -1))
+            if edge < 0:  # back at the start, or a dead end
                 break
-            walked.add(edge)
-            if vertex not in place:
-                place[vertex] = len(path)
+            visited.add(edge)
+            if vertex not in position:
+                position[vertex] = len(path)
                 path.append(vertex)
                 continue
-            loop = path[place[vertex] :]
+            loop = path[position[vertex] :]
             if len(loop) > 2:
                 loops.append(np.array(loop))
-            for passed in loop[1:]:
-                del place[passed]
-            del path[place[vertex] + 1 :]
+            for old in loop[1:]:
+                del position[old]
+            del path[position[vertex] + 1 :]
     return loops
 
 
-def _with_patch(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
-    """A patch on a loop, as a disc of rings with the rim's spacing is triangulated, bent like a thin plate."""
+def _fill_hole(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
+    """Fill a hole with the triangulation of a disc of rings, spaced like the rim and bent like a thin plate."""
     n = len(loop)
     if n == 3:
         return vertices, np.vstack([faces, loop[None]])
@@ -250,9 +247,9 @@ def _with_patch(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
         disc.append(_circle((np.arange(size) + ring / 2) / size, radius))
     disc.append(np.zeros((1, 2)))
     plane = np.concatenate(disc)
-    patch = Delaunay(plane).simplices.astype(np.int64)  # counter-clockwise, as the loop runs
+    patch = Delaunay(plane).simplices.astype(np.int64)  # counter-clockwise, like the loop
     points = np.vstack([rim, np.zeros((len(plane) - n, 3))])
-    points[n:] = _relaxed(points, patch, n, order=1)
+    points[n:] = _solve_umbrella(points, patch, n, order=1)
     index = np.concatenate([loop, len(vertices) + np.arange(len(points) - n)])
     faces = np.vstack([faces, index[patch]])
     return _fair(np.vstack([vertices, points[n:]]), faces, len(vertices)), faces
@@ -262,8 +259,8 @@ def _circle(turns: Floats, radius: float) -> Floats:
     return radius * np.stack([np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], axis=1)
 
 
-def _relaxed(points: Floats, faces: Integers, n_fixed: int, order: int) -> Floats:
-    """The free points, after the first `n_fixed`, where the `order`-th power of the umbrella operator vanishes."""
+def _solve_umbrella(points: Floats, faces: Integers, n_fixed: int, order: int) -> Floats:
+    """Return the free points, those after the first `n_fixed`, at which the umbrella operator's power `order` is 0."""
     edges, _ = undirected_edges(faces, len(points))
     size, ends = len(points), (edges.T.ravel(), edges[:, ::-1].T.ravel())
     graph = sparse.coo_array((np.ones(2 * len(edges)), ends), shape=(size, size)).tocsr()
@@ -274,11 +271,11 @@ def _relaxed(points: Floats, faces: Integers, n_fixed: int, order: int) -> Float
 
 
 def _fair(vertices: Floats, faces: Integers, n_old: int) -> Floats:
-    """The vertices, those from `n_old` on moved so that the surface goes on smoothly over the rim (a thin plate)."""
+    """Move the vertices from `n_old` on so that the surface continues smoothly across the rim, like a thin plate."""
     ring = np.unique(faces[(faces >= n_old).any(axis=1)])
     near = faces[np.isin(faces, ring).any(axis=1)]
     near = faces[np.isin(faces, np.unique(near)).any(axis=1)]
     used = np.unique(near)
-    fixed = int((used < n_old).sum())
-    free = _relaxed(vertices[used], np.searchsorted(used, near), fixed, order=2)
+    n_fixed = int((used < n_old).sum())
+    free = _solve_umbrella(vertices[used], np.searchsorted(used, near), n_fixed, order=2)
     return np.concatenate([vertices[:n_old], free])

@@ -1,105 +1,104 @@
-"""One surface of parts that overlap: the outer shape, exactly, where a grid would only come near it."""
+"""Unite overlapping parts into one surface: their exact outer shape, which a grid would only approximate."""
 
 import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers, Surface
-from igps.mesh._tidying import SPECK, oriented, tidied, welded, with_small_holes_filled
+from igps.mesh._tidying import SPECK, fill_small_holes, orient, tidy, weld
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, compact, diagonal, face_areas, face_parts, face_patches, unit
 
-# A place sees the outside if so many of the directions on one of its sides meet nothing.
-_OPEN = 0.03
-_DIRECTIONS, _PLACES_PER_PATCH = 100, 30
-# Surfaces that are so near to each other, in units of the bounding box's diagonal, are one.
-_COINCIDENT = 1e-6
-# Surfaces of more patches or parts are heaps of triangles, for which a grid is the quicker way.
-_MOST_PATCHES, _MOST_PARTS = 200, 200
+_MIN_OPEN = 0.03  # a point of a surface is visible if this share of the directions on one of its sides is free
+_N_DIRECTIONS, _SAMPLES_PER_PATCH = 100, 30
+_COINCIDENT = 1e-6  # surfaces nearer than this coincide, in units of the bounding box's diagonal
+# Surfaces of more patches or parts are left to the grid, which is faster there.
+_MAX_PATCHES, _MAX_PARTS = 200, 200
 
 
-def without_walls(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
-    """Without the walls inside the body, and the sheets that lie on another, where more than two faces meet in an edge.
+def drop_inner_walls(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
+    """Drop walls inside the body and sheets that lie on another one, if more than two faces meet in their edges.
 
-    Parts that overlap and share vertices leave them, as does a body that was cut and put together again. A patch (see
-    `face_patches`) goes only if that opens no hole, because two others meet wherever it ends, and if the others cover
-    what of it sees the outside. What sees the least goes first, then the smallest.
+    They come from overlapping parts with common vertices, and from bodies that were cut and put together again. A patch
+    (see `face_patches`) is dropped only if two others meet wherever it ends, so that no hole opens, and if others cover
+    its visible points. The least visible patches are dropped first; among equals, the smallest.
     """
     patch, ends_at_others = face_patches(faces, len(vertices))
-    if not 1 < len(ends_at_others) <= _MOST_PATCHES:
+    if not 1 < len(ends_at_others) <= _MAX_PATCHES:
         return vertices, faces
     points = np.ascontiguousarray((vertices - vertices.mean(axis=0)) / diagonal(vertices))
-    seen = _places(points, faces, patch)
+    samples = _sample_patches(points, faces, patch)
     n_dropped = 0
-    while (number := _superfluous(points, faces, patch, ends_at_others, *seen)) >= 0:
-        kept = (patch >= 0) & (patch != number)
+    while (dropped := _superfluous_patch(points, faces, patch, ends_at_others, *samples)) >= 0:
+        is_kept = (patch >= 0) & (patch != dropped)
         patch = np.full(len(faces), -1)
-        patch[kept], ends_at_others = face_patches(faces[kept], len(points))
+        patch[is_kept], ends_at_others = face_patches(faces[is_kept], len(points))
         n_dropped += 1
     if not n_dropped:
         return vertices, faces
     notes.append(f"dropped {n_dropped} walls inside")
     vertices, faces = compact(vertices, faces[patch >= 0])
-    return vertices, oriented(faces, notes)
+    return vertices, orient(faces, notes)
 
 
-def _superfluous(
-    points: Floats, faces: Integers, patch: Integers, ends_at_others: Booleans, places: Floats, at: Integers,
-    sees: Booleans,
+def _superfluous_patch(
+    points: Floats, faces: Integers, patch: Integers, ends_at_others: Booleans, samples: Floats,
+    face_of_sample: Integers, is_visible: Booleans,
 ) -> int:  # fmt: skip
-    """The patch that may go first, or −1; faces that are gone are of patch −1, and `places` lie on the faces `at`."""
+    """Return the next patch to drop, or -1; dropped faces have the patch -1."""
     import igl
 
-    of_patch, there = patch[at], patch >= 0
-    size = np.bincount(patch[there], face_areas(points, faces[there]))
-    n_places = np.maximum(np.bincount(of_patch[of_patch >= 0], minlength=len(size)), 1)
-    seeing = np.bincount(of_patch[of_patch >= 0], sees[of_patch >= 0], len(size)) / n_places
-    for number in np.lexsort((size, seeing)).tolist():
-        if not ends_at_others[number]:
+    patch_of_sample, is_left = patch[face_of_sample], patch >= 0
+    size = np.bincount(patch[is_left], face_areas(points, faces[is_left]))
+    in_patch = patch_of_sample >= 0
+    n_samples = np.maximum(np.bincount(patch_of_sample[in_patch], minlength=len(size)), 1)
+    visible_share = np.bincount(patch_of_sample[in_patch], is_visible[in_patch], len(size)) / n_samples
+    for k in np.lexsort((size, visible_share)).tolist():
+        if not ends_at_others[k]:
             continue
-        shown = np.ascontiguousarray(places[(of_patch == number) & sees])
-        rest = faces[there & (patch != number)]
-        squared = igl.point_mesh_squared_distance(shown, points, rest)[0] if len(shown) else np.zeros(1)
+        visible = np.ascontiguousarray(samples[(patch_of_sample == k) & is_visible])
+        others = faces[is_left & (patch != k)]
+        squared = igl.point_mesh_squared_distance(visible, points, others)[0] if len(visible) else np.zeros(1)
         if np.max(squared) <= _COINCIDENT**2:
-            return number
+            return k
     return -1
 
 
-def _places(points: Floats, faces: Integers, patch: Integers) -> tuple[Floats, Integers, Booleans]:
-    """Places (S, 3) on each patch, evenly by area and always the same; their faces (S,); and which see outside."""
+def _sample_patches(points: Floats, faces: Integers, patch: Integers) -> tuple[Floats, Integers, Booleans]:
+    """Sample each patch uniformly by area, reproducibly: points (S, 3), their faces (S,), and which are visible."""
     import igl
 
     areas = face_areas(points, faces)
     generator = np.random.default_rng(0)
     chosen = []
-    for number in range(int(patch.max()) + 1):
-        members = np.nonzero((patch == number) & (areas > 0))[0]
+    for k in range(int(patch.max()) + 1):
+        members = np.nonzero((patch == k) & (areas > 0))[0]
         if len(members):
-            chosen.append(generator.choice(members, _PLACES_PER_PATCH, p=areas[members] / areas[members].sum()))
-    at = np.concatenate(chosen)
-    places = np.einsum("sc,scx->sx", generator.dirichlet(np.ones(3), len(at)), points[faces[at]])
-    normals = unit(area_vectors(points, faces[at]))
-    occluded = [
-        np.asarray(igl.ambient_occlusion(points, faces, places, np.ascontiguousarray(side), _DIRECTIONS)).ravel()
+            chosen.append(generator.choice(members, _SAMPLES_PER_PATCH, p=areas[members] / areas[members].sum()))
+    face = np.concatenate(chosen)
+    samples = np.einsum("sc,scx->sx", generator.dirichlet(np.ones(3), len(face)), points[faces[face]])
+    normals = unit(area_vectors(points, faces[face]))
+    occlusion = [
+        np.asarray(igl.ambient_occlusion(points, faces, samples, np.ascontiguousarray(side), _N_DIRECTIONS)).ravel()
         for side in (normals, -normals)
     ]
-    return places, at, 1 - np.minimum(*occluded) > _OPEN
+    return samples, face, 1 - np.minimum(*occlusion) > _MIN_OPEN
 
 
-def united(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
-    """The outer surface of parts that are closed each by itself and overlap, by manifold3d.
+def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
+    """Return the outer surface of overlapping closed parts, by manifold3d.
 
-    Each part is tidied on its own, and turned outward. The surface as it is, and no note, if a part is not closed, if
-    they do not overlap or are too many or only one.
+    Each part is first tidied on its own and oriented outward. The surface is returned unchanged, without a note, if a
+    part is not closed, if the parts do not form one piece, or if there are too many parts or only one.
     """
     import manifold3d
 
     part, areas = face_parts(vertices, faces)
-    speck = areas < SPECK * areas.sum()
-    if not 1 < int((~speck).sum()) <= _MOST_PARTS:
+    is_speck = areas < SPECK * areas.sum()
+    if not 1 < int((~is_speck).sum()) <= _MAX_PARTS:
         return vertices, faces
     solids = []
-    for number in np.nonzero(~speck)[0]:
-        points, triangles = compact(vertices, faces[part == number])
-        for step in (welded, tidied, with_small_holes_filled):
+    for k in np.nonzero(~is_speck)[0]:
+        points, triangles = compact(vertices, faces[part == k])
+        for step in (weld, tidy, fill_small_holes):
             points, triangles = step(points, triangles, [])
         try:
             body = Mesh(points, triangles)
@@ -109,9 +108,9 @@ def united(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
         if solid.status() != manifold3d.Error.NoError:
             return vertices, faces
         solids.append(solid)
-    whole = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
-    if whole.status() != manifold3d.Error.NoError or len(whole.decompose()) != 1:
+    union = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
+    if union.status() != manifold3d.Error.NoError or len(union.decompose()) != 1:
         return vertices, faces
-    mesh = whole.to_mesh64()
+    mesh = union.to_mesh64()
     notes.append(f"united {len(solids)} closed parts that overlap")
     return np.asarray(mesh.vert_properties)[:, :3].copy(), np.asarray(mesh.tri_verts, dtype=np.int64)

@@ -1,9 +1,9 @@
-"""The surface of a label: from voxels to a closed triangle mesh without stairs, true to a fraction of a voxel.
+"""Make a closed triangle mesh without stairs from the voxels of a label, accurate to a fraction of a voxel.
 
-A label that has many more voxels than the mesh needs vertices is put on a coarser grid first, as shares of its voxels,
-where nothing of it is too thin for that. Then a smooth function that agrees with every voxel (`_label_field`) is
-interpolated by cubic splines along the long sides of the voxels, marching cubes take its zero level, quadrics (Garland
-and Heckbert 1997) leave as many vertices as are wanted, and the volume is made that of the voxels.
+A label with many more voxels than the mesh needs vertices is first put on a coarser grid, unless it is too thin for
+that; the coarse voxels hold shares. Then a smooth function that agrees with every voxel (`_label_field`) is
+interpolated by cubic splines along the long sides of the voxels. Marching cubes extract its zero level, quadrics
+(Garland and Heckbert 1997) reduce the vertices, and the volume is set to that of the voxels.
 """
 
 import math
@@ -13,42 +13,41 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers, Singles, Surface
-from igps.mesh._isosurface import level_surface, simplified, with_volume
-from igps.mesh._label_field import PAD, filled_share, smooth_field
-from igps.mesh._label_gaps import TOUCHING, with_missed_slices
-from igps.mesh._level_set import LEAST, joined, without_bubbles
+from igps.mesh._isosurface import level_surface, restore_volume, simplify_surface
+from igps.mesh._label_field import PAD, filled_volume, smooth_field
+from igps.mesh._label_gaps import TOUCHING, fill_missed_slices
+from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles, join_pieces
 from igps.mesh.limits import check_grid
 from igps.mesh.mesh import MeshError
 from igps.mesh.surface import connected, signed_volume, stacked
 
 MAX_VERTICES = 5000
-"""Most vertices of a label's surface, by default."""
+"""Default maximal number of vertices of a label's surface."""
 
 LEAST_VOXELS = 8
-"""Fewest voxels that have a shape."""
+"""Minimal number of voxels of a label; fewer have no shape."""
 
-_ISLAND = 0.02  # share of the voxels below which a piece apart is dropped
-_SPECK = 0.005  # share of the volume below which a piece of the surface is none of the label's
-_SPARE = 4  # the grid may make so many times more vertices than are wanted, which are then simplified
-_FEWEST = 1500  # vertices that the grid makes at least, if need be by interpolation
-_MOST_REFINED = 4
-_N_LEVELS = 3
-# Radius of the bars between pieces, over the square root of the area. It is more than most cells, so that bars are as
-# thick on every grid.
+_ISLAND = 0.02  # separate pieces of less than this share of the voxels are dropped
+_SPECK = 0.005  # pieces of the surface of less than this share of the volume are artefacts between voxels
+_MAX_SURPLUS = 4  # the grid may make this many times `max_vertices`, before simplification
+_MIN_VERTICES = 1500  # the field is interpolated until the grid makes about as many
+_MAX_REFINEMENT = 4
+_N_LEVELS = 3  # iterations for the level that gives the volume
+# Radius of the bars between pieces, over the square root of the area. It exceeds most cells, so that the thickness of
+# bars does not depend on the grid.
 _BAR = 0.02
-# Share of a label that may lie where it is too thin for a coarser grid.
-_THIN = 0.005
+_MAX_THIN = 0.005  # maximal share of a label that may be too thin for a coarser grid
 
 
 def voxel_surface(
     inside: ArrayLike, affine: ArrayLike | None = None, *, max_vertices: int = MAX_VERTICES, cavities: bool = False,
     joins: bool = False, name: str = "volume",
 ) -> tuple[Floats, Integers, tuple[str, ...]]:  # fmt: skip
-    """The closed, outward surface of the voxels of a body.
+    """Make a closed, outward oriented surface of the voxels of a body.
 
-    It encloses their volume, has the centres of all voxels on their side unless it was put on a coarser grid, and is
-    closed where the body ends at the border of the volume. Voxels that share only a corner are one piece. Holes inside
-    are filled.
+    The surface encloses the volume of the voxels. The centres of all voxels are on the right side of it, unless the
+    body was put on a coarser grid. A body that reaches the border of the volume is closed there. Voxels that share only
+    a corner are connected. Holes inside are filled.
 
     Example:
         >>> ball = ((np.indices((24, 24, 24)) - 11.3) ** 2).sum(axis=0) < 10**2
@@ -58,17 +57,18 @@ def voxel_surface(
 
     Args:
         inside: (X, Y, Z), true at voxels whose centre lies in the body.
-        affine: (4, 4) from indices of voxels to the world; may shear and mirror. None for voxels of side 1.
-        max_vertices: about so many vertices at most.
-        cavities: hollows of the size of a label, too, get a surface, turned towards the inside.
-        joins: pieces become one: a few slices between them are filled, and wider gaps bridged where they are narrowest.
-        name: what error messages call the body.
+        affine: (4, 4) from voxel indices to world coordinates; may shear and mirror. None for voxels of side 1.
+        max_vertices: approximate maximal number of vertices.
+        cavities: keep hollows of at least `LEAST_VOXELS` voxels; they get surfaces that are oriented inward.
+        joins: join separate pieces: up to three missed slices between them are filled, and wider gaps are bridged by
+            bars where they are narrowest.
+        name: name of the body in error messages.
 
     Returns:
-        Vertices (V, 3) in the world, faces (F, 3) of one or several closed pieces, and notes of what was done.
+        Vertices (V, 3) in world coordinates, faces (F, 3) of one or several closed pieces, and notes of what was done.
 
     Raises:
-        MeshError: too few voxels, most of them in small pieces, or an affine that is singular.
+        MeshError: the mask has too few voxels, most voxels lie in small pieces, or the affine is singular.
     """
     mask = np.asarray(inside, dtype=bool)
     if mask.ndim != 3:
@@ -77,46 +77,47 @@ def voxel_surface(
     spacing = checked_spacing(matrix, name)
     n_voxels = int(np.count_nonzero(mask))
     if n_voxels < LEAST_VOXELS:
-        few = f"{name}: {n_voxels} voxels, at least {LEAST_VOXELS} expected: they tell no shape."
-        raise MeshError(f"{few} Leave it out, or label it on a finer grid.")
+        few = f"{name}: expected at least {LEAST_VOXELS} voxels, got {n_voxels}, which have no shape."
+        raise MeshError(f"{few} Leave out the label, or segment it on a finer grid.")
     (box,) = ndimage.find_objects(mask.view(np.uint8))
     low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
-    mask = with_missed_slices(mask[box], notes) if joins else mask[box]
-    mask, hollows = _cleaned(mask, notes, LEAST_VOXELS if cavities else None, name)
-    share, factor = _coarsened(mask, spacing, max_vertices)
-    mask = _with_thick_contacts(share >= 0.5)
+    mask = fill_missed_slices(mask[box], notes) if joins else mask[box]
+    mask, hollows = _clean(mask, notes, LEAST_VOXELS if cavities else None, name)
+    share, factor = _coarsen(mask, spacing, max_vertices)
+    mask = _thicken_contacts(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
     check_grid(share.size, name)
     sides = spacing * factor / (spacing * factor).min()  # nothing depends on the unit of length
     field = smooth_field(share, sides)
-    # Into how many parts each side goes, so that the parts are about equal and make vertices enough.
+    # Each side is divided so that its parts are about equal and give enough vertices.
     n_vertices = _n_vertices(mask, sides)
-    finer = min(max(math.ceil(math.sqrt(_FEWEST / n_vertices)), 1), _MOST_REFINED)
-    fineness = np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
-    field = _refined(field, share, fineness, sides / fineness)
-    n_cells = float(share.sum(dtype=np.float64) * fineness.prod())
+    refinement = min(max(math.ceil(math.sqrt(_MIN_VERTICES / n_vertices)), 1), _MAX_REFINEMENT)
+    n_parts = np.maximum(np.round(refinement * sides / sides.min()), 1).astype(np.int64)
+    field = _refine(field, share, n_parts, sides / n_parts)
+    n_cells = float(share.sum(dtype=np.float64) * n_parts.prod())
     if joins and ndimage.label(mask)[1] > 1:
         n_before = np.count_nonzero(field < 0)
-        # A surface has about one and a half vertices for a square of the grid's side.
-        field = joined(field.astype(np.float32, copy=False), notes, _BAR * math.sqrt(n_vertices / 1.5) * finer)
+        # A surface has about 1.5 vertices per squared side of a cell.
+        radius = _BAR * math.sqrt(n_vertices / 1.5) * refinement
+        field = join_pieces(field.astype(np.float32, copy=False), notes, radius)
         n_cells += np.count_nonzero(field < 0) - n_before
-    vertices, faces = _meshed(field, sides / fineness, n_cells * (sides / fineness).prod(), max_vertices, name)
-    # Index of the first voxel's centre: that of a block of `factor` voxels lies (factor - 1) / 2 further.
+    vertices, faces = _mesh(field, sides / n_parts, n_cells * (sides / n_parts).prod(), max_vertices, name)
+    # The centre of a block of `factor` voxels lies (factor - 1) / 2 beyond that of its first voxel.
     index = (vertices / sides - PAD) * factor + (factor - 1) / 2 + low
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = np.ascontiguousarray(faces[:, ::-1])
     surfaces = [(index @ matrix[:3, :3].T + matrix[:3, 3], faces)]
     matrix = matrix @ np.block([[np.eye(3), low[:, None]], [np.zeros(3), 1]])
     for hollow in hollows:
-        points, inwards, told = voxel_surface(hollow, matrix, max_vertices=max_vertices, name=name)
-        notes += [f"in a cavity: {note}" for note in told]
-        surfaces.append((points, inwards[:, ::-1]))
+        points, triangles, cavity_notes = voxel_surface(hollow, matrix, max_vertices=max_vertices, name=name)
+        notes += [f"in a cavity: {note}" for note in cavity_notes]
+        surfaces.append((points, triangles[:, ::-1]))
     return *stacked(surfaces), tuple(notes)
 
 
 def checked_spacing(affine: Floats, name: str) -> Floats:
-    """(3,) sides of a voxel, length; a MeshError if the affine is no invertible matrix (4, 4) of finite numbers."""
+    """Return the sides (3,) of a voxel, or raise a MeshError unless the affine is a finite invertible matrix (4, 4)."""
     if affine.shape != (4, 4) or not np.isfinite(affine).all():
         raise MeshError(f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}.")
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
@@ -126,47 +127,47 @@ def checked_spacing(affine: Floats, name: str) -> Floats:
     return spacing
 
 
-def _cleaned(mask: Booleans, notes: list[str], least: int | None, name: str) -> tuple[Booleans, list[Booleans]]:
-    """Without islands, and with holes filled; and the holes of at least so many voxels, none if None."""
+def _clean(mask: Booleans, notes: list[str], min_hole: int | None, name: str) -> tuple[Booleans, list[Booleans]]:
+    """Drop islands and fill holes. Also return the masks of the holes of at least `min_hole` voxels, none if None."""
     label, island, size = _islands(mask)
     if len(island):
-        lost = int(size[island].sum())
-        if 2 * lost >= size.sum():  # lesions
-            scattered = f"{name}: {lost / size.sum():.0%} of the voxels lie in {len(island)} pieces apart, each below"
-            remedy = 'Take pieces for bodies: LoadOptions(bodies="pieces"), --bodies pieces; or connect them.'
-            raise MeshError(f"{scattered} {_ISLAND:.0%} of the label: no one body. {remedy}")
+        n_dropped = int(size[island].sum())
+        if 2 * n_dropped >= size.sum():  # such as lesions
+            share = f"{name}: {n_dropped / size.sum():.0%} of the voxels lie in {len(island)} separate pieces"
+            remedy = 'Read each piece as a body: LoadOptions(bodies="pieces"), --bodies pieces; or connect the pieces.'
+            raise MeshError(f"{share}, each below {_ISLAND:.0%} of the label; one body was expected. {remedy}")
         mask = mask & ~np.isin(label, island)
         pieces = "1 small piece" if len(island) == 1 else f"{len(island)} small pieces"
-        notes.append(f"dropped {pieces} apart of {lost} voxels, {lost / size.sum():.1%} of the label")
-    # Voxels outside are connected by faces.
+        notes.append(f"dropped {pieces} apart of {n_dropped} voxels, {n_dropped / size.sum():.1%} of the label")
+    # Voxels outside are connected only across faces.
     hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
     if n_hollow < 2:
         return mask, []
     outside, hollow = hollow[0, 0, 0], hollow[1:-1, 1:-1, 1:-1]
     size = np.bincount(hollow.reshape(-1))
     size[[0, outside]] = 0
-    kept = [] if least is None else np.flatnonzero(size >= least).tolist()
+    kept = [] if min_hole is None else np.flatnonzero(size >= min_hole).tolist()
     if n_filled := int(size.sum() - size[kept].sum()):
         notes.append(f"filled holes of {n_filled} voxels")
     return np.asarray(hollow != outside), [hollow == k for k in kept]
 
 
 def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
-    """The piece of each voxel, from 1; the pieces that are too small to stay; and the voxels of each, of 0 none."""
+    """Return the piece of each voxel, from 1; the pieces too small to keep; and the number of voxels of each piece."""
     label, _ = ndimage.label(mask, TOUCHING)
     size = np.bincount(label.reshape(-1))
     size[0] = 0
     return label, np.nonzero(size < _ISLAND * size.sum())[0][1:], size
 
 
-def _with_thick_contacts(mask: Booleans) -> Booleans:
-    """With voxels added beside edges and corners at which pieces only touch."""
+def _thicken_contacts(mask: Booleans) -> Booleans:
+    """Add voxels where parts touch only at an edge or a corner."""
     for _ in range(3):
         label, n_pieces = ndimage.label(mask)
         if n_pieces < 2:
             break
         padded = np.pad(label, 1)
-        extra = np.zeros_like(mask)
+        added = np.zeros_like(mask)
         for step in np.ndindex(3, 3, 3):
             offset = np.array(step) - 1
             if np.abs(offset).sum() < 2 or tuple(offset) < (0, 0, 0):
@@ -175,87 +176,87 @@ def _with_thick_contacts(mask: Booleans) -> Booleans:
             at = np.argwhere((label > 0) & (moved > 0) & (label != moved))
             for axis in np.nonzero(offset)[0][:-1]:
                 at[:, axis] += offset[axis]
-                extra[tuple(at.T)] = True
-        if not extra.any():
+                added[tuple(at.T)] = True
+        if not added.any():
             break
-        mask = mask | extra
+        mask = mask | added
     return mask
 
 
 def _n_vertices(mask: Booleans, sides: Floats) -> float:
-    """About how many vertices marching cubes make on a grid as fine as the shortest side."""
-    layers = [np.moveaxis(mask, axis, 0) for axis in range(3)]
-    cuts = np.array([np.count_nonzero(one[1:] != one[:-1]) + np.count_nonzero(one[[0, -1]]) for one in layers])
-    return float((cuts * sides.prod() / sides).sum() / sides.min() ** 2)
+    """Estimate how many vertices marching cubes make on a grid as fine as the shortest side."""
+    masks = [np.moveaxis(mask, axis, 0) for axis in range(3)]
+    n_cuts = np.array([np.count_nonzero(m[1:] != m[:-1]) + np.count_nonzero(m[[0, -1]]) for m in masks])
+    return float((n_cuts * sides.prod() / sides).sum() / sides.min() ** 2)
 
 
-def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Singles, Integers]:
-    """Shares of larger voxels, and how many of the given ones each takes along each axis."""
+def _coarsen(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Singles, Integers]:
+    """Return the shares of larger voxels, and how many voxels of the mask each takes along each axis."""
     from skimage.measure import block_reduce
 
     share, factor = mask.astype(np.float32), np.ones(3, dtype=np.int64)
     n_pieces = ndimage.label(mask, TOUCHING)[1]
-    while _n_vertices(mask, spacing * factor) > _SPARE * max_vertices:
+    while _n_vertices(mask, spacing * factor) > _MAX_SURPLUS * max_vertices:
         sides = spacing * factor
-        halved = sides < 1.5 * sides.min()
-        if not _is_thick(mask, halved):
+        is_halved = sides < 1.5 * sides.min()
+        if not _is_thick(mask, is_halved):
             break
-        coarse = block_reduce(share, tuple(np.where(halved, 2, 1)), np.mean)  # of single precision, which is exact
-        # Small pieces that hung on a thread go, as they would have without it.
+        coarse = block_reduce(share, tuple(np.where(is_halved, 2, 1)), np.mean)  # exact in single precision
+        # Drop small pieces that were connected only by threads too thin for the coarse grid.
         label, island, size = _islands(coarse >= 0.5)
         if np.count_nonzero(size) - len(island) != n_pieces:
             break
         coarse[np.isin(label, island) & (label > 0)] = 0
-        share, factor, mask = coarse, factor * np.where(halved, 2, 1), np.asarray(coarse >= 0.5)
+        share, factor, mask = coarse, factor * np.where(is_halved, 2, 1), np.asarray(coarse >= 0.5)
     return share, factor
 
 
 def _is_thick(mask: Booleans, axes: Booleans) -> bool:
-    """Whether hardly any of the body is less than three voxels thick along the axes."""
+    """Return whether nearly all of the body is at least three voxels thick along the axes."""
     core = ndimage.minimum_filter(mask, tuple(np.where(axes, 3, 1)), mode="constant")
-    reached = ndimage.maximum_filter(core, tuple(np.where(axes, 5, 1)), mode="constant")
-    return bool(np.count_nonzero(mask & ~reached) <= _THIN * np.count_nonzero(mask))
+    is_thick = ndimage.maximum_filter(core, tuple(np.where(axes, 5, 1)), mode="constant")
+    return bool(np.count_nonzero(mask & ~is_thick) <= _MAX_THIN * np.count_nonzero(mask))
 
 
-def _refined(field: Floats | Singles, share: Singles, fineness: Integers, sides: Floats) -> Floats | Singles:
-    """The field between the centres of the voxels, at the level that gives their volume.
+def _refine(field: Floats | Singles, share: Singles, n_parts: Integers, sides: Floats) -> Floats | Singles:
+    """Interpolate the field between the centres of the voxels, and shift it to the level that gives their volume.
 
-    It is negative between neighbours in the body, which therefore hold together.
+    The field is made negative between neighbours in the body, so that they stay connected.
     """
     from scipy.interpolate import CubicSpline
 
     inside = share >= 0.5
-    for axis, parts in enumerate(fineness.tolist()):
-        if parts > 1:
+    for axis, n in enumerate(n_parts.tolist()):
+        if n > 1:
             index = np.arange(field.shape[axis])
-            places = np.linspace(0, index[-1], index[-1] * parts + 1)
-            field = CubicSpline(index, field, axis=axis, bc_type="natural")(places)
-    volume, least = share.sum(dtype=np.float64) * fineness.prod(), LEAST * float(sides.min())
+            spline = CubicSpline(index, field, axis=axis, bc_type="natural")
+            field = spline(np.linspace(0, index[-1], index[-1] * n + 1))
+    volume, min_abs = share.sum(dtype=np.float64) * n_parts.prod(), MIN_ABS_VALUE * float(sides.min())
     for _ in range(_N_LEVELS):
-        filled, slope = filled_share(field, float(sides.sum()))
+        filled, slope = filled_volume(field, float(sides.sum()))
         field -= (volume - filled) / max(slope, 1e-9)
-    for axis, parts in enumerate(fineness.tolist()):
+    for axis, n in enumerate(n_parts.tolist()):
         both = inside & np.roll(inside, -1, axis)
-        for part in range(parts):
-            at = tuple(slice(part if k == axis else 0, None, step) for k, step in enumerate(fineness.tolist()))
+        for part in range(n):
+            at = tuple(slice(part if k == axis else 0, None, step) for k, step in enumerate(n_parts.tolist()))
             line = field[at]
-            line[both[tuple(slice(n) for n in line.shape)] & (line > -least)] = -least
+            line[both[tuple(slice(size) for size in line.shape)] & (line > -min_abs)] = -min_abs
     return field
 
 
-def _meshed(field: Floats | Singles, sides: Floats, volume: float, max_vertices: int, name: str) -> Surface:
-    """The zero level of a field as closed pieces, in the unit of the sides, which are about equal."""
+def _mesh(field: Floats | Singles, sides: Floats, volume: float, max_vertices: int, name: str) -> Surface:
+    """Mesh the zero level of a field as closed pieces of this volume; the sides of a cell are about equal."""
     cell = float(sides.min())
-    level = np.where(field < 0, np.minimum(field, -LEAST * cell), np.maximum(field, LEAST * cell)) / cell
-    vertices, faces = level_surface(without_bubbles(level.astype(np.float32, copy=False)), name)
+    min_abs = MIN_ABS_VALUE * cell
+    level = np.where(field < 0, np.minimum(field, -min_abs), np.maximum(field, min_abs)) / cell
+    vertices, faces = level_surface(fill_bubbles(level.astype(np.float32, copy=False)), name)
     vertices = vertices * (sides / cell)
     pieces = connected(vertices, faces)
     volumes = np.abs([signed_volume(*piece) for piece in pieces])
     parts = []
-    # Specks between voxels are none of theirs.
-    for own in [piece for piece, size in zip(pieces, volumes, strict=True) if size > _SPECK * volumes.sum()]:
-        if signed_volume(*own) < 0:
-            own = own[0], own[1][:, ::-1]
-        parts.append(simplified(*own, max(round(max_vertices * len(own[0]) / len(vertices)), 50)))
+    for piece in [piece for piece, size in zip(pieces, volumes, strict=True) if size > _SPECK * volumes.sum()]:
+        if signed_volume(*piece) < 0:
+            piece = piece[0], piece[1][:, ::-1]
+        parts.append(simplify_surface(*piece, max(round(max_vertices * len(piece[0]) / len(vertices)), 50)))
     points, triangles = stacked(parts)
-    return with_volume(points, triangles, volume / cell**3) * cell, np.ascontiguousarray(triangles)
+    return restore_volume(points, triangles, volume / cell**3) * cell, np.ascontiguousarray(triangles)

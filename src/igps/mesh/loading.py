@@ -1,4 +1,4 @@
-"""A file becomes bodies: which it holds, and each as a closed surface."""
+"""Read a file: list its bodies, and make a closed surface of each."""
 
 import logging
 import os
@@ -10,7 +10,7 @@ import numpy as np
 
 from igps._arrays import Floats
 from igps._threads import one_thread
-from igps.mesh._tidying import joined_at_free_edges
+from igps.mesh._tidying import weld_boundaries
 from igps.mesh.formats import FORMATS, Format, RawBody, format_of
 from igps.mesh.formats._format import faults, joined, pieces
 from igps.mesh.limits import check_memory
@@ -21,25 +21,24 @@ from igps.mesh.surface import compact, diagonal, face_parts
 
 logger = logging.getLogger(__name__)
 
-# Steps of coordinates, over the size, that make eigenvalues wrong by about a hundredth.
-_COARSE = 0.004
+_COARSE = 0.004  # rounding step of coordinates, over the size of the body, that changes eigenvalues by about 1 %
 
 
 @dataclass(frozen=True)
 class BodyRef:
-    """A body that a file holds: the file, and its name there, None where the file is one body."""
+    """Reference to a body in a file."""
 
     path: Path
-    part: str | None = None
+    part: str | None = None  # name of the body in the file; None if the file is one body
 
     def __str__(self) -> str:
         return str(self.path) if self.part is None else f"{self.path}#{self.part}"
 
 
 def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[BodyRef]:
-    """The bodies of a file, without making surfaces of them where the format can tell."""
+    """List the bodies of a file. Their surfaces are not computed, unless the format has no other way to list them."""
     path = Path(path)
-    if _bodies(_format(path), options) == "whole":
+    if _body_kind(_format(path), options) == "whole":
         return [BodyRef(path)]
     return [BodyRef(path, body.part) for body in _read(path, options)]
 
@@ -48,10 +47,10 @@ def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[
 def load_mesh(
     path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None, least_vertices: int = 0
 ) -> Mesh:
-    """Read a mesh, a cloud of points, a label volume or a molecule, and make a body of it.
+    """Read a mesh, a point cloud, a label volume or a molecule, and make a body of it.
 
-    Polygons are cut into triangles. Vertices keep their order and are not merged; only in an STL file, which has none,
-    corners in one place are a vertex.
+    Polygons are cut into triangles. Vertices keep their order and are not merged. In an STL file, which has no shared
+    vertices, coincident corners become one vertex.
 
     Example:
         >>> import tempfile, trimesh
@@ -62,36 +61,36 @@ def load_mesh(
         (8, 6.0)
 
     Args:
-        options: what of the file is a body, and what may be done to it; what was done is kept in `Mesh.notes`.
-        part: which of its bodies, see `list_bodies`; needed where there are several.
-        least_vertices: a body with fewer is subdivided, unless `options` mends never.
+        options: what counts as a body of the file, and how it may be repaired. The repairs are listed in `Mesh.notes`.
+        part: name of the body, see `list_bodies`; required if the file has several.
+        least_vertices: minimal number of vertices. A smaller mesh is subdivided, unless `options.mend` is "never".
 
     Raises:
-        MeshError: the file is missing or unreadable, has no such part, or the surface is not usable.
+        MeshError: the file is missing or unreadable or has no such part, or the surface is not usable.
     """
     raw = read_surface(path, options, part=part)
     return surface_body(raw, BodyRef(Path(path), raw.part), options, least_vertices=least_vertices)
 
 
 def load_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[Mesh]:
-    """All usable bodies of a file; the others are logged. A MeshError if none is usable."""
-    found, faults = [], []
+    """Return all usable bodies of a file, and log the errors of the others; a MeshError if no body is usable."""
+    bodies, errors = [], []
     for _, body in each_body(path, options):
         if isinstance(body, MeshError):
             logger.warning("%s", body)
-            faults.append(body)
+            errors.append(body)
         else:
-            found.append(body)
-    if not found:
-        raise faults[0] if faults else MeshError(f"{path}: no body in it. Check the file.")
-    return found
+            bodies.append(body)
+    if not bodies:
+        raise errors[0] if errors else MeshError(f"{path}: the file holds no body. Check the file.")
+    return bodies
 
 
 def each_body(
     path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None,
     least_vertices: int = 0,
 ) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:  # fmt: skip
-    """The bodies of a file, read once, or those of the given parts; what is wrong with one stands in its place."""
+    """Iterate over the bodies of a file, or over the given parts; the MeshError of an unusable body takes its place."""
     for ref, raw in each_surface(path, options, parts=parts):
         with one_thread():
             try:
@@ -104,7 +103,7 @@ def each_body(
 def each_surface(
     path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None
 ) -> Iterator[tuple[BodyRef, RawBody]]:
-    """The surfaces of the bodies of a file, or of the given parts, unchecked, one after the other; see `each_body`."""
+    """Iterate over the unchecked surfaces of the bodies of a file, or of the given parts; see `each_body`."""
     path = Path(path)
     for raw in _read(path, options, parts[0] if parts and len(parts) == 1 else None):
         if parts is None or raw.part in parts:
@@ -113,44 +112,44 @@ def each_surface(
                 try:
                     with faults(ref, _format(path)):
                         body = raw.made()
-                except MeshError as fault:  # leaves the others
+                except MeshError as fault:  # the other bodies may be sound
                     body = replace(raw, fault=fault, make=None)
             yield ref, body
 
 
 def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None) -> RawBody:
-    """The surface of a body as the file has it, unchecked; its only one, if none is named."""
+    """Return the unchecked surface of a body as it is in the file; for `part` and the errors see `load_mesh`."""
     path = Path(path)
     bodies = _read(path, options, part)
-    found = [body for body in bodies if body.part == part] if part is not None else bodies
-    if len(found) == 1:
+    matching = [body for body in bodies if body.part == part] if part is not None else bodies
+    if len(matching) == 1:
         with faults(path, _format(path)):
-            return found[0].made()
+            return matching[0].made()
     names = [body.part for body in (bodies if part is None else list_bodies(path, options))]
     shown = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
     if part is None:
         raise MeshError(f"{path}: holds {len(names)} bodies: {shown}. Name one as part=, or read all by load_bodies.")
     if names == [None]:
-        raise MeshError(f"{path}: is one body, and has none called {part!r}. Leave that name out.")
+        raise MeshError(f"{path}: is a single body, and has no body {part!r}. Leave out the name.")
     raise MeshError(f"{path}: has no body {part!r}; there are: {shown}. Choose one of them.")
 
 
 def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> Mesh:
-    """The body that the options make of a surface, see `load_mesh`; a MeshError if it is not usable."""
+    """Make a body of a surface, see `load_mesh`; a MeshError if the surface is not usable."""
     if raw.fault is not None:
         raise raw.fault
     name = str(ref)
     vertices, faces, notes = raw.vertices, raw.faces, raw.notes
     if options.component == "largest" and len(faces):
         check_arrays(vertices, faces, name)
-        connected = faces if options.mend == "never" else joined_at_free_edges(vertices, faces)
-        owner, areas = face_parts(vertices, connected)
+        connected = faces if options.mend == "never" else weld_boundaries(vertices, faces)
+        part, areas = face_parts(vertices, connected)
         if len(areas) > 1:
             n_before = len(vertices)
-            vertices, faces = compact(vertices, faces[owner == int(np.argmax(areas))])
-            kept = f"{len(vertices)} of {n_before} vertices"
-            notes = (*notes, f"kept the largest of {len(areas)} components ({kept})")
-    notes = (*notes, *_rounding(vertices, name))
+            vertices, faces = compact(vertices, faces[part == int(np.argmax(areas))])
+            counts = f"{len(vertices)} of {n_before} vertices"
+            notes = (*notes, f"kept the largest of {len(areas)} components ({counts})")
+    notes = (*notes, *_rounding_notes(vertices, name))
     if options.allow_open and options.mend != "always":
         try:
             return Mesh(vertices, faces, name=name, allow_open=True, notes=notes, unit=raw.unit)
@@ -164,44 +163,46 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
     return mesh.annotated(unit=raw.unit)
 
 
-def _rounding(vertices: Floats, name: str) -> list[str]:
-    """A note of numbers in single precision so far from the origin that their last digits are seen in the shape."""
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused later
+def _rounding_notes(vertices: Floats, name: str) -> list[str]:
+    """Return a note if coordinates in single precision are so far from the origin that rounding changes the shape."""
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are rejected later
         single = vertices.astype(np.float32)
         step = float(np.spacing(np.abs(single).max(initial=0)))
         size = diagonal(vertices) if len(vertices) else 0.0
     if not _COARSE * size < step < size or (single != vertices).any():
         return []
     note = f"coordinates are rounded to {step:.2g}, {step / size:.1%} of the size, so far from the origin"
-    logger.warning("%s: %s. Move the body to the origin before it is written.", name, note)
+    logger.warning("%s: %s. Move the body to the origin before writing the file.", name, note)
     return [note]
 
 
 def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[RawBody]:
-    kind = _format(path)
-    how = _bodies(kind, options)
-    if kind.bodies[0] == "whole":
+    """Read all bodies of a file, or at least the one named `part`."""
+    file_format = _format(path)
+    kind = _body_kind(file_format, options)
+    if file_format.bodies[0] == "whole":
         check_memory(path)
-    with faults(path, kind):  # of the bodies at least the one that is named
-        bodies = list(kind.read(path, replace(options, bodies=how), part if how not in ("whole", "pieces") else None))
-        if how == "whole":
+    part = None if kind in ("whole", "pieces") else part
+    with faults(path, file_format):
+        bodies = list(file_format.read(path, replace(options, bodies=kind), part))
+        if kind == "whole":
             return [joined(bodies)]
-        return pieces(joined(bodies)) if how == "pieces" and how not in kind.bodies else bodies
+        return pieces(joined(bodies)) if kind == "pieces" and kind not in file_format.bodies else bodies
 
 
-def _bodies(kind: Format, options: LoadOptions) -> BodyKind:
-    return options.bodies if options.bodies in (*kind.bodies, "whole", "pieces") else kind.bodies[0]
+def _body_kind(file_format: Format, options: LoadOptions) -> BodyKind:
+    return options.bodies if options.bodies in (*file_format.bodies, "whole", "pieces") else file_format.bodies[0]
 
 
 def _format(path: Path) -> Format:
-    if not os.path.isfile(path):  # False, too, of a name that no file can have
+    if not os.path.isfile(path):  # unlike Path.is_file, it raises nothing for names that no file can have
         if os.path.isdir(path):
-            raise MeshError(f"{path}: a folder; a file expected. Name each file of it.")
+            raise MeshError(f"{path}: expected a file, got a folder. Name each file in it.")
         raise MeshError(f"{path}: no such file. Check the path.")
     if path.stat().st_size == 0:
         raise MeshError(f"{path}: the file is empty (0 bytes). Export it again.")
-    kind = format_of(path)
-    if kind is None:
-        known = ", ".join(suffix for one in FORMATS for suffix in one.suffixes)
-        raise MeshError(f"{path}: not a format that is read. Convert it to one of {known}.")
-    return kind
+    file_format = format_of(path)
+    if file_format is None:
+        suffixes = ", ".join(suffix for known in FORMATS for suffix in known.suffixes)
+        raise MeshError(f"{path}: unknown file format. Convert the file to one of {suffixes}.")
+    return file_format

@@ -1,7 +1,7 @@
-"""The least that makes a body of a surface: as it is, welded, filled, united, smoothed, subdivided, or watertight.
+"""Make a body of a surface by as few repairs as possible: weld, fill, unite, smooth, subdivide, or make watertight.
 
-A mesh that is a body already and not noisy is left as it is, bit for bit. Every step says in the mesh's notes what it
-did, and `repair_steps` tells from the notes which steps were needed.
+A mesh that is a body already and not noisy is returned bit for bit. Every repair is recorded in the notes of the mesh,
+and `repair_steps` returns the repairs that notes record.
 """
 
 import logging
@@ -14,11 +14,11 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 from igps._parameters import check_one_of
-from igps.mesh._tidying import tidied, welded, with_small_holes_filled, without_hidden
-from igps.mesh._union import united, without_walls
-from igps.mesh.denoising import denoised, is_noisy
+from igps.mesh._tidying import drop_hidden_parts, fill_small_holes, tidy, weld
+from igps.mesh._union import drop_inner_walls, unite_parts
+from igps.mesh.denoising import is_noisy, remove_noise
 from igps.mesh.mesh import Mesh, MeshError, check_arrays, check_places, check_size
-from igps.mesh.simplification import subdivided
+from igps.mesh.simplification import subdivide
 from igps.mesh.watertight import crosses_itself, watertight
 
 logger = logging.getLogger(__name__)
@@ -28,14 +28,14 @@ Cavities = Literal["fill", "keep"]
 Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
 MENDING_VERSION = 8
-"""Raised whenever a surface that is mended would give another body: part of the cache keys of such bodies alone."""
+"""Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
 
-# The first words of the notes of each step.
-_WORDS: dict[str, Step] = {step: step for step in get_args(Step)}
-_WORDS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
-# A mesh that is subdivided gets so many vertices for each that is needed: with just enough the last eigenfunctions
-# would be those of the triangles.
-_PLENTY = 4
+# First words of the notes of each step.
+_STARTS: dict[str, Step] = {step: step for step in get_args(Step)}
+_STARTS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
+# A mesh with too few vertices is subdivided to this multiple of the minimum: with just enough vertices the last
+# eigenfunctions would depend on the triangles.
+_SUBDIVISION_FACTOR = 4
 
 
 def mend(
@@ -43,28 +43,28 @@ def mend(
     normals: Floats | None = None, cavities: Cavities = "fill", denoise: bool = True, name: str = "mesh",
     notes: tuple[str, ...] = (),
 ) -> Mesh:  # fmt: skip
-    """A body from a surface in any state, by the least that helps.
+    """Make a body of a surface in any state, by as few repairs as possible.
 
-    In this order, and no further than needed: the surface as it is; coincident vertices welded, degenerate and doubled
-    faces, fins, specks and closed parts inside the body dropped, faces turned; small holes filled; walls inside dropped
-    or closed parts that overlap united, where that makes a body; `watertight`. A surface that is rough with a scanner's
-    noise is smoothed, because noise adds area. One of fewer than `least_vertices` is subdivided, longest edges first.
+    Repairs are made in this order, until the surface is a body: weld coincident vertices, drop degenerate and duplicate
+    faces, and orient the faces; drop fins and specks; fill small holes; drop closed parts inside the body; drop inner
+    walls, or unite overlapping closed parts; make it `watertight`. A body that is rough with scanner noise is smoothed,
+    because noise adds area. A body of fewer than `least_vertices` vertices is subdivided, longest edges first.
 
     Args:
         vertices: (V, 3) positions, any length unit.
-        faces: (F, 3) vertex indices; None or empty for a cloud of points, which is made watertight.
-        how: "auto" for the above; "never" takes bodies only; "always" makes watertight what after welding is not the
-            boundary of one body that does not cross itself, which "auto" does not ask.
-        least_vertices: such as the number of eigenpairs plus two; not with "never".
-        normals: (V, 3) of a cloud of points, if known.
-        cavities: "fill" drops closed parts inside the body; "keep" takes them for the surfaces of hollows, unless it is
-            made watertight.
-        denoise: whether a surface that is rough with noise is smoothed; thin branches made of voxels look like noise.
-        name: what error messages call the surface, usually its file.
-        notes: what was done to it before.
+        faces: (F, 3) vertex indices; None or empty for a point cloud, which is made watertight.
+        how: "auto": as above. "never": accept bodies only. "always": make every surface watertight that, after welding,
+            does not bound one body or intersects itself; "auto" does not check for intersections.
+        least_vertices: minimal number of vertices, such as the number of eigenpairs plus two; ignored with "never".
+        normals: (V, 3) normals of a point cloud, if known.
+        cavities: "fill" drops closed parts inside the body. "keep" makes them the surfaces of hollows, unless the body
+            is made watertight.
+        denoise: smooth a surface that is rough with noise. Thin branches made of voxels look like noise.
+        name: name of the surface in error messages, usually its file.
+        notes: earlier notes of the surface.
 
     Raises:
-        MeshError: the surface is not a body (with "never"), or nothing can be made of it.
+        MeshError: the surface is not a body (with "never"), or no body can be made of it.
     """
     check_one_of(get_args(Mending), how=how)
     if how == "never":
@@ -80,72 +80,72 @@ def mend(
         check_arrays(vertices, faces, name)
         vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
         if len(triangles) == 1:
-            raise MeshError(f"{name}: a single triangle is no body. Check that the export is complete.")
+            raise MeshError(f"{name}: expected a closed surface, got a single triangle. Export it again.")
         corners = vertices[triangles]
         if (corners == corners[:, :1]).all():
-            raise MeshError(f"{name}: all faces are in one point; a surface was expected. Check the file.")
-        check_size(corners.reshape(-1, 3), name)  # before squares of its lengths overflow or vanish
-        mesh = (_remade if how == "always" else _mended)(vertices, triangles, name, cavities == "keep", denoise)
+            raise MeshError(f"{name}: expected a surface, but all faces lie in one point. Check the file.")
+        check_size(corners.reshape(-1, 3), name)  # before squares of lengths overflow or vanish
+        mesh = (_remake if how == "always" else _mend)(vertices, triangles, name, cavities == "keep", denoise)
     n_outer = int(mesh.outer()[1].sum())
     if n_outer < least_vertices:
-        mesh = subdivided(mesh, _PLENTY * least_vertices + len(mesh.vertices) - n_outer)
+        mesh = subdivide(mesh, _SUBDIVISION_FACTOR * least_vertices + len(mesh.vertices) - n_outer)
     for note in mesh.notes:
         logger.info("%s: %s", name, note)
     return mesh.annotated(notes=notes)
 
 
 def repair_steps(notes: Iterable[str]) -> tuple[Step, ...]:
-    """The steps behind the notes of a `Mesh` or `Signature`, in order, each once."""
-    return tuple(dict.fromkeys(step for note in notes for start, step in _WORDS.items() if note.startswith(start)))
+    """Return the repairs that the notes of a `Mesh` or `Signature` record, in order and without repetition."""
+    return tuple(dict.fromkeys(step for note in notes for start, step in _STARTS.items() if note.startswith(start)))
 
 
-def _mended(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
+def _mend(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
     notes: list[str] = []
-    given = vertices, faces
-    hidden = partial(without_hidden, cavities=cavities)
-    for step in (None, welded, tidied, with_small_holes_filled, hidden):
+    original = vertices, faces
+    drop_hidden = partial(drop_hidden_parts, cavities=cavities)
+    for step in (None, weld, tidy, fill_small_holes, drop_hidden):
         if step is not None and len(faces):
             vertices, faces = step(vertices, faces, notes)
         if body := _body(vertices, faces, notes, name, cavities, denoise):
             return body
-    # Of a heap of parts these may make no body: then what they did is given up.
-    for attempt, surface, done in ((without_walls, (vertices, faces), list(notes)), (united, given, [])):
-        if len(surface[1]) and (body := _body(*attempt(*surface, done), done, name, cavities, denoise)):
+    # These steps may give no body if there are many loose parts; their result is then discarded.
+    for step, surface, record in ((drop_inner_walls, (vertices, faces), list(notes)), (unite_parts, original, [])):
+        if len(surface[1]) and (body := _body(*step(*surface, record), record, name, cavities, denoise)):
             return body
-    body = watertight(_smoothed(vertices, faces, notes, denoise), faces, name=name)
+    body = watertight(_smooth(vertices, faces, notes, denoise), faces, name=name)
     return body.annotated(notes=tuple(notes))
 
 
 def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, cavities: bool, denoise: bool) -> Mesh | None:
-    """The body that these are, smoothed if it is noisy; None if they are none."""
+    """Return the body with this surface, smoothed if it is noisy, or None if the surface bounds no body."""
     try:
         mesh = Mesh(vertices, faces, name=name, notes=tuple(notes), cavities=cavities)
     except MeshError:
         return None
-    smooth = _smoothed(mesh.vertices, mesh.faces, notes, denoise)
+    smooth = _smooth(mesh.vertices, mesh.faces, notes, denoise)
     return mesh if smooth is mesh.vertices else replace(mesh, vertices=smooth, notes=tuple(notes))
 
 
-def _remade(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
-    """The surface as it is, welded or smoothed, if it bounds one body then; otherwise what a grid makes of it.
+def _remake(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
+    """Weld and smooth a surface, and make it watertight only if that gives no body, or one that crosses itself.
 
-    A grid would join what lies side by side nearer than a cell, as the coils of a spring do.
+    A grid would join parts that are nearer than a cell, such as the coils of a spring.
     """
     notes: list[str] = []
-    neat = vertices, faces
-    for step in (None, welded):
+    surface = vertices, faces
+    for step in (None, weld):
         if step is not None:
-            neat = step(vertices, faces, notes)
-        if (body := _body(*neat, notes, name, cavities, denoise)) and not crosses_itself(body.vertices, body.faces):
+            surface = step(vertices, faces, notes)
+        if (body := _body(*surface, notes, name, cavities, denoise)) and not crosses_itself(body.vertices, body.faces):
             return body
         notes = []
-    smooth = _smoothed(*neat, notes, denoise)
-    body = watertight(smooth, neat[1], name=name) if notes else watertight(vertices, faces, name=name)
+    smooth = _smooth(*surface, notes, denoise)
+    body = watertight(smooth, surface[1], name=name) if notes else watertight(vertices, faces, name=name)
     return body.annotated(notes=tuple(notes))
 
 
-def _smoothed(vertices: Floats, faces: Integers, notes: list[str], denoise: bool) -> Floats:
+def _smooth(vertices: Floats, faces: Integers, notes: list[str], denoise: bool) -> Floats:
     if not denoise or not len(faces) or not is_noisy(vertices, faces):
         return vertices
     notes.append("smoothed: the surface was rough with noise")
-    return denoised(vertices, faces)
+    return remove_noise(vertices, faces)

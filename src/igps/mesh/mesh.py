@@ -1,4 +1,4 @@
-"""The checked triangle mesh that everything else trusts."""
+"""The triangle mesh: checked when it is made, trusted by all other code."""
 
 import copy
 import logging
@@ -31,21 +31,21 @@ MILLIMETRES: Mapping[str, float] = {
     "centimeters": 10.0, "millimeter": 1.0, "millimeters": 1.0, "micrometer": 1e-3, "micrometers": 1e-3,
     "\\u00B5m": 1e-3, "\u03bcm": 1e-3,  # the second with the Greek letter, not the sign of micro
 }  # fmt: skip
-"""In a unit of length, by the names that files and libraries give it."""
+"""Length of units in millimetres, by their names in files and libraries."""
 
 
 def millimetres(unit: str | None) -> float:
-    """How many millimetres a unit of length has; 1 where the unit is not known."""
+    """Return the length of a unit in millimetres, 1 if the unit is unknown."""
     return MILLIMETRES.get(unit or "mm", 1.0)
 
 
 _REPAIR = 'LoadOptions(mend="auto"), on the command line --mend auto,'
-# A closed surface with less volume than this share of its diagonal's cube is a folded sheet, not a body.
-_FLAT = 1e-10
-# Between these, areas, volumes and eigenfunctions in single precision neither overflow nor lose digits.
-_SMALLEST, _LARGEST = 1e-30, 1e30
-# A mesh so many diagonals away from the origin keeps nine digits of its coordinates, and enough of its triangles.
-_FARTHEST = 1e6
+# A closed surface with less volume, as a share of its diagonal's cube, is a folded sheet, not a body.
+_MIN_VOLUME = 1e-10
+# Between these diagonals, areas, volumes and eigenfunctions in single precision neither overflow nor lose digits.
+_MIN_DIAGONAL, _MAX_DIAGONAL = 1e-30, 1e30
+# Maximal distance from the origin, in diagonals. A mesh there keeps nine digits of its coordinates, which suffice.
+_MAX_DISTANCE = 1e6
 
 
 class MeshError(ValueError):
@@ -55,7 +55,7 @@ class MeshError(ValueError):
         >>> try:
         ...     Mesh(np.zeros((3, 3)), np.array([[0, 1, 5], [0, 2, 5]]))
         ... except MeshError as error:
-        ...     print(error)  # names the file, if it is of one
+        ...     print(error)  # names the file, if there is one
         mesh: 2 faces refer to vertices out of range (0 to 2 exist, 0 to 5 are used). The file is damaged; export it
         again.
     """
@@ -63,7 +63,7 @@ class MeshError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh that bounds a body, checked when made and trusted after.
+    """Triangle mesh that bounds a body, checked when it is made.
 
     Example:
         >>> import trimesh
@@ -74,18 +74,18 @@ class Mesh:
 
     Args:
         vertices: (V, 3) positions, any length unit.
-        faces: (F, 3) vertex indices, counter-clockwise seen from outside. A closed mesh that is inside out is turned,
-            which `notes` records.
-        name: what error messages call the mesh, usually its file.
-        allow_open: accept boundary edges; the winding number then decides what is inside.
-        notes: what was done to the mesh on its way here, in words.
-        unit: of length, such as "mm"; None where it is not known.
-        cavities: accept closed surfaces inside the largest, turned the other way, which bound hollows of the body.
+        faces: (F, 3) vertex indices, counter-clockwise seen from outside. A mesh that is inside out is reversed, and
+            `notes` says so.
+        name: name of the mesh in error messages, usually its file.
+        allow_open: accept boundary edges; the winding number then tells inside from outside.
+        notes: earlier changes of the mesh, in words.
+        unit: unit of length, such as "mm"; None if unknown.
+        cavities: accept closed surfaces inside the largest, oriented inward, which bound hollows of the body.
 
     Raises:
         MeshError: no faces, NaN or infinite vertices, out-of-range or repeated indices, unreferenced vertices,
             non-manifold edges, open boundaries, inconsistent orientation, several components, no volume, or a size or
-            a distance from the origin at which numbers lose their digits.
+            a distance from the origin at which floating-point numbers lose precision.
     """
 
     vertices: Floats
@@ -104,9 +104,9 @@ class Mesh:
         _check_topology(faces, len(vertices), self.name, self.allow_open, self.cavities)
         check_size(vertices, self.name)
         volume = signed_volume(vertices, faces)
-        if abs(volume) <= _FLAT * diagonal(vertices) ** 3:
-            found = f"{volume:.3g} for a bounding box diagonal of {diagonal(vertices):.3g}"
-            flat = f"{self.name}: the surface encloses no volume ({found}); a body was expected."
+        if abs(volume) <= _MIN_VOLUME * diagonal(vertices) ** 3:
+            sizes = f"{volume:.3g} for a bounding box diagonal of {diagonal(vertices):.3g}"
+            flat = f"{self.name}: the surface encloses no volume ({sizes}); a body was expected."
             raise MeshError(f"{flat} Give a flat sheet some thickness.")
         if volume < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
@@ -120,7 +120,7 @@ class Mesh:
 
     @classmethod
     def of(cls, body: Any, spacing: Sequence[float] | None = None) -> Self:
-        """The Mesh of a body as another library keeps it; a Mesh is given back as it is.
+        """Convert a body of another library to a Mesh; a Mesh is returned unchanged.
 
         Example:
             >>> import trimesh
@@ -132,8 +132,8 @@ class Mesh:
 
         Args:
             body: a Mesh; a closed surface as a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, whose
-                polygons are cut into triangles; or voxels of one label, an array (X, Y, Z) or an image of nibabel.
-            spacing: of an array, the sides of a voxel in millimetres; voxels of side 1 without a unit if None.
+                polygons are cut into triangles; or voxels of one label, as an array (X, Y, Z) or a nibabel image.
+            spacing: sides of a voxel of an array in millimetres. None for voxels of side 1 without a unit.
         """
         if isinstance(body, cls):
             return body
@@ -143,11 +143,11 @@ class Mesh:
         return cls(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
 
     def annotated(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Self:
-        """The same mesh with more notes, before its own, and with a unit if one is given; nothing is checked again."""
+        """Return the mesh with `notes` before its own, and with `unit` unless None, without checking it again."""
         return self._changed(notes=(*notes, *self.notes), unit=unit or self.unit)
 
     def numbered_by_faces(self) -> Self:
-        """The same mesh with its vertices in the order in which the faces first use them."""
+        """Return the mesh with its vertices in the order in which the faces first use them."""
         used, first = np.unique(self.faces, return_index=True)
         order = used[np.argsort(first)]
         return self._changed(vertices=self.vertices[order], faces=np.argsort(order)[self.faces])
@@ -159,14 +159,14 @@ class Mesh:
         return other
 
     def outer(self) -> tuple[Self, Booleans]:
-        """The body without its cavities, and which of the vertices (V,) belong to it."""
+        """Return the body without its cavities, and which vertices (V,) belong to its outer surface."""
         surfaces = connected(self.vertices, self.faces) if self.cavities else []
         if len(surfaces) < 2:
             return self, np.ones(len(self.vertices), dtype=bool)
         outermost = int(np.argmax([signed_volume(*surface) for surface in surfaces]))
         vertices, faces = surfaces[outermost]
-        own = components(self.faces, len(self.vertices))[1] == outermost
-        return replace(self, vertices=vertices, faces=faces, cavities=False), own
+        is_outer = components(self.faces, len(self.vertices))[1] == outermost
+        return replace(self, vertices=vertices, faces=faces, cavities=False), is_outer
 
     @cached_property
     def area(self) -> float:
@@ -185,11 +185,11 @@ class Mesh:
 
     @property
     def genus(self) -> int:
-        """Number of handles, of all surfaces together; a MeshError of an open mesh."""
+        """Number of handles of all surfaces together; a MeshError for an open mesh."""
         n_vertices, n_faces = len(self.vertices), len(self.faces)
         if len(undirected_edges(self.faces, n_vertices)[0]) * 2 != n_faces * 3:
             raise MeshError(f"{self.name}: an open surface has no genus; a closed one was expected. Close the holes.")
-        # Euler's formula for C pieces, V − E + F = 2 C − 2 genus, with 2E = 3F
+        # Euler's formula for C surfaces, V - E + F = 2 C - 2 genus, with 2 E = 3 F.
         return components(self.faces, n_vertices)[0] - (n_vertices - n_faces // 2) // 2
 
     def __repr__(self) -> str:
@@ -197,7 +197,7 @@ class Mesh:
 
 
 def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
-    """Raise a MeshError unless the arrays have the shapes of a mesh, indices in range and finite coordinates."""
+    """Raise a MeshError unless the arrays are finite coordinates (V, 3), and faces (F, 3) with indices in range."""
     v, f = np.asarray(vertices), np.asarray(faces)
     check_places(v, name)
     if f.size == 0:
@@ -213,7 +213,7 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
 
 
 def check_places(vertices: NDArray[Any], name: str) -> None:
-    """Raise a MeshError unless these are finite coordinates (V, 3)."""
+    """Raise a MeshError unless the vertices are finite coordinates (V, 3)."""
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MeshError(f"{name}: vertices: expected shape (V, 3), got {vertices.shape}.")
     finite = np.isfinite(vertices).all(axis=1)
@@ -225,19 +225,19 @@ def check_places(vertices: NDArray[Any], name: str) -> None:
 
 
 def check_size(vertices: Floats, name: str) -> None:
-    """Raise a MeshError where a surface is too small, too large or too far away to compute with."""
+    """Raise a MeshError if a surface is too small, too large or too far from the origin to compute with."""
     with np.errstate(over="ignore"):
         length, distance = diagonal(vertices), float(np.abs(vertices).max())
-    if not _SMALLEST <= length <= _LARGEST:
+    if not _MIN_DIAGONAL <= length <= _MAX_DIAGONAL:
         raise MeshError(
-            f"{name}: the diagonal of the bounding box is {length:.3g}; {_SMALLEST:g} to {_LARGEST:g} expected, where "
-            "areas and eigenfunctions can be told in floating point. Scale the mesh, or remove stray vertices."
+            f"{name}: expected a bounding box diagonal from {_MIN_DIAGONAL:g} to {_MAX_DIAGONAL:g}, for which areas "
+            f"stay in floating-point range, got {length:.3g}. Scale the mesh, or remove stray vertices."
         )
-    if distance > _FARTHEST * length:
+    if distance > _MAX_DISTANCE * length:
         raise MeshError(
             f"{name}: the mesh lies {distance / length:.3g} times its own size away from the origin, where its "
-            f"coordinates are mostly rounded off; at most {_FARTHEST:g} times expected. Move it to the origin before "
-            "it is written."
+            f"coordinates are mostly rounded off; at most {_MAX_DISTANCE:g} times is expected. Move the mesh to the "
+            "origin before writing the file."
         )
 
 
@@ -247,27 +247,27 @@ def _check_topology(faces: Integers, n_vertices: int, name: str, allow_open: boo
     start, end = directed_edges(faces)
     edge_of = undirected_edges(faces, n_vertices)[1]
     count = np.bincount(edge_of)
-    n_crowded, n_free = int((count > 2).sum()), int((count == 1).sum())
+    n_non_manifold, n_boundary = int((count > 2).sum()), int((count == 1).sum())
     balance = np.bincount(edge_of, weights=np.where(start < end, 1.0, -1.0), minlength=len(count))
-    n_twisted = int(((count == 2) & (balance != 0)).sum())
+    n_inconsistent = int(((count == 2) & (balance != 0)).sum())
     n_components, _ = components(faces, n_vertices)
     read = f"Read the file with {_REPAIR}"
-    for is_wrong, what in (
+    for is_wrong, message in (
         (n_repeated, f"{n_repeated} faces use a vertex twice. {read} to drop them."),
         (n_unused, f"{n_unused} vertices belong to no face. {read} to drop them."),
-        (n_crowded, f"{n_crowded} non-manifold edges (shared by more than two faces). {read} to drop duplicate faces; "
-                    "if edges remain, separate the sheets that meet there in a modelling tool."),
-        (n_free and not allow_open, f"open surface with {n_free} boundary edges. Close the holes; or read the file "
-         f"with {_REPAIR} if vertices are only duplicated there (as in every STL file); or with allow_open=True, "
+        (n_non_manifold, f"{n_non_manifold} non-manifold edges (shared by more than two faces). {read} to drop "
+         "duplicate faces; if edges remain, separate the sheets that meet there in a modelling tool."),
+        (n_boundary and not allow_open, f"open surface with {n_boundary} boundary edges. Close the holes; or read the "
+         f"file with {_REPAIR} if vertices are only duplicated there (as in every STL file); or with allow_open=True, "
          "--allow_open, to tell inside from outside by the winding number."),
-        (n_twisted, f"inconsistent orientation, {n_twisted} edges are run through twice in the same direction. {read} "
-                    "to orient the faces."),
+        (n_inconsistent, f"inconsistent orientation, {n_inconsistent} edges are traversed twice in the same direction. "
+         f"{read} to orient the faces."),
         (n_components > 1 and not cavities, f"{n_components} connected components; the commute time between them is "
          "infinite. Read the file with LoadOptions(component='largest'), on the command line --component largest, to "
          f"keep one; with {_REPAIR} if coincident vertices are merely not welded; or join them."),
     ):  # fmt: skip
         if is_wrong:
-            raise MeshError(f"{name}: {what}")
+            raise MeshError(f"{name}: {message}")
 
 
 def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
@@ -277,13 +277,13 @@ def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
     for k, (points, triangles) in enumerate(surfaces):
         if k == outer:
             continue
-        patch = face_patches(triangles, len(points))[0]  # two that meet at a vertex are one surface
+        patch = face_patches(triangles, len(points))[0]  # patches that meet in a vertex are one connected surface
         is_outward = any(signed_volume(points, triangles[patch == i]) >= 0 for i in range(patch.max() + 1))
-        # About a point of a cavity's own surface the winding number of that surface is anything from 0 to 1
-        around = {i: winding_number(one[0], one[1], points) for i, one in enumerate(surfaces) if i != k}
+        # The cavity's own surface is left out: at its vertices, its winding number may be anything from 0 to 1.
+        around = {i: winding_number(*surface, points) for i, surface in enumerate(surfaces) if i != k}
         lies_inside = around.pop(outer).min() >= 0.5
         if is_outward or not lies_inside or any(abs(winding).max() > 0.5 for winding in around.values()):
             raise MeshError(
-                f"{name}: one of {len(surfaces)} closed surfaces is no cavity of the body: it is turned outwards, lies "
-                f"outside the largest, or in another cavity. Read the file with {_REPAIR} or without cavities."
+                f"{name}: one of {len(surfaces)} closed surfaces bounds no cavity: it is oriented outward, outside the "
+                f"largest surface, or inside another cavity. Read the file with {_REPAIR} or without cavities."
             )

@@ -1,4 +1,4 @@
-"""Bodies in memory, of other libraries, recognised by their attributes: none of the libraries is imported."""
+"""Convert bodies of other libraries. They are recognised by their attributes, so that no library is imported."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,53 +15,51 @@ from igps.mesh.options import LoadOptions
 
 
 def bodies_of_object(thing: Any, name: str, options: LoadOptions = LoadOptions()) -> list[RawBody]:
-    """The bodies of a surface, see `raw_of`; or of labels: an array, a pair of one and its spacing, or an image."""
+    """Return the bodies of a surface (see `raw_of`), or of labels: an array, a pair (array, spacing), or an image."""
     labels, spacing = thing if isinstance(thing, tuple) and len(thing) == 2 else (thing, None)
     if not _is_volume(labels):
         return [raw_of(thing)[1]]
-    found = label_bodies(volume_in_memory(labels, spacing, name, options), options)
-    return [replace(found[0], part=None)] if [body.part for body in found] == ["1"] else found  # of a mask
+    bodies = label_bodies(volume_in_memory(labels, spacing, name, options), options)
+    is_mask = [body.part for body in bodies] == ["1"]
+    return [replace(bodies[0], part=None)] if is_mask else bodies
 
 
 def raw_of(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, RawBody]:
-    """Name and surface, unchecked, of a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage; or of the one label
-    of an array or an image of nibabel. A TypeError of anything else.
-    """
+    """Return the name and the unchecked surface of a body; for the types see `Mesh.of`, a TypeError for any other."""
     if _is_volume(thing):
         bodies = bodies_of_object((thing, spacing), "volume")
         if len(bodies) > 1:
-            several = f"volume: one label expected, got {', '.join(str(body.part) for body in bodies)[:80]}."
-            raise MeshError(f"{several} Choose one, as labels == 1, or make a SignatureDataset of all.")
+            several = f"volume: expected one label, got {', '.join(str(body.part) for body in bodies)[:80]}."
+            raise MeshError(f"{several} Select one, such as labels == 1, or make a SignatureDataset of all.")
         raw = bodies[0].made()
         if raw.fault is not None:
             raise raw.fault
         return "volume", raw
     metadata, source = getattr(thing, "metadata", None), getattr(thing, "source", None)
-    known = metadata.get("file_name") if isinstance(metadata, dict) else None
-    path = getattr(source, "file_path", None)  # where trimesh keeps that of a file that it read
-    name = str(known or (Path(path).name if path else "mesh"))
+    file_name = metadata.get("file_name") if isinstance(metadata, dict) else None
+    path = getattr(source, "file_path", None)  # trimesh keeps the path of the file here
+    name = str(file_name or (Path(path).name if path else "mesh"))
     if hasattr(thing, "get_arrays_from_intent"):
         points, faces = (thing.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE"))
         if not points or not faces:
-            raise TypeError("the GIFTI image holds no surface: it lacks points or triangles. Give one of a surface.")
+            raise TypeError("mesh: expected a GIFTI image of a surface, got one without points or triangles.")
         return name, RawBody(np.asarray(points[0].data, np.float64), np.asarray(faces[0].data, np.int64), unit="mm")
     if hasattr(thing, "points") and hasattr(thing, "faces"):
         vertices = np.asarray(thing.points, np.float64)
-        return name, RawBody(
-            vertices, flat_triangles(*corners_of_rows(np.asarray(thing.faces, dtype=np.int64)), vertices)
-        )
+        corners, n_corners = corners_of_rows(np.asarray(thing.faces, dtype=np.int64))
+        return name, RawBody(vertices, flat_triangles(corners, n_corners, vertices))
     if hasattr(thing, "vertices") and hasattr(thing, "faces"):
         unit = getattr(thing, "units", None) or getattr(thing, "unit", None)
         vertices, triangles = np.asarray(thing.vertices, np.float64), np.asarray(thing.faces, np.int64)
         return name, RawBody(vertices, triangles, unit=unit, notes=getattr(thing, "notes", ()))
-    given = f"{type(thing).__module__}.{type(thing).__qualname__}"
+    kind = f"{type(thing).__module__}.{type(thing).__qualname__}"
     raise TypeError(
-        f"mesh: expected a Mesh, a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage or labels, got {given}. "
+        f"mesh: expected a Mesh, a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage or labels, got {kind}. "
         "Read a file with igps.load_mesh, or pass Mesh(vertices, faces)."
     )
 
 
 def _is_volume(thing: Any) -> bool:
-    """Whether it is an array of voxels, or an image of nibabel of them."""
+    """Return whether an object is an array of voxels or a nibabel image."""
     is_image = hasattr(thing, "dataobj") and hasattr(thing, "affine")
     return is_image or (isinstance(thing, np.ndarray) and thing.ndim == 3)

@@ -1,4 +1,4 @@
-"""How a file is read, and which bodies it gives."""
+"""Options for reading a file as bodies."""
 
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
@@ -10,12 +10,12 @@ Component = Literal["largest"]
 BodyKind = Literal["whole", "labels", "objects", "pieces", "chains", "models", "assembly"]
 
 MAX_UNPACKED = 2**30
-"""Bytes that a compressed file, an archive or repeated objects may unpack to, by default."""
+"""Default limit, in bytes, of the unpacked size of a compressed file, an archive or repeated objects."""
 
 
 @dataclass(frozen=True)
 class LoadOptions:
-    """How a file is read.
+    """Options for reading a file: what counts as a body, and how its surface is repaired.
 
     Example:
         >>> import tempfile, trimesh
@@ -28,21 +28,21 @@ class LoadOptions:
         ('welded 28 coincident vertices',)
 
     Args:
-        mend: "auto" does the least that makes a body of the surface; "never" refuses what is no body;
-            "always" makes every surface watertight that does not bound one body without crossing itself, for
-            collections of mixed quality.
+        mend: "auto" makes as few repairs as possible; "never" raises an error for a surface that bounds no body;
+            "always" makes every surface watertight that does not bound one body or crosses itself, for collections of
+            mixed quality.
         component: "largest" keeps only the connected component of the largest area.
-        allow_open: accept open boundaries; the winding number then decides what is inside.
-        bodies: what of a file is a body. "whole": all of it; "labels" of a volume; "objects" of a scene, solids of a
-            CAD file, files of an archive; "pieces": what is not connected; "chains", "models" or the "assembly" of a
-            molecule. None takes labels, chains, or else the whole; so does a kind that the format does not have.
-        max_unpacked: bytes that a file may unpack to.
-        names: a table of the names of labels, see `read_label_names`; None for those of the volume, or beside it.
-        threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
-        cavities: "fill" fills hollow bodies; "keep" lets the surfaces of their hollows bound them too.
+        allow_open: accept open boundaries; the winding number then tells inside from outside.
+        bodies: what counts as a body. "whole": the whole file; "labels" of a volume; "objects" of a scene, solids of a
+            CAD file, files of an archive; "pieces": connected components; "chains", "models" or the "assembly" of a
+            molecule. None, or a kind that the format does not have: labels, chains, or else the whole file.
+        max_unpacked: maximal unpacked size of a file, in bytes.
+        names: file with a table of label names, see `read_label_names`; None for the names in or beside the volume.
+        threshold: minimal probability of the voxels of a body, in volumes of probabilities.
+        cavities: "fill" fills hollow bodies; "keep" makes the surfaces of hollows part of their boundary.
 
     Raises:
-        ValueError: an unknown value.
+        ValueError: an invalid value.
     """
 
     mend: Mending = "auto"
@@ -64,7 +64,8 @@ class LoadOptions:
             raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
 
     def as_dict(self) -> dict[str, object]:
-        """The options on which a body depends, for the keys of caches; the later ones only where not default."""
-        later = {"bodies": None, "threshold": 0.5, "cavities": "fill"}
+        """Return the options on which a body depends, for cache keys."""
+        # Options that were added later are left out at their defaults, which keeps older keys valid.
+        added = {"bodies": None, "threshold": 0.5, "cavities": "fill"}
         options = {name: value for name, value in asdict(self).items() if name not in ("max_unpacked", "names")}
-        return {name: value for name, value in options.items() if name not in later or value != later[name]}
+        return {name: value for name, value in options.items() if name not in added or value != added[name]}

@@ -1,14 +1,14 @@
-"""From any triangles, or points, to the closed surface of one body: distances, a flood, marching cubes.
+"""Make the closed surface of one body from any triangles or points: distances, a flood, marching cubes.
 
-What a flood from outside cannot reach is the body; `_outside` says which openings it passes. The grid's points carry
-their exact distance to the triangles, negative in the body, so that the surface of a solid lies where it was; only what
-has no inside, a sheet or a wire, gets a thickness of about a cell. Marching cubes draw the surface (Lewiner et al.
-2003), and quadrics simplify it (Garland and Heckbert 1997).
+The body is what a flood from outside does not reach; `_outside` decides which openings the flood passes. The grid
+points have exact distances to the triangles, negative inside the body, so the surface of a solid stays in place. Only
+sheets and wires, which enclose nothing, get a thickness of about a cell. Marching cubes extract the surface (Lewiner et
+al. 2003), and quadrics simplify it (Garland and Heckbert 1997).
 
-**Several pieces** become one body: those of less than a five-hundredth of the volume are dropped, the others joined by
-straight bars of about a cell's radius, each where the gap is narrowest (a minimum spanning tree of the gaps). Joined
-pieces retrieve nearly as the whole body does; the spectra of all pieces side by side tell how a body was cut, and the
-largest piece alone is another body: both retrieve far worse.
+**Several pieces** become one body: pieces of less than 1/500 of the volume are dropped, and the others are joined by
+straight bars of about a cell's radius where the gaps are narrowest (a minimum spanning tree of the gaps). Retrieval
+with joined pieces is nearly as good as with the whole body. The spectra of all pieces side by side depend on how the
+body was cut, and the largest piece alone is another body: both retrieve far worse.
 """
 
 from dataclasses import replace
@@ -19,22 +19,22 @@ from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
 from igps._parameters import check_at_least
-from igps.mesh._isosurface import level_surface, simplified
-from igps.mesh._level_set import Grid, cell_sizes, distances, joined, level_set, rounded
-from igps.mesh._outside import OrientedSurface, outside_of
+from igps.mesh._isosurface import level_surface, simplify_surface
+from igps.mesh._level_set import Grid, cell_sizes, distances, join_pieces, level_set, merge_near_vertices
+from igps.mesh._outside import OrientedSurface, find_outside
 from igps.mesh.mesh import Mesh, MeshError, check_places
 from igps.mesh.surface import diagonal, face_areas, largest, longest_side, unit
 
-# Groups of triangles of less than this share of the area are specks, if they are apart in a grid of so many cells.
+# Groups of triangles of less than this share of the area are specks, if a grid of this many cells per side separates
+# them from all others.
 _SPECK_AREA, _SPECK_CELLS = 2e-3, 64
-# Volume over area in cells, half a rod's radius. Cells are made so small that long thin bodies have the first, unless
-# that makes too many; bodies with less than the second get a note that they are coarse.
-_THICK, _COARSE = 1.5, 0.75
-# Faces beyond which vertices are first rounded to a quarter of a cell, so that time and memory stay bounded.
-_MANY_FACES = 400_000
-# Points of a cloud beyond which they are thinned out first.
-_MANY_POINTS = 200_000
-# Points that are so much less spread across than along are on a line, whatever single precision did to them.
+# Thickness (volume over area, half a rod's radius) in cells: the grid is refined up to the first as far as its size
+# allows, and bodies below the second get a note that they are coarse.
+_FINE, _COARSE = 1.5, 0.75
+# The vertices of meshes with more faces are first merged within quarters of a cell, to bound time and memory.
+_MAX_FACES = 400_000
+_MAX_POINTS = 200_000  # larger clouds are thinned out first
+# Points with a smaller ratio of spread across to spread along lie on a line, up to single precision.
 _LINE = 1e-5
 
 
@@ -42,22 +42,22 @@ def watertight(
     vertices: Floats, faces: Integers | None = None, *, normals: Floats | None = None, resolution: int = 96,
     max_vertices: int | None = 5000, name: str = "mesh",
 ) -> Mesh:  # fmt: skip
-    """The closed, oriented, edge-manifold surface of one body from triangles in any state, or from points.
+    """Make the closed, oriented, edge-manifold surface of one body from triangles in any state, or from points.
 
-    Solids keep their surface, sheets get about a cell, small openings are closed, and what cannot be seen from outside
-    is filled.
+    Solids keep their surface, sheets get about a cell of thickness, small openings are closed, and everything that is
+    not visible from outside is filled.
 
     Args:
         vertices: (V, 3) positions, any length unit.
-        faces: (F, 3) vertex indices in any order and orientation, or None for a cloud of points.
-        normals: (V, 3) of a cloud, of any length and either sign; estimated from the neighbours if None.
-        resolution: the grid has about as many cells as a cube of this side. Flat and long bodies get up to twice as
-            many along their longest side, and closed ones that are thin more, as long as there are no more in all.
-        max_vertices: the surface is simplified to so many; None keeps all.
-        name: what error messages call the surface.
+        faces: (F, 3) vertex indices in any order and orientation, or None for a point cloud.
+        normals: (V, 3) normals of a point cloud, of any length and either sign; estimated from the neighbours if None.
+        resolution: the grid has about as many cells as a cube of this side. Flat and long bodies get up to
+            2 * `resolution` cells along their longest side; thin closed bodies get more, with no more cells in all.
+        max_vertices: approximate maximal number of vertices after simplification; None keeps all.
+        name: name of the surface in error messages.
 
     Raises:
-        MeshError: there is no surface (fewer than ten points, no triangle with an area).
+        MeshError: there is no surface (fewer than ten points, or no triangle with an area).
     """
     check_at_least(8, resolution=resolution)
     vertices = np.asarray(vertices, dtype=np.float64)
@@ -72,47 +72,47 @@ def watertight(
     if not len(faces):
         flat = f"{name}: no triangle has an area; a surface was expected."
         raise MeshError(f"{flat} If the file holds lines, give them thickness.")
-    faces = _without_specks(vertices, faces, notes)
-    usual, least = cell_sizes(vertices, faces, resolution, spacing)
-    grid = Grid.around(vertices, faces, least)
+    faces = _drop_specks(vertices, faces, notes)
+    default_size, min_size = cell_sizes(vertices, faces, resolution, spacing)
+    grid = Grid.around(vertices, faces, min_size)
     vertices = grid.to_cells(vertices)
-    if len(faces) > _MANY_FACES:
-        vertices, faces = rounded(vertices, faces)
+    if len(faces) > _MAX_FACES:
+        vertices, faces = merge_near_vertices(vertices, faces)
     surface = OrientedSurface.of(vertices, faces)
-    thickness = surface.thickness * least if surface.is_nearly_closed else np.inf
-    cell = float(np.clip(thickness / _THICK, least, usual))
+    thickness = surface.thickness * min_size if surface.is_nearly_closed else np.inf
+    cell = float(np.clip(thickness / _FINE, min_size, default_size))
     if thickness < _COARSE * cell:
         notes.append(f"coarse: about {4 * thickness / cell:.1f} cells thick")
-    if cell > least:
+    if cell > min_size:
         finest, grid = grid, Grid.around(grid.from_cells(vertices), faces, cell)
-        vertices, of_surface = (grid.to_cells(finest.from_cells(places)) for places in (vertices, surface.vertices))
-        surface = replace(surface, vertices=of_surface)
+        vertices, oriented = (grid.to_cells(finest.from_cells(points)) for points in (vertices, surface.vertices))
+        surface = replace(surface, vertices=oriented)
     distance, nearest = distances(vertices, faces, grid.shape)
-    outside, closed = outside_of(distance, surface)
-    if closed:
-        notes.append(f"closed {closed} openings")
-    field = joined(level_set(distance, nearest, outside, surface), notes)
+    outside, n_closed = find_outside(distance, surface)
+    if n_closed:
+        notes.append(f"closed {n_closed} openings")
+    field = join_pieces(level_set(distance, nearest, outside, surface), notes)
     vertices, faces = largest(*level_surface(field, name))
     notes.append(f"made watertight on a grid of {' x '.join(str(n) for n in grid.shape)} cells")
     if max_vertices is not None:
-        vertices, faces = simplified(vertices, faces, max_vertices)
+        vertices, faces = simplify_surface(vertices, faces, max_vertices)
     return Mesh(grid.from_cells(vertices), faces, name=name, notes=tuple(notes))
 
 
 def crosses_itself(vertices: Floats, faces: Integers) -> bool:
-    """Whether any two faces have points in common beyond their common vertices and edge, by exact predicates."""
+    """Return whether any two faces intersect outside their common vertices and edges, by exact predicates."""
     from igl.predicates import find_self_intersections
 
     surface = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
     return bool(find_self_intersections(*surface, first_only=True)[0])
 
 
-def _without_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Integers:
-    """The faces without groups that lie apart from everything else and have next to no area."""
+def _drop_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Integers:
+    """Drop groups of faces that are separate from all others and have next to no area."""
     corners = vertices[faces]
     low, side = corners.min(axis=(0, 1)), longest_side(corners.reshape(-1, 3))
     cell = side / _SPECK_CELLS
-    points, face = _spread(corners, cell)
+    points, face = _sample_triangles(corners, cell)
     index = np.floor((points - low) / cell).astype(np.int64) + 1
     occupied = np.zeros(index.max(axis=0) + 2, dtype=bool)
     occupied[tuple(index.T)] = True
@@ -121,59 +121,59 @@ def _without_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Inte
     group[face] = label[tuple(index.T)]
     area = face_areas(vertices, faces)
     share = np.bincount(group, weights=area, minlength=count + 1) / area.sum()
-    keep = (share >= _SPECK_AREA)[group]
-    # Where everything is in pieces that small, none is a speck.
-    if keep.all() or area[keep].sum() < 0.98 * area.sum():
+    is_kept = (share >= _SPECK_AREA)[group]
+    # If much of the area is in such small groups, none is a speck.
+    if is_kept.all() or area[is_kept].sum() < 0.98 * area.sum():
         return faces
-    notes.append(f"dropped {len(np.unique(group[~keep]))} specks")
-    return _without_specks(vertices, faces[keep], notes)
+    notes.append(f"dropped {len(np.unique(group[~is_kept]))} specks")
+    return _drop_specks(vertices, faces[is_kept], notes)
 
 
-def _spread(corners: Floats, spacing: float) -> tuple[Floats, Integers]:
-    """Points on triangles, at most about `spacing` apart, and the triangle of each."""
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    n = np.clip(np.ceil(edges / spacing), 1, 4 * _SPECK_CELLS).astype(np.int64)
+def _sample_triangles(corners: Floats, spacing: float) -> tuple[Floats, Integers]:
+    """Return points on triangles, at most about `spacing` apart, and the triangle of each point."""
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    n_parts = np.clip(np.ceil(longest / spacing), 1, 4 * _SPECK_CELLS).astype(np.int64)
     points, owner = [], []
-    for k in np.unique(n):
-        i, j = np.nonzero(np.add.outer(np.arange(k + 1), np.arange(k + 1)) <= k)
-        weights = np.stack([i, j, k - i - j], axis=1) / k
-        of_n = np.nonzero(n == k)[0]
-        points.append(np.einsum("pi,fij->fpj", weights, corners[of_n]).reshape(-1, 3))
-        owner.append(np.repeat(of_n, len(weights)))
+    for n in np.unique(n_parts):
+        i, j = np.nonzero(np.add.outer(np.arange(n + 1), np.arange(n + 1)) <= n)
+        weights = np.stack([i, j, n - i - j], axis=1) / n
+        triangle = np.nonzero(n_parts == n)[0]
+        points.append(np.einsum("pi,fij->fpj", weights, corners[triangle]).reshape(-1, 3))
+        owner.append(np.repeat(triangle, len(weights)))
     return np.concatenate(points), np.concatenate(owner)
 
 
 def splats(points: Floats, normals: Floats | None, resolution: int, name: str) -> tuple[Floats, Integers, float]:
-    """A disc (a hexagon) around each point of a cloud, and the spacing of the points."""
+    """Return the vertices and faces of hexagonal discs around the points of a cloud, and the spacing of the points."""
     if len(points) < 10:
-        few = f"{name}: a cloud of {len(points)} points; at least 10 are needed for a surface."
+        few = f"{name}: expected at least 10 points for a surface, got {len(points)}."
         raise MeshError(f"{few} Check that the file holds faces, or scan more points.")
     side = longest_side(points)
     if side == 0:
-        raise MeshError(f"{name}: all points are in one place; a surface was expected. Check the file.")
-    from_middle = points - points.mean(axis=0)
-    _, across, along = np.linalg.eigvalsh(from_middle.T @ from_middle)
+        raise MeshError(f"{name}: expected a surface, but all points coincide. Check the file.")
+    centred = points - points.mean(axis=0)
+    _, across, along = np.linalg.eigvalsh(centred.T @ centred)
     if across < _LINE**2 * along:
-        line = f"{name}: all {len(points)} points are on one line; a surface was expected."
+        line = f"{name}: expected a surface, but all {len(points)} points lie on one line."
         raise MeshError(f"{line} If the file holds lines, give them thickness.")
-    if len(points) > _MANY_POINTS:
-        # One point in each quarter of a cell.
+    if len(points) > _MAX_POINTS:
+        # Keep one point in each quarter of a cell.
         lattice = np.floor((points - points.min(axis=0)) / (side / (4 * resolution))).astype(np.int64)
         _, first = np.unique(lattice, axis=0, return_index=True)
         points, normals = points[first], None if normals is None else normals[first]
-    away, neighbours = cKDTree(points).query(points, k=min(13, len(points)))
-    # A disc reaches the third ring of neighbours or so in an even cloud; where points are rare, it does not run wild.
-    own = away[:, min(6, away.shape[1] - 1)]
-    spacing = float(np.median(own))
-    radius = np.clip(own, spacing / 2, 2 * spacing)
+    distance, neighbours = cKDTree(points).query(points, k=min(13, len(points)))
+    # In an even cloud, a disc reaches about the third ring of neighbours; its radius is bounded where points are rare.
+    reach = distance[:, min(6, distance.shape[1] - 1)]
+    spacing = float(np.median(reach))
+    radius = np.clip(reach, spacing / 2, 2 * spacing)
     if normals is None:
         local = points[neighbours] - points[neighbours].mean(axis=1, keepdims=True)
         _, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", local, local))
         normals = axes[:, :, 0]
     normals = np.asarray(normals, dtype=np.float64)
     if normals.shape != points.shape or not np.isfinite(normals).all():
-        raise MeshError(f"{name}: normals: expected finite numbers of shape {points.shape}. Leave them out.")
-    # Two directions of the plane: the axis least along the normal gives the first.
+        raise MeshError(f"{name}: normals: expected finite numbers of shape {points.shape}. Leave out the normals.")
+    # Two directions in the plane, computed from the axis that is least parallel to the normal.
     axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     u = unit(np.cross(normals, axis))
     v = unit(np.cross(normals, u))

@@ -8,18 +8,17 @@ from igps.mesh.surface import has_area
 
 
 def winding_number(vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]) -> Floats:
-    """Winding number (P,) of a mesh about points (P, 3): the solid angles of its faces over 4π, exact to rounding.
+    """Return the winding numbers (P,) of a mesh about points (P, 3): the solid angle of its faces over 4π.
 
-    1 inside and 0 outside a closed, outward oriented surface; fractions for an open one. On the surface itself the
-    value is one of those beside it, or between. By libigl (Jacobson, Kavan and Sorkine-Hornung 2013).
-
-    A ValueError of an invalid shape, index or value.
+    They are 1 inside and 0 outside a closed, outward oriented surface, and fractions for an open one; on the surface
+    itself they lie between the values on both sides. They are exact up to rounding, by libigl (Jacobson, Kavan and
+    Sorkine-Hornung 2013). A ValueError is raised for invalid arrays, and if all faces are flat.
     """
     import igl
 
     vertices, faces, points = checked_places(vertices, faces, points)
     if not has_area(vertices[faces]).any():
-        raise ValueError("faces: expected at least one face with an area, got flat ones only; check the mesh")
+        raise ValueError("faces: expected at least one face with an area, got flat faces only; check the mesh")
     if not len(points):
         return np.zeros(0)
     return np.asarray(igl.winding_number(vertices, faces, points))
@@ -28,16 +27,18 @@ def winding_number(vertices: NDArray[np.floating], faces: NDArray[np.integer], p
 def checked_places(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
 ) -> tuple[Floats, Integers, Floats]:
-    """The vertices of a mesh, its faces and points, in double precision and 64 bits; a ValueError if one is invalid."""
-    at, index, where = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
-    for name, array in (("vertices", at), ("faces", index), ("points", where)):
+    """Return the vertices and faces of a mesh, and points, as float64 and int64; a ValueError for invalid arrays."""
+    v, f, p = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
+    for name, array in (("vertices", v), ("faces", f), ("points", p)):
         if array.ndim != 2 or array.shape[1] != 3:
             raise ValueError(f"{name}: expected shape (n, 3), got {array.shape}")
-    for name, array in (("vertices", at), ("points", where)):
+    for name, array in (("vertices", v), ("points", p)):
         if not np.isfinite(array).all():
             raise ValueError(f"{name}: expected finite coordinates, got NaN or infinity; remove those rows")
-    if not np.issubdtype(index.dtype, np.integer):
-        raise ValueError(f"faces: expected integer vertex indices, got {index.dtype}")
-    if len(index) == 0 or index.min() < 0 or index.max() >= len(at):
-        raise ValueError(f"faces: expected at least one face, with indices in [0, {len(at)}), got another")
-    return at, np.array(index, np.int64, order="C"), where
+    if not np.issubdtype(f.dtype, np.integer):
+        raise ValueError(f"faces: expected integer vertex indices, got {f.dtype}")
+    if len(f) == 0:
+        raise ValueError("faces: expected at least one face, got none")
+    if f.min() < 0 or f.max() >= len(v):
+        raise ValueError(f"faces: expected indices in [0, {len(v)}), got {f.min()} to {f.max()}")
+    return v, np.array(f, np.int64, order="C"), p

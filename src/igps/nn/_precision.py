@@ -1,4 +1,4 @@
-"""Matrix products whose rounding no setting of the process may coarsen."""
+"""Matrix products in full precision, whatever the settings of the process allow."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -9,25 +9,25 @@ import torch
 from igps._threads import ProcessSetting
 
 
-def _change() -> Callable[[], None]:
-    """Allow no TF32 or bfloat16 in float32 products; what restores the settings as they were.
+def _enable() -> Callable[[], None]:
+    """Forbid TF32 and bfloat16 in float32 products, and return a function that restores the settings.
 
-    PyTorch keeps them twice: as `torch.set_float32_matmul_precision` leaves them, and, from 2.9 on, for each backend.
-    The first cannot be read where the second contradicts it.
+    PyTorch has two kinds of settings: the common one of `torch.set_float32_matmul_precision`, and, since 2.9, one for
+    each backend. The common one cannot be read while those of the backends contradict it.
     """
     common: str | None
     try:
         common = torch.get_float32_matmul_precision()
     except RuntimeError:
         common = None
-    backends = (torch.backends.cuda, torch.backends.mkldnn)
-    known = [one for one in backends if hasattr(getattr(one, "matmul", None), "fp32_precision")]
-    before = [(backend, _own_precision(backend)) for backend in known]
-    if common == "highest" and all(_is_full(backend) for backend in known):
+    candidates = (torch.backends.cuda, torch.backends.mkldnn)
+    backends = [x for x in candidates if hasattr(getattr(x, "matmul", None), "fp32_precision")]
+    before = [(backend, _own_precision(backend)) for backend in backends]
+    if common == "highest" and all(_is_full(backend) for backend in backends):
         return lambda: None
     if common is not None:
         torch.set_float32_matmul_precision("highest")
-    for backend in known:
+    for backend in backends:
         if not _is_full(backend):
             backend.matmul.fp32_precision = "ieee"
 
@@ -46,21 +46,22 @@ def _is_full(backend: Any) -> bool:
 
 
 def _own_precision(backend: Any) -> str:
-    # It reads as that of the backend, or of all backends, where it has none of its own, and must have none again.
+    # A backend without a setting of its own reports the inherited one; restoring that would turn it into its own.
     precision = backend.matmul.fp32_precision
-    of_all = getattr(torch.backends, "fp32_precision", "none")
-    return "none" if precision == getattr(backend, "fp32_precision", of_all) else precision
+    inherited = getattr(backend, "fp32_precision", getattr(torch.backends, "fp32_precision", "none"))
+    return "none" if precision == inherited else precision
 
 
-_setting = ProcessSetting(_change)
+_setting = ProcessSetting(_enable)
 
 
 def full_precision() -> AbstractContextManager[None]:
-    """A context in which float32 matrix products are computed in float32.
+    """Return a context in which float32 matrix products are computed in float32.
 
-    `torch.set_float32_matmul_precision("medium")`, and the settings of `torch.backends` like it, allow TF32 or
-    bfloat16: a distance from inner products would be wrong by 10⁻³ to 10⁻² of the largest, and fall into another bin.
-    The settings belong to the process: while a thread is inside, they hold for all threads; when the last one leaves,
-    they are restored. What PyTorch traces for `torch.compile` or `torch.export` runs later, under the settings of then.
+    `torch.set_float32_matmul_precision("medium")` and similar settings of `torch.backends` allow TF32 or bfloat16. A
+    distance from inner products would then be wrong by 10⁻³ to 10⁻² of the largest, and fall into another bin.
+
+    While any thread is inside, the settings hold for all threads of the process; the last thread that leaves restores
+    them. Code traced by `torch.compile` or `torch.export` runs later, under the settings of that time.
     """
     return nullcontext() if torch.compiler.is_compiling() else _setting()

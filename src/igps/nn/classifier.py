@@ -9,11 +9,11 @@ from igps.retrieval.distances import square_root
 
 
 class Classifier(nn.Module):
-    """The logits of classes, linear in the roots of a descriptor's cells, which are normalised over the batch.
+    """A linear classifier on the square roots of a descriptor's cells, with batch normalisation.
 
-    With `nn.CrossEntropyLoss` and any optimiser it is trained as any network. A descriptor without parameters is as
-    fixed as it was; learnable axes and filters are trained along. For labelled folders without a training loop, see
-    `igps.fit`.
+    Train it like any network, with `nn.CrossEntropyLoss` and an optimiser. Learnable axes and filters of the descriptor
+    are trained as well; a descriptor without parameters stays fixed. To classify labelled folders without a training
+    loop, see `igps.fit`.
 
     Example:
         >>> from igps import descriptor
@@ -21,8 +21,8 @@ class Classifier(nn.Module):
         1923
 
     Args:
-        descriptor: of histograms, or of other numbers ≥ 0.
-        n_classes: of logits.
+        descriptor: gives histograms, or other numbers ≥ 0.
+        n_classes: number of logits.
         dropout: share of cells dropped in training.
     """
 
@@ -31,11 +31,11 @@ class Classifier(nn.Module):
         check_at_least(2, n_classes=n_classes)
         self.descriptor = descriptor
         n = descriptor.n_features
-        # One scale for all cells would leave most of them without weight
+        # Normalised cell by cell: with one scale for all, most cells would have no influence.
         self.layers = nn.Sequential(nn.BatchNorm1d(n, affine=False), nn.Dropout(dropout), nn.Linear(n, n_classes))
 
     def forward(self, batch: SignatureBatch) -> Tensor:
-        """(N, n_classes) logits of N shapes."""
+        """Return the logits (N, n_classes) of N shapes."""
         cells = self.descriptor(batch).flatten(1).to(next(self.layers.parameters()).dtype)
         logits: Tensor = self.layers(square_root(cells))
         return logits

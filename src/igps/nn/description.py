@@ -36,9 +36,9 @@ def describe(
     n_workers: int | None = None,
     progress: bool = False,
 ) -> Tensor:
-    """Descriptions of the meshes of a dataset, in evaluation mode, without gradients, on the descriptor's device.
+    """Describe the meshes of a dataset, in evaluation mode, without gradients, on the descriptor's device.
 
-    Signatures that are not cached are computed on the way; `dataset.precompute()` does that on all cores.
+    Signatures that are not cached are computed first; `dataset.precompute()` does this on all cores.
 
     Example:
         >>> import tempfile, trimesh
@@ -55,111 +55,110 @@ def describe(
     Args:
         dataset: N meshes.
         descriptor: a `Descriptor`, or any module from `SignatureBatch` to (N, ...).
-        failures: a list, to which meshes that cannot be described are added, in order; they have no row in the result,
-            see `SignatureDataset.usable`. None to raise at the first.
-        cache_tag: all that descriptions depend on beside Signatures, see `igps.descriptors.fingerprint.cache_tag`. What
-            has been described under the same tag is read from the cache, and what is described now is kept there. None
-            to describe all.
-        batch_size: shapes at a time.
+        failures: a list that receives the meshes that cannot be described, in order; they have no row in the result,
+            see `SignatureDataset.usable`. If None, the first failure raises an error.
+        cache_tag: identifies everything but the Signatures that descriptions depend on, see
+            `igps.descriptors.fingerprint.cache_tag`. Descriptions are read from the cache under this tag, and new ones
+            are written to it. None disables the cache.
+        batch_size: number of shapes that are described at once.
         n_workers: threads, or processes for descriptors that work in NumPy; all cores if None.
-        progress: show a bar.
+        progress: show a progress bar.
 
     Returns:
         (N, ...) on the CPU.
 
     Raises:
-        MeshError: a mesh that cannot be described, if `failures` is None; or none that can.
+        MeshError: a mesh cannot be described and `failures` is None, or no mesh can be described.
         ValueError: the Signatures lack what the descriptor needs, or there is no mesh.
     """
     if isinstance(descriptor, Descriptor):
         descriptor.requirements.check_config(dataset.config)
     if not isinstance(descriptor, nn.Module):
-        given = f"igps.descriptor({descriptor!r})" if isinstance(descriptor, str) else "a Descriptor"
-        raise TypeError(f"descriptor: expected a module, got {descriptor!r}. Give {given}.")
+        remedy = f"igps.descriptor({descriptor!r})" if isinstance(descriptor, str) else "a Descriptor"
+        raise TypeError(f"descriptor: expected a module, got {descriptor!r}. Give {remedy}.")
     if not len(dataset):
         raise ValueError("dataset: expected at least one mesh to describe, got none.")
-    kept = None if cache_tag is None else _DescriptionStore(dataset, cache_tag)
-    found = {} if kept is None else kept.found()
+    cache = None if cache_tag is None else _DescriptionStore(dataset, cache_tag)
+    descriptions = {} if cache is None else cache.read()
     failed: dict[int, Failure] = {}
-    missing = [i for i in range(len(dataset)) if i not in found]
+    missing = [i for i in range(len(dataset)) if i not in descriptions]
     if isinstance(descriptor, BodyDescriptor):
-        described = _on_processes(dataset, descriptor, missing, n_workers)
+        results = _on_processes(dataset, descriptor, missing, n_workers)
     else:
         chunks = [missing[i : i + batch_size] for i in range(0, len(missing), batch_size)]
-        described = _on_threads(dataset, descriptor, chunks, n_workers)
+        results = _on_threads(dataset, descriptor, chunks, n_workers)
     with (
         evaluation_mode(descriptor),
-        tqdm(desc="descriptions", total=len(dataset), initial=len(found), disable=not progress) as bar,
-        contextlib.closing(described),
+        tqdm(desc="descriptions", total=len(dataset), initial=len(descriptions), disable=not progress) as bar,
+        contextlib.closing(results),
     ):
-        for indices, outcomes in described:
+        for indices, outcomes in results:
             bar.update(len(indices))
             for i, outcome in zip(indices, outcomes, strict=True):
                 if not isinstance(outcome, Failure):
-                    found[i] = outcome
-                    if kept is not None:
-                        kept.keep(i, outcome)
+                    descriptions[i] = outcome
+                    if cache is not None:
+                        cache.write(i, outcome)
                 elif failures is None:
                     raise MeshError(outcome.error)
                 else:
                     failed[i] = outcome
     if failures is not None:
         failures += [failed[i] for i in sorted(failed)]
-    if not found:
+    if not descriptions:
         raise MeshError(failed[0].error)
-    return torch.from_numpy(np.stack([found[i] for i in sorted(found)]))
+    return torch.from_numpy(np.stack([descriptions[i] for i in sorted(descriptions)]))
 
 
 def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
-    """Fit the centres of axes by quantiles to the samples of a collection; whether there were such axes.
+    """Fit the centres of quantile axes to the samples of a collection, and return whether any axis needed it.
 
-    What has its centres keeps them. Of each body as many samples count, the first 500. A ValueError where the samples
-    have no such attribute.
+    Fitted axes stay unchanged. Each body contributes its first 500 samples. A missing attribute raises a ValueError.
     """
-    axes = [one for one in descriptor.modules() if isinstance(one, Attribute) and not one.is_fitted]
+    axes = [axis for axis in descriptor.modules() if isinstance(axis, Attribute) and not axis.is_fitted]
     values: list[list[Singles]] = [[] for _ in axes]
     for signature in dataset.signatures() if axes else ():
         check_attributes(descriptor, signature.interior.attributes)
-        for axis, found in zip(axes, values, strict=True):
-            found.append(signature.interior.attributes[axis.name][:500])
-    for axis, found in zip(axes, values, strict=True):
-        axis.fit(torch.from_numpy(np.concatenate(found)))
+        for axis, samples in zip(axes, values, strict=True):
+            samples.append(signature.interior.attributes[axis.name][:500])
+    for axis, samples in zip(axes, values, strict=True):
+        axis.fit(torch.from_numpy(np.concatenate(samples)))
     return bool(axes)
 
 
 def check_attributes(descriptor: nn.Module, names: Collection[str]) -> None:
-    """Raise a ValueError where an axis needs an attribute that is not among these names."""
-    for one in descriptor.modules():
-        if isinstance(one, Attribute) and one.name not in names:
+    """Raise a ValueError if an axis needs an attribute that is not among the names."""
+    for axis in descriptor.modules():
+        if isinstance(axis, Attribute) and axis.name not in names:
             raise ValueError(
-                f"attributes: expected {one.name!r} of each body, got {sorted(names)}. Give it as --attribute "
-                f"{one.name}=..., or as SignatureDataset(attributes=...)."
+                f"attributes: expected {axis.name!r} of each body, got {sorted(names)}. Give it as --attribute "
+                f"{axis.name}=..., or as SignatureDataset(attributes=...)."
             )
 
 
 def check_centres(descriptor: nn.Module) -> None:
-    """Raise a ValueError where an axis waits for `fit_centres`."""
-    for one in descriptor.modules():
-        if isinstance(one, Attribute):
-            one.check_fitted()
+    """Raise a ValueError if an axis has not been fitted by `fit_centres`."""
+    for axis in descriptor.modules():
+        if isinstance(axis, Attribute):
+            axis.check_fitted()
 
 
 @contextlib.contextmanager
 def evaluation_mode(module: nn.Module) -> Iterator[None]:
-    """Put a module, and all in it, into evaluation mode, and afterwards back into the mode of before."""
-    modes = [(one, one.training) for one in module.modules()]
+    """Put a module and its submodules into evaluation mode, and restore the mode of each afterwards."""
+    modes = [(submodule, submodule.training) for submodule in module.modules()]
     module.eval()
     try:
         yield
     finally:
-        for one, training in modes:
-            one.training = training
+        for submodule, training in modes:
+            submodule.training = training
 
 
 def _on_threads(
     dataset: SignatureDataset, descriptor: nn.Module, chunks: Sequence[Sequence[int]], n_workers: int | None
 ) -> _Described:
-    """Chunks of the meshes with the description of each, on threads; one by one on a device."""
+    """Yield chunks of indices with the outcomes of their meshes, on threads; on a GPU, one chunk at a time."""
     device = next(descriptor.parameters(), next(descriptor.buffers(), torch.empty(0))).device
 
     def outcomes(indices: Sequence[int]) -> Sequence[Singles | Failure]:
@@ -177,21 +176,21 @@ def _on_threads(
 def _on_processes(
     dataset: SignatureDataset, descriptor: nn.Module, indices: Sequence[int], n_workers: int | None
 ) -> _Described:
-    """The same one by one on processes: a mesh that kills its process costs no other its description."""
+    """Yield indices with their outcomes, one mesh at a time on processes: a crash affects no other mesh."""
     jobs = [(descriptor, dataset.subset([i]), torch.device("cpu")) for i in indices]
-    for number, outcome in run(describe_timed, jobs, n_workers=n_workers):
+    for number, result in run(describe_timed, jobs, n_workers=n_workers):
         i = indices[number]
-        one = Failure.of(dataset.bodies, i, outcome.reason) if isinstance(outcome, Failed) else outcome[0][0]
-        yield [i], [one]
+        outcome = Failure.of(dataset.bodies, i, result.reason) if isinstance(result, Failed) else result[0][0]
+        yield [i], [outcome]
 
 
 def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tuple[Singles, float]:
-    """(N, ...) descriptions of all meshes of a dataset at once, and the seconds of processor time that they took.
+    """Describe all meshes of a dataset at once: return the descriptions (N, ...) and the processor time in seconds.
 
-    The time includes reading the meshes, where the descriptor needs them, but not the Signatures.
+    The time includes reading the meshes, if the descriptor needs them, but not computing the Signatures.
     """
     descriptor, dataset, device = job
-    with one_thread(), torch.inference_mode():  # hold for the thread that enters them
+    with one_thread(), torch.inference_mode():  # both apply only to the thread that enters them
         batch = dataset.batch(range(len(dataset)))
         start = time.process_time()
         if isinstance(descriptor, Descriptor) and descriptor.requirements.mesh:
@@ -204,7 +203,7 @@ def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tup
 
 
 class _DescriptionStore:
-    """The descriptions of a dataset in its cache; a cache that cannot be written is no error."""
+    """Access to the cached descriptions of a dataset; a cache that cannot be written only causes a warning."""
 
     def __init__(self, dataset: SignatureDataset, cache_tag: str) -> None:
         self._dataset, self._tag = dataset, cache_tag
@@ -213,19 +212,20 @@ class _DescriptionStore:
         self._cache.remove_abandoned()
         self._is_writable = True
 
-    def found(self) -> dict[int, Singles]:
-        values = {i: self._cache.get(self._key(one)) for i, one in enumerate(self._keys) if one is not None}
-        return {i: one for i, one in values.items() if one is not None}
+    def read(self) -> dict[int, Singles]:
+        """Return the descriptions that are cached, by the index of the mesh."""
+        values = {i: self._cache.get(self._key(key)) for i, key in enumerate(self._keys) if key is not None}
+        return {i: x for i, x in values.items() if x is not None}
 
-    def keep(self, i: int, values: Singles) -> None:
-        """Keep a description, unless its file has changed meanwhile."""
+    def write(self, i: int, values: Singles) -> None:
+        """Cache the description of mesh i, unless its file has changed since the dataset was read."""
         key = self._keys[i]
         if key is None or not self._is_writable or self._dataset.subset([i]).cached_keys() != [key]:
             return
         try:
             self._cache.put(self._key(key), values)
         except OSError as error:
-            logger.warning("%s: descriptions are not kept (%s)", self._cache.directory, error)
+            logger.warning("%s: descriptions are not cached (%s)", self._cache.directory, error)
             self._is_writable = False
 
     def _key(self, key: str) -> str:

@@ -1,4 +1,4 @@
-"""What a descriptor is: how bodies are described, what that needs, and how two descriptions are compared."""
+"""Base classes of descriptors: how bodies are described, what this requires, and how descriptions are compared."""
 
 import contextlib
 import re
@@ -31,14 +31,14 @@ from igps.retrieval.vectors import MOST_NUMBERS, SearchDistance
 from igps.signature.signature import SignatureConfig, compute_signature
 
 NAME = re.compile(r"\w{1,100}(\+\w{1,40}(=[\d.e-]{1,10})?){0,9}")
-"""What the name of a descriptor in a file is: files are called after it."""
+"""Pattern of the names of descriptors that can be saved, as names of files are derived from them."""
 
 
 class Descriptor(Specified, ABC):
-    """A descriptor: a module from a `SignatureBatch` to descriptions (N, ...), with the distance that compares them.
+    """A descriptor: a module from a `SignatureBatch` to descriptions (N, ...), with a distance between descriptions.
 
-    A descriptor of your own defines `describe`, its `name`, and where the defaults do not fit its `requirements` and
-    `distances`. All commands take it as `--descriptor package.module:NAME`, all functions as an object.
+    To write a descriptor of your own, define `describe` and `name`, and override `requirements` and `distances` if the
+    defaults do not fit. All commands take it as `--descriptor package.module:NAME`, all functions as an object.
 
     Example:
         >>> import trimesh
@@ -59,18 +59,18 @@ class Descriptor(Specified, ABC):
         [[2, 2, 2, 6, 6, 6, 6, 6, 12, 12]]
 
     Attributes:
-        name: by which it is asked for and listed.
+        name: the name by which the descriptor is selected and listed.
         source: author, year.
         invariant_to: which of "motion" (rotation, translation, reflection), "scale" and "pose" (isometric bending)
-            leave its descriptions as they are, but for discretisation.
-        requirements: of a body; all eigenpairs, unless redefined.
+            leave descriptions unchanged, apart from discretisation.
+        requirements: what a body must have; by default, all eigenpairs.
         searched_by: the distance by which an index finds candidates, "cosine" for unit vectors or "chi_square" for
-            histograms; what is near by `distances` must be among the few hundred that are nearest by it. None where
-            neither is: an index compares with all.
+            histograms. The nearest bodies by `distances` must be among the few hundred nearest bodies by this distance.
+            If None, an index compares a query with all bodies.
         card: facts about a fitted descriptor, by name.
-        scale: the median of its distances between bodies of one class, by which size and side are weighed against it,
-            see `IndividualDescriptor`; None if it is not known.
-        description_shape: of the entries of a description in the eyes of `distances`, (-1,) where it is a row.
+        scale: median distance between bodies of one class, against which `IndividualDescriptor` weighs size and side;
+            None if unknown.
+        description_shape: shape of one description, as `distances` takes it; (-1,) if it is a vector.
     """
 
     name: str = "descriptor"
@@ -84,7 +84,7 @@ class Descriptor(Specified, ABC):
 
     @property
     def n_features(self) -> int:
-        """The size of a description; found by describing a ball where a descriptor does not define it."""
+        """The number of entries of a description; by default, determined by describing a ball."""
         import trimesh
 
         ball = trimesh.creation.icosphere(subdivisions=3)
@@ -94,56 +94,56 @@ class Descriptor(Specified, ABC):
             return self(collate([compute_signature(mesh, config)], [mesh]))[0].numel()
 
     def save(self, path: str | Path, card: Mapping[str, Any] | None = None) -> None:
-        """Write it to a safetensors file, or a folder to share, which `igps.load` and every `--descriptor` takes.
+        """Save the descriptor as a safetensors file or a folder, for `igps.load` and all `--descriptor` options.
 
         Args:
-            path: such as ``mine.safetensors``; a file that is there is replaced. A name without this ending is that of
-                a folder, which gets ``model.safetensors`` and its card, ``README.md``, as hubs of models expect them.
-            card: what a reader should know of it, for JSON; its own if None.
+            path: such as ``mine.safetensors``; an existing file is overwritten. A path without this suffix is a folder,
+                which gets the files ``model.safetensors`` and ``README.md`` (the card) that model hubs expect.
+            card: facts about the descriptor, for JSON; its own `card` if None.
 
         Raises:
-            ValueError: it is made of other modules than the library's, or its name is not of letters, digits and _.
+            ValueError: the descriptor contains modules of other packages, or its name is not of letters, digits and _.
         """
         if not NAME.fullmatch(self.name):
-            raise ValueError(f"name: expected letters, digits and _, got {self.name!r}. Make it with another.")
+            raise ValueError(f"name: expected letters, digits and _, got {self.name!r}. Choose another name.")
         save_module(self, path, dict(self.card if card is None else card))
 
     @abstractmethod
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, ...) descriptions of N shapes that have what is needed; finite numbers."""
+        """Return descriptions (N, ...) of N shapes that meet the requirements; finite numbers."""
 
     def forward(self, batch: SignatureBatch) -> Tensor:
-        """(N, ...) descriptions of N shapes; a ValueError if the batch lacks what the descriptor needs."""
+        """Return descriptions (N, ...) of N shapes; raise a ValueError if the batch does not meet the requirements."""
         self.requirements.check(batch)
-        # On other devices nothing is gained, and what is traced runs later.
-        with one_thread() if blocks.in_loops(batch.device) else contextlib.nullcontext():
+        # On other devices a limit on threads has no advantage, and traced code runs later.
+        with one_thread() if blocks.uses_loops(batch.device) else contextlib.nullcontext():
             return self.describe(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, ...) and (G, ...) descriptions to (Q, G) distances ≥ 0, smaller is closer; χ² unless redefined."""
+        """Return distances (Q, G) ≥ 0 between descriptions (Q, ...) and (G, ...); smaller is closer; default χ²."""
         return chi_square(queries, gallery)
 
     def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
-        """(N, ...) descriptions to (N, D) for statistics, which compare by Euclidean distance.
+        """Map descriptions (N, ...) to vectors (N, D) for statistics by Euclidean distance.
 
-        Square roots of histograms (Hellinger), and others as they are, unless redefined.
+        By default, these are the square roots of histograms (Hellinger distance), and other descriptions unchanged.
 
         Args:
-            descriptions: of bodies.
-            of_one_kind: whether all bodies are of one kind, such as an organ; what tells kinds apart may be left out.
+            descriptions: (N, ...).
+            of_one_kind: whether all bodies are of one kind, such as an organ; entries for kinds may then be left out.
         """
         rows = descriptions.flatten(1)
         return rows.sqrt() if self.searched_by == "chi_square" else rows
 
     def short(self, descriptions: Tensor) -> Tensor:
-        """(N, D) descriptions to (N, ≤ 256), for engines that compare so few by the cosine; or a ValueError."""
+        """Map descriptions (N, D) to (N, ≤ 256) for engines with cosine distances; by default, raise a ValueError."""
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {self.name!r}.")
 
 
 class BodyDescriptor(Descriptor):
-    """A descriptor that looks at one body at a time, in NumPy; it has no gradient.
+    """A descriptor that describes one body at a time, in NumPy, without gradients.
 
-    Those of the library are made with parameters; one out of range is a ValueError.
+    The constructors of the library's own body descriptors raise a ValueError for a parameter out of range.
 
     Example:
         >>> import trimesh
@@ -164,20 +164,20 @@ class BodyDescriptor(Descriptor):
 
     @abstractmethod
     def describe_body(self, body: Body) -> Singles:
-        """The description of one body; raises a ValueError for a body that it cannot describe."""
+        """Return the description of one body; raise a ValueError if it cannot be described."""
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, ...) descriptions, on the device of the batch."""
+        """Return descriptions (N, ...) on the device of the batch."""
         descriptions = [np.asarray(self.describe_body(body), dtype=np.float32) for body in batch.bodies()]
         return torch.from_numpy(np.stack(descriptions)).to(batch.device)
 
 
 class HistogramDescriptor(Descriptor):
-    """Histograms of samples or of their pairs, one or several side by side, compared by χ².
+    """One or several histograms of samples or of their pairs, compared by χ².
 
-    Several are flattened and joined into one histogram of sum 1, in which each part has the same share, and in a part
-    each of its histograms. The χ² distance is then the mean of those of the parts. Embeddings that are the same module,
-    and samples that are the same subset, are computed once for all.
+    Several histograms are flattened and joined into one histogram of sum 1. All parts have equal shares in it, and so
+    have all histograms within a part; the χ² distance is the mean of the distances of the parts. Histograms that use
+    the same embedding module, or the same subset of samples, share the computation.
 
     Example:
         >>> from igps.nn.histograms.pairs import PairHistogram
@@ -186,7 +186,7 @@ class HistogramDescriptor(Descriptor):
         ((640, 64), [[0.0, 1.0, 1.0]])
 
     Args:
-        histograms: one `DescriptionPart`, such as a `PairHistogram`; or the parts, each one or several of them.
+        histograms: one `DescriptionPart`, such as a `PairHistogram`; or a list of parts, each one or several of them.
         name, source, invariant_to: see `Descriptor`.
 
     Raises:
@@ -209,7 +209,7 @@ class HistogramDescriptor(Descriptor):
         if not groups or not all(groups):
             raise ValueError("histograms: expected at least one in each part, got none.")
         self.histograms = nn.ModuleList(histogram for group in groups for histogram in group)
-        # Histograms in each part; None where a single one is given, which keeps its shape in descriptions
+        # Histograms in each part; None for a single histogram, whose descriptions keep its shape.
         self._sizes = None if isinstance(histograms, DescriptionPart) else tuple(len(group) for group in groups)
         self.name, self.source, self.invariant_to = name, source, tuple(invariant_to)
         self.requirements = reduce(or_, (histogram.requirements for group in groups for histogram in group))
@@ -217,23 +217,23 @@ class HistogramDescriptor(Descriptor):
     @property
     def parts(self) -> tuple[tuple[DescriptionPart, ...], ...]:
         """The histograms of each part."""
-        histograms = [one for one in self.histograms if isinstance(one, DescriptionPart)]
+        histograms = [x for x in self.histograms if isinstance(x, DescriptionPart)]
         sizes = self._sizes or (1,)
-        # By slices: PyTorch 2.6 traces an iterator, taken some at a time, as if it began anew each time
+        # Slices, as PyTorch 2.6 traces an iterator that is consumed in steps as if it started anew at each step.
         return tuple(tuple(histograms[end - size : end]) for size, end in zip(sizes, accumulate(sizes), strict=True))
 
     @property
     def part_cells(self) -> tuple[int, ...]:
-        """Cells of each part."""
+        """The number of cells of each part."""
         return tuple(sum(histogram.n_cells for histogram in part) for part in self.parts)
 
     @property
     def n_features(self) -> int:
-        """Cells of all parts."""
+        """The number of cells of all parts."""
         return sum(self.part_cells)
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, C(C+1)/2, B, ...) histograms of a single one, (N, cells) of several; each body's of sum 1."""
+        """Return histograms of sum 1: (N, C(C+1)/2, B, ...) of a single one, (N, cells) of several."""
         features = BatchFeatures(batch, self.training)
         if self._sizes is None:
             return self.parts[0][0](features)
@@ -242,13 +242,13 @@ class HistogramDescriptor(Descriptor):
 
 
 class EmbeddedDescriptor(Descriptor):
-    """A descriptor under a head fitted to its descriptions, compared by the head's distance.
+    """A descriptor followed by a head; embeddings are compared by the head's distance.
 
     Args:
-        descriptor: `SignatureBatch` to descriptions.
-        head: of these descriptions.
+        descriptor: maps a `SignatureBatch` to descriptions.
+        head: fitted to these descriptions.
         name, source: see `Descriptor`.
-        invariant_to: see `Descriptor`; that of `descriptor` if None, though a head may have learned more.
+        invariant_to: see `Descriptor`; if None, that of `descriptor`, although the head may have learned more.
     """
 
     searched_by: SearchDistance | None = "cosine"
@@ -270,23 +270,23 @@ class EmbeddedDescriptor(Descriptor):
 
     @property
     def n_features(self) -> int:
-        """D of the embeddings."""
+        """The embedding width D."""
         device = next(self.head.buffers()).device
         with torch.no_grad():
             return self.head(torch.ones(2, self.descriptor.n_features, device=device)).shape[1]
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, D) embeddings of length 1."""
+        """Return embeddings (N, D) of length 1."""
         return self.head(self.descriptor(batch))
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, D) and (G, D) embeddings to (Q, G) distances of the head."""
+        """Return the head's distances (Q, G) between embeddings (Q, D) and (G, D)."""
         return self.head.distances(queries, gallery)
 
     def coordinates(self, embeddings: Tensor, *, of_one_kind: bool = False) -> Tensor:
-        """(N, D) embeddings as they are, or what tells bodies of one kind apart, see `Head.within_class`."""
+        """Return embeddings (N, D) unchanged, or for bodies of one kind reduced by `Head.within_class`."""
         return self.head.within_class(embeddings) if of_one_kind else embeddings
 
     def short(self, embeddings: Tensor) -> Tensor:
-        """(N, D) embeddings to (N, ≤ 256) of length 1: themselves, or those of `Head.short`, which may have none."""
+        """Map embeddings (N, D) to (N, ≤ 256) of length 1: unchanged if short enough, otherwise by `Head.short`."""
         return embeddings if embeddings.shape[1] <= MOST_NUMBERS else self.head.short(embeddings)

@@ -1,4 +1,4 @@
-"""Spectral embeddings: eigenfunctions, weighted by a function of their eigenvalues, as coordinates of a point."""
+"""Spectral embeddings: the coordinates of a point are eigenfunctions, weighted by a function of their eigenvalues."""
 
 import math
 from typing import Literal, get_args
@@ -11,31 +11,31 @@ from igps.nn.specification import Specified
 from igps.retrieval.distances import row_distances
 
 EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
-_KINDS = get_args(EmbeddingKind)  # here, as older compilers of PyTorch cannot trace it
+_KINDS = get_args(EmbeddingKind)  # a constant, as older versions of torch.compile cannot trace get_args
 
-# λ·area from below the smallest of elongated bodies to beyond the 250th of any (4π·250, Weyl's law).
+# Range of λ·area: from below the smallest of elongated bodies to beyond the 250th of any body (4π·250, Weyl's law).
 _FILTER_RANGE = (2.0, 5000.0)
 
 
 def spectral_weights(
     eigenvalues: Tensor, area: Tensor, kind: EmbeddingKind = "commute_time", time: float | None = None
 ) -> Tensor:
-    """Factors √area·g(λ·area) that turn eigenfunctions into an embedding that does not change with scale.
+    """Return the factors √area·g(λ·area) that turn eigenfunctions into a scale-invariant embedding.
 
     g(x) is x^(−1/2) for the commute time (Rustamov 2007), e^(−x·time) for diffusion (Coifman, Lafon 2006) and 1/x for
     the biharmonic distance (Lipman, Rustamov, Funkhouser 2010).
 
     Args:
-        eigenvalues: (..., K) positive, 1/length²; infinite where padded, with weight 0.
-        area: (...) of the surface, length².
-        kind: which g.
-        time: diffusion time over area, dimensionless; for "diffusion" alone.
+        eigenvalues: (..., K) positive, 1/length²; infinite where padded, which gives the factor 0.
+        area: (...) area of the surface, length².
+        kind: selects g.
+        time: diffusion time over area, dimensionless; only for "diffusion".
 
     Returns:
         (..., K), length.
 
     Raises:
-        ValueError: unknown kind, or a time that is missing, not positive, or given to another kind.
+        ValueError: the kind is unknown, or the time is missing, not positive, or given to a kind without time.
     """
     _check_kind(kind, time)
     if kind == "commute_time":
@@ -56,10 +56,10 @@ def spectral_embedding(
     time: float | None = None,
     n_eigenpairs: int | None = None,
 ) -> Tensor:
-    """Eigenfunctions (..., P, K), 1/length, times their `spectral_weights`; see there for other arguments and errors.
+    """Multiply eigenfunctions (..., P, K), 1/length, by `spectral_weights`; see there for other arguments and errors.
 
     Args:
-        n_eigenpairs: keep so many of the first; None, or more than there are, keeps all.
+        n_eigenpairs: number of leading eigenpairs to use; None, or a number above K, uses all.
 
     Returns:
         (..., P, min(K, n_eigenpairs)) in the eigenfunctions' type, float32 at least, dimensionless.
@@ -69,24 +69,24 @@ def spectral_embedding(
 
 
 def interior_distance(p: Tensor, q: Tensor) -> Tensor:
-    """(..., P, Q) interior distances: Euclidean of embeddings (..., P, K) and (..., Q, K) (Rustamov 2010, eq. 5)."""
+    """Return Euclidean distances (..., P, Q) of embeddings (..., P, K) and (..., Q, K) (Rustamov 2010, equation 5)."""
     return row_distances(p, q)
 
 
 def barycentroid_potential(embedding: Tensor) -> Tensor:
-    """(..., P) the potential U, the norm of embeddings (..., P, K) (Rustamov 2010); least at the barycentroid."""
+    """Return the norm U (..., P) of embeddings (..., P, K), which is least at the barycentroid (Rustamov 2010)."""
     if not embedding.requires_grad:
         return torch.linalg.vector_norm(embedding, dim=-1)
-    nothing = ~embedding.detach().any(dim=-1)  # padding, where a norm has a first derivative of 0 and no second one
-    norms = torch.linalg.vector_norm(embedding.masked_fill(nothing.unsqueeze(-1), 1), dim=-1)
-    return norms.masked_fill(nothing, 0)
+    is_zero = ~embedding.detach().any(dim=-1)  # padding, where the norm has no second derivative
+    norms = torch.linalg.vector_norm(embedding.masked_fill(is_zero.unsqueeze(-1), 1), dim=-1)
+    return norms.masked_fill(is_zero, 0)
 
 
 class SpectralEmbedding(Specified):
-    """`spectral_embedding` as a module, its weights fixed or learned.
+    """`spectral_embedding` as a module, with fixed or learned weights.
 
-    A learned filter multiplies the weights of the kind by exp(s(log(λ·area))), s piecewise linear between knots and
-    constant beyond them: it is non-negative, starts at the kind itself, and serves every shape whatever its K.
+    A learned filter multiplies the weights by exp(s(log(λ·area))), where s is piecewise linear between knots and
+    constant beyond them. The filter is positive, starts at 1, and applies to shapes with any number of eigenpairs.
 
     Example:
         The commute time divides each eigenfunction by the root of its eigenvalue.
@@ -97,10 +97,10 @@ class SpectralEmbedding(Specified):
 
     Args:
         kind, time, n_eigenpairs: see `spectral_embedding`.
-        n_knots: parameters of the learned filter; 0 for a fixed one.
+        n_knots: number of knots of a learned filter; 0 for fixed weights.
 
     Raises:
-        ValueError: see `spectral_weights`, a single knot, or no eigenpair.
+        ValueError: see `spectral_weights`; also for a single knot, or no eigenpair.
     """
 
     def __init__(
@@ -122,20 +122,20 @@ class SpectralEmbedding(Specified):
         self.log_gain = nn.Parameter(torch.zeros(n_knots)) if n_knots else None
 
     def weights(self, eigenvalues: Tensor, area: Tensor) -> Tensor:
-        """(..., K) factors of the eigenfunctions, length; with an area of 1 the filter g at the eigenvalues."""
+        """Return the factors (..., K) of the eigenfunctions, length; for an area of 1, the filter g(λ)."""
         weights = spectral_weights(eigenvalues, area, self.kind, self.time)
         if self.log_gain is None:
             return weights
-        least, most = (math.log(x) for x in _FILTER_RANGE)
+        start, end = (math.log(x) for x in _FILTER_RANGE)
         last = len(self.log_gain) - 1
         x = (eigenvalues * area.to(eigenvalues.dtype).unsqueeze(-1)).log()
-        position = ((x - least) * (last / (most - least))).clamp(0, last)
+        position = ((x - start) * (last / (end - start))).clamp(0, last)
         lower = position.long().clamp(max=last - 1)
         gain = self.log_gain.to(weights.dtype)
         return weights * torch.lerp(gain[lower], gain[lower + 1], position - lower).exp()
 
     def forward(self, eigenfunctions: Tensor, eigenvalues: Tensor, area: Tensor) -> Tensor:
-        """Embed (..., P, K) eigenfunctions with (..., K) eigenvalues and (...) areas."""
+        """Embed eigenfunctions (..., P, K) with eigenvalues (..., K) and areas (...)."""
         weights = self.weights(eigenvalues[..., : self.n_eigenpairs], area)
         return _weigh(eigenfunctions[..., : self.n_eigenpairs], weights)
 

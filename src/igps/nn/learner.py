@@ -21,19 +21,19 @@ from igps.nn.heads.base import Head
 from igps.nn.heads.learned import BlendedDistance
 from igps.retrieval.metric import RetrievalScoresMetric
 
-# Packages whose classes a checkpoint may name without an explicit word.
+# Packages whose classes a checkpoint may name by default.
 _TRUSTED = ("igps", "torch", "pytorch_lightning", "pytorch_metric_learning")
 
 
 class RetrievalLearner(LightningModule):
-    """Learns whatever has parameters in the descriptor and the distance, by a loss on the head's embeddings.
+    """Trains the parameters of a descriptor and a distance, by a loss on the head's embeddings.
 
-    It trains on any DataLoader of `SignatureBatch`es with labels. The head is fitted to the descriptions of the
-    training shapes before the first step, and one that is fitted in closed form, such as a `WhitenedHead`, again before
-    each validation and after each epoch; what is trained then are bins and filters, through it.
+    It takes any DataLoader of `SignatureBatch`es with labels. The head is fitted to the descriptions of the training
+    shapes before the first step. A head in closed form, such as a `WhitenedHead`, is fitted again before each
+    validation and after each epoch; gradients then train bins and filters through it.
 
-    Validation and test log the retrieval scores of the distance, each shape against all others of its part. A distance
-    without a head has nothing to train, and `Trainer.test` gives the scores of the plain descriptor.
+    Validation and test log retrieval scores, with each shape as a query against all other shapes of the split. A
+    distance without a head cannot be trained, but `Trainer.test` gives the scores of the plain descriptor.
 
     Example:
         >>> import tempfile
@@ -59,16 +59,15 @@ class RetrievalLearner(LightningModule):
     Args:
         descriptor: a `Descriptor`, or any module from `SignatureBatch` to histograms (N, ...).
         distance: between descriptions; its head is trained.
-        loss: embeddings (N, D) and labels (N,) to a scalar; supervised contrastive (Khosla et al. 2020) if None, which
-            needs `pytorch-metric-learning`.
-        learning_rate: of the head; cosine decay over the epochs.
+        loss: maps embeddings (N, D) and labels (N,) to a scalar; supervised contrastive (Khosla et al. 2020) if None,
+            which needs `pytorch-metric-learning`.
+        learning_rate: of the head, with cosine decay over the epochs.
         bin_rate: learning rate of the descriptor's parameters.
-        weight_decay: of the head alone.
-        miner: embeddings and labels to the pairs or triplets that a loss of `pytorch-metric-learning` is to use; all of
-            a batch if None.
+        weight_decay: of the head only.
+        miner: of `pytorch-metric-learning`, selects the pairs or triplets that the loss uses; if None, it uses all.
 
     Raises:
-        ValueError: a descriptor with more than histograms, such as `molecular` with size.
+        ValueError: the descriptor has entries other than histograms, such as `molecular` with size.
     """
 
     def __init__(
@@ -82,7 +81,7 @@ class RetrievalLearner(LightningModule):
         miner: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        # Modules are made anew from a configuration, or given to load_from_checkpoint; their parameters are the state.
+        # Modules are rebuilt from a configuration, or passed to load_from_checkpoint; the state holds their parameters.
         self.save_hyperparameters(ignore=() if has_configuration() else ("descriptor", "distance", "loss", "miner"))
         self.descriptor = descriptor
         self.distance = distance
@@ -93,14 +92,15 @@ class RetrievalLearner(LightningModule):
         self.weight_decay = weight_decay
         self.part_cells = descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
         if isinstance(descriptor, HistogramDescriptor) and descriptor.n_features != sum(descriptor.part_cells):
-            found = f"{descriptor.name}, which keeps the size of bodies beside them"
-            raise ValueError(f"descriptor: expected histograms alone, got {found}. Take its without_size().")
+            raise ValueError(
+                f"descriptor: expected only histograms, got {descriptor.name} with size. Use without_size()."
+            )
         if distance.head is not None and self.part_cells is not None and any(map(is_lazy, distance.parameters())):
-            # The optimiser needs parameters that have a size.
+            # A first call gives lazy parameters the sizes that the optimiser needs.
             with torch.no_grad():
                 distance.head.eval()(torch.ones(1, sum(self.part_cells)))
             distance.head.train()
-        # A method, not the module: the metric's state must not repeat its parameters in the checkpoint.
+        # A method, not the module: otherwise the checkpoint would hold its parameters twice.
         self.scores = RetrievalScoresMetric(self.distances)
         self._fitted_at = -1
 
@@ -108,14 +108,14 @@ class RetrievalLearner(LightningModule):
     def load_from_checkpoint(
         cls, checkpoint_path: str | Path | IO[bytes], *arguments: Any, trusted: Sequence[str] = (), **options: Any
     ) -> Self:
-        """The learner of a checkpoint, as `LightningModule.load_from_checkpoint` gives it, on the CPU by default.
+        """Load a learner as `LightningModule.load_from_checkpoint` does, on the CPU by default.
 
-        One that training/train.py wrote knows its configuration; to that of another script give `descriptor=` and
-        `distance=`. No code of the file is run: its configuration may name classes of this library, of torch, Lightning
-        and pytorch-metric-learning, and of packages that `trusted` names.
+        A checkpoint of training/train.py holds its configuration; for one of another script, pass `descriptor=` and
+        `distance=`. No code of the file is run: its configuration may name only classes of this library, of torch,
+        Lightning and pytorch-metric-learning, and of the packages in `trusted`.
 
         Raises:
-            ValueError: it names a class of another package.
+            ValueError: the file is no checkpoint or damaged, or it names a class of another package.
         """
         options.setdefault("map_location", "cpu")
         options.setdefault("weights_only", True)
@@ -135,11 +135,11 @@ class RetrievalLearner(LightningModule):
         return super().load_from_checkpoint(checkpoint_path, *arguments, **options)
 
     def forward(self, batch: SignatureBatch) -> Tensor:
-        """Descriptions of a batch."""
+        """Return the descriptions (N, ...) of a batch."""
         return self.descriptor(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, G) distances between descriptions (Q, ...) and (G, ...)."""
+        """Return distances (Q, G) between descriptions (Q, ...) and (G, ...)."""
         return self.distance(queries, gallery)
 
     @property
@@ -149,41 +149,41 @@ class RetrievalLearner(LightningModule):
         return self.distance.head
 
     def setup(self, stage: str) -> None:
-        """Refuse to train without a head, before the optimiser is made."""
+        """Raise a ValueError if there is no head to train, before the optimiser is created."""
         if stage == "fit":
             _ = self._head
 
     def on_train_start(self) -> None:
-        """Fit the head to the training shapes, or centre its inputs on them; a resumed run has done so."""
+        """Fit the head to the training shapes, or centre its inputs on them; a resumed run is fitted already."""
         if self.global_step == 0:
             self._fit(calibrate=False)
 
     def on_train_epoch_end(self) -> None:
-        """A checkpoint of this epoch holds a distance whose parts have one scale, and a head that fits the bins."""
+        """Fit the head to the current bins and calibrate the distance, so that the checkpoint holds both."""
         self._fit()
 
     def on_validation_epoch_start(self) -> None:
-        """The scale changes with the head."""
+        """Fit the head and calibrate the distance, as both changed in training."""
         if not self.trainer.sanity_checking and self.trainer.state.fn == "fit":
             self._fit()
 
     @one_thread()
     def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
-        """Loss of one P×K batch."""
+        """Return the loss of one P×K batch."""
         embeddings, labels = self._head(self(batch)), _known_labels(batch)
-        chosen = () if self.miner is None else (self.miner(embeddings, labels),)
-        loss: Tensor = self.loss(embeddings, labels, *chosen)
+        mined = () if self.miner is None else (self.miner(embeddings, labels),)
+        loss: Tensor = self.loss(embeddings, labels, *mined)
         self.log("train_loss", loss, batch_size=len(batch), prog_bar=True)
         return loss
 
     @one_thread()
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
-        """Gradients of the loss, on as few threads as the loss itself."""
+        """Compute the gradients of the loss on one thread, like the loss itself."""
         super().backward(loss, *args, **kwargs)
 
     @one_thread()
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        """A whole step: Lightning computes the loss and its gradients from inside of it."""
+        """Make a step on one thread; Lightning computes the loss and its gradients within it."""
         super().optimizer_step(*args, **kwargs)
 
     @one_thread()
@@ -194,15 +194,15 @@ class RetrievalLearner(LightningModule):
     test_step = validation_step
 
     def on_validation_epoch_end(self) -> None:
-        """Scores over the validation part."""
+        """Log the scores of the validation split."""
         self._log_scores("val")
 
     def on_test_epoch_end(self) -> None:
-        """Scores over the test part."""
+        """Log the scores of the test split."""
         self._log_scores("test")
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """AdamW: decay for the head, none for bins and filters, which have a meaning where they start."""
+        """Return AdamW with weight decay for the head, but not for bins and filters, whose initial values matter."""
         groups = [
             {"params": list(self.distance.parameters()), "lr": self.learning_rate, "weight_decay": self.weight_decay},
             {"params": list(self.descriptor.parameters()), "lr": self.bin_rate, "weight_decay": 0.0},
@@ -212,17 +212,17 @@ class RetrievalLearner(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs)}
 
     @one_thread()
-    def _log_scores(self, part: str) -> None:
+    def _log_scores(self, split: str) -> None:
         if not self.trainer.sanity_checking:
             for name, value in self.scores.compute().items():
-                self.log(f"{part}_{name}", value, prog_bar=name == "ft")
+                self.log(f"{split}_{name}", value, prog_bar=name == "ft")
         self.scores.reset()
 
     @one_thread()
     def _fit(self, calibrate: bool = True) -> None:
-        """Fit the head and the scale to the training shapes as they are described now, in evaluation mode.
+        """Fit the head to the current descriptions of the training shapes and calibrate the distance.
 
-        A head that is trained by gradients is fitted, which is centred, only once.
+        A head that is trained by gradients is fitted only once, before training, which centres its inputs.
         """
         if self._fitted_at == self.global_step:
             return
@@ -237,28 +237,28 @@ class RetrievalLearner(LightningModule):
 
     @torch.no_grad()
     def _training_descriptions(self) -> tuple[Tensor, Tensor]:
-        """Descriptions of all shapes of the training loader's dataset, each once."""
+        """Describe all shapes of the training loader's dataset, each once."""
         loader = self.trainer.train_dataloader
         if not isinstance(loader, DataLoader):
             raise ValueError(f"train_dataloaders: expected one DataLoader, got {type(loader).__name__}.")
-        in_order = DataLoader(loader.dataset, batch_size=16, collate_fn=loader.collate_fn)
-        parts = [(self(batch.to(self.device)), _known_labels(batch)) for batch in in_order]
-        descriptions, labels = zip(*parts, strict=True)
+        ordered = DataLoader(loader.dataset, batch_size=16, collate_fn=loader.collate_fn)
+        batches = [(self(batch.to(self.device)), _known_labels(batch)) for batch in ordered]
+        descriptions, labels = zip(*batches, strict=True)
         return torch.cat(descriptions), torch.cat(labels)
 
 
 def _known_labels(batch: SignatureBatch) -> Tensor:
-    """(N,) labels of a batch; a ValueError where a class is not known, as −1 would be a class like any other."""
+    """Return the labels (N,) of a batch; raise a ValueError for −1, which would otherwise count as a class."""
     if bool((batch.labels < 0).any()):
         raise ValueError(
-            "labels: expected the class of each body, got −1, an unknown one. Give folders of classes, a labels.csv, "
-            "or SignatureDataset(labels=...)."
+            "labels: expected the class of each body, got −1 (unknown). Give folders of classes, a labels.csv, or "
+            "SignatureDataset(labels=...)."
         )
     return batch.labels
 
 
 def _class_paths(configuration: Any) -> Iterator[str]:
-    """Everything in a configuration that is made by its import path."""
+    """Yield the import paths of all classes that a configuration names."""
     if isinstance(configuration, Mapping):
         for key, value in configuration.items():
             if key in ("class_path", "_class_path", "_instantiator") and isinstance(value, str):

@@ -1,1 +1,1 @@
-"""Pictures and tables of what the studies found."""
+"""Figures, tables and the page of results."""

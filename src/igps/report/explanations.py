@@ -1,4 +1,4 @@
-"""Where each body of a folder of results differs from its nearest, for the page."""
+"""Explanations for the page of results: where each body differs from its nearest."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ from igps.signature.signature import SAMPLE_KINDS, Signature
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """A body and its nearest."""
+    """Explanation of the distance between a body and its nearest, on the vertices of both surfaces."""
 
-    other: str  # the name of the nearest
-    told: str  # the largest shares of their distance, in words
-    values: tuple[NDArray[np.uint8], NDArray[np.uint8]]  # (V,) of both surfaces: 128 where they are alike, or more
+    other: str  # name of the nearest body
+    told: str  # the largest shares of the distance, as text
+    values: tuple[NDArray[np.uint8], NDArray[np.uint8]]  # (V,) of both surfaces: 128 for no share, larger for a share
 
 
 def keep_explanations(
@@ -36,62 +36,64 @@ def keep_explanations(
     *,
     n_workers: int | None = None,
 ) -> dict[str, Painted]:
-    """Explain the distance of each body to its nearest by a system, and write that as a NumPy archive.
+    """Explain the distance of each body to its nearest, and write the explanations to a NumPy archive.
 
-    The descriptor is the one of histograms that the system's distances are by; bodies without a surface are left out.
+    The descriptor, of histograms, is the one of the system's distances. Bodies without a surface are left out.
     """
-    place = {name: i for i, name in enumerate(dataset.bodies.names)}
+    indices = {name: i for i, name in enumerate(dataset.bodies.names)}
     nearest = [system.names[row[0]] for row in system.ranked()] if len(system.names) > 1 else []
-    pairs = [pair for pair in zip(system.names, nearest, strict=False) if set(pair) <= surfaces.keys() & place.keys()]
+    pairs = [pair for pair in zip(system.names, nearest, strict=False) if set(pair) <= surfaces.keys() & indices.keys()]
     jobs = {
-        p[0]: (descriptor, dataset.subset([place[name] for name in p]), [surfaces[name] for name in p]) for p in pairs
+        pair[0]: (descriptor, dataset.subset([indices[name] for name in pair]), [surfaces[name] for name in pair])
+        for pair in pairs
     }
-    found = run_jobs(_painted, jobs, "explanation", n_workers)
-    found = {name: found[name] for name in system.names if name in found}
-    both = [np.concatenate(one.values) for one in found.values()]
+    results = run_jobs(_explain_pair, jobs, "explanation", n_workers)
+    results = {name: results[name] for name in system.names if name in results}
+    values = [np.concatenate(painted.values) for painted in results.values()]
     np.savez_compressed(
         path,
-        names=np.array(list(found), dtype=str),
-        others=np.array([one.other for one in found.values()], dtype=str),
-        told=np.array([one.told for one in found.values()], dtype=str),
-        counts=np.array([len(one.values[0]) for one in found.values()], dtype=np.int64),
-        ends=np.cumsum([len(one) for one in both], dtype=np.int64),
-        values=np.concatenate([np.empty(0, np.uint8), *both]),
+        names=np.array(list(results), dtype=str),
+        others=np.array([painted.other for painted in results.values()], dtype=str),
+        told=np.array([painted.told for painted in results.values()], dtype=str),
+        counts=np.array([len(painted.values[0]) for painted in results.values()], dtype=np.int64),
+        ends=np.cumsum([len(both) for both in values], dtype=np.int64),
+        values=np.concatenate([np.empty(0, np.uint8), *values]),
     )
-    return found
+    return results
 
 
 def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[str, Painted]:
-    """What `keep_explanations` wrote, by name, where the surfaces are unchanged; nothing without a file."""
+    """Read the explanations of an archive whose surfaces are unchanged, by name; none if there is no file."""
     if not path.is_file():
         return {}
     with np.load(path) as archive:
-        kept = {name: archive[name] for name in archive}
-    found = {}
-    columns = (kept[name].tolist() for name in ("names", "others", "told", "counts"))
-    for name, other, told, count, values in zip(*columns, np.split(kept["values"], kept["ends"])[:-1], strict=True):
-        sizes = [len(surfaces[one].vertices) if one in surfaces else -1 for one in (name, other)]
+        arrays = {name: archive[name] for name in archive}
+    results = {}
+    columns = (arrays[name].tolist() for name in ("names", "others", "told", "counts"))
+    split_values = np.split(arrays["values"], arrays["ends"])[:-1]
+    for name, other, told, count, values in zip(*columns, split_values, strict=True):
+        sizes = [len(surfaces[body].vertices) if body in surfaces else -1 for body in (name, other)]
         if sizes == [count, len(values) - count]:
-            found[name] = Painted(other, told, (values[:count], values[count:]))
-    return found
+            results[name] = Painted(other, told, (values[:count], values[count:]))
+    return results
 
 
-def _painted(job: tuple[Descriptor, SignatureDataset, list[PageSurface]]) -> Painted:
+def _explain_pair(job: tuple[Descriptor, SignatureDataset, list[PageSurface]]) -> Painted:
     descriptor, dataset, surfaces = job
     with one_thread():
-        found = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
-    shares = found.places or found.samples
-    one, other = (_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i]) for i in (0, 1))
-    return Painted(dataset.bodies.names[1], found.summary(), (one, other))
+        explanation = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
+    shares = explanation.places or explanation.samples
+    one, other = (_vertex_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i]) for i in (0, 1))
+    return Painted(dataset.bodies.names[1], explanation.summary(), (one, other))
 
 
-def _values(mesh: Mesh, signature: Signature, shares: Shares, surface: PageSurface) -> NDArray[np.uint8]:
-    """At the vertices of a surface, which lies in its cube as the mesh does in its own."""
+def _vertex_values(mesh: Mesh, signature: Signature, shares: Shares, surface: PageSurface) -> NDArray[np.uint8]:
+    """Return the values (V,) of `Painted` at the vertices of a page surface, which fills its cube as the mesh does."""
     axes = axes_of(signature.surface.points)
-    turned = {kind: getattr(signature, kind).points @ axes for kind in SAMPLE_KINDS}
-    corners = mesh.vertices @ axes
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    samples = {kind: getattr(signature, kind).points @ axes for kind in SAMPLE_KINDS}
+    vertices = mesh.vertices @ axes
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
     points = surface.vertices / STEPS - 0.5
-    values = on_surface(shares, turned, points * (high - low).max() + (low + high) / 2)
+    values = on_surface(shares, samples, points * (high - low).max() + (low + high) / 2)
     largest = float(np.quantile(np.abs(values), 0.98)) or 1.0
     return np.rint(128 + 127 * np.clip(values / largest, -1, 1)).astype(np.uint8)

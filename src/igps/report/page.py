@@ -1,4 +1,4 @@
-"""The page of results: one HTML file that loads nothing, to look at rankings, scores and bodies."""
+"""The page of results: a self-contained HTML file that shows rankings, scores and bodies."""
 
 import base64
 import hashlib
@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Any
 
 from igps.report.explanations import Painted
-from igps.report.page_data import N_WORST, data_of, letters
+from igps.report.page_data import N_WORST, base64_text, data_of
 from igps.report.results import Results
 from igps.report.surfaces import PageSurface
 from igps.report.tables import TITLES
@@ -15,44 +15,43 @@ from igps.report.tables import TITLES
 _TEMPLATE = files("igps.report") / "template"
 _SCRIPTS = ("three.min.js", "bodies.js", "tables.js", "map.js", "tree.js", "page.js")
 N_OUTLIERS = 50
-"""How many of the most unlike bodies the page lists."""
-# Inside the axes of the plot of precision and recall, in units of its drawing.
-_PLOT_WIDTH, _PLOT_HEIGHT = 600, 340
+"""Largest number of outliers on the page."""
+_PLOT_WIDTH, _PLOT_HEIGHT = 600, 340  # of the axes of the precision–recall plot, in SVG units
 
 SCORE_MEANINGS = dict(  # noqa: C408
     nn="nearest neighbour: share of queries whose nearest shape is of their class",
-    ft="first tier: share of the class among as many nearest shapes as it has other members",
-    st="second tier: share of the class among twice as many",
-    e="E-measure: harmonic mean of precision and recall in the first 32",
-    dcg="discounted cumulative gain: hits count less the later they come",
+    ft="first tier: share of the query's class that is among the nearest n shapes, for a class with n other members",
+    st="second tier: the same among the nearest 2n shapes",
+    e="E-measure: harmonic mean of precision and recall among the nearest 32 shapes",
+    dcg="discounted cumulative gain: shapes of the class count less the lower their rank",
     adr="average dynamic recall",
     adr_self="average dynamic recall with the query itself in the ranking, as in SHREC'07",
     map="mean average precision",
 )
-"""What the scores are, by name."""
+"""Explanations of the scores by name."""
 
 
 def page_of(
     results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, Painted] | None = None
 ) -> str:
-    """The page of results as text, with surfaces by the name of the mesh, and explanations of those that have one."""
+    """Return the page of results as HTML text, with surfaces and explanations by the name of the mesh."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
-    # Escapes all that it is given
+    # Autoescape, because names and notes come from files
     environment = Environment(
         loader=PackageLoader("igps.report", "template"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
     data = data_of(results, surfaces, explanations)
-    # A policy that names the page's own scripts and style by content: no other can run, wherever it came from.
+    # The content security policy allows only the page's own scripts and style, identified by their hashes
     scripts = [(_TEMPLATE / name).read_text(encoding="utf-8").strip() + "\n" for name in _SCRIPTS]
     style = (_TEMPLATE / "page.css").read_text(encoding="utf-8")
     policy = (
-        f"default-src 'none'; script-src {' '.join(map(_fingerprint, scripts))}; style-src {_fingerprint(style)}; "
+        f"default-src 'none'; script-src {' '.join(map(_source_hash, scripts))}; style-src {_source_hash(style)}; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-    classes, places = data["classes"], {name: i for i, name in enumerate(results.names)}
+    classes, indices = data["classes"], {name: i for i, name in enumerate(results.names)}
     members: list[list[int]] = [[] for _ in classes] or [[]]
     for i, shape in enumerate(data["shapes"]):
         members[shape["label"] if classes else 0].append(i)
@@ -62,24 +61,24 @@ def page_of(
         title=_title(results, data),
         data=data,
         members=members,
-        surfaces=Markup("\n".join(letters(surface.packed()) for surface in packed)),
+        surfaces=Markup("\n".join(base64_text(surface.packed()) for surface in packed)),
         scripts=[Markup(source) for source in scripts],
         style=Markup(style),
         policy=policy,
         licence=(_TEMPLATE / "three.LICENSE").read_text(encoding="utf-8"),
         titles=TITLES,
         meanings=SCORE_MEANINGS,
-        curves=[_drawn(i, system) for i, system in enumerate(data["systems"]) if system["curve"]],
+        curves=[_curve(i, system) for i, system in enumerate(data["systems"]) if system["curve"]],
         n_worst=N_WORST,
         plot=(_PLOT_WIDTH, _PLOT_HEIGHT),
-        config=_flat(results.config),
+        config=_config_rows(results.config),
         disturbances=(results.robustness or {}).get("disturbances", {}),
-        outliers=[{**one, "place": places.get(one["name"])} for one in results.outliers[:N_OUTLIERS]],
+        outliers=[{**row, "place": indices.get(row["name"])} for row in results.outliers[:N_OUTLIERS]],
         n_repaired=sum(bool(shape["notes"]) for shape in data["shapes"]),
     )
 
 
-def _fingerprint(source: str) -> str:
+def _source_hash(source: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(source.encode()).digest()).decode()}'"
 
 
@@ -88,12 +87,12 @@ def _title(results: Results, data: Mapping[str, Any]) -> str:
     if data["classes"]:
         shapes += f" in {len(data['classes'])} class{'es' * (len(data['classes']) != 1)}"
     names = [system.name for system in results.systems] or list((results.robustness or {}).get("movements", {}))
-    what = names[0] if len(names) == 1 else f"{len(names)} descriptors"
-    return f"{shapes}, {what}" + (" under disturbance" if results.robustness else "")
+    descriptors = names[0] if len(names) == 1 else f"{len(names)} descriptors"
+    return f"{shapes}, {descriptors}" + (" under disturbance" if results.robustness else "")
 
 
-def _drawn(i: int, system: Mapping[str, Any]) -> dict[str, Any]:
-    """A curve of precision and recall as points of the drawing."""
+def _curve(i: int, system: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the precision–recall curve of the i-th system in SVG coordinates, with its style, name and values."""
     values = list(zip(*system["curve"], strict=True))
     points = [
         (round(recall * _PLOT_WIDTH, 1), round((1 - precision) * _PLOT_HEIGHT, 1)) for recall, precision in values
@@ -102,10 +101,10 @@ def _drawn(i: int, system: Mapping[str, Any]) -> dict[str, Any]:
     return {"style": i, "name": system["name"], "points": points, "path": path, "values": values}
 
 
-def _flat(config: Mapping[str, Any]) -> Sequence[tuple[str, str]]:
-    def told(value: Any) -> str:
+def _config_rows(config: Mapping[str, Any]) -> Sequence[tuple[str, str]]:
+    def as_text(value: Any) -> str:
         if isinstance(value, list | tuple):
             return ", ".join(map(str, value)) or "none"
         return "none" if value is None else str(value)
 
-    return [(name.replace("_", " "), told(value)) for name, value in config.items()]
+    return [(name.replace("_", " "), as_text(value)) for name, value in config.items()]

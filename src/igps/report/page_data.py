@@ -1,4 +1,4 @@
-"""The numbers that the page of results is drawn from, as its scripts read them."""
+"""The data of the page of results, in the form that its scripts read."""
 
 import base64
 import math
@@ -17,47 +17,48 @@ from igps.report.surfaces import PageSurface
 from igps.retrieval import RetrievalScores, precision_recall_curve, retrieval_scores
 
 N_WORST = 20
-"""How many of the rankings that are most wrong the page shows at most."""
-_N_WRONG = 3
-_LEAST_RANKED = 48
+"""Largest number of worst confusions on the page."""
+_N_WRONG = 3  # wrong shapes that are shown for each of them
+_MIN_RANKED = 48  # shortest ranking of a query
 _DECIMALS = 5
-_OF_QUERIES = ("nn", "ft", "st", "map")
-# Fewer are no map; more take too long to lay out, and no browser draws them well
-_LEAST_MAPPED, _MOST_MAPPED = 3, 3000
+_QUERY_SCORES = ("nn", "ft", "st", "map")  # scores that are shown for each query
+_MIN_MAPPED, _MAX_MAPPED = 3, 3000  # shapes of a map; more take too long to lay out and to draw in a browser
 
 
 def data_of(
     results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, Painted] | None = None
 ) -> dict[str, Any]:
-    """All numbers of the page but the surfaces themselves; for `shapes` see `_shapes`, for `systems` `_of_system`."""
+    """Return the data of the page without its surfaces; for `shapes` see `_shapes`, for `systems` `_system_data`."""
     classes = sorted(set(results.labels or ()))
     index = {name: i for i, name in enumerate(results.names)}
     sizes = Counter(results.labels or ())
-    # As long as a second tier is.
-    n_ranked = max(_LEAST_RANKED, 2 * max(sizes.values(), default=0))
+    n_ranked = max(_MIN_RANKED, 2 * max(sizes.values(), default=0))  # covers the second tier of every class
     return {
         "classes": classes,
         "shapes": _shapes(results, surfaces, classes, explanations or {}),
-        "columns": {name: [of.get(one) for one in results.names] for name, of in results.columns.items()},
-        "systems": [_of_system(system, index, classes, n_ranked) for system in results.systems],
+        "columns": {title: [column.get(name) for name in results.names] for title, column in results.columns.items()},
+        "systems": [_system_data(system, index, classes, n_ranked) for system in results.systems],
         "movements": finite((results.robustness or {}).get("movements", {})),
     }
 
 
-def letters(content: bytes) -> str:
-    """Bytes in base 64."""
+def base64_text(content: bytes) -> str:
+    """Encode bytes in base 64."""
     return base64.b64encode(content).decode("ascii")
 
 
 def _shapes(
     results: Results, surfaces: Mapping[str, PageSurface], classes: Sequence[str], explanations: Mapping[str, Painted]
 ) -> list[dict[str, Any]]:
-    """Of each body its name, class, notes and surface: place among the surfaces and numbers of vertices and faces.
+    """Return the data of each body.
 
-    Of one of several in a file, its part and the others of the file by their numbers. Where that is explained, how it
-    differs from its nearest: `other`, `told`, and `values` of the vertices of both surfaces.
+    Every body has its `name`, `label` (index of its class), and `notes`; a body with a surface has `surface` (index
+    among the surfaces, numbers of vertices and of faces), `mesh` (measures of the original mesh), `unit`, and the range
+    of the `potential`; one of several bodies in a file has its `part` and the indices of the others, `together`; and
+    an explained body has `explained`: its nearest (`other`), the largest shares (`told`), and the `values` of the
+    vertices of both surfaces.
     """
-    found, place = [], 0
+    result, n_surfaces = [], 0
     files: dict[str, list[int]] = {}
     for i, name in enumerate(results.names):
         if name in results.parts:
@@ -72,48 +73,53 @@ def _shapes(
         if i in together:
             shape.update(part=results.parts[name], together=together[i])
         if name in surfaces:
-            one = surfaces[name]
-            shape["surface"] = [place, len(one.vertices), len(one.faces)]
-            shape["mesh"] = [one.n_vertices, one.n_faces, _significant(one.area), _significant(one.volume)]
-            shape["unit"] = one.unit
-            shape["potential"] = [_significant(value) for value in one.potential_range]
-            place += 1
+            surface = surfaces[name]
+            shape["surface"] = [n_surfaces, len(surface.vertices), len(surface.faces)]
+            measures = (_significant(surface.area), _significant(surface.volume))
+            shape["mesh"] = [surface.n_vertices, surface.n_faces, *measures]
+            shape["unit"] = surface.unit
+            shape["potential"] = [_significant(value) for value in surface.potential_range]
+            n_surfaces += 1
         if name in explanations:
             painted = explanations[name]
-            values = [letters(one.tobytes()) for one in painted.values]
+            values = [base64_text(array.tobytes()) for array in painted.values]
             other = results.names.index(painted.other)
             shape["explained"] = {"other": other, "told": painted.told, "values": values}
-        found.append(shape)
-    return found
+        result.append(shape)
+    return result
 
 
-def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str], n_ranked: int) -> dict[str, Any]:
-    """Of a descriptor: `shapes` it describes as numbers among all; for each of them the nearest others, uint32 (N, top)
-    `ranked` and float32 (N, top) `distances`; mean scores, those of each class and each query; confusion, curve; the
-    `worst` confusions, see `_worst`; the `map`, see `_map`."""
+def _system_data(system: System, index: Mapping[str, int], classes: Sequence[str], n_ranked: int) -> dict[str, Any]:
+    """Return the data of a descriptor.
+
+    These are the `shapes` that it describes (indices among all shapes); for each of them the `top` nearest others,
+    `ranked` (uint32) and their `distances` (float32), both (N, top); mean scores, scores per class and per query; the
+    precision–recall `curve`; the `confusion`, see `_confusion`; the `worst` confusions, see `_worst`; and the `map`,
+    see `_map`.
+    """
     order = system.ranked()
-    near = order[:, :n_ranked]
-    places = np.array([index[name] for name in system.names])
-    distances = np.take_along_axis(system.distances.numpy(), near, axis=1)
+    nearest = order[:, :n_ranked]
+    indices = np.array([index[name] for name in system.names])
+    distances = np.take_along_axis(system.distances.numpy(), nearest, axis=1)
     scored: dict[str, Any] = dict.fromkeys(("scores", "per_class", "per_query", "curve", "worst"))
-    if system.labels is not None and len(set(system.labels)) < len(system.labels):  # two share a class
+    if system.labels is not None and len(set(system.labels)) < len(system.labels):  # some shapes share a class
         scores = retrieval_scores(system.distances, system.labels)
         curve = precision_recall_curve(system.distances, system.labels)
         by_class = {str(label): values for label, values in scores.per_class().items()}
         numbers = {
             "scores": scores.mean(),
             "per_class": [by_class.get(name) for name in classes],
-            "per_query": {one: getattr(scores, one).tolist() for one in _OF_QUERIES},
+            "per_query": {name: getattr(scores, name).tolist() for name in _QUERY_SCORES},
             "curve": [curve.recall.tolist(), curve.precision.tolist()],
         }
-        scored = {**finite(numbers, _DECIMALS), "worst": _worst(system, order, scores, places)}
+        scored = {**finite(numbers, _DECIMALS), "worst": _worst(system, order, scores, indices)}
     return {
         "name": system.name,
         "seconds": system.seconds_per_mesh,
-        "shapes": places.tolist(),
-        "top": near.shape[1],
-        "ranked": letters(places[near].astype("<u4").tobytes()),
-        "distances": letters(distances.astype("<f4").tobytes()),
+        "shapes": indices.tolist(),
+        "top": nearest.shape[1],
+        "ranked": base64_text(indices[nearest].astype("<u4").tobytes()),
+        "distances": base64_text(distances.astype("<f4").tobytes()),
         **scored,
         "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
         "map": _map(system),
@@ -121,26 +127,29 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
 
 
 def _map(system: System) -> dict[str, Any] | None:
-    """Where the shapes lie, (N, 2) `points` and the `stress`; the `cluster` of each, the `stability` of these, of which
-    `n_stable` are stable; and the `tree`: of each joining, the lowest first, two branches and their distance; rows come
-    before joinings."""
+    """Return the map and the clusters of the shapes that a descriptor describes; None if there are too few or too many.
+
+    The map has `points` (N, 2) and its `stress`; each shape has a `cluster`, and each cluster its `stability`, of which
+    `n_stable` are stable. The `tree` lists the two children of each node and their distance, the lowest node first: a
+    child below N is a shape, and child N + i is node i.
+    """
     distances = system.distances.double().numpy()
-    if not _LEAST_MAPPED <= len(distances) <= _MOST_MAPPED or not np.isfinite(distances).all():
+    if not _MIN_MAPPED <= len(distances) <= _MAX_MAPPED or not np.isfinite(distances).all():
         return None
-    found, clusters = body_map(distances), clusters_of(distances, n_resamples=50)
-    extent = float(np.ptp(found.points, axis=0).max()) or 1.0
+    layout, clusters = body_map(distances), clusters_of(distances, n_resamples=50)
+    extent = float(np.ptp(layout.points, axis=0).max()) or 1.0
     return {
-        "points": ((found.points - found.points.min(axis=0)) / extent).round(4).tolist(),
-        "stress": round(found.stress, 3),
+        "points": ((layout.points - layout.points.min(axis=0)) / extent).round(4).tolist(),
+        "stress": round(layout.stress, 3),
         "cluster": clusters.labels.tolist(),
         "stability": finite(clusters.stability, _DECIMALS),
-        "n_stable": sum(one >= STABLE for one in clusters.stability),
+        "n_stable": sum(stability >= STABLE for stability in clusters.stability),
         "tree": [[int(one), int(other), _significant(height)] for one, other, height, _ in clusters.tree.tolist()],
     }
 
 
 def _confusion(order: Integers, labels: Sequence[str], classes: Sequence[str]) -> dict[str, list[list[int]]] | None:
-    """(C, C) how many shapes of a class (row) have their nearest in a class (column), and so for their first tiers."""
+    """Count (C, C) the nearest shapes, and the first tiers, of each class of queries (row) by their class (column)."""
     if not order.size:
         return None
     codes = np.array([classes.index(label) for label in labels])
@@ -152,34 +161,35 @@ def _confusion(order: Integers, labels: Sequence[str], classes: Sequence[str]) -
     return {"nearest": nearest.tolist(), "tier": tier.tolist()}
 
 
-def _worst(system: System, order: Integers, scores: RetrievalScores, places: Integers) -> list[dict[str, Any]]:
-    """The queries whose rankings are most wrong, at most twenty, the worst first; ranks count from 1.
+def _worst(system: System, order: Integers, scores: RetrievalScores, indices: Integers) -> list[dict[str, Any]]:
+    """Return the queries with the worst rankings, at most `N_WORST`, the worst first.
 
-    The later the first shape of the query's class comes, the worse; then the lower the first tier; then by name. So a
-    query whose nearest is right comes after all others, and one whose whole first tier is right is no confusion.
+    A ranking is worse the lower the first shape of the query's class is ranked; ties are ordered by the first tier,
+    then by name. Queries whose whole first tier is correct are left out.
 
-    Of each `query`, its number among all shapes; the `rank` of the first shape of its class; the ranks of the `wrong`
-    ones before that, or where that is the nearest, of those in the first tier: at most three.
+    Each has the `query` (index among all shapes), the `rank` of the first shape of its class, from 1, and the ranks of
+    at most three `wrong` shapes: those before the first shape of the class or, if this is the nearest, those in the
+    first tier.
     """
     _, codes = np.unique(np.asarray(system.labels), return_inverse=True)
-    first_tier = scores.ft.numpy()  # NaN for a shape without another of its class
+    first_tier = scores.ft.numpy()  # NaN for a shape that is alone in its class
     queries = np.flatnonzero(first_tier < 1).tolist()
-    right = codes[order[queries]] == codes[queries][:, None]
-    ranks = (right.argmax(axis=1) + 1).tolist()
+    is_relevant = codes[order[queries]] == codes[queries][:, None]
+    ranks = (is_relevant.argmax(axis=1) + 1).tolist()
     worst = sorted(range(len(queries)), key=lambda i: (-ranks[i], first_tier[queries[i]], system.names[queries[i]]))
-    found = []
+    result = []
     for i in worst[:N_WORST]:
-        wrong = np.flatnonzero(~right[i, : ranks[i] - 1 or int(right[i].sum())])[:_N_WRONG] + 1
-        found.append({"query": int(places[queries[i]]), "rank": ranks[i], "wrong": wrong.tolist()})
-    return found
+        wrong = np.flatnonzero(~is_relevant[i, : ranks[i] - 1 or int(is_relevant[i].sum())])[:_N_WRONG] + 1
+        result.append({"query": int(indices[queries[i]]), "rank": ranks[i], "wrong": wrong.tolist()})
+    return result
 
 
 def finite(value: Any, decimals: int | None = None) -> Any:
-    """The same, perhaps rounded, with None for numbers that JSON does not know, as of a score that is not defined."""
+    """Return a copy of nested data with None for numbers that are not finite, for JSON, and optionally rounded."""
     if isinstance(value, Mapping):
-        return {name: finite(one, decimals) for name, one in value.items()}
+        return {name: finite(item, decimals) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(one, decimals) for one in value]
+        return [finite(item, decimals) for item in value]
     if not isinstance(value, float):
         return value
     return (value if decimals is None else round(value, decimals)) if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""What a folder of results holds, read again for its page; and where its meshes lie and how they were read."""
+"""Reading of a folder of results for its page, and the file that records its meshes and reading options."""
 
 import csv
 import json
@@ -28,14 +28,14 @@ _RETRIEVAL, _COMPARISON, _ROBUSTNESS = "distances.npz", "compare.json", "robustn
 class System:
     """Distances of one descriptor among the N meshes that it describes."""
 
-    name: str
-    names: tuple[str, ...]
-    labels: tuple[str, ...] | None  # None where they are not known
-    distances: Tensor  # (N, N), a row a query
-    seconds_per_mesh: float | None = None  # of processor time for a description; None where it was not measured
+    name: str  # of the descriptor
+    names: tuple[str, ...]  # of the meshes
+    labels: tuple[str, ...] | None  # None if unknown
+    distances: Tensor  # (N, N), rows are queries
+    seconds_per_mesh: float | None = None  # mean processor time of a description; None if it was not measured
 
     def ranked(self) -> Integers:
-        """(N, N − 1) the other meshes, nearest first, ties in the order of the meshes."""
+        """Return the indices (N, N − 1) of the other meshes, nearest first, ties in the order of the meshes."""
         n = len(self.names)
         order = rank(self.distances)
         return order[order != torch.arange(n)[:, None]].view(n, max(n - 1, 0)).numpy()
@@ -43,7 +43,7 @@ class System:
 
 @dataclass(frozen=True)
 class Unused:
-    """A mesh that one descriptor could not use, or none of them could."""
+    """A mesh that a descriptor, or every descriptor, could not use."""
 
     file: str
     error: str
@@ -52,64 +52,64 @@ class Unused:
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All that a page is made from but pictures."""
+    """Contents of a page, without its surfaces and explanations."""
 
-    command: str  # that wrote them
+    command: str  # command that wrote the results
     names: tuple[str, ...]  # of all meshes that were used
-    labels: tuple[str, ...] | None  # None where they are not known
+    labels: tuple[str, ...] | None  # None if unknown
     systems: tuple[System, ...] = ()
-    rows: tuple[Mapping[str, Any], ...] = ()  # the table of `igps compare`, one line a descriptor
-    robustness: Mapping[str, Any] | None = None  # robustness.json
+    rows: tuple[Mapping[str, Any], ...] = ()  # table of `igps compare`, one row per descriptor
+    robustness: Mapping[str, Any] | None = None  # contents of robustness.json
     unused: tuple[Unused, ...] = ()
-    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)  # what was done to a mesh, by name
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)  # notes on the mending of meshes, by name
     config: Mapping[str, Any] = field(default_factory=dict)
-    parts: Mapping[str, str] = field(default_factory=dict)  # of bodies that share their file with others, by name
+    parts: Mapping[str, str] = field(default_factory=dict)  # parts of bodies that share their file, by name
     columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)  # by column and name of the body
-    groups: tuple[Mapping[str, Any], ...] = ()  # what `igps groups` wrote to the same folder, a line a body
-    outliers: tuple[Mapping[str, Any], ...] = ()  # what `igps outliers` wrote there
+    groups: tuple[Mapping[str, Any], ...] = ()  # results of `igps groups` in the same folder, one row per body
+    outliers: tuple[Mapping[str, Any], ...] = ()  # results of `igps outliers` in the same folder
 
 
 def read_results(folder: Path) -> Results:
-    """What `igps retrieve`, `compare` or `robustness` wrote to a folder; of several, the last."""
-    readers = {_RETRIEVAL: _retrieval, _COMPARISON: _comparison, _ROBUSTNESS: _robustness}
-    written = {name: (folder / name).stat().st_mtime for name in readers if (folder / name).is_file()}
-    if not written:
+    """Read the results that `igps retrieve`, `compare` or `robustness` wrote to a folder; the latest, if several."""
+    readers = {_RETRIEVAL: _read_retrieval, _COMPARISON: _read_comparison, _ROBUSTNESS: _read_robustness}
+    times = {name: (folder / name).stat().st_mtime for name in readers if (folder / name).is_file()}
+    if not times:
         raise FileNotFoundError(
             f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve`, `igps compare` and "
             "`python -m training.study robustness` write with --out."
         )
-    about, notes, unused = _json(folder / MESHES_FILE), dict[str, list[str]](), list[Unused]()
-    for name, note in map(dict.values, _rows(folder / "notes.csv")):
+    sources, notes, unused = _read_json(folder / MESHES_FILE), dict[str, list[str]](), list[Unused]()
+    for name, note in map(dict.values, _read_rows(folder / "notes.csv")):
         notes.setdefault(name, []).append(note)
-    for *descriptor, name, error in map(dict.values, _rows(folder / "failures.csv")):
+    for *descriptor, name, error in map(dict.values, _read_rows(folder / "failures.csv")):
         unused.append(Unused(name, error, None if descriptor in ([], ["all"]) else descriptor[0]))
-    found = readers[max(written, key=lambda name: written[name])](folder)
-    bodies = about.get("meshes", [])
+    results = readers[max(times, key=lambda name: times[name])](folder)
+    bodies = sources.get("meshes", [])
     return replace(
-        found,
-        unused=(*unused, *found.unused),
+        results,
+        unused=(*unused, *results.unused),
         notes=notes,
-        config=found.config or about.get("signature", {}),
-        parts={one["file"]: one["part"] for one in bodies if one.get("part")},
+        config=results.config or sources.get("signature", {}),
+        parts={body["file"]: body["part"] for body in bodies if body.get("part")},
         columns={
-            name: {one["file"]: value for one, value in zip(bodies, values, strict=True)}
-            for name, values in about.get("columns", {}).items()
+            name: {body["file"]: value for body, value in zip(bodies, values, strict=True)}
+            for name, values in sources.get("columns", {}).items()
         },
-        groups=tuple(_json(folder / "groups.json")),
-        outliers=tuple(_json(folder / "outliers.json")),
+        groups=tuple(_read_json(folder / "groups.json")),
+        outliers=tuple(_read_json(folder / "outliers.json")),
     )
 
 
 def write_sources(folder: Path, dataset: SignatureDataset) -> None:
-    """Write meshes.json: of each body its name in the results, file, part, columns; reading, signature, cache."""
-    pipeline, files, names = dataset.pipeline, dataset.bodies, dataset.pipeline.reading.names
+    """Write meshes.json: names, paths, parts and columns of the bodies, reading options, configuration, and cache."""
+    pipeline, bodies, names = dataset.pipeline, dataset.bodies, dataset.pipeline.reading.names
     summary = {
         "format": _FORMAT,
         "meshes": [
             {"file": name, "path": str(body.path.resolve()), "part": body.part}
-            for name, body in zip(files.names, files, strict=True)
+            for name, body in zip(bodies.names, bodies, strict=True)
         ],
-        "columns": files.columns,
+        "columns": bodies.columns,
         "reading": {**asdict(pipeline.reading), "names": names and os.path.abspath(names)},
         "signature": asdict(pipeline.config),
         "cache_dir": str(pipeline.cache_dir.resolve()),
@@ -118,7 +118,11 @@ def write_sources(folder: Path, dataset: SignatureDataset) -> None:
 
 
 def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset | None:
-    """The meshes of a folder of results, None where it does not tell them; `meshes` is where they were moved to."""
+    """Return the dataset of a folder of results, None without meshes.json; `meshes` is where meshes were moved to.
+
+    Raises:
+        ValueError: meshes.json has another format.
+    """
     path = folder / MESHES_FILE
     if not path.is_file():
         return None
@@ -126,10 +130,10 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         summary: dict[str, Any] = json.loads(path.read_text())
         if summary["format"] != _FORMAT:
             raise ValueError(f"its format is {summary['format']!r}")
-        names = tuple(str(one["file"]) for one in summary["meshes"])
-        parts = tuple(one.get("part") for one in summary["meshes"])
+        names = tuple(str(mesh["file"]) for mesh in summary["meshes"])
+        parts = tuple(mesh.get("part") for mesh in summary["meshes"])
         if meshes is None:
-            paths = tuple(Path(one["path"]) for one in summary["meshes"])
+            paths = tuple(Path(mesh["path"]) for mesh in summary["meshes"])
         else:
             paths = tuple(meshes / file_name_of(name, part) for name, part in zip(names, parts, strict=True))
         columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
@@ -139,60 +143,61 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         raise ValueError(f"{path}: expected the format {_FORMAT} ({error}). Run the command again.") from error
 
 
-def _retrieval(folder: Path) -> Results:
-    config = dict(_json(folder / "scores.json").get("config", {}))
-    system = _system(folder / _RETRIEVAL, str(config.get("descriptor", "descriptor")))
+def _read_retrieval(folder: Path) -> Results:
+    config = dict(_read_json(folder / "scores.json").get("config", {}))
+    system = _read_system(folder / _RETRIEVAL, str(config.get("descriptor", "descriptor")))
     return Results("retrieve", system.names, system.labels, (system,), config=config)
 
 
-def _comparison(folder: Path) -> Results:
+def _read_comparison(folder: Path) -> Results:
     rows = json.loads((folder / _COMPARISON).read_text())
     systems, label_of = [], dict[str, str]()
     names: dict[str, None] = {}
     for row in rows:
         path = folder / "distances" / f"{row['descriptor']}.npz"
         if row["n_models"] and path.is_file():
-            systems.append(system := _system(path, row["descriptor"], row["seconds_per_mesh"]))
+            systems.append(system := _read_system(path, row["descriptor"], row["seconds_per_mesh"]))
             names.update(dict.fromkeys(system.names))
             label_of.update(zip(system.names, system.labels or (), strict=False))
     labels = tuple(label_of[name] for name in names) if label_of else None
     return Results("compare", tuple(names), labels, tuple(systems), rows=tuple(rows))
 
 
-def _robustness(folder: Path) -> Results:
-    summary = _json(folder / _ROBUSTNESS)
+def _read_robustness(folder: Path) -> Results:
+    summary = _read_json(folder / _ROBUSTNESS)
     names: dict[str, None] = {}
     unused: dict[tuple[str, str], Unused] = {}
     for descriptor, movements in summary["movements"].items():
         for column, movement in movements.items():
-            if column in summary["disturbances"]:  # the others are of pairs of poses
+            if column in summary["disturbances"]:  # the other columns have pairs of poses in place of meshes
                 names.update(dict.fromkeys([*movement["each"], *movement["notes"]]))
-            for file, why in movement["notes"].items():
-                unused.setdefault((file, why), Unused(file, f"{column}: {why}", descriptor))
-    lost, config = tuple(unused.values()), summary.get("config", {})
-    return Results("robustness", tuple(names), None, robustness=summary, unused=lost, config=config)
+            for file, reason in movement["notes"].items():
+                unused.setdefault((file, reason), Unused(file, f"{column}: {reason}", descriptor))
+    config = summary.get("config", {})
+    return Results("robustness", tuple(names), None, robustness=summary, unused=tuple(unused.values()), config=config)
 
 
-def _system(path: Path, name: str, seconds: float | None = None) -> System:
+def _read_system(path: Path, name: str, seconds: float | None = None) -> System:
     with np.load(path) as archive:
         names = tuple(archive["names"].tolist())
         labels = tuple(str(label) for label in archive["labels"].tolist()) if "labels" in archive else ()
         distances = torch.from_numpy(archive["distances"])
     if len(labels) not in (0, len(names)) or distances.shape != (len(names), len(names)):
         raise ValueError(
-            f"{path}: expected distances between {len(names)} meshes and as many labels or none, got "
-            f"{tuple(distances.shape)} and {len(labels)}. Run the command again."
+            f"{path}: expected distances and labels (or no labels) of {len(names)} meshes, got distances "
+            f"{tuple(distances.shape)} and {len(labels)} labels. Run the command again."
         )
     return System(name, names, labels or None, distances, seconds)
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
+def _read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file; an empty list if there is no file."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
-def _json(path: Path) -> Any:
-    """What is in a file; an empty dictionary where there is none."""
+def _read_json(path: Path) -> Any:
+    """Return the contents of a JSON file; an empty dictionary if there is no file."""
     return json.loads(path.read_text()) if path.is_file() else {}

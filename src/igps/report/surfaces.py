@@ -1,4 +1,4 @@
-"""Small surfaces of meshes for the page of results: few vertices, quantised, with the barycentroid potential."""
+"""Simplified surfaces for the page of results: few vertices, quantised, with the barycentroid potential."""
 
 import contextlib
 import logging
@@ -26,71 +26,71 @@ from igps.signature.signature import Signature
 logger = logging.getLogger(__name__)
 
 _FORMAT = "igps-surfaces-2"
-_MOST_VERTICES, _LEAST_VERTICES = 1200, 150
-# What the surfaces of a page may take in all, and what a vertex takes: 19 bytes, in letters of six bits.
-_MOST_BYTES, _BYTES_A_VERTEX = 20e6, 19 * 4 / 3
+_MAX_VERTICES, _MIN_VERTICES = 1200, 150  # of one surface
+# Size of all surfaces of a page, and of one vertex, which has 19 bytes as text in base 64
+_MAX_BYTES, _BYTES_PER_VERTEX = 20e6, 19 * 4 / 3
 STEPS = 2**16 - 1
-"""Into which the cube around a surface is divided along each axis."""
-_NEIGHBOURS = 4  # samples that a vertex takes its potential from
+"""Number of steps along each axis of the cube in which vertices are quantised."""
+_N_NEIGHBOURS = 4  # samples whose mean is the potential of a vertex
 
 
 @dataclass(frozen=True, eq=False)
 class PageSurface:
-    """The small surface of a body, for the page."""
+    """The simplified surface of a body on the page."""
 
-    vertices: NDArray[np.uint16]  # (V, 3) in a cube around it, the longest principal axis along y, the next along x
+    vertices: NDArray[np.uint16]  # (V, 3) in the bounding cube, the longest principal axis along y, the next along x
     faces: NDArray[np.uint16]  # (F, 3), counter-clockwise seen from outside
-    potential: NDArray[np.uint8]  # (V,) barycentroid potential, from its least value on the surface to the largest
-    potential_range: tuple[float, float]  # these values, no unit
-    n_vertices: int  # of the mesh that was described, as all that follows
+    potential: NDArray[np.uint8]  # (V,) barycentroid potential, 0 at its minimum on the surface, 255 at its maximum
+    potential_range: tuple[float, float]  # minimum and maximum of the potential, no unit
+    n_vertices: int  # of the original mesh, as the following fields
     n_faces: int
     area: float  # length²
     volume: float  # length³
-    key: str  # of the Signature in the cache, which tells whether the mesh file has changed since
-    unit: str | None = None  # of length, such as "mm"; None where it is not known
+    key: str  # cache key of the Signature, which changes with the mesh file
+    unit: str | None = None  # of length, such as "mm"; None if unknown
 
     def packed(self) -> bytes:
-        """Vertices, faces and potential behind each other, little-endian."""
+        """Return the bytes of vertices, faces and potential, in this order and little-endian."""
         parts = (self.vertices.astype("<u2"), self.faces.astype("<u2"), self.potential)
         return b"".join(part.tobytes() for part in parts)
 
 
 def fitting_vertices(n_shapes: int) -> int:
-    """How many vertices each of so many surfaces may have for their page to stay below 30 MB."""
-    return int(np.clip(_MOST_BYTES / _BYTES_A_VERTEX / max(n_shapes, 1), _LEAST_VERTICES, _MOST_VERTICES))
+    """Return the largest number of vertices of each surface that keeps a page of n shapes below 30 MB."""
+    return int(np.clip(_MAX_BYTES / _BYTES_PER_VERTEX / max(n_shapes, 1), _MIN_VERTICES, _MAX_VERTICES))
 
 
 def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, PageSurface]:
-    """The surfaces of meshes by name: read from an archive those that are there, computed and written the others.
+    """Return the surfaces of meshes by name, from an archive where possible; compute and store the others.
 
-    A mesh file that has changed since is read again; of one that is gone, what was kept serves. A mesh that cannot be
-    read, and was not kept, is left out and logged.
+    The surface of a mesh file that has changed is computed again; that of a deleted file is used from the archive. A
+    mesh that cannot be read and is not in the archive is logged and left out.
     """
-    kept = read_surfaces(path)
+    stored = read_surfaces(path)
     names, bodies = dataset.bodies.names, dataset.bodies
-    missing = [i for i, name in enumerate(names) if not _is_current(dataset.pipeline, bodies[i], kept.get(name))]
+    missing = [i for i, name in enumerate(names) if not _is_current(dataset.pipeline, bodies[i], stored.get(name))]
     if missing:
         make = partial(_surface_of_body, dataset.pipeline, fitting_vertices(len(names)))
         jobs = {names[i]: bodies[i] for i in missing}
-        kept |= run_jobs(make, jobs, "picture", n_workers)
-    found = {name: kept[name] for name in names if name in kept}
+        stored |= run_jobs(make, jobs, "picture", n_workers)
+    surfaces = {name: stored[name] for name in names if name in stored}
     if missing:
-        write_surfaces(path, found)
-    return found
+        write_surfaces(path, surfaces)
+    return surfaces
 
 
 def run_jobs(
     work: Callable[[Job], Result], jobs: Mapping[str, Job], what: str, n_workers: int | None
 ) -> dict[str, Result]:
-    """The results of jobs by name; a job that fails is logged as lacking `what`, and left out."""
-    names, found = list(jobs), dict[str, Result]()
+    """Run jobs in parallel and return their results by name; a failed job is logged as "no `what`" and left out."""
+    names, results = list(jobs), dict[str, Result]()
     with contextlib.closing(run(work, list(jobs.values()), n_workers=n_workers)) as outcomes:
         for number, outcome in tqdm(outcomes, total=len(jobs), desc=f"{what}s"):
             if isinstance(outcome, Failed):
                 logger.warning("%s: no %s: %s", names[number], what, outcome.reason)
             else:
-                found[names[number]] = outcome
-    return found
+                results[names[number]] = outcome
+    return results
 
 
 def _surface_of_body(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef) -> PageSurface:
@@ -98,22 +98,22 @@ def _surface_of_body(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef
 
 
 def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "") -> PageSurface:
-    """The surface of a mesh with at most `n_vertices` vertices; its potential is from samples of the Signature."""
+    """Return a surface of at most `n_vertices` vertices, with the potential interpolated from surface samples."""
     try:
-        small = simplify(mesh, n_vertices)
-        vertices, faces = small.vertices, small.faces
-    except MeshError:  # only to look at: what is between the handles may close
+        simplified = simplify(mesh, n_vertices)
+        vertices, faces = simplified.vertices, simplified.faces
+    except MeshError:  # a surface whose handles close is good enough for display
         vertices, faces = clustered(mesh.vertices, mesh.faces, n_vertices)
     samples = signature.surface.points
     potential = np.sqrt(np.square(signature.surface.eigenfunctions, dtype=np.float64) @ (1 / signature.eigenvalues))
-    distances, nearest = cKDTree(samples).query(vertices, min(_NEIGHBOURS, len(samples)))
+    distances, nearest = cKDTree(samples).query(vertices, min(_N_NEIGHBOURS, len(samples)))
     distances, nearest = distances.reshape(len(vertices), -1), nearest.reshape(len(vertices), -1)
     weights = 1 / (distances + 1e-6 * mesh.diagonal)
     values = (weights * potential[nearest]).sum(axis=1) / weights.sum(axis=1)
     low, high = float(values.min()), float(values.max())
-    turned = vertices @ axes_of(samples)
-    lowest, highest = turned.min(axis=0), turned.max(axis=0)
-    in_cube = (turned - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
+    rotated = vertices @ axes_of(samples)
+    lowest, highest = rotated.min(axis=0), rotated.max(axis=0)
+    in_cube = (rotated - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
     return PageSurface(
         np.rint(STEPS * in_cube).astype(np.uint16), faces.astype(np.uint16),
         np.rint(255 * (values - low) / ((high - low) or 1)).astype(np.uint8), (low, high),
@@ -122,35 +122,40 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
 
 
 def write_surfaces(path: Path, surfaces: Mapping[str, PageSurface]) -> None:
-    """Write surfaces as a NumPy archive: the arrays of all behind each other, with the numbers that tell them apart."""
-    many = list(surfaces.values())
+    """Write surfaces to a NumPy archive, as concatenated arrays with the sizes of each surface."""
+    values = list(surfaces.values())
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
         path,
         format=np.array(_FORMAT),
         names=np.array(list(surfaces), dtype=str),
-        keys=np.array([one.key for one in many], dtype=str),
-        units=np.array([one.unit or "" for one in many], dtype=str),
-        vertices=np.concatenate([np.empty((0, 3), np.uint16), *(one.vertices for one in many)]),
-        faces=np.concatenate([np.empty((0, 3), np.uint16), *(one.faces for one in many)]),
-        potential=np.concatenate([np.empty(0, np.uint8), *(one.potential for one in many)]),
-        counts=np.array([(len(one.vertices), len(one.faces)) for one in many]).reshape(-1, 2),
-        mesh_counts=np.array([(one.n_vertices, one.n_faces) for one in many]).reshape(-1, 2),
-        measures=np.array([(*one.potential_range, one.area, one.volume) for one in many]).reshape(-1, 4),
+        keys=np.array([s.key for s in values], dtype=str),
+        units=np.array([s.unit or "" for s in values], dtype=str),
+        vertices=np.concatenate([np.empty((0, 3), np.uint16), *(s.vertices for s in values)]),
+        faces=np.concatenate([np.empty((0, 3), np.uint16), *(s.faces for s in values)]),
+        potential=np.concatenate([np.empty(0, np.uint8), *(s.potential for s in values)]),
+        counts=np.array([(len(s.vertices), len(s.faces)) for s in values]).reshape(-1, 2),
+        mesh_counts=np.array([(s.n_vertices, s.n_faces) for s in values]).reshape(-1, 2),
+        measures=np.array([(*s.potential_range, s.area, s.volume) for s in values]).reshape(-1, 4),
     )
 
 
 def read_surfaces(path: Path) -> dict[str, PageSurface]:
-    """What `write_surfaces` wrote, by name; nothing where there is no file; a ValueError of another kind of file."""
+    """Read an archive of `write_surfaces`, by name; return an empty dictionary if there is no file.
+
+    Raises:
+        ValueError: the file has another format.
+    """
     if not path.is_file():
         return {}
     with np.load(path) as archive:
         if "format" not in archive or str(archive["format"]) != _FORMAT:
-            raise ValueError(f"{path}: expected an archive of the format {_FORMAT}. Remove it to have it made again.")
+            raise ValueError(f"{path}: expected an archive of the format {_FORMAT}. Delete it and run again.")
         arrays = {name: archive[name] for name in archive}
     ends = np.cumsum(arrays["counts"], axis=0)
     columns = [
-        np.split(arrays[name], ends[:, of])[:-1] for name, of in (("vertices", 0), ("faces", 1), ("potential", 0))
+        np.split(arrays[name], ends[:, column])[:-1]
+        for name, column in (("vertices", 0), ("faces", 1), ("potential", 0))
     ]
     columns += [arrays[name].tolist() for name in ("names", "measures", "mesh_counts", "keys", "units")]
     return {
@@ -161,20 +166,20 @@ def read_surfaces(path: Path) -> dict[str, PageSurface]:
     }
 
 
-def _is_current(pipeline: SignaturePipeline, body: BodyRef, kept: PageSurface | None) -> bool:
-    """Whether the file is gone, or unchanged since the surface was made."""
-    if kept is None:
+def _is_current(pipeline: SignaturePipeline, body: BodyRef, stored: PageSurface | None) -> bool:
+    """Return whether a stored surface can be used: the file is unchanged, or it was deleted."""
+    if stored is None:
         return False
     try:
-        return pipeline.key(body) == kept.key
+        return pipeline.key(body) == stored.key
     except MeshError:
         return True
 
 
 def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Floats, Integers]:
-    """At most `n_vertices` vertices, each the mean of those in a cell of a grid (Rossignac and Borrel 1993).
+    """Simplify a surface to at most `n_vertices` vertices by clustering in a grid (Rossignac and Borrel 1993).
 
-    Handles and gaps may close, so that the result is good to look at and for nothing else.
+    Handles and gaps may close, so the result is suitable only for display.
     """
     low, extent = vertices.min(axis=0), longest_side(vertices)
     resolution = max(2, int(np.sqrt(n_vertices)))
@@ -187,7 +192,7 @@ def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Float
         resolution = max(1, int(0.93 * resolution))
     counts = np.bincount(cell_of)
     means = np.stack([np.bincount(cell_of, vertices[:, axis]) / counts for axis in range(3)], axis=1)
-    moved = cell_of[faces]
-    whole = (moved != np.roll(moved, 1, axis=1)).all(axis=1)
-    _, first = np.unique(np.sort(moved[whole], axis=1), axis=0, return_index=True)
-    return compact(means, moved[whole][np.sort(first)])
+    clusters = cell_of[faces]
+    kept = clusters[(clusters != np.roll(clusters, 1, axis=1)).all(axis=1)]
+    _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
+    return compact(means, kept[np.sort(first)])

@@ -1,4 +1,4 @@
-"""The benchmark itself: numbered classes and shapes, generated on demand or written to a folder."""
+"""The benchmark: numbered classes and shapes, generated on demand or written to a folder."""
 
 import json
 import operator
@@ -17,26 +17,28 @@ from igps.shapes.meshing import defect, mesh, roughen
 from igps.shapes.skeleton import pose
 from igps.shapes.templates import TEMPLATES
 
-_VERSION = 1  # raised whenever the same arguments would give other meshes
+_VERSION = 1  # raise it whenever the same arguments give other meshes
 _MAX_ATTEMPTS = 20
-_POSE, _MOTION = 0, 1  # what a random stream is for: keeps the streams of one seed apart
+_POSE, _MOTION = 0, 1  # keys of random streams, which differ although their seed is the same
 
 
 @dataclass(frozen=True, eq=False)
 class GeneratedShape:
+    """A generated mesh and its class."""
+
     vertices: Floats  # (V,3) float64, in units of about half the height of a figure
     faces: Integers  # (F,3) int64, outward
     label: str  # name of the class
     name: str  # class and running number, such as ``biped/00``
     genus: int  # number of handles of the surface; V − E + F = 2 − 2 genus
-    rotation: Floats  # (3,3) what turned it out of its upright frame; ``vertices @ rotation`` stands upright again
+    rotation: Floats  # (3,3) from the upright frame to that of the mesh; ``vertices @ rotation`` is upright
 
 
 class ArticulatedShapes:
     """A deterministic, labelled benchmark of closed manifold meshes of articulated bodies, class after class.
 
-    A class index means the same class for the same seed whatever ``n_classes``, and a shape depends on its class, its
-    number in the class, ``seed`` and ``n_vertices`` alone, so shapes may be made in any order and by many processes.
+    A shape depends only on its class, its number in the class, ``seed`` and ``n_vertices``, but not on ``n_classes``.
+    Shapes may therefore be generated in any order and by several processes.
 
     Example:
         >>> shapes = ArticulatedShapes(n_classes=3, n_per_class=2)
@@ -47,7 +49,7 @@ class ArticulatedShapes:
         n_classes: number of classes, at most twelve.
         n_per_class: number of shapes of each class.
         seed: seed of all random draws, not negative.
-        n_vertices: vertices of a shape, kept within 40 percent.
+        n_vertices: number of vertices of a shape, within 40 percent.
 
     Raises:
         ValueError: an argument is out of range, or (on access) a shape cannot be made at this resolution.
@@ -76,16 +78,16 @@ class ArticulatedShapes:
 
     @property
     def labels(self) -> list[str]:
-        """The class name of every shape."""
+        """The class name of each shape."""
         return [name for name in self.class_names for _ in range(self.n_per_class)]
 
     @property
     def names(self) -> list[str]:
-        """The unique name of every shape, ``class/number``."""
+        """The unique name of each shape, ``class/number``."""
         return [f"{name}/{number:02d}" for name in self.class_names for number in range(self.n_per_class)]
 
     def __getitem__(self, index: int) -> GeneratedShape:
-        """Generate one shape, in a fraction of a second; nothing is kept. A ValueError if no pose gave a valid mesh."""
+        """Generate a shape, in a fraction of a second, without a cache; a ValueError if no pose gives a valid mesh."""
         position = operator.index(index)
         if not -len(self) <= position < len(self):
             raise IndexError(f"index must lie in [{-len(self)}, {len(self)}), got {index}")
@@ -97,7 +99,7 @@ class ArticulatedShapes:
         name = f"{label}/{number:02d}"
         motion = np.random.default_rng([self.seed, _MOTION, class_index, number])
         rotation = np.asarray(Rotation.from_quat(motion.normal(size=4)).as_matrix())
-        found: str | None = None
+        fault: str | None = None
         for attempt in range(_MAX_ATTEMPTS):
             rng = np.random.default_rng([self.seed, _POSE, class_index, number, attempt])
             target = int(self.n_vertices * rng.uniform(0.8, 1.25))
@@ -105,20 +107,20 @@ class ArticulatedShapes:
             body = pose(skeleton, rng, 1.0 - 0.8 * attempt / _MAX_ATTEMPTS, rotation)
             vertices, faces, spacing = mesh(body, target)
             vertices = roughen(vertices, faces, spacing * rng.uniform(0.0, 0.12), 10.0 * spacing, rng)
-            found = defect(vertices, faces, skeleton.genus, self.n_vertices)
-            if found is None:
+            fault = defect(vertices, faces, skeleton.genus, self.n_vertices)
+            if fault is None:
                 vertices += rng.uniform(-1.0, 1.0, 3)
                 return GeneratedShape(vertices, faces, label, name, skeleton.genus, rotation)
         raise ValueError(
-            f"n_vertices={self.n_vertices}: no valid mesh of {name} in {_MAX_ATTEMPTS} attempts, the last had {found}; "
-            "thin parts need a higher n_vertices, another seed gives other poses"
+            f"n_vertices={self.n_vertices}: no valid mesh of {name} in {_MAX_ATTEMPTS} attempts, the last had {fault}. "
+            "Raise n_vertices if parts are thin, or choose another seed for other poses."
         )
 
     def write(self, root: str | os.PathLike[str], progress: bool = False) -> None:
-        """Write every shape to ``root/<class>/<number>.off``, leaving out what is there already.
+        """Write each shape to ``root/<class>/<number>.off``, unless a complete file exists.
 
-        Each file appears whole or not at all, so an interrupted run is resumed by the same call and several processes
-        may write at once. ``root/shapes.json`` records the generator's settings; classes and shapes may be added later.
+        Files are written atomically: the same call resumes an interrupted one, and several processes may write at once.
+        ``root/shapes.json`` records the settings of the generator; classes and shapes may be added later.
 
         Raises:
             ValueError: ``root`` holds shapes of another seed, resolution or version.
@@ -136,20 +138,20 @@ class ArticulatedShapes:
 
 
 def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
-    """The folder that ``shapes.json`` says to be of these settings, made where absent; a ValueError if of others."""
-    folder, wanted = Path(root), json.dumps(settings)
+    """Return the folder of shapes with these settings, made if absent; a ValueError if it holds shapes of others."""
+    folder, expected = Path(root), json.dumps(settings)
     manifest = folder / "shapes.json"
     if not manifest.exists():
         folder.mkdir(parents=True, exist_ok=True)
         with whole_file(manifest) as file:
-            file.write(wanted.encode())
-    elif (found := manifest.read_text(encoding="utf-8")) != wanted:
-        raise ValueError(f"root={str(root)!r} holds shapes of {found}, not of {wanted}; choose another folder")
+            file.write(expected.encode())
+    elif (recorded := manifest.read_text(encoding="utf-8")) != expected:
+        raise ValueError(f"root={str(root)!r} holds shapes of {recorded}, not of {expected}. Choose another folder.")
     return folder
 
 
 def off_text(vertices: Floats, faces: Integers) -> str:
-    """A mesh in the Object File Format; 17 digits give the same float64 values back."""
+    """Write a mesh in the Object File Format; 17 digits preserve float64 values exactly."""
     lines = [f"OFF\n{len(vertices)} {len(faces)} 0"]
     lines += [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in vertices.tolist()]
     lines += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
@@ -157,10 +159,8 @@ def off_text(vertices: Floats, faces: Integers) -> str:
 
 
 def is_whole_off(path: Path) -> bool:
-    """Whether an OFF file is there with as many lines as its header promises."""
-    if not path.is_file():
-        return False
-    text = path.read_bytes()
+    """Return whether a file is OFF with as many lines as its header declares."""
+    text = path.read_bytes() if path.is_file() else b""
     header = text[:64].split()
     if len(header) < 3 or header[0] != b"OFF":
         return False

@@ -11,21 +11,21 @@ from igps.mesh.mesh import Mesh, MeshError
 from igps.shapes.skeleton import Placed
 
 _MIN_ANGLE = 5.0  # degrees; keeps every cotangent below 11.5
-_VERTEX_TOLERANCE = 0.4
-_COARSE_CELLS = 30_000
-_SNAP = 0.1  # grid values closer to zero than this share of the spacing move away from it
+_VERTEX_TOLERANCE = 0.4  # as a share of the requested number
+_COARSE_CELLS = 30_000  # of the grid that estimates the surface area
+_SNAP = 0.1  # share of the spacing to which smaller absolute grid values are raised
 _RELAXATION_STEPS = 10
 
 
 def mesh(body: Sequence[Placed], target: int) -> tuple[Floats, Integers, float]:
-    """Vertices (V,3), outward faces (F,3) and the grid spacing, with V within about a tenth of ``target``."""
+    """Mesh a body: vertices (V,3), V within about a tenth of ``target``, outward faces (F,3) and the grid spacing."""
     from skimage.measure import marching_cubes
 
-    # A vertex is a crossing of the surface with a grid line: 1.5 of them in an area of spacing², on average.
+    # Vertices are crossings of the surface with grid lines: on average 1.5 of them in an area of spacing².
     spacing = float(np.sqrt(1.5 * _rough_area(body) / target))
     for _ in range(3):
         low, grid = _sample(body, spacing)
-        # Snapped, no vertex comes close to a grid point: no two coincide, no face degenerates.
+        # Keep vertices away from grid points: otherwise they may coincide, and faces degenerate.
         near = np.abs(grid) < _SNAP * spacing
         grid[near] = np.where(grid[near] < 0.0, -_SNAP * spacing, _SNAP * spacing)
         points, faces, _, _ = marching_cubes(grid, 0.0, gradient_direction="descent")
@@ -49,28 +49,27 @@ def roughen(vertices: Floats, faces: Integers, amplitude: float, wavelength: flo
 
 
 def defect(vertices: Floats, faces: Integers, genus: int, n_vertices: int, min_angle: float = _MIN_ANGLE) -> str | None:
-    """What keeps a mesh out of the benchmark, in words, or None; ``min_angle`` in degrees."""
+    """Return what makes a mesh unfit for the benchmark, in words, or None; ``min_angle`` in degrees."""
     import igl
 
-    count = len(vertices)
-    if abs(count / n_vertices - 1.0) > _VERTEX_TOLERANCE:
-        return f"{count} vertices"
+    if abs(len(vertices) / n_vertices - 1.0) > _VERTEX_TOLERANCE:
+        return f"{len(vertices)} vertices"
     try:
         body = Mesh(vertices, faces)
     except MeshError as error:
         return str(error)
     if body.genus != genus:
-        return f"genus {body.genus} in place of {genus}"
+        return f"genus {body.genus}, expected {genus}"
     if body.notes:
         return "inside out"
     angle = float(np.degrees(igl.internal_angles(vertices, faces).min()))
-    if not angle >= min_angle:  # it is NaN where corners lie in one place or in a row
+    if not angle >= min_angle:  # NaN if corners coincide or are collinear
         return f"a triangle with an angle of {angle:.2g} degrees"
     return None
 
 
 def _distance(body: Sequence[Placed], points: Floats) -> Floats:
-    """The blended signed distance (V,) at points (V,3)."""
+    """Return the blended signed distance (V,) at points (V,3)."""
     x, y, z = points.T
     total = body[0].distance(x, y, z)
     for part in body[1:]:
@@ -79,7 +78,7 @@ def _distance(body: Sequence[Placed], points: Floats) -> Floats:
 
 
 def _smooth_minimum(a: Floats, b: Floats, blend: float) -> Floats:
-    """The polynomial smooth union of two distances; differs from the minimum where they are closer than ``blend``."""
+    """Return the polynomial smooth union of two distances, their minimum unless they differ by less than ``blend``."""
     overlap = np.maximum(blend - np.abs(a - b), 0.0)
     return np.minimum(a, b) - overlap * overlap / (4.0 * blend)
 
@@ -90,7 +89,7 @@ def _bounds(body: Sequence[Placed]) -> tuple[Floats, Floats]:
 
 
 def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
-    """The grid's first corner (3,) and the blended distances on it; each solid is evaluated only near itself."""
+    """Return the first corner (3,) of a grid, and the blended distances on it; solids are evaluated only nearby."""
     margin = max(part.blend for part in body) + 2.5 * spacing
     low, high = _bounds(body)
     low = low - margin
@@ -108,7 +107,7 @@ def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
 
 
 def _rough_area(body: Sequence[Placed]) -> float:
-    """Surface area from the volume of a band of half-width one coarse cell around the surface."""
+    """Estimate the surface area from the volume of a band that reaches one coarse cell to both sides of the surface."""
     low, high = _bounds(body)
     spacing = float((np.prod(high - low) / _COARSE_CELLS) ** (1.0 / 3.0))
     _, grid = _sample(body, spacing)

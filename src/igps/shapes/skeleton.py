@@ -1,7 +1,7 @@
-"""Skeletons: trees of solids held by ball joints, and how one is bent into a pose.
+"""Skeletons: trees of solids connected by ball joints, and their poses.
 
-Directions: z is up, y points backwards. A limb runs along its own +z; a joint's limits are degrees about its own x
-(raise), y (swing) and z (twist).
+In the world, z is up and y points backwards. A limb extends along its own +z. The limits of a joint are degrees about
+its own x (raise), y (swing) and z (twist).
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ DOWN: Vector = (0.0, 0.0, -1.0)
 
 @dataclass(frozen=True)
 class Part:
-    """A solid and the joint that holds it."""
+    """A solid and the joint that connects it to its parent."""
 
     solid: Solid
     group: str = "body"  # parts of one group share their proportions
     bend: Vector = ORIGIN  # limits of the joint (raise, swing, twist), degrees
-    at: Vector = ORIGIN  # the joint's place on the parent
-    turn: Floats = field(default_factory=lambda: np.eye(3))  # the joint's frame at rest, in the parent's
-    blend: float = 0.06  # how far from the solid its union with the others is smooth
-    lift: float = 0.0  # how far the solid's own origin lies along z from the joint
+    at: Vector = ORIGIN  # position of the joint in the frame of the parent
+    turn: Floats = field(default_factory=lambda: np.eye(3))  # frame of the joint at rest, in that of the parent
+    blend: float = 0.06  # distance within which the union with other solids is smooth
+    lift: float = 0.0  # distance of the origin of the solid from the joint, along z
     children: tuple[Part, ...] = ()
 
     def joined(self, at: Vector, heading: Vector = UP, roll: float = 0.0) -> Part:
-        """This part held at another place, its +z along ``heading``, turned around it by ``roll`` radians."""
+        """Return a copy at another place, with +z along ``heading``, rotated around it by ``roll`` radians."""
         return replace(self, at=at, turn=aim(heading, roll))
 
     def walk(self) -> Iterator[Part]:
-        """This part and all below it."""
+        """Iterate over this part and its descendants."""
         yield self
         for child in self.children:
             yield from child.walk()
@@ -46,14 +46,14 @@ class Part:
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A tree of parts, and the number of handles made by limbs that meet again."""
+    """A tree of parts; ``loops`` counts the handles that limbs form where they meet."""
 
     root: Part
     loops: int = 0
 
     @property
     def genus(self) -> int:
-        """The number of handles of every shape of this skeleton."""
+        """The number of handles of all shapes of this skeleton."""
         return self.loops + sum(part.solid.genus for part in self.root.walk())
 
 
@@ -67,14 +67,14 @@ class Placed:
     blend: float
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        """The solid's signed distance at world coordinates."""
-        # Written out: a library product may sum in another order on another number of threads.
+        """Return the signed distance of the solid at world coordinates."""
+        # Not a matrix product, which may sum in another order on another number of threads.
         r, (a, b, c) = self.rotation, self.offset
         x, y, z = x - a, y - b, z - c
         return self.solid.distance(*(r[0, i] * x + r[1, i] * y + r[2, i] * z for i in range(3)))
 
     def bounds(self) -> tuple[Floats, Floats]:
-        """The lower and upper corner of a box around the solid, along the world's axes."""
+        """Return the lower and upper corner of a box around the solid, along the axes of the world."""
         low, high = self.solid.box()
         centre = (self.rotation * (0.5 * (low + high))).sum(axis=1) + self.offset
         half = (np.abs(self.rotation) * (0.5 * (high - low))).sum(axis=1)
@@ -82,7 +82,7 @@ class Placed:
 
 
 def aim(heading: Vector, roll: float = 0.0) -> Floats:
-    """A rotation that takes +z to ``heading``, with x level (x itself where the heading is steep) before the roll."""
+    """Return a rotation of +z to ``heading``; before the roll, x is level, or close to x if the heading is steep."""
     z = np.array(heading) / np.linalg.norm(heading)
     x = np.array([1.0, 0.0, 0.0]) - z[0] * z if abs(z[2]) > 0.9 else np.array([-z[1], z[0], 0.0])
     x /= np.linalg.norm(x)
@@ -90,32 +90,28 @@ def aim(heading: Vector, roll: float = 0.0) -> Floats:
 
 
 def turned(axes: str, *degrees: float) -> Floats:
-    """A rotation by Euler angles, as in `scipy.spatial.transform.Rotation.from_euler`."""
+    """Return a rotation by Euler angles, see `scipy.spatial.transform.Rotation.from_euler`."""
     return np.asarray(Rotation.from_euler(axes, degrees, degrees=True).as_matrix()).reshape(3, 3)
 
 
 def circle(count: int, phase: float = 0.0) -> list[tuple[float, float]]:
-    """Equally spaced points (cos, sin) of the unit circle."""
+    """Return equally spaced points (cos, sin) of the unit circle."""
     return [(float(np.cos(a)), float(np.sin(a))) for a in phase + 2.0 * np.pi * np.arange(count) / count]
 
 
 def limb(
-    group: str,
-    lengths: Sequence[float],
-    radii: Sequence[float],
-    bends: Sequence[tuple[float, float]],
-    tip: Sequence[Part] = (),
-    knee: Vector = UP,
-) -> Part:
-    """A chain of tapered capsules that carries ``tip``.
+    group: str, lengths: Sequence[float], radii: Sequence[float], bends: Sequence[tuple[float, float]],
+    tip: Sequence[Part] = (), knee: Vector = UP,
+) -> Part:  # fmt: skip
+    """Return a chain of tapered capsules with the parts ``tip`` at its end.
 
     Args:
         group: the group of all segments.
-        lengths: one per segment.
-        radii: one more: where segments begin, meet and end.
-        bends: (raise, swing) limits of the joints; the last pair holds for all further ones.
+        lengths: lengths of the segments.
+        radii: radii where segments begin, meet and end, one more than ``lengths``.
+        bends: (raise, swing) limits of the joints; further joints have the limits of the last pair.
         tip: parts on the last segment.
-        knee: heading of each later segment in the frame of the one before.
+        knee: heading of each segment but the first, in the frame of the segment before it.
     """
     children = tuple(tip)
     for i in reversed(range(len(lengths))):
@@ -126,7 +122,7 @@ def limb(
 
 
 def pose(skeleton: Skeleton, rng: np.random.Generator, flex: float, rotation: Floats) -> list[Placed]:
-    """Draw proportions and joint angles (``flex`` times the limits) and place every solid."""
+    """Draw proportions and joint angles, up to ``flex`` times their limits, and place all solids."""
     proportions: dict[str, tuple[float, float]] = {}
     placed: list[Placed] = []
 

@@ -1,6 +1,6 @@
-"""The solids that bodies are made of, each in its own frame and given by a signed distance function.
+"""The solids of which bodies consist, each in its own frame and defined by a signed distance function.
 
-The functions take coordinates of any shapes that broadcast, so that a grid is evaluated from its three axes.
+Distance functions broadcast their coordinates, so that a grid is evaluated from its three axes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Vector = tuple[float, float, float]
 
 
 class Solid(ABC):
-    """A solid in its own frame, given by a signed distance function."""
+    """A solid in its own frame, defined by a signed distance function."""
 
     @property
     def genus(self) -> int:
@@ -26,24 +26,24 @@ class Solid(ABC):
 
     @abstractmethod
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        """The signed distance (exact or a good approximation), negative inside."""
+        """Return the signed distance (exact or a good approximation), negative inside."""
 
     @abstractmethod
     def box(self) -> tuple[Floats, Floats]:
-        """The lower and upper corner of a box around the solid."""
+        """Return the lower and upper corner of a box around the solid."""
 
     @abstractmethod
     def stretched(self, thick: float, length: float) -> Solid:
-        """The solid with other proportions."""
+        """Return the solid with its thickness and length scaled by these factors."""
 
     def factors(self, thick: float, length: float) -> Floats:
-        """The factors (3,) by which points fixed to the solid move when it is stretched."""
+        """Return the factors (3,) by which points attached to the solid move when it is stretched."""
         return np.array([thick, thick, length])
 
 
 @dataclass(frozen=True)
 class Cone(Solid):
-    """A tapered capsule: spheres of radius ``start`` at the origin to ``end`` at (0, 0, length)."""
+    """A tapered capsule: the sweep of a sphere from radius ``start`` at the origin to ``end`` at (0, 0, length)."""
 
     length: float
     start: float
@@ -52,7 +52,7 @@ class Cone(Solid):
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         radial = np.hypot(x, y)
         slope = (self.start - self.end) / self.length
-        # The nearest sphere of a tapered sweep lies off the perpendicular foot by the taper's tilt.
+        # The taper shifts the nearest sphere along the axis from the foot of the perpendicular.
         along = np.clip(z - radial * (slope / np.sqrt(1.0 - slope * slope)), 0.0, self.length)
         return np.hypot(radial, z - along) - (self.start - slope * along)
 
@@ -95,13 +95,13 @@ class Arc(Solid):
         return np.full(3, length)
 
     def tip(self) -> Vector:
-        """The far end of the centre line."""
+        """Return the far end of the centre line."""
         return (0.0, self.bend * (1.0 - np.cos(self.angle)), self.bend * np.sin(self.angle))
 
 
 @dataclass(frozen=True)
 class Ring(Solid):
-    """A torus in the x-z plane around the y axis, drawn out along z by straight sides of half length ``side``."""
+    """A torus around the y axis, elongated along z by straight sides of half length ``side``."""
 
     radius: float
     tube: float
@@ -136,7 +136,7 @@ class Blob(Solid):
         a, b, c = self.radii
         unit = np.sqrt((x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2)
         gradient = np.sqrt((x / a**2) ** 2 + (y / b**2) ** 2 + (z / c**2) ** 2)
-        # First order in the distance from the surface; the floor keeps the centre finite and inside.
+        # Exact to first order at the surface; the bound on the gradient keeps the centre finite and inside.
         return unit * (unit - 1.0) / np.maximum(gradient, 1e-9) - 1e-12
 
     def box(self) -> tuple[Floats, Floats]:
@@ -149,7 +149,7 @@ class Blob(Solid):
 
 @dataclass(frozen=True)
 class Box(Solid):
-    """A box around the origin with edges rounded to radius ``rounding``."""
+    """A box around the origin with edges rounded at the radius ``rounding``."""
 
     size: Vector
     rounding: float
@@ -169,7 +169,7 @@ class Box(Solid):
 
 @dataclass(frozen=True)
 class Shell(Solid):
-    """A hollow body of revolution around z: a wall ``wall`` thick along the polyline ``profile`` of (radius, z)."""
+    """A hollow body of revolution around z, with a wall of thickness ``wall`` along the (radius, z) of ``profile``."""
 
     profile: tuple[tuple[float, float], ...]
     wall: float

@@ -1,4 +1,4 @@
-"""The named classes: twelve skeletons made by hand, of animals and of things."""
+"""The twelve classes: skeletons of animals and things, designed by hand."""
 
 from collections.abc import Callable
 

@@ -1,1 +1,1 @@
-"""A body becomes a Signature: Laplacian, voxels, mean value coordinates, attributes. Deterministic, float64."""
+"""From a mesh to its Signature: Laplacian, voxels, mean value coordinates, attributes. Deterministic, in float64."""

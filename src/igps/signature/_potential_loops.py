@@ -1,4 +1,4 @@
-"""Loops that Numba compiles for `igps.signature.surface_potential`: what its tree gives at blocks of points."""
+"""Compiled loops for `igps.signature.surface_potential`: potentials of its tree of patches at blocks of points."""
 
 import math
 
@@ -7,39 +7,32 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 
-_TINY = math.ulp(1.0) ** 2  # keeps a logarithm finite whose factor is 0
+_TINY = math.ulp(1.0) ** 2  # keeps the logarithm of a side finite on that side, where its factor is 0
 
 
 @compiled()
 def fill_potentials(
-    points: Floats,
-    block: int,
-    patches: Floats,
-    reaches: Floats,
-    first: Integers,
-    size: int,
-    limits: Floats,
-    faces: Floats,
-    out: Floats,
-) -> None:
-    """Fill the potentials at points, block after block of points that lie close together.
+    points: Floats, block: int, patches: Floats, min_distances: Floats, level_starts: Integers, branching: int,
+    squared_limits: Floats, faces: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Fill `out` with the potentials at points, one block of neighbouring points at a time.
 
     Args:
-        points: (n, 3).
-        block: how many see the same clusters.
-        patches: (N, 10) of all levels, the faces first: centre c, area A, and the form A·(3/2 C − ½ tr C·1) with C the
-            covariance, as xx, yy, zz, 2xy, 2xz, 2yz.
-        reaches: (N,) distance from the centre from which on a patch's series serves.
-        first: (levels + 1,) patch at which each level begins, and their number.
-        size: patches of a level in one of the next.
-        limits: (F,) squared distance from a face's centre from which on its quarters' series serve.
+        points: (n, 3) in spatial order.
+        block: number of points for which the same patches are far.
+        patches: (N, 10) of all levels, beginning with the faces: centre c, area A, and the quadratic form
+            A·(3/2 C − ½ tr C·1) with C the covariance, as xx, yy, zz, 2xy, 2xz, 2yz.
+        min_distances: (N,) smallest distance from its centre at which the series of a patch is used.
+        level_starts: (n_levels + 1,) first patch of each level, and N.
+        branching: number of patches that are merged into a patch of the next level.
+        squared_limits: (F,) squared distance from a face's centre from which on the series of its quarters are used.
         faces: (F, 25), see `near_potential`.
         out: (n,).
     """
-    n_levels = len(first) - 1
-    x, far = np.empty((3, block)), np.empty(block)
-    # At most the patches of the coarsest level, and of each level below the children of one patch, wait.
-    waiting = np.empty((first[n_levels] - first[n_levels - 1] + size * n_levels, 2), np.int64)
+    n_levels = len(level_starts) - 1
+    x, is_far = np.empty((3, block)), np.empty(block)
+    # The stack holds at most all patches of the coarsest level, and the children of one patch for each level below.
+    stack = np.empty((level_starts[n_levels] - level_starts[n_levels - 1] + branching * n_levels, 2), np.int64)
     for start in range(0, len(points), block):
         n = min(block, len(points) - start)
         low, high = points[start].copy(), points[start].copy()
@@ -47,84 +40,85 @@ def fill_potentials(
             for axis in range(3):
                 x[axis, i] = points[start + i, axis]
                 low[axis], high[axis] = min(low[axis], x[axis, i]), max(high[axis], x[axis, i])
-        here, sums = x[:, :n], out[start : start + n]
+        block_points, sums = x[:, :n], out[start : start + n]
         sums[:] = 0
-        n_waiting = 0
-        for patch in range(first[n_levels - 1], first[n_levels]):
-            waiting[n_waiting, 0], waiting[n_waiting, 1] = patch, n_levels - 1
-            n_waiting += 1
-        while n_waiting > 0:
-            n_waiting -= 1
-            patch, level = waiting[n_waiting, 0], waiting[n_waiting, 1]
+        n_stacked = 0
+        for patch in range(level_starts[n_levels - 1], level_starts[n_levels]):
+            stack[n_stacked, 0], stack[n_stacked, 1] = patch, n_levels - 1
+            n_stacked += 1
+        while n_stacked > 0:
+            n_stacked -= 1
+            patch, level = stack[n_stacked, 0], stack[n_stacked, 1]
             squared_gap = 0.0
             for axis in range(3):
                 gap = patches[patch, axis] - min(max(patches[patch, axis], low[axis]), high[axis])
                 squared_gap += gap * gap
-            if squared_gap >= reaches[patch] ** 2:
-                far[:n] = 1
-                add_series(patches[patch], 1.0, 0.0, patches[patch], here, far, sums)
+            if squared_gap >= min_distances[patch] ** 2:
+                is_far[:n] = 1
+                add_series(patches[patch], 1.0, 0.0, patches[patch], block_points, is_far, sums)
             elif level > 0:
-                child = first[level - 1] + size * (patch - first[level])
-                for member in range(child, min(child + size, first[level])):
-                    waiting[n_waiting, 0], waiting[n_waiting, 1] = member, level - 1
-                    n_waiting += 1
+                children = level_starts[level - 1] + branching * (patch - level_starts[level])
+                for child in range(children, min(children + branching, level_starts[level])):
+                    stack[n_stacked, 0], stack[n_stacked, 1] = child, level - 1
+                    n_stacked += 1
             else:
-                add_face(patches[patch], limits[patch], faces[patch], here, far, sums)
+                add_face(patches[patch], squared_limits[patch], faces[patch], block_points, is_far, sums)
 
 
 @compiled()
 def add_series(
-    patch: Floats, scale: float, share: float, towards: Floats, points: Floats, far: Floats, sums: Floats
+    patch: Floats, scale: float, share: float, target: Floats, points: Floats, is_far: Floats, sums: Floats
 ) -> None:
-    """Add A/r + A (3/2 dᵀCd − ½ tr C r²)/r⁵ of a patch (10,) at points (3, n), times `far` (n,).
+    """Add the series of a patch (10,), A/r + A (3/2 dᵀCd − ½ tr C r²)/r⁵, times `is_far` (n,) at points (3, n).
 
-    The patch may be made smaller by a scale, and moved by a share of the way to another point (3,).
+    The patch is first scaled by `scale` about its centre, and moved by `share` of the way to the point `target` (3,).
     """
     c0, c1, c2 = (
-        patch[0] + share * (towards[0] - patch[0]),
-        patch[1] + share * (towards[1] - patch[1]),
-        patch[2] + share * (towards[2] - patch[2]),
+        patch[0] + share * (target[0] - patch[0]),
+        patch[1] + share * (target[1] - patch[1]),
+        patch[2] + share * (target[2] - patch[2]),
     )
     area = patch[3] * scale**2
     f0, f1, f2 = patch[4] * scale**4, patch[5] * scale**4, patch[6] * scale**4
     f3, f4, f5 = patch[7] * scale**4, patch[8] * scale**4, patch[9] * scale**4
     for i in range(points.shape[1]):
         a, b, c = c0 - points[0, i], c1 - points[1, i], c2 - points[2, i]
-        # A patch at the point itself is not far from it, and counts for nothing here.
+        # A patch at the point itself is never far, so its term is multiplied by 0 below.
         inverse = 1 / max(a * a + b * b + c * c, 1e-24)
         second = a * (f0 * a + f3 * b + f4 * c) + b * (f1 * b + f5 * c) + f2 * c * c
-        sums[i] += far[i] * (area + second * (inverse * inverse)) * math.sqrt(inverse)
+        sums[i] += is_far[i] * (area + second * (inverse * inverse)) * math.sqrt(inverse)
 
 
 @compiled()
-def add_face(patch: Floats, limit: float, face: Floats, points: Floats, far: Floats, sums: Floats) -> None:
-    """Add a face that was opened at points (3, n): by the series of its quarters, or near it in closed form."""
+def add_face(patch: Floats, squared_limit: float, face: Floats, points: Floats, is_far: Floats, sums: Floats) -> None:
+    """Add the potential of one face at points (3, n): by the series of its quarters, or near it in closed form."""
     n_far = 0
     for i in range(points.shape[1]):
         a, b, c = patch[0] - points[0, i], patch[1] - points[1, i], patch[2] - points[2, i]
-        if a * a + b * b + c * c < limit:
-            far[i] = 0
+        if a * a + b * b + c * c < squared_limit:
+            is_far[i] = 0
             sums[i] += near_potential(face, points[0, i], points[1, i], points[2, i])
         else:
-            far[i] = 1
+            is_far[i] = 1
             n_far += 1
     if n_far > 0:
-        # The quarters have half of the face's size; one is in its middle, the others half-way to its corners.
+        # The quarters have half of the face's size: three lie half-way to its corners, one in its middle.
         for corner in range(3):
-            add_series(patch, 0.5, 0.5, face[3 * corner : 3 * corner + 3], points, far, sums)
-        add_series(patch, 0.5, 0.0, face, points, far, sums)
+            add_series(patch, 0.5, 0.5, face[3 * corner : 3 * corner + 3], points, is_far, sums)
+        add_series(patch, 0.5, 0.0, face, points, is_far, sums)
 
 
 @compiled()
 def near_potential(face: Floats, x: float, y: float, z: float) -> float:
-    """The potential of a face (25,) at a point: Σ p ln((r + r' + l)/(r + r' − l)) − |h Ω| over its sides.
+    """Return the potential of a face (25,) at a point, in closed form.
 
-    For a side of length l, p is the distance of the point's projection from its line, positive inside, and r, r' are
-    the distances of its ends; h is that from the plane and Ω the solid angle (Van Oosterom and Strackee 1983). On a
-    side both p and the quotient's denominator vanish, and their product is 0.
+    It is −|h Ω| + Σ p ln((r + r' + l)/(r + r' − l)), summed over the sides. For a side of length l, p is the distance
+    of the point's projection from the line of the side, positive inside, and r, r' are the distances of the point from
+    its ends. The height h is the distance of the point from the plane, and Ω the solid angle of the face (Van Oosterom
+    and Strackee 1983). On a side, p and the denominator both vanish: the term is 0.
 
-    A face's numbers are its corners, its normal, the outward normals of its sides in its plane, the lengths of these,
-    and twice its area.
+    The entries of a face are its corners, its normal, the outward normals of its sides in its plane, the lengths of its
+    sides, and twice its area.
     """
     a = (face[0] - x, face[1] - y, face[2] - z)
     b = (face[3] - x, face[4] - y, face[5] - z)
@@ -145,5 +139,5 @@ def dot(p: tuple[float, float, float], q: tuple[float, float, float]) -> float:
 
 @compiled()
 def logarithm(total: float, length: float) -> float:
-    """ln((r + r' + l)/(r + r' − l)) of a side of length l, from the sum of the distances of its ends."""
+    """Return ln((r + r' + l)/(r + r' − l)) for a side of length l, from the sum r + r' of the distances to its ends."""
     return math.log((total + length) / max(total - length, _TINY))

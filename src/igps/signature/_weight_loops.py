@@ -1,6 +1,6 @@
-"""Compiled loops of the mean value weights: Taylor series far from the surface, the closed form near it.
+"""Compiled loops for mean value weights: Taylor series far from the surface, the closed form near it.
 
-Points x are (3, n) and close together. What describes the surface is explained in `igps.signature._far_field`.
+Points x are (3, n), and close together. The tables of the surface are those of `igps.signature._far_field.HatSurface`.
 """
 
 import math
@@ -11,12 +11,13 @@ from numpy.polynomial import Chebyshev, Polynomial
 from igps._arrays import Booleans, Floats, Integers, Singles
 from igps._compiled import CONTRACTED, compiled
 
-Arrays = tuple[Integers, Floats, Integers, Integers]
+SurfaceArrays = tuple[Integers, Floats, Integers, Integers]
+"""Faces, table, face_starts and incident_faces of a `HatSurface`."""
 
-_PAIRS = 128  # pairs of a face and a point at a time: their numbers stay in the first-level cache
-_ON_SURFACE = 2e-9  # half-diagonals: closer points take the surface value, and coplanar faces count as exactly so
+_N_PAIRS = 128  # pairs of a face and a point computed at a time: their data stay in the first-level cache
+_ON_SURFACE = 2e-9  # half-diagonals; points closer than this are on the surface, or in the plane of a face
 _TAN = math.tan(math.pi / 8)
-# arctan(√q)/√q for √q up to tan π/8, to rounding, the highest power first
+# Coefficients of arctan(√q)/√q for √q ≤ tan π/8, accurate to rounding, from the highest power down.
 _ARCTAN = tuple(
     Chebyshev.interpolate(lambda q: np.arctan(np.sqrt(q)) / np.sqrt(q), 12, domain=[1e-9, _TAN**2])
     .convert(kind=Polynomial)
@@ -26,43 +27,43 @@ _ARCTAN = tuple(
 
 
 @compiled()
-def seen_from(
-    low: Floats, high: Floats, centres: Floats, radii: Floats, first: Integers, ratio: float, leaf: int, n_hats: int
+def find_far_clusters(
+    low: Floats, high: Floats, centres: Floats, radii: Floats, starts: Integers, ratio: float, leaf: int, n_hats: int
 ) -> tuple[Integers, Integers]:
-    """The clusters that are `ratio` radii or more away from all of a box, and the hats in none of them, ascending."""
+    """Return the clusters that are `ratio` radii or more from a box, and, ascending, the hats in none of these."""
     clusters, hats = np.empty(len(radii), np.int64), np.empty(n_hats, np.int64)
-    n_clusters, n_opened, n_waiting = 0, 0, 0
-    n_levels = len(first) - 1
-    waiting = np.empty((first[n_levels] - first[n_levels - 1] + 4 * n_levels, 2), np.int64)
-    for cluster in range(first[n_levels] - 1, first[n_levels - 1] - 1, -1):
-        waiting[n_waiting, 0], waiting[n_waiting, 1] = cluster, n_levels - 1
-        n_waiting += 1
-    while n_waiting > 0:
-        n_waiting -= 1
-        cluster, level = waiting[n_waiting, 0], waiting[n_waiting, 1]
+    n_clusters, n_near, n_stacked = 0, 0, 0
+    n_levels = len(starts) - 1
+    stack = np.empty((starts[n_levels] - starts[n_levels - 1] + 4 * n_levels, 2), np.int64)
+    for cluster in range(starts[n_levels] - 1, starts[n_levels - 1] - 1, -1):
+        stack[n_stacked, 0], stack[n_stacked, 1] = cluster, n_levels - 1
+        n_stacked += 1
+    while n_stacked > 0:
+        n_stacked -= 1
+        cluster, level = stack[n_stacked, 0], stack[n_stacked, 1]
         squared_gap = 0.0
         for axis in range(3):
             centre = centres[cluster, axis]
             squared_gap += (centre - min(max(centre, low[axis]), high[axis])) ** 2
-        number = cluster - first[level]
+        number = cluster - starts[level]
         if squared_gap >= (ratio * radii[cluster]) ** 2:
             clusters[n_clusters] = cluster
             n_clusters += 1
         elif level > 0:
-            children = first[level - 1] + 4 * number
-            for child in range(min(children + 4, first[level]) - 1, children - 1, -1):
-                waiting[n_waiting, 0], waiting[n_waiting, 1] = child, level - 1
-                n_waiting += 1
+            children = starts[level - 1] + 4 * number
+            for child in range(min(children + 4, starts[level]) - 1, children - 1, -1):
+                stack[n_stacked, 0], stack[n_stacked, 1] = child, level - 1
+                n_stacked += 1
         else:
             for hat in range(leaf * number, min(leaf * number + leaf, n_hats)):
-                hats[n_opened] = hat
-                n_opened += 1
-    return clusters[:n_clusters], hats[:n_opened]
+                hats[n_near] = hat
+                n_near += 1
+    return clusters[:n_clusters], hats[:n_near]
 
 
 @compiled(fastmath=CONTRACTED)
 def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: Floats, near: Booleans) -> None:
-    """Fill the weights (h, n) of the chosen hats (h,), 0 within `ratio` radii, and which points (h, n) are so near."""
+    """Fill the weights (h, n) of the chosen hats (h,): 0 where a point is `near`, within `ratio` radii of the hat."""
     n = x.shape[1]
     squared = np.empty(n)
     for k in range(len(chosen)):
@@ -107,22 +108,22 @@ def fill_clusters(x: Floats, chosen: Integers, centres: Floats, radii: Floats, t
 
 
 @compiled()
-def replace_near(x: Floats, chosen: Integers, near: Booleans, surface: Arrays, weights: Floats) -> None:
-    """Add the closed form to the weights (…, n), the last rows of which are the chosen hats' (h,).
+def add_near_faces(x: Floats, chosen: Integers, near: Booleans, surface: SurfaceArrays, weights: Floats) -> None:
+    """Add the closed form to the weights (…, n), whose last rows are those of the chosen hats (h,).
 
-    Only near pairs get it; `near` (h + 1, n) ends with a row of none. Points on the surface get their triangle's
-    barycentric coordinates, and nothing else. The surface is given by its faces, table, first and around.
+    It is added where a hat is `near` a point (h + 1, n); the last row of `near` is False. Points on the surface get the
+    barycentric coordinates in their face, and zero everywhere else.
     """
-    faces, table, first, around = surface
+    faces, table, face_starts, incident_faces = surface
     n, n_chosen = x.shape[1], len(chosen)
-    of_hats = weights[len(weights) - n_chosen :]
-    place = np.empty(len(first) - 1, np.int64)
-    place[:] = n_chosen
+    hat_weights = weights[len(weights) - n_chosen :]
+    row_of = np.empty(len(face_starts) - 1, np.int64)
+    row_of[:] = n_chosen
     for k in range(n_chosen):
-        place[chosen[k]] = k
-    pairs = np.empty((2, n + _PAIRS), np.int64)
-    touched, shares = np.empty(n, np.int64), np.empty((n, 3))
-    touched[:] = -1
+        row_of[chosen[k]] = k
+    pairs = np.empty((2, n + _N_PAIRS), np.int64)
+    face_at, barycentric = np.empty(n, np.int64), np.empty((n, 3))
+    face_at[:] = -1
     n_pairs = 0
     for k in range(n_chosen):
         hat, any_near = chosen[k], False
@@ -130,52 +131,54 @@ def replace_near(x: Floats, chosen: Integers, near: Booleans, surface: Arrays, w
             any_near |= near[k, i]
         if not any_near:
             continue
-        for at in range(first[hat], first[hat + 1]):
-            face = around[at]
-            # A face counts once: with its first near corner.
-            one, two = n_chosen, n_chosen
+        for j in range(face_starts[hat], face_starts[hat + 1]):
+            face = incident_faces[j]
+            # Each face is added once: at its near corner of lowest number. Look up the corners below this one.
+            row_1, row_2 = n_chosen, n_chosen
             for corner in range(3):
                 if faces[face, corner] < hat:
-                    one, two = place[faces[face, corner]], one
+                    row_1, row_2 = row_of[faces[face, corner]], row_1
             for i in range(n):
-                if near[k, i] and not near[one, i] and not near[two, i]:
+                if near[k, i] and not near[row_1, i] and not near[row_2, i]:
                     pairs[0, n_pairs], pairs[1, n_pairs] = face, i
                     n_pairs += 1
-            if n_pairs >= _PAIRS:
-                add_faces(x, pairs[:, :n_pairs], faces, table, place, near, of_hats, touched, shares)
+            if n_pairs >= _N_PAIRS:
+                add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, face_at, barycentric)
                 n_pairs = 0
-    add_faces(x, pairs[:, :n_pairs], faces, table, place, near, of_hats, touched, shares)
+    add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, face_at, barycentric)
     for i in range(n):
-        if touched[i] >= 0:
+        if face_at[i] >= 0:
             for k in range(len(weights)):
                 weights[k, i] = 0
             for corner in range(3):
-                of_hats[place[faces[touched[i], corner]], i] = shares[i, corner]
+                hat_weights[row_of[faces[face_at[i], corner]], i] = barycentric[i, corner]
 
 
 @compiled()
 def add_faces(
-    x: Floats, pairs: Integers, faces: Integers, table: Floats, place: Integers, near: Booleans, weights: Floats,
-    touched: Integers, shares: Floats,
+    x: Floats, pairs: Integers, faces: Integers, table: Floats, row_of: Integers, near: Booleans, weights: Floats,
+    face_at: Integers, barycentric: Floats,
 ) -> None:  # fmt: skip
-    """Add the closed form of pairs (2, m) of a face and a point, accurate up to the surface.
+    """Add the closed form for pairs (2, m) of a face and a point, accurate up to the surface.
 
-    Noted are the first face that a point lies on, and the point's barycentric coordinates there.
+    For a point on the surface, face_at (n,) records the first face that contains it, and barycentric (n, 3) the
+    coordinates.
 
-    With λ the barycentric coordinates of the projection of x, h its distance to the plane, e_l the sides, N_l the
-    product of the vectors from x to the ends of side l and θ_l the angle between them, the published N_i·m / (N_i·v_i)
-    becomes ½ [λ_i s/h + h Σ_l g_l e_l·e_i / |n|²] |n|, with g_l = θ_l/|N_l| and s = Σ_l g_l λ_l, because
-    N_l = λ_l n + h n̂×e_l. The length of N_l taken from that too makes all terms agree near side l.
+    Let λ be the barycentric coordinates of the projection of x, h its distance to the plane, e_l the sides, N_l the
+    cross product of the vectors from x to the ends of side l, and θ_l the angle between these. The published
+    N_i·m / (N_i·v_i) becomes ½ [λ_i s/h + h Σ_l g_l e_l·e_i / |n|²] |n|, with g_l = θ_l/|N_l| and s = Σ_l g_l λ_l,
+    because N_l = λ_l n + h n̂×e_l. The length of N_l is also taken from this identity, so that all terms agree near a
+    side.
     """
     n_pairs = pairs.shape[1]
-    kept, squares, cosines = np.empty((n_pairs, 4)), np.empty(3 * n_pairs), np.empty(3 * n_pairs)
+    projections, squares, cosines = np.empty((n_pairs, 4)), np.empty(3 * n_pairs), np.empty(3 * n_pairs)
     for m in range(n_pairs):
         row, i = table[pairs[0, m]], pairs[1, m]
         a0, a1, a2 = row[0] - x[0, i], row[1] - x[1, i], row[2] - x[2, i]
         b0, b1, b2 = row[3] - x[0, i], row[4] - x[1, i], row[5] - x[2, i]
         c0, c1, c2 = row[6] - x[0, i], row[7] - x[1, i], row[8] - x[2, i]
         height = row[9] * a0 + row[10] * a1 + row[11] * a2
-        # λ |n|, twice the area of the projection with each side
+        # λ |n|: twice the areas of the triangles that the projection spans with each side.
         area_0 = -(row[12] * b0 + row[13] * b1 + row[14] * b2)
         area_1 = -(row[15] * c0 + row[16] * c1 + row[17] * c2)
         area_2 = row[21] - area_0 - area_1
@@ -185,33 +188,33 @@ def add_faces(
         cosines[3 * m] = b0 * c0 + b1 * c1 + b2 * c2
         cosines[3 * m + 1] = c0 * a0 + c1 * a1 + c2 * a2
         cosines[3 * m + 2] = a0 * b0 + a1 * b1 + a2 * b2
-        kept[m, 0], kept[m, 1], kept[m, 2], kept[m, 3] = area_0, area_1, area_2, height
+        projections[m, 0], projections[m, 1], projections[m, 2], projections[m, 3] = area_0, area_1, area_2, height
     divide_angles(squares, cosines)
     for m in range(n_pairs):
         face, i = pairs[0, m], pairs[1, m]
-        row, areas, height = table[face], kept[m], kept[m, 3]
+        row, areas, height = table[face], projections[m], projections[m, 3]
         g, sides = squares[3 * m : 3 * m + 3], table[face, 18:21]
         half = (sides[0] + sides[1] + sides[2]) / 2
-        total = g[0] * areas[0] + g[1] * areas[1] + g[2] * areas[2]
-        # In the plane of a face but outside it s vanishes like h², the weight like h: what is left is rounding.
-        flat = 0.0 if abs(height) < _ON_SURFACE and total < 1e-2 else total / height
-        on_face, whole = abs(height) <= _ON_SURFACE and touched[i] < 0, 0.0
+        s = g[0] * areas[0] + g[1] * areas[1] + g[2] * areas[2]
+        # In the plane of a face but outside the face, s vanishes like h² and the weight like h: s/h is only rounding.
+        s_over_h = 0.0 if abs(height) < _ON_SURFACE and s < 1e-2 else s / height
+        on_face, total_area = abs(height) <= _ON_SURFACE and face_at[i] < 0, 0.0
         for corner in range(3):
-            left, right, k = (corner + 2) % 3, (corner + 1) % 3, place[faces[face, corner]]
+            left, right, k = (corner + 2) % 3, (corner + 1) % 3, row_of[faces[face, corner]]
             if near[k, i]:
                 second = g[corner] * sides[corner] + g[left] * (sides[right] - half) + g[right] * (sides[left] - half)
-                weights[k, i] += (second * height + flat * areas[corner]) / (2 * row[21])
+                weights[k, i] += (second * height + s_over_h * areas[corner]) / (2 * row[21])
             on_face &= areas[corner] >= -_ON_SURFACE * math.sqrt(sides[corner])
-            whole += max(areas[corner], 0.0)
+            total_area += max(areas[corner], 0.0)
         if on_face:
-            touched[i] = face
+            face_at[i] = face
             for corner in range(3):
-                shares[i, corner] = max(areas[corner], 0.0) / whole
+                barycentric[i, corner] = max(areas[corner], 0.0) / total_area
 
 
 @compiled(fastmath=CONTRACTED)
 def divide_angles(squares: Floats, cosines: Floats) -> None:
-    """Angles over lengths in place of the lengths' squares: arctan2(length, cosine) / length, to rounding."""
+    """Replace squared lengths by angles over lengths, arctan2(length, cosine) / length, accurate to rounding."""
     for m in range(len(squares)):
         y, cosine = max(math.sqrt(squares[m]), 1e-150), cosines[m]
         x = abs(cosine)
@@ -229,11 +232,12 @@ def divide_angles(squares: Floats, cosines: Floats) -> None:
 
 @compiled(fastmath=CONTRACTED)
 def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, terms: Singles) -> None:
-    """Fill what each hat adds (V, 19) to the sums of its cluster, which is one of `size` consecutive hats.
+    """Fill the contribution (V, 19) of each hat to the sums of its cluster, which consists of `size` consecutive hats.
 
-    The moments of n dS about the cluster's centre are F = ∫ λ n, T + F sᵀ with T the symmetric part of ∫ λ n (y − p)ᵀ,
-    and 2 T s + F E with E the second moment of y under λ; s is from the centre to the hat's. They are contracted with
-    the derivatives of u, which are |e|² times e, −4 e eᵀ + |e|², and 24 e e e − 4 |e|² e in each of three ways.
+    The moments of n dS about the cluster's centre are F = ∫ λ n, T + F sᵀ, and 2 T s + F E, where T is the symmetric
+    part of ∫ λ n (y − p)ᵀ, E the second moment of y under λ, and s the vector from the cluster's centre to the hat's.
+    They are contracted with the derivatives of u, which are |e|² times e, −4 e eᵀ + |e|², and 24 e e e − 4 |e|² e in
+    each of three ways.
     """
     for hat in range(len(hats)):
         p, out, centre, scale = hats[hat], terms[hat], centres[hat // size], 1 / radii[hat // size]

@@ -1,4 +1,4 @@
-"""Scalars and directions of samples that a histogram may be split by, beside the potential."""
+"""Attributes of samples: scalars and directions that a histogram may use as axes, beside the potential."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -14,17 +14,13 @@ AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 
 def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
-    """The named attributes of points inside, (P,) or (P, 3), free of scale and motion."""
-    functions = {
-        "depth": depth,
-        "electrostatic_potential": electrostatic_potential,
-        "surface_direction": surface_direction,
-    }
+    """Return attributes of interior points (P, 3), independent of scale and place: each (P,), or a direction (P, 3)."""
+    functions = {function.__name__: function for function in (depth, electrostatic_potential, surface_direction)}
     return {name: functions[name](mesh, points).astype(np.float32) for name in names}
 
 
 def surface_attributes(mesh: Mesh, faces: Integers, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
-    """Those of the named attributes that points on these faces (P,) have: "surface_direction", the outward normal."""
+    """Return the named attributes of points on faces (P,): at most "surface_direction", the outward normal (P, 3)."""
     if "surface_direction" not in names:
         return {}
     normals = area_vectors(mesh.vertices, mesh.faces)[faces]
@@ -32,19 +28,20 @@ def surface_attributes(mesh: Mesh, faces: Integers, names: Sequence[AttributeNam
 
 
 def depth(mesh: Mesh, points: Floats) -> Floats:
-    """(P,) distances of points (P, 3) to the surface over √area: 0 on it, 0.28 in the centre of a ball, its maximum."""
-    return np.linalg.norm(_to_surface(mesh, points), axis=1) / np.sqrt(mesh.area)
+    """Return the distances (P,) of points (P, 3) from the surface over √area: at most 0.28, in the centre of a ball."""
+    return np.linalg.norm(_vectors_to_surface(mesh, points), axis=1) / np.sqrt(mesh.area)
 
 
 def surface_direction(mesh: Mesh, points: Floats) -> Floats:
-    """(P, 3) unit vectors from points (P, 3) inside to the nearest of the surface, the outward normal near it; 0 on it.
+    """Return unit vectors (P, 3) from interior points (P, 3) to the nearest surface points.
 
-    Where several points of the surface are nearest, as on the axis of a tube, it is one of their directions.
+    Near the surface this is the outward normal, on it 0. If several surface points are nearest, as on the axis of a
+    tube, one of their directions is returned.
     """
-    return unit(_to_surface(mesh, points))
+    return unit(_vectors_to_surface(mesh, points))
 
 
-def _to_surface(mesh: Mesh, points: Floats) -> Floats:
+def _vectors_to_surface(mesh: Mesh, points: Floats) -> Floats:
     import igl
 
     *_, nearest = igl.point_mesh_squared_distance(
@@ -54,11 +51,11 @@ def _to_surface(mesh: Mesh, points: Floats) -> Floats:
 
 
 def electrostatic_potential(mesh: Mesh, points: Floats) -> Floats:
-    """(P,) potentials of a uniform unit charge on the surface, (1/√area) ∫ dS/|x − s| at points x: √4π in a ball.
+    """Return the potentials (P,) of a uniform unit charge on the surface, (1/√area) ∫ dS/|x − s|, at points x (P, 3).
 
-    It is high where much surface is near: deep in thick parts and among folded ones, low in thin limbs and at their
-    tips. Rustamov 2010, section 4, names electrostatic potentials as a further dimension; where a body has charges of
-    its own (a protein), pass that potential as an attribute instead. It does not depend on how the surface is cut into
-    triangles; on the surface it is finite. See `surface_potential` for the method and its error.
+    It is √4π in a ball. It is high where much surface is near, as deep in thick parts and among folds, and low in thin
+    limbs and at their tips. Rustamov 2010, section 4, names electrostatic potentials as a further dimension; if a body
+    has charges of its own (a protein), pass their potential as an attribute instead. The potential does not depend on
+    the triangulation, and is finite on the surface. See `surface_potential` for the method and its error.
     """
     return surface_potential(mesh.vertices, mesh.faces, points) / np.sqrt(mesh.area)

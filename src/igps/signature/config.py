@@ -9,46 +9,46 @@ from igps._parameters import check_at_least, check_one_of, check_share
 from igps.signature.attributes import AttributeName
 from igps.signature.laplacian import Backend
 
-# The order of the samples, see `ordering_keys`, depends on about so many eigenpairs. With as many or more of one body
-# the same samples come in the same order, to rounding.
-_ORDERED_BY = 64
+# Number of eigenpairs that determines the order of the samples, see `ordering_keys`. Configurations with at least as
+# many give the samples of a body the same order, up to rounding.
+_N_ORDERING_EIGENPAIRS = 64
 
 
 @dataclass(frozen=True)
 class SignatureConfig:
     """Every parameter that a Signature depends on.
 
-    The samples of a Signature and their first eigenfunctions do not depend on how many there are, if at least 64. So
-    each is the beginning of those with more, see `larger` and `Signature.truncated`; but for that their meshes must be
-    the same, and one with fewer vertices than `least_vertices` is subdivided.
+    From 64 eigenpairs on, the samples of a Signature and their first eigenfunctions do not depend on the number of
+    eigenpairs. A Signature is then the beginning of one with more eigenpairs, see `larger` and `Signature.truncated`.
+    This requires the same mesh for both: one with fewer vertices than `least_vertices` is subdivided.
 
     Example:
         >>> SignatureConfig(n_eigenpairs=50).min_samples, SignatureConfig.paper().min_samples
         (1000, 0)
 
     Args:
-        n_eigenpairs: eigenpairs kept, without the constant one; None for as many as the descriptor requires (see
-            `Requirements.apply_to`), 250 without a descriptor.
+        n_eigenpairs: number of eigenpairs, without the constant one; None for the number that the descriptor requires
+            (see `Requirements.apply_to`), or 250 without a descriptor.
         resolution: voxels along the longest side of the bounding box.
-        min_samples: the grid is refined until at least so many voxels lie inside; 0 keeps `resolution`.
-        n_surface_samples: area-weighted random samples of the surface.
-        backend: "cotangent" or "robust", see `laplacian`. Where the cotangent matrices have no eigenpairs to the
-            tolerance, the others are used, and the Signature's notes say so.
-        max_vertices: simplify larger meshes first; None keeps them.
-        accuracy: relative error that 99 % of the interior distances may have, which speeds up the mean value
-            coordinates; None evaluates them exactly.
-        attributes: of the samples: "depth" and "electrostatic_potential" of the interior ones, "surface_direction" of
-            all, see `interior_attributes` and `surface_attributes`.
-        seed: of the surface samples and of the eigensolver's start.
-        least_vertices: meshes with fewer are subdivided when they are read, unless `mend` is "never"; None for two more
-            than the eigenpairs, the fewest that these can be computed from.
+        min_samples: the grid is refined until at least this many voxels lie inside; 0 keeps `resolution`.
+        n_surface_samples: number of area-weighted random samples of the surface.
+        backend: "cotangent" or "robust", see `laplacian`. If the eigenpairs of the cotangent matrices do not reach the
+            tolerance, the robust matrices are used, and a note of the Signature says so.
+        max_vertices: meshes with more vertices are simplified first; None keeps them.
+        accuracy: bound on the relative error of 99 % of the interior distances, which makes the mean value coordinates
+            faster; None evaluates them exactly.
+        attributes: of the samples: "depth" and "electrostatic_potential" (interior only) and "surface_direction", see
+            `interior_attributes` and `surface_attributes`.
+        seed: of the surface samples and of the eigensolver's start vectors.
+        least_vertices: meshes with fewer vertices are subdivided when they are read, unless `mend` is "never"; None for
+            two more than the number of eigenpairs, the fewest from which these can be computed.
     """
 
-    # Raise it whenever the same mesh and parameters would give another Signature: it is part of every cache key.
+    # Part of every cache key: raise it whenever the same mesh and parameters would give another Signature.
     ALGORITHM_VERSION: ClassVar[int] = 5
 
     DEFAULT_EIGENPAIRS: ClassVar[int] = 250
-    # As many as descriptors of the library ask for, so that caches may hold them.
+    # Numbers of eigenpairs that descriptors of the library require, and that caches may therefore hold.
     SIZES: ClassVar[tuple[int, ...]] = (64, 100, 250)
 
     n_eigenpairs: int | None = None
@@ -75,59 +75,60 @@ class SignatureConfig:
         names, known = tuple(self.attributes), get_args(AttributeName)  # JSON and YAML have lists
         object.__setattr__(self, "attributes", names)
         if not set(names) <= set(known) or len(set(names)) < len(names):
-            raise ValueError(f"attributes: expected different ones of {', '.join(known)}, got {', '.join(names)}.")
+            raise ValueError(f"attributes: expected distinct names among {', '.join(known)}, got {', '.join(names)}.")
 
     @classmethod
     def paper(cls) -> Self:
-        """Rustamov 2010: 250 eigenpairs and a 32-voxel grid that is never refined."""
+        """Return the configuration of Rustamov 2010: 250 eigenpairs and a 32-voxel grid that is never refined."""
         return cls(n_eigenpairs=250, min_samples=0)
 
     @property
     def n_kept(self) -> int:
-        """`n_eigenpairs`, or how many there are where it is None."""
+        """`n_eigenpairs`, or its default if None."""
         return self.DEFAULT_EIGENPAIRS if self.n_eigenpairs is None else self.n_eigenpairs
 
     @property
     def n_vertices_read(self) -> int:
-        """`least_vertices`, or what the eigenpairs need where it is None."""
+        """`least_vertices`, or the fewest that the eigenpairs require if None."""
         return self.n_kept + 2 if self.least_vertices is None else self.least_vertices
 
     def resolved(self) -> Self:
-        """The same with a number of eigenpairs."""
+        """Return the configuration with `n_eigenpairs` as a number."""
         return replace(self, n_eigenpairs=self.n_kept)
 
     def with_eigenpairs(self, n_eigenpairs: int) -> Self:
-        """The same where only the first so many eigenpairs are needed, unless a number of them is given already.
+        """Return a configuration with at least n_eigenpairs, or this one if its own number is set.
 
-        Meshes are subdivided as for the default number, so that this is the beginning of that Signature.
+        At least 64 are computed, and meshes are subdivided as for the default number, so that the Signature is the
+        beginning of the default one.
         """
         if self.n_eigenpairs is not None:
             return self
-        n_computed = max(n_eigenpairs, _ORDERED_BY)
+        n_computed = max(n_eigenpairs, _N_ORDERING_EIGENPAIRS)
         if n_computed >= self.DEFAULT_EIGENPAIRS:
             return replace(self, n_eigenpairs=n_computed)
         return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
 
     def larger(self) -> Iterator[Self]:
-        """Configurations whose Signatures begin with this one's, the smallest first, among those that caches may hold.
+        """Yield configurations that caches may hold and whose Signatures begin with this one's, the smallest first.
 
-        For a mesh that is subdivided that holds only of those with as many `n_vertices_read`.
+        For a mesh that is subdivided, this is true only of configurations with the same `n_vertices_read`.
         """
-        everything: tuple[AttributeName, ...] = get_args(AttributeName)
+        all_attributes: tuple[AttributeName, ...] = get_args(AttributeName)
         sizes, n_vertices = [self.n_kept], self.n_vertices_read
-        if self.n_kept >= _ORDERED_BY:
-            most = math.inf if self.max_vertices is None else self.max_vertices - 2
-            sizes += [size for size in self.SIZES if self.n_kept < size <= most]
+        if self.n_kept >= _N_ORDERING_EIGENPAIRS:
+            max_eigenpairs = math.inf if self.max_vertices is None else self.max_vertices - 2
+            sizes += [size for size in self.SIZES if self.n_kept < size <= max_eigenpairs]
             n_vertices = max(n_vertices, self.DEFAULT_EIGENPAIRS + 2)
         for n_eigenpairs in sizes:
-            for attributes in dict.fromkeys((self.attributes, everything)):
-                one = replace(self, n_eigenpairs=n_eigenpairs, attributes=attributes, least_vertices=n_vertices)
-                if one.as_dict() != self.as_dict():
-                    yield one
+            for attributes in dict.fromkeys((self.attributes, all_attributes)):
+                candidate = replace(self, n_eigenpairs=n_eigenpairs, attributes=attributes, least_vertices=n_vertices)
+                if candidate.as_dict() != self.as_dict():
+                    yield candidate
 
     def as_dict(self) -> dict[str, Any]:
-        """The parameters by name and the algorithm's version; `least_vertices` only where the others do not tell."""
-        found = {**asdict(self), "n_eigenpairs": self.n_kept, "algorithm_version": self.ALGORITHM_VERSION}
+        """Return the parameters and the algorithm's version by name; an implied `least_vertices` is left out."""
+        parameters = {**asdict(self), "n_eigenpairs": self.n_kept, "algorithm_version": self.ALGORITHM_VERSION}
         if self.n_vertices_read == self.n_kept + 2:
-            del found["least_vertices"]
-        return found
+            del parameters["least_vertices"]
+        return parameters

@@ -12,14 +12,14 @@ from igps.mesh.surface import longest_side
 
 Backend = Literal["cotangent", "robust"]
 
-# A face thinner than this (twice its area over its longest edge squared) gets mollified edge lengths.
-_DEGENERATE = 1e-8
-# Added to each edge of such a face, in units of its longest edge: makes its cotangents at most about a thousand.
+# Thinner faces (twice the area over the squared longest edge) get mollified edge lengths.
+_MIN_THICKNESS = 1e-8
+# Added to each edge of such a face, in units of its longest edge: limits its cotangents to about a thousand.
 _MOLLIFIER = 1e-6
 
 
 def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_matrix, Floats]:
-    """Stiffness and mass of the generalised eigenproblem `stiffness φ = λ mass φ`.
+    """Return stiffness and mass of the generalised eigenproblem `stiffness φ = λ mass φ`.
 
     Args:
         mesh: V vertices.
@@ -41,7 +41,7 @@ def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_ma
         import robust_laplacian
     except ImportError as error:
         raise ImportError('backend="robust" needs robust-laplacian: pip install "interior-gps[robust]".') from error
-    # In unit scale, because the library's mollification is an absolute length.
+    # Scale the mesh to unit size, because robust-laplacian mollifies by an absolute length.
     scale = longest_side(mesh.vertices)
     centred = (mesh.vertices - mesh.vertices.mean(axis=0)) / scale
     stiffness, mass = robust_laplacian.mesh_laplacian(centred, np.asarray(mesh.faces))
@@ -54,16 +54,16 @@ def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
     edges = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
     squared = np.einsum("fij,fij->fi", edges, edges)
     double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    thin = double_area <= _DEGENERATE * squared.max(axis=1)
-    if thin.any():
+    is_thin = double_area <= _MIN_THICKNESS * squared.max(axis=1)
+    if is_thin.any():
         # Intrinsic mollification (Sharp and Crane 2020) of the degenerate faces alone: the cotangent matrix stays
         # positive semi-definite, and a vertex whose faces all have zero area keeps a positive mass.
-        longest = np.sqrt(squared[thin].max(axis=1, keepdims=True))
-        lengths = np.sqrt(squared[thin]) + _MOLLIFIER * longest
-        squared[thin] = lengths**2
+        longest = np.sqrt(squared[is_thin].max(axis=1, keepdims=True))
+        lengths = np.sqrt(squared[is_thin]) + _MOLLIFIER * longest
+        squared[is_thin] = lengths**2
         c, b, a = np.sort(lengths, axis=1).T  # Heron's formula in Kahan's arrangement, stable for needles
-        double_area[thin] = 2 * (np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4)
-    # cot at corner i = (b·b + c·c − a·a) / (4 area), a the edge opposite i.
+        double_area[is_thin] = 2 * (np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4)
+    # cot at corner i = (b·b + c·c − a·a) / (4 area), where a is the edge opposite corner i.
     cotangents = (squared.sum(axis=1, keepdims=True) - 2 * squared) / (2 * double_area[:, None])
     return _stiffness(mesh.faces, cotangents, len(mesh.vertices)), _mixed_voronoi_mass(
         mesh.faces, cotangents, squared, double_area / 2, len(mesh.vertices)
@@ -71,7 +71,7 @@ def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
 
 
 def _stiffness(faces: Integers, cotangents: Floats, n_vertices: int) -> sparse.csr_matrix:
-    # Half of the cotangent of each corner, at one of the two entries of the edge opposite it.
+    # Half of each corner's cotangent belongs to the edge opposite it. Enter it at one of the edge's two entries.
     shape = n_vertices, n_vertices
     ends = faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()
     halves = sparse.csr_matrix((cotangents.ravel() / 2, ends), shape=shape)
@@ -80,13 +80,13 @@ def _stiffness(faces: Integers, cotangents: Floats, n_vertices: int) -> sparse.c
 
 
 def _mixed_voronoi_mass(faces: Integers, cotangents: Floats, squared: Floats, area: Floats, n_vertices: int) -> Floats:
-    # Meyer et al. 2002, section 3.3. The Voronoi share of corner i takes an eighth of edge² · cot of the angle that
-    # faces the edge, over the two edges at i; in an obtuse face the corners take fixed shares instead.
+    # Meyer et al. 2002, section 3.3. The Voronoi area of corner i is the sum of edge² · cot / 8 over the two edges
+    # at i, with the angle opposite the edge. In an obtuse face the corners get fixed shares of the area instead.
     share = squared * cotangents / 8
     voronoi = share.sum(axis=1, keepdims=True) - share
     obtuse = cotangents < 0
     fixed = np.where(obtuse, area[:, None] / 2, area[:, None] / 4)
-    corner = np.where(obtuse.any(axis=1, keepdims=True), fixed, voronoi)
+    corner_areas = np.where(obtuse.any(axis=1, keepdims=True), fixed, voronoi)
     mass = np.zeros(n_vertices)
-    np.add.at(mass, faces, corner)
+    np.add.at(mass, faces, corner_areas)
     return mass

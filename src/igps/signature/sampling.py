@@ -15,41 +15,40 @@ class SurfacePoints:
     """Points on the faces of a mesh."""
 
     mesh: Mesh
-    face: Integers  # (P,) of each point
-    weights: Floats  # (P, 3) its barycentric coordinates there
+    face: Integers  # (P,) index of each point's face
+    weights: Floats  # (P, 3) barycentric coordinates in the face
 
     @property
     def positions(self) -> Floats:
-        """(P, 3) length."""
+        """Positions (P, 3), length."""
         return self.interpolate(self.mesh.vertices)
 
     def interpolate(self, values: Floats) -> Floats:
-        """(P, D) linear interpolation of values (V, D) at the vertices."""
+        """Return the linear interpolation (P, D) of values (V, D) at the vertices."""
         return np.einsum("pi,pid->pd", self.weights, values[self.mesh.faces[self.face]])
 
 
-def surface_points(mesh: Mesh, n_points: int, seed: int, places: Floats | None = None) -> SurfacePoints:
-    """Random points evenly distributed over the surface.
+def surface_points(mesh: Mesh, n_points: int, seed: int, keys: Floats | None = None) -> SurfacePoints:
+    """Draw random points, uniformly distributed over the surface.
 
-    By places (V,) of the vertices, faces and corners are taken in an order that does not depend on how they are
-    numbered, see `igps.signature.ordering`. One point is then drawn in each of `n_points` equal shares of the area, and
-    the points come in that order.
+    Keys (V,) of the vertices, see `igps.signature.ordering`, give faces and corners an order independent of their
+    numbering. One point is then drawn in each of `n_points` equal parts of the area, and the points are in that order.
     """
     generator = np.random.default_rng(seed)
     area = face_areas(mesh.vertices, mesh.faces)
-    if places is None:
+    if keys is None:
         face = generator.choice(len(area), size=n_points, p=area / area.sum())
         return SurfacePoints(mesh, face, _in_triangles(n_points, generator))
-    at_corners = places[mesh.faces]
-    order = np.argsort(at_corners.sum(axis=1), kind="stable")
+    corner_keys = keys[mesh.faces]
+    order = np.argsort(corner_keys.sum(axis=1), kind="stable")
     face = order[systematic_sample(area[order], n_points, generator)]
     weights = np.empty((n_points, 3))
-    np.put_along_axis(weights, np.argsort(at_corners, axis=1)[face], _in_triangles(n_points, generator), axis=1)
+    np.put_along_axis(weights, np.argsort(corner_keys, axis=1)[face], _in_triangles(n_points, generator), axis=1)
     return SurfacePoints(mesh, face, weights)
 
 
 def _in_triangles(n_points: int, generator: np.random.Generator) -> Floats:
-    """(P, 3) barycentric coordinates, uniform in a triangle (Osada et al. 2002, equation 1)."""
+    """Draw uniform barycentric coordinates (P, 3) in a triangle (Osada et al. 2002, equation 1)."""
     r = np.sqrt(generator.random(n_points))
     s = generator.random(n_points)
     return np.stack([1 - r, r * (1 - s), r * s], axis=1)

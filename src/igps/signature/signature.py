@@ -1,4 +1,4 @@
-"""From one mesh to its Signature: eigenfunctions sampled in the interior and on the surface."""
+"""Computation of the Signature of a mesh: eigenfunctions sampled in the interior and on the surface."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ logger = logging.getLogger(__name__)
 SampleKind = Literal["interior", "surface"]
 SAMPLE_KINDS: tuple[SampleKind, ...] = ("interior", "surface")
 
-# Largest relative residual of an eigenpair. It is mostly far smaller; on meshes with very thin triangles rounding does
-# not allow much less, and the histograms cannot tell.
-_RESIDUAL = 1e-6
+# Largest relative residual of an eigenpair. It is mostly far smaller; meshes with very thin triangles do not allow much
+# less because of rounding, and a smaller one does not change the histograms.
+_MAX_RESIDUAL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,16 +46,16 @@ class Samples:
 
     points: Floats  # (P, 3) length
     eigenfunctions: Singles  # (P, K) 1/length, not scaled by any power of the eigenvalues
-    # By name, each (P,) or (P, C); a direction has C = 3
+    # by name, each (P,) or (P, C); a direction has C = 3
     attributes: Mapping[str, Singles] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.points)
 
     def with_attributes(self, values: Mapping[str, ArrayLike]) -> Samples:
-        """The same samples with more attributes, such as a field or an image at their points; no spectrum is needed.
+        """Return the samples with more attributes, such as a field or an image at their points; no spectrum is needed.
 
-        Values that are known at a mesh's vertices are carried to the points by `igps.signature.mean_value.extend`.
+        Values at the vertices of a mesh can be extended to the points by `igps.signature.mean_value.extend`.
 
         Example:
             >>> samples = Samples(np.array([[0.0, 0, 1], [0, 0, 3]]), np.ones((2, 5), np.float32))
@@ -63,29 +63,30 @@ class Samples:
             array([1., 3.], dtype=float32)
 
         Args:
-            values: by name, a number for each of the P points, (P,), or C numbers, (P, C), such as a direction. One of
-                a name that is there already takes its place.
+            values: by name, (P,) or (P, C): a number for each of the P points, or C numbers, such as a direction. An
+                existing attribute of the same name is replaced.
 
         Raises:
-            ValueError: values of another shape, or not finite.
+            ValueError: values have another shape, or are not finite.
         """
-        found = dict(self.attributes)
-        for name, given in values.items():
-            array = np.asarray(given, dtype=np.float32)
+        attributes = dict(self.attributes)
+        for name, value in values.items():
+            array = np.asarray(value, dtype=np.float32)
             if array.ndim not in (1, 2) or len(array) != len(self) or not np.isfinite(array).all():
                 raise ValueError(
                     f"{name}: expected a finite number, or several, for each of {len(self)} points, got an array of "
                     f"shape {array.shape} with {int((~np.isfinite(array)).sum())} values that are not finite."
                 )
-            found[name] = array
-        return replace(self, attributes=found)
+            attributes[name] = array
+        return replace(self, attributes=attributes)
 
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """What the descriptors need to know of one mesh.
+    """Eigenvalues of one mesh, and its eigenfunctions at samples: the input of all descriptors.
 
-    The eigenfunctions are kept unscaled, so that every spectral embedding can be chosen without computing them again.
+    The eigenfunctions are stored unscaled, so that every spectral embedding can be derived without computing them
+    again.
 
     Example:
         >>> import trimesh
@@ -98,16 +99,16 @@ class Signature:
 
     Args:
         eigenvalues: (K,) float64 ascending, 1/length², without the zero of the constant eigenfunction.
-        interior: P voxel centres inside the body, eigenfunctions extended by mean value coordinates.
-        surface: area-weighted random points of the surface, eigenfunctions interpolated linearly. Both in an order that
-            depends on the body's form alone, see `ordering_keys`.
+        interior: P voxel centres inside the body; eigenfunctions are extended to them by mean value coordinates.
+        surface: area-weighted random points of the surface; eigenfunctions are interpolated linearly. The order of both
+            kinds of samples depends only on the shape of the body, see `ordering_keys`.
         area: of the surface, length².
         volume: of the body, length³.
-        config: the parameters that made it.
+        config: the parameters of the computation.
         name: of the mesh.
-        notes: what was done to the mesh before, and to the computation, in words.
-        residual: the largest of the eigenpairs, relative to the eigenvalue; NaN where it is not known.
-        unit: of length, such as "mm"; None where it is not known.
+        notes: changes made to the mesh, and fallbacks of the computation, in words.
+        residual: largest residual of the eigenpairs, relative to the eigenvalue; NaN if unknown.
+        unit: of length, such as "mm"; None if unknown.
     """
 
     eigenvalues: Floats
@@ -123,22 +124,22 @@ class Signature:
 
     @property
     def barycentroid(self) -> Floats:
-        """(3,) interior sample of least potential Σ φₖ²/λₖ, a centre that hardly moves with pose (Rustamov 2010)."""
+        """Interior sample (3,) of smallest potential Σ φₖ²/λₖ, a centre that hardly moves with pose (Rustamov 2010)."""
         potential = np.square(self.interior.eigenfunctions, dtype=np.float64) @ (1 / self.eigenvalues)
         return self.interior.points[int(np.argmin(potential))]
 
     def map_samples(self, change: Callable[[Samples], Samples]) -> Signature:
-        """The Signature with a function applied to its interior and to its surface samples."""
+        """Return the Signature with a function applied to its interior and to its surface samples."""
         return replace(self, interior=change(self.interior), surface=change(self.surface))
 
     def truncated(self, config: SignatureConfig) -> Signature:
-        """The Signature of a smaller configuration: this one's is among its `SignatureConfig.larger`."""
+        """Return the Signature of a smaller configuration; the `larger` ones of that must include the present one."""
 
         def cut(samples: Samples) -> Samples:
-            attributes = samples.attributes.items()
-            kept: dict[str, Singles] = {name: one for name, one in attributes if name in config.attributes}
+            items = samples.attributes.items()
+            attributes: dict[str, Singles] = {name: values for name, values in items if name in config.attributes}
             functions = np.ascontiguousarray(samples.eigenfunctions[:, : config.n_kept])
-            return replace(samples, eigenfunctions=functions, attributes=kept)
+            return replace(samples, eigenfunctions=functions, attributes=attributes)
 
         eigenvalues = self.eigenvalues[: config.n_kept].copy()
         return replace(self.map_samples(cut), eigenvalues=eigenvalues, config=config)
@@ -148,10 +149,11 @@ class Signature:
 def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | None = None) -> Signature:
     """Sample the eigenfunctions of a mesh in its interior and on its surface (Rustamov 2010, section 3).
 
-    Of a body with cavities they are those of its outer surface, carried by the mean value coordinates of that to the
-    wall and to the surfaces of the cavities. So a cavity is a part of the inside that is missing: as it shrinks, the
-    Signature becomes that of the full body, and the two sides of a thin wall lie side by side. With eigenfunctions of
-    its own each surface would be at right angles to the others, at an infinite commute time.
+    The eigenfunctions of a body with cavities are those of its outer surface. Mean value coordinates of the outer
+    surface extend them to the wall and to the surfaces of the cavities. A cavity is thus a missing part of the
+    interior: as it shrinks, the Signature tends to that of the full body, and the two sides of a thin wall lie side by
+    side. If each surface had eigenfunctions of its own, the surfaces would be orthogonal to each other, at an infinite
+    commute time.
 
     Example:
         The first eigenvalues of the unit sphere are l (l + 1), each 2 l + 1 times.
@@ -163,80 +165,72 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
         [2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
 
     Args:
-        mesh: the body, or what `Mesh.of` makes one of.
+        mesh: the body, or an object that `Mesh.of` accepts.
         config: `SignatureConfig()` if None.
 
     Raises:
-        TypeError: the body is neither.
-        MeshError: too few vertices for the eigenpairs asked, or no interior sample.
+        TypeError: the mesh is no object that `Mesh.of` accepts.
+        MeshError: the mesh has too few vertices for the eigenpairs, or no interior sample.
         ConvergenceError: the eigensolver failed.
     """
     config = (config or SignatureConfig()).resolved()
-    mesh = Mesh.of(mesh).numbered_by_faces()  # to rounding, results depend on the numbers
+    mesh = Mesh.of(mesh).numbered_by_faces()  # rounding depends on the numbering
     if config.max_vertices is not None:
         mesh = simplify(mesh, config.max_vertices)
     outer, is_outer = mesh.outer()
     if len(outer.vertices) < config.n_kept + 2:
         raise MeshError(
-            f"{mesh.name}: {len(outer.vertices)} vertices are too few for {config.n_kept} eigenpairs; at least "
-            f"{config.n_kept + 2} are needed. Subdivide the mesh or lower n_eigenpairs."
+            f"{mesh.name}: expected at least {config.n_kept + 2} vertices for {config.n_kept} eigenpairs, got "
+            f"{len(outer.vertices)}. Subdivide the mesh or lower n_eigenpairs."
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
     spectrum, notes = _spectrum(outer, config)
     eigenvalues, functions, residual = spectrum.eigenvalues, spectrum.eigenfunctions, spectrum.residual
     roots = np.sqrt(eigenvalues)
-    # The accuracy is that of interior distances, which are those between rows of eigenfunctions so weighted.
+    # `accuracy` is that of interior distances, which are distances between rows of eigenfunctions over √λ.
     extension = Extension(outer.vertices, outer.faces, functions, divisors=roots, accuracy=config.accuracy)
-    if not is_outer.all():  # a cavity is a part of the inside that is missing
+    if not is_outer.all():
         functions = np.empty((len(mesh.vertices), len(eigenvalues)))
         functions[is_outer] = spectrum.eigenfunctions
         functions[~is_outer] = extension(mesh.vertices[~is_outer]) * roots
     surface = _surface(mesh, functions, eigenvalues, config)
-    del spectrum, functions  # of a large mesh the eigenfunctions fill more memory than all else
+    del spectrum, functions  # on a large mesh they take more memory than all else
     interior = _interior(mesh, extension, eigenvalues, points, config)
     for where, samples in (("interior", interior), ("surface", surface)):
         if not np.isfinite(samples.eigenfunctions).all():
             raise MeshError(
-                f"{mesh.name}: the eigenfunctions are not finite at some {where} samples. The triangles are too "
-                "ill-shaped: pass backend='robust', or remesh."
+                f"{mesh.name}: expected finite eigenfunctions, got NaN or infinity at some {where} samples. The "
+                "triangles are too ill-shaped: pass backend='robust', or remesh."
             )
     return Signature(
-        eigenvalues=eigenvalues,
-        interior=interior,
-        surface=surface,
-        area=mesh.area,
-        volume=mesh.volume,
-        config=config,
-        name=mesh.name,
-        notes=(*mesh.notes, *notes),
-        residual=residual,
-        unit=mesh.unit,
-    )
+        eigenvalues, interior, surface, mesh.area, mesh.volume, config, mesh.name,
+        notes=(*mesh.notes, *notes), residual=residual, unit=mesh.unit,
+    )  # fmt: skip
 
 
 def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str, ...]]:
-    """The eigenpairs, of the intrinsic-Delaunay matrices where the cotangent ones fail, and a note if they were."""
+    """Compute the eigenpairs; if the cotangent matrices fail, use the intrinsic-Delaunay ones and return a note."""
 
     def solve(config: SignatureConfig) -> Spectrum:
         stiffness, mass = laplacian(mesh, config.backend)
         return eigenpairs(
-            stiffness, mass, config.n_kept, positions=mesh.vertices, tolerance=_RESIDUAL, seed=config.seed
+            stiffness, mass, config.n_kept, positions=mesh.vertices, tolerance=_MAX_RESIDUAL, seed=config.seed
         )
 
     try:
         return solve(config), ()
-    except (ConvergenceError, ValueError) as failure:  # a ValueError: slivers make entries that no solver can use
+    except (ConvergenceError, ValueError) as failure:  # ValueError: matrix entries of slivers
         if config.backend == "robust":
             raise
         try:
             spectrum = solve(replace(config, backend="robust"))
-        except ImportError as missing:
-            raise ConvergenceError(f"{mesh.name}: {failure}. Remesh the body; or else: {missing}") from failure
-        except (ConvergenceError, ValueError) as second:
+        except ImportError as import_error:
+            raise ConvergenceError(f"{mesh.name}: {failure}. Remesh the body; or else: {import_error}") from failure
+        except (ConvergenceError, ValueError) as second_failure:
             raise ConvergenceError(
                 f"{mesh.name}: the eigenpairs fail with the cotangent matrices ({failure}) and with the "
-                f"intrinsic-Delaunay ones ({second}). The triangles are too ill-shaped: remesh."
-            ) from second
+                f"intrinsic-Delaunay ones ({second_failure}). The triangles are too ill-shaped: remesh."
+            ) from second_failure
         note = f"intrinsic-Delaunay matrices were used: the cotangent ones failed ({failure})"
         logger.warning("%s: %s", mesh.name, note)
         return spectrum, (note,)
@@ -245,7 +239,7 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
 def _interior(
     mesh: Mesh, extension: Extension, eigenvalues: Floats, points: Floats, config: SignatureConfig
 ) -> Samples:
-    """Those at the points, by the extension of eigenfunctions over the roots of their eigenvalues."""
+    """Return the samples at the points, where `extension` is that of the eigenfunctions over √λ."""
     values = extension(points)
     values *= np.sqrt(eigenvalues)
     order = np.argsort(ordering_keys(values, eigenvalues, mesh.area, nearest_spacing(points)), kind="stable")
@@ -254,8 +248,8 @@ def _interior(
 
 
 def _surface(mesh: Mesh, functions: Floats, eigenvalues: Floats, config: SignatureConfig) -> Samples:
-    marks = vertex_area_shares(mesh.faces, face_areas(mesh.vertices, mesh.faces))
-    order = ordering_keys(functions, eigenvalues, mesh.area, marks)
-    points = surface_points(mesh, config.n_surface_samples, config.seed, order)
+    tie_breakers = vertex_area_shares(mesh.faces, face_areas(mesh.vertices, mesh.faces))
+    keys = ordering_keys(functions, eigenvalues, mesh.area, tie_breakers)
+    points = surface_points(mesh, config.n_surface_samples, config.seed, keys)
     values = points.interpolate(functions).astype(np.float32)
     return Samples(points.positions, values, surface_attributes(mesh, points.face, config.attributes))

@@ -1,13 +1,14 @@
-"""The potential ∫ dS/|x − s| of a uniformly charged triangle mesh, to a relative error that is kept everywhere.
+"""The potential ∫ dS/|x − s| of a uniformly charged triangle mesh, with a bound on the relative error.
 
-Triangles near a point count by the closed form (Wilton, Rao, Glisson, Schaubert, Al-Bundak and Butler 1984); distant
-ones, and clusters of them, by the Taylor series of 1/r about their centroid up to the second order; the first vanishes
-there. What is left out of a patch with area A, radius R and mean squared distance σ² from its centroid is at most
-A/d · Rσ²/d³ / (1 − R/d) at a distance d from the centroid. As all contributions are positive, a patch that is taken as
-far only where this is below a share of A/d keeps that relative error for the sum.
+Near triangles are integrated in closed form (Wilton, Rao, Glisson, Schaubert, Al-Bundak and Butler 1984). Distant
+triangles and clusters of triangles are replaced by the Taylor series of 1/r about their centroid up to second order;
+the first-order term is zero. Let a patch have area A, radius R and mean squared distance σ² from its centroid. At a
+distance d from the centroid, the remainder is at most A/d · Rσ²/d³ / (1 − R/d). The series is used only where this is
+less than a given fraction of A/d. Since all contributions are positive, that fraction also bounds the relative error of
+the sum.
 
-A face that is near is cut into quarters first: where the series serves for these, it takes the place of the closed
-form, which is needed at half the distance only.
+A near face is first cut into quarters. Where their series is accurate enough it replaces the closed form, which is then
+needed at half the distance only.
 """
 
 from __future__ import annotations
@@ -21,92 +22,93 @@ from igps.mesh.surface import longest_side
 from igps.signature._potential_loops import fill_potentials
 from igps.signature.ordering import spatial_order
 
-_POINTS = 32  # in a block; they see the same clusters
-_FACES = 8  # in the smallest clusters, and so many clusters of one level in one of the next
-_FLAT = 1e-14  # a face's height over its length, below which it has no area and no normal to speak of
+_BLOCK_SIZE = 32  # points for which the same patches are far
+_BRANCHING = 8  # patches that are merged into one of the next level
+_MIN_HEIGHT = 1e-14  # of a face, relative to its longest side: flatter faces have no numerical normal
 
 
 def surface_potential(vertices: Floats, faces: Integers, points: Floats, accuracy: float = 1e-3) -> Floats:
-    """(P,) ∫ dS/|x − s|, length, over a triangle mesh at points x (P, 3) anywhere, on the surface too.
+    """Return ∫ dS/|x − s| (P,), length, over a triangle mesh, at points x (P, 3) inside, outside or on the surface.
 
-    The accuracy is a relative error that is proved for every value. The largest found with 10⁻³, on 26 bodies with and
-    without needles, was 4·10⁻⁶: what is left out changes its sign from patch to patch.
+    The accuracy is a proved bound on the relative error of every value. The largest error seen at 10⁻³ was 4·10⁻⁶, on
+    26 bodies with and without needles: the remainders of patches have different signs.
     """
     corners = vertices[faces]
     centre, scale = corners.mean(axis=(0, 1)), longest_side(vertices)
     corners = (corners - centre) / scale
     sides = np.roll(corners, -1, axis=1) - corners
     heights = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / np.square(sides).sum(axis=2).max(axis=1)
-    corners = corners[heights > _FLAT]
+    corners = corners[heights > _MIN_HEIGHT]
     x = (np.asarray(points, np.float64) - centre) / scale
     out = np.zeros(len(x))
     if not len(corners) or not len(x):
         return out
-    corners = corners[spatial_order(corners.mean(axis=1), _FACES)]
-    levels = [_Patches.of(corners)]
-    while len(levels[-1].areas) > 2 * _FACES:
-        levels.append(levels[-1].merged(_FACES))
-    whole = levels[0]
-    # The centroids of the quarters are that of the face and those half-way to its corners.
-    quarters = _Patches(whole.areas / 4, whole.centres, whole.spreads / 4, whole.radii / 2)
-    limits = np.square(quarters.reaches(accuracy) + whole.radii / 2)
-    order = spatial_order(x, _POINTS)
-    found = np.empty(len(x))
+    corners = corners[spatial_order(corners.mean(axis=1), _BRANCHING)]
+    levels = [_Patches.from_triangles(corners)]
+    while len(levels[-1].areas) > 2 * _BRANCHING:
+        levels.append(levels[-1].merged(_BRANCHING))
+    whole_faces = levels[0]
+    # Quarters have their centroids at the centroid of the face and half-way to its corners.
+    quarters = _Patches(whole_faces.areas / 4, whole_faces.centres, whole_faces.covariances / 4, whole_faces.radii / 2)
+    squared_limits = np.square(quarters.min_distances(accuracy) + whole_faces.radii / 2)
+    order = spatial_order(x, _BLOCK_SIZE)
+    potentials = np.empty(len(x))
     fill_potentials(
-        x[order], _POINTS, np.concatenate([level.table for level in levels]),
-        np.concatenate([level.reaches(accuracy) for level in levels]),
-        np.cumsum([0, *(len(level.areas) for level in levels)]), _FACES, limits, _face_table(corners), found,
+        x[order], _BLOCK_SIZE, np.concatenate([level.table for level in levels]),
+        np.concatenate([level.min_distances(accuracy) for level in levels]),
+        np.cumsum([0, *(len(level.areas) for level in levels)]), _BRANCHING, squared_limits, _face_table(corners),
+        potentials,
     )  # fmt: skip
-    out[order] = found * scale
+    out[order] = potentials * scale
     return out
 
 
 @dataclass(frozen=True)
 class _Patches:
-    """Pieces of the surface, as the series sees them."""
+    """Pieces of the surface, with the moments that the series needs."""
 
     areas: Floats  # (n,)
     centres: Floats  # (n, 3) centroids
-    spreads: Floats  # (n, 3, 3) covariance of the points
-    radii: Floats  # (n,) of a ball about the centroid that holds the patch
+    covariances: Floats  # (n, 3, 3)
+    radii: Floats  # (n,) of balls about the centroids that contain the patches
 
     @staticmethod
-    def of(corners: Floats) -> _Patches:
-        """Of triangles (n, 3, 3)."""
+    def from_triangles(corners: Floats) -> _Patches:
+        """Make a patch of each triangle (n, 3, 3)."""
         centres = corners.mean(axis=1)
         arms = corners - centres[:, None]
         areas = np.linalg.norm(np.cross(arms[:, 0] - arms[:, 1], arms[:, 0] - arms[:, 2]), axis=1) / 2
         return _Patches(areas, centres, arms.transpose(0, 2, 1) @ arms / 12, np.linalg.norm(arms, axis=2).max(axis=1))
 
     def merged(self, size: int) -> _Patches:
-        """So many consecutive ones as one."""
+        """Merge each `size` consecutive patches into one."""
         starts = np.arange(0, len(self.areas), size)
         group = np.arange(len(self.areas)) // size
         areas = np.add.reduceat(self.areas, starts)
         centres = np.add.reduceat(self.areas[:, None] * self.centres, starts) / areas[:, None]
         arms = self.centres - centres[group]
-        moments = self.areas[:, None, None] * (self.spreads + arms[:, :, None] * arms[:, None])
+        moments = self.areas[:, None, None] * (self.covariances + arms[:, :, None] * arms[:, None])
         radii = np.maximum.reduceat(np.linalg.norm(arms, axis=1) + self.radii, starts)
         return _Patches(areas, centres, np.add.reduceat(moments, starts) / areas[:, None, None], radii)
 
-    def reaches(self, accuracy: float) -> Floats:
-        """(n,) distance from the centroid from which on the series has a relative error below the accuracy."""
-        variances = np.trace(self.spreads, axis1=1, axis2=2)
+    def min_distances(self, accuracy: float) -> Floats:
+        """Return the distances (n,) from the centroids beyond which the series has this relative accuracy."""
+        variances = np.trace(self.covariances, axis1=1, axis2=2)
         # (g + R/2)² (g − R/2) ≥ g³ for g ≥ R.
-        least = np.cbrt(self.radii * variances / accuracy)
-        return np.maximum(least, 1.5 * self.radii) + self.radii / 2
+        bounds = np.cbrt(self.radii * variances / accuracy)
+        return np.maximum(bounds, 1.5 * self.radii) + self.radii / 2
 
     @property
     def table(self) -> Floats:
-        """(n, 10): centroid, area, and the form A·(3/2 C − ½ tr C·1) as xx, yy, zz, 2xy, 2xz, 2yz."""
-        trace = np.trace(self.spreads, axis1=1, axis2=2)
-        form = self.areas[:, None, None] * (1.5 * self.spreads - 0.5 * trace[:, None, None] * np.eye(3))
+        """Columns (n, 10): centroid, area, and the quadratic form A·(3/2 C − ½ tr C·1) as xx, yy, zz, 2xy, 2xz, 2yz."""
+        trace = np.trace(self.covariances, axis1=1, axis2=2)
+        form = self.areas[:, None, None] * (1.5 * self.covariances - 0.5 * trace[:, None, None] * np.eye(3))
         entries = form[:, (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)] * [1, 1, 1, 2, 2, 2]
         return np.concatenate([self.centres, self.areas[:, None], entries], axis=1)
 
 
 def _face_table(corners: Floats) -> Floats:
-    """(F, 25) of triangles (F, 3, 3): corners, normal, outward normals of the sides in the plane, lengths, 2 area."""
+    """Return corners, normal, outward side normals, side lengths and twice the area of each triangle as (F, 25)."""
     sides = np.roll(corners, -1, axis=1) - corners  # from each corner to the next
     normals = np.cross(sides[:, 0], sides[:, 1])
     double_areas = np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Which cells of a cubic grid lie inside a surface: scan lines along three axes, winding numbers in doubt."""
+"""Cells of a cubic grid inside a surface: scan lines along three axes, and winding numbers where these disagree."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,32 +10,32 @@ from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import box_sides, directed_edges, longest_side
 from igps.mesh.winding import winding_number
 
-# A cell centre closer to the surface than this share of a cell lies on it, and does not count as inside. It is far
+# Distance from the surface, in units of a cell, within which a cell centre is on the surface and not inside. It is far
 # above rounding, so that a moved or turned mesh keeps its samples.
 _ON_SURFACE = 1e-6
-# The finest grid that `min_samples` may ask for, and the most cells of one: some 40 bytes each while it is scanned.
+# Limits of a grid: cells along the longest side, and cells in all, which take about 40 bytes each during the scan.
 _MAX_RESOLUTION = 512
 _MAX_CELLS = 2**25
 
 
 def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> Floats:
-    """(P, 3) centres, length, of the cubic voxels inside the mesh (Rustamov 2010, section 3).
+    """Return the centres (P, 3), length, of the cubic voxels inside the mesh (Rustamov 2010, section 3).
 
-    The grid is centred on the bounding box, with cells of 1/`resolution` of its longest side, so that moving the mesh,
-    or turning it by the symmetries of the grid, moves and turns the samples.
+    The grid is centred on the bounding box, with cells of 1/`resolution` of its longest side. Moving the mesh, or
+    turning it by a symmetry of the grid, therefore moves and turns the samples.
 
-    Until at least `min_samples` cells are inside, the grid is refined; 0 keeps the resolution.
+    The grid is refined until at least `min_samples` cells are inside; 0 keeps the resolution.
 
     Raises:
         MeshError: no cell centre is inside, `min_samples` is out of reach, or the grid would fill the memory.
     """
     check_at_least(1, resolution=resolution)
     check_at_least(0, min_samples=min_samples)
-    finest = _finest_resolution(mesh)
-    if resolution > finest:
+    max_resolution = _largest_resolution(mesh)
+    if resolution > max_resolution:
         raise MeshError(
-            f"{mesh.name}: a grid of {resolution} cells along the longest side has more than the {_MAX_CELLS} cells "
-            f"that are held in memory at once. Lower the resolution to {finest}."
+            f"{mesh.name}: expected a resolution of at most {max_resolution} ({_MAX_RESOLUTION} cells along the "
+            f"longest side, {_MAX_CELLS} in all), got {resolution}. Lower the resolution."
         )
     while True:
         axes = grid_axes(mesh, resolution)
@@ -43,21 +43,21 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
         inside = inside_grid(mesh, axes)
         count = int(inside.sum())
         if count >= max(min_samples, 1):
-            index = np.nonzero(inside)
-            return np.stack([axis[i] for axis, i in zip(axes, index, strict=True)], axis=1)
-        if min_samples == 0 or resolution >= finest:
-            wanted = f"at least {min_samples} samples" if min_samples else "an interior sample"
+            cells = np.nonzero(inside)
+            return np.stack([axis[i] for axis, i in zip(axes, cells, strict=True)], axis=1)
+        if min_samples == 0 or resolution >= max_resolution:
+            remedy = "lower min_samples" if min_samples else "raise the resolution, or set min_samples to refine it"
             raise MeshError(
-                f"{mesh.name}: {count} cells of a grid of {resolution} along the longest side lie inside, {wanted} "
-                "expected. The body is too thin for this grid: raise the resolution, or set min_samples to refine it."
+                f"{mesh.name}: expected at least {max(min_samples, 1)} cells inside, got {count} in a grid of "
+                f"{resolution} along the longest side. The body is too thin for this grid: {remedy}."
             )
-        # The count grows with the cube of the resolution for a body, with less for a thin one: approach from below.
+        # The count grows with the cube of the resolution, for a thin body more slowly: approach min_samples from below.
         growth = (min_samples / max(count, 1)) ** (1 / 3)
-        resolution = min(int(np.ceil(resolution * min(max(growth, 1.05), 2.0))), finest)
+        resolution = min(int(np.ceil(resolution * min(max(growth, 1.05), 2.0))), max_resolution)
 
 
-def _finest_resolution(mesh: Mesh) -> int:
-    """The largest resolution whose grid is within the limits."""
+def _largest_resolution(mesh: Mesh) -> int:
+    """Return the largest resolution whose grid is within the limits."""
     sides = box_sides(mesh.vertices) / longest_side(mesh.vertices)
     resolution = _MAX_RESOLUTION
     while np.prod(np.ceil(sides * resolution).clip(1)) > _MAX_CELLS:
@@ -66,21 +66,22 @@ def _finest_resolution(mesh: Mesh) -> int:
 
 
 def grid_axes(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Floats]:
-    """Coordinates of the cell centres along x, y and z of the cubic grid centred on the mesh's bounding box."""
+    """Return the coordinates of the cell centres along x, y and z of the cubic grid centred on the bounding box."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     cell = (high - low).max() / resolution
-    # The small slack keeps a side of exactly n cells at n cells, whatever the rounding.
+    # A small tolerance keeps a side of exactly n cells at n cells in spite of rounding.
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1).astype(int)
     x, y, z = ((low[i] + high[i]) / 2 + (np.arange(counts[i]) - (counts[i] - 1) / 2) * cell for i in range(3))
     return x, y, z
 
 
 def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
-    """(X, Y, Z) whether the mesh's winding number is above one half, at each point of the grid spanned by `axes`.
+    """Return booleans (X, Y, Z): whether the winding number is above one half at the points of a grid.
 
-    Along each axis the signed crossings of every grid line are summed from both ends. On a closed mesh the six sums
-    agree, and are the winding number. Where a hole lets one line through, the other five outvote it; where more
-    disagree, the winding number is computed from solid angles (Jacobson et al. 2013). Points on the surface are out.
+    Along each axis, the signed crossings of every grid line are summed from both ends. On a closed mesh the six sums
+    agree with the winding number. If a line passes through a hole, the other five sums outvote its sum; if more
+    disagree, the winding number is computed from solid angles (Jacobson et al. 2013). Points on the surface are not
+    inside.
     """
     shape = tuple(len(axis) for axis in axes)
     votes = np.zeros(shape, dtype=np.int8)
@@ -88,10 +89,10 @@ def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
     for i in range(3):
         order = (i, (i + 1) % 3, (i + 2) % 3)
         line = tuple(axes[k] for k in order)
-        after, before, touched = _scan(mesh.vertices[:, order], mesh.faces, line)
-        back = np.argsort(order)
-        votes += ((after > 0).astype(np.int8) + (before > 0)).transpose(back)
-        on_surface |= touched.transpose(back)
+        after, before, touching = _scan(mesh.vertices[:, order], mesh.faces, line)
+        inverse = np.argsort(order)
+        votes += ((after > 0).astype(np.int8) + (before > 0)).transpose(inverse)
+        on_surface |= touching.transpose(inverse)
     inside = votes >= 5
     doubtful = np.nonzero((votes > 1) & (votes < 5) & ~on_surface)
     if len(doubtful[0]):
@@ -103,10 +104,10 @@ def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
 def _scan(
     vertices: Floats, faces: Integers, axes: tuple[Floats, ...]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], Booleans]:
-    """Signed crossings of the grid lines along the first axis, after and before each point, and the points touched.
+    """Return sums of signed crossings along the first axis, after and before each point, and points on the surface.
 
-    Every comparison belongs to one edge and gives the same answer in both faces of that edge, so that a line through an
-    edge or a vertex crosses exactly one of the faces that meet there: ties are decided as if the line were moved by an
+    Every comparison belongs to one edge and has the same result in both faces of the edge. A line through an edge or a
+    vertex therefore crosses exactly one of the faces that meet there: ties are resolved as if the line were moved by an
     infinitesimal amount (Edelsbrunner and Mücke 1990), never by rounding.
     """
     x_axis, y_axis, z_axis = axes
@@ -122,7 +123,7 @@ def _scan(
     t = (z_axis[row] - a[:, 2]) / (b[:, 2] - a[:, 2])
     y = a[:, 1] + t * (b[:, 1] - a[:, 1])
     x = a[:, 0] + t * (b[:, 0] - a[:, 0])
-    # A plane that crosses a face crosses exactly two of its edges, one up and one down: pair them.
+    # A plane that crosses a face crosses exactly two of its edges, one upward and one downward: pair them.
     order = np.lexsort((upward[half_edge], row, half_edge // 3))
     down, up = order[0::2], order[1::2]
     row = row[up]
@@ -130,32 +131,32 @@ def _scan(
     # Columns: the points of each such segment on the lines y = const, half-open in y.
     column_down, column_up = np.searchsorted(y_axis, y[down], "left"), np.searchsorted(y_axis, y[up], "left")
     segment, column = _ranges(np.minimum(column_down, column_up), np.maximum(column_down, column_up))
-    # The face is seen from its outside, looking along −x, where its upward edge lies on the larger y.
+    # +1 where the outward normal points towards +x: seen from there, the upward edge has the larger y.
     sign = np.where(column_up > column_down, 1, -1)[segment].astype(np.int32)
     y0, y1, x0, x1 = (values[segment] for values in (y[down], y[up], x[down], x[up]))
     crossing = x0 + (y_axis[column] - y0) / (y1 - y0) * (x1 - x0)
 
-    # A crossing at x counts for every point of its line that lies on its left: put it where the suffix sum starts.
+    # A crossing counts for all points of its line with smaller x: enter it where their suffix sum starts.
     position = np.searchsorted(x_axis, crossing, "left")
     size = (len(x_axis) + 1, len(y_axis), len(z_axis))
     flat = np.ravel_multi_index((position, column, row[segment]), size)
-    at = np.bincount(flat, weights=sign, minlength=int(np.prod(size))).reshape(size).astype(np.int32)
-    # The points on the left of a crossing have indices below its position.
-    after = np.cumsum(at[::-1], axis=0)[::-1][1:]
-    before = -np.cumsum(at, axis=0)[:-1]
+    crossings = np.bincount(flat, weights=sign, minlength=int(np.prod(size))).reshape(size).astype(np.int32)
+    # The points with smaller x than a crossing have indices below its position.
+    after = np.cumsum(crossings[::-1], axis=0)[::-1][1:]
+    before = -np.cumsum(crossings, axis=0)[:-1]
 
-    touched = np.zeros(size, dtype=bool)
-    # The first axis tells the cell, or where that has one point, as across a flat body, the next does.
+    on_surface = np.zeros(size, dtype=bool)
+    # Use the first axis with several points: an axis across a flat body may have only one.
     cell = next((float(axis[1] - axis[0]) for axis in axes if len(axis) > 1), longest_side(vertices))
     for neighbour in (position - 1, position):
         clipped = np.clip(neighbour, 0, len(x_axis) - 1)
-        close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell
-        touched[clipped[close], column[close], row[segment][close]] = True
-    return after, before, touched[:-1]
+        is_close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell
+        on_surface[clipped[is_close], column[is_close], row[segment][is_close]] = True
+    return after, before, on_surface[:-1]
 
 
 def _ranges(first: Integers, last: Integers) -> tuple[Integers, Integers]:
-    """The pairs (i, k) with first[i] ≤ k < last[i], in order."""
+    """Return all pairs (i, k) with first[i] ≤ k < last[i], in order."""
     length = np.maximum(last - first, 0)
     owner = np.repeat(np.arange(len(first)), length)
     start = np.cumsum(length) - length

@@ -1,7 +1,8 @@
 """Eigenpairs of sparse symmetric matrices, with a proof that none is missing.
 
-The room knows nothing of meshes: a stiffness and a mass from any library go in as plain arrays. Each module uses only
-those before it: checks, products, ordering, tree, pivots, fronts, multifrontal, basis, krylov, lanczos, eigensolver.
+The package knows nothing of meshes: stiffness and mass are plain arrays, from any library. Each module imports only
+from those before it in this list: checks, products, ordering, tree, pivots, fronts, multifrontal, basis, krylov,
+lanczos, eigensolver.
 """
 
 from igps.spectra._lanczos import ConvergenceError

@@ -1,4 +1,4 @@
-"""What the matrices must be, before anything is computed with them."""
+"""Checks of the matrices, before any computation."""
 
 import numpy as np
 from scipy import sparse
@@ -6,12 +6,12 @@ from scipy.sparse.csgraph import connected_components
 
 from igps._parameters import check_at_least
 
-# Below these, relative to what it came from, a number is rounding, a matrix sloppy
-ROUNDING, SLOPPINESS = 1e-14, 1e-8
+# Relative size of rounding errors, and relative tolerance for the symmetry and the row sums of a matrix.
+ROUNDING, TOLERANCE = 1e-14, 1e-8
 
 
 def canonical(matrix: sparse.csr_array) -> sparse.csr_array:
-    """The matrix with sorted indices and no duplicates; the argument is not touched."""
+    """Return the matrix with sorted indices and without duplicates; the argument is not changed."""
     matrix = sparse.csr_array(matrix)
     if not matrix.has_canonical_format:
         matrix = matrix.copy()
@@ -20,22 +20,22 @@ def canonical(matrix: sparse.csr_array) -> sparse.csr_array:
 
 
 def checked_entries(matrix: sparse.csr_array, indptr: np.ndarray, indices: np.ndarray) -> sparse.csr_array:
-    """The canonical matrix, which must store the entries of the one whose structure is known."""
+    """Return the canonical matrix, and check that it stores the same entries as a known structure."""
     matrix = canonical(matrix)
     if not (np.array_equal(matrix.indptr, indptr) and np.array_equal(matrix.indices, indices)):
-        raise ValueError("matrix must store the same entries as the one that was dissected: dissect it anew")
+        raise ValueError("matrix: expected the stored entries of the analysed matrix, got others. Analyse it anew.")
     return matrix
 
 
 def checked_mass(mass: np.ndarray | sparse.sparray | sparse.spmatrix) -> np.ndarray:
-    """The mass as a new float64 vector, (V,) where a vector or a diagonal sparse matrix is given."""
+    """Return the mass as a new float64 vector (V,), if it is a vector or a diagonal sparse matrix."""
     if not sparse.issparse(mass):
         return np.array(mass, dtype=np.float64)
     entries = sparse.coo_array(mass)
     if mass.shape[0] != mass.shape[1] or np.any(entries.data[entries.row != entries.col]):
         raise ValueError(
-            f"mass must be (V,) or a diagonal sparse matrix, got a sparse matrix of shape {mass.shape} that is not "
-            "diagonal: lump it, mass.sum(axis=1)"
+            f"mass: expected (V,) or a diagonal sparse matrix, got a sparse matrix of shape {mass.shape} that is not "
+            "diagonal. Lump it: mass.sum(axis=1)."
         )
     return np.array(mass.diagonal(), dtype=np.float64)
 
@@ -43,58 +43,62 @@ def checked_mass(mass: np.ndarray | sparse.sparray | sparse.spmatrix) -> np.ndar
 def checked_stiffness(
     stiffness: sparse.sparray | sparse.spmatrix, mass: np.ndarray, n_eigenpairs: int
 ) -> sparse.csr_array:
-    """The stiffness as an exactly symmetric csr array, which may be the argument, after all checks on the arguments."""
+    """Check all arguments; return the stiffness as an exactly symmetric csr array, which may be the argument."""
     if not sparse.issparse(stiffness):
-        raise ValueError(f"stiffness must be a scipy sparse matrix, got {type(stiffness).__name__}")
+        raise ValueError(f"stiffness: expected a scipy sparse matrix, got {type(stiffness).__name__}.")
     n_vertices = len(mass)
     if mass.ndim != 1 or stiffness.shape != (n_vertices, n_vertices):
-        raise ValueError(f"stiffness must be (V, V) and mass (V,), got {stiffness.shape} and {mass.shape}")
+        raise ValueError(f"stiffness and mass: expected (V, V) and (V,), got {stiffness.shape} and {mass.shape}.")
     check_at_least(1, n_eigenpairs=n_eigenpairs)
     if n_eigenpairs + 1 >= n_vertices:
         raise ValueError(
-            f"n_eigenpairs={n_eigenpairs} needs matrices of more than {n_eigenpairs + 1} rows, these have "
-            f"{n_vertices}: ask for fewer eigenpairs, or subdivide the surface"
+            f"n_eigenpairs: expected at most {n_vertices - 2} for matrices of {n_vertices} rows, got {n_eigenpairs}. "
+            "Compute fewer eigenpairs, or subdivide the surface."
         )
     stiffness = canonical(sparse.csr_array(stiffness, dtype=np.float64))
     if not np.isfinite(stiffness.data).all():
         raise ValueError(
-            "stiffness has entries that are not finite: of a surface, repair the degenerate triangles first"
+            "stiffness: expected finite entries, got NaN or infinity. Repair degenerate triangles of the surface."
         )
     if not np.isfinite(mass).all() or mass.min() <= 0:
         raise ValueError(
-            "mass must be finite and positive: of a surface, remove unreferenced vertices and empty triangles"
+            "mass: expected finite positive entries, got others. Remove unreferenced vertices and empty triangles."
         )
     if stiffness.trace() < 0:
         raise ValueError(
-            "stiffness must be positive semi-definite, its trace is negative: pass -stiffness if your library has the "
-            "other sign, as libigl's cotmatrix"
+            "stiffness: expected a positive semi-definite matrix, got a negative trace. Pass -stiffness if your "
+            "library has the opposite sign, as libigl's cotmatrix."
         )
 
     transpose = sparse.csr_array(stiffness.T)
     arrays = ((matrix.indptr, matrix.indices, matrix.data) for matrix in (stiffness, transpose))
-    exact = all(map(np.array_equal, *arrays))
+    is_symmetric = all(map(np.array_equal, *arrays))
     magnitude = abs(stiffness)
-    if not exact and abs(stiffness - transpose).max() > SLOPPINESS * magnitude.max():
-        raise ValueError("stiffness must be symmetric")
-    # relative to each row: only this detects the zero mode at any scale and beside any sliver
-    if (np.abs(stiffness.sum(axis=1)) > SLOPPINESS * magnitude.sum(axis=1)).any():
+    if not is_symmetric and abs(stiffness - transpose).max() > TOLERANCE * magnitude.max():
+        raise ValueError("stiffness: expected a symmetric matrix, got one that differs from its transpose.")
+    # Relative to each row, so that the zero mode is recognised at any scale and in spite of slivers.
+    if (np.abs(stiffness.sum(axis=1)) > TOLERANCE * magnitude.sum(axis=1)).any():
         raise ValueError(
-            "the rows of stiffness must sum to zero, as on a closed surface the constant is an eigenfunction"
+            "stiffness: expected rows that sum to zero, as the constant is an eigenfunction on a closed surface; got "
+            "other sums."
         )
-    symmetric = stiffness if exact else sparse.csr_array((stiffness + transpose) / 2)
+    symmetric = stiffness if is_symmetric else sparse.csr_array((stiffness + transpose) / 2)
     n_components = connected_components(_significant(symmetric), directed=False, return_labels=False)
     if n_components > 1:
         raise ValueError(
-            f"stiffness has {n_components} connected components and so {n_components} zero eigenvalues, expected 1: "
-            "of a surface, join the components or keep one of them"
+            f"stiffness: expected 1 connected component, got {n_components}, each with a zero eigenvalue. Join the "
+            "components of the surface or keep one of them."
         )
     return symmetric
 
 
 def _significant(stiffness: sparse.csr_array) -> sparse.csr_array:
-    """The matrix without entries that are zero but for rounding: these would tie components together in vain."""
+    """Return the matrix without entries that are rounding errors of zero, which would connect components."""
     entries, diagonal = stiffness.tocoo(), stiffness.diagonal()
-    kept = np.abs(entries.data) > ROUNDING * np.minimum(diagonal[entries.row], diagonal[entries.col])
-    if kept.all():
+    large = np.abs(entries.data) > ROUNDING * np.minimum(diagonal[entries.row], diagonal[entries.col])
+    if large.all():
         return stiffness
-    return sparse.csr_array((entries.data[kept], (entries.row[kept], entries.col[kept])), shape=stiffness.shape)
+    return sparse.csr_array(
+        (entries.data[large], (entries.row[large], entries.col[large])),
+        shape=stiffness.shape,
+    )

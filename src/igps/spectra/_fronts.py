@@ -1,4 +1,4 @@
-"""The compiled loops of `_multifrontal`: elimination of fronts, and the two ways through the tree of a solve."""
+"""Compiled loops of `_multifrontal`: elimination of fronts, and the forward and backward pass of a solve."""
 
 from typing import Any
 
@@ -6,34 +6,35 @@ import numpy as np
 
 from igps._arrays import Floats
 from igps._compiled import compiled
-from igps.spectra._pivots import AT_ONCE, Scratch, invert_front
+from igps.spectra._pivots import STEP, Scratch, invert_front
 from igps.spectra._products import COLUMNS, ONE, ROWS, ZERO, product
 from igps.spectra._tree import Nodes, Structure
 
 
 @compiled(inline="always")
-def assemble(n: int, tree: Structure, values: Floats, shift: float, updates: Floats, scratch: Scratch) -> None:
-    """Write the upper triangle of a node's front, (S + B, S + B): of the matrix, and its children's complements."""
-    first, start, place, front = tree.first, tree.start, scratch.place, scratch.front
-    begin, stop = first[n], first[n + 1]
-    n_own = stop - begin
-    width = n_own + start[n + 1] - start[n]
-    for k in range(start[n], start[n + 1]):
-        place[tree.boundary[k]] = n_own + k - start[n]
+def assemble(node: int, tree: Structure, values: Floats, shift: float, updates: Floats, scratch: Scratch) -> None:
+    """Write the upper triangle of a node's front (S + B, S + B), including the Schur complements of its children."""
+    own_start, boundary_start = tree.own_start, tree.boundary_start
+    boundary_row, front = scratch.boundary_row, scratch.front
+    own_begin, own_end = own_start[node], own_start[node + 1]
+    n_own = own_end - own_begin
+    width = n_own + boundary_start[node + 1] - boundary_start[node]
+    for k in range(boundary_start[node], boundary_start[node + 1]):
+        boundary_row[tree.boundary[k]] = n_own + k - boundary_start[node]
     for i in range(width):
         front[i * width + i : (i + 1) * width] = 0.0
     for i in range(n_own):
-        vertex = tree.order[begin + i]
+        vertex = tree.order[own_begin + i]
         for k in range(tree.indptr[vertex], tree.indptr[vertex + 1]):
-            j = tree.number[tree.indices[k]]
-            if j >= begin + i:
-                front[i * width + (j - begin if j < stop else place[j])] += values[k]
+            j = tree.position[tree.indices[k]]
+            if j >= own_begin + i:
+                front[i * width + (j - own_begin if j < own_end else boundary_row[j])] += values[k]
         front[i * width + i] -= shift
     for side in range(2):
-        child = tree.children[n, side]
+        child = tree.children[node, side]
         if child < 0:
             continue
-        base, size = start[child], start[child + 1] - start[child]
+        base, size = boundary_start[child], boundary_start[child + 1] - boundary_start[child]
         for i in range(size):
             row = tree.parent_row[base + i] * width
             source = tree.update_start[child] + i * size
@@ -43,128 +44,121 @@ def assemble(n: int, tree: Structure, values: Floats, shift: float, updates: Flo
 
 @compiled()
 def eliminate(
-    nodes: Nodes,
-    largest: int,
-    tree: Structure,
-    values: Floats,
-    shift: float,
-    updates: Floats,
-    blocks: Floats,
+    nodes: Nodes, max_own: int, tree: Structure, values: Floats, shift: float, updates: Floats, blocks: Floats,
     scratch: Scratch,
-) -> tuple[int, int]:
-    """Eliminate the nodes of a range one after another; their negative pivots, and the node at which it stops.
+) -> tuple[int, int]:  # fmt: skip
+    """Eliminate a range of nodes; return the number of negative pivots, and the node where the elimination stopped.
 
-    Before the end of the range it stops at a node, whose front is assembled, that has more than ``largest`` own
-    unknowns, or whose pivots must be taken in another order.
+    It stops before the end of the range at a node with more than ``max_own`` own unknowns, or whose pivots must be
+    taken in another order. The front of that node is assembled.
     """
     n_negative = 0
-    first, start, front, pivot = tree.first, tree.start, scratch.front, scratch.pivot
-    for n in range(nodes[0], nodes[1]):
-        assemble(n, tree, values, shift, updates, scratch)
-        n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
+    own_start, boundary_start, front, inverse = tree.own_start, tree.boundary_start, scratch.front, scratch.inverse
+    for node in range(nodes[0], nodes[1]):
+        assemble(node, tree, values, shift, updates, scratch)
+        n_own, n_boundary = own_start[node + 1] - own_start[node], boundary_start[node + 1] - boundary_start[node]
         width = n_own + n_boundary
-        if n_own > largest:
-            return n_negative, n
-        padded = -(-n_own // AT_ONCE) * AT_ONCE
-        negative = invert_front(scratch, n_own, width, padded)
-        if negative < 0:
-            return n_negative, n
-        n_negative += negative
-        begin, at = tree.block_start[n], tree.update_start[n]
+        if n_own > max_own:
+            return n_negative, node
+        padded = -(-n_own // STEP) * STEP
+        n_new = invert_front(scratch, n_own, width, padded)
+        if n_new < 0:
+            return n_negative, node
+        n_negative += n_new
+        begin, update_begin = tree.block_start[node], tree.update_start[node]
         for i in range(n_own):
             for j in range(n_own):
-                blocks[begin + i * width + j] = pivot[j * padded + i]
+                blocks[begin + i * width + j] = inverse[j * padded + i]
         if n_boundary == 0:
             continue
         coupling, elimination = (front, n_own, width), (blocks, begin + n_own, width)
         shape = (n_own, n_boundary, n_own)
-        product(shape, -1.0, (pivot, ZERO, ONE, padded), coupling, False, elimination, elimination)
-        # of the complement the upper triangle, some rows at a time
+        product(shape, -1.0, (inverse, ZERO, ONE, padded), coupling, False, elimination, elimination)
+        # Compute the upper triangle of the Schur complement, a few rows at a time.
         for i in range(0, n_boundary, ROWS):
-            n_rows, left = min(ROWS, n_boundary - i), max(0, min(i, n_boundary - COLUMNS))
+            n_rows, skipped = min(ROWS, n_boundary - i), max(0, min(i, n_boundary - COLUMNS))
             product(
-                (n_rows, n_boundary - left, n_own), 1.0, (front, n_own + i, width, ONE),
-                (blocks, begin + n_own + left, width), True, (front, (n_own + i) * width + n_own + left, width),
-                (updates, at + i * n_boundary + left, n_boundary),
+                (n_rows, n_boundary - skipped, n_own), 1.0, (front, n_own + i, width, ONE),
+                (blocks, begin + n_own + skipped, width), True, (front, (n_own + i) * width + n_own + skipped, width),
+                (updates, update_begin + i * n_boundary + skipped, n_boundary),
             )  # fmt: skip
     return n_negative, nodes[1]
 
 
 @compiled()
-def add_row(into: Floats, at: int, source: Floats, of: Any, b: int) -> None:
-    """Add row ``of`` of one flat array to row ``at`` of another, rows of b numbers each."""
-    # An unsigned index is one that need not be counted from the end.
-    begin, origin = np.uint64(at * b), np.uint64(of * b)
+def add_row(target: Floats, target_row: int, source: Floats, source_row: Any, b: int) -> None:
+    """Add a row of one flat array to a row of another; both have rows of b numbers."""
+    # Unsigned indices spare Numba the check for negative ones.
+    first, source_first = np.uint64(target_row * b), np.uint64(source_row * b)
     for c in range(np.uint64(b)):
-        into[begin + c] += source[origin + c]
+        target[first + c] += source[source_first + c]
 
 
 @compiled()
 def forward(
-    nodes: Nodes, right: Floats, tree: Structure, blocks: Floats, x: Floats, carried: Floats, largest: int
+    nodes: Nodes, right: Floats, tree: Structure, blocks: Floats, x: Floats, carried: Floats, max_rows: int
 ) -> None:
-    """The way up through a range of nodes: x, (V, b) flat, becomes D x; Eᵀ x is carried to the boundary's owners.
+    """Pass upwards through a range of nodes: x, (V, b) flat, becomes D x, and Eᵀ x is carried to the boundary's owners.
 
     The right-hand sides are (b, V).
     """
     b = len(right)
-    order, first, children, start, parent_row = tree.order, tree.first, tree.children, tree.start, tree.parent_row
-    carried_start = tree.carried_start
-    rows = np.empty(largest * b)
-    for n in range(nodes[0], nodes[1]):
-        n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
-        width, own = n_own + n_boundary, x[first[n] * b :]
+    order, own_start, boundary_start = tree.order, tree.own_start, tree.boundary_start
+    children, parent_row, carried_start = tree.children, tree.parent_row, tree.carried_start
+    rows = np.empty(max_rows * b)
+    for node in range(nodes[0], nodes[1]):
+        n_own, n_boundary = own_start[node + 1] - own_start[node], boundary_start[node + 1] - boundary_start[node]
+        width, own_x = n_own + n_boundary, x[own_start[node] * b :]
         for i in range(n_own):
-            place = np.uint64(order[first[n] + i])
+            vertex = np.uint64(order[own_start[node] + i])
             for c in range(np.uint64(b)):
-                own[np.uint64(i * b) + c] = right[c, place]
-        # what the children carry: to own unknowns first, to those on the boundary behind the product
+                own_x[np.uint64(i * b) + c] = right[c, vertex]
+        # Contributions of the children: to own unknowns before the product, to boundary rows after it.
         for side in range(2):
-            child = children[n, side]
+            child = children[node, side]
             if child >= 0:
-                source, place = carried[carried_start[child] * b :], start[child]
-                k = np.int64(0)  # a plain 0 would make a function of its own of `add_row`
-                while k < start[child + 1] - place and parent_row[place + k] < n_own:
-                    add_row(own, parent_row[place + k], source, k, b)
+                source, base = carried[carried_start[child] * b :], boundary_start[child]
+                k = np.int64(0)  # a plain 0 has another type, for which Numba would compile `add_row` again
+                while k < boundary_start[child + 1] - base and parent_row[base + k] < n_own:
+                    add_row(own_x, parent_row[base + k], source, k, b)
                     k += 1
-        # D is symmetric: one product with the transposed block gives D x and Eᵀ x
-        block, found = (blocks, tree.block_start[n], width, ONE), (rows, ZERO, b)
-        product((width, b, n_own), 1.0, block, (x, first[n] * b, b), False, found, found)
+        # D is symmetric: one product with the transposed block gives both D x and Eᵀ x.
+        block, product_rows = (blocks, tree.block_start[node], width, ONE), (rows, ZERO, b)
+        product((width, b, n_own), 1.0, block, (x, own_start[node] * b, b), False, product_rows, product_rows)
         for i in range(n_own * b):
-            own[i] = rows[i]
+            own_x[i] = rows[i]
         for side in range(2):
-            child = children[n, side]
+            child = children[node, side]
             if child >= 0:
-                source, place = carried[carried_start[child] * b :], start[child]
-                k = start[child + 1] - place - 1
-                while k >= 0 and parent_row[place + k] >= n_own:
-                    add_row(rows, parent_row[place + k], source, k, b)
+                source, base = carried[carried_start[child] * b :], boundary_start[child]
+                k = boundary_start[child + 1] - base - 1
+                while k >= 0 and parent_row[base + k] >= n_own:
+                    add_row(rows, parent_row[base + k], source, k, b)
                     k -= 1
-        target = carried[carried_start[n] * b :]
+        target = carried[carried_start[node] * b :]
         for i in range(n_boundary * b):
             target[i] = rows[n_own * b + i]
 
 
 @compiled()
-def backward(nodes: Nodes, tree: Structure, blocks: Floats, x: Floats, largest: int, solution: Floats) -> None:
-    """The way down through a range of nodes: x, (V, b) flat, becomes D x + E x_boundary, the solution (b, V)."""
+def backward(nodes: Nodes, tree: Structure, blocks: Floats, x: Floats, max_rows: int, solution: Floats) -> None:
+    """Pass downwards through a range of nodes: x, (V, b) flat, becomes D x + E x_boundary, the solution (b, V)."""
     b = len(solution)
-    order, first, start, boundary = tree.order, tree.first, tree.start, tree.boundary
-    known, found = np.empty(largest * b), np.empty(largest * b)
-    for n in range(nodes[1] - 1, nodes[0] - 1, -1):
-        n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
-        own, width = x[first[n] * b :], n_own + n_boundary
+    order, own_start, boundary_start, boundary = tree.order, tree.own_start, tree.boundary_start, tree.boundary
+    boundary_x, rows = np.empty(max_rows * b), np.empty(max_rows * b)
+    for node in range(nodes[1] - 1, nodes[0] - 1, -1):
+        n_own, n_boundary = own_start[node + 1] - own_start[node], boundary_start[node + 1] - boundary_start[node]
+        own_x, width = x[own_start[node] * b :], n_own + n_boundary
         for k in range(n_boundary):
-            to, place = np.uint64(k * b), np.uint64(boundary[start[n] + k]) * np.uint64(b)
+            row, source = np.uint64(k * b), np.uint64(boundary[boundary_start[node] + k]) * np.uint64(b)
             for c in range(np.uint64(b)):
-                known[to + c] = x[place + c]
-        elimination = (blocks, tree.block_start[n] + n_own, ONE, width)
-        product(
-            (n_own, b, n_boundary), 1.0, elimination, (known, ZERO, b), True, (x, first[n] * b, b), (found, ZERO, b)
-        )
+                boundary_x[row + c] = x[source + c]
+        elimination = (blocks, tree.block_start[node] + n_own, ONE, width)
+        shape, product_rows = (n_own, b, n_boundary), (rows, ZERO, b)
+        product(shape, 1.0, elimination, (boundary_x, ZERO, b), True, (x, own_start[node] * b, b), product_rows)
         for i in range(n_own * b):
-            own[i] = found[i]
+            own_x[i] = rows[i]
         for i in range(n_own):
-            place = np.uint64(order[first[n] + i])
+            vertex = np.uint64(order[own_start[node] + i])
             for c in range(np.uint64(b)):
-                solution[c, place] = own[np.uint64(i * b) + c]
+                solution[c, vertex] = own_x[np.uint64(i * b) + c]

@@ -1,4 +1,4 @@
-"""A block Krylov basis that grows block by block, and the eigenpairs of the operator projected on it."""
+"""A block Krylov basis, and the eigenpairs of the operator projected on it."""
 
 import math
 from collections.abc import Callable
@@ -10,49 +10,51 @@ import torch
 from scipy.linalg import qr
 
 from igps._threads import ALONE, Team
-from igps.spectra._basis import Basis, pieces_of
+from igps.spectra._basis import Basis, split
 from igps.spectra._checks import ROUNDING
 from igps.spectra._multifrontal import Factors
 from igps.spectra._products import overlaps, subtract
 
-# Below this, relative to what it came from, a pivot makes a Cholesky factor inaccurate
-CHOLESKY_QR_PIVOT = 1e-6
-# Below this, dividing by a pivot makes too much of what rounding left of the basis to wait for the next sweep
-QUICK_PIVOT = 1e-4
-# Above this, relative to the largest pivot, a Cholesky factor makes rows orthonormal but for rounding
-ROUND_PIVOT = 0.1
-# So many blocks go by between two sweeps, or one where a sweep has found a larger loss of orthogonality; a smaller one
-# may be taken out in single precision
-SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 3e-8
-# Columns of the basis that are turned into eigenvectors at once
-COLUMNS_AT_ONCE = 8192
+# Smallest pivot, relative to the longest row, for which a Cholesky factor is accurate.
+MIN_CHOLESKY_PIVOT = 1e-6
+# Smallest pivot, relative to the longest row, with which a block can wait for the next reorthogonalisation. Division by
+# a smaller one magnifies rounding errors too much.
+MIN_QUICK_PIVOT = 1e-4
+# Smallest pivot, relative to the largest, for which one Cholesky factor makes rows orthonormal up to rounding.
+MIN_ONE_PASS_PIVOT = 0.1
+# Number of blocks between two reorthogonalisations; it becomes 1 after a loss of orthogonality above MAX_LOSS.
+INTERVAL, MAX_LOSS = 2, 1e-7
+# Largest loss of orthogonality that is removed in single precision.
+MAX_SINGLE_LOSS = 3e-8
+# Number of columns of the basis that are turned into eigenvectors at a time.
+PIECE_COLUMNS = 8192
 
 
 @dataclass(frozen=True)
 class RitzPairs:
-    """Eigenpairs of the projected problem, in the order of their eigenvalues."""
+    """Eigenpairs of the projected problem, ordered by eigenvalue."""
 
     eigenvalues: torch.Tensor  # (m,) of A
     residuals: torch.Tensor  # (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator
-    coefficients: torch.Tensor  # (m + b, m) of those Ritz vectors, not normalised, in the basis with its next block
+    coefficients: torch.Tensor  # (m + b, m) of these Ritz vectors, not normalised, in the basis with its next block
     below_shift: torch.Tensor  # (m,) whether θ < 0
 
     def leading(self, n_below: int, tolerance: float) -> torch.Tensor:
-        """Indices of the pairs up to the first that has not converged; none if fewer than n_below lie below σ."""
-        converged = (self.residuals <= tolerance * self.eigenvalues) & (self.eigenvalues > 0)
-        below = torch.nonzero(converged & self.below_shift).flatten()
+        """Return the indices of the pairs before the first unconverged one; none unless n_below of them lie below σ."""
+        is_converged = (self.residuals <= tolerance * self.eigenvalues) & (self.eigenvalues > 0)
+        below = torch.nonzero(is_converged & self.below_shift).flatten()
         if len(below) < n_below:
             return below[:0]
         above = torch.nonzero(~self.below_shift).flatten()
-        n_above = int(torch.cumprod(converged[above].int(), 0).sum())
+        n_above = int(torch.cumprod(is_converged[above].int(), 0).sum())
         return torch.cat([below, above[:n_above]])
 
 
 class Krylov(Basis):
     """Orthonormal basis of a block Krylov space of (A − σI)⁻¹, grown block by block, and the operator projected on it.
 
-    Vectors are stored as rows, since products of the basis with a block are fastest so. The first row is the zero mode:
-    the others stay orthogonal to it, and the projected problem leaves it out.
+    Vectors are stored as rows, because products of the basis with a block are fastest in this layout. The first row is
+    the zero mode: the others stay orthogonal to it, and it is left out of the projected problem.
     """
 
     def __init__(
@@ -68,12 +70,12 @@ class Krylov(Basis):
         self._factors = factors
         self._generator = generator
         self._block_size = block_size
-        # rows previous:current and current:stop of the basis are the last two blocks, the last not yet multiplied
+        # Rows _previous:_current and _current:_stop of the basis are the last two blocks; the last awaits `expand`.
         self._previous = self._current = 1
-        self._every = SWEEP_EVERY
+        self._interval = INTERVAL
         self._coupling = torch.empty(0, 0, dtype=torch.float64, device="cpu")
-        # a random vector is mostly high frequencies: one application leaves what matters
-        self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], swept=True)
+        # Random vectors consist mostly of high frequencies, which one application of the operator removes.
+        self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], is_orthogonal=True)
 
     @property
     def size(self) -> int:
@@ -81,61 +83,61 @@ class Krylov(Basis):
         return self._current - 1
 
     def expand(self) -> None:
-        """Multiply the last block, and append what is new in the product as the next block."""
+        """Multiply the last block, and append the new directions of the product as the next block."""
         last = slice(self._current, self._stop)
         near = self._basis[self._previous : self._stop]
         product = self._apply(self._basis[last])
-        (projection,) = self._sums(lambda piece: (overlaps(product, near, piece),))
+        (projection,) = self._sum_pieces(lambda piece: (overlaps(product, near, piece),))
         diagonal = projection[:, self._current - self._previous :]
 
-        def leave_new(piece: slice) -> tuple[torch.Tensor]:
+        def project_out(piece: slice) -> tuple[torch.Tensor]:
             product[:, piece].addmm_(projection, near[:, piece], alpha=-1)
             return (overlaps(product, product, piece),)
 
-        (remainder,) = self._sums(leave_new)
-        # the longest row of the product, by Pythagoras: what the recurrence took from it, and what is left
+        (remainder,) = self._sum_pieces(project_out)
+        # Length of the longest row of the product, from its projection and its remainder, by Pythagoras' theorem.
         scale = math.sqrt(float((remainder.diagonal() + projection.square().sum(1)).max()))
         quick = self._factor_quickly(product, remainder, scale)
         if quick is None:
-            self._sweep()
+            self._reorthogonalise()
         block, coupling = quick or self._orthonormal(product, near=self._previous, scale=scale)
         self._projected[last, last] = (diagonal + diagonal.T) / 2
         self._previous, self._current = self._current, self._stop
-        self._append(block, swept=quick is None)
+        self._append(block, is_orthogonal=quick is None)
         new = slice(self._current, self._stop)
         self._projected[new, last] = coupling
         self._projected[last, new] = coupling.T
         self._coupling = coupling
-        if self._stop - self._swept >= self._every * len(block) and self._sweep() > SWEEP_LOSS:
-            self._every = 1
+        if self._stop - self._n_orthogonal >= self._interval * len(block) and self._reorthogonalise() > MAX_LOSS:
+            self._interval = 1
 
     def widen(self) -> None:
-        """Enlarge the last block, and those that follow, by random vectors: they see what the start block did not."""
-        self._sweep()
+        """Enlarge the last block, and those after it, by random vectors, for directions that the start block lacked."""
+        self._reorthogonalise()
         block, _ = self._orthonormal(self._random(self._block_size), near=self._previous)
-        self._append(block, swept=True)
+        self._append(block, is_orthogonal=True)
         self._coupling = torch.cat([self._coupling, self._coupling.new_zeros(len(block), self._coupling.shape[1])])
 
     def ritz_pairs(self, shift: float) -> RitzPairs:
-        self._sweep()
-        inside = slice(1, self._current)
-        theta, coefficients = torch.linalg.eigh(self._projected[inside, inside])
-        outside = self._coupling @ coefficients[-self._coupling.shape[1] :]
+        self._reorthogonalise()
+        rows = slice(1, self._current)
+        theta, coefficients = torch.linalg.eigh(self._projected[rows, rows])
+        next_coefficients = self._coupling @ coefficients[-self._coupling.shape[1] :]
         eigenvalues = shift + 1 / theta
         order = torch.argsort(eigenvalues)
         return RitzPairs(
             eigenvalues=eigenvalues[order],
-            residuals=(torch.linalg.norm(outside, dim=0) / theta**2)[order],
-            coefficients=torch.cat([coefficients, outside / theta])[:, order],
+            residuals=(torch.linalg.norm(next_coefficients, dim=0) / theta**2)[order],
+            coefficients=torch.cat([coefficients, next_coefficients / theta])[:, order],
             below_shift=(theta < 0)[order],
         )
 
     def eigenvectors(
         self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray
     ) -> tuple[np.ndarray, list[Callable[[], None]]]:
-        """(V, K) for the eigenvectors of the Ritz pairs with these indices, and the steps that fill it, in any order.
+        """Return an array (V, K) for the eigenvectors of the Ritz pairs with these indices, and the steps that fill it.
 
-        Entry i of a vector becomes row ``order[i]``.
+        The steps may run in any order. Entry i of a vector becomes row ``order[i]``.
         """
         coefficients = _coefficients(ritz, index).numpy()
         vectors = torch.empty(self._basis.shape[1], len(index), dtype=torch.float64, device="cpu").numpy()
@@ -146,14 +148,14 @@ class Krylov(Basis):
         return vectors, [partial(combine, piece) for piece in self._small_pieces()]
 
     def eigenvectors_in_place(self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray) -> np.ndarray:
-        """The same eigenvectors (V, K), never in memory beside the basis, which is lost; see `loses_basis`."""
+        """Return the same eigenvectors (V, K), written over the basis, which is lost; see `overwrites_basis`."""
         coefficients = _coefficients(ritz, index)
         n_vertices, n_vectors = self._basis.shape[1], coefficients.shape[1]
         for piece in self._small_pieces():
             self._basis[:n_vectors, piece] = coefficients.T @ self._basis[1 : self._stop, piece]
         rows = self._memory
         self._basis, self._memory = self._basis.new_empty(0, n_vertices), np.empty((0, n_vertices))
-        # gives back what lies behind; no other array looks into it any more
+        # Release the rest of the memory; no other array refers to it any more.
         rows.resize((n_vectors, n_vertices), refcheck=False)
         vectors = np.empty((n_vertices, n_vectors))
         for piece in self._small_pieces():
@@ -162,51 +164,51 @@ class Krylov(Basis):
 
     def _small_pieces(self) -> list[slice]:
         n_vertices = self._basis.shape[1]
-        return pieces_of(n_vertices, -(-n_vertices // COLUMNS_AT_ONCE))
+        return split(n_vertices, -(-n_vertices // PIECE_COLUMNS))
 
     def _random(self, n_rows: int) -> torch.Tensor:
         return torch.from_numpy(self._generator.standard_normal((n_rows, self._basis.shape[1])))
 
     def _apply(self, block: torch.Tensor) -> torch.Tensor:
-        """The products (b, V) of the operator with b rows."""
+        """Return the products (b, V) of the operator with b rows."""
         return self._factors.solve(block.T, self._team).T
 
-    def _sweep(self) -> float:
-        """Make the rows since the last sweep orthogonal to all before them, and orthonormal; how far they were from it.
+    def _reorthogonalise(self) -> float:
+        """Make the new rows orthonormal and orthogonal to all before them; return their loss of orthogonality.
 
-        The recurrence leaves of older rows what rounding left in the last two blocks, times the ratio of the largest θ
-        to the spread of the others: with each block some hundred times as much. Two blocks go by before it is swept
-        out, in both at once, as products of the basis with twice as many columns take less than twice the time. The
-        projection is then wrong by the square of what was lost (Simon 1984), which is below rounding. Single precision
-        takes out exactly enough of what is that small; then the rows are mostly still orthonormal.
+        The recurrence leaves components along older rows: the rounding errors in the last two blocks, times the ratio
+        of the largest θ to the spread of the others. They grow by a factor of some hundred with each block. They are
+        removed after two blocks, from both at once, because products of the basis with twice as many columns take less
+        than twice the time. The error of the projection is then the square of the loss (Simon 1984), which is below
+        rounding. A loss up to MAX_SINGLE_LOSS is removed in single precision, and the rows are mostly still orthonormal
+        afterwards.
         """
-        old, new = self._basis[: self._swept], self._basis[self._swept : self._stop]
+        old, new = self._basis[: self._n_orthogonal], self._basis[self._n_orthogonal : self._stop]
         if not len(new):
             return 0.0
-        (lost,) = self._sums(lambda piece: (overlaps(new, old, piece),))
-        largest = float(lost.abs().max())
-        if self._single is not None and largest <= SINGLE_LOSS:
-            old, lost = self._single[: self._swept], lost.float()
+        (overlap,) = self._sum_pieces(lambda piece: (overlaps(new, old, piece),))
+        loss = float(overlap.abs().max())
+        if self._single is not None and loss <= MAX_SINGLE_LOSS:
+            old, overlap = self._single[: self._n_orthogonal], overlap.float()
 
-        def take_out(piece: slice) -> tuple[torch.Tensor]:
-            subtract(new, lost, old, piece)
+        def remove(piece: slice) -> tuple[torch.Tensor]:
+            subtract(new, overlap, old, piece)
             return (overlaps(new, new, piece),)
 
-        (squares,) = self._sums(take_out)
+        (squares,) = self._sum_pieces(remove)
         if float((squares - torch.eye(len(new), device="cpu")).abs().max()) > ROUNDING:
             self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
-        self._mark_swept()
-        return largest
+        self._mark_orthogonal()
+        return loss
 
     def _orthonormal(
         self, block: torch.Tensor, near: int, scale: float | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Rows Q orthonormal and orthogonal to the basis, and R with block = Qᵀ R + what the basis spans, by columns.
+        """Return rows Q, orthonormal and orthogonal to the basis, and R; blockᵀ is Qᵀ R and a combination of the basis.
 
-        ``scale`` is how long the longest row was before something of the basis was taken from it.
-
-        The recurrence says that only the basis from row ``near`` on contributes, the full pass after it sweeps out
-        what rounding has left. Together that costs one product with the basis and one back.
+        According to the recurrence, only rows of the basis from ``near`` on contribute; the full pass after it removes
+        rounding errors. Both together cost one product with the basis and one back. ``scale`` is the length of the
+        longest row before components along the basis were removed.
         """
         scale = float(torch.linalg.norm(block, dim=1).max()) if scale is None else scale
         coupling = torch.eye(len(block), dtype=torch.float64, device="cpu")
@@ -217,45 +219,45 @@ class Krylov(Basis):
         return block, coupling
 
     def _factor_rows(self, block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Orthonormal rows Q and R with blockᵀ = Qᵀ R; for a direction lost in rounding a random row and no R."""
+        """Return orthonormal rows Q and R with blockᵀ = Qᵀ R; directions lost in rounding get random rows and no R."""
         factor, failed = torch.linalg.cholesky_ex(block @ block.T)
-        if not failed and torch.diagonal(factor).min() > CHOLESKY_QR_PIVOT * scale:
+        if not failed and torch.diagonal(factor).min() > MIN_CHOLESKY_PIVOT * scale:
             return _inverse(factor) @ block, factor.T
         q, r, order = qr(block.T.numpy(), mode="economic", pivoting=True)
-        lost = np.abs(np.diag(r)) <= ROUNDING * scale
-        r[lost] = 0
+        is_lost = np.abs(np.diag(r)) <= ROUNDING * scale
+        r[is_lost] = 0
         rows = torch.from_numpy(np.ascontiguousarray(q.T))
-        if lost.any():
-            rows[torch.from_numpy(lost)] = self._random(int(lost.sum())) / math.sqrt(block.shape[1])
+        if is_lost.any():
+            rows[torch.from_numpy(is_lost)] = self._random(int(is_lost.sum())) / math.sqrt(block.shape[1])
         return rows, torch.from_numpy(r[:, np.argsort(order)])
 
     def _factor_quickly(
         self, block: torch.Tensor, squares: torch.Tensor, scale: float
     ) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """As `_factor_rows`, in the next rows of the basis, given the rows' products; again where rounding asks for it.
+        """Factor rows as `_factor_rows`, given their products, into the next rows of the basis; None for a small pivot.
 
-        None if a pivot is small.
+        The factorization is repeated if rounding requires it.
         """
         first, failed = torch.linalg.cholesky_ex(squares)
         smallest, largest = torch.aminmax(torch.diagonal(first))
-        if failed or not smallest > QUICK_PIVOT * scale:
+        if failed or not smallest > MIN_QUICK_PIVOT * scale:
             return None
         rows = self._next_rows(len(block))
         self._multiply(_inverse(first), block, rows)
-        if smallest > ROUND_PIVOT * largest:
+        if smallest > MIN_ONE_PASS_PIVOT * largest:
             return rows, first.T
-        (squares,) = self._sums(lambda piece: (overlaps(rows, rows, piece),))
+        (squares,) = self._sum_pieces(lambda piece: (overlaps(rows, rows, piece),))
         second = torch.linalg.cholesky(squares)
         self._multiply(_inverse(second), rows, rows)
         return rows, second.T @ first.T
 
 
 def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
-    """(m + b, K) of the Ritz pairs with these indices, of length 1."""
+    """Return the normalised coefficients (m + b, K) of the Ritz pairs with these indices."""
     coefficients = ritz.coefficients[:, index]
     return coefficients / torch.linalg.norm(coefficients, dim=0)
 
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
-    """Of a lower triangular matrix."""
+    """Return the inverse of a lower triangular matrix."""
     return torch.linalg.solve_triangular(factor, torch.eye(len(factor), dtype=factor.dtype, device="cpu"), upper=False)

@@ -1,30 +1,31 @@
 """Sparse symmetric factorization as a sequence of dense eliminations, compiled.
 
-Solvers such as SuperLU walk a sparse factor column by column and reach a few per cent of the machine's speed. Here
-the matrix is cut into a binary tree of small dense blocks:
+Solvers such as SuperLU process a sparse factor column by column, at a few per cent of the machine's peak speed. Here
+the matrix is split into a binary tree of small dense blocks:
 
-1. *Nested dissection* (George 1973; `_ordering`). A vertex separator splits the graph of the matrix in two halves, each
-   half is split again, down to leaves of some tens of vertices. On a surface the first separator has O(√V) vertices.
-2. *Multifrontal elimination* (Duff & Reid 1983), children first. A node owns the vertices of its separator, a leaf all
-   that is left to it; its *boundary* are the vertices of its ancestors that its subtree touches. Of its dense *front*
+1. *Nested dissection* (George 1973; `_ordering`). A vertex separator splits the graph of the matrix into two halves,
+   which are split again, down to leaves of some tens of vertices. On a surface the first separator has O(√V) vertices.
+2. *Multifrontal elimination* (Duff & Reid 1983), children first. A node owns the vertices of its separator, and a leaf
+   owns its remaining vertices. The *boundary* of a node consists of the vertices of its ancestors that its subtree
+   touches. Each node has a dense *front*
 
        F = [F₁₁ F₁₂]   own rows
            [F₂₁ F₂₂]   boundary rows
 
-   the own unknowns are eliminated, and the Schur complement F₂₂ − F₂₁ F₁₁⁻¹ F₁₂ is added into the parent's front. As
-   the nodes come depth first, that is soon, while the processor's cache still holds it, and only the complements along
-   one branch are kept.
-3. *Solve*. Each node keeps D = F₁₁⁻¹ and E = −F₁₁⁻¹ F₁₂. On the way up, Eᵀ b_own is added to the right-hand sides of
+   from which the own unknowns are eliminated. The Schur complement F₂₂ − F₂₁ F₁₁⁻¹ F₁₂ is added to the parent's front.
+   Since nodes are processed depth first, this happens while the complement is still in the processor's cache, and only
+   the complements along one branch are stored.
+3. *Solve*. Each node stores D = F₁₁⁻¹ and E = −F₁₁⁻¹ F₁₂. On the way up, Eᵀ b_own is added to the right-hand sides of
    the boundary; on the way down, x_own = D b_own + E x_boundary.
 
-The negative eigenvalues of all pivot blocks F₁₁ together number as many as those of the matrix (Sylvester's law of
-inertia). For A − σI that is the number of eigenvalues of A below σ, and proves that an eigensolver missed none.
+The pivot blocks F₁₁ together have as many negative eigenvalues as the matrix (Sylvester's law of inertia). For A − σI
+this is the number of eigenvalues of A below σ, which proves that an eigensolver has missed none.
 
-No pivot moves from one block to another. That is stable for a positive definite matrix. For an indefinite A − σI it is
-so unless σ lies close to an eigenvalue of a leading block, which is rare but does happen: check a residual.
+Pivots stay in their blocks. This is stable for a positive definite matrix. It is also stable for an indefinite A − σI,
+unless σ is close to an eigenvalue of a leading block. That is rare but possible: check a residual.
 
-`_fronts` has the compiled loops. Pivot blocks of more than LARGE unknowns are PyTorch's, and so are those that are
-indefinite and need pivots in another order.
+`_fronts` contains the compiled loops. PyTorch handles pivot blocks of more than MAX_COMPILED unknowns, and
+indefinite ones that need another order of pivots.
 """
 
 from __future__ import annotations
@@ -43,51 +44,51 @@ from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
 from igps.spectra._pivots import Scratch
 from igps.spectra._tree import Nodes, Structure, tree_structure
 
-# Own unknowns of a node above which its dense algebra is PyTorch's, for which a team can work
-LARGE = 127
-# Rows or columns of such a node that are multiplied at once
-AT_ONCE = 256
+# Largest number of own unknowns of a node that compiled loops handle. PyTorch handles larger nodes, with a team.
+MAX_COMPILED = 127
+# Number of rows or columns of a larger node that are multiplied at a time.
+PIECE_SIZE = 256
 
 
 class SingularMatrixError(ValueError):
-    """A pivot block of the shifted matrix is singular: the shift hits an eigenvalue of it."""
+    """A pivot block of the shifted matrix is singular: the shift is an eigenvalue of the block."""
 
 
 @dataclass(frozen=True)
 class Tree:
-    """Elimination order and fronts for one sparsity pattern; serves any number of values and shifts."""
+    """Elimination order and fronts for one sparsity pattern, usable with any values and shifts."""
 
     structure: Structure
-    subtrees: list[Nodes]  # may be eliminated, and solved, side by side
-    above: list[Nodes]  # the other nodes, each behind its children
+    subtrees: list[Nodes]  # can be eliminated and solved in parallel
+    above: list[Nodes]  # the other nodes, each after its children
 
     def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
-        """The factors of ``matrix − shift · I``, of which both triangles are read; a team changes none of their bits.
+        """Factorize ``matrix − shift · I``, of which both triangles are read; every team gives the same bits.
 
-        A ValueError if the matrix stores other entries than the one that was analysed, a SingularMatrixError if a pivot
-        block is singular, as at an eigenvalue.
+        A ValueError is raised if the matrix stores other entries than the analysed one, a SingularMatrixError if a
+        pivot block is singular, as for a shift at an eigenvalue.
         """
         blocks = np.empty(self.structure.block_start[-1])
         return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
 
     def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> int:
-        """The number of negative eigenvalues of ``matrix − shift · I``; arguments and errors as of `factorize`."""
+        """Return the number of negative eigenvalues of ``matrix − shift · I``, with the errors of `factorize`."""
         return self._eliminate(matrix, shift, team, None)
 
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
-        """The structure for unknowns in the order of elimination, such a matrix, and which each was before (V,)."""
+        """Return the tree and the matrix with unknowns in elimination order, and the former index (V,) of each."""
         order = self.structure.order
         matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)[order][:, order]
         matrix.sort_indices()
         indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
-        same = np.arange(len(order))
-        structure = self.structure._replace(indptr=indptr, indices=indices, order=same, number=same)
+        identity = np.arange(len(order))
+        structure = self.structure._replace(indptr=indptr, indices=indices, order=identity, position=identity)
         return replace(self, structure=structure), matrix, order
 
     def _eliminate(self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None) -> int:
-        """Write the blocks, if they are to be kept; the number of negative eigenvalues."""
+        """Eliminate all nodes, with their blocks written if given; return the number of negative eigenvalues."""
         matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)
-        n_updates = (self.structure.update_start + np.diff(self.structure.start) ** 2).max()
+        n_updates = (self.structure.update_start + np.diff(self.structure.boundary_start) ** 2).max()
         values, updates = matrix.data.astype(np.float64, copy=False), np.empty(n_updates)
 
         def eliminate(nodes: Nodes) -> int:
@@ -98,28 +99,31 @@ class Tree:
     def _eliminate_range(
         self, nodes: Nodes, values: Floats, shift: float, updates: Floats, blocks: Floats | None, team: Team
     ) -> int:
-        """Write the blocks of a range of nodes, and what they leave to nodes behind it; their negative pivots."""
+        """Eliminate a range of nodes, as `_eliminate`; complements for later nodes are written to updates."""
         (begin, end), structure = nodes, self.structure
-        n_own, n_boundary = np.diff(structure.first[begin : end + 1]), np.diff(structure.start[begin : end + 1])
-        front = np.empty(int((n_own + n_boundary).max()) ** 2)
-        if blocks is None:  # each takes the place of the last
-            blocks = np.empty(int((n_own * (n_own + n_boundary)).max()))
+        own_sizes = np.diff(structure.own_start[begin : end + 1])
+        boundary_sizes = np.diff(structure.boundary_start[begin : end + 1])
+        front = np.empty(int((own_sizes + boundary_sizes).max()) ** 2)
+        if blocks is None:  # each block overwrites the previous one
+            blocks = np.empty(int((own_sizes * (own_sizes + boundary_sizes)).max()))
             structure = structure._replace(block_start=np.zeros_like(structure.block_start))
-        padded = min(LARGE, int(n_own.max())) + loops.AT_ONCE
+        padded = min(MAX_COMPILED, int(own_sizes.max())) + loops.STEP
         squares = [np.empty(padded**2) for _ in range(3)]
-        strips = [np.empty(loops.AT_ONCE * (padded + loops.AT_ONCE)) for _ in range(2)]
+        strips = [np.empty(loops.STEP * (padded + loops.STEP)) for _ in range(2)]
         scratch = Scratch(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
         n_negative, node = 0, begin
         while True:
-            n_more, node = loops.eliminate((node, end), LARGE, structure, values, shift, updates, blocks, scratch)
-            n_negative += n_more
+            n_new, node = loops.eliminate((node, end), MAX_COMPILED, structure, values, shift, updates, blocks, scratch)
+            n_negative += n_new
             if node == end:
                 return n_negative
-            size, n_bound = int(n_own[node - begin]), int(n_boundary[node - begin])
-            n_negative += _eliminate_alone(
-                torch.from_numpy(front[: (size + n_bound) ** 2].reshape(size + n_bound, size + n_bound)),
-                torch.from_numpy(blocks[structure.block_start[node] :][: size * (size + n_bound)].reshape(size, -1)),
-                torch.from_numpy(updates[structure.update_start[node] :][: n_bound**2].reshape(n_bound, n_bound)),
+            n_own, n_boundary = int(own_sizes[node - begin]), int(boundary_sizes[node - begin])
+            width = n_own + n_boundary
+            block, update = blocks[structure.block_start[node] :], updates[structure.update_start[node] :]
+            n_negative += _eliminate_node(
+                torch.from_numpy(front[: width**2].reshape(width, width)),
+                torch.from_numpy(block[: n_own * width].reshape(n_own, width)),
+                torch.from_numpy(update[: n_boundary**2].reshape(n_boundary, n_boundary)),
                 team,
             )
             node += 1
@@ -127,27 +131,27 @@ class Tree:
 
 @dataclass(frozen=True)
 class Factors:
-    """The factors of one matrix: solves with it, and its number of negative eigenvalues."""
+    """Factors of one matrix, for solves, and its number of negative eigenvalues."""
 
-    tree: Tree  # the structure they were made with
-    blocks: np.ndarray  # each node's (S, S + B) block [D E], end to end
+    tree: Tree
+    blocks: np.ndarray  # (S, S + B) block [D E] of each node, end to end
     n_negative: int
 
     def solve(self, right_hand_sides: torch.Tensor, team: Team = ALONE) -> torch.Tensor:
-        """The solutions (V, b) for right-hand sides (V, b), float64, both best stored by columns."""
+        """Return the solutions (V, b) for right-hand sides (V, b), float64, both preferably stored by columns."""
         tree, structure = self.tree, self.tree.structure
         n_vertices, b = right_hand_sides.shape
         right = right_hand_sides.T.contiguous().numpy()
         solution = torch.empty(b, n_vertices, dtype=torch.float64, device="cpu")
-        n_boundary = np.diff(structure.start)
+        n_boundary = np.diff(structure.boundary_start)
         x, carried = np.empty(n_vertices * b), np.empty((structure.carried_start + n_boundary).max() * b)
-        largest = int((np.diff(structure.first) + n_boundary).max())
+        max_rows = int((np.diff(structure.own_start) + n_boundary).max())
 
         def forward(nodes: Nodes) -> None:
-            loops.forward(nodes, right, structure, self.blocks, x, carried, largest)
+            loops.forward(nodes, right, structure, self.blocks, x, carried, max_rows)
 
         def backward(nodes: Nodes) -> None:
-            loops.backward(nodes, structure, self.blocks, x, largest, solution.numpy())
+            loops.backward(nodes, structure, self.blocks, x, max_rows, solution.numpy())
 
         team.each(forward, tree.subtrees)
         for nodes in tree.above:
@@ -159,16 +163,16 @@ class Factors:
 
 
 def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = LEAF_SIZE) -> Tree:
-    """Elimination order and fronts for all matrices with one symmetric sparsity pattern.
+    """Compute elimination order and fronts for all matrices with one symmetric sparsity pattern.
 
     Args:
-        matrix: (V, V) with a symmetric pattern that holds the whole diagonal; only the pattern is read.
-        coordinates: (V, d) places along which the graph is cut, any unit; short edges make good cuts. Without
-            them hop distances to a few far-apart vertices serve, with somewhat larger blocks.
-        leaf_size: a part of about so many vertices is not split any more.
+        matrix: (V, V) with a symmetric pattern that contains the whole diagonal; only the pattern is read.
+        coordinates: (V, d) positions for cutting the graph, any unit; short edges make good cuts. Without them hop
+            distances from a few vertices far apart are used, which lead to somewhat larger blocks.
+        leaf_size: approximate number of vertices of a part that is not split further.
 
     Raises:
-        ValueError: the pattern is not symmetric or lacks diagonal entries, or coordinates do not fit it.
+        ValueError: the pattern is not symmetric or lacks diagonal entries, or coordinates have the wrong shape.
     """
     matrix, coordinates = checked_graph(matrix, coordinates)
     node, n_levels = nested_dissection(matrix, coordinates, leaf_size)
@@ -176,21 +180,21 @@ def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, 
     return Tree(*tree_structure(node, n_levels, indptr, indices))
 
 
-def _eliminate_alone(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:
-    """Write D, E and the complement of a front; of both only the upper triangle counts. Its negative pivots."""
-    n_own, n_bound = len(block), len(update)
+def _eliminate_node(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:
+    """Write D, E and the complement, from a front: both upper triangles. Return the number of negative pivots."""
+    n_own, n_boundary = len(block), len(update)
     pivot, coupling = front[:n_own, :n_own].triu(), front[:n_own, n_own:]
     inverse, n_negative = _invert(pivot + pivot.triu(1).T)
     block[:, :n_own] = inverse
-    elimination, below = block[:, n_own:], front[n_own:, n_own:]
-    pieces = [slice(begin, begin + AT_ONCE) for begin in range(0, n_bound, AT_ONCE)]
+    elimination, trailing = block[:, n_own:], front[n_own:, n_own:]
+    pieces = [slice(begin, begin + PIECE_SIZE) for begin in range(0, n_boundary, PIECE_SIZE)]
 
     def eliminate(piece: slice) -> None:
         elimination[:, piece] = -(inverse @ coupling[:, piece])
 
     def complement(piece: slice) -> None:
-        behind = slice(piece.start, None)
-        torch.addmm(below[piece, behind], coupling[:, piece].T, elimination[:, behind], out=update[piece, behind])
+        cols = slice(piece.start, None)
+        torch.addmm(trailing[piece, cols], coupling[:, piece].T, elimination[:, cols], out=update[piece, cols])
 
     team.each(eliminate, pieces)
     team.each(complement, pieces)
@@ -198,15 +202,15 @@ def _eliminate_alone(front: torch.Tensor, block: torch.Tensor, update: torch.Ten
 
 
 def _invert(pivot: torch.Tensor) -> tuple[torch.Tensor, int]:
-    """The inverse of a symmetric block (S, S), and its number of negative eigenvalues."""
+    """Return the inverse of a symmetric block (S, S), and its number of negative eigenvalues."""
     factor, failed = torch.linalg.cholesky_ex(pivot)
     if not failed:
         return torch.cholesky_inverse(factor), 0
     factor, order, failed = torch.linalg.ldl_factor_ex(pivot)
     if failed:
-        raise SingularMatrixError("a pivot block of the shifted matrix is singular: use a slightly different shift")
+        raise SingularMatrixError("shift: expected regular pivot blocks, got a singular one. Change it slightly.")
     inverse = torch.linalg.ldl_solve(factor, order, torch.eye(len(pivot), dtype=pivot.dtype, device="cpu"))
-    # Bunch & Kaufman's pivots: a 1×1 one counts by its sign, a 2×2 one (marked by a negative index) has one eigenvalue
-    # of either sign
+    # Bunch–Kaufman pivots: a 1×1 pivot counts by its sign; a 2×2 pivot, marked by negative indices, has one eigenvalue
+    # of each sign.
     n_negative = ((order > 0) & (factor.diagonal() < 0)).sum() + (order < 0).sum() // 2
     return (inverse + inverse.T) / 2, int(n_negative)

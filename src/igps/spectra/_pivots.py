@@ -1,4 +1,4 @@
-"""The compiled loops that invert the pivot blocks of `_fronts`."""
+"""Compiled loops that invert the pivot blocks of `_fronts`."""
 
 from typing import NamedTuple, cast
 
@@ -9,107 +9,107 @@ from igps.spectra._products import COLUMNS, ONE, ZERO, product
 
 
 class Scratch(NamedTuple):
-    """Flat arrays to compute in."""
+    """Flat work arrays."""
 
-    place: np.ndarray  # the rows of a boundary in a front
+    boundary_row: np.ndarray  # row in the front of each position on the boundary
     front: np.ndarray
-    pivot: np.ndarray  # the inverse of a front's pivot block
-    copy: np.ndarray  # of as many entries as that, as the next
-    squares: np.ndarray
+    inverse: np.ndarray  # of the front's pivot block
+    pivot_copy: np.ndarray  # as large as `inverse`
+    residual: np.ndarray  # as large as `inverse`
     rows: np.ndarray  # see `invert`
-    columns: np.ndarray
+    columns: np.ndarray  # see `invert`
 
 
-# Unknowns that are eliminated at once inside of a pivot block
-AT_ONCE = cast(int, np.int64(COLUMNS))
-# What may be missing of an indefinite block times its inverse to the identity, in norm
-MOST_MISSING = 3e-13
+# Number of unknowns of a pivot block that are eliminated together.
+STEP = cast(int, np.int64(COLUMNS))
+# Largest Frobenius norm of I − A X for an indefinite block A and its computed inverse X.
+MAX_RESIDUAL = 3e-13
 
 
 @compiled(inline="always")
 def invert_pivot(pivot: np.ndarray, size: int) -> int:
-    """Replace a block, rows of AT_ONCE numbers, by its inverse; its negative pivots, -1 if one is 0 or not finite.
+    """Replace a block, with rows of STEP numbers, by its inverse; return its number of negative pivots.
 
-    What is behind ``size`` in a row must be finite.
+    Return -1 if a pivot is 0 or not finite. The entries after ``size`` in a row must be finite.
     """
     n_negative = 0
     for q in range(np.uint64(size)):
-        row = q * np.uint64(AT_ONCE)
+        row = q * np.uint64(STEP)
         value = pivot[row + q]
         if not 0.0 < abs(value) < np.inf:
             return -1
         n_negative += value < 0
         pivot[row + q] = 1.0
-        for j in range(np.uint64(AT_ONCE)):
+        for j in range(np.uint64(STEP)):
             pivot[row + j] *= 1.0 / value
         for i in range(np.uint64(size)):
             if i != q:
-                other = i * np.uint64(AT_ONCE)
+                other = i * np.uint64(STEP)
                 factor = pivot[other + q]
                 pivot[other + q] = 0.0
-                for j in range(np.uint64(AT_ONCE)):
+                for j in range(np.uint64(STEP)):
                     pivot[other + j] -= factor * pivot[row + j]
     return n_negative
 
 
 @compiled(inline="always")
 def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np.ndarray) -> int:
-    """Replace a symmetric matrix (n, width) by its inverse; its negative pivots, -1 if one is 0 or not finite.
+    """Replace a symmetric matrix (n, width) by its inverse; return its number of negative pivots, or -1 on failure.
 
-    Gauss and Jordan's elimination of AT_ONCE unknowns at a time, of which the width is a multiple. As the pivots are
-    taken as they come, the inverse is accurate where the matrix is definite; elsewhere see `invert_front`. What is
-    behind n in a row must be 0; rows (AT_ONCE · width,) and columns ((n + AT_ONCE) · AT_ONCE,) are to compute in.
+    This is Gauss–Jordan elimination of STEP unknowns at a time; the width is a multiple of STEP. Pivots are taken in
+    their order, so the inverse is accurate for a definite matrix; for others see `invert_front`. The entries after n in
+    a row must be 0. The work arrays are rows (STEP · width,) and columns ((n + STEP) · STEP,).
     """
     n_negative = 0
-    pivot = columns[n * AT_ONCE :]
-    for k in range(0, n, AT_ONCE):
-        size = min(AT_ONCE, n - k)
+    pivot = columns[n * STEP :]
+    for k in range(0, n, STEP):
+        size = min(STEP, n - k)
         for i in range(size):
-            for j in range(AT_ONCE):
-                pivot[i * AT_ONCE + j] = matrix[(k + i) * width + k + j]
+            for j in range(STEP):
+                pivot[i * STEP + j] = matrix[(k + i) * width + k + j]
         negative = invert_pivot(pivot, size)
         if negative < 0:
             return -1
         n_negative += negative
-        # the rows that are eliminated, times the inverse of their pivot
-        eliminated, times_inverse = (matrix, k * width, width), (rows, ZERO, width)
-        product((size, width, size), 1.0, (pivot, ZERO, AT_ONCE, ONE), eliminated, False, times_inverse, times_inverse)
+        # Multiply the eliminated rows by the inverse of their pivot block.
+        eliminated, scaled = (matrix, k * width, width), (rows, ZERO, width)
+        product((size, width, size), 1.0, (pivot, ZERO, STEP, ONE), eliminated, False, scaled, scaled)
         for i in range(size):
             for j in range(size):
-                rows[i * width + k + j] = pivot[i * AT_ONCE + j]
+                rows[i * width + k + j] = pivot[i * STEP + j]
         for i in range(n):
             for j in range(size):
-                columns[i * AT_ONCE + j] = matrix[i * width + k + j]
+                columns[i * STEP + j] = matrix[i * width + k + j]
                 matrix[i * width + k + j] = 0.0
         for begin, end in ((0, k), (k + size, n)):
-            shape, rest = (end - begin, width, size), (matrix, begin * width, width)
-            product(shape, -1.0, (columns, begin * AT_ONCE, ONE, AT_ONCE), times_inverse, True, rest, rest)
+            shape, others = (end - begin, width, size), (matrix, begin * width, width)
+            product(shape, -1.0, (columns, begin * STEP, ONE, STEP), scaled, True, others, others)
         for i in range(size * width):
             matrix[k * width + i] = rows[i]
     return n_negative
 
 
 @compiled()
-def load(matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width: int, backwards: bool) -> None:
-    """Copy the symmetric matrix (n, width) of which a front has the upper triangle, with zeros behind it."""
+def load(matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width: int, is_reversed: bool) -> None:
+    """Copy a symmetric matrix (n, width) from the upper triangle of a front, and pad its rows with zeros."""
     for i in range(n):
         for j in range(i, n):
             value = front[i * front_width + j]
-            row, column = (n - 1 - i, n - 1 - j) if backwards else (i, j)
+            row, column = (n - 1 - i, n - 1 - j) if is_reversed else (i, j)
             matrix[row * width + column] = matrix[column * width + row] = value
         for j in range(n, width):
             matrix[i * width + j] = 0.0
 
 
 @compiled(inline="always")
-def missing(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, scratch: np.ndarray) -> float:
-    """The Frobenius norm of I − A X."""
-    whole = (scratch, ZERO, width)
+def residual_norm(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, scratch: np.ndarray) -> float:
+    """Return the Frobenius norm of I − A X for a matrix A and its computed inverse X."""
+    residual = (scratch, ZERO, width)
     for i in range(n * width):
         scratch[i] = 0.0
     for i in range(n):
         scratch[i * width + i] = 1.0
-    product((n, width, n), -1.0, (matrix, ZERO, width, ONE), (inverse, ZERO, width), True, whole, whole)
+    product((n, width, n), -1.0, (matrix, ZERO, width, ONE), (inverse, ZERO, width), True, residual, residual)
     squares = 0.0
     for i in range(n * width):
         squares += scratch[i] ** 2
@@ -118,25 +118,25 @@ def missing(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, scratch
 
 @compiled(inline="always")
 def invert_front(scratch: Scratch, n: int, front_width: int, width: int) -> int:
-    """Write the inverse (n, width) of a front's pivot block; the negative eigenvalues of that, -1 if it cannot tell.
+    """Invert the pivot block (n, width) of a front; return its number of negative eigenvalues, or -1 on failure.
 
-    A definite block is inverted accurately with its pivots in any order. An indefinite one may lose digits in one
-    order, rarely in both; I − A X tells how many. Where it is small, the signs of the pivots are right as well: on the
-    way from A to the matrix whose inverse X is, no eigenvalue passes zero.
+    A definite block is inverted accurately with its pivots in any order. An indefinite block may lose digits in one
+    order, rarely also in the reverse order; the norm of I − A X measures the loss. Where it is small, the signs of the
+    pivots are also right: no eigenvalue crosses zero between A and the matrix whose exact inverse is X.
     """
-    inverse = scratch.pivot
-    for backwards in (False, True):
-        load(inverse, scratch.front, n, front_width, width, backwards)
+    inverse = scratch.inverse
+    for is_reversed in (False, True):
+        load(inverse, scratch.front, n, front_width, width, is_reversed)
         n_negative = invert(inverse, n, width, scratch.rows, scratch.columns)
         if n_negative > 0:
-            load(scratch.copy, scratch.front, n, front_width, width, backwards)
-            if not missing(scratch.copy, inverse, n, width, scratch.squares) <= MOST_MISSING:
+            load(scratch.pivot_copy, scratch.front, n, front_width, width, is_reversed)
+            if not residual_norm(scratch.pivot_copy, inverse, n, width, scratch.residual) <= MAX_RESIDUAL:
                 continue
         if n_negative >= 0:
-            if backwards:
+            if is_reversed:
                 for i in range(n // 2 + n % 2):
                     for j in range(n if i < n // 2 else n // 2):
-                        here, there = i * width + j, (n - 1 - i) * width + n - 1 - j
-                        inverse[here], inverse[there] = inverse[there], inverse[here]
+                        k, mirrored = i * width + j, (n - 1 - i) * width + n - 1 - j
+                        inverse[k], inverse[mirrored] = inverse[mirrored], inverse[k]
             return n_negative
     return -1

@@ -1,16 +1,16 @@
-"""Products of small or long matrices, where they are faster than with a BLAS.
+"""Products of small or long matrices, where compiled loops are faster than a BLAS.
 
-A BLAS is made for matrices that are large both ways: it first copies its operands into an order of its own. Two kinds
-of products of the eigensolver are not, and take most of its time.
+A BLAS is made for matrices with many rows and columns: it first copies its operands into its own layout. Two kinds of
+products of the eigensolver are different, and take most of its time.
 
 *Fronts of some tens of unknowns, and solves with few right-hand sides* (`product`). A tile of the result, ROWS by
 COLUMNS, stays in the processor's registers until it is complete, and takes a third of the time. Numba's compiler does
 not find this by itself: with loops that it arranges over rows of four, all of `eigenpairs` takes 1.9 times as long at
-10,000 vertices. So the tile is written in LLVM's own words (`_tile`); everything around it is plain Numba.
+10,000 vertices. The tile is therefore written in LLVM instructions (`_tile`); everything around it is plain Numba.
 
-*A few long rows with many* (`overlaps`), of which the Krylov basis is made. On AMD's processors compiled loops take
-down to half the time of a BLAS, and all of `eigenpairs` 0.88 times. On Intel's with AVX-512, for which MKL is made,
-they take up to twice its time, and all of `eigenpairs` 1.14 times. So the processor decides (`loops_beat_blas`).
+*A few long rows with many* (`overlaps`), for the Krylov basis. On AMD processors compiled loops take down to half the
+time of a BLAS, and all of `eigenpairs` 0.88 times. On Intel processors with AVX-512, for which MKL is made, they take
+up to twice its time, and all of `eigenpairs` 1.14 times. The processor therefore decides (`loops_beat_blas`).
 """
 
 from functools import cache, partial
@@ -24,55 +24,55 @@ from igps._compiled import SUMS, Lazy, compiled
 
 Four = tuple[float, float, float, float]
 
-# Of a tile: AVX2 has registers for so many sums, and for the numbers that are multiplied
+# Size of a tile: AVX2 has registers for this number of sums, and for the factors.
 ROWS, COLUMNS = 6, 8
-# Columns of a few rows that the processor's second cache holds
+# Number of columns of a few rows that the second-level cache holds.
 CHUNK = 4096
-# In a tuple for `product` a plain 0 or 1 would be part of its type, for each of which Numba compiles once more
+# Arguments of `product`. A plain 0 or 1 would become part of the type of its tuple, and Numba compile for each type.
 ZERO, ONE = cast(int, np.int64(0)), cast(int, np.int64(1))
 
 Rows = tuple[np.ndarray, int, int]
-"""A matrix in a flat array: where it begins, and how far its rows lie apart."""
+"""A matrix in a flat array: the array, the start of the matrix, and the step between rows."""
 Strided = tuple[np.ndarray, int, int, int]
-"""The same, and how far its columns lie apart."""
+"""As `Rows`, and the step between columns."""
 
 
 @cache
 def loops_beat_blas() -> bool:
-    """Whether compiled loops are faster than PyTorch's BLAS at products of a few long rows with many."""
+    """Return whether compiled loops are faster than PyTorch's BLAS for products of a few long rows with many."""
     from llvmlite import binding
 
-    wide = torch.backends.mkl.is_available() and binding.get_host_cpu_features().get("avx512f", False)
-    return not wide or binding.get_host_cpu_name().startswith("znver")
+    has_mkl_avx512 = torch.backends.mkl.is_available() and binding.get_host_cpu_features().get("avx512f", False)
+    return not has_mkl_avx512 or binding.get_host_cpu_name().startswith("znver")
 
 
 def overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Tensor:
-    """The products (n, m) of rows (n, V) with others (m, V), over a piece of the columns."""
+    """Return the products (n, m) of rows (n, V) with other rows (m, V), over a piece of the columns."""
     if loops_beat_blas():
         return torch.from_numpy(overlaps_by_loops(rows.numpy(), others.numpy(), piece.start, piece.stop))
-    return (others[:, piece] @ rows[:, piece].T).T  # the many first: MKL is faster so
+    return (others[:, piece] @ rows[:, piece].T).T  # MKL is faster with the longer operand first
 
 
 def subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, piece: slice) -> None:
-    """Take factors (n, m) times others from rows, in a piece of the columns; in the precision of the others.
+    """Subtract factors (n, m) times others from rows, over a piece of the columns, in the precision of the others.
 
-    NumPy's product: single precision stays what it is, whatever PyTorch is told of its own.
+    The product is NumPy's: its single precision does not depend on PyTorch's setting for matrix products.
     """
     rows.numpy()[:, piece] -= factors.numpy() @ others.numpy()[:, piece]
 
 
 def _tile(n_columns: int) -> Any:
-    """A function for one tile of `product`, ROWS rows of so many numbers, each row one of LLVM's vectors.
+    """Make a function for one tile of `product`: ROWS rows of n_columns numbers, each row an LLVM vector.
 
-    Of fewer rows the last stands in for the others: it is computed and written several times.
+    If fewer rows are left, the last one is computed and written several times.
     """
     from llvmlite import ir
     from numba import types
     from numba.core import cgutils
     from numba.extending import intrinsic
 
-    number, whole = ir.DoubleType(), ir.IntType(64)
-    vector = ir.VectorType(number, n_columns) if n_columns > 1 else number
+    real, integer = ir.DoubleType(), ir.IntType(64)
+    vector = ir.VectorType(real, n_columns) if n_columns > 1 else real
     fused = ("contract",)
 
     def tile(
@@ -86,52 +86,52 @@ def _tile(n_columns: int) -> Any:
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             names = ("a", "a_at", "a_step", "a_stride", "x", "x_at", "x_step", "keep", "source", "source_at",
                      "source_step", "out", "out_at", "out_step", "n_rows", "n_terms", "factor")  # fmt: skip
-            given = dict(zip(names, values, strict=True))
-            for kind, name in zip(signature.args, names, strict=True):
-                if isinstance(kind, types.Array):
-                    given[name] = context.make_array(kind)(context, builder, given[name]).data
+            arguments = dict(zip(names, values, strict=True))
+            for numba_type, name in zip(signature.args, names, strict=True):
+                if isinstance(numba_type, types.Array):
+                    arguments[name] = context.make_array(numba_type)(context, builder, arguments[name]).data
 
-            def place(name: str, offset: Any) -> Any:
-                return builder.gep(given[name], [builder.add(given[name + "_at"], offset)])
+            def pointer(name: str, offset: Any) -> Any:
+                return builder.gep(arguments[name], [builder.add(arguments[name + "_at"], offset)])
 
-            def spread(value: Any) -> Any:
-                """The number in all places of a vector."""
+            def broadcast(value: Any) -> Any:
+                """Fill a vector with a number."""
                 if n_columns == 1:
                     return value
-                one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.IntType(32)(0))
-                return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), n_columns), None))
+                first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.IntType(32)(0))
+                return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), n_columns), None))
 
-            def row(name: str, number_of_row: Any) -> Any:
-                at = place(name, builder.mul(number_of_row, given[name + "_step"]))
-                return builder.bitcast(at, vector.as_pointer())
+            def row(name: str, index: Any) -> Any:
+                start = pointer(name, builder.mul(index, arguments[name + "_step"]))
+                return builder.bitcast(start, vector.as_pointer())
 
-            last = builder.sub(given["n_rows"], whole(1))
-            rows = [builder.select(builder.icmp_signed("<", whole(i), last), whole(i), last) for i in range(ROWS)]
-            columns_of_a = [place("a", builder.mul(i, given["a_stride"])) for i in rows]
+            last = builder.sub(arguments["n_rows"], integer(1))
+            rows = [builder.select(builder.icmp_signed("<", integer(i), last), integer(i), last) for i in range(ROWS)]
+            columns_of_a = [pointer("a", builder.mul(i, arguments["a_stride"])) for i in rows]
             sums = [cgutils.alloca_once_value(builder, ir.Constant(vector, None)) for _ in rows]
-            with cgutils.for_range(builder, given["n_terms"]) as loop:
-                of_x = builder.load(row("x", loop.index), align=8)
-                offset = builder.mul(loop.index, given["a_step"])
+            with cgutils.for_range(builder, arguments["n_terms"]) as loop:
+                x_row = builder.load(row("x", loop.index), align=8)
+                offset = builder.mul(loop.index, arguments["a_step"])
                 for column, total in zip(columns_of_a, sums, strict=True):
-                    term = builder.fmul(spread(builder.load(builder.gep(column, [offset]))), of_x, flags=fused)
+                    term = builder.fmul(broadcast(builder.load(builder.gep(column, [offset]))), x_row, flags=fused)
                     builder.store(builder.fadd(builder.load(total), term, flags=fused), total)
-            factor = spread(given["factor"])
+            factor = broadcast(arguments["factor"])
             products = [builder.fmul(builder.load(total), factor, flags=fused) for total in sums]
-            with builder.if_else(given["keep"]) as (added, alone):
+            with builder.if_else(arguments["keep"]) as (added, alone):
                 with added:
-                    kept = [builder.load(row("source", i), align=8) for i in rows]
-                    for i, of_source, found in zip(rows, kept, products, strict=True):
-                        builder.store(builder.fadd(of_source, found, flags=fused), row("out", i), align=8)
+                    source_rows = [builder.load(row("source", i), align=8) for i in rows]
+                    for i, source_row, result in zip(rows, source_rows, products, strict=True):
+                        builder.store(builder.fadd(source_row, result, flags=fused), row("out", i), align=8)
                 with alone:
-                    for i, found in zip(rows, products, strict=True):
-                        builder.store(found, row("out", i), align=8)
+                    for i, result in zip(rows, products, strict=True):
+                        builder.store(result, row("out", i), align=8)
             return context.get_dummy_value()
 
         i64 = types.int64
-        arguments = (
+        argument_types = (
             a, i64, i64, i64, x, i64, i64, types.boolean, source, i64, i64, out, i64, i64, i64, i64, types.float64,
         )  # fmt: skip
-        return types.void(*arguments), generate
+        return types.void(*argument_types), generate
 
     return intrinsic(tile)
 
@@ -144,7 +144,7 @@ narrow_tile: Any = Lazy(partial(_tile, 1))
 def product(
     shape: tuple[int, int, int], factor: float, a: Strided, x: Rows, keep: bool, source: Rows, out: Rows
 ) -> None:
-    """out ← factor · Aᵀ X, plus the source if it is to be kept; shape (m, n, k) of out (m, n) and of A and X, k rows.
+    """Compute out ← factor · Aᵀ X, plus the source if `keep`; shape is (m, n, k) for out (m, n), A (k, m) and X (k, n).
 
     Rows of n numbers are written once or twice: ``out`` may not be the source, unless n is a multiple of COLUMNS.
     """
@@ -168,8 +168,8 @@ def product(
 
 @compiled()
 def overlaps_by_loops(a: Floats, b: Floats, begin: int, end: int) -> Floats:
-    """The products (n, m) of rows (n, V) with rows (m, V), over the columns from ``begin`` to ``end``."""
-    found = np.zeros((len(a), len(b)))
+    """Return the products (n, m) of rows (n, V) with rows (m, V), over the columns from ``begin`` to ``end``."""
+    products = np.zeros((len(a), len(b)))
     for start in range(begin, end, CHUNK):
         stop = min(start + CHUNK, end)
         for j in range(0, len(b), 6):
@@ -177,15 +177,15 @@ def overlaps_by_loops(a: Floats, b: Floats, begin: int, end: int) -> Floats:
                 sums = four_by_six(a, i, b, j, start, stop)
                 for column in range(min(6, len(b) - j)):
                     for row in range(min(4, len(a) - i)):
-                        found[i + row, j + column] += sums[column][row]
-    return found
+                        products[i + row, j + column] += sums[column][row]
+    return products
 
 
 @compiled(fastmath=SUMS)
 def four_by_six(
     a: Floats, i: int, b: Floats, j: int, begin: int, end: int
 ) -> tuple[Four, Four, Four, Four, Four, Four]:
-    """The products of four rows of one array, from ``i`` on, with each of six of another; the last stands in for more.
+    """Return the products of four rows of one array with six rows of another; missing rows are replaced by the last.
 
     The compiler keeps sums in registers only if each has a name.
     """
@@ -194,7 +194,7 @@ def four_by_six(
     b0, b1, b2 = b[j], b[min(j + 1, last_b)], b[min(j + 2, last_b)]
     b3, b4, b5 = b[min(j + 3, last_b)], b[min(j + 4, last_b)], b[min(j + 5, last_b)]
     s0 = s1 = s2 = s3 = s4 = s5 = (0.0, 0.0, 0.0, 0.0)
-    # An unsigned index is one that need not be counted from the end.
+    # Unsigned indices spare Numba the check for negative ones.
     for v in range(np.uint64(begin), np.uint64(end)):
         x = a0[v], a1[v], a2[v], a3[v]
         s0, s1, s2 = added(s0, x, b0[v]), added(s1, x, b1[v]), added(s2, x, b2[v])
@@ -204,5 +204,5 @@ def four_by_six(
 
 @compiled(fastmath=SUMS)
 def added(sums: Four, x: Four, y: float) -> Four:
-    """Sums with y times x added."""
+    """Return the sums plus x times y."""
     return sums[0] + x[0] * y, sums[1] + x[1] * y, sums[2] + x[2] * y, sums[3] + x[3] * y

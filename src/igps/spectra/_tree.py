@@ -1,6 +1,6 @@
-"""The elimination tree of a dissected matrix: which unknowns each node owns, which it touches, and where fronts meet.
+"""The elimination tree of a dissected matrix: own unknowns, boundary and children of each node.
 
-Nodes and unknowns are numbered depth first, each node behind its children: in the order of their elimination.
+Nodes and unknowns are numbered depth first, each node after its children, which is the order of elimination.
 """
 
 from typing import NamedTuple
@@ -9,122 +9,124 @@ import numpy as np
 
 from igps._arrays import Integers
 
-# Unknowns from which a subtree is worth a thread of its own, and the most subtrees, as a power of two
-SUBTREE, MOST_SUBTREES = 2**13, 3
+# Smallest number of unknowns that are worth a thread of their own, and log₂ of the largest number of subtrees.
+MIN_SUBTREE, MAX_SUBTREE_DEPTH = 2**13, 3
 
 Nodes = tuple[int, int]
-"""A range of nodes: the first, and the one behind the last."""
+"""A range of nodes: the first, and the one after the last."""
 
 
 class Structure(NamedTuple):
-    """What is known of a matrix before its values: its pattern, and the nodes of the tree, N in number."""
+    """The symbolic factorization of a matrix: its pattern, and the N nodes of its elimination tree."""
 
     indptr: np.ndarray  # (V + 1,) int32, of the csr matrix
     indices: np.ndarray  # (E,) int32
-    order: np.ndarray  # (V,) the vertex of each number
-    number: np.ndarray  # (V,) the number of each vertex
-    first: np.ndarray  # (N + 1,) where each node's own numbers start
+    order: np.ndarray  # (V,) vertex at each position of the elimination order
+    position: np.ndarray  # (V,) position of each vertex in the elimination order
+    own_start: np.ndarray  # (N + 1,) first position that each node owns
     children: np.ndarray  # (N, 2) nodes, or -1
-    start: np.ndarray  # (N + 1,) where each node's boundary starts among all boundaries
-    boundary: np.ndarray  # sorted numbers each
-    parent_row: np.ndarray  # the row of each vertex of a boundary in the front of the node's parent
-    block_start: np.ndarray  # (N + 1,) where each node's block [D E] starts among all blocks
-    update_start: np.ndarray  # (N,) where its complement starts among those that wait to be added
-    carried_start: np.ndarray  # (N,) where the rows that it adds to its boundary start among those that wait
+    boundary_start: np.ndarray  # (N + 1,) start of each node's boundary in `boundary`
+    boundary: np.ndarray  # positions, ascending for each node
+    parent_row: np.ndarray  # row of each boundary entry in the front of the node's parent
+    block_start: np.ndarray  # (N + 1,) start of each node's block [D E] in the array of blocks
+    update_start: np.ndarray  # (N,) start of its Schur complement on the stack of complements
+    carried_start: np.ndarray  # (N,) start of its contribution to the right-hand sides on their stack
 
 
 def tree_structure(
     node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.ndarray
 ) -> tuple[Structure, list[Nodes], list[Nodes]]:
-    """Of a full binary tree for vertices (V,) assigned to the places of a heap, with its `side_by_side` subtrees.
+    """Return the structure of a full binary tree, its `parallel_subtrees`, and the nodes above these.
 
-    The third result are the nodes above these, as ranges, each behind its children.
+    The vertices (V,) are assigned to the places of a heap. The nodes above are ranges of one node, each after its
+    children.
     """
     n_nodes = 2**n_levels - 1
-    post = np.full(n_nodes, n_nodes - 1)  # the number of each place in the heap
+    node_at = np.full(n_nodes, n_nodes - 1)  # node at each place of the heap
     children, parent = np.full((n_nodes, 2), -1), np.full(n_nodes, -1)
     for level in range(n_levels - 1):
-        above = np.arange(2**level - 1, 2 ** (level + 1) - 1)
-        right = post[above] - 1
-        left = right - (2 ** (n_levels - level - 1) - 1)  # before it comes all of the right one's subtree
-        post[2 * above + 1], post[2 * above + 2] = left, right
-        children[post[above]] = np.stack([left, right], axis=1)
-        parent[left] = parent[right] = post[above]
-    of_vertex = post[node]
-    order = np.argsort(of_vertex, kind="stable")
-    number = np.empty_like(order)
-    number[order] = np.arange(len(node))
-    first = np.append(0, np.cumsum(np.bincount(of_vertex, minlength=n_nodes)))
-    level_of = np.empty(n_nodes, np.int64)
-    level_of[post] = np.log2(np.arange(1, n_nodes + 1))
-    start, boundary, rows = _boundaries(first, parent, level_of, number, indptr, indices)
-    n_own, n_boundary = np.diff(first), np.diff(start)
-    subtrees = side_by_side(n_levels, len(node))
-    inside = {n for begin, end in subtrees for n in range(begin, end)}
-    alone = [(n, n + 1) for n in range(n_nodes) if n not in inside]
+        parents = np.arange(2**level - 1, 2 ** (level + 1) - 1)
+        right = node_at[parents] - 1
+        left = right - (2 ** (n_levels - level - 1) - 1)  # the whole right subtree lies between
+        node_at[2 * parents + 1], node_at[2 * parents + 2] = left, right
+        children[node_at[parents]] = np.stack([left, right], axis=1)
+        parent[left] = parent[right] = node_at[parents]
+    node_of = node_at[node]
+    order = np.argsort(node_of, kind="stable")
+    position = np.empty_like(order)
+    position[order] = np.arange(len(node))
+    own_start = np.append(0, np.cumsum(np.bincount(node_of, minlength=n_nodes)))
+    depth = np.empty(n_nodes, np.int64)
+    depth[node_at] = np.log2(np.arange(1, n_nodes + 1))
+    boundary_start, boundary, rows = _boundaries(own_start, parent, depth, position, indptr, indices)
+    n_own, n_boundary = np.diff(own_start), np.diff(boundary_start)
+    subtrees = parallel_subtrees(n_levels, len(node))
+    in_subtrees = {n for begin, end in subtrees for n in range(begin, end)}
+    above = [(n, n + 1) for n in range(n_nodes) if n not in in_subtrees]
     blocks = np.append(0, np.cumsum(n_own * (n_own + n_boundary)))
-    updates, carried = (stacked_places(children, sizes, [*subtrees, *alone]) for sizes in (n_boundary**2, n_boundary))
+    updates, carried = (stack_starts(children, sizes, [*subtrees, *above]) for sizes in (n_boundary**2, n_boundary))
     structure = Structure(
-        indptr, indices, order, number, first, children, start, boundary, rows, blocks, updates, carried
+        indptr, indices, order, position, own_start, children, boundary_start, boundary, rows, blocks, updates, carried
     )
-    return structure, subtrees, alone
+    return structure, subtrees, above
 
 
 def _boundaries(
-    first: Integers, parent: Integers, level_of: Integers, number: Integers, indptr: np.ndarray, indices: np.ndarray
+    own_start: Integers, parent: Integers, depth: Integers, position: Integers, indptr: np.ndarray, indices: np.ndarray
 ) -> tuple[Integers, Integers, Integers]:
-    """Where each node's boundary starts, the boundaries, sorted, and the row of each entry in the parent's front.
+    """Return the start of each node's boundary, the boundaries, and the row of each entry in the parent's front.
 
-    A node's boundary is what its own edges reach, and its children's boundaries, less what it owns.
+    The boundary of a node consists of the unknowns that its edges reach and of its children's boundaries, without the
+    unknowns that it owns.
     """
-    n_nodes, n_vertices = len(parent), len(number)
+    n_nodes, n_vertices = len(parent), len(position)
 
-    def behind(node: Integers, reached: Integers) -> Integers:
-        """Of pairs of a node and an unknown those where that lies behind the node, as numbers that sort by node."""
-        kept = reached >= first[node + 1]
-        return node[kept] * n_vertices + reached[kept]
+    def after(node: Integers, reached: Integers) -> Integers:
+        """Return the pairs whose unknown comes after those of the node, as numbers that sort by node."""
+        is_after = reached >= own_start[node + 1]
+        return node[is_after] * n_vertices + reached[is_after]
 
-    owner = np.repeat(np.arange(n_nodes), np.diff(first))
-    by_edges = behind(owner[number].repeat(np.diff(indptr)), number[indices])
-    level_of_edge = level_of[by_edges // n_vertices]
-    inherited, found = by_edges[:0], []
-    for level in reversed(range(level_of.max() + 1)):
-        found.append(np.union1d(inherited, by_edges[level_of_edge == level]))
-        node, reached = np.divmod(found[-1], n_vertices)
-        inherited = behind(parent[node], reached)
-    every = np.sort(np.concatenate(found))
-    node, boundary = np.divmod(every, n_vertices)
+    owner = np.repeat(np.arange(n_nodes), np.diff(own_start))
+    from_edges = after(owner[position].repeat(np.diff(indptr)), position[indices])
+    level_of_edge = depth[from_edges // n_vertices]
+    inherited, levels = from_edges[:0], []
+    for level in reversed(range(depth.max() + 1)):
+        levels.append(np.union1d(inherited, from_edges[level_of_edge == level]))
+        node, reached = np.divmod(levels[-1], n_vertices)
+        inherited = after(parent[node], reached)
+    pairs = np.sort(np.concatenate(levels))
+    node, boundary = np.divmod(pairs, n_vertices)
     start = np.append(0, np.cumsum(np.bincount(node, minlength=n_nodes)))
-    above = parent[node]
-    on_boundary = np.diff(first)[above] + np.searchsorted(every, above * n_vertices + boundary) - start[above]
-    return start, boundary, np.where(boundary < first[above + 1], boundary - first[above], on_boundary)
+    parents = parent[node]
+    on_boundary = np.diff(own_start)[parents] + np.searchsorted(pairs, parents * n_vertices + boundary) - start[parents]
+    return start, boundary, np.where(boundary < own_start[parents + 1], boundary - own_start[parents], on_boundary)
 
 
-def side_by_side(n_levels: int, n_unknowns: int) -> list[Nodes]:
-    """The ranges of nodes of a few large subtrees, in the order in which a full tree is numbered depth first.
+def parallel_subtrees(n_levels: int, n_unknowns: int) -> list[Nodes]:
+    """Return the ranges of nodes of a few large subtrees of a full tree that is numbered depth first.
 
-    They depend on the matrix alone, not on the threads that there are: neither do rounding errors.
+    They depend only on the matrix and not on the number of threads, and so do rounding errors.
     """
-    depth = min(MOST_SUBTREES, n_levels - 1, max(0, int(n_unknowns / SUBTREE).bit_length()))
+    depth = min(MAX_SUBTREE_DEPTH, n_levels - 1, max(0, int(n_unknowns / MIN_SUBTREE).bit_length()))
     subtrees, begin = [], 0
     for number in range(1, 2**depth + 1):
         subtrees.append((begin, begin + 2 ** (n_levels - depth) - 1))
-        begin = subtrees[-1][1] + (number & -number).bit_length() - 1  # behind it come the nodes that it completes
+        begin = subtrees[-1][1] + (number & -number).bit_length() - 1  # skips the parents that it completes
     return subtrees
 
 
-def stacked_places(children: np.ndarray, sizes: np.ndarray, ranges: list[Nodes]) -> np.ndarray:
-    """Where the result of each node starts, of these sizes; each range of nodes has its own place.
+def stack_starts(children: np.ndarray, sizes: np.ndarray, ranges: list[Nodes]) -> np.ndarray:
+    """Return the start of each node's result on a stack, from the sizes of the results.
 
-    In a range, a node's result waits until its parent takes it: when a node is done, its children's results are the
-    last two that wait, and its own takes their place.
+    Each range of nodes has its own stack. A result stays there until its parent is computed: the results of both
+    children are then on top, and the parent's result replaces them.
     """
-    place, length, left = np.zeros(len(sizes), dtype=np.int64), sizes.tolist(), children[:, 0].tolist()
+    starts, lengths, left_child = np.zeros(len(sizes), dtype=np.int64), sizes.tolist(), children[:, 0].tolist()
     end = 0
     for first, last in ranges:
         top = end
         for n in range(first, last):
-            place[n] = top if left[n] < first else place[left[n]]
-            top = int(place[n]) + length[n]
+            starts[n] = top if left_child[n] < first else starts[left_child[n]]
+            top = int(starts[n]) + lengths[n]
             end = max(end, top)
-    return place
+    return starts

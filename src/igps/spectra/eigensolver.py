@@ -1,23 +1,23 @@
 """The K smallest non-zero eigenpairs of the generalised problem ``L φ = λ M φ``, with a proof that none is missing.
 
-The algorithm is block Lanczos with a shift inside the wanted part of the spectrum (Ericsson & Ruhe 1980; Grimes,
-Lewis & Simon 1994):
+The algorithm is block Lanczos with a shift inside the wanted part of the spectrum (Ericsson & Ruhe 1980; Grimes, Lewis
+& Simon 1994):
 
 1. With y = M^½ φ the problem is A y = λ y, A = M^-½ L M^-½, and orthogonality is Euclidean. Lengths are measured in
    units of √area, so that nothing depends on the scale of the coordinates.
-2. Weyl's law N(λ) ≈ λ · area / 4π places a shift σ where about SHIFT_RANK of the wanted eigenvalues lie below it.
-   (A − σI)⁻¹ is applied by `_multifrontal`. It maps λ to θ = 1/(λ − σ), so that the wanted eigenvalues lie at both ends
-   of the spectrum, and those below σ have nothing unwanted on their side. The basis that is needed is a third smaller
-   than with a shift below the spectrum. Bands with a shift each (manifold harmonics, Vallet & Lévy 2008) would shrink
-   it further, but cost a factorization each and leave vectors of neighbouring bands to be made orthogonal.
-3. The block Krylov basis Q follows the three-term recurrence, with one full reorthogonalisation of every two blocks at
-   once. With T = Qᵀ (A − σI)⁻¹ Q and its eigenpairs (θ, s), the Ritz vectors are Q s.
-4. One more application of (A − σI)⁻¹ to a Ritz vector takes only the block R that couples the basis to the next one. It
-   removes the high frequencies, which A would amplify, and leaves a residual that is known before any vector is formed:
-   ‖A y − λ y‖ = ‖R s_last‖ / θ², with s_last the rows of s that belong to the last block.
-5. The eigenvalues below a second shift μ, in a gap behind the last wanted one, number as many as the negative pivots
-   of A − μI (Sylvester's law of inertia). Where that is more than were found, the block is widened by random
-   vectors and the iteration goes on: so a multiplet larger than the block is found.
+2. Weyl's law N(λ) ≈ λ · area / 4π gives a shift σ with about SHIFT_RANK of the wanted eigenvalues below it.
+   (A − σI)⁻¹ is applied by `_multifrontal`. It maps λ to θ = 1/(λ − σ): the wanted eigenvalues are at both ends of the
+   spectrum, and those below σ have no unwanted ones at their end. The basis is a third smaller than with a shift below
+   the spectrum. Several bands with a shift each (manifold harmonics, Vallet & Lévy 2008) would reduce it further, but
+   each costs a factorization, and the vectors of neighbouring bands would have to be orthogonalised.
+3. The block Krylov basis Q is computed by the three-term recurrence, with a full reorthogonalisation of two blocks at a
+   time. With T = Qᵀ (A − σI)⁻¹ Q and its eigenpairs (θ, s), the Ritz vectors are Q s.
+4. Another application of (A − σI)⁻¹ to a Ritz vector requires only the block R that couples the basis to the next
+   block. It removes high frequencies, which A would amplify, and the residual of the result is known before any vector
+   is formed: ‖A y − λ y‖ = ‖R s_last‖ / θ², where s_last are the rows of s that belong to the last block.
+5. Let μ be a second shift, in a gap after the last wanted eigenvalue. There are as many eigenvalues below μ as negative
+   pivots of A − μI (Sylvester's law of inertia). If fewer were found, the block is widened by random vectors and the
+   iteration continues. In this way a multiplet larger than the block is found.
 """
 
 import logging
@@ -34,32 +34,32 @@ from scipy.sparse.linalg import ArpackError, eigsh
 from igps._compiled import compiled
 from igps._threads import one_thread
 from igps.spectra._checks import ROUNDING, checked_mass, checked_stiffness
-from igps.spectra._lanczos import ConvergenceError, gap_behind, lanczos
+from igps.spectra._lanczos import ConvergenceError, gap_after, lanczos
 from igps.spectra._multifrontal import SingularMatrixError, analyse
 
 logger = logging.getLogger(__name__)
 
-# Pairs computed beyond the last one, to find a gap behind it; the Lanczos basis holds some anyway
+# Number of extra pairs that ARPACK computes, to find a gap after the last wanted one.
 N_GUARDS = 16
-# The largest residual that rounding may excuse
+# Largest residual that is accepted because of rounding.
 RESIDUAL_LIMIT = 1e-4
-# Of the eigenvectors, that change their places together
-ROWS_AT_ONCE = 2**12
-# Up to here a dense solver is as fast, or the basis would fill most of the space
-DENSE_VERTICES, DENSE_VERTICES_PER_EIGENPAIR = 1000, 4
+# Number of rows of the eigenvectors that are reordered at a time.
+REORDERED_ROWS = 2**12
+# Largest problem for the dense solver, which is then as fast; or else the basis would span most of the space.
+MAX_DENSE_VERTICES, MAX_DENSE_VERTICES_PER_EIGENPAIR = 1000, 4
 
 Solver = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """The low end of the spectrum of `L φ = λ M φ`, a shape's Laplace–Beltrami spectrum; the constant is left out.
+    """Smallest non-zero eigenpairs of `L φ = λ M φ`, such as the Laplace–Beltrami spectrum of a shape.
 
     Attributes:
         eigenvalues: (K,) float64, ascending, 1/length².
         eigenfunctions: (V, K) float64, M-orthonormal, 1/length.
-        mass: (V,) float64, the vertex areas, length².
-        residual: the largest ‖L φ − λ M φ‖ / λ of the pairs, in the norm of M⁻¹, as measured.
+        mass: (V,) float64, vertex areas, length².
+        residual: largest measured ‖L φ − λ M φ‖ / λ of the pairs, in the norm of M⁻¹.
     """
 
     eigenvalues: np.ndarray
@@ -78,12 +78,12 @@ def eigenpairs(
     tolerance: float = 1e-7,
     seed: int = 0,
 ) -> Spectrum:
-    """The ``n_eigenpairs`` smallest non-zero eigenpairs of ``L φ = λ M φ`` on a connected closed surface.
+    """Compute the ``n_eigenpairs`` smallest non-zero eigenpairs of ``L φ = λ M φ`` on a connected closed surface.
 
     None is missing: their number is proved by inertia. The residual of each pair, ‖L φ − λ M φ‖ / λ in the norm of M⁻¹,
-    is at most the tolerance, or as small as rounding allows, and then at most RESIDUAL_LIMIT. Small matrices go to a
-    dense solver; where a solver fails, ARPACK follows, with a logged warning and the same proof. Within a multiplet the
-    basis is arbitrary. The result is the same for the same seed, to the bit with any number of threads.
+    is at most the tolerance, or, if rounding does not allow this, at most RESIDUAL_LIMIT. A dense solver handles small
+    matrices. ARPACK is the fallback, with a logged warning and the same proof. Within a multiplet the basis is
+    arbitrary. The result depends only on the arguments, to the bit and with any number of threads.
 
     The matrices may come from any library, with the sign that makes the stiffness positive semi-definite.
 
@@ -99,20 +99,20 @@ def eigenpairs(
     Args:
         stiffness: (V, V) positive semi-definite, symmetric, rows summing to zero; no unit (cotangents).
         mass: (V,) lumped vertex areas, length², or a diagonal (V, V) sparse matrix of them.
-        n_eigenpairs: how many, the zero mode not counted.
-        positions: (V, 3) vertex positions, any unit. They only guide the elimination order; without them it is slower.
+        n_eigenpairs: number of eigenpairs K, without the zero mode.
+        positions: (V, 3) vertex positions, any unit. They are used for a faster elimination order only.
         tolerance: largest residual, relative to the eigenvalue. An eigenvalue's error is about its square.
         seed: of the random start vectors.
 
     Raises:
-        ValueError: the matrices are malformed or not finite, rows do not sum to zero, the matrix falls into
-            several components or has too few rows.
+        ValueError: the matrices are malformed or not finite, rows do not sum to zero, or the matrix has several
+            components or too few rows.
         ConvergenceError: the tolerance was not reached.
     """
     mass = checked_mass(mass)
     stiffness = checked_stiffness(stiffness, mass, n_eigenpairs)
     if positions is not None and (positions.shape != (len(mass), 3) or not np.isfinite(positions).all()):
-        raise ValueError(f"positions must be finite and ({len(mass)}, 3), got {positions.shape}")
+        raise ValueError(f"positions: expected finite values of shape ({len(mass)}, 3), got {positions.shape}.")
 
     area = mass.sum()
     scale = np.sqrt(area / mass)
@@ -126,43 +126,43 @@ def eigenpairs(
         return lanczos(matrix, np.sqrt(mass / area), n_eigenpairs, positions, tolerance, seed, inside)
 
     def arpack() -> tuple[np.ndarray, np.ndarray]:
-        n_guarded = min(n_eigenpairs + N_GUARDS, len(mass) - 2)
-        eigenvalues, eigenfunctions = _arpack(stiffness, mass, n_guarded, seed)
+        n_computed = min(n_eigenpairs + N_GUARDS, len(mass) - 2)
+        eigenvalues, eigenfunctions = _arpack(stiffness, mass, n_computed, seed)
         eigenvalues *= area
         _prove_complete(matrix, eigenvalues, n_eigenpairs, positions)
         return eigenvalues[:n_eigenpairs], eigenfunctions[:, :n_eigenpairs] * np.sqrt(mass)[:, None]
 
-    small = len(mass) <= max(DENSE_VERTICES, DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs)
-    solvers: list[Solver] = [dense, arpack] if small else [partial(krylov, True), partial(krylov, False), arpack]
-    eigenvalues, vectors, residual = _first_that_passes(solvers, matrix, tolerance)
+    is_small = len(mass) <= max(MAX_DENSE_VERTICES, MAX_DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs)
+    solvers: list[Solver] = [dense, arpack] if is_small else [partial(krylov, True), partial(krylov, False), arpack]
+    eigenvalues, vectors, residual = _first_success(solvers, matrix, tolerance)
     vectors /= np.sqrt(mass)[:, None]
     return Spectrum(eigenvalues / area, vectors, mass, residual)
 
 
-def _first_that_passes(
+def _first_success(
     solvers: Sequence[Solver], matrix: sparse.csr_array, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Eigenvalues (K,), orthonormal eigenvectors (V, K) and the largest residual, by the first solver that passes."""
+    """Return eigenvalues (K,), orthonormal eigenvectors (V, K) and largest residual of the first solver to succeed."""
     for solver in solvers:
         try:
             eigenvalues, vectors = solver()
             residual, correction = _residual(matrix, eigenvalues, vectors, tolerance)
-            # Rayleigh's quotients: what rounding leaves in (A − σI)⁻¹ near an eigenvalue is not in A y
+            # Rayleigh quotients: unlike (A − σI)⁻¹ near an eigenvalue, A y has no large rounding errors.
             eigenvalues = eigenvalues + correction
             order = np.argsort(eigenvalues, kind="stable")
-            if (order[1:] < order[:-1]).any():  # in a multiplet
+            if (order[1:] < order[:-1]).any():  # possible in a multiplet
                 eigenvalues = eigenvalues[order]
-                for start in range(0, len(vectors), ROWS_AT_ONCE):  # a second copy of all may take gigabytes
-                    rows = vectors[start : start + ROWS_AT_ONCE]
+                for start in range(0, len(vectors), REORDERED_ROWS):  # in parts: a full copy may take gigabytes
+                    rows = vectors[start : start + REORDERED_ROWS]
                     rows[:] = rows[:, order]
             return eigenvalues, vectors, residual
         except (ConvergenceError, SingularMatrixError, np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
             if solver is solvers[-1]:
-                raise ConvergenceError(f"no solver reached the tolerance, the last one: {error}") from error
+                raise ConvergenceError(f"no solver reached the tolerance; the last error: {error}") from error
             if solver is solvers[-2]:
                 logger.warning("falling back to ARPACK: %s", error)
             else:
-                logger.info("falling back to a shift below 0: %s", error)
+                logger.info("falling back to a shift below the spectrum: %s", error)
     raise AssertionError("unreachable")
 
 
@@ -176,7 +176,7 @@ def _arpack(
             stiffness.tocsc(), n_eigenpairs + 1, sparse.diags_array(mass, format="csc"), sigma=shift, v0=start
         )
     except (ArpackError, RuntimeError) as error:
-        raise ConvergenceError(f"ARPACK found no {n_eigenpairs} eigenpairs: {error}") from error
+        raise ConvergenceError(f"ARPACK failed to compute {n_eigenpairs} eigenpairs: {error}") from error
     order = np.argsort(eigenvalues)[1:]
     return eigenvalues[order], eigenfunctions[:, order]
 
@@ -184,20 +184,22 @@ def _arpack(
 def _prove_complete(
     matrix: sparse.csr_array, eigenvalues: np.ndarray, n_eigenpairs: int, positions: np.ndarray | None
 ) -> None:
-    gap = gap_behind(torch.from_numpy(eigenvalues), n_eigenpairs)
+    gap = gap_after(torch.from_numpy(eigenvalues), n_eigenpairs)
     if gap is None:
-        raise ConvergenceError(f"no gap behind eigenvalue {n_eigenpairs} to count at: ask for more or fewer eigenpairs")
-    n_present = analyse(matrix, positions).inertia(matrix, gap[1]) - 1
-    if n_present != gap[0]:
-        raise ConvergenceError(f"found {gap[0]} of {n_present} eigenvalues below {gap[1]:.6g} / area")
+        raise ConvergenceError(f"no gap after eigenvalue {n_eigenpairs} for the proof. Use more or fewer eigenpairs.")
+    n_found, bound = gap
+    n_present = analyse(matrix, positions).inertia(matrix, bound) - 1
+    if n_present != n_found:
+        raise ConvergenceError(f"found {n_found} of {n_present} eigenvalues below {bound:.6g} / area")
 
 
 def _residual(
     matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.ndarray, tolerance: float
 ) -> tuple[float, np.ndarray]:
-    """The largest relative residual, and what makes of the eigenvalues Rayleigh's quotients of their vectors (K,).
+    """Return the largest relative residual, and corrections (K,) that turn the eigenvalues into Rayleigh quotients.
 
-    A ConvergenceError if one is above the tolerance though rounding allows a smaller one, or above RESIDUAL_LIMIT.
+    A ConvergenceError is raised if a residual is above the tolerance though rounding allows a smaller one, or above
+    RESIDUAL_LIMIT.
     """
     largest = 0.0
     squares, corrections = _defects(
@@ -211,12 +213,12 @@ def _residual(
         if not (residuals <= tolerance).all():
             rounding = np.linalg.norm(abs(matrix) @ np.abs(vectors[:, part]), axis=0) * ROUNDING / np.abs(values)
             allowed = np.maximum(tolerance, np.minimum(tolerance + rounding, RESIDUAL_LIMIT))
-            bad = ~(residuals <= allowed)
-            if bad.any():
+            failed = ~(residuals <= allowed)
+            if failed.any():
                 raise ConvergenceError(
-                    f"{bad.sum()} of eigenpairs {start + 1} to {start + len(values)} have a relative residual above "
-                    f"{allowed[bad].min():.1e}, up to {residuals[bad].max():.1e}: raise the tolerance, or of a surface "
-                    "repair the bad triangles"
+                    f"{failed.sum()} of eigenpairs {start + 1} to {start + len(values)} have a relative residual above "
+                    f"{allowed[failed].min():.1e}, up to {residuals[failed].max():.1e}. Raise the tolerance, or "
+                    "repair thin triangles of the surface."
                 )
     return largest, corrections
 
@@ -225,7 +227,7 @@ def _residual(
 def _defects(
     values: np.ndarray, indptr: np.ndarray, indices: np.ndarray, eigenvalues: np.ndarray, vectors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) squared lengths of A y − λ y and (K,) its products with y, for a csr matrix and vectors (V, K)."""
+    """Return squared lengths (K,) of A y − λ y and its products (K,) with y, for a csr matrix A and vectors (V, K)."""
     n_vertices, n_vectors = vectors.shape
     defect, squares, products = np.empty(n_vectors), np.zeros(n_vectors), np.zeros(n_vectors)
     for i in range(n_vertices):

@@ -96,16 +96,16 @@ def test_values_that_are_not_finite_are_refused() -> None:
 def test_a_missing_attribute_lists_what_there_is() -> None:
     with pytest.raises(
         ValueError,
-        match=r"attributes: expected 'charge' among those of the surface samples, got \['depth', 'surface_direction'\]",
+        match=r"attributes: expected the surface samples to have 'charge', got \['depth', 'surface_direction'\]",
     ):
         Attribute("charge", [0.1, 0.2]).values(view("surface"), nn.Identity())
     bare = batch_of(torch.rand(1, 5, 3))
-    with pytest.raises(ValueError, match="expected 'surface_direction' among those of the interior samples"):
+    with pytest.raises(ValueError, match="expected the interior samples to have 'surface_direction'"):
         PairCosines().pairs(SampleFeatures(bare, "interior", bare.interior), SpectralEmbedding())
 
 
 def test_directions_are_no_classes() -> None:
-    with pytest.raises(ValueError, match="expected a scalar to split by, but 'surface_direction' is a direction"):
+    with pytest.raises(ValueError, match="expected a scalar, got 'surface_direction', which is a direction"):
         Attribute("surface_direction", [0.0, 1.0]).values(view(), nn.Identity())
 
 

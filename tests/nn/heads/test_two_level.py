@@ -232,7 +232,7 @@ def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> N
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"parts": (0, 2)}, r"parts: expected some of 0 to 1"),
+        ({"parts": (0, 2)}, r"parts: expected indices from 0 to 1"),
         ({"n_directions": 0}, "n_directions: expected at least 1, got 0"),
         ({"shrinkage": 0.0}, "shrinkage: expected a positive number"),
     ],
@@ -256,9 +256,9 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
         WCCNHead()(histograms)
     with pytest.raises(ValueError, match=r"scales, share: .* got \(0.0,\) and 0.5"):
         TwoLevelHead(scales=[0.0])
-    with pytest.raises(ValueError, match=r"a positive number for each of 1 body heads, .* got \(0.1, 0.2\)"):
+    with pytest.raises(ValueError, match=r"a positive scale for each of 1 body heads, .* got \(0.1, 0.2\)"):
         TwoLevelHead(scales=[0.1, 0.2])
-    with pytest.raises(ValueError, match=r"one between 0 and 1, got \(0.1,\) and 1"):
+    with pytest.raises(ValueError, match=r"a share between 0 and 1, got \(0.1,\) and 1"):
         TwoLevelHead(share=1)
     with pytest.raises(ValueError, match="body_heads, individual_head: expected heads with lengths"):
         TwoLevelHead(body_heads=[WCCNHead()])

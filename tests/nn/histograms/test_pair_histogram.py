@@ -537,7 +537,9 @@ def test_a_single_sample_forms_no_pair(argument: str) -> None:
 
 
 def test_bad_batch_is_refused(batch: SignatureBatch) -> None:
-    with pytest.raises(ValueError, match=r"expected 'charge' among .* got \['depth', 'surface_direction'\]"):
+    with pytest.raises(
+        ValueError, match=r"expected the interior samples to have 'charge', got \['depth', 'surface_direction'\]"
+    ):
         PairHistogram([Attribute("charge", [0.1, 0.2]), InteriorDistance()])(batch)
     broken = batch_of(torch.rand(1, 5, 3), None, None, {"depth": torch.full((1, 5), torch.nan)})
     with pytest.raises(ValueError, match="Attribute: expected finite values"):

@@ -67,7 +67,7 @@ def test_does_not_depend_on_order_or_on_the_basis(cloud: tuple[torch.Tensor, tor
     ("embedding", "potential", "message"),
     [
         (torch.zeros(1, 3), torch.zeros(1), "two points"),
-        (torch.zeros(5, 3), torch.zeros(4), r"potential: expected shape \(5,\), one of each point, got \(4,\)"),
+        (torch.zeros(5, 3), torch.zeros(4), r"potential: expected shape \(5,\), one per point, got \(4,\)"),
         (torch.zeros(5), torch.zeros(5), r"embedding: expected shape \(P, D\), got \(5,\)"),
         (torch.full((5, 3), torch.nan), torch.zeros(5), "finite"),
         (torch.zeros(5, 3), -torch.ones(5), "non-negative"),

@@ -107,7 +107,7 @@ def test_a_sample_with_a_wrong_direction_makes_no_ball_small(ball_radii: Radii) 
 def test_three_samples_are_enough_and_two_are_not(ball_radii: Radii) -> None:
     points, outward = torch.eye(3), torch.tensor([0.0, 0.0, 1.0])
     assert ball_radii(points, outward.expand(3, 3)).tolist() == [[10.0, 10.0]] * 3
-    with pytest.raises(ValueError, match="samples: expected at least 3 of each body, which tell its balls, got 2"):
+    with pytest.raises(ValueError, match="samples: expected at least 3 of each body for its balls, got 2"):
         ball_radii(points[:2], outward.expand(2, 3))
 
 

@@ -34,7 +34,7 @@ BACK_ENDS = ["compiled", "torch", pytest.param("cuda", marks=pytest.mark.skipif(
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Where the points are; on the CPU by compiled loops or by operations of PyTorch."""
     if request.param == "torch":
-        monkeypatch.setattr(blocks, "in_loops", lambda _: False)
+        monkeypatch.setattr(blocks, "uses_loops", lambda _: False)
     return "cuda" if request.param == "cuda" else "cpu"
 
 
@@ -125,8 +125,8 @@ def test_histogram_is_the_sum_of_hats_over_all_pairs(
     if block is not None:
         n_rows, n_columns = block
         n_values = max(1, sum("cosines" not in kind for kind in layout))
-        monkeypatch.setattr(count_by_loops, "_MOST_COLUMNS", n_columns)
-        monkeypatch.setattr(count_by_loops, "_BLOCK", n_rows * n_columns * n_values)
+        monkeypatch.setattr(count_by_loops, "_MAX_COLUMNS", n_columns)
+        monkeypatch.setattr(count_by_loops, "_BLOCK_SIZE", n_rows * n_columns * n_values)
         monkeypatch.setattr(count_by_torch, "_BLOCK", n_rows * len(given["points"]) * 4 ** len(layout))
     result = counted(layout, {name: value.to(device) for name, value in given.items()}).cpu()
     axes = [axis for kind in layout for axis in KINDS[kind][1](given)]
@@ -353,8 +353,8 @@ def test_gradients_equal_those_of_the_dense_definition(
 ) -> None:
     """Also by memberships that are zero, whose gradient is not."""
     if block is not None:
-        monkeypatch.setattr(count_by_loops, "_MOST_COLUMNS", block[1])
-        monkeypatch.setattr(count_by_loops, "_BLOCK", math.prod(block))
+        monkeypatch.setattr(count_by_loops, "_MAX_COLUMNS", block[1])
+        monkeypatch.setattr(count_by_loops, "_BLOCK_SIZE", math.prod(block))
         monkeypatch.setattr(count_by_torch, "_BLOCK", block[0] * 29 * 9 * 2 ** len(layout))
     given = {name: value.to(device).requires_grad_() for name, value in some(29).items()}
     pairs = [KINDS[kind][0](given) for kind in layout]
@@ -450,7 +450,7 @@ def good() -> dict[str, Tensor]:
     ("change", "message"),
     [
         ({name: value[:1] for name, value in some(5, 2).items()}, "two points to form a pair, got 1"),
-        ({"points": torch.zeros(4, 3)}, r"expected one of each of the 5 points, got shape \(4, 3\)"),
+        ({"points": torch.zeros(4, 3)}, r"expected values for each of the 5 points, got shape \(4, 3\)"),
         ({"points": torch.full((5, 3), torch.nan)}, "expected finite values, got NaN or infinity"),
         ({"coordinates": torch.full((5, 3), torch.inf)}, "expected finite values, got NaN or infinity"),
         ({"points": torch.tensor([[-1e19], [1e19]] * 2 + [[0.0]])}, "expected distances that can be squared"),

@@ -1,10 +1,11 @@
-"""Formats: a file becomes bodies. Each has a module, and `FORMATS` lists them.
+"""File formats: each module reads one kind of file, and `FORMATS` lists them.
 
 **To add a format**, write a module here with a function `read(path, options, part)` that returns a list of `RawBody`
-and raises anything where the file is faulty; make it a `Format` with its suffixes; and add that to `FORMATS` below.
-The rest is done for it: error messages that name the file, "whole" and "pieces", mending, listing, caching. What a
-header claims is checked before memory is taken (`check_unpacked`), modules that not everybody has are imported within
-`read`, no path that the file holds leads out of its folder, and other files that it reads are told by `Format.beside`.
+and raises any exception if the file is faulty. Make a `Format` of it, with the suffixes of its files, and add that
+`Format` to `FORMATS` below. Error messages that name the file, the bodies "whole" and "pieces", mending, listing and
+caching then work without further code. A reader checks declared sizes before it takes memory for them
+(`check_unpacked`), imports optional dependencies within `read`, and refuses paths in the file that lead out of its
+folder. `Format.beside` lists the other files that it reads.
 """
 
 from pathlib import Path
@@ -27,31 +28,29 @@ FORMATS: tuple[Format, ...] = (
 
 
 def format_of(path: str | Path) -> Format | None:
-    """The format whose suffix ends the file's name, the longest of several; None if there is none."""
+    """Return the format of a file by its suffix, the longest known one that ends the file's name; None if unknown."""
     name = Path(path).name.lower()
-    found = [(len(suffix), kind) for kind in FORMATS for suffix in kind.suffixes if name.endswith(suffix)]
-    ignored = any(name.endswith(suffix) for kind in FORMATS for suffix in kind.ignored)
-    return None if ignored or not found else max(found, key=lambda one: one[0])[1]
+    if any(name.endswith(kind.ignored) for kind in FORMATS):
+        return None
+    matches = {suffix: kind for kind in FORMATS for suffix in kind.suffixes if name.endswith(suffix)}
+    return matches[max(matches, key=len)] if matches else None
 
 
 def files_read(path: Path, options: LoadOptions = LoadOptions()) -> list[Path]:
-    """All files on which the bodies of a file depend, as far as they are there: itself first.
-
-    A MeshError of a file that cannot be read far enough to tell.
-    """
+    """Return a file and existing others on which its bodies depend; a MeshError if it is too damaged to list them."""
     kind = format_of(path)
     if kind is None or kind.beside is None or not path.is_file():
         return [path]
     with faults(path, kind):
-        return [path, *(one for one in kind.beside(path, options) if one.is_file())]
+        return [path, *(other for other in kind.beside(path, options) if other.is_file())]
 
 
 def is_searched(path: str | Path) -> bool:
-    """Whether a file of this name is read where it lies in a folder."""
-    found = format_of(path)
-    return found is not None and found.is_searched
+    """Return whether a file of this name is taken for a body when a folder is searched."""
+    kind = format_of(path)
+    return kind is not None and kind.is_searched
 
 
 def searched_suffixes() -> list[str]:
-    """The suffixes of files that are read where they lie in a folder, sorted."""
+    """Return the suffixes of files that are taken for bodies when a folder is searched, sorted."""
     return sorted(suffix for kind in FORMATS if kind.is_searched for suffix in kind.suffixes)

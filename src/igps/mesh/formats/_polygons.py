@@ -1,15 +1,15 @@
-"""Polygons of a file, cut into triangles."""
+"""Triangulation of the polygons of a file."""
 
 import numpy as np
 
 from igps._arrays import Floats, Integers
 
-# Polygons of more corners are not cut ear by ear: the time grows with the square of their number, or faster.
-_MOST_CORNERS = 2000
+# Larger polygons are cut into fans without regard to folds: ear clipping takes time quadratic in the corners, or worse.
+_MAX_EAR_CORNERS = 2000
 
 
 def triangles(corners: Integers, n_corners: Integers) -> Integers:
-    """Polygons, with their corners laid end to end, cut into triangles from their first corners, (F, 3).
+    """Cut polygons, whose corners are laid end to end, into fans of triangles (F, 3) around their first corners.
 
     Triangles come first, then the first and the second halves of quadrilaterals, then larger polygons.
     """
@@ -19,27 +19,27 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
     pieces += [quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]]
     large = np.flatnonzero(n_corners > 4)
     if len(large):
-        n = n_corners[large] - 2
-        at = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
-        first = np.repeat(starts[large], n)
+        n_triangles = n_corners[large] - 2
+        at = np.arange(n_triangles.sum()) - np.repeat(np.cumsum(n_triangles) - n_triangles, n_triangles)
+        first = np.repeat(starts[large], n_triangles)
         pieces.append(np.stack([corners[first], corners[first + at + 1], corners[first + at + 2]], axis=1))
     return np.concatenate(pieces)
 
 
-def of_strip(corners: Integers) -> Integers:
-    """The triangles (n - 2, 3) of a strip (n,): each has a side of the one before, and is turned like it."""
+def strip_triangles(corners: Integers) -> Integers:
+    """Return the triangles (n − 2, 3) of a strip (n,), all with the orientation of the first."""
     if len(corners) < 3:
         return np.zeros((0, 3), dtype=np.int64)
-    found = np.lib.stride_tricks.sliding_window_view(corners, 3).copy()
-    found[1::2] = found[1::2, ::-1]
-    return found
+    faces = np.lib.stride_tricks.sliding_window_view(corners, 3).copy()
+    faces[1::2] = faces[1::2, ::-1]
+    return faces
 
 
 def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> Integers:
-    """The same, but polygons that would fold over themselves are cut ear by ear (Meisters 1975), and come last.
+    """Triangulate as `triangles` does, except for polygons whose fans would fold over themselves.
 
-    A polygon that crosses itself may run out of ears; the rest is cut from its first corner. Polygons of fewer than
-    three corners have no area, and are left out.
+    Those polygons are triangulated by ear clipping (Meisters 1975), and come last. A polygon that crosses itself may
+    run out of ears; what is left of it is cut into a fan. Polygons of fewer than three corners are dropped.
     """
     has_area = n_corners >= 3
     corners, n_corners = corners[np.repeat(has_area, n_corners)], n_corners[has_area]
@@ -50,33 +50,34 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
     first = np.repeat(corners[starts], n_corners)
     following = np.roll(corners, -1)
     following[starts + n_corners - 1] = corners[starts]
-    doubled = np.cross(vertices[corners] - vertices[first], vertices[following] - vertices[first])
-    whole = np.stack([np.bincount(owner, doubled[:, axis], len(n_corners)) for axis in range(3)], axis=1)
-    with np.errstate(invalid="ignore"):  # what is not finite is refused later
-        turned = np.einsum("ij,ij->i", doubled, whole[owner]) < -1e-9 * np.einsum("ij,ij->i", whole, whole)[owner]
-    folded = np.zeros(len(n_corners), dtype=bool)
-    folded[owner[turned]] = True
-    folded &= n_corners <= _MOST_CORNERS
-    kept = triangles(corners[~folded[owner]], n_corners[~folded])
-    cut = [_without_ears(corners[starts[i] :][: n_corners[i]], vertices, whole[i]) for i in np.flatnonzero(folded)]
-    return np.concatenate([kept, *cut])
+    # Doubled area vectors of the triangles in the fans, and of whole polygons
+    in_fan = np.cross(vertices[corners] - vertices[first], vertices[following] - vertices[first])
+    total = np.stack([np.bincount(owner, in_fan[:, axis], len(n_corners)) for axis in range(3)], axis=1)
+    with np.errstate(invalid="ignore"):  # coordinates that are not finite are refused later
+        is_flipped = np.einsum("ij,ij->i", in_fan, total[owner]) < -1e-9 * np.einsum("ij,ij->i", total, total)[owner]
+    is_folded = np.zeros(len(n_corners), dtype=bool)
+    is_folded[owner[is_flipped]] = True
+    is_folded &= n_corners <= _MAX_EAR_CORNERS
+    fans = triangles(corners[~is_folded[owner]], n_corners[~is_folded])
+    clipped = [_clip_ears(corners[starts[i] :][: n_corners[i]], vertices, total[i]) for i in np.flatnonzero(is_folded)]
+    return np.concatenate([fans, *clipped])
 
 
-def _without_ears(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
-    """Triangles (n − 2, 3) of a polygon (n,) that may have corners turned inwards."""
-    left, found, at, tried = polygon.tolist(), [], 0, 0
-    while tried <= len(left) > 3:
-        a, b, c = (left[(at + k) % len(left)] for k in (-1, 0, 1))
-        three = vertices[[a, b, c]]
-        sides = np.roll(three, -1, axis=0) - three
-        others = vertices[[k for k in left if k not in (a, b, c)]]
-        # On which side of each side the others lie, (n, 3)
-        beside = np.cross(sides, others[:, None] - three) @ normal
+def _clip_ears(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
+    """Triangulate a polygon (n,), which may be concave, into (n − 2, 3) triangles."""
+    remaining, ears, at, n_tried = polygon.tolist(), [], 0, 0
+    while n_tried <= len(remaining) > 3:
+        a, b, c = (remaining[(at + k) % len(remaining)] for k in (-1, 0, 1))
+        triangle = vertices[[a, b, c]]
+        sides = np.roll(triangle, -1, axis=0) - triangle
+        others = vertices[[k for k in remaining if k not in (a, b, c)]]
+        # On which side of each side of the triangle the other corners lie, (n, 3)
+        beside = np.cross(sides, others[:, None] - triangle) @ normal
         if np.cross(sides[0], sides[1]) @ normal > 0 and not (beside >= 0).all(axis=1).any():
-            found.append((a, b, c))
-            del left[at]
-            at, tried = at % len(left), 0
+            ears.append((a, b, c))
+            del remaining[at]
+            at, n_tried = at % len(remaining), 0
         else:
-            at, tried = (at + 1) % len(left), tried + 1
-    rest = [(left[0], left[k], left[k + 1]) for k in range(1, len(left) - 1)]
-    return np.array([*found, *rest], dtype=np.int64)
+            at, n_tried = (at + 1) % len(remaining), n_tried + 1
+    fan = [(remaining[0], remaining[k], remaining[k + 1]) for k in range(1, len(remaining) - 1)]
+    return np.array([*ears, *fan], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""The text of a structure file, as gemmi's models, chains, residues and atoms."""
+"""Structure files of molecules, parsed into gemmi's models, chains, residues and atoms."""
 
 from __future__ import annotations
 
@@ -17,38 +17,39 @@ if TYPE_CHECKING:
     import gemmi
 
 SUFFIXES = frozenset({".pdb", ".ent", ".cif", ".mmcif", ".pqr"})
-"""Of structure files; a further ".gz" may follow."""
+"""Suffixes of structure files; ".gz" may follow."""
 
 # Twice the largest structures of the Protein Data Bank.
-_MOST_BYTES = 2**31
+_MAX_BYTES = 2**31
 _ATOM_LINE = re.compile(rb"^(?:ATOM  |HETATM)[^\r\n]*", re.MULTILINE)
-# Without any of these gemmi reads no atoms.
-_COLUMNS = ("id", "type_symbol", "label_asym_id", "label_alt_id", "Cartn_x", "Cartn_y", "Cartn_z")
+# Columns of _atom_site without which gemmi reads no atoms.
+_REQUIRED_COLUMNS = ("id", "type_symbol", "label_asym_id", "label_alt_id", "Cartn_x", "Cartn_y", "Cartn_z")
 _END_LINE = re.compile(rb"^END[ \t]*$", re.MULTILINE)
-_NUMBER_OF_RESIDUE = re.compile(r"([A-Za-z]?)(-?\d+)([A-Za-z]?)")
+# The chain, number and insertion code of a residue in a PQR file, as in "A12B"; chain and code may be missing.
+_RESIDUE_NUMBER = re.compile(r"([A-Za-z]?)(-?\d+)([A-Za-z]?)")
 
 
-def suffix(path: Path) -> str:
-    """The suffix in lower case, of a gzipped file that before ".gz"."""
+def suffix_of(path: Path) -> str:
+    """Return the suffix in lower case, that before ".gz" for a gzipped file."""
     return Path(path.name.lower().removesuffix(".gz")).suffix
 
 
 def read_structures(path: Path) -> dict[str, gemmi.Structure]:
-    """What the file holds, by its name in the file: one, called "", but for mmCIF with atoms in several blocks of data.
+    """Read the structures of a file by name: one called "", or those of mmCIF with atoms in several data blocks.
 
-    Of a PQR file the charges of atoms are their occupancies, and the radii their B-factors.
+    The atoms of a PQR file carry their charges as occupancies and their radii as B-factors.
     """
-    text = _text(path)
-    if suffix(path) == ".pqr":
+    text = _read_text(path)
+    if suffix_of(path) == ".pqr":
         return {"": _pqr(text, path)}
     gemmi = gemmi_module()
     try:
-        if suffix(path) in (".pdb", ".ent"):
-            return {"": _pdb(_as_models(_ATOM_LINE.sub(_with_numbers, text)))}
+        if suffix_of(path) in (".pdb", ".ent"):
+            return {"": _pdb(_frames_as_models(_ATOM_LINE.sub(_mark_missing, text)))}
         document = gemmi.cif.read_string(text.decode("utf-8", "replace"))
         blocks = [block for block in document if block.find_values("_atom_site.id")] or [document[0]]
         for block in blocks:
-            if missing := [name for name in _COLUMNS if not block.find_values(f"_atom_site.{name}")]:
+            if missing := [name for name in _REQUIRED_COLUMNS if not block.find_values(f"_atom_site.{name}")]:
                 raise ValueError(f"_atom_site has no {', '.join(missing)}")
             _mark_unknown(block)
         names = distinct(block.name for block in blocks) if len(blocks) > 1 else [""]
@@ -61,29 +62,29 @@ def read_structures(path: Path) -> dict[str, gemmi.Structure]:
 def parts_of(
     structures: Mapping[str, gemmi.Structure], bodies: str, path: Path
 ) -> Iterator[tuple[str, list[gemmi.Chain], list[str]]]:
-    """The name of each body, its chains, and notes."""
+    """Yield the name of each body, its chains, and notes."""
     gemmi = gemmi_module()
-    for name, structure, model in ((name, one, model) for name, one in structures.items() for model in one):
-        of = f"{name} " * bool(name) + f"model {model.num} " * (len(structure) > 1)
+    for name, structure, model in ((name, item, model) for name, item in structures.items() for model in item):
+        prefix = f"{name} " * bool(name) + f"model {model.num} " * (len(structure) > 1)
         if bodies == "chains":
-            # A chain may come in several pieces.
+            # The atoms of a chain may stand in several places of the file
             for label in dict.fromkeys(chain.name for chain in model):
-                yield f"{path}#{of}chain {label or 'without name'}", [c for c in model if c.name == label], []
+                yield f"{path}#{prefix}chain {label or 'without name'}", [c for c in model if c.name == label], []
         elif bodies == "assembly" and len(structure.assemblies):
-            first = structure.assemblies[0]
+            assembly = structure.assemblies[0]
             try:
-                made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
+                chains = gemmi.make_assembly(assembly, model, gemmi.HowToNameCopiedChain.AddNumber)
             except RuntimeError as error:
-                fault = f"{path}: {of}assembly {first.name} cannot be made of the file's chains ({error})."
-                raise MeshError(f"{fault} Take the whole file, or its models or chains as bodies.") from error
-            yield f"{path}#{of}assembly {first.name}", list(made), []
+                fault = f"{path}: {prefix}assembly {assembly.name} cannot be made of the file's chains ({error})."
+                raise MeshError(f"{fault} Take the whole file, its models or its chains as bodies.") from error
+            yield f"{path}#{prefix}assembly {assembly.name}", list(chains), []
         else:
-            notes = ["the file names no assembly: the model was taken as it is"] if bodies == "assembly" else []
-            yield f"{path}#{of}".strip("# "), list(model), notes
+            notes = ["the file defines no assembly: the model was used"] if bodies == "assembly" else []
+            yield f"{path}#{prefix}".strip("# "), list(model), notes
 
 
 def gemmi_module() -> Any:
-    """Gemmi, or an ImportError that says how to install it."""
+    """Import gemmi, or raise an ImportError that tells how to install it."""
     try:
         import gemmi
     except ImportError as error:
@@ -91,27 +92,27 @@ def gemmi_module() -> Any:
     return gemmi
 
 
-def _text(path: Path) -> bytes:
-    if suffix(path) not in SUFFIXES:
+def _read_text(path: Path) -> bytes:
+    if suffix_of(path) not in SUFFIXES:
         raise MeshError(f"{path}: expected a structure in {', '.join(sorted(SUFFIXES))}, gzipped or not.")
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
     try:
         with gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb") as file:
-            text = file.read(_MOST_BYTES + 1)
+            text = file.read(_MAX_BYTES + 1)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise MeshError(f"{path}: the gzipped file is cut short or damaged ({error}). Download it again.") from error
-    if len(text) > _MOST_BYTES:
-        raise MeshError(f"{path}: more than {_MOST_BYTES:,} bytes of text, which no structure has. Check the file.")
+    if len(text) > _MAX_BYTES:
+        raise MeshError(f"{path}: expected at most {_MAX_BYTES:,} bytes of text, got more. Check the file.")
     if not text.strip():
         raise MeshError(f"{path}: the file is empty. Export it again.")
     return text.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
 
 
 def _pdb(text: bytes) -> gemmi.Structure:
-    """A structure in which no residue is told to be of a polymer unless the file lists the polymers' sequences.
+    """Parse a PDB file, and mark residues as parts of polymers only if the file lists the polymers' sequences.
 
-    Before TER, where gemmi takes all for polymers, some programs write ligands, too.
+    Gemmi takes every residue before TER for a part of a polymer, but some programs write ligands there, too.
     """
     structure = gemmi_module().read_pdb_string(text)
     if not any(entity.full_sequence for entity in structure.entities):
@@ -120,30 +121,30 @@ def _pdb(text: bytes) -> gemmi.Structure:
     return structure
 
 
-def _with_numbers(line: re.Match[bytes]) -> bytes:
-    """A line of a PDB file, with NaN where a coordinate or B-factor is no number: gemmi would read a 0 or 20 there."""
-    whole = line.group()
+def _mark_missing(line: re.Match[bytes]) -> bytes:
+    """Put NaN for coordinates and B-factors of a PDB line that are no numbers: gemmi would read them as 0 or 20."""
+    text = line.group()
     for start, end in ((30, 38), (38, 46), (46, 54), (60, 66)):
         try:
-            float(whole[start:end])
+            float(text[start:end])
         except ValueError:
-            if len(whole) >= 54:
-                whole = whole[:start].ljust(start) + b"nan".rjust(end - start) + whole[end:]
-    return whole
+            if len(text) >= 54:
+                text = text[:start].ljust(start) + b"nan".rjust(end - start) + text[end:]
+    return text
 
 
-def _as_models(text: bytes) -> bytes:
-    """What END parts, as frames of simulations are, becomes models: gemmi would read the first alone."""
+def _frames_as_models(text: bytes) -> bytes:
+    """Turn frames of a simulation, separated by END, into models: gemmi would read the first frame only."""
     frames = [frame for frame in _END_LINE.split(text) if _ATOM_LINE.search(frame)]
     return b"ENDMDL\n".join(frames) if len(frames) > 1 else text
 
 
 def _mark_unknown(block: gemmi.cif.Block) -> None:
-    """NaN where a B-factor is not known: gemmi would read 20."""
+    """Put NaN for unknown B-factors of mmCIF: gemmi would read them as 20."""
     column = block.find_values("_atom_site.B_iso_or_equiv")
     if not column and (loop := block.find_values("_atom_site.id").get_loop()):
         loop.add_columns(["_atom_site.B_iso_or_equiv"], "nan")
-    elif not column:  # of a single atom
+    elif not column:  # a single atom, without a loop
         block.set_pair("_atom_site.B_iso_or_equiv", "nan")
     for row, value in enumerate(column):
         if value in ("?", "."):
@@ -151,9 +152,9 @@ def _mark_unknown(block: gemmi.cif.Block) -> None:
 
 
 def _pqr(text: bytes, path: Path) -> gemmi.Structure:
-    """Fields are separated by blanks: type, serial number, atom, residue, [chain,] number, x, y, z, charge, radius.
+    """Parse a PQR file: lines of type, serial number, atom, residue, [chain,] number, x, y, z, charge and radius.
 
-    Where numbers are long, some programs leave no blank between "HETATM" and the serial, or chain and number.
+    Fields are separated by blanks, but some programs leave none before long numbers behind "HETATM" or the chain.
     """
     gemmi = gemmi_module()
     structure = gemmi.Structure()
@@ -166,16 +167,16 @@ def _pqr(text: bytes, path: Path) -> gemmi.Structure:
         fields = line.replace("HETATM", "HETATM ", 1).split()
         try:
             x, y, z, charge, radius = map(float, fields[-5:])
-            name, residue, *chain, place = fields[2:-5]
-            found = _NUMBER_OF_RESIDUE.fullmatch(place)
-            if len(name) > 4 or len(chain) > 1 or found is None or not radius >= 0:
-                raise ValueError("10 or 11 fields, the last a radius of at least 0, were expected")
-            chain = chain or [found[1]]
+            name, residue, *chain, residue_number = fields[2:-5]
+            match = _RESIDUE_NUMBER.fullmatch(residue_number)
+            if len(name) > 4 or len(chain) > 1 or match is None or not radius >= 0:
+                raise ValueError("expected 10 or 11 fields, the last a radius of at least 0")
+            chain = chain or [match[1]]
         except ValueError as error:
             fault = f"{path}: line {number} is no atom of a PQR file ({error})."
-            raise MeshError(f"{fault} It may be cut short; write it again, with blanks between fields.") from error
+            raise MeshError(f"{fault} It may be cut short. Write it again, with blanks between fields.") from error
         residues = chains.setdefault(chain[0], [])
-        key = gemmi.SeqId(int(found[2]), found[3] or " ")
+        key = gemmi.SeqId(int(match[2]), match[3] or " ")
         if not residues or residues[-1].seqid != key or residues[-1].name != residue:
             new = gemmi.Residue()
             new.name, new.seqid, new.het_flag = residue, key, line[0]
@@ -188,7 +189,7 @@ def _pqr(text: bytes, path: Path) -> gemmi.Structure:
 
 
 def _add_model(structure: gemmi.Structure, chains: dict[str, list[Any]]) -> None:
-    """Move the chains, if there are any, to a new model."""
+    """Move the collected chains, if any, to a new model of the structure."""
     gemmi = gemmi_module()
     model = gemmi.Model(len(structure) + 1)
     for name, residues in chains.items():

@@ -1,4 +1,4 @@
-"""What trimesh reads, from bytes: of other files it gets those of the same folder alone."""
+"""Formats that trimesh reads; it gets bytes, and other files only from the same folder."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from igps.mesh.options import LoadOptions
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
-class Beside(trimesh.resolvers.Resolver):
-    """The files of one folder, and those below it."""
+class FolderResolver(trimesh.resolvers.Resolver):
+    """Access of trimesh to the files in and below one folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder.resolve()
 
-    def place(self, name: str) -> Path:
-        """The file of a name, in which blanks and the like may be written as in addresses."""
-        place = (self._folder / name).resolve()
-        place = place if place.is_file() else (self._folder / unquote(name)).resolve()
-        if not place.is_relative_to(self._folder):
+    def path(self, name: str) -> Path:
+        """Return the path of a file; characters of the name may be escaped as in URLs."""
+        path = (self._folder / name).resolve()
+        path = path if path.is_file() else (self._folder / unquote(name)).resolve()
+        if not path.is_relative_to(self._folder):
             raise ValueError(f"it refers to {name!r}, outside of its folder")
-        return place
+        return path
 
     def get(self, name: str) -> bytes:
-        return self.place(name).read_bytes()
+        return self.path(name).read_bytes()
 
     def keys(self) -> list[str]:
         return []
 
-    def namespaced(self, namespace: str) -> Beside:
+    def namespaced(self, namespace: str) -> FolderResolver:
         return self
 
     def write(self, name: str, data: bytes) -> None:
@@ -47,12 +47,12 @@ class Beside(trimesh.resolvers.Resolver):
 
 
 def objects(path: Path, options: LoadOptions, content: bytes | None = None, **loading: Any) -> list[RawBody]:
-    """A body for each place of a scene where a geometry stands; `loading` is for trimesh."""
+    """Return a body for each node of a scene that has a geometry; `loading` is passed to trimesh."""
     loading = {"file_type": path.suffix.lower().lstrip("."), **loading}
     stream = BytesIO(path.read_bytes() if content is None else content)
-    scene = trimesh.load_scene(stream, resolver=Beside(path.parent), process=False, **loading)
+    scene = trimesh.load_scene(stream, resolver=FolderResolver(path.parent), process=False, **loading)
     nodes = [(node, *scene.graph.get(node)) for node in scene.graph.nodes_geometry]
-    sizes = {name: 24 * (len(one.vertices) + len(getattr(one, "faces", ()))) for name, one in scene.geometry.items()}
+    sizes = {name: 24 * (len(x.vertices) + len(getattr(x, "faces", ()))) for name, x in scene.geometry.items()}
     check_unpacked(sum(sizes[name] for _, _, name in nodes), path, options.max_unpacked)
     bodies = []
     for part, (_, matrix, name) in zip(distinct(str(node) for node, _, _ in nodes), nodes, strict=True):
@@ -68,15 +68,15 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
             bodies.append(RawBody(vertices, part=part, normals=np.hstack(normals) if len(normals) == 3 else None))
             continue
         faces = np.asarray(geometry.faces, dtype=np.int64)
-        turned = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
-        bodies.append(RawBody(vertices, np.ascontiguousarray(turned), part))
+        faces = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces  # turned back if mirrored
+        bodies.append(RawBody(vertices, np.ascontiguousarray(faces), part))
     if not bodies:
         raise ValueError("it holds no surface")
     return bodies
 
 
 def ply_columns(scene: trimesh.Scene) -> dict[str, NDArray[Any]]:
-    """(V, C) of every property of the vertices of a PLY file, which trimesh keeps in its metadata."""
-    raws = (thing.metadata.get("_ply_raw", {}) for thing in (scene, *scene.geometry.values()))
-    rows: dict[str, Any] = next((one["vertex"] for one in raws if "data" in one.get("vertex", {})), {"properties": ()})
-    return {name: np.asarray(rows["data"][name]).reshape(rows["length"], -1) for name in rows["properties"]}
+    """Return the properties of the vertices of a PLY file, (V, C) by name, from trimesh's metadata."""
+    raw = (item.metadata.get("_ply_raw", {}).get("vertex", {}) for item in (scene, *scene.geometry.values()))
+    vertex: dict[str, Any] = next((x for x in raw if "data" in x), {"properties": ()})
+    return {name: np.asarray(vertex["data"][name]).reshape(vertex["length"], -1) for name in vertex["properties"]}

@@ -1,4 +1,4 @@
-"""XML from strangers: no entities, no other files, and arrays that unpack to no more than they announce."""
+"""Untrusted XML: entities and references to other files are refused, and arrays must unpack to their declared size."""
 
 import lzma
 import zlib
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 
 def parse(content: bytes) -> ElementTree.Element:
-    """The tree of a document, with names without prefixes."""
+    """Parse a document into a tree; prefixes of element names are removed."""
     builder = ElementTree.TreeBuilder()
     parser = _parser(lambda name, attributes: builder.start(name, attributes))
     parser.EndElementHandler = builder.end
@@ -22,7 +22,7 @@ def parse(content: bytes) -> ElementTree.Element:
 
 
 def walk(stream: Any, start: Callable[[str, dict[str, str]], Any]) -> None:
-    """Call `start` with the name, without prefix, and the attributes of every element of a document, as it is read."""
+    """Call `start` with the name, without prefix, and the attributes of every element while a document is read."""
     _parser(start).ParseFile(stream)
 
 
@@ -35,20 +35,20 @@ def _parser(start: Callable[[str, dict[str, str]], Any]) -> expat.XMLParserType:
 
 
 def _refuse(name: str, *_: object) -> None:
-    raise ValueError(f"its XML declares the entity {name!r}, which such files do without")
+    raise ValueError(f"its XML declares the entity {name!r}, which is not allowed")
 
 
 def from_text(text: str, kind: np.dtype) -> NDArray[np.generic]:
-    """Numbers separated by white space."""
-    return np.array(text.split(), dtype=kind)  # as an array of words it would be as wide as the longest
+    """Parse numbers separated by white space."""
+    return np.array(text.split(), dtype=kind)  # an array of strings would be as wide as the longest
 
 
 def inflated(content: bytes, n_bytes: int, name: str = "zlib") -> bytes:
-    """The bytes of a compressed block; a ValueError if they are not as many as expected."""
+    """Decompress a block with zlib or lzma; a ValueError if the result has not `n_bytes` bytes."""
     if name == "lzma":
         unpacked = lzma.LZMADecompressor().decompress(content, n_bytes + 1)
     else:
-        unpacked = zlib.decompressobj(wbits=47).decompress(content, n_bytes + 1)  # with a header of zlib or gzip
+        unpacked = zlib.decompressobj(wbits=47).decompress(content, n_bytes + 1)  # zlib or gzip by the header
     if len(unpacked) != n_bytes:
-        raise ValueError(f"a block unpacks to {len(unpacked)} bytes or more, not to the {n_bytes} that it announces")
+        raise ValueError(f"a block unpacks to {len(unpacked)} bytes or more, expected {n_bytes}")
     return unpacked

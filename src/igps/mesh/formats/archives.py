@@ -1,4 +1,4 @@
-"""Archives and compressed files: unpacked to a folder of their own, as far as is allowed, and read there."""
+"""Archives and compressed files: unpacked to a temporary folder, up to the allowed size, and read there."""
 
 import bz2
 import gzip
@@ -22,15 +22,15 @@ _OPENERS: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """A body for each file that is one, by its name."""
+    """Return a body, named by its path in the archive, for each file in a known format."""
     bodies = []
     with tempfile.TemporaryDirectory() as folder:
-        for name, place in _unpacked(path, Path(folder), options):
+        for name, unpacked in _unpack(path, Path(folder), options):
             try:
-                if part in (None, name) and (found := _inside(place, path, options, None)):
-                    bodies.append(replace(joined(found), part=name))
+                if part in (None, name) and (inner := _read_unpacked(unpacked, path, options, None)):
+                    bodies.append(replace(joined(inner), part=name))
             except MeshError as fault:
-                if options.bodies != "objects":  # the whole would lack it
+                if options.bodies != "objects":  # otherwise the whole would be incomplete
                     raise
                 bodies.append(RawBody(part=name, fault=fault))
     if not bodies:
@@ -40,60 +40,62 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 
 def read_compressed(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder) / path.stem
+        unpacked = Path(folder) / path.stem
         with _OPENERS[path.suffix.lower()](path) as stream:
-            _copy(_Counted(stream, path, options), place)
-        found = _inside(place, path, options, part)
-    if not found:
-        raise ValueError(f"{path.stem} has no suffix of a format that is known")
-    return found
+            _copy(_LimitedStream(stream, path, options), unpacked)
+        bodies = _read_unpacked(unpacked, path, options, part)
+    if not bodies:
+        raise ValueError(f"{path.stem} has no suffix of a known format")
+    return bodies
 
 
-def _inside(place: Path, path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """What an unpacked file holds; nothing if it is none of a body."""
+def _read_unpacked(unpacked: Path, path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """Read the bodies of a file unpacked from `path`; none if its format is unknown or is that of an archive."""
     from igps.mesh.formats import format_of
 
-    kind = format_of(place)
+    kind = format_of(unpacked)
     if kind is None or not kind.is_searched:
         return []
     try:
-        with faults(place, kind):
-            return list(kind.read(place, options, part))
+        with faults(unpacked, kind):
+            return list(kind.read(unpacked, options, part))
     except MeshError as error:
-        raise MeshError(str(error).replace(str(place), f"{path}: {place.name}")) from error
+        raise MeshError(str(error).replace(str(unpacked), f"{path}: {unpacked.name}")) from error
 
 
-def _unpacked(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str, Path]]:
-    """The names of the files in an archive, and where they are now; without links, hidden files and paths out of it."""
-    found = []
+def _unpack(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str, Path]]:
+    """Unpack an archive, without links, hidden files and paths out of the folder; return names and unpacked files."""
+    files = []
     with _members(path, options) as members:
         for name, stream in members:
-            inside = PurePosixPath(name.replace("\\", "/"))
-            place = folder / inside  # elsewhere, of a name that begins with a slash, or on Windows with a drive
-            if not place.is_relative_to(folder) or any(one.startswith(".") for one in inside.parts) or not inside.name:
-                continue  # a Mac adds a hidden file of the same suffix to each
-            place.parent.mkdir(parents=True, exist_ok=True)
-            _copy(stream, place)
-            found.append((name, place))
-    return found
+            member = PurePosixPath(name.replace("\\", "/"))
+            target = folder / member  # outside of the folder if the name begins with a slash, or a drive of Windows
+            # Parts with a leading dot are "..", or hidden: macOS adds hidden files with the suffixes of the others
+            is_inside = target.is_relative_to(folder) and not any(part.startswith(".") for part in member.parts)
+            if is_inside and member.name:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                _copy(stream, target)
+                files.append((name, target))
+    return files
 
 
 @contextmanager
 def _members(path: Path, options: LoadOptions) -> Iterator[Iterator[tuple[str, IO[bytes]]]]:
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            files = [one for one in archive.infolist() if not one.is_dir()]
-            check_unpacked(sum(one.file_size for one in files), path, options.max_unpacked)  # no more is read of any
-            yield ((one.filename, archive.open(one)) for one in files)
+            files = [info for info in archive.infolist() if not info.is_dir()]
+            # The module reads no more of a member than its declared size
+            check_unpacked(sum(info.file_size for info in files), path, options.max_unpacked)
+            yield ((info.filename, archive.open(info)) for info in files)
         return
-    last = path.suffix.lower()
-    opener = _OPENERS.get({".tgz": ".gz", ".tbz2": ".bz2", ".txz": ".xz"}.get(last, last), open)
-    with opener(path, "rb") as stream, tarfile.open(fileobj=_Counted(stream, path, options), mode="r|") as packed:
-        yield ((one.name, file) for one in packed if one.isreg() and (file := packed.extractfile(one)))
+    suffix = path.suffix.lower()
+    opener = _OPENERS.get({".tgz": ".gz", ".tbz2": ".bz2", ".txz": ".xz"}.get(suffix, suffix), open)
+    with opener(path, "rb") as stream, tarfile.open(fileobj=_LimitedStream(stream, path, options), mode="r|") as packed:
+        yield ((info.name, file) for info in packed if info.isreg() and (file := packed.extractfile(info)))
 
 
-class _Counted(io.RawIOBase):
-    """A stream that gives no more than is allowed."""
+class _LimitedStream(io.RawIOBase):
+    """A stream that raises a MeshError once more bytes than allowed are read."""
 
     def __init__(self, stream: Any, path: Path, options: LoadOptions) -> None:
         self._stream, self._path, self._limit, self._n_read = stream, path, options.max_unpacked, 0
@@ -105,8 +107,8 @@ class _Counted(io.RawIOBase):
         return content
 
 
-def _copy(stream: Any, place: Path) -> None:
-    with place.open("wb") as out:
+def _copy(stream: Any, target: Path) -> None:
+    with target.open("wb") as out:
         shutil.copyfileobj(stream, out)
 
 

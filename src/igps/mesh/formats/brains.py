@@ -1,4 +1,4 @@
-"""Surfaces of brains: GIFTI, and FreeSurfer's triangle files (lh.pial, ...). Both are in millimetres."""
+"""Surfaces of brains in GIFTI and in FreeSurfer's triangle files (lh.pial, ...), both in millimetres."""
 
 import base64
 import re
@@ -16,13 +16,14 @@ from igps.mesh.options import LoadOptions
 
 _TYPES = {"NIFTI_TYPE_FLOAT32": "f4", "NIFTI_TYPE_FLOAT64": "f8", "NIFTI_TYPE_INT32": "i4", "NIFTI_TYPE_UINT8": "u1"}
 _POINTS, _TRIANGLES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
-_MOST_AXES = 6
+_MAX_AXES = 6
 _MAGIC = b"\xff\xff\xfe"
-# A mark of those whose points are in the coordinates of images.
-_IN_SCANNER = np.array([2, 1], ">i4").tobytes()
-# Where the end of a surface file of FreeSurfer tells of the volume that the surface was made of.
-_AXES = re.compile(rb"^[xyzc]ras\s*=\s*(\S+)\s+(\S+)\s+(\S+)", re.MULTILINE)
-_AXES_OF_SURFACES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+# A tag behind the triangles of FreeSurfer files whose points are in the coordinates of images.
+_SCANNER_TAG = np.array([2, 1], ">i4").tobytes()
+# Lines at the end of a FreeSurfer file: axes and centre of the volume from which the surface was made.
+_VOLUME_AXES = re.compile(rb"^[xyzc]ras\s*=\s*(\S+)\s+(\S+)\s+(\S+)", re.MULTILINE)
+# The axes of that volume in the coordinates of the surface.
+_SURFACE_AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _SURFACES = ("pial", "white", "inflated", "orig", "smoothwm", "sphere", "sphere.reg")
 
 
@@ -30,27 +31,27 @@ def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBo
     root = _xml.parse(path.read_bytes())
     arrays = {
         intent: _array(element, path, options)
-        for element in reversed(list(root.iter("DataArray")))  # the first of several stays
+        for element in reversed(list(root.iter("DataArray")))  # the first of several wins
         if (intent := element.get("Intent")) in (_POINTS, _TRIANGLES)
     }
     if len(arrays) < 2:
-        raise ValueError("no surface in it: it lacks points or triangles; maps of values on a surface have neither")
+        raise ValueError("no surface in it: expected points and triangles, which maps of values on a surface lack")
     return [RawBody(arrays[_POINTS].astype(np.float64), arrays[_TRIANGLES].astype(np.int64), unit="mm")]
 
 
 def gifti_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
-    """The arrays of values at vertices of a GIFTI file, by their names."""
-    found = {}
+    """Return the arrays of values at vertices of a GIFTI file by name."""
+    arrays = {}
     for number, element in enumerate(_xml.parse(path.read_bytes()).iter("DataArray"), 1):
         if element.get("Intent") not in (_POINTS, _TRIANGLES):
-            names = [one.findtext("Value") for one in element.iter("MD") if one.findtext("Name") == "Name"]
-            found[(names or [None])[0] or f"array {number}"] = _array(element, path, options)
-    return found
+            names = [entry.findtext("Value") for entry in element.iter("MD") if entry.findtext("Name") == "Name"]
+            arrays[(names or [None])[0] or f"array {number}"] = _array(element, path, options)
+    return arrays
 
 
 def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.generic]:
-    if (n_axes := int(element.get("Dimensionality", "2"))) > _MOST_AXES:
-        raise ValueError(f"an array of {n_axes} axes, of which GIFTI has {_MOST_AXES} at most")
+    if (n_axes := int(element.get("Dimensionality", "2"))) > _MAX_AXES:
+        raise ValueError(f"an array of {n_axes} axes, expected at most {_MAX_AXES}")
     shape = [int(element.get(f"Dim{i}", "0")) for i in range(n_axes)]
     kind = np.dtype(_TYPES[element.get("DataType", "")])
     n_bytes = prod(shape) * kind.itemsize
@@ -63,40 +64,40 @@ def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.gen
         content = _xml.inflated(content, n_bytes) if encoding.startswith("GZip") else content
         values = np.frombuffer(content, kind.newbyteorder("<" if element.get("Endian") == "LittleEndian" else ">"))
     else:
-        raise ValueError(f"its numbers are encoded as {encoding}, which is not read")
-    by_columns = element.get("ArrayIndexingOrder") == "ColumnMajorOrder"
-    return values.reshape(shape[::-1]).T if by_columns else values.reshape(shape)
+        raise ValueError(f"its numbers are encoded as {encoding}, which is not supported")
+    is_column_major = element.get("ArrayIndexingOrder") == "ColumnMajorOrder"
+    return values.reshape(shape[::-1]).T if is_column_major else values.reshape(shape)
 
 
 def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     content = path.read_bytes()
-    at = content.find(b"\n\n") + 2  # behind a line that tells who made it
+    at = content.find(b"\n\n") + 2  # behind a line about the author
     if not content.startswith(_MAGIC) or at < 2:
         raise ValueError("not a triangle file of FreeSurfer")
     n_vertices, n_faces = (int(n) for n in np.frombuffer(content, ">i4", 2, at))
-    needed, there = 12 * (n_vertices + n_faces), len(content) - at - 8
-    if min(n_vertices, n_faces) < 0 or there < needed:
-        raise ValueError(f"{n_vertices} vertices and {n_faces} triangles announced, {there} of {needed} bytes there")
+    n_expected, n_bytes = 12 * (n_vertices + n_faces), len(content) - at - 8
+    if min(n_vertices, n_faces) < 0 or n_bytes < n_expected:
+        raise ValueError(f"expected {n_vertices} vertices, {n_faces} triangles, {n_expected} bytes, got {n_bytes}")
     vertices = np.frombuffer(content, ">f4", 3 * n_vertices, at + 8).astype(np.float64)
     faces = np.frombuffer(content, ">i4", 3 * n_faces, at + 8 + 12 * n_vertices).astype(np.int64)
     return [RawBody(vertices.reshape(-1, 3), faces.reshape(-1, 3), unit="mm")]
 
 
 def in_scanner(path: Path, points: Floats) -> Floats:
-    """Points (P, 3) of the body of a file in the coordinates of images.
+    """Transform points (P, 3) from the coordinates of a surface file to those of images.
 
-    Points of FreeSurfer's triangle files have their origin in the middle of a volume, whose place and axes are written
-    at the end of the file. Those of other files are in the coordinates of images already.
+    FreeSurfer's triangle files have their origin in the centre of a volume, whose position and axes stand at the end of
+    the file. The points of other files are returned unchanged: they are in the coordinates of images.
     """
     if not path.name.lower().endswith(FREESURFER.suffixes):
         return points
     content = path.read_bytes()
     at = content.find(b"\n\n") + 2
     tail = content[at + 8 + 12 * int(np.frombuffer(content, ">i4", 2, at).sum()) :]
-    told = np.array(_AXES.findall(tail), dtype=np.float64)
-    if told.shape != (4, 3) or not re.search(rb"valid\s*=\s*1", tail) or tail[:8] == _IN_SCANNER:
+    axes = np.array(_VOLUME_AXES.findall(tail), dtype=np.float64)  # and the centre, (4, 3)
+    if axes.shape != (4, 3) or not re.search(rb"valid\s*=\s*1", tail) or tail[:8] == _SCANNER_TAG:
         return points
-    return points @ _AXES_OF_SURFACES.T @ told[:3] + told[3]
+    return points @ _SURFACE_AXES.T @ axes[:3] + axes[3]
 
 
 GIFTI = Format("GIFTI", (".gii",), read_gifti, ignored=(".func.gii", ".label.gii", ".shape.gii", ".time.gii"))

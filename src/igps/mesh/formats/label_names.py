@@ -1,4 +1,4 @@
-"""Names of labels: by a table of ITK-SNAP, 3D Slicer, FreeSurfer, FSLeyes, nnU-Net, by CSV, or of NIfTI or MGH."""
+"""Names of labels, from tables of ITK-SNAP, 3D Slicer, FreeSurfer, FSLeyes and nnU-Net, CSV, and NIfTI or MGH files."""
 
 import csv
 import html
@@ -13,26 +13,26 @@ from igps.mesh.mesh import MeshError
 
 logger = logging.getLogger(__name__)
 
-_SUFFIXES = (".label", ".ctbl", ".lut", ".txt", ".csv", ".tsv", ".json")  # of tables for a volume
-_BESIDE = ("FreeSurferColorLUT.txt", "dataset.json")  # for all volumes of a folder
-_MOST_BYTES = 1 << 24
+_SUFFIXES = (".label", ".ctbl", ".lut", ".txt", ".csv", ".tsv", ".json")  # of tables for one volume
+_FOLDER_TABLES = ("FreeSurferColorLUT.txt", "dataset.json")  # for all volumes of a folder
+_MAX_BYTES = 1 << 24
 # ITK-SNAP: index, three colours, opacity, visibility, mesh visibility, "name".
 _SNAP = re.compile(r'(\d+)(?:\s+[\d.]+){6}\s+"([^"]*)"')
 # FSLeyes: index, three colours, name to the end of the line.
 _FSLEYES = re.compile(r"(\d+)(?:\s+[\d.]+){3}\s+(?![\d.\s]*$)(.+)")
-# 3D Slicer and FreeSurfer: index, name, colours; 3D Slicer quotes names, or has _ for a space.
+# 3D Slicer and FreeSurfer: index, name, colours; 3D Slicer quotes names, or writes _ for a space.
 _COLOURS = re.compile(r'(\d+)\s+("[^"]*"|\S+)(?:\s+[\d.]+){3,4}')
 _WORKBENCH = re.compile(rb"<Label\b([^>]*)>(.*?)</Label>", re.DOTALL)
 _KEY = re.compile(rb"""\bKey\s*=\s*["'](\d+)["']""")
-_COLOUR_TABLE, _NEW_LAYOUT = 1, -2  # in an MGH file
+_COLOUR_TABLE, _NEW_LAYOUT = 1, -2  # a tag of an MGH file, and the version of the table behind it
 
 
 def read_label_names(path: str | Path) -> dict[int, str]:
-    """The names that a table gives to labels.
+    """Read a table of the names of labels.
 
-    Label descriptions of ITK-SNAP, colour tables of 3D Slicer, FreeSurfer and FSLeyes, JSON from numbers to names or
-    back, also under "labels" as nnU-Net has it, and CSV or TSV whose first line names a column of labels (label,
-    LabelValue, index, id or value) and one of names (name or label_name).
+    Supported are label descriptions of ITK-SNAP; colour tables of 3D Slicer, FreeSurfer and FSLeyes; JSON that maps
+    numbers to names or names to numbers, at the top level or, as in nnU-Net, under "labels"; and CSV or TSV whose first
+    line names a column of labels (label, LabelValue, index, id or value) and a column of names (name or label_name).
 
     Example:
         >>> import tempfile
@@ -46,12 +46,12 @@ def read_label_names(path: str | Path) -> dict[int, str]:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise MeshError(f"{path}: {path.stat().st_size:,} bytes are no table of names. Give the table.")
+        if path.stat().st_size > _MAX_BYTES:
+            raise MeshError(f"{path}: {path.stat().st_size:,} bytes are too many for a table of names. Check the path.")
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
-        raise MeshError(f"{path}: the names of labels are not readable ({error}). Check the path.") from error
-    names = _of_json(text) if path.suffix.lower() == ".json" else _of_csv(text) or _of_lines(text)
+        raise MeshError(f"{path}: the table of names is not readable ({error}). Check the path.") from error
+    names = _parse_json(text) if path.suffix.lower() == ".json" else _parse_csv(text) or _parse_lines(text)
     if not names:
         raise MeshError(
             f"{path}: names no label. Expected label descriptions of ITK-SNAP, a colour table of 3D Slicer, "
@@ -61,21 +61,21 @@ def read_label_names(path: str | Path) -> dict[int, str]:
 
 
 def table_beside(path: Path) -> Path | None:
-    """The first table of names beside a volume: under its name, or of FreeSurfer or nnU-Net for the folder; or none."""
+    """Return the first readable table of names beside a volume: named like the volume, or for the folder; else None."""
     stem = re.sub(r"(\.seg)?\.[^.]+(\.gz)?$", "", path.name, flags=re.IGNORECASE)
-    for name in (*(stem + suffix for suffix in _SUFFIXES), *_BESIDE):
+    for name in (*(stem + suffix for suffix in _SUFFIXES), *_FOLDER_TABLES):
         table = path.with_name(name)
         if table != path and table.is_file():
             try:
                 read_label_names(table)
                 return table
             except MeshError as error:
-                logger.info("%s: no names from the file beside it: %s", path, error)
+                logger.info("%s: the file beside it is not used as a table of names: %s", path, error)
     return None
 
 
 def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:
-    """Those in the extensions of a NIfTI header, as Connectome Workbench and TotalSegmentator write them; or none."""
+    """Return the names of labels in NIfTI header extensions as Connectome Workbench and TotalSegmentator write them."""
     names: dict[int, str] = {}
     for content in contents:
         for attributes, name in _WORKBENCH.findall(content):
@@ -86,55 +86,55 @@ def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:
 
 
 def names_in_tags(content: bytes) -> dict[int, str]:
-    """Those of the colour table among the tags at the end of an MGH file, as FreeSurfer writes it; or none.
+    """Return the names of labels of the colour table in the tags at the end of an MGH file, as FreeSurfer writes it.
 
-    Big-endian numbers: a tag and the bytes that follow it, but for the table, which begins at once.
+    Numbers are big-endian. Behind each tag stand the size and the content, behind the colour table's only the content.
     """
     stream = io.BytesIO(content)
 
-    def number(size: int = 4) -> int:
+    def read_number(size: int = 4) -> int:
         return int.from_bytes(stream.read(size), "big", signed=True)  # 0 at the end
 
-    def words() -> bytes:
-        return stream.read(max(number(), 0))
+    def read_bytes() -> bytes:
+        return stream.read(max(read_number(), 0))
 
-    while (tag := number()) not in (0, _COLOUR_TABLE):
-        stream.seek(min(max(number(8), 0), len(content)), io.SEEK_CUR)
+    while (tag := read_number()) not in (0, _COLOUR_TABLE):
+        stream.seek(min(max(read_number(8), 0), len(content)), io.SEEK_CUR)
     names: dict[int, str] = {}
-    if tag and number() == _NEW_LAYOUT:
-        number(), words()  # the largest label, the file of the table
-        for _ in range(min(number(), len(content) // 24)):  # a label without a name takes as many bytes
-            label, name = number(), words()
+    if tag and read_number() == _NEW_LAYOUT:
+        read_number(), read_bytes()  # the largest label, the path of the table
+        for _ in range(min(read_number(), len(content) // 24)):  # an entry takes at least 24 bytes
+            label, name = read_number(), read_bytes()
             names[label] = name.rstrip(b"\0").decode("utf-8", "replace")
-            stream.read(16)  # the colour
+            stream.read(16)  # red, green, blue and transparency
     return cleaned(names)
 
 
 def cleaned(names: dict[int, str]) -> dict[int, str]:
-    """On one line each, without those that are empty, and without the background."""
-    words = {label: " ".join(name.split()) for label, name in names.items()}
-    return {label: name for label, name in words.items() if name and label > 0}
+    """Put each name on one line, and drop empty names and those of the background."""
+    lines = {label: " ".join(name.split()) for label, name in names.items()}
+    return {label: name for label, name in lines.items() if name and label > 0}
 
 
-def _of_lines(text: str) -> dict[int, str]:
+def _parse_lines(text: str) -> dict[int, str]:
     lines = (line.strip() for line in text.splitlines())
     rows = (_SNAP.match(line) or _FSLEYES.match(line) or _COLOURS.match(line) for line in lines)
     return cleaned({int(row[1]): row[2].strip('"') for row in rows if row})
 
 
-def _of_csv(text: str) -> dict[int, str]:
+def _parse_csv(text: str) -> dict[int, str]:
     lines = text.splitlines()
     rows = csv.DictReader(lines, delimiter="\t" if lines and "\t" in lines[0] else ",")
     columns = {(column or "").strip().lower(): column for column in rows.fieldnames or ()}
-    number = next((columns[key] for key in ("labelvalue", "label", "index", "id", "value") if key in columns), None)
-    name = next((columns[key] for key in ("name", "label_name", "labelname") if key in columns), None)
-    if number is None or name is None:
+    labels = next((columns[key] for key in ("labelvalue", "label", "index", "id", "value") if key in columns), None)
+    names = next((columns[key] for key in ("name", "label_name", "labelname") if key in columns), None)
+    if labels is None or names is None:
         return {}
-    pairs = ((str(row[number] or "").strip(), str(row[name] or "")) for row in rows)
-    return cleaned({int(label): words for label, words in pairs if _is_number(label)})
+    pairs = ((str(row[labels] or "").strip(), str(row[names] or "")) for row in rows)
+    return cleaned({int(label): name for label, name in pairs if _is_number(label)})
 
 
-def _of_json(text: str) -> dict[int, str]:
+def _parse_json(text: str) -> dict[int, str]:
     try:
         content = json.loads(text)
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""Molecules: the balls of atoms that a structure file holds, by chain, by model or by assembly."""
+"""Molecules of structure files, as balls of atoms; a body is a chain, a model or an assembly."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 from igps._parameters import check_one_of
-from igps.mesh.formats._format import Format, RawBody, made_later, stamp_of
-from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structures, suffix
+from igps.mesh.formats._format import Format, RawBody, deferred, stamp_of
+from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structures, suffix_of
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.mesh.residues import BACKBONE, CHARGED_ATOMS, PHOSPHATES, STANDARD, WATER, residue_ball, side_chain_ball
@@ -28,21 +28,20 @@ logger = logging.getLogger(__name__)
 
 MoleculeBodies = Literal["chains", "models", "assembly"]
 
-# Elements that the first letter of an atom's name gives where the file does not.
-_ELEMENTS = frozenset("HCNOSP")
-# The elements of residues with standard names, with the selenium of a methionine; and deuterium.
-_OF_STANDARD = frozenset({*_ELEMENTS, "D", "Se"})
-# Radius of an atom whose element is not known, carbon's.
-_UNKNOWN_RADIUS = 1.7
+# Elements that are inferred from the first letter of an atom's name if the file states none.
+_INFERRED_ELEMENTS = frozenset("HCNOSP")
+# Elements of residues with standard names; selenium is that of selenomethionine.
+_STANDARD_ELEMENTS = frozenset({*_INFERRED_ELEMENTS, "D", "Se"})
+_UNKNOWN_RADIUS = 1.7  # Å, of atoms of unknown elements: that of carbon
 
 _NOTES = {
-    "alternative": "{} alternative locations: that of the highest occupancy was taken",
+    "alternative": "{} alternative locations: the one of the highest occupancy was used",
     "nowhere": "{} atoms without a position were left out",
-    "named": "{} atoms without an element: their names tell it",
-    "element": f"{{}} atoms of an unknown element: a radius of {_UNKNOWN_RADIUS} Å was taken",
+    "named": "{} atoms without an element: it was inferred from their names",
+    "element": f"{{}} atoms of an unknown element: a radius of {_UNKNOWN_RADIUS} Å was used",
     "residue": "{} residues of an unknown name",
-    "side chain": "{} residues without side chain: balls of the side chain's volume stand for them",
-    "alpha": "{} residues of Cα alone: balls of the residue's volume stand for them",
+    "side chain": "{} residues without a side chain: a ball of its volume was used",
+    "alpha": "{} residues of Cα alone: a ball of the residue's volume was used",
     "repeated": "{} residues repeat a number: all were kept",
     "ligand": "{} ligands were left out",
 }
@@ -50,25 +49,25 @@ _NOTES = {
 
 @dataclass(frozen=True, eq=False)
 class Molecule:
-    """The A balls of a body, and its R residues."""
+    """A body of A balls, which are atoms or stand for missing ones, and R residues."""
 
-    name: str  # of the file, with the model, chain or assembly
+    name: str  # file name, with the model, chain or assembly
     positions: Floats  # (A, 3) Å
     radii: Floats  # (A,) van der Waals radii, Å
     charges: Floats  # (A,) elementary charges
-    residue_of: Integers  # (A,) the residue of each ball, from 0
-    residue_names: tuple[str, ...]  # three letters; a modified amino acid has the name of the one that it was
-    residue_positions: Floats  # (R, 3) of the Cα atoms, or else the mean of a residue's atoms, Å
-    b_factors: Floats  # (R,) means of the residue's atoms: B-factors, Å², or a model's pLDDT; NaN if the file has none
-    notes: tuple[str, ...] = ()  # what was done to the structure, in words
+    residue_of: Integers  # (A,) index of the residue of each ball
+    residue_names: tuple[str, ...]  # codes of three letters; a modified amino acid has the code of its parent
+    residue_positions: Floats  # (R, 3) Å, positions of Cα, or of a residue without Cα the mean of its atoms
+    b_factors: Floats  # (R,) means over atoms: B-factors, Å², or pLDDT of predicted models; NaN if unknown
+    notes: tuple[str, ...] = ()  # remarks on how the structure was read
 
     def __repr__(self) -> str:
         return f"Molecule({self.name!r}, {len(self.residue_names)} residues, {len(self.radii)} balls)"
 
 
 def is_structure(path: str | Path) -> bool:
-    """Whether a file has a suffix of PDB, mmCIF or PQR, with ".gz" behind it or without."""
-    return suffix(Path(path)) in SUFFIXES
+    """Return whether a file has a suffix of PDB, mmCIF or PQR, gzipped or not."""
+    return suffix_of(Path(path)) in SUFFIXES
 
 
 def read_molecule(
@@ -76,12 +75,13 @@ def read_molecule(
 ) -> list[Molecule]:
     """Read the bodies of a structure file: PDB, mmCIF or PQR, gzipped or not.
 
-    Each model of an ensemble, and each block of data of mmCIF that has atoms, gives bodies of its own. Water is left
-    out. Of alternative locations that of the highest occupancy is taken, the first of equals. Radii are van der Waals
-    radii of the elements (Bondi 1964), and charges those of residues at pH 7, without the ends of chains. A PQR file
-    has its own of both, and keeps its hydrogens. Where all atoms of a side chain are missing, a ball of its volume
-    touches Cα on the side of Cβ; a residue of Cα alone is a ball of its whole volume (Zamyatnin 1972). So backbones and
-    traces are bodies, too.
+    Each model of an ensemble, and each data block of mmCIF with atoms, yields separate bodies. Water is left out. The
+    alternative location with the highest occupancy is used, the first one of a tie. Radii are van der Waals radii of
+    the elements (Bondi 1964), and charges those of residues at pH 7, without the ends of chains. Radii, charges and
+    hydrogens of a PQR file are used as they are.
+
+    Backbones and Cα traces can be read, too (volumes of Zamyatnin 1972): if all atoms of a side chain are missing, a
+    ball of its volume touches Cα in the direction of Cβ, and a residue of Cα alone becomes a ball of its volume.
 
     Example:
         >>> import tempfile
@@ -93,9 +93,9 @@ def read_molecule(
         (('ZN',), [1.39])
 
     Args:
-        bodies: "chains" or "models", each by itself, or of every model the first biological "assembly" that the file
-            names. Those without usable atoms are left out, which is logged.
-        ligands: keep what belongs to no polymer, as is done in a file without polymers.
+        bodies: "chains", "models", or "assembly" for the first biological assembly of the file, made from each model.
+            Bodies without usable atoms are left out with a warning in the log.
+        ligands: keep residues that belong to no polymer. They are always kept if the file has no polymers.
         hydrogens: keep hydrogens, which most structures lack.
 
     Raises:
@@ -106,42 +106,43 @@ def read_molecule(
     path = Path(path)
     check_one_of(get_args(MoleculeBodies), bodies=bodies)
     parts = list(parts_of(read_structures(path), bodies, path))
-    found, left_out = _molecules(parts, ligands, hydrogens, suffix(path) == ".pqr")
-    if not found and not ligands:
-        found, left_out = _molecules(parts, True, hydrogens, suffix(path) == ".pqr")
-    if not found:
-        none = f"{path}: no atoms of a molecule that have positions, in {len(parts)} {bodies}."
-        raise MeshError(f"{none} Check that the file is complete, and not of water alone.")
+    is_pqr = suffix_of(path) == ".pqr"
+    molecules, left_out = _molecules(parts, ligands, hydrogens, is_pqr)
+    if not molecules and not ligands:
+        molecules, left_out = _molecules(parts, True, hydrogens, is_pqr)
+    if not molecules:
+        fault = f"{path}: no atoms of a molecule with positions, in {len(parts)} {bodies}."
+        raise MeshError(f"{fault} Check that the file is complete, and not of water alone.")
     for name in left_out:
-        logger.warning("%s: no atoms of a polymer, left out; read its ligands, or check the file.", name)
-    return found
+        logger.warning("%s: no atoms of a polymer, left out. Read it with ligands=True, or check the file.", name)
+    return molecules
 
 
 @lru_cache(maxsize=1)
 def molecules_by_part(path: Path, changed: tuple[int, int, int], bodies: MoleculeBodies) -> dict[str, Molecule]:
-    """The bodies of a structure file by their parts; read once while `changed`, its `stamp_of`, is the same."""
-    found = read_molecule(path, bodies)
-    return {molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule for molecule in found}
+    """Return the bodies of a structure file by part; `changed`, its `stamp_of`, is part of the cache key."""
+    molecules = read_molecule(path, bodies)
+    return {molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule for molecule in molecules}
 
 
 def _molecules(
     parts: list[tuple[str, list[gemmi.Chain], list[str]]], ligands: bool, hydrogens: bool, is_pqr: bool
 ) -> tuple[list[Molecule], list[str]]:
-    """The molecules of the parts, and the names of parts without one."""
-    found, left_out = [], []
+    """Build the molecules of parts; return also the names of parts without usable atoms."""
+    molecules, left_out = [], []
     for name, chains, notes in parts:
-        one = _Builder(ligands, hydrogens or is_pqr, is_pqr)
+        builder = _Builder(ligands, hydrogens or is_pqr, is_pqr)
         for chain in chains:
-            one.add_chain(chain)
-        if any(radius > 0 for _, radius, _, _ in one.balls):
-            found.append(one.molecule(name, notes))
+            builder.add_chain(chain)
+        if any(radius > 0 for _, radius, _, _ in builder.balls):
+            molecules.append(builder.molecule(name, notes))
         else:
             left_out.append(name)
-    return found, left_out
+    return molecules, left_out
 
 
 class _Builder:
-    """Collects the balls and residues of one molecule."""
+    """Builder of a molecule from its chains."""
 
     def __init__(self, ligands: bool, hydrogens: bool, is_pqr: bool) -> None:
         self.ligands, self.hydrogens, self.is_pqr = ligands, hydrogens, is_pqr
@@ -151,11 +152,11 @@ class _Builder:
 
     def molecule(self, name: str, notes: list[str]) -> Molecule:
         own = ["radii and charges are those of the PQR file"] if self.is_pqr else []
-        counted = [text.format(self._count[what]) for what, text in _NOTES.items() if self._count[what]]
+        counted = [text.format(self._count[key]) for key, text in _NOTES.items() if self._count[key]]
         positions, radii, charges, residue_of = map(np.array, zip(*self.balls, strict=True))
-        names, places, b_factors = zip(*self._residues, strict=True)
+        names, centres, b_factors = zip(*self._residues, strict=True)
         return Molecule(
-            name, positions, radii, charges, residue_of, names, np.array(places), np.array(b_factors),
+            name, positions, radii, charges, residue_of, names, np.array(centres), np.array(b_factors),
             (*notes, *own, *counted),
         )  # fmt: skip
 
@@ -166,35 +167,35 @@ class _Builder:
                 continue
             atoms = self._atoms(residue)
             if self._add_residue(residue, atoms):
-                place = str(residue.seqid)
-                self._count["repeated"] += place in seen
-                seen.add(place)
+                number = str(residue.seqid)
+                self._count["repeated"] += number in seen
+                seen.add(number)
 
     def _add_residue(self, residue: gemmi.Residue, atoms: list[gemmi.Atom]) -> bool:
-        """Whether the residue belongs to the molecule."""
+        """Add the balls of a residue, unless it is a ligand to be left out; return whether it was added."""
         gemmi = gemmi_module()
         kind = gemmi.find_tabulated_residue(residue.name)
         name = _standard(residue.name, kind)
         named = {atom.name for atom in atoms}
         is_known = name != residue.name or (kind.is_amino_acid() or kind.is_nucleic_acid())
-        # An ion of an unknown name is a single atom, which is no polymer; the name of calcium is that of Cα.
-        is_alone = len(atoms) == 1 and (not named & {"CA", "P"} or atoms[0].element.name == "Ca")
+        # A single atom is an ion of an unknown name, unless it is Cα or P; the ion of calcium has the name of Cα
+        is_ion = len(atoms) == 1 and (not named & {"CA", "P"} or atoms[0].element.name == "Ca")
         is_linked = residue.het_flag == "A" or residue.entity_type == gemmi.EntityType.Polymer
-        in_polymer = is_known or {"N", "CA", "C"} <= named or (is_linked and not is_alone)
+        in_polymer = is_known or {"N", "CA", "C"} <= named or (is_linked and not is_ion)
         if not atoms or not (in_polymer or self.ligands):
             self._count["ligand"] += bool(atoms)
             return False
         self._count["residue"] += in_polymer and not is_known
-        at = np.array([atom.pos.tolist() for atom in atoms])
+        positions = np.array([atom.pos.tolist() for atom in atoms])
         alpha = next((i for i, atom in enumerate(atoms) if atom.name == "CA"), None) if in_polymer else None
         b_factor = np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms]))
-        self._residues.append((name, at.mean(axis=0) if alpha is None else at[alpha], b_factor))
+        self._residues.append((name, positions.mean(axis=0) if alpha is None else positions[alpha], b_factor))
         charged = (PHOSPHATES if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {})) if in_polymer else {}
         if alpha is not None and not self.is_pqr and (named == {"CA"} or (named <= BACKBONE and name != "GLY")):
-            self._add_coarse_ball(name, atoms, at, sum(charged.values()))
+            self._add_coarse_ball(name, atoms, positions, sum(charged.values()))
             if named == {"CA"}:
                 return True
-        for atom, position in zip(atoms, at, strict=True):
+        for atom, position in zip(atoms, positions, strict=True):
             if self.is_pqr:
                 self._add_ball(position, atom.b_iso, atom.occ)
             else:
@@ -202,10 +203,10 @@ class _Builder:
         return True
 
     def _radius(self, atom: gemmi.Atom) -> float:
-        """The van der Waals radius of the atom's element, which its name tells if need be."""
+        """Return the van der Waals radius of the atom's element, inferred from its name if need be."""
         if atom.element.atomic_number:
             return float(atom.element.vdw_r)
-        if (letter := _letter(atom)) in _ELEMENTS:
+        if (letter := _first_letter(atom)) in _INFERRED_ELEMENTS:
             self._count["named"] += 1
             return float(gemmi_module().Element(letter).vdw_r)
         self._count["element"] += 1
@@ -214,45 +215,46 @@ class _Builder:
     def _add_ball(self, position: Floats, radius: float, charge: float) -> None:
         self.balls.append((position, radius, charge, len(self._residues) - 1))
 
-    def _add_coarse_ball(self, name: str, atoms: list[gemmi.Atom], at: Floats, charge: float) -> None:
-        """The ball for a missing side chain, or for a residue of Cα alone."""
-        place = {atom.name: position for atom, position in zip(atoms, at, strict=True)}
-        if len(place) == 1:
+    def _add_coarse_ball(self, name: str, atoms: list[gemmi.Atom], positions: Floats, charge: float) -> None:
+        """Add the ball for a missing side chain, or for a residue of Cα alone."""
+        position_of = {atom.name: position for atom, position in zip(atoms, positions, strict=True)}
+        if len(position_of) == 1:
             self._count["alpha"] += 1
-            self._add_ball(place["CA"], residue_ball(name), charge)
+            self._add_ball(position_of["CA"], residue_ball(name), charge)
             return
         self._count["side chain"] += 1
-        radius, centre = side_chain_ball(name), place["CA"]
-        if {"N", "C"} <= place.keys():
-            # Tetrahedral geometry has Cβ in this direction.
-            b, c = centre - place["N"], place["C"] - centre
+        radius, centre = side_chain_ball(name), position_of["CA"]
+        if {"N", "C"} <= position_of.keys():
+            # The direction of Cβ in ideal tetrahedral geometry
+            b, c = centre - position_of["N"], position_of["C"] - centre
             direction = -0.58273431 * np.cross(b, c) + 0.56802827 * b - 0.54067466 * c
             centre = centre + radius * direction / max(float(np.linalg.norm(direction)), 1e-9)
         self._add_ball(centre, radius, charge)
 
     def _conformers(self, chain: gemmi.Chain) -> Iterator[gemmi.Residue]:
-        """The residues; of alternatives the one of highest occupancy."""
+        """Yield the residues; of alternative ones in the same place only the one of the highest occupancy."""
 
-        def place(numbered: tuple[int, gemmi.Residue]) -> str | int:
+        def key(numbered: tuple[int, gemmi.Residue]) -> str | int:
             number, residue = numbered
             is_alternative = len(residue) > 0 and all(atom.has_altloc() for atom in residue)
             return str(residue.seqid) if is_alternative else number
 
-        for _, group in groupby(enumerate(chain), place):
+        for _, group in groupby(enumerate(chain), key):
             residues = [residue for _, residue in group]
             self._count["alternative"] += len(residues) - 1
             yield max(residues, key=lambda residue: max((atom.occ for atom in residue), default=0.0))
 
     def _atoms(self, residue: gemmi.Residue) -> list[gemmi.Atom]:
-        """Those that have a position, one of each that has alternatives."""
+        """Return the atoms that have a position, each at its alternative location of the highest occupancy."""
         chosen: dict[Any, Any] = {}
         gemmi = gemmi_module()
         is_standard = residue.name in STANDARD or gemmi.find_tabulated_residue(residue.name).is_standard()
         for number, atom in enumerate(residue):
-            # Where names begin in the wrong column, gemmi takes Cα for calcium
-            if is_standard and atom.element.name not in _OF_STANDARD:
+            # If names begin in the wrong column, gemmi takes Cα for calcium
+            if is_standard and atom.element.name not in _STANDARD_ELEMENTS:
                 atom.element = gemmi.Element("X")
-            if not self.hydrogens and (atom.is_hydrogen() or (not atom.element.atomic_number and _letter(atom) == "H")):
+            is_hydrogen = atom.is_hydrogen() or (not atom.element.atomic_number and _first_letter(atom) == "H")
+            if is_hydrogen and not self.hydrogens:
                 continue
             if not np.isfinite(atom.pos.tolist()).all():
                 self._count["nowhere"] += 1
@@ -264,13 +266,13 @@ class _Builder:
         return list(chosen.values())
 
 
-def _letter(atom: gemmi.Atom) -> str:
-    """The first letter of an atom's name, which may have digits before it."""
+def _first_letter(atom: gemmi.Atom) -> str:
+    """Return the first letter of an atom's name, which digits may precede."""
     return str(atom.name).lstrip("0123456789'\"*").upper()[:1]
 
 
 def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
-    """The name of the amino acid that a modified one was; of others their own."""
+    """Return the name of the parent of a modified amino acid; other names are returned unchanged."""
     if name in STANDARD:
         return STANDARD[name]
     if kind.is_standard() or not kind.is_amino_acid():
@@ -280,14 +282,14 @@ def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surfaces of the chains, models or the assembly of a structure file, in ångström."""
+    """Return the surfaces of the chains, models or assemblies of a structure file, in ångström."""
     from igps.mesh.molecular_surface import molecular_surface
 
-    how: MoleculeBodies = options.bodies if options.bodies in ("chains", "assembly") else "models"
-    found = molecules_by_part(path, stamp_of(path), how)
-    names = [name for name in found if part in (None, name)]
-    return [made_later(partial(molecular_surface, found[name]), name, "Å") for name in names]
+    bodies: MoleculeBodies = options.bodies if options.bodies in ("chains", "assembly") else "models"
+    molecules = molecules_by_part(path, stamp_of(path), bodies)
+    names = [name for name in molecules if part in (None, name)]
+    return [deferred(partial(molecular_surface, molecules[name]), name, "Å") for name in names]
 
 
-_SUFFIXES = tuple(sorted(one + packed for one in SUFFIXES for packed in ("", ".gz")))
+_SUFFIXES = tuple(sorted(suffix + ending for suffix in SUFFIXES for ending in ("", ".gz")))
 FORMAT = Format("a structure", _SUFFIXES, read, ("chains", "models", "assembly"), extra="molecules")

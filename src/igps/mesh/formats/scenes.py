@@ -1,4 +1,4 @@
-"""Scenes and CAD files: GLB, glTF, COLLADA, 3DXML and XAML, STEP. An object is what stands at a place of the scene."""
+"""Scenes and CAD files: GLB, glTF, COLLADA, 3DXML, XAML and STEP. An object is a node of the scene with a geometry."""
 
 import json
 import shutil
@@ -12,16 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct, pieces
-from igps.mesh.formats._trimesh import Beside, objects
+from igps.mesh.formats._trimesh import FolderResolver, objects
 from igps.mesh.limits import check_memory
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.mesh.surface import signed_volume
 
-# How far triangles may be from a curved face, over the length of its edges, and the angle between two, radians.
+# Tolerances of the triangulation of curved faces: distance as a share of the edge length, and angle in radians.
 _DEFLECTION, _ANGLE = 0.005, 0.2
-_DRACO = "KHR_draco_mesh_compression"  # which trimesh unpacks where DracoPy is installed
-_FAN, _LARGEST_ITEM = 6, 64  # a mode of primitives; bytes of a matrix of 4 x 4
+_DRACO = "KHR_draco_mesh_compression"  # trimesh decompresses it if DracoPy is installed
+_FAN, _MAX_ITEM = 6, 64  # the mode of fans of triangles; bytes of the largest item of an array, a 4 × 4 matrix
 _CONVERT = (
     "import sys, cascadio; cascadio.step_to_glb(*sys.argv[1:], "
     f"tol_linear={_DEFLECTION}, tol_relative=True, tol_angular={_ANGLE}, merge_primitives=True)"
@@ -31,64 +31,64 @@ _CONVERT = (
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            check_unpacked(sum(one.file_size for one in archive.infolist()), path, options.max_unpacked)
+            check_unpacked(sum(info.file_size for info in archive.infolist()), path, options.max_unpacked)
     return objects(path, options)
 
 
 def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The objects of a glTF scene, which is in metres."""
+    """Read the objects of a glTF scene, in metres."""
     scene = _scene(path)
     for name in scene.get("extensionsRequired", []):
         if name.endswith("_compression") and (name != _DRACO or find_spec("DracoPy") is None):
-            raise ValueError(f"it is compressed by {name}, which is not read; export it uncompressed")
-    # Of an array without bytes trimesh makes zeros, and for every use of one a copy
-    n_bytes = sum(_LARGEST_ITEM * abs(one["count"]) for one in scene.get("accessors", []) if "bufferView" not in one)
-    for primitive in (one for mesh in scene.get("meshes", []) for one in mesh["primitives"]):
-        if primitive.get("mode") == _FAN:  # which trimesh passes over
-            raise ValueError("it holds fans of triangles, which are not read; export it as plain triangles")
+            raise ValueError(f"it is compressed by {name}, which is not supported; export it uncompressed")
+    # Trimesh fills arrays without bytes with zeros, and copies an array at each use
+    n_bytes = sum(_MAX_ITEM * abs(array["count"]) for array in scene.get("accessors", []) if "bufferView" not in array)
+    for primitive in (item for mesh in scene.get("meshes", []) for item in mesh["primitives"]):
+        if primitive.get("mode") == _FAN:  # trimesh would skip it
+            raise ValueError("it holds fans of triangles, which are not supported; export it as plain triangles")
         used = ((primitive["attributes"].get("POSITION"), 24), (primitive.get("indices"), 8))
         arrays = [scene["accessors"][number] for number, _ in used if number is not None]
         n_bytes += sum(size * abs(scene["accessors"][number]["count"]) for number, size in used if number is not None)
-        if any("sparse" in one or one.get("normalized") for one in arrays):  # trimesh reads other numbers
-            raise ValueError("its coordinates are sparse or normalized, which is not read; export it uncompressed")
+        if any("sparse" in array or array.get("normalized") for array in arrays):  # trimesh would misread it
+            raise ValueError("its coordinates are sparse or normalized, which is not supported; export it uncompressed")
     check_unpacked(n_bytes, path, options.max_unpacked)
     return [replace(body, unit="m") for body in objects(path, options)]
 
 
 def _scene(path: Path) -> dict[str, Any]:
-    """What a file of glTF says of its numbers: all of a .gltf, the first chunk of a .glb."""
+    """Parse the JSON of a glTF file: all of a .gltf, or the first chunk of a .glb."""
     with path.open("rb") as file:
         head = file.read(20)
         is_binary = head.startswith(b"glTF")
-        found = json.loads(file.read(int.from_bytes(head[12:16], "little")) if is_binary else head + file.read())
-    return dict(found)
+        text = file.read(int.from_bytes(head[12:16], "little")) if is_binary else head + file.read()
+    return dict(json.loads(text))
 
 
 def _buffers(path: Path, options: LoadOptions) -> list[Path]:
-    """The files that hold the numbers of a glTF scene."""
+    """Return the files beside a glTF scene that hold its arrays."""
     if path.suffix.lower() != ".gltf":
         return []
     check_memory(path)
-    names = [one.get("uri", "data:") for one in _scene(path).get("buffers", [])]
-    return [Beside(path.parent).place(name) for name in names if not name.startswith("data:")]
+    names = [buffer.get("uri", "data:") for buffer in _scene(path).get("buffers", [])]
+    return [FolderResolver(path.parent).path(name) for name in names if not name.startswith("data:")]
 
 
 def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The solids of a STEP file, in millimetres, each with the name of the part that it belongs to."""
+    """Read the solids of a STEP file, in millimetres, each named after its part."""
     solids, names = [], []
     for body in objects(path, options, _converted(path), file_type="glb", merge_primitives=True):
-        found = pieces(body)
-        if any(signed_volume(one.vertices, one.faces) <= 0 for one in found):  # one is the wall of a hollow
-            found = [body]
-        solids += found
-        names += [str(body.part)] * len(found)
+        components = pieces(body)
+        if any(signed_volume(piece.vertices, piece.faces) <= 0 for piece in components):  # the wall of a cavity
+            components = [body]
+        solids += components
+        names += [str(body.part)] * len(components)
     named = zip(solids, distinct(names), strict=True)
     return [replace(solid, vertices=1000 * solid.vertices, part=name, unit="mm") for solid, name in named]
 
 
 def _converted(path: Path) -> bytes:
-    """The glTF scene of a STEP file, made in a process of its own: OpenCASCADE crashes on some damaged files."""
-    import cascadio  # noqa: F401  # to report a missing module as such
+    """Convert a STEP file to binary glTF, in another process because OpenCASCADE crashes on some damaged files."""
+    import cascadio  # noqa: F401  # raises ImportError in this process if missing
 
     with tempfile.TemporaryDirectory() as folder:
         step, scene = Path(folder) / "x.step", Path(folder) / "x.glb"

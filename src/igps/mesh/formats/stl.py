@@ -1,4 +1,4 @@
-"""STL: the corners of triangles, as text or bytes. Corners in one place are one vertex: the format has no others."""
+"""STL: the corners of triangles, as text or bytes. Equal corners are merged, as the format has no shared vertices."""
 
 import re
 from pathlib import Path
@@ -10,43 +10,43 @@ from igps.mesh.formats._format import Format, RawBody
 from igps.mesh.options import LoadOptions
 
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
-_HEADER = 84
+_HEADER = 84  # bytes, with the number of triangles at the end
 _VERTEX = re.compile(rb"vertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     content = path.read_bytes()
-    announced = int.from_bytes(content[80:_HEADER], "little")
-    exact = len(content) == _HEADER + _TRIANGLE.itemsize * announced
-    is_text = not exact and content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
-    corners, notes = _text(content) if is_text else _binary(content, announced)
+    n_declared = int.from_bytes(content[80:_HEADER], "little")
+    is_exact = len(content) == _HEADER + _TRIANGLE.itemsize * n_declared
+    is_text = not is_exact and content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
+    corners, notes = _read_text(content) if is_text else _read_binary(content, n_declared)
     if not len(corners):
         raise ValueError("no triangle in it")
     return [RawBody(*merged(corners), notes=notes)]
 
 
-def _text(content: bytes) -> tuple[Floats, tuple[str, ...]]:
+def _read_text(content: bytes) -> tuple[Floats, tuple[str, ...]]:
     corners = np.array(b"\n".join(_VERTEX.findall(content)).split(), dtype=np.float64)
     if len(corners) % 9:
-        raise ValueError(f"{len(corners) // 3} vertices are no triangles; the file is cut short")
+        raise ValueError(f"{len(corners) // 3} vertices do not make whole triangles; the file is cut short")
     return corners.reshape(-1, 3), ()
 
 
-def _binary(content: bytes, announced: int) -> tuple[Floats, tuple[str, ...]]:
-    """The triangles that are there, whatever number the header announces."""
-    there = max(len(content) - _HEADER, 0) // _TRIANGLE.itemsize
-    n = min(there, announced) or there
-    notes = () if n == announced else (f"the header announces {announced} triangles: the {n} that are there were read",)
+def _read_binary(content: bytes, n_declared: int) -> tuple[Floats, tuple[str, ...]]:
+    """Read the triangles of the file, even if their number differs from that in the header."""
+    n_complete = max(len(content) - _HEADER, 0) // _TRIANGLE.itemsize
+    n = min(n_complete, n_declared) or n_complete
+    notes = () if n == n_declared else (f"the header declares {n_declared} triangles: {n} were read",)
     rows = np.frombuffer(content, _TRIANGLE, n, _HEADER) if n else np.zeros(0, _TRIANGLE)
     return rows["corners"].reshape(-1, 3).astype(np.float64), notes
 
 
 def merged(corners: Floats) -> Surface:
-    """The places (V, 3) of corners (3F, 3), in the order in which they first come, and the triangles (F, 3)."""
-    corners = corners + 0.0  # -0 is 0
-    _, first, place = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    """Merge equal corners (3F, 3) into vertices (V, 3), in order of their first use; return them and faces (F, 3)."""
+    corners = corners + 0.0  # turns -0 into 0
+    _, first, index = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
-    return corners[np.sort(first)], rank[place.ravel()].reshape(-1, 3)
+    return corners[np.sort(first)], rank[index.ravel()].reshape(-1, 3)
 
 
 FORMAT = Format("STL", (".stl", ".stl_ascii"), read)

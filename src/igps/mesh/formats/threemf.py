@@ -1,4 +1,4 @@
-"""3MF: a plate of objects, each as often and where its plan says, in a unit of length."""
+"""3MF: objects, placed on a build plate by a list of items, in a unit of length."""
 
 from __future__ import annotations
 
@@ -16,17 +16,15 @@ from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct,
 from igps.mesh.options import LoadOptions
 
 _UNITS = {"micron": "µm", "millimeter": "mm", "centimeter": "cm", "inch": "in", "foot": "ft", "meter": "m"}
-# Objects may be made of objects, but not without end.
-_DEEPEST = 32
-# What an object or a place of one takes at least, bytes.
-_PLACE = 100
+_MAX_DEPTH = 32  # of objects within objects
+_MIN_BYTES = 100  # the least memory that a placed object takes
 
-Key = tuple[str, str]  # of an object: the member of the archive that it stands in, and its number
+Key = tuple[str, str]  # of an object: its member of the archive, and its id there
 
 
 @dataclass
 class _Placed:
-    """An object at a place: vertices (V, 3) times `matrix` (4, 3), with a column of ones."""
+    """An object in its place; `matrix` (4, 3) maps its vertices, with 1 appended, to the coordinates of its parent."""
 
     key: Key
     matrix: Floats
@@ -42,77 +40,78 @@ class _Object:
 
 
 class _Model:
-    """Objects and plan of the members of an archive."""
+    """The objects and items of the members of an archive."""
 
     def __init__(self, archive: zipfile.ZipFile, main: str) -> None:
         self.unit = ""
         self.objects: dict[Key, _Object] = {}
         self.items: list[_Placed] = []
         self._object = _Object("")
-        members = [main]  # those that others refer to are added while they are read
+        members = [main]  # grows by the members to which those already read refer
         for self._member in members:
             with archive.open(self._member) as stream:
                 _xml.walk(stream, self._start)
-            referred = {placed.key[0] for one in self.objects.values() for placed in one.components}
+            referred = {placed.key[0] for obj in self.objects.values() for placed in obj.components}
             members.extend(sorted((referred | {placed.key[0] for placed in self.items}) - set(members)))
 
-    def _start(self, name: str, of: dict[str, str]) -> None:
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
         if name == "vertex":
-            self._object.vertices.extend((float(of["x"]), float(of["y"]), float(of["z"])))
+            self._object.vertices.extend((float(attributes["x"]), float(attributes["y"]), float(attributes["z"])))
         elif name == "triangle":
-            self._object.triangles.extend((int(of["v1"]), int(of["v2"]), int(of["v3"])))
+            self._object.triangles.extend((int(attributes["v1"]), int(attributes["v2"]), int(attributes["v3"])))
         elif name == "object":
-            label = of.get("name") or of.get("partnumber") or f"object {of['id']}"
-            self._object = self.objects[self._member, of["id"]] = _Object(label)
+            number = attributes["id"]
+            label = attributes.get("name") or attributes.get("partnumber") or f"object {number}"
+            self._object = self.objects[self._member, number] = _Object(label)
         elif name == "component":
-            self._object.components.append(self._placed(of))
+            self._object.components.append(self._placed(attributes))
         elif name == "item":
-            self.items.append(self._placed(of))
+            self.items.append(self._placed(attributes))
         elif name == "model":
-            self.unit = self.unit or of.get("unit", "millimeter")
+            self.unit = self.unit or attributes.get("unit", "millimeter")
 
-    def _placed(self, of: dict[str, str]) -> _Placed:
-        numbers = of.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
-        path = next((value for key, value in of.items() if key.rpartition(":")[2] == "path"), "").lstrip("/")
+    def _placed(self, attributes: dict[str, str]) -> _Placed:
+        numbers = attributes.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
+        path = next((value for key, value in attributes.items() if key.rpartition(":")[2] == "path"), "").lstrip("/")
         matrix = np.array(numbers, dtype=np.float64).reshape(4, 3)
-        return _Placed((path or self._member, of["objectid"]), matrix, of.get("partnumber", ""))
+        return _Placed((path or self._member, attributes["objectid"]), matrix, attributes.get("partnumber", ""))
 
     def leaves(self, placed: _Placed, budget: list[int], depth: int = 0) -> Iterator[RawBody]:
-        """The surfaces of an object and of all that it is made of; `budget` holds the bytes that are left."""
-        if depth > _DEEPEST:
-            raise ValueError("objects that are made of themselves, or of others without end")
-        one = self.objects[placed.key]
-        budget[0] -= _PLACE + 8 * (len(one.vertices) + len(one.triangles))
+        """Yield the surfaces of an object and of its components, while the bytes left in `budget` suffice."""
+        if depth > _MAX_DEPTH:
+            raise ValueError("objects that are made of themselves, or nested too deeply")
+        obj = self.objects[placed.key]
+        budget[0] -= _MIN_BYTES + 8 * (len(obj.vertices) + len(obj.triangles))
         if budget[0] < 0:
             return
-        if one.triangles:
-            vertices = np.frombuffer(one.vertices).reshape(-1, 3) @ placed.matrix[:3] + placed.matrix[3]
-            faces = np.frombuffer(one.triangles, dtype=np.int64).reshape(-1, 3)
-            mirrored = np.linalg.det(placed.matrix[:3]) < 0
-            yield RawBody(vertices, np.ascontiguousarray(faces[:, ::-1]) if mirrored else faces.copy())
-        for component in one.components:
+        if obj.triangles:
+            vertices = np.frombuffer(obj.vertices).reshape(-1, 3) @ placed.matrix[:3] + placed.matrix[3]
+            faces = np.frombuffer(obj.triangles, dtype=np.int64).reshape(-1, 3)
+            is_mirrored = np.linalg.det(placed.matrix[:3]) < 0
+            yield RawBody(vertices, np.ascontiguousarray(faces[:, ::-1]) if is_mirrored else faces.copy())
+        for component in obj.components:
             matrix = component.matrix @ placed.matrix[:3]
             matrix[3] += placed.matrix[3]
             yield from self.leaves(_Placed(component.key, matrix), budget, depth + 1)
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """What stands on the plate: the items of the plan, an object made of others as one body."""
+    """Read the items on the build plate; an item with several components is one body."""
     with zipfile.ZipFile(path) as archive:
-        models = [one for one in archive.infolist() if one.filename.lower().endswith(".model")]
-        check_unpacked(sum(one.file_size for one in models), path, options.max_unpacked)
-        names = [one.filename for one in models]
+        models = [info for info in archive.infolist() if info.filename.lower().endswith(".model")]
+        check_unpacked(sum(info.file_size for info in models), path, options.max_unpacked)
+        names = [info.filename for info in models]
         if not names:
             raise ValueError("no model in it")
         main = next((name for name in names if name.lower() == "3d/3dmodel.model"), names[0])
         model = _Model(archive, main)
-    items = model.items or [_Placed(key, np.eye(4, 3)) for key, one in model.objects.items() if one.triangles]
+    items = model.items or [_Placed(key, np.eye(4, 3)) for key, obj in model.objects.items() if obj.triangles]
     budget = [options.max_unpacked]
-    found = [list(model.leaves(item, budget)) for item in items]
+    leaves = [list(model.leaves(item, budget)) for item in items]
     if budget[0] < 0:
         check_unpacked(options.max_unpacked - budget[0], path, options.max_unpacked)
     names = distinct(item.name or model.objects[item.key].name for item in items)
-    parts = [(name, joined(leaves)) for name, leaves in zip(names, found, strict=True) if leaves]
+    parts = [(name, joined(surfaces)) for name, surfaces in zip(names, leaves, strict=True) if surfaces]
     return [RawBody(body.vertices, body.faces, name, _UNITS.get(model.unit)) for name, body in parts]
 
 

@@ -1,4 +1,4 @@
-"""Values at the vertices of a surface, or at the points of tetrahedra, as files have them."""
+"""Readers of values at the vertices of surfaces or of tetrahedra."""
 
 from collections.abc import Mapping
 from io import BytesIO
@@ -21,34 +21,36 @@ _VTK = (".vtk", ".vtp", ".vtu")
 
 
 def read(path: Path) -> Arrays:
-    """Arrays (V,) or (V, C) by name: of PLY, VTK, GIFTI, or of FreeSurfer's files of thickness, curvature and the like.
-    A ValueError if there is none, or the file is damaged."""
+    """Read the arrays (V,) or (V, C) of values at vertices by name; a ValueError if there are none.
+
+    Formats are PLY, VTK, GIFTI, and FreeSurfer's files of thickness, curvature and the like.
+    """
     name = path.name.lower()
     if name.endswith(_VTK):
-        found = vtk.point_values(path, LoadOptions()).values
+        arrays = vtk.point_values(path, LoadOptions()).values
     elif name.endswith(".gii"):
-        found = brains.gifti_values(path, LoadOptions())
+        arrays = brains.gifti_values(path, LoadOptions())
     elif name.endswith(".ply"):
-        found = _ply(path)
+        arrays = _ply(path)
     else:
-        found = {path.suffix.lstrip("."): _freesurfer(path)}
-    if not found:
-        raise MeshError(f"{path}: has no values at vertices. Export it with them.")
-    return {one: np.asarray(values, dtype=np.float64) for one, values in found.items()}
+        arrays = {path.suffix.lstrip("."): _freesurfer(path)}
+    if not arrays:
+        raise MeshError(f"{path}: expected values at vertices, got none. Export the file with values.")
+    return {key: np.asarray(values, dtype=np.float64) for key, values in arrays.items()}
 
 
 def read_tetrahedra(path: Path) -> tuple[Floats, Integers, Arrays]:
-    """Points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) by name, of a VTK file; a ValueError without them."""
-    found = vtk.point_values(path, LoadOptions())
-    if not len(found.tetrahedra) or not found.values:
+    """Read points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) at points by name; a ValueError without them."""
+    data = vtk.point_values(path, LoadOptions())
+    if not len(data.tetrahedra) or not data.values:
         raise MeshError(f"{path}: expected tetrahedra with values at their points. Export both.")
-    if found.tetrahedra.min() < 0 or found.tetrahedra.max() >= len(found.vertices):
-        raise MeshError(f"{path}: a tetrahedron has a corner that is no point. Export it again.")
-    return found.vertices, found.tetrahedra, {name: values.astype(float) for name, values in found.values.items()}
+    if data.tetrahedra.min() < 0 or data.tetrahedra.max() >= len(data.vertices):
+        raise MeshError(f"{path}: a tetrahedron refers to a point that is not there. Export it again.")
+    return data.vertices, data.tetrahedra, {name: values.astype(float) for name, values in data.values.items()}
 
 
 def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
-    """The array of a name, or the only one."""
+    """Return the array of a name; an empty name stands for the only array."""
     if name in arrays:
         return arrays[name]
     if not name and len(arrays) == 1:
@@ -57,18 +59,18 @@ def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
 
 
 def _ply(path: Path) -> dict[str, NDArray[np.generic]]:
-    """Every property of the vertices, but for places, normals and colours."""
+    """Read the properties of vertices other than coordinates, normals and colours."""
     scene = trimesh.load_scene(BytesIO(path.read_bytes()), file_type="ply", process=False, fix_texture=False)
     columns = ply_columns(scene).items()
-    usual = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
-    return {name: values[:, 0] if values.shape[1] == 1 else values for name, values in columns if name not in usual}
+    ignored = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
+    return {name: values[:, 0] if values.shape[1] == 1 else values for name, values in columns if name not in ignored}
 
 
 def _freesurfer(path: Path) -> NDArray[np.generic]:
     content = path.read_bytes()
     if not content.startswith(_MAGIC) or len(content) < 15:
-        raise ValueError("neither of the suffix of a format that is read, nor a file of values of FreeSurfer")
-    n, _, n_each = (int(x) for x in np.frombuffer(content, ">i4", 3, 3))
-    if n < 1 or n_each != 1 or len(content) < 15 + 4 * n:
-        raise ValueError(f"{n} vertices of {n_each} values announced, {len(content) - 15} of {4 * n} bytes there")
+        raise ValueError("expected PLY, VTK or GIFTI by its suffix, or a file of values of FreeSurfer")
+    n, _, n_values = (int(x) for x in np.frombuffer(content, ">i4", 3, 3))
+    if n < 1 or n_values != 1 or len(content) < 15 + 4 * n:
+        raise ValueError(f"expected {n} vertices in {4 * n} bytes, got {n_values} values each in {len(content) - 15}")
     return np.frombuffer(content, ">f4", n, 15)

@@ -1,6 +1,6 @@
-"""Label volumes: NIfTI, NRRD, MetaImage, MGH, DICOM SEG and TIFF stacks; every label is a body.
+"""Label volumes: NIfTI, NRRD, MetaImage, MGH, DICOM SEG and TIFF stacks; each label is a body.
 
-The world is RAS, x to the patient's right, y to the front and z up, in millimetres. No volume is resampled.
+World coordinates are RAS (x to the patient's right, y to the front, z up) in millimetres. No volume is resampled.
 """
 
 from collections import Counter
@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from igps._arrays import Booleans, Floats
 from igps.mesh._label_measures import LabelVoxels
-from igps.mesh.formats._format import Format, RawBody, faults, made_later
+from igps.mesh.formats._format import Format, RawBody, deferred, faults
 from igps.mesh.formats._volume_files import READERS, RawVolume, detached, of_nibabel, read_raw, suffix_of
 from igps.mesh.formats.label_names import cleaned, read_label_names, table_beside
 from igps.mesh.label_surface import LEAST_VOXELS, checked_spacing, voxel_surface
@@ -25,31 +25,30 @@ from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 
-# More different values are intensities of an image; so are more than a few, if less than a share of neighbours are
-# alike: of labels of two voxels' width half are.
-_MOST_LABELS, _FEW_LABELS, _ALIKE = 20_000, 50, 0.3
-# How far labels may be off whole numbers: NIfTI keeps what was given as numbers with a fraction as scaled integers.
-_ROUNDING = 0.01
-
+# Volumes with more values than _MAX_LABELS are refused as images. So are those with more than _MAX_UNCHECKED values if
+# less than a share _MIN_EQUAL of adjacent voxels are equal; labels as thin as two voxels have a share of one half.
+_MAX_LABELS, _MAX_UNCHECKED, _MIN_EQUAL = 20_000, 50, 0.3
+# Tolerance of labels that should be whole numbers: NIfTI may store them as scaled integers.
+_LABEL_TOLERANCE = 0.01
 
 Box = tuple[slice, slice, slice]
 
 
 @dataclass(frozen=True)
 class LabelBody:
-    """A body of a volume: its label and name, its number of voxels, and where in the arrays it lies."""
+    """A label of a volume that is a body."""
 
     label: int
     name: str
     n_voxels: int
-    layer: int
-    value: int
-    box: Box
+    layer: int  # index of the array in `LabelVolume.layers`
+    value: int  # of the label in that array
+    box: Box  # the smallest that contains the label in that array
 
 
 @dataclass(frozen=True, eq=False)
 class LabelVolume:
-    """Labels of voxels, and where they are in the world.
+    """Labels of voxels, with the affine to the world.
 
     Example:
         >>> labels = np.zeros((20, 20, 20), dtype=np.uint8)
@@ -58,61 +57,62 @@ class LabelVolume:
         >>> [(body.label, body.name, body.n_voxels) for body in volume.bodies]
         [(1, '1', 2048), (2, 'liver', 2048)]
 
-    A MeshError of no labels, labels that are no whole numbers from 0, names that numbers do not tell apart, or a
-    singular affine.
+    Raises:
+        MeshError: no labels, labels other than whole numbers from 0, ambiguous names, or a singular affine.
     """
 
-    layers: tuple[NDArray[Any], ...]  # (X, Y, Z) whole numbers, 0 the background; several where segments overlap
-    affine: Floats  # (4, 4) from indices of voxels to the world
-    name: str = "volume"  # what error messages call it, usually its file
+    layers: tuple[NDArray[Any], ...]  # (X, Y, Z) whole numbers, 0 is the background; several if segments overlap
+    affine: Floats  # (4, 4) from voxel indices to the world
+    name: str = "volume"  # used in messages, usually the path
     names: dict[int, str] | None = None  # of labels
-    # (label, layer, value in it) of files that list their segments; None for one layer of labels
+    # (label, layer, value in the layer), if the file lists its segments; None for one layer of labels
     segments: tuple[tuple[int, int, int], ...] | None = None
     unit: str | None = "mm"  # of length, None if unknown
-    notes: tuple[str, ...] = ()  # what was done to it
+    notes: tuple[str, ...] = ()  # remarks on how the volume was read
 
     def __post_init__(self) -> None:
         checked_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
         if not self.bodies:
-            told = f"{self.name}: no voxel has a label, all are 0"
-            told += f" ({'; '.join(self.notes)})" if self.notes else ""
-            raise MeshError(f"{told}. Check that the right file was exported.")
-        seen: dict[str, int] = {}  # a name may be what another got for its number
+            fault = f"{self.name}: no voxel has a label, all are 0"
+            fault += f" ({'; '.join(self.notes)})" if self.notes else ""
+            raise MeshError(f"{fault}. Check that the right file was exported.")
+        seen: dict[str, int] = {}  # a given name may equal one that was made distinct by its number
         for body in self.bodies:
             if (other := seen.setdefault(body.name, body.label)) != body.label:
-                both = f"{self.name}: labels {other} and {body.label} are both named {body.name!r}."
-                raise MeshError(f"{both} Rename one, or give names by a table.")
+                fault = f"{self.name}: labels {other} and {body.label} are both named {body.name!r}."
+                raise MeshError(f"{fault} Rename one, or give names by a table.")
 
     @cached_property
     def bodies(self) -> tuple[LabelBody, ...]:
-        """A body for each label that any voxel has, in ascending order; those of one name with their numbers behind."""
-        names, found = self.names or {}, []
+        """The bodies of all labels that occur, in ascending order; names that repeat are followed by the label."""
+        names, bodies = self.names or {}, []
         for layer, labels in enumerate(self.layers):
-            known = {value: label for label, at, value in self.segments or () if at == layer}
-            for value, count, box in _counted(labels, self.name):
+            known = {value: label for label, index, value in self.segments or () if index == layer}
+            for value, n_voxels, box in _count_labels(labels, self.name):
                 label = known.get(value, value if len(self.layers) == 1 else None)
                 if label is not None:
-                    found.append(LabelBody(label, names.get(label, str(label)), count, layer, value, box))
-        given = Counter(body.name for body in found)
-        told = (replace(one, name=f"{one.name} ({one.label})") if given[one.name] > 1 else one for one in found)
-        return tuple(sorted(told, key=lambda body: body.label))
+                    bodies.append(LabelBody(label, names.get(label, str(label)), n_voxels, layer, value, box))
+        uses = Counter(body.name for body in bodies)
+        distinct = (replace(x, name=f"{x.name} ({x.label})") if uses[x.name] > 1 else x for x in bodies)
+        return tuple(sorted(distinct, key=lambda body: body.label))
 
     def body(self, part: int | str) -> LabelBody:
-        """The body of a label, or of a name; a MeshError with the names that there are, if there is none."""
-        named: dict[int | str, LabelBody] = {str(body.label): body for body in self.bodies}
-        named |= {key: body for body in self.bodies for key in (body.label, body.name)}  # teeth are named by numbers
-        if part in named:
-            return named[part]
+        """Return the body of a label or name; if there is none, a MeshError lists the names."""
+        by_key: dict[int | str, LabelBody] = {str(body.label): body for body in self.bodies}
+        # Names win over the numbers of other labels: teeth have numbers as names
+        by_key |= {key: body for body in self.bodies for key in (body.label, body.name)}
+        if part in by_key:
+            return by_key[part]
         known = ", ".join(body.name for body in self.bodies[:10]) + (", …" if len(self.bodies) > 10 else "")
         raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
 
     def mask(self, part: int | str) -> Booleans:
-        """Where the label is, within `LabelBody.box`."""
+        """Return the mask of a label within its `LabelBody.box`."""
         body = self.body(part)
         return np.asarray(self.layers[body.layer][body.box] == body.value)
 
     def voxels(self, part: int | str) -> LabelVoxels:
-        """Where the label is, with its place in the grid."""
+        """Return the mask of a label with its place in the volume."""
         low = np.array([side.start for side in self.body(part).box])
         return LabelVoxels(self.mask(part), low, self.layers[0].shape, np.asarray(self.affine, dtype=np.float64))
 
@@ -120,10 +120,12 @@ class LabelVolume:
 def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) -> LabelVolume:
     """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.nhdr`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`.
 
-    Names of labels come from `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, extensions of NIfTI, tags of
-    MGH), else from a table beside it (see `table_beside`); without one a label is its number, and the only label of a
-    mask, 1 or 255, has the name of the file. A MeshError of a file that is missing, cut short, too large, or holds no
-    labels.
+    Names of labels come from the table `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, NIfTI extensions,
+    MGH tags), else from a table beside it (see `table_beside`). Otherwise labels are named by their numbers, and the
+    only label of a mask, 1 or 255, is named after the file.
+
+    Raises:
+        MeshError: the file is missing, cut short, too large, or holds no labels.
     """
     path = Path(path)
     if not path.is_file():
@@ -136,7 +138,7 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
 def volume_in_memory(
     labels: Any, spacing: Sequence[float] | None = None, name: str = "volume", options: LoadOptions = LoadOptions()
 ) -> LabelVolume:
-    """The volume of an array (X, Y, Z) with the sides of its voxels, in millimetres, or of an image of nibabel."""
+    """Make a volume of an array (X, Y, Z) and the sides of a voxel, in millimetres, or of an image of nibabel."""
     if hasattr(labels, "dataobj"):
         raw = of_nibabel(labels, name)
     else:
@@ -150,21 +152,21 @@ def volume_in_memory(
 
 
 def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto", cavities: Cavities = "fill") -> Mesh:
-    """The surface of a label, by its number or name, as a body in the world; see `voxel_surface` and `mend`."""
+    """Return the surface of a label, by number or name, in world coordinates; see `voxel_surface` and `mend`."""
     body = volume.body(part)
     name = f"{volume.name}#{body.name}"
     affine = np.array(volume.affine, dtype=np.float64)
     affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
-    mask, affine = _canonical(volume.mask(part), affine)
+    mask, affine = _reoriented(volume.mask(part), affine)
     vertices, faces, notes = voxel_surface(mask, affine, cavities=cavities == "keep", joins=how != "never", name=name)
-    notes = (*volume.notes, *notes)
     if (volume.names or {}).get(body.label, body.name) != body.name:
-        notes = (*notes, "another label has the same name: the number was put behind. Give names by a table")
+        notes = (*notes, "another label has the same name: the number was appended. Give names by a table")
+    notes = (*volume.notes, *notes)
     return mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name, notes=notes)
 
 
-def _canonical(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
-    """With axes that run as nearly along x, y and z as they can: formats store the same voxels in different orders."""
+def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
+    """Permute and flip the axes to run as nearly along x, y, z as possible, whatever order a format stores them in."""
     order = linear_sum_assignment(-np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0))[1]
     mask, affine = mask.transpose(order), affine[:, [*order, 3]]
     for axis in np.nonzero(np.diag(affine)[:3] < 0)[0]:
@@ -175,15 +177,14 @@ def _canonical(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
 
 
 def _labelled(raw: RawVolume, name: str, options: LoadOptions, path: Path | None = None) -> LabelVolume:
-    """The labels, with their names by a table, or by the file or what lies beside it, if it is one."""
+    """Turn the values of a volume into labels, and find their names; see `read_label_volume`."""
     notes: list[str] = []
-    layers = tuple(_whole_numbers(values, name, options.threshold, notes) for values in raw.layers)
+    layers = tuple(_integer_labels(values, name, options.threshold, notes) for values in raw.layers)
     segments, names = None, raw.names
     if raw.segments:
-        # A value may stand for one segment in each layer
+        # The same value may stand for different segments in different layers
         values = [value for _, _, value in raw.segments]
-        unique = len(set(values)) == len(values)
-        labels = values if unique else list(range(1, len(values) + 1))
+        labels = values if len(set(values)) == len(values) else list(range(1, len(values) + 1))
         segments = tuple((label, layer, value) for label, (_, layer, value) in zip(labels, raw.segments, strict=True))
         names = cleaned({label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True)})
     if options.names is not None:
@@ -192,20 +193,20 @@ def _labelled(raw: RawVolume, name: str, options: LoadOptions, path: Path | None
         names = read_label_names(table) if (table := table_beside(path)) else {}
         label = int(layers[0].max(initial=0))
         is_mask = label in (1, 255) and bool(((layers[0] == 0) | (layers[0] == label)).all())
-        if not names and not raw.segments and is_mask:  # is called by its file
+        if not names and not raw.segments and is_mask:
             names = {label: path.name[: -len(suffix_of(path))]}
     return LabelVolume(layers, raw.affine, name, names, segments, raw.unit, tuple(dict.fromkeys(notes)))
 
 
-def _whole_numbers(values: NDArray[Any], name: str, threshold: float, notes: list[str]) -> NDArray[Any]:
-    """Labels from 0, of the smallest type; probabilities are cut at the threshold."""
+def _integer_labels(values: NDArray[Any], name: str, threshold: float, notes: list[str]) -> NDArray[Any]:
+    """Convert values to labels of the smallest unsigned type; probabilities are binarised at the threshold."""
     if values.dtype.kind == "f":
         if n_bad := int(np.count_nonzero(~np.isfinite(values))):
-            raise MeshError(f"{name}: {n_bad} voxels are NaN or infinite; labels expected. Set them to 0.")
-        slabs = values.T if values.flags.f_contiguous else values  # one by one, a whole copy may be too large
-        odd = np.concatenate([np.empty(0), *(one[np.abs(one - np.rint(one)) > _ROUNDING] for one in slabs)])
-        # SPM keeps them as bytes times a rounded 1/255, and resampled ones overshoot
-        if len(odd) and values.min() >= -_ROUNDING and values.max() <= 1 + _ROUNDING:
+            raise MeshError(f"{name}: {n_bad} voxels are NaN or infinite, expected labels. Set them to 0.")
+        slabs = values.T if values.flags.f_contiguous else values  # a copy of all may be too large
+        odd = np.concatenate([np.empty(0), *(x[np.abs(x - np.rint(x)) > _LABEL_TOLERANCE] for x in slabs)])
+        # Probabilities may leave [0, 1]: SPM stores bytes times a rounded 1/255, and resampling overshoots
+        if len(odd) and values.min() >= -_LABEL_TOLERANCE and values.max() <= 1 + _LABEL_TOLERANCE:
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
             return (values >= threshold).astype(np.uint8)
         if len(odd):
@@ -216,24 +217,24 @@ def _whole_numbers(values: NDArray[Any], name: str, threshold: float, notes: lis
     low, high = (int(np.rint(values.min())), int(np.rint(values.max()))) if values.size else (0, 0)
     if low < 0:
         raise MeshError(
-            f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}; 0 for the "
-            "background and positive numbers expected. Is it an image? Export its labels."
+            f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}; expected 0 "
+            "for the background and positive numbers. Export the labels if it is an image."
         )
     if high >= 2**31:
-        raise MeshError(f"{name}: label {high} is too large; below 2³¹ expected. Number the labels anew.")
+        raise MeshError(f"{name}: label {high} is too large, expected less than 2³¹. Renumber the labels.")
     if values.dtype.kind != "f":
         return np.asarray(values, dtype=np.min_scalar_type(high))
     return np.rint(values, out=np.empty_like(values, dtype=np.min_scalar_type(high)), casting="unsafe")
 
 
-def _counted(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]]:
-    """The values that occur, without 0, ascending; how often; and the smallest box that holds each."""
+def _count_labels(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]]:
+    """Return the values that occur except 0, ascending, with their counts and bounding boxes."""
     array = np.asarray(labels)
     if array.ndim != 3 or array.dtype.kind not in "biu":
         raise MeshError(f"{name}: expected whole numbers of shape (X, Y, Z), got {array.dtype} of shape {array.shape}.")
     array = array.view(np.uint8) if array.dtype.kind == "b" else array
     if array.size and array.min() < 0:
-        raise MeshError(f"{name}: negative labels, such as {array.min()}; numbers from 0 expected.")
+        raise MeshError(f"{name}: expected labels from 0, got {array.min()}. Renumber them.")
     if not array.size or array.max() < 2**16:
         counts = np.zeros(int(array.max(initial=0)) + 1, dtype=np.int64)
         for plane in array:
@@ -246,52 +247,52 @@ def _counted(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]]:
         start = int(values[0] == 0)
         numbered = index.reshape(array.shape) + (1 - start)
         values, counts = values[start:], counts[start:]
-    if len(values) > _MOST_LABELS or (len(values) > _FEW_LABELS and _is_speckled(array, values[counts.argmax()])):
-        many = f"{name}: {len(values)} different values, which look like an image and not like labels."
-        raise MeshError(f"{many} Export the labels.")
+    n = len(values)
+    if n > _MAX_LABELS or (n > _MAX_UNCHECKED and _is_speckled(array, values[counts.argmax()])):
+        raise MeshError(f"{name}: {n} values, which look like an image and not like labels. Export the labels.")
     boxes = [box for box in ndimage.find_objects(numbered) if box is not None]
     return zip(values.tolist(), counts.tolist(), boxes, strict=True)
 
 
-def _is_speckled(labels: NDArray[Any], most: int) -> bool:
-    """Whether hardly any neighbours along x are alike, but for the background and the most frequent value."""
-    counted = (labels != 0) & (labels != most)
+def _is_speckled(labels: NDArray[Any], most_frequent: int) -> bool:
+    """Return whether few neighbours along x are equal, without the background and the most frequent value."""
+    counted = (labels != 0) & (labels != most_frequent)
     pairs = counted[1:] & counted[:-1]
-    return bool(np.count_nonzero(pairs & (labels[1:] == labels[:-1])) < _ALIKE * np.count_nonzero(pairs))
+    return bool(np.count_nonzero(pairs & (labels[1:] == labels[:-1])) < _MIN_EQUAL * np.count_nonzero(pairs))
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surfaces of the labels of a volume; or of all of them together as the whole, or in pieces."""
+    """Read the labels of a volume as bodies; see `label_bodies`."""
     return label_bodies(read_label_volume(path, options), options, part)
 
 
 def label_bodies(volume: LabelVolume, options: LoadOptions, part: str | None = None) -> list[RawBody]:
-    """The bodies of a volume, or the one named, by `options`; their surfaces are made later."""
+    """Return deferred bodies of a volume: its labels, or all of them as the whole or in pieces, by `options`."""
     if options.bodies in ("whole", "pieces"):
         labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
         volume = replace(volume, layers=(labelled,), names=None, segments=None)
         volume = _in_pieces(volume) if options.bodies == "pieces" else volume
-    made = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
+    surface = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
     if options.bodies == "whole":
-        return [made_later(partial(made, 1), None, volume.unit, partial(volume.voxels, 1))]
+        return [deferred(partial(surface, 1), None, volume.unit, partial(volume.voxels, 1))]
     names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
-    return [made_later(partial(made, name), name, volume.unit, partial(volume.voxels, name)) for name in names]
+    return [deferred(partial(surface, name), name, volume.unit, partial(volume.voxels, name)) for name in names]
 
 
 def _in_pieces(volume: LabelVolume) -> LabelVolume:
-    """With a label for each piece, in the order of the voxels; without those that are too small to be bodies."""
+    """Give each connected component its own label, in the order of the voxels, without those too small for a body."""
     label, _ = ndimage.label(volume.layers[0], np.ones((3, 3, 3)))
-    small = np.bincount(label.ravel(), minlength=2) < LEAST_VOXELS
-    small[0] = False
-    if small[1:].all():  # one of them says so
-        small[:] = False
-    names = {k: f"piece {i}" for i, k in enumerate((np.flatnonzero(~small[1:]) + 1).tolist(), 1)}
-    notes = (f"left out {small.sum()} specks",) if small.any() else ()
-    return replace(volume, layers=(np.where(small[label], 0, label),), names=names, notes=(*volume.notes, *notes))
+    is_speck = np.bincount(label.ravel(), minlength=2) < LEAST_VOXELS
+    is_speck[0] = False
+    if is_speck[1:].all():  # keep them: their error says that they are too small
+        is_speck[:] = False
+    names = {k: f"piece {i}" for i, k in enumerate((np.flatnonzero(~is_speck[1:]) + 1).tolist(), 1)}
+    notes = (f"left out {is_speck.sum()} specks",) if is_speck.any() else ()
+    return replace(volume, layers=(np.where(is_speck[label], 0, label),), names=names, notes=(*volume.notes, *notes))
 
 
 def _beside(path: Path, options: LoadOptions) -> list[Path]:
-    """The file of the voxels, if it is another one, and the table of names."""
+    """Return the files of the voxels, if they are others, and the table of names."""
     table = table_beside(path) if options.names is None else Path(options.names)
     return [*detached(path), *([table] if table else [])]
 

@@ -1,1 +1,1 @@
-"""Counts of samples and pairs, and what is found at samples: torch for gradients and devices, Numba for the CPU."""
+"""Counts of pairs and features of samples: PyTorch for gradients and other devices, Numba for the CPU."""

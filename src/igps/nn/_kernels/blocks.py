@@ -1,4 +1,4 @@
-"""Where compiled loops work on tensors, and how many bodies are computed at once."""
+"""The choice between compiled loops and operations of PyTorch, and the number of bodies computed at once."""
 
 from collections.abc import Callable
 
@@ -8,22 +8,22 @@ from torch import Tensor
 from igps.retrieval.distances import in_transforms
 
 BLOCK = 2**25
-"""Numbers of a block, which fill a device."""
+"""Numbers in a block: enough to keep a GPU busy."""
 
 
-def in_loops(device: torch.device) -> bool:
-    """Whether compiled loops work on tensors of a device; where not, operations of PyTorch do, which can be traced."""
+def uses_loops(device: torch.device) -> bool:
+    """Whether tensors of a device are processed by compiled loops, or by operations of PyTorch, which can be traced."""
     return device.type == "cpu" and not torch.compiler.is_compiling() and not in_transforms()
 
 
-def of_bodies(function: Callable[..., Tensor], points: Tensor, others: Tensor, *more: Tensor) -> Tensor:
-    """What a function of tensors of bodies, (N, P, ...), (N, T, ...) and more, makes of all; it looks at P·T pairs.
+def map_bodies(function: Callable[..., Tensor], points: Tensor, others: Tensor, *more: Tensor) -> Tensor:
+    """Apply a function to tensors of N bodies, (N, P, ...), (N, T, ...) and more, in batches of bodies.
 
-    On the CPU one body comes after the other, as their pairs then stay in its cache; elsewhere as many as fill a
-    device; traced, all.
+    The function takes memory for P·T pairs of each body. On the CPU a batch is one body, whose pairs then stay in the
+    cache; on other devices it fills the device. Traced code takes all bodies at once.
     """
-    given = (points, others, *more)
+    tensors = (points, others, *more)
     if torch.compiler.is_compiling():
-        return function(*given)
-    n_bodies = 1 if in_loops(points.device) else max(1, BLOCK // (points.shape[1] * others.shape[1] or 1))
-    return torch.cat([function(*some) for some in zip(*(one.split(n_bodies) for one in given), strict=True)])
+        return function(*tensors)
+    n_bodies = 1 if uses_loops(points.device) else max(1, BLOCK // (points.shape[1] * others.shape[1] or 1))
+    return torch.cat([function(*batch) for batch in zip(*(x.split(n_bodies) for x in tensors), strict=True)])

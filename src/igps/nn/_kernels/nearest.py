@@ -1,4 +1,4 @@
-"""The smallest entries of each row, for the few nearest of many points."""
+"""The smallest entries of each row, for the nearest of many points."""
 
 import numpy as np
 import torch
@@ -11,33 +11,33 @@ from igps.nn._kernels import blocks
 
 
 def smallest(values: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """The n smallest entries of each row of (..., P, T), the smallest first: (..., P, n) values and their columns.
+    """Return the n smallest entries (..., P, n) of each row of (..., P, T), in ascending order, and their columns.
 
-    No gradient flows through them. The columns of infinite entries say nothing.
+    There is no gradient. The columns of infinite entries are undefined.
     """
     values = values.detach()
-    if not blocks.in_loops(values.device):
-        found = values.topk(n, dim=-1, largest=False)
-        return found.values, found.indices
-    # PyTorch copies and partly sorts each row, which takes some times as long as to keep the few smallest of it.
+    if not blocks.uses_loops(values.device):
+        top = values.topk(n, dim=-1, largest=False)
+        return top.values, top.indices
+    # Faster than PyTorch, which copies and partly sorts each row.
     rows = values.contiguous().numpy().reshape(-1, values.shape[-1])
-    kept, columns = np.full((len(rows), n), np.inf, rows.dtype), np.zeros((len(rows), n), np.int64)
+    entries, columns = np.full((len(rows), n), np.inf, rows.dtype), np.zeros((len(rows), n), np.int64)
     if n:
-        keep_smallest(rows, kept, columns)
+        keep_smallest(rows, entries, columns)
     shape = (*values.shape[:-1], n)
-    return torch.from_numpy(kept.reshape(shape)), torch.from_numpy(columns.reshape(shape))
+    return torch.from_numpy(entries.reshape(shape)), torch.from_numpy(columns.reshape(shape))
 
 
 @compiled()
-def keep_smallest(values: NDArray[Real], kept: NDArray[Real], columns: Integers) -> None:
-    """Write the smallest entries of each row of (P, T) in order to (P, n), which holds infinity, and their columns."""
-    last = kept.shape[1] - 1
+def keep_smallest(values: NDArray[Real], entries: NDArray[Real], columns: Integers) -> None:
+    """Write the smallest entries of each row of (P, T) and their columns to (P, n); `entries` starts as infinity."""
+    last = entries.shape[1] - 1
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             value = values[i, j]
-            if value < kept[i, last]:
+            if value < entries[i, last]:
                 k = last
-                while k > 0 and kept[i, k - 1] > value:
-                    kept[i, k], columns[i, k] = kept[i, k - 1], columns[i, k - 1]
+                while k > 0 and entries[i, k - 1] > value:
+                    entries[i, k], columns[i, k] = entries[i, k - 1], columns[i, k - 1]
                     k -= 1
-                kept[i, k], columns[i, k] = value, j
+                entries[i, k], columns[i, k] = value, j

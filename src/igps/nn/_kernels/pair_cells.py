@@ -1,4 +1,4 @@
-"""Compiled loops that find, of a row of pairs, the cells that they fall into and their shares along each axis."""
+"""Compiled loops that compute the cells of a row of pairs, and their shares along each axis."""
 
 from typing import Any, NamedTuple
 
@@ -9,38 +9,37 @@ from igps._arrays import Booleans, Integers
 from igps._compiled import compiled
 
 Numbers = NDArray[Any]
-Places = NDArray[np.int32]
+Indices = NDArray[np.int32]
 
-# How the loops get the values of axes: as they are; distances from inner products; three cosines at once from points.
+# Kinds of axes: values that are passed in; distances, from inner products; three cosines at once, from oriented points.
 VALUES, DISTANCES, COSINES = 0, 1, 2
-# Numbers that a compiled loop takes at once, at most.
-_VECTOR = 32
+_MAX_VECTOR = 32  # upper bound of the numbers that a compiled loop processes at once
 
 
 class Axes(NamedTuple):
-    """K axes, of which R have values and 3 S are cosines."""
+    """K axes: R axes of values or distances, and S triples of cosines."""
 
-    kinds: Integers  # in order, `VALUES`, `DISTANCES`, or `COSINES`, which are three axes
-    norms: Numbers  # (R, P) squared lengths of the points of axes of distances
-    oriented: Numbers  # (S, 2, D, P) for each three axes of cosines the points, and their directions of length 1
-    centres: Numbers  # (K, B) ascending, of each axis its own number of them
-    n_centres: Integers  # (K,) how many these are
-    inverse: Numbers  # (K, B − 1) one over the gaps between centres; where they are equal, the first is over the mean
-    equal: Booleans  # (K,) whether these gaps are equal
+    kinds: Integers  # `VALUES`, `DISTANCES`, or `COSINES` (three axes), in the order of the axes
+    norms: Numbers  # (R, P) squared lengths of the points; 0 for axes of values
+    oriented: Numbers  # (S, 2, D, P) points and their directions of length 1, for each triple of cosines
+    centres: Numbers  # (K, B) ascending; the number of centres differs between axes
+    n_centres: Integers  # (K,) number of centres of each axis
+    inverse_gaps: Numbers  # (K, B − 1) 1 / gap between centres; for equal gaps, the first entry is 1 / mean gap
+    has_equal_gaps: Booleans  # (K,) whether all gaps are equal
 
 
 class Row(NamedTuple):
-    """What is found of the pairs of a row, a number for each of J columns."""
+    """Results for the pairs of one row of a block, with an entry for each of J columns."""
 
-    cells: Places  # (J,) below their values
-    shares: Numbers  # (K, J) how far each value is on the way from the centre below to that above
+    cells: Indices  # (J,) index of the cell of each pair, over all axes
+    shares: Numbers  # (K, J) position of the value between the centres below and above it, from 0 to 1
     features: Numbers  # (S, 5, J) see `cosines`
-    interval: Places  # (J,) room
+    interval: Indices  # (J,) scratch space
 
 
 @compiled()
 def new_row(axes: Axes, n_columns: int, values: Numbers) -> Row:
-    """Room for a row, in the type of the values."""
+    """Allocate a row, in the type of the values."""
     return Row(
         np.empty(n_columns, np.int32),
         np.empty((len(axes.n_centres), n_columns), values.dtype),
@@ -51,103 +50,104 @@ def new_row(axes: Axes, n_columns: int, values: Numbers) -> Row:
 
 @compiled()
 def whole_vectors(first: int, n_columns: int) -> int:
-    """The column from which to work, so that it is by whole vectors: what is left over takes longer than one."""
-    return max(0, n_columns - (n_columns - first + _VECTOR - 1) // _VECTOR * _VECTOR)
+    """Return the column to start at, at most ``first``, so that loops process whole vectors: a remainder is slower."""
+    return max(0, n_columns - (n_columns - first + _MAX_VECTOR - 1) // _MAX_VECTOR * _MAX_VECTOR)
 
 
 @compiled(inline="always")
-def locate_row(values: Numbers, i: int, axes: Axes, point: int, column: int, start: int, found: Row) -> None:
-    """Fill in what is found of row i, that of a point, from the column ``start`` on; else see `count_block`."""
-    found.cells[start:] = 0
-    k = r = s = np.int64(0)  # a plain 0 would make a function of its own of `locate`
+def locate_row(values: Numbers, i: int, axes: Axes, point: int, column: int, start: int, result: Row) -> None:
+    """Fill in the result of row i of a block, which belongs to a point, from column ``start`` on; see `count_block`."""
+    result.cells[start:] = 0
+    k = r = s = np.int64(0)  # with a literal 0, `locate` would be compiled a second time
     for kind in axes.kinds:
         if kind == COSINES:
-            cosines(axes.oriented[s, 0], axes.oriented[s, 1], point, column, start, found.features[s])
+            cosines(axes.oriented[s, 0], axes.oriented[s, 1], point, column, start, result.features[s])
             for f in range(3):
-                locate(found.features[s, f, start:], axes, k, start, found)
+                locate(result.features[s, f, start:], axes, k, start, result)
                 k += 1
             s += 1
             continue
         value = values[r, i, start:]
         if kind == DISTANCES:
             distances(value, axes.norms[r, point], axes.norms[r, column + start :])
-        locate(value, axes, k, start, found)
+        locate(value, axes, k, start, result)
         k += 1
         r += 1
 
 
 @compiled()
 def distances(products: Numbers, norm: Any, norms: Numbers) -> None:
-    """Turn inner products (n,) of a point with others into distances; from the squared lengths of it and of them."""
-    two, none = products.dtype.type(2), products.dtype.type(0)
+    """Replace inner products (n,) of a point and other points by distances, from the squared lengths of all."""
+    two, zero = products.dtype.type(2), products.dtype.type(0)
     for j in range(len(products)):
-        products[j] = np.sqrt(max(norm + norms[j] - two * products[j], none))
+        products[j] = np.sqrt(max(norm + norms[j] - two * products[j], zero))
 
 
 @compiled()
 def cosines(points: Numbers, directions: Numbers, point: int, column: int, start: int, features: Numbers) -> None:
-    """Fill the features (5, J) of a point with those of the columns from a start on.
+    """Fill in the features (5, J) of a point and the points of the columns from ``start`` on.
 
-    These are the larger and the smaller cosine to the line, that between the directions, one over the length of the
-    line, and the first point's own cosine to it, see `point_pair_features`; of points (D, P) and directions (D, P).
+    The features are the larger and the smaller cosine of the directions with the connecting line, the cosine between
+    the directions (see `point_pair_features`), 1 / length of the line, and the cosine of the point's own direction with
+    the line. Points and directions are (D, P).
     """
-    least, none, most = features.dtype.type(-1), features.dtype.type(0), features.dtype.type(1)
-    # Slices of rows, one by one: of a slice of them all it would not be known that they have no gaps.
-    here, there, between = features[0, start:], features[1, start:], features[2, start:]
+    minus_one, zero, one = features.dtype.type(-1), features.dtype.type(0), features.dtype.type(1)
+    # Slices of single rows: for a slice of the matrix the compiler would not know that rows are contiguous.
+    larger, smaller, between = features[0, start:], features[1, start:], features[2, start:]
     length, own = features[3, start:], features[4, start:]
     n = len(length)
-    length[:] = none
-    here[:] = none
-    there[:] = none
-    between[:] = none
+    length[:] = zero
+    larger[:] = zero
+    smaller[:] = zero
+    between[:] = zero
     for d in range(len(points)):
         x, u = points[d, point], directions[d, point]
         xs, us = points[d, column + start :], directions[d, column + start :]
-        for j in range(n):  # few arrays in a loop: of many the compiler makes no vectors
+        for j in range(n):  # separate loops, as the compiler does not vectorise loops over many arrays
             line = xs[j] - x
             length[j] += line * line
-            here[j] += u * line
+            larger[j] += u * line
         for j in range(n):
-            there[j] += us[j] * (x - xs[j])
+            smaller[j] += us[j] * (x - xs[j])
         for j in range(n):
             between[j] += u * us[j]
     for j in range(n):
-        inverse = most / np.sqrt(length[j]) if length[j] > none else none
-        own[j], length[j] = min(max(here[j] * inverse, least), most), inverse
+        inverse = one / np.sqrt(length[j]) if length[j] > zero else zero
+        own[j], length[j] = min(max(larger[j] * inverse, minus_one), one), inverse
     for j in range(n):
-        other = min(max(there[j] * length[j], least), most)
-        here[j], there[j] = max(own[j], other), min(own[j], other)
+        other = min(max(smaller[j] * length[j], minus_one), one)
+        larger[j], smaller[j] = max(own[j], other), min(own[j], other)
 
 
 @compiled()
-def locate(values: Numbers, axes: Axes, k: Any, start: int, found: Row) -> None:
-    """Sort values (n,) from a start on into the intervals between the centres of axis k, and refine the cells."""
-    centres, inverse = axes.centres[k, : axes.n_centres[k]], axes.inverse[k]
-    cell, share, interval = found.cells[start:], found.shares[k, start:], found.interval[start:]
-    none, one, end = values.dtype.type(0), values.dtype.type(1), values.dtype.type(len(centres) - 1)
+def locate(values: Numbers, axes: Axes, k: Any, start: int, result: Row) -> None:
+    """Find the intervals of values (n,), from column ``start`` on, along axis k, and refine the cells by them."""
+    centres, inverse_gaps = axes.centres[k, : axes.n_centres[k]], axes.inverse_gaps[k]
+    cell, share, interval = result.cells[start:], result.shares[k, start:], result.interval[start:]
+    zero, one, end = values.dtype.type(0), values.dtype.type(1), values.dtype.type(len(centres) - 1)
     width, last = np.int32(len(centres)), np.int32(len(centres) - 2)
-    if axes.equal[k]:
-        origin, scale = centres[0], inverse[0]
+    if axes.has_equal_gaps[k]:
+        origin, scale = centres[0], inverse_gaps[0]
         for j in range(len(values)):
-            along = (values[j] - origin) * scale
-            along = along if along > none else none
-            along = along if along < end else end
-            q = min(np.int32(along), last)
-            share[j] = along - values.dtype.type(q)
+            position = (values[j] - origin) * scale
+            position = position if position > zero else zero
+            position = position if position < end else end
+            q = min(np.int32(position), last)
+            share[j] = position - values.dtype.type(q)
             cell[j] = cell[j] * width + q
         return
     half = 1
     while 2 * half <= last:
         half *= 2
     interval[:] = 0
-    while half > 0:  # a search by halves, of all values at once
+    while half > 0:  # binary search for all values at once
         step = np.int32(half)
         for j in range(len(values)):
-            # An unsigned index is one that need not be counted from the end.
+            # Unsigned indices, as for signed ones Numba adds a check for negative indices.
             q = min(np.int32(interval[j] + step), last)
             interval[j] = q if values[j] >= centres[np.uint32(q)] else interval[j]
         half //= 2
     for j in range(len(values)):
         below = np.uint32(interval[j])
-        share[j] = min(max((values[j] - centres[below]) * inverse[below], none), one)
+        share[j] = min(max((values[j] - centres[below]) * inverse_gaps[below], zero), one)
         cell[j] = cell[j] * width + interval[j]

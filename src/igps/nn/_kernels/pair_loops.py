@@ -1,13 +1,12 @@
 """Loops over pairs of points that Numba compiles: the counts of `igps.nn._kernels.pairs`, and their gradient.
 
-A block of pairs has rows and columns: row i is point ``row + i``, column j point ``column + j`` with row ≤ column, and
-the pairs whose second point comes after the first are counted, each unordered pair once. A pair falls into the cell
-below its values, and is shared out between the 2^K corners of that cell: what belongs to the next bins is kept beside
-the cell's own count, where one store reaches both.
+A block of pairs has rows and columns. Row i is point ``row + i`` and column j is point ``column + j``, with
+row ≤ column. Only pairs whose second point comes after the first are counted, so that each unordered pair counts once.
 
-Of a row, the cells of all its pairs and their shares along each axis are found first, axis by axis, in loops that the
-compiler turns into vectors (`pair_cells`). Then each pair is added to its corners (`pair_sums`), or, for the gradient,
-reads them.
+Along each of K axes, a pair lies between the centres of two bins; these intervals form its cell. The pair is shared
+between the 2^K corners of the cell, whose counts are stored side by side and only added to their bins at the end. For
+each row, vectorised loops first compute the cells of all pairs and their shares along each axis (`pair_cells`). Each
+pair is then added to the corners of its cell (`pair_sums`), or, for the gradient, reads their values.
 """
 
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 
 from igps._arrays import Floats
 from igps._compiled import compiled
-from igps.nn._kernels.pair_cells import COSINES, DISTANCES, Axes, Numbers, Places, locate_row, new_row, whole_vectors
+from igps.nn._kernels.pair_cells import COSINES, DISTANCES, Axes, Indices, Numbers, locate_row, new_row, whole_vectors
 from igps.nn._kernels.pair_sums import (
     LANES,
     add_axes,
@@ -32,128 +31,130 @@ from igps.nn._kernels.pair_sums import (
 
 @compiled()
 def count_block(
-    values: Numbers, axes: Axes, row: int, column: int, classes: Places, weights: Floats, packs: bool, total: Floats
+    values: Numbers, axes: Axes, row: int, column: int, classes: Indices, weights: Floats, packs: bool, total: Floats
 ) -> None:
     """Count a block of pairs.
 
     Args:
-        values: (R, I, J) of the axes that are not cosines, in order; of distances the inner products, overwritten.
-        axes: see there.
-        row, column: see above.
-        classes: (M, P) that each point belongs to, and its weights (M, P) in them.
+        values: (R, I, J) of the axes other than cosines, in order; overwritten. For distances, the inner products.
+        axes: see `Axes`.
+        row, column: first point of the rows and of the columns.
+        classes, weights: (M, P) classes of each point, and its weights in them.
         packs: whether there is one axis, in single precision, and M and all weights are 1.
-        total: (C(C+1)/2, cells·2^K) to add to; of the corners the last axis alternates fastest.
+        total: (C(C+1)/2, cells·2^K) to add to; among the corners, the last axis varies fastest.
     """
     n_rows, n_columns = values.shape[1:]
     n_axes, n_members = len(axes.n_centres), len(classes)
     n_corners = 1 << n_axes
     n_cells = total.shape[1] // n_corners
     n_classes = int(np.sqrt(2.0 * len(total)))
-    # Of the row, or of rows in the same classes: by the class of the other end, whose first cell is its home.
+    # Sums of consecutive rows in the same classes, by the class of the column's point, whose cells start at its home.
     sums = np.zeros((n_classes * n_cells, n_corners))
     by_class = sums.reshape((n_classes, n_cells * n_corners))
     home = (classes[:, column : column + n_columns] * n_cells).astype(np.int32)
-    found = new_row(axes, n_columns, values)
+    result = new_row(axes, n_columns, values)
     packed = np.zeros((n_classes * n_cells if packs else 0) * LANES, np.int64)
-    lowest, highest = no_cells(n_cells, n_members)
+    lowest, highest = initial_range(n_cells, n_members)
     for i in range(n_rows):
         point = row + i
         first = max(point + 1 - column, 0)
         start = whole_vectors(first, n_columns)
         if i > 0:
-            same = True
+            is_same = True
             for m in range(n_members):
-                same &= classes[m, point] == classes[m, point - 1] and weights[m, point] == weights[m, point - 1]
-            if not same:
+                is_same &= classes[m, point] == classes[m, point - 1] and weights[m, point] == weights[m, point - 1]
+            if not is_same:
                 unpack(packed, sums)
                 flush(by_class, lowest * n_corners, (highest + 1) * n_corners, classes, weights, point - 1, total)
-                lowest, highest = no_cells(n_cells, n_members)
-        locate_row(values, i, axes, point, column, start, found)
-        cell, shares = found.cells[first:], found.shares
+                lowest, highest = initial_range(n_cells, n_members)
+        locate_row(values, i, axes, point, column, start, result)
+        cell, shares = result.cells[first:], result.shares
         if n_members > 1:
             for j in range(len(cell)):
                 lowest, highest = min(lowest, cell[j]), max(highest, cell[j])
         for m in range(n_members):
-            begin, weight = home[m, first:], weights[m, column + first :]
+            home_m, weight = home[m, first:], weights[m, column + first :]
             if packs:
-                pack_pairs(found.cells[start:], home[0, start:], shares[0, start:], found.interval[start:])
-                add_whole_pairs(cell, found.interval[first:], packed)
+                pack_pairs(result.cells[start:], home[0, start:], shares[0, start:], result.interval[start:])
+                add_whole_pairs(cell, result.interval[first:], packed)
             elif n_axes == 1:
-                add_one_axis(cell, begin, shares[0, first:], weight, sums)
+                add_one_axis(cell, home_m, shares[0, first:], weight, sums)
             elif n_axes == 4:
-                add_four_axes(cell, begin, shares, first, weight, sums)
+                add_four_axes(cell, home_m, shares, first, weight, sums)
             else:
-                add_axes(cell, begin, shares, first, weight, sums)
+                add_axes(cell, home_m, shares, first, weight, sums)
     unpack(packed, sums)
     flush(by_class, lowest * n_corners, (highest + 1) * n_corners, classes, weights, row + n_rows - 1, total)
 
 
 @compiled()
 def gradient_block(
-    values: Numbers, axes: Axes, row: int, column: int, classes: Places, weights: Floats, upstream: Numbers,
-    turns: Numbers, by_weights: Floats, by_centres: Floats,
+    values: Numbers, axes: Axes, row: int, column: int, classes: Indices, weights: Floats, upstream: Numbers,
+    by_cosines: Numbers, by_weights: Floats, by_centres: Floats,
 ) -> None:  # fmt: skip
-    """The gradient of `count_block`, whose first arguments are the same.
+    """Compute the gradient of `count_block`, which takes the same first arguments.
 
     Args:
-        values: overwritten with the derivatives by them, of distances by their squares; 0 where there is no pair.
+        values: overwritten with the derivatives by them, or by squared distances; 0 where there is no pair.
         upstream: (C(C+1)/2, cells·2^K) derivatives by the counts.
-        turns: (S, 4, I, J) to fill, for each three axes of cosines, with the derivatives by u·(y − x), v·(x − y), u·v
-            and |y − x|², of points x and y with directions u and v, x being that of the row.
+        by_cosines: (S, 4, I, J) to fill, for each triple of cosines, with the derivatives by u·(y − x), v·(x − y), u·v
+            and |y − x|², where x and u are the point and direction of the row, y and v those of the column.
         by_weights, by_centres: (M, P) and (K, B) to add to.
     """
     n_rows, n_columns = values.shape[1:]
     n_axes, n_members = len(axes.n_centres), len(classes)
     n_corners = 1 << n_axes
     n_classes = int(np.sqrt(2.0 * len(upstream)))
-    found = new_row(axes, n_columns, values)
-    cells, shares, features = found.cells, found.shares, found.features
+    result = new_row(axes, n_columns, values)
+    cells, shares, features = result.cells, result.shares, result.features
     slopes = np.empty(n_axes)
-    none = values.dtype.type(0)
+    zero = values.dtype.type(0)
     for i in range(n_rows):
         point = row + i
         first = max(point + 1 - column, 0)
         start = whole_vectors(first, n_columns)
-        locate_row(values, i, axes, point, column, start, found)
-        values[:, i, : min(first, n_columns)] = none
-        turns[:, :, i, : min(first, n_columns)] = none
+        locate_row(values, i, axes, point, column, start, result)
+        values[:, i, : min(first, n_columns)] = zero
+        by_cosines[:, :, i, : min(first, n_columns)] = zero
         for j in range(first, n_columns):
             other = column + j
             slopes[:] = 0
-            begin = np.uint32(cells[j] * n_corners)
+            corner = np.uint32(cells[j] * n_corners)
             for m in range(n_members):
-                of_row = weights[m, point]
+                row_weight = weights[m, point]
                 for n in range(n_members):
-                    of_column = weights[n, other]
-                    if of_row == 0 and of_column == 0:
+                    column_weight = weights[n, other]
+                    if row_weight == 0 and column_weight == 0:
                         continue
                     pair = np.uint32(pair_row(classes[m, point], classes[n, other], n_classes))
-                    mean = interpolate(upstream[pair], begin, shares, j, of_row * of_column, slopes)
-                    by_weights[m, point] += of_column * mean
-                    by_weights[n, other] += of_row * mean
-            within: Any = cells[j]
+                    mean = interpolate(upstream[pair], corner, shares, j, row_weight * column_weight, slopes)
+                    by_weights[m, point] += column_weight * mean
+                    by_weights[n, other] += row_weight * mean
+            cell: Any = cells[j]
             for k in range(n_axes - 1, -1, -1):
                 share, width = np.float64(shares[k, j]), np.uint32(axes.n_centres[k])
-                q, within = np.uint32(within % width), np.uint32(within // width)
-                inside = share < 1 and (share > 0 or q > 0)  # on a centre, the slope is that beyond it
-                slope = slopes[k] * axes.inverse[k, np.uint32(0) if axes.equal[k] else q] if inside else 0.0
+                q, cell = np.uint32(cell % width), np.uint32(cell // width)
+                is_inside = share < 1 and (share > 0 or q > 0)  # on a centre, the slope above it is taken
+                gap = np.uint32(0) if axes.has_equal_gaps[k] else q
+                slope = slopes[k] * axes.inverse_gaps[k, gap] if is_inside else 0.0
                 by_centres[k, q] -= slope * (1 - share)
                 by_centres[k, q + np.uint32(1)] -= slope * share
                 slopes[k] = slope
             k = r = s = 0
             for kind in axes.kinds:
                 if kind == COSINES:
-                    to_line, length = features[s, 4, j], features[s, 3, j]
-                    own, others = slopes[k] * length, slopes[k + 1] * length
-                    along = -(slopes[k] * features[s, 0, j] + slopes[k + 1] * features[s, 1, j]) * length * length / 2
-                    if to_line != features[s, 0, j]:
-                        own, others = others, own
-                    turns[s, 0, i, j], turns[s, 1, i, j], turns[s, 2, i, j] = own, others, slopes[k + 2]
-                    turns[s, 3, i, j] = along
+                    own_cosine, inverse = features[s, 4, j], features[s, 3, j]
+                    by_row, by_column = slopes[k] * inverse, slopes[k + 1] * inverse
+                    by_square = slopes[k] * features[s, 0, j] + slopes[k + 1] * features[s, 1, j]
+                    if own_cosine != features[s, 0, j]:  # the larger cosine is that of the column
+                        by_row, by_column = by_column, by_row
+                    by_cosines[s, 0, i, j], by_cosines[s, 1, i, j] = by_row, by_column
+                    by_cosines[s, 2, i, j] = slopes[k + 2]
+                    by_cosines[s, 3, i, j] = -by_square * inverse * inverse / 2
                     k += 3
                     s += 1
                     continue
-                if kind == DISTANCES:  # points that coincide have no direction to move apart in
+                if kind == DISTANCES:  # the derivative for coinciding points is set to 0
                     values[r, i, j] = slopes[k] / (2 * values[r, i, j]) if values[r, i, j] > 0 else 0.0
                 else:
                     values[r, i, j] = slopes[k]
@@ -162,48 +163,48 @@ def gradient_block(
 
 
 @compiled(inline="always")
-def interpolate(upstream: Numbers, begin: Any, shares: Numbers, j: int, weight: float, slopes: Floats) -> float:
-    """What is upstream (cells·2^K,) of a pair, by its shares (K, J) between the corners of a cell, from one on.
+def interpolate(upstream: Numbers, start: Any, shares: Numbers, j: int, weight: float, slopes: Floats) -> float:
+    """Return the mean of upstream derivatives (cells·2^K,) at the corners of the cell of pair j, by its shares (K, J).
 
-    Adds its derivatives by the shares, times a weight, to the slopes (K,). Of the last two axes it takes the four
-    corners at once, which stay in registers; over the corners of the others it sums.
+    The corners begin at index ``start``. The derivatives of the mean by the shares, times the weight, are added to the
+    slopes (K,). For the last two axes, the four corners are read together and stay in registers; the loop is over the
+    corners of the other, outer axes.
     """
     n_outer = len(shares) - 2
     if n_outer < 0:
-        low, high = np.float64(upstream[begin]), np.float64(upstream[begin + np.uint32(1)])
+        low, high = np.float64(upstream[start]), np.float64(upstream[start + np.uint32(1)])
         slopes[0] += weight * (high - low)
         return low + shares[0, j] * (high - low)
     mean, one, two = 0.0, np.float64(shares[n_outer, j]), np.float64(shares[n_outer + 1, j])
     for corner in range(1 << n_outer):
-        at = begin + np.uint32(4 * corner)
-        p, q = np.float64(upstream[at]), np.float64(upstream[at + np.uint32(1)])
-        r, s = np.float64(upstream[at + np.uint32(2)]), np.float64(upstream[at + np.uint32(3)])
+        i = start + np.uint32(4 * corner)
+        p, q = np.float64(upstream[i]), np.float64(upstream[i + np.uint32(1)])
+        r, s = np.float64(upstream[i + np.uint32(2)]), np.float64(upstream[i + np.uint32(3)])
         below, above = p + two * (q - p), r + two * (s - r)
-        here, outside = below + one * (above - below), 1.0
+        inner_mean, outer_share = below + one * (above - below), 1.0
         for k in range(n_outer):
-            of_others = 1.0
+            other_shares = 1.0
             for other in range(n_outer):
                 if other != k:
-                    of_others *= side(shares[other, j], corner >> (n_outer - 1 - other) & 1)
-            slopes[k] += weight * of_others * (here if corner >> (n_outer - 1 - k) & 1 else -here)
-            outside *= side(shares[k, j], corner >> (n_outer - 1 - k) & 1)
-        slopes[n_outer] += weight * outside * (above - below)
-        slopes[n_outer + 1] += weight * outside * (q - p + one * (s - r - q + p))
-        mean += outside * here
+                    other_shares *= corner_share(shares[other, j], corner >> (n_outer - 1 - other) & 1)
+            slopes[k] += weight * other_shares * (inner_mean if corner >> (n_outer - 1 - k) & 1 else -inner_mean)
+            outer_share *= corner_share(shares[k, j], corner >> (n_outer - 1 - k) & 1)
+        slopes[n_outer] += weight * outer_share * (above - below)
+        slopes[n_outer + 1] += weight * outer_share * (q - p + one * (s - r - q + p))
+        mean += outer_share * inner_mean
     return mean
 
 
 @compiled(inline="always")
-def side(share: Any, beyond: int) -> float:
-    """What a corner has along an axis: the share if it lies beyond, or the rest of it."""
-    return np.float64(share) if beyond else 1.0 - np.float64(share)
+def corner_share(share: Any, is_upper: int) -> float:
+    """Return the part of a pair that an upper or lower corner gets along an axis."""
+    return np.float64(share) if is_upper else 1.0 - np.float64(share)
 
 
 @compiled()
-def no_cells(n_cells: int, n_members: int) -> tuple[int, int]:
-    """The lowest and the highest cell counted in, before any is.
+def initial_range(n_cells: int, n_members: int) -> tuple[int, int]:
+    """Return the initial range of cells with counts: empty, or all cells if each point has one class.
 
-    Of points in one class each so many rows are counted together that to look for these two would take longer than to
-    add up cells that have nothing.
+    In that case many rows are flushed together, and adding empty cells takes less time than tracking the range.
     """
     return (n_cells, -1) if n_members > 1 else (0, n_cells - 1)

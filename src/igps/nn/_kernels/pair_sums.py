@@ -1,6 +1,6 @@
-"""Compiled loops that add pairs to the sums of the cells they fall into, and these to the counts.
+"""Compiled loops that add pairs to the sums of their cells, and the sums to the counts.
 
-Of a weight w and a share s one corner gets w·s and the other w − w·s, which rounding makes no less than 0.
+A weight w with share s is split into w·s and w − w·s, which rounding cannot make negative.
 """
 
 from typing import Any
@@ -9,140 +9,141 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 from igps._compiled import CONTRACTED, compiled
-from igps.nn._kernels.pair_cells import Numbers, Places
+from igps.nn._kernels.pair_cells import Indices, Numbers
 
-# A whole pair and its share in one integer: the shares of 2¹⁸ pairs, the most of a block, do not reach the count, nor
-# is a digit lost of a share of single precision, but in the first interval.
-_SHARE, _PAIR = 2**24, 2**44
-# Pairs that follow each other often fall into the same cell. In turn into so many copies of it, none waits for another.
+# Scales of a share and of the number of pairs, which are packed in one integer. The shares of 2¹⁸ pairs, the maximum of
+# a block, do not overflow into the number; shares in single precision lose no digit, except in the first interval.
+_SHARE_SCALE, _PAIR_SCALE = 2**24, 2**44
+# Copies of each cell. Consecutive pairs often fall into the same cell, but into different copies, so that no addition
+# waits for the previous one.
 LANES = 4
 
 
 @compiled()
-def pack_pairs(cell: Places, home: Places, share: Numbers, parts: Places) -> None:
-    """Add its home to the cell of each pair (n,), and fill in its share (n,) as an integer."""
+def pack_pairs(cell: Indices, home: Indices, share: Numbers, integer_shares: Indices) -> None:
+    """Replace the cells of pairs (n,) by indices of `add_whole_pairs`, and fill in their shares (n,) as integers."""
     for j in range(len(cell)):
         cell[j] = (cell[j] + home[j]) * np.int32(LANES) + np.int32(j % LANES)
-        parts[j] = np.int32(share[j] * share.dtype.type(_SHARE))
+        integer_shares[j] = np.int32(share[j] * share.dtype.type(_SHARE_SCALE))
 
 
 @compiled()
-def add_whole_pairs(cell: Places, parts: Places, packed: Integers) -> None:
-    """`add_one_axis` of pairs that weigh 1, into integers (cells·LANES,): one store for both corners, no rounding."""
+def add_whole_pairs(cell: Indices, integer_shares: Indices, packed: Integers) -> None:
+    """`add_one_axis` for weights of 1, into integers (cells·LANES,): a single store for both corners, no rounding."""
     for j in range(len(cell)):
-        packed[np.uint32(cell[j])] += _PAIR + np.int64(parts[j])
+        packed[np.uint32(cell[j])] += _PAIR_SCALE + np.int64(integer_shares[j])
 
 
 @compiled()
 def unpack(packed: Integers, sums: Floats) -> None:
-    """Move what was packed to the sums (cells, 2)."""
+    """Write the packed counts to the sums (cells, 2), and clear them."""
     for c in range(len(packed) // LANES):
         pairs = packed[LANES * c : LANES * (c + 1)]
-        both = 0
+        packed_sum = 0
         for lane in range(LANES):
-            both += pairs[lane]
-        beyond = (both % _PAIR) / _SHARE
-        sums[c, 0] = both // _PAIR - beyond
-        sums[c, 1] = beyond
+            packed_sum += pairs[lane]
+        upper = (packed_sum % _PAIR_SCALE) / _SHARE_SCALE
+        sums[c, 0] = packed_sum // _PAIR_SCALE - upper
+        sums[c, 1] = upper
         pairs[:] = 0
 
 
 @compiled(fastmath=CONTRACTED)
-def add_one_axis(cell: Places, home: Places, share: Numbers, weights: Floats, sums: Floats) -> None:
-    """Add pairs (n,) of one row to the sums (cells, 2), by the cell below the value and the first of the class.
+def add_one_axis(cell: Indices, home: Indices, share: Numbers, weights: Floats, sums: Floats) -> None:
+    """Add pairs (n,) of one row to the sums (cells, 2).
 
-    Weights and classes are those of the other ends.
+    The class of a pair's second point determines its first cell (``home``); the weights are those of the second point.
     """
     for j in range(len(cell)):
-        into = np.uint32(cell[j] + home[j])
-        beyond = weights[j] * share[j]
-        sums[into, 0] += weights[j] - beyond
-        sums[into, 1] += beyond
+        i = np.uint32(cell[j] + home[j])
+        upper = weights[j] * share[j]
+        sums[i, 0] += weights[j] - upper
+        sums[i, 1] += upper
 
 
 @compiled(fastmath=CONTRACTED)
 def add_two_axes(
-    cell: Places, home: Places, first: Numbers, second: Numbers, weights: Floats, sums: Floats, at: Any
+    cell: Indices, home: Indices, first: Numbers, second: Numbers, weights: Floats, sums: Floats, corner: Any
 ) -> None:
-    """The same by the shares along two axes, into four corners from one on."""
+    """`add_one_axis` for the shares along two axes, into four corners starting at ``corner``."""
     for j in range(len(cell)):
-        into = np.uint32(cell[j] + home[j])
+        i = np.uint32(cell[j] + home[j])
         a, b, c, d = quarters(weights[j], first[j], second[j])
-        sums[into, at] += a
-        sums[into, at + 1] += b
-        sums[into, at + 2] += c
-        sums[into, at + 3] += d
+        sums[i, corner] += a
+        sums[i, corner + 1] += b
+        sums[i, corner + 2] += c
+        sums[i, corner + 3] += d
 
 
 @compiled(fastmath=CONTRACTED)
 def quarters(weight: float, first: float, second: float) -> tuple[float, float, float, float]:
-    """A weight shared out between the four corners of two axes, none of them less than 0."""
-    beyond = weight * first
-    before = weight - beyond
-    corner, side = beyond * second, before * second
-    return before - side, side, beyond - corner, corner
+    """Share a weight between the four corners of two axes; no part is negative."""
+    upper = weight * first
+    lower = weight - upper
+    upper_second, lower_second = upper * second, lower * second
+    return lower - lower_second, lower_second, upper - upper_second, upper_second
 
 
 @compiled(fastmath=CONTRACTED)
-def add_four_axes(cell: Places, home: Places, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
-    """`add_axes` along four, a distance and three cosines, which takes half of the time in one pass."""
+def add_four_axes(cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
+    """`add_axes` for four axes, a distance and three cosines; a single pass takes half of the time."""
     one, two, three, four = shares[0, first:], shares[1, first:], shares[2, first:], shares[3, first:]
     for j in range(len(cell)):
-        into = np.uint32(cell[j] + home[j])
+        i = np.uint32(cell[j] + home[j])
         inner = quarters(1.0, np.float64(three[j]), np.float64(four[j]))
         outer = quarters(weights[j], np.float64(one[j]), np.float64(two[j]))
-        # A plain number would make a function of its own of each.
-        add_corners(sums, into, np.int64(0), outer[0], inner)
-        add_corners(sums, into, np.int64(4), outer[1], inner)
-        add_corners(sums, into, np.int64(8), outer[2], inner)
-        add_corners(sums, into, np.int64(12), outer[3], inner)
+        # Literal numbers would compile `add_corners` four times.
+        add_corners(sums, i, np.int64(0), outer[0], inner)
+        add_corners(sums, i, np.int64(4), outer[1], inner)
+        add_corners(sums, i, np.int64(8), outer[2], inner)
+        add_corners(sums, i, np.int64(12), outer[3], inner)
 
 
 @compiled(fastmath=CONTRACTED)
-def add_corners(sums: Floats, cell: Any, at: Any, weight: float, parts: tuple[float, float, float, float]) -> None:
-    """Add a weight to a cell's four corners from one on, in parts."""
-    sums[cell, at] += weight * parts[0]
-    sums[cell, at + 1] += weight * parts[1]
-    sums[cell, at + 2] += weight * parts[2]
-    sums[cell, at + 3] += weight * parts[3]
+def add_corners(sums: Floats, cell: Any, corner: Any, weight: float, parts: tuple[float, float, float, float]) -> None:
+    """Add the parts of a weight to four corners of a cell, starting at ``corner``."""
+    sums[cell, corner] += weight * parts[0]
+    sums[cell, corner + 1] += weight * parts[1]
+    sums[cell, corner + 2] += weight * parts[2]
+    sums[cell, corner + 3] += weight * parts[3]
 
 
 @compiled()
-def add_axes(cell: Places, home: Places, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
-    """`add_one_axis` of the shares along any number of axes from two on, (K, n) from the first on."""
+def add_axes(cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
+    """`add_one_axis` for two or more axes, whose shares (K, J) are used from column ``first`` on."""
     n_outer = len(shares) - 2
-    rest = np.empty(len(cell))
+    part = np.empty(len(cell))
     for corner in range(1 << n_outer):
         for j in range(len(cell)):
-            rest[j] = weights[j]
+            part[j] = weights[j]
         for k in range(n_outer):
             if corner >> (n_outer - 1 - k) & 1:
                 for j in range(len(cell)):
-                    rest[j] *= shares[k, first + j]
+                    part[j] *= shares[k, first + j]
             else:
                 for j in range(len(cell)):
-                    rest[j] -= rest[j] * shares[k, first + j]
-        add_two_axes(cell, home, shares[n_outer, first:], shares[n_outer + 1, first:], rest, sums, np.int64(4 * corner))
+                    part[j] -= part[j] * shares[k, first + j]
+        add_two_axes(cell, home, shares[n_outer, first:], shares[n_outer + 1, first:], part, sums, np.int64(4 * corner))
 
 
 @compiled(inline="always")
-def pair_row(one: int, other: int, n_classes: int) -> int:
-    """The row of a histogram in which pairs of two classes count, see `class_pairs`."""
-    a, b = min(one, other), max(one, other)
+def pair_row(first: int, second: int, n_classes: int) -> int:
+    """Return the row of a histogram in which pairs of two classes count, see `class_pairs`."""
+    a, b = min(first, second), max(first, second)
     return a * n_classes - a * (a - 1) // 2 + b - a
 
 
 @compiled()
-def flush(sums: Floats, lowest: int, highest: int, classes: Places, weights: Floats, point: int, total: Floats) -> None:
-    """Add the sums (C, cells·corners) of rows like a point, by its weights (M, P) in its classes, and clear them.
+def flush(sums: Floats, start: int, end: int, classes: Indices, weights: Floats, point: int, total: Floats) -> None:
+    """Add the sums (C, cells·corners) of a row to the total, with the weights (M, P) of its point, and clear them.
 
-    All that was counted is from the lowest place to before the highest.
+    Only the range from ``start`` to before ``end`` contains counts.
     """
     n_classes = len(sums)
     for other in range(n_classes):
         for m in range(len(classes)):
             pair = pair_row(classes[m, point], other, n_classes)
-            for c in range(lowest, highest):
+            for c in range(start, end):
                 total[pair, c] += weights[m, point] * sums[other, c]
-        for c in range(lowest, highest):
+        for c in range(start, end):
             sums[other, c] = 0

@@ -1,7 +1,7 @@
 """The axes of histograms: of points, such as `Potential`, and of pairs of points, such as `InteriorDistance`.
 
-An axis of your own is a subclass of `PointAxis` or `PairAxis`. One that belongs to the library is a class in this
-folder, exported here, and entered in `AXES` by its name if it has a default layout.
+An axis of your own is a subclass of `PointAxis` or `PairAxis`. To add an axis to the library, define its class in this
+folder, export it here, and enter it in `AXES` if it can be constructed without arguments.
 """
 
 from igps.nn._kernels.pair_values import (
@@ -52,11 +52,11 @@ AXES: dict[str, type[PointAxis | PairAxis]] = {
     "pair_twist": PairTwist,
     "ball_radius": BallRadius,
 }
-"""The axes that have a layout of their own, by name."""
+"""The axes that can be constructed without arguments, by name."""
 
 
 def axis_of(name: str) -> PointAxis | PairAxis:
-    """The axis of a name, as it is by default; a ValueError where no axis has this name."""
+    """Return the axis of a name with its default layout; raise a ValueError for an unknown name."""
     if name not in AXES:
         raise ValueError(f"axes: expected one of {', '.join(AXES)}, or an axis, got {name!r}.")
     return AXES[name]()  # type: ignore[call-arg]

@@ -1,4 +1,4 @@
-"""Centres of bins and classes, and where values lie among them."""
+"""Centres of bins and classes."""
 
 import math
 from collections.abc import Sequence
@@ -10,26 +10,26 @@ from torch.nn.functional import softplus
 from igps._parameters import check_at_least, check_positive
 from igps.nn.specification import Specified
 
-# The part of its start that a learned gap between centres always keeps, so that no interval closes.
-_LEAST_GAP = 1e-3
+# Lower bound of a learned gap between centres, as a share of its start value, so that no interval closes.
+_MIN_GAP = 1e-3
 
 
-def middles(n: int, largest: float, name: str) -> Tensor:
-    """(n,) middles of n equal intervals of [0, largest]; a ValueError of the argument n_`name` where there are none."""
+def interval_centres(n: int, reach: float, name: str) -> Tensor:
+    """Return the centres (n,) of n equal intervals of [0, reach]; a ValueError of n_`name` if there are none."""
     check_at_least(1, **{f"n_{name}": n})
-    check_positive(reach=largest)
-    return (torch.arange(n) + 0.5) * (largest / n)
+    check_positive(reach=reach)
+    return (torch.arange(n) + 0.5) * (reach / n)
 
 
 class OrderedCentres(Specified):
     """Ascending centres of bins or classes, fixed or learned.
 
-    Learned centres are the running sum of positive gaps, each its start times softplus(θ)/log 2 with θ = 0 at first,
-    so that they ascend whatever the parameters become. Centres that start positive stay positive.
+    Learned centres are running sums of positive gaps, so that they ascend for all parameters. Each gap is its start
+    value times softplus(θ)/log 2, where the parameter θ starts at 0. Centres that start positive stay positive.
 
     Args:
         start: (B,) ascending.
-        learnable: whether they are parameters.
+        learnable: whether the centres are parameters.
 
     Raises:
         ValueError: values that are not finite or do not ascend.
@@ -42,15 +42,15 @@ class OrderedCentres(Specified):
         values = torch.as_tensor(start, dtype=torch.float32)
         if values.ndim != 1 or not len(values) or not torch.isfinite(values).all() or (values.diff() <= 0).any():
             raise ValueError(f"start: expected finite values in ascending order, got {values.tolist()}.")
-        # A copy: safetensors refuses tensors that share memory.
+        # A copy, as safetensors refuses tensors that share memory.
         self.register_buffer("start", values.clone())
         self.log_gap = nn.Parameter(torch.zeros(len(values))) if learnable else None
 
     def forward(self) -> Tensor:
-        """(B,) centres."""
+        """Return the centres (B,)."""
         if self.log_gap is None:
             return self.start
         first = self.start[:1]
         origin = torch.where(first > 0, 0, first - self.start.diff()[:1]) if len(self.start) > 1 else first.clamp(max=0)
         gaps = torch.cat([origin, self.start]).diff()
-        return origin + (gaps * (_LEAST_GAP + (1 - _LEAST_GAP) / math.log(2) * softplus(self.log_gap))).cumsum(0)
+        return origin + (gaps * (_MIN_GAP + (1 - _MIN_GAP) / math.log(2) * softplus(self.log_gap))).cumsum(0)

@@ -1,4 +1,4 @@
-"""Axes of points: classes of the samples of a body, by their potential, the balls that touch them, or an attribute."""
+"""Axes of points: classes of the samples of a body, by potential, by the radius of touching balls, or by attribute."""
 
 import math
 from abc import ABC, abstractmethod
@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from igps._parameters import check_one_of
 from igps.data.attribute_sources import ResidueAttribute
 from igps.data.requirements import Requirements, embedding_requirements
-from igps.nn._kernels.located import located
-from igps.nn.axes.centres import OrderedCentres, middles
+from igps.nn._kernels.intervals import find_intervals
+from igps.nn.axes.centres import OrderedCentres, interval_centres
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import barycentroid_potential
 from igps.nn.specification import Specified
@@ -24,12 +24,12 @@ _SIDES = get_args(Side)
 
 
 class PointAxis(Specified, ABC):
-    """Classes of points.
+    """Base class of axes of points, which sort samples into classes.
 
     Args:
         centres: (C,) of the classes, ascending.
-        soft: whether a point belongs to the two classes whose centres surround its value, in linear proportion, or to
-            the nearest alone.
+        soft: whether a point belongs to the two classes whose centres surround its value, in linear proportion;
+            otherwise it belongs only to the nearest class.
         learnable: whether the centres are parameters; implies `soft`, as only soft classes have gradients.
     """
 
@@ -40,29 +40,29 @@ class PointAxis(Specified, ABC):
 
     @property
     def n_classes(self) -> int:
-        """C."""
+        """The number C of classes."""
         return len(self.centres.start)
 
     def requirements(self, embedding: nn.Module) -> Requirements:
-        """Of a body, with this embedding for the histogram."""
+        """Return what a body must have, given the embedding of the histogram."""
         return Requirements()
 
     @abstractmethod
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
-        """(N, P) of the samples."""
+        """Return the values (N, P) of the samples."""
 
     def memberships(self, values: Tensor) -> Tensor:
-        """(..., P, C) non-negative, rows of sum 1, from (..., P) values; a ValueError if one is not finite."""
+        """Return weights (..., P, C) ≥ 0, with rows of sum 1, of values (..., P); a ValueError if any is not finite."""
         classes, weights = self.members(values, torch.ones_like(values, dtype=torch.bool))
         return weights.new_zeros(*values.shape, self.n_classes).scatter_add(-1, classes, weights)
 
     def members(self, values: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """The classes that points of values (..., P) belong to, and how much: `memberships` without its zeros.
+        """Return the classes of values (..., P) and their weights, that is, `memberships` in sparse form.
 
-        They are (..., P, M) integers and weights of sum 1, M = 2 for soft classes and 1 for hard ones. A ValueError of
-        values that are not finite where the mask is true.
+        Both are (..., P, M): integers, and weights of sum 1, with M = 2 for soft classes and M = 1 for hard ones.
+        Raises a ValueError if a value in the mask (..., P) is not finite.
         """
-        # What is traced for `torch.compile` cannot raise.
+        # Code traced by `torch.compile` cannot raise.
         if not torch.compiler.is_compiling() and not torch.isfinite(torch.where(mask, values, 0)).all():
             raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
         centres = self.centres().to(values.dtype)
@@ -70,7 +70,7 @@ class PointAxis(Specified, ABC):
             boundaries = (centres.detach()[1:] + centres.detach()[:-1]) / 2
             classes = torch.bucketize(values.detach(), boundaries, right=True).unsqueeze(-1)
             return classes, torch.ones_like(classes, dtype=values.dtype)
-        below, share = located(values, centres)
+        below, share = find_intervals(values, centres)
         return torch.stack([below, below + 1], dim=-1), torch.stack([1 - share, share], dim=-1)
 
 
@@ -79,8 +79,8 @@ class Potential(PointAxis):
 
     Args:
         n_classes: C equal intervals of [0, `reach`], with their centres in the middle.
-        reach: end of the last interval; what lies beyond counts in the last class.
-        embedding: other than the histogram's: for a second scale.
+        reach: end of the last interval; larger values count in the last class.
+        embedding: replaces the embedding of the histogram, for example to add a second scale.
         soft, learnable: see `PointAxis`.
     """
 
@@ -93,29 +93,28 @@ class Potential(PointAxis):
         soft: bool = False,
         learnable: bool = False,
     ) -> None:
-        super().__init__(middles(n_classes, reach, "classes"), soft, learnable)
+        super().__init__(interval_centres(n_classes, reach, "classes"), soft, learnable)
         self.embedding = embedding
 
     def requirements(self, embedding: nn.Module) -> Requirements:
-        """Those of the embedding, its own or the histogram's."""
+        """Return the requirements of the axis's own embedding, or of the histogram's."""
         return embedding_requirements(self.embedding or embedding)
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
-        """(N, P) potential."""
+        """Return the potential (N, P)."""
         return barycentroid_potential(features.embedded(self.embedding or embedding))
 
 
 class BallRadius(PointAxis):
-    """Classes of the radius of the largest ball that touches the surface at a sample, from inside or from outside.
+    """Classes of the radius of the largest ball that touches the surface at a surface sample, see `ball_radii`.
 
-    From inside it is half the local thickness, from outside it tells how narrow the hollow is in which a sample lies.
-    Both are pose-invariant but near joints, and tell a plate from a rod and a block, and a bowl from a dome. See
-    `ball_radii`. Surface samples alone have such balls.
+    The radius inside is half the local thickness; the radius outside measures how narrow a hollow is. Both are
+    pose-invariant except near joints, and distinguish a plate from a rod or a block, and a bowl from a dome.
 
     Args:
         side: "inside" or "outside".
-        smallest, largest: centres of the first and last class, over √area; the others lie between them in a geometric
-            progression, along which points are in linear proportion in two classes.
+        smallest, largest: centres of the first and last class, over √area. The centres form a geometric progression;
+            a point belongs to two classes, in proportion to the logarithm of its radius.
         n_classes: C.
     """
 
@@ -132,13 +131,13 @@ class BallRadius(PointAxis):
         self.side = side
 
     def requirements(self, embedding: nn.Module) -> Requirements:
-        """The directions."""
+        """Return the requirement of surface directions."""
         return Requirements(attributes=("surface_direction",))
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
-        """(N, P) logarithms of the radii over √area; a ValueError of interior samples."""
+        """Return the logarithms (N, P) of the radii over √area; raise a ValueError for interior samples."""
         if features.kind != "surface":
-            raise ValueError("samples: expected surface samples, which balls touch, got interior ones.")
+            raise ValueError("samples: expected surface samples for ball radii, got interior samples.")
         return features.ball_radii()[..., _SIDES.index(self.side)].log()
 
 
@@ -148,11 +147,11 @@ class Attribute(PointAxis):
     Args:
         name: of the attribute.
         centres: of the classes, ascending, in the attribute's unit; None with `quantiles`.
-        quantiles: so many classes, whose centres are quantiles of a collection, see `fit_centres`; they are saved.
+        quantiles: number of classes with quantiles of a collection as centres, see `fit_centres`; they are saved.
         soft, learnable: see `PointAxis`.
 
     Raises:
-        ValueError: not one of centres and quantiles.
+        ValueError: neither or both of `centres` and `quantiles` are given, or there are fewer than 2 quantiles.
     """
 
     fitted: Tensor
@@ -175,63 +174,64 @@ class Attribute(PointAxis):
 
     @property
     def is_fitted(self) -> bool:
-        """Whether its centres are known."""
+        """Whether the centres are known."""
         return self.quantiles is None or bool(self.fitted)
 
     def fit(self, values: Tensor) -> None:
-        """Take for centres the quantiles of values (P,) at (i + 1/2) / n; equal ones are moved apart a little."""
+        """Set the centres to the quantiles of values (P,) at (i + 1/2) / n; equal quantiles are moved apart."""
         n = len(self.centres.start)
         centres = torch.quantile(values.double(), (torch.arange(n, dtype=torch.float64) + 0.5) / n)
-        least = max(float(values.double().std()), float(values.abs().max()), 1e-12) * 1e-4
+        min_gap = max(float(values.double().std()), float(values.abs().max()), 1e-12) * 1e-4
         for i in range(1, n):
-            centres[i] = max(centres[i], centres[i - 1] + least)
+            centres[i] = max(centres[i], centres[i - 1] + min_gap)
         self.centres.start.copy_(centres)
         self.fitted.fill_(True)
 
     def check_fitted(self) -> None:
-        """Raise a ValueError where the centres are still to come."""
+        """Raise a ValueError if the centres have not been fitted."""
         if not self.is_fitted:
             raise ValueError(
-                f"{self.name}: expected centres, got {self.quantiles} quantiles of no collection. Call "
-                "igps.nn.fit_centres(descriptor, dataset), or take the file descriptor.safetensors that `igps retrieve "
-                "--out` writes."
+                f"{self.name}: expected centres, got {self.quantiles} quantiles that are not fitted. "
+                "Call igps.nn.fit_centres(descriptor, dataset), or use the file descriptor.safetensors that `igps "
+                "retrieve --out` writes."
             )
 
     def requirements(self, embedding: nn.Module) -> Requirements:
-        """The attribute, if it is one that Signatures are computed with, or one of residues."""
+        """Return the `attribute_requirements` of the attribute."""
         return attribute_requirements(self.name)
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
-        """(N, P) of the attribute; a ValueError if the samples have none of this name, or it is a direction."""
+        """Return the attribute (N, P); raise a ValueError if the samples do not have it, or it is a direction."""
         self.check_fitted()
         values = features.attribute(self.name)
         if values.ndim != 2:
-            raise ValueError(f"attributes: expected a scalar to split by, but {self.name!r} is a direction.")
+            raise ValueError(f"attributes: expected a scalar, got {self.name!r}, which is a direction.")
         return values
 
 
 def attribute_requirements(name: str) -> Requirements:
-    """What a sample's attribute needs of a body: nothing where it is one of your own."""
+    """Return what an attribute of samples requires of a body: nothing for an attribute that users supply."""
     if name in RESIDUE_ATTRIBUTES:
         return Requirements(sources={name: ResidueAttribute(name)})
-    return Requirements(attributes=tuple(one for one in get_args(AttributeName) if one == name))
+    return Requirements(attributes=tuple(x for x in get_args(AttributeName) if x == name))
 
 
 def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:
-    """Soft classes (..., P, C) of values (..., P), rows of sum 1: linear kernels (hats) around ascending centres (C,).
+    """Return memberships (..., P, C) of values (..., P), with rows of sum 1: hat functions at ascending centres (C,).
 
-    Below the first and beyond the last a value is of that class alone. Differentiable in both arguments.
+    Values below the first or above the last centre belong only to that class. Differentiable in both arguments.
     """
-    # How far past each centre on the way to the next, 0 to 1: successive differences are the hats, and sum to 1.
-    passed = ((values.unsqueeze(-1) - centres[:-1]) / centres.diff()).clamp(0, 1)
-    one, none = torch.ones_like(values).unsqueeze(-1), torch.zeros_like(values).unsqueeze(-1)
-    return torch.cat([one, passed], dim=-1) - torch.cat([passed, none], dim=-1)
+    # Position of a value between each centre and the next, from 0 to 1; the hats are the successive differences.
+    position = ((values.unsqueeze(-1) - centres[:-1]) / centres.diff()).clamp(0, 1)
+    ones, zeros = torch.ones_like(values).unsqueeze(-1), torch.zeros_like(values).unsqueeze(-1)
+    return torch.cat([ones, position], dim=-1) - torch.cat([position, zeros], dim=-1)
 
 
 def largest_members(memberships: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Classes and weights (N, P, M) from memberships (N, P, C) in all classes, M as many as any point belongs to.
+    """Return memberships (N, P, C) in sparse form: classes and weights (N, P, M), see `PointAxis.members`.
 
-    With a gradient M is C, so that memberships that are 0 have theirs too.
+    M is the largest number of classes that a point belongs to. With gradients M is C, so that memberships of 0 have a
+    gradient as well.
     """
     n_members = memberships.shape[2]
     if not (memberships.requires_grad or torch.compiler.is_compiling()):

@@ -1,4 +1,4 @@
-"""Heads: what turns descriptions into vectors whose distances answer a question, fitted or trained on labels."""
+"""Heads: modules that map descriptions to embeddings, fitted in closed form or trained on labels."""
 
 from igps.nn.heads.base import Head
 from igps.nn.heads.classifier import ClassifierHead

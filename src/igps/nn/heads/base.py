@@ -1,4 +1,4 @@
-"""What a head is, and the mathematics that several share: class means, principal directions, whitening."""
+"""The base class of heads, and functions that several heads share: class means, principal directions, whitening."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -10,46 +10,46 @@ from torch import Tensor
 from igps.nn.specification import Specified
 from igps.retrieval.distances import cosine, square_root
 
-# Of the largest sum of squares: directions along which less is left are rounding
-_NOTHING_LEFT = 1e-10
+# Relative to the largest sum of squares; directions with a smaller sum are rounding errors.
+_MIN_RELATIVE_SQUARE = 1e-10
 
 
 class Head(Specified, ABC):
-    """Descriptions to embeddings of length 1, and the distance that compares embeddings.
+    """A module from descriptions to embeddings of length 1, with a distance between embeddings.
 
-    A head of your own defines `fit` and `forward`, and `distances` where the cosine distance is not its own. Its
-    buffers take their sizes from what it is fitted to, also when it is loaded. One that must be fitted before it is
-    used raises a RuntimeError.
+    A head of your own defines `fit` and `forward`, and overrides `distances` if it does not use the cosine distance.
+    The sizes of its buffers follow from the training shapes, and are restored on loading. A head that needs fitting
+    raises a RuntimeError if it is used before.
     """
 
     @abstractmethod
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take from training shapes what is not learned by gradients.
+        """Fit everything that is not learned by gradients to the training shapes.
 
         Args:
             descriptions: (N, ...), histograms for all heads of the library.
             labels: (N,) classes, integers.
-            part_cells: cells of each part of a description, see `HistogramDescriptor.part_cells`; None takes all as one
-                part.
+            part_cells: cells of each part of a description, see `HistogramDescriptor.part_cells`; if None, a
+                description is a single part.
 
         Raises:
-            ValueError: shapes that do not match, or too few classes, or shapes of a class.
+            ValueError: the shapes of tensors do not match, or there are too few classes, or too few shapes in a class.
         """
 
     @abstractmethod
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) descriptions to (N, D) embeddings of length 1."""
+        """Map descriptions (N, ...) to embeddings (N, D) of length 1."""
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, D) and (G, D) embeddings, as `forward` gives them, to (Q, G) distances; the cosine's unless redefined."""
+        """Return distances (Q, G) between embeddings (Q, D) and (G, D) of `forward`; by default, cosine distances."""
         return cosine(queries, gallery)
 
     def within_class(self, embeddings: Tensor) -> Tensor:
-        """(N, ≤ D) the numbers of (N, D) embeddings that tell bodies of one class apart; all, unless redefined."""
+        """Return the columns (N, ≤ D) of embeddings (N, D) that distinguish bodies of one class; by default, all."""
         return embeddings
 
     def short(self, embeddings: Tensor) -> Tensor:
-        """(N, D) embeddings to (N, ≤ 256) of length 1 whose cosines are nearly theirs; a ValueError if it has none."""
+        """Map embeddings (N, D) to (N, ≤ 256) of length 1 with nearly the same cosines; by default, a ValueError."""
         raise ValueError(
             f"short: expected a head that shortens its embeddings, as the TwoLevelHead of pretrained does, got "
             f"{type(self).__name__} and embeddings of {embeddings.shape[1]} numbers."
@@ -64,17 +64,17 @@ class Head(Specified, ABC):
         self._note_buffers()
 
     def _note_buffers(self) -> None:
-        """Keep as numbers what buffers say of sizes: on a device to read them waits, and what is traced cannot."""
+        """Copy the buffers `part_cells` and `lengths` to numbers: reading a GPU is slow, and impossible in tracing."""
         buffers = self.named_buffers(recurse=False)
-        # In a dictionary, which is no part of a fingerprint
-        self._noted: dict[str, Any] = {name: one.tolist() for name, one in buffers if name in ("part_cells", "lengths")}
+        # A dictionary, as fingerprints ignore dictionaries.
+        self._noted: dict[str, Any] = {name: x.tolist() for name, x in buffers if name in ("part_cells", "lengths")}
 
     def _not_fitted(self) -> RuntimeError:
         return RuntimeError(f"{type(self).__name__}: expected to be fitted first. Call fit(descriptions, labels).")
 
 
 def square_roots(histograms: Tensor) -> Tensor:
-    """(N, cells) roots of the cells of histograms (N, ...), with a finite gradient; a ValueError of one below zero."""
+    """Return the square roots (N, cells) of histograms (N, ...), with a finite gradient; a ValueError if any is < 0."""
     cells = histograms.flatten(1)
     if not torch.compiler.is_compiling() and bool((cells < 0).any()):
         raise ValueError("descriptions: expected histograms, entries ≥ 0, got a negative one.")
@@ -82,21 +82,21 @@ def square_roots(histograms: Tensor) -> Tensor:
 
 
 def check_cells(cells: Tensor, n_expected: int) -> None:
-    """Raise a ValueError unless these (N, cells) are as many as the head was fitted to."""
+    """Raise a ValueError unless descriptions (N, cells) have as many cells as those that the head was fitted to."""
     if cells.shape[1] != n_expected:
         raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
 
 
 def checked_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
-    """(parts,) how many of (N, cells) values each part has, one part if None; a ValueError if they do not add up."""
-    found = list(part_cells or (cells.shape[1],))
-    if min(found) < 1 or sum(found) != cells.shape[1]:
-        raise ValueError(f"part_cells: expected cells that add up to {cells.shape[1]}, got {found}.")
-    return torch.tensor(found, device=cells.device)
+    """Return the cells (parts,) of each part, or all (N, cells) as one part if None; a ValueError for a wrong sum."""
+    sizes = list(part_cells or (cells.shape[1],))
+    if min(sizes) < 1 or sum(sizes) != cells.shape[1]:
+        raise ValueError(f"part_cells: expected cells that add up to {cells.shape[1]}, got {sizes}.")
+    return torch.tensor(sizes, device=cells.device)
 
 
 def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
-    """The labels (N,) on the device of the descriptions (N, ...); raises a ValueError if they are not aligned."""
+    """Return the labels (N,) on the device of the descriptions (N, ...); raise a ValueError if they do not match."""
     if labels.shape != descriptions.shape[:1]:
         raise ValueError(
             f"labels: expected one for each of {len(descriptions)} descriptions, got shape {tuple(labels.shape)}."
@@ -105,7 +105,7 @@ def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
 
 
 def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
-    """The classes (N,) of descriptions (N, ...), numbered from 0; a ValueError if not aligned, or all are single."""
+    """Return the classes (N,) of descriptions (N, ...), numbered from 0; a ValueError if no class has two members."""
     _, members = checked_labels(descriptions, labels).unique(return_inverse=True)
     if int(members.max()) + 1 == len(members):
         raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
@@ -113,33 +113,33 @@ def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
 
 
 def class_means(rows: Tensor, members: Tensor) -> Tensor:
-    """(C, D) means of rows (N, D) by their classes (N,), numbered from 0 without a gap."""
+    """Return the means (C, D) of rows (N, D) by their classes (N,), which are numbered from 0 without gaps."""
     n_members = torch.bincount(members)
     return rows.new_zeros(len(n_members), rows.shape[1]).index_add_(0, members, rows) / n_members[:, None]
 
 
 def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """The n orthonormal directions along which rows (N, D) differ most from the origin, and the sums of their squares.
+    """Return the first k ≤ n principal directions of rows (N, D) about the origin, and the sums of squares along them.
 
-    They are (k, D) and (k,), the largest first; k ≤ n, as directions without extent are left out.
+    The orthonormal directions (k, D) and the sums (k,) are in descending order. Directions without extent are left out.
     """
     n_rows, width = rows.shape
-    wide = width > n_rows
-    squares, axes = torch.linalg.eigh(rows @ rows.T if wide else rows.T @ rows)  # from the smaller matrix
-    n = min(n, int((squares > _NOTHING_LEFT * squares[-1]).sum()))
+    is_wide = width > n_rows
+    squares, axes = torch.linalg.eigh(rows @ rows.T if is_wide else rows.T @ rows)  # of the smaller matrix
+    n = min(n, int((squares > _MIN_RELATIVE_SQUARE * squares[-1]).sum()))
     squares, axes = squares.flip(0)[:n], axes.flip(1)[:, :n]
-    return (axes.T @ rows) / squares.sqrt()[:, None] if wide else axes.T, squares
+    return (axes.T @ rows) / squares.sqrt()[:, None] if is_wide else axes.T, squares
 
 
 def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: int) -> tuple[Tensor, Tensor]:
-    """The directions along which shapes of one class differ most, and what is left of each: see `damped`.
+    """Return the directions along which shapes of one class differ most, and the gains that whiten them, for `damped`.
 
     With W the covariance within classes over its mean eigenvalue, and s the shrinkage, (W + s·I)^(−1/2) is, up to a
-    factor, the identity but for a gain along each eigenvector of W. Source: within-class covariance normalisation,
+    factor, the identity except for a gain along each eigenvector of W. Source: within-class covariance normalisation,
     Hatch, Kajarekar and Stolcke 2006.
 
-    Of residuals (N, D), rows of the training shapes less the mean of their class, these are at most n orthonormal
-    directions (k, D), of the largest eigenvalues, and gains (k,) in (0, 1]. The mean is taken over `rank` eigenvalues.
+    Residuals (N, D) are rows of the training shapes minus the mean of their class. The mean eigenvalue is taken over
+    `rank` eigenvalues. Returns k ≤ n orthonormal directions (k, D), of the largest eigenvalues, and gains (k,) ≤ 1.
     """
     directions, squares = principal_directions(residuals, min(n, rank))
     relative = squares * rank / residuals.square().sum()
@@ -147,6 +147,6 @@ def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: in
 
 
 def damped(rows: Tensor, directions: Tensor, gains: Tensor) -> Tensor:
-    """(N, D) rows with what they have of each direction (k, D), orthonormal, times its gain (k,)."""
-    directions = directions.to(rows.dtype)  # those of a head in half precision
+    """Return rows (N, D) with their component along each orthonormal direction (k, D) multiplied by its gain (k,)."""
+    directions = directions.to(rows.dtype)  # the head may be in half precision
     return rows - ((rows @ directions.T) * (1 - gains)) @ directions

@@ -1,4 +1,4 @@
-"""A head that tells classes with calibrated probabilities, and what is of none of them."""
+"""A head that classifies shapes with calibrated probabilities, and detects shapes of unknown classes."""
 
 import copy
 import math
@@ -12,19 +12,19 @@ from torch.nn import functional
 from igps.nn.heads.base import Head, checked_labels
 from igps.nn.heads.closed_form import KernelHead
 
-_MOST_FOLDS = 5
-_TEMPERATURES = torch.logspace(-2.5, 0, 60)
-# Training shapes of a class that a shape's distance from it is taken to, and what share of known shapes is called so
-_N_NEAREST, _KNOWN_CALLED_UNKNOWN = 2, 0.05
+_MAX_FOLDS = 5
+_TEMPERATURES = torch.logspace(-2.5, 0, 60)  # candidates of the calibration
+_N_NEAREST = 2  # training shapes of the predicted class that strangeness is computed from
+_FALSE_UNKNOWN_RATE = 0.05  # share of the shapes of known classes that are called unknown
 
 
 class ClassifierHead(KernelHead):
-    """A `KernelHead` whose scores are calibrated on folds that are held out of its training shapes.
+    """A `KernelHead` whose scores are calibrated on held-out folds of its training shapes.
 
-    Probabilities are the softmax of the scores over a temperature, that of the greatest likelihood on shapes that were
-    held out (Guo, Pleiss, Sun and Weinberger 2017). How strange a shape is: its mean distance from the two nearest
-    training shapes of the class that it is taken for, each part in units of its median, minus its score of that class.
-    From the 95th percentile of held-out shapes on, it is called unknown.
+    Probabilities are the softmax of the scores divided by a temperature, which maximises the likelihood of held-out
+    shapes (Guo, Pleiss, Sun and Weinberger 2017). The strangeness of a shape is its mean distance to the two nearest
+    training shapes of its predicted class, with each part in units of its median, minus its score for this class. A
+    shape is unknown if its strangeness is at least the 95th percentile of held-out shapes.
 
     Args:
         prior, n_directions, shrinkage, ridge, prior_share, temperature: see `KernelHead`.
@@ -57,58 +57,58 @@ class ClassifierHead(KernelHead):
     ) -> Self:
         """Fit to the training shapes, and calibrate on folds of them.
 
-        Where no class has two shapes nothing can be held out: probabilities are guesses then, and nothing is unknown.
+        If no class has two shapes, nothing can be held out: probabilities are uncalibrated, and no shape is unknown.
 
         Args:
             descriptions, labels, part_cells: see `Head.fit`.
-            calibrate: whether probabilities and what is unknown are asked for; it takes six times as long.
+            calibrate: whether to calibrate probabilities and strangeness; this takes six times as long.
 
         Raises:
-            ValueError: shapes that do not match, or fewer than two classes.
+            ValueError: the shapes of tensors do not match, or there are fewer than two classes.
         """
-        scores, strange, truth = [], [], []
+        scores, strangeness, classes = [], [], []
         for held_out in folds(checked_labels(descriptions, labels)) if calibrate else ():
-            rest = copy.deepcopy(self)
-            rest.fit(descriptions[~held_out], labels[~held_out], part_cells, calibrate=False)
-            scores.append(rest.scores(descriptions[held_out]))
-            strange.append(rest.strangeness(descriptions[held_out]))
-            truth.append(torch.searchsorted(rest.classes, labels[held_out].to(rest.classes)))
+            head = copy.deepcopy(self)
+            head.fit(descriptions[~held_out], labels[~held_out], part_cells, calibrate=False)
+            scores.append(head.scores(descriptions[held_out]))
+            strangeness.append(head.strangeness(descriptions[held_out]))
+            classes.append(torch.searchsorted(head.classes, labels[held_out].to(head.classes)))
         super().fit(descriptions, labels, part_cells)
         self.members = torch.searchsorted(self.classes, labels.to(self.classes))
-        if truth:
-            every, members = torch.cat(scores), torch.cat(truth)
-            losses = [functional.cross_entropy(every / one, members) for one in _TEMPERATURES.to(every)]
+        if classes:
+            logits, targets = torch.cat(scores), torch.cat(classes)
+            losses = [functional.cross_entropy(logits / t, targets) for t in _TEMPERATURES.to(logits)]
             self.calibration.copy_(_TEMPERATURES[int(torch.stack(losses).argmin())])
-            self.strange_from.copy_(torch.cat(strange).quantile(1 - _KNOWN_CALLED_UNKNOWN))
+            self.strange_from.copy_(torch.cat(strangeness).quantile(1 - _FALSE_UNKNOWN_RATE))
         return self
 
     def probabilities(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, n_classes) probabilities, in the order of `classes`."""
+        """Return probabilities (N, n_classes) of histograms (N, ...), in the order of `classes`."""
         return (self.scores(descriptions) / self.calibration).softmax(dim=1)
 
     def strangeness(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N,), larger for what is like no training class; unknown from `strange_from` on."""
-        scores, taken_for = self.scores(descriptions).max(dim=1)
+        """Return the strangeness (N,) of histograms (N, ...); shapes with at least `strange_from` are unknown."""
+        scores, predicted = self.scores(descriptions).max(dim=1)
         of_parts = self._distances(self._vectors(descriptions)) / self.medians[:, None, None]
         distances = torch.einsum("k,kij->ij", self.shares, of_parts)
-        others = self.members != taken_for[:, None]
-        nearest = distances.masked_fill(others, math.inf).topk(min(_N_NEAREST, len(self.members)), largest=False).values
-        real = torch.isfinite(nearest)  # a class may have fewer
-        return nearest.where(real, 0).sum(dim=1) / real.sum(dim=1) - scores
+        other = self.members != predicted[:, None]
+        nearest = distances.masked_fill(other, math.inf).topk(min(_N_NEAREST, len(self.members)), largest=False).values
+        is_real = torch.isfinite(nearest)  # a class may have fewer shapes
+        return nearest.where(is_real, 0).sum(dim=1) / is_real.sum(dim=1) - scores
 
 
-def folds(labels: Tensor, n_folds: int = _MOST_FOLDS) -> Iterator[Tensor]:
-    """(N,) masks of held-out folds: each shape once, at most all but one of a class, and never a class of one.
+def folds(labels: Tensor, n_folds: int = _MAX_FOLDS) -> Iterator[Tensor]:
+    """Yield masks (N,) of held-out folds, which never hold out all shapes of a class.
 
-    There are fewer folds where all classes are smaller.
+    Each shape of a class with two or more shapes is held out once. There are fewer folds if all classes are smaller.
     """
     generator = torch.Generator().manual_seed(0)
     fold = torch.full(labels.shape, -1)
     for offset, label in enumerate(labels.unique().tolist()):
         members = torch.nonzero(labels.cpu() == label).flatten()
         if len(members) > 1:
-            drawn = members[torch.randperm(len(members), generator=generator)]
-            fold[drawn] = (torch.arange(len(members)) + offset) % n_folds
+            shuffled = members[torch.randperm(len(members), generator=generator)]
+            fold[shuffled] = (torch.arange(len(members)) + offset) % n_folds
     for number in range(n_folds):
         if bool((fold == number).any()):
             yield (fold == number).to(labels.device)

@@ -1,4 +1,4 @@
-"""Heads fitted in closed form: within seconds, without a choice of step or stop, and the same every time."""
+"""Heads fitted in closed form: within seconds, deterministically, and without learning rates or stopping rules."""
 
 from collections.abc import Sequence
 from typing import Self
@@ -21,28 +21,26 @@ from igps.nn.heads.base import (
 )
 from igps.retrieval.distances import cosine
 
-# With so many training shapes of a class, its scores are trusted in full
-_MANY = 6
-# Variances of distances below this are rounding
-_SMALLEST_VARIANCE = 1e-8
+_MIN_CLASS_SIZE = 6  # with fewer training shapes per class on average, the temperature of the softmax is raised
+_MIN_VARIANCE = 1e-8  # smaller variances of distances are rounding errors
 
 
 class WhitenedHead(Head):
-    """Histograms to unit vectors, damped along the directions in which shapes of one class differ.
+    """Maps histograms to unit vectors, damped along the directions in which shapes of one class differ.
 
     The square roots of histograms are centred on the training shapes and whitened within classes, see
-    `within_class_whitening`. How poses change a histogram is much the same from class to class, so that this head,
-    unlike one with free parameters, serves classes that were not trained on. Before it is fitted, it gives the roots of
-    histograms, brought to length 1.
+    `within_class_whitening`. Changes of pose have similar effects on the histograms of all classes. This head therefore
+    also applies to classes that are not in the training set, unlike a head with free parameters. Before it is fitted,
+    it returns the square roots of histograms, normalised to length 1.
 
-    The parts of a `HistogramDescriptor` may be treated one by one: each is whitened and brought to one length, so that
-    the cosine distance is the mean of those of the parts.
+    The parts of a `HistogramDescriptor` can be treated separately: each part is whitened and normalised, so that the
+    cosine distance is the mean of the distances of the parts.
 
-    A prior is another head of the same descriptions, fitted elsewhere, such as that of `pretrained`. Beside one, the
-    distance is the weighted mean of its own and the prior's. Of the many parts of such descriptions, not all serve the
-    classes at hand. So the parts then count by Fisher's discriminant (1936) of pairs: each distance times
-    (m − m′) / (v + v′), m and v its mean and variance between shapes of two training classes, m′ and v′ between those
-    of one.
+    A prior is another head for the same descriptions, fitted elsewhere, such as that of `pretrained`. With a prior, the
+    distance is the weighted mean of the head's own distance and the prior's. As not all parts of such descriptions
+    distinguish the given classes, the parts are then weighted by Fisher's discriminant (1936) of pairs,
+    (m − m′) / (v + v′). Here m and v are the mean and variance of a part's distances between shapes of different
+    training classes, m′ and v′ between shapes of the same class.
 
     Example:
         >>> import torch
@@ -53,10 +51,10 @@ class WhitenedHead(Head):
         [[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
 
     Args:
-        n_directions: directions that are damped in each part, the largest.
-        shrinkage: s of the whitening; a large one leaves only the centring.
-        prior: a fitted head, which stays as it is; None for no other.
-        prior_share: its weight, between 0 and 1.
+        n_directions: number of directions, those of the largest variance, that are damped in each part.
+        shrinkage: s of the whitening; with a large value, only the centring remains.
+        prior: a fitted head, which is not changed; None for no prior.
+        prior_share: weight of the prior, between 0 and 1.
     """
 
     mean: Tensor
@@ -83,18 +81,18 @@ class WhitenedHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take mean and directions from the training shapes, see `Head.fit`."""
+        """Fit mean and directions to the training shapes, see `Head.fit`."""
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
         means = class_means(roots, members)
         self.centre(descriptions, part_cells)
         residuals = self.parts((roots - means[members]).double())
         for part, directions, gains in zip(residuals, self.parts(self.directions), self.gains, strict=True):
-            # The mean eigenvalue is that of the N − C that residuals of N shapes of C classes allow.
+            # Residuals of N shapes in C classes have at most N − C eigenvalues above 0, which the mean is taken over.
             rank = len(roots) - len(means)
-            kept, left = within_class_whitening(part, rank, self.shrinkage, self.n_directions)
-            directions[: len(kept)] = kept
-            gains[: len(left)] = left
+            own_directions, own_gains = within_class_whitening(part, rank, self.shrinkage, self.n_directions)
+            directions[: len(own_directions)] = own_directions
+            gains[: len(own_gains)] = own_gains
         if self.prior is not None and len(means) > 1:
             discriminants = torch.stack([_discriminant(part, members) for part in self.whitened_parts(roots)])
             if discriminants.sum() > 0:
@@ -103,7 +101,7 @@ class WhitenedHead(Head):
 
     @torch.no_grad()
     def centre(self, descriptions: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take the mean alone from histograms (N, ...), and damp nothing: for shapes without labels, or one a class."""
+        """Fit only the mean to histograms (N, ...), without damping: for shapes without labels, or one per class."""
         roots = square_roots(descriptions)
         self.part_cells = checked_parts(roots, part_cells)
         self._note_buffers()
@@ -115,11 +113,11 @@ class WhitenedHead(Head):
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, D) of length 1."""
+        """Map histograms (N, ...) to embeddings (N, D) of length 1."""
         roots = square_roots(descriptions)
         if len(self.mean):
-            shares = self.part_shares.sqrt()
-            own = torch.cat([n * part for n, part in zip(shares, self.whitened_parts(roots), strict=True)], dim=1)
+            factors = self.part_shares.sqrt()
+            own = torch.cat([x * part for x, part in zip(factors, self.whitened_parts(roots), strict=True)], dim=1)
         else:
             own = functional.normalize(roots, dim=1)
         if self.prior is None:
@@ -128,36 +126,37 @@ class WhitenedHead(Head):
         return torch.cat([(1 - share).sqrt() * own, share.sqrt() * self.prior(descriptions)], dim=1)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, D) and (G, D) embeddings to (Q, G): the cosine distance, or beside a prior a mean with its own."""
+        """Return cosine distances (Q, G) of embeddings (Q, D) and (G, D), or their weighted mean with the prior's."""
         if self.prior is None:
             return cosine(queries, gallery)
         if not len(self.mean):
             raise self._not_fitted()
-        own, priors = zip(*(one.tensor_split([len(self.mean)], dim=1) for one in (queries, gallery)), strict=True)
-        of_prior = self.prior.distances(*(one / self.prior_share.sqrt() for one in priors))
+        own, priors = zip(*(x.tensor_split([len(self.mean)], dim=1) for x in (queries, gallery)), strict=True)
+        of_prior = self.prior.distances(*(x / self.prior_share.sqrt() for x in priors))
         return (1 - self.prior_share) * cosine(*own) + self.prior_share * of_prior
 
     def whitened_parts(self, roots: Tensor) -> list[Tensor]:
-        """Unit vectors (N, cells) of each part, of the square roots (N, D) of histograms."""
+        """Return the whitened unit vectors (N, cells) of each part, from the square roots (N, D) of histograms."""
         check_cells(roots, len(self.mean))
-        of_parts = zip(self.parts(roots - self.mean), self.parts(self.directions), self.gains, strict=True)
-        return [functional.normalize(damped(*one), dim=1) for one in of_parts]
+        parts = zip(self.parts(roots - self.mean), self.parts(self.directions), self.gains, strict=True)
+        return [functional.normalize(damped(*part), dim=1) for part in parts]
 
     def parts(self, cells: Tensor) -> tuple[Tensor, ...]:
-        """Views of (N, D) values, one of each part."""
+        """Split values (N, D) into a view for each part."""
         return cells.split(self._noted["part_cells"], dim=1)
 
 
 class KernelHead(Head):
-    """Histograms to what they have of each training class, by kernel ridge regression on a `WhitenedHead`.
+    """Maps histograms to scores of the training classes, by kernel ridge regression on a `WhitenedHead`.
 
-    The kernel is exp(−d/m), d the cosine distance of the whitened histograms, m its median between training shapes, and
-    the mean of such kernels if there are several parts. It is regressed onto the indicators of the classes. Beside a
-    prior (see `WhitenedHead`), the kernel of the prior's distance is one more, with a weight of its own. It is the best
-    head here for classes that were trained on; for other classes use the `WhitenedHead`.
+    The kernel is exp(−d/m), where d is the cosine distance of the whitened histograms and m its median between training
+    shapes. With several parts, the kernel is the mean of the kernels of the parts. The targets of the regression are
+    the indicators of the classes. A prior (see `WhitenedHead`) adds the kernel of its distance, with a weight of its
+    own. This is the best head of the library for classes in the training set; for other classes use the `WhitenedHead`.
 
-    An embedding is half the scores about their mean, how much of each class a shape has, and half the roots of their
-    softmax, which class it is of: by the latter alone, shapes of one class would coincide.
+    An embedding consists of two halves of equal weight: the scores minus their mean, which tell how similar a shape is
+    to each class, and the square roots of the softmax of the scores, which tell its class. With only the second half,
+    shapes of one class would coincide.
 
     Example:
         >>> import torch
@@ -168,12 +167,12 @@ class KernelHead(Head):
         [0]
 
     Args:
-        prior: a fitted head, which stays as it is; None for no other. With one training shape of each class, which
-            tells nothing of how the shapes of a class vary, its kernel is the only one.
+        prior: a fitted head, which is not changed; None for no prior. With one training shape per class, which does not
+            show how the shapes of a class vary, only the kernel of the prior is used.
         n_directions, shrinkage: of the `WhitenedHead`.
         ridge: added to the kernel's diagonal, which is 1.
         prior_share: weight of the prior's kernel, between 0 and 1.
-        temperature: of the softmax, with six training shapes of a class or more; with n on average, 6 / n of it.
+        temperature: of the softmax; with n < 6 training shapes per class on average, it is multiplied by 6 / n.
     """
 
     anchors: Tensor
@@ -210,14 +209,14 @@ class KernelHead(Head):
         self.classes, members = checked_labels(descriptions, labels).unique(return_inverse=True)
         if len(self.classes) < 2:
             raise ValueError(f"labels: expected at least two classes, got {len(self.classes)}.")
-        several = len(self.classes) < len(members)
-        if several:
+        has_class_variation = len(self.classes) < len(members)
+        if has_class_variation:
             self.whitened.fit(descriptions, labels, part_cells)
         else:
             self.whitened.centre(descriptions, part_cells)
         self.anchors = self._vectors(descriptions)
         n_parts = len(self.whitened.part_cells)
-        share = 0.0 if self.prior is None else self.prior_share if several else 1.0
+        share = 0.0 if self.prior is None else self.prior_share if has_class_variation else 1.0
         shares = [(1 - share) / n_parts] * n_parts + ([] if self.prior is None else [share])
         self.shares = self.anchors.new_tensor(shares)
         i, j = torch.triu_indices(len(self.anchors), len(self.anchors), 1, device=self.anchors.device)
@@ -226,53 +225,53 @@ class KernelHead(Head):
         kernel = self._kernel(self.anchors).double()
         kernel.diagonal().add_(self.ridge)
         targets = functional.one_hot(members, len(self.classes)).double()
-        # As they lie in memory when loaded, so that products with them round alike
+        # Contiguous as after loading from a file, so that products with them are rounded in the same way.
         self.coefficients = torch.linalg.solve(kernel, targets).to(self.anchors.dtype).contiguous()
         return self
 
     def scores(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, n_classes), about 1 for the class that a shape is of and 0 for others."""
+        """Return scores (N, n_classes) of histograms (N, ...): about 1 for the class of a shape, 0 for others."""
         if not len(self.anchors):
             raise self._not_fitted()
         kernel = self._kernel(self._vectors(descriptions))
         return kernel @ self.coefficients.to(kernel.dtype)
 
     def predict(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N,) classes, as they were named in `fit`."""
+        """Return the predicted classes (N,) of histograms (N, ...), with the labels given to `fit`."""
         return self.classes[self.scores(descriptions).argmax(dim=1)]
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, 2 n_classes) of length 1."""
+        """Map histograms (N, ...) to embeddings (N, 2 n_classes) of length 1."""
         scores = self.scores(descriptions)
-        of_each = functional.normalize(scores - 1 / len(self.classes), dim=1)
-        # Few shapes of a class leave scores of other classes that are nearly as large
-        n_of_each = len(self.anchors) / len(self.classes)
-        likely = (scores / (self.temperature * max(1, _MANY / n_of_each))).softmax(dim=1).sqrt()
-        return torch.cat([of_each, likely], dim=1) / 2**0.5
+        similarity = functional.normalize(scores - 1 / len(self.classes), dim=1)
+        # With few shapes per class, the scores of other classes are nearly as large, so the temperature is raised.
+        class_size = len(self.anchors) / len(self.classes)
+        likely = (scores / (self.temperature * max(1, _MIN_CLASS_SIZE / class_size))).softmax(dim=1).sqrt()
+        return torch.cat([similarity, likely], dim=1) / 2**0.5
 
     def _kernel(self, vectors: Tensor) -> Tensor:
         kernels = (-self._distances(vectors) / self.medians[:, None, None]).exp()
         return torch.einsum("k,kij->ij", self.shares.to(kernels.dtype), kernels)
 
     def _vectors(self, descriptions: Tensor) -> Tensor:
-        """Unit vectors of the parts and of the prior, side by side."""
+        """Return the unit vectors of the parts and of the prior, concatenated."""
         own = self.whitened.whitened_parts(square_roots(descriptions))
         return torch.cat(own if self.prior is None else [*own, self.prior(descriptions)], dim=1)
 
     def _distances(self, vectors: Tensor) -> Tensor:
-        """(kernels, N, n_shapes) distances to the training shapes: cosine's of the parts, and the prior's own."""
+        """Return distances (kernels, N, n_shapes) to the training shapes: cosine for each part, then the prior's."""
         sizes, both = self.whitened._noted["part_cells"], (vectors, self.anchors.to(vectors.dtype))
-        split = [one.split([*sizes, one.shape[1] - sum(sizes)], dim=1) for one in both]
-        found = [1 - one @ other.T for one, other in list(zip(*split, strict=True))[: len(sizes)]]
+        own, anchors = (x.split([*sizes, x.shape[1] - sum(sizes)], dim=1) for x in both)
+        distances = [1 - own[k] @ anchors[k].T for k in range(len(sizes))]
         if self.prior is not None:
-            found.append(self.prior.distances(split[0][-1], split[1][-1]))
-        return torch.stack(found)
+            distances.append(self.prior.distances(own[-1], anchors[-1]))
+        return torch.stack(distances)
 
 
 def _discriminant(vectors: Tensor, members: Tensor) -> Tensor:
-    """How well cosine distances of unit vectors (N, D) tell pairs of one class (N,) from others, ≥ 0 (Fisher 1936)."""
+    """Return the discriminant (Fisher 1936) ≥ 0 between cosine distances of unit vectors within and between classes."""
     distances = 1 - vectors @ vectors.T
-    alike = members[:, None] == members
-    far, near = distances[~alike], distances[alike.fill_diagonal_(False)]
-    variance = near.var(correction=0) + far.var(correction=0)
-    return ((far.mean() - near.mean()) / variance.clamp_min(_SMALLEST_VARIANCE)).clamp_min(0)
+    is_same = members[:, None] == members
+    between, within = distances[~is_same], distances[is_same.fill_diagonal_(False)]
+    variance = within.var(correction=0) + between.var(correction=0)
+    return ((between.mean() - within.mean()) / variance.clamp_min(_MIN_VARIANCE)).clamp_min(0)

@@ -1,4 +1,4 @@
-"""What gradients learn on top of histograms: an embedding, and a distance blended of the plain one and a head's."""
+"""A head that is trained by gradients, and a distance that blends a head's distance with a plain one."""
 
 from collections.abc import Sequence
 from typing import Self
@@ -13,13 +13,13 @@ from igps.retrieval.distances import Distance, chi_square
 
 
 class ProjectionHead(Head):
-    """Histograms to unit vectors whose cosine distance is learned by gradients: one layer, or two.
+    """One or two layers from histograms to unit vectors, trained by gradients.
 
-    The square root of a histogram is a unit vector too (its distances are Hellinger's), which tames its largest cells.
-    The first layer takes its size from the first descriptions that it sees.
+    The inputs are the square roots of histograms, which are unit vectors with Hellinger distances; the root reduces the
+    influence of the largest cells. The first layer takes its size from the first descriptions.
 
     Args:
-        width: D of the embedding.
+        width: embedding width D.
         n_hidden: units of the hidden layer; 0 makes the head linear.
         dropout: share of hidden units dropped in training.
         cell_dropout: share of cells dropped in training.
@@ -40,20 +40,20 @@ class ProjectionHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Centre and scale the inputs by the histograms (N, ...) of the training shapes, N at least 2.
+        """Fit the centring and scaling of the inputs to the histograms (N, ...) of the training shapes, N ≥ 2.
 
-        The layers are trained by gradients; labels and parts are not needed here.
+        The layers are trained by gradients; labels and parts are ignored.
         """
         roots = square_roots(descriptions)
         if len(roots) < 2:
             raise ValueError(f"descriptions: expected those of at least two training shapes, got {len(roots)}.")
         self.mean = roots.mean(dim=0)
-        # One scale for all cells: a scale for each would blow up the cells that are nearly always empty.
+        # One scale for all cells, as a scale for each would amplify the cells that are nearly always empty.
         self.scale.copy_(roots.std(dim=0).mean().clamp_min(torch.finfo(roots.dtype).tiny))
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, D) of length 1."""
+        """Map histograms (N, ...) to embeddings (N, D) of length 1."""
         roots = square_roots(descriptions)
         if len(self.mean):
             check_cells(roots, len(self.mean))
@@ -62,16 +62,16 @@ class ProjectionHead(Head):
 
 
 class BlendedDistance(nn.Module):
-    """A weighted sum of a plain distance and a head's, each in units of its median between training shapes.
+    """A weighted sum of a plain distance and a head's distance, each in units of its median between training shapes.
 
-    A head with free parameters forgets what it was not trained on; beside the plain distance it may gain on classes
-    never seen as well. Without a head this is the plain distance.
+    A head with free parameters specialises in the training classes; the sum with the plain distance can also improve
+    the distances of other classes. Without a head, it is the plain distance.
 
     Args:
         head: of the descriptions, or None.
-        plain: (Q, ...) and (G, ...) descriptions to (Q, G) distances, such as `Descriptor.distances`; χ² if None.
-        share: of the head's distance in the sum, from 0 (plain) to 1 (the head alone, as `EmbeddedDescriptor` has it
-            but for the unit).
+        plain: maps descriptions (Q, ...) and (G, ...) to distances (Q, G), such as `Descriptor.distances`; χ² if None.
+        share: weight of the head's distance, from 0 (only the plain distance) to 1 (only the head's distance, which
+            then differs from that of an `EmbeddedDescriptor` by its unit).
     """
 
     plain_unit: Tensor
@@ -89,7 +89,7 @@ class BlendedDistance(nn.Module):
 
     @torch.no_grad()
     def calibrate(self, descriptions: Tensor) -> None:
-        """Take the units from the descriptions (N, ...) of the training shapes, after the head is trained."""
+        """Fit the units to the descriptions (N, ...) of the training shapes, after the head is trained."""
         if self.head is None:
             return
         pairs = tuple(torch.triu_indices(len(descriptions), len(descriptions), 1))
@@ -101,7 +101,7 @@ class BlendedDistance(nn.Module):
             unit.copy_(distances[pairs].median().clamp_min(torch.finfo(distances.dtype).tiny))
 
     def forward(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, ...) and (G, ...) descriptions to (Q, G) distances."""
+        """Return distances (Q, G) between descriptions (Q, ...) and (G, ...)."""
         plain = self.plain(queries, gallery)
         if self.head is None:
             return plain

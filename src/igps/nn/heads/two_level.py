@@ -1,4 +1,4 @@
-"""A head of levels: poses of an individual come first, then its like, then other bodies of its class, then the rest."""
+"""A head with levels: other poses of a body rank first, then look-alikes, then other bodies of its class."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -14,46 +14,46 @@ from igps.nn.heads.wccn import MEDIAN, WCCNHead
 from igps.retrieval.distances import cosine, euclidean, square_root
 from igps.retrieval.vectors import MOST_NUMBERS
 
-# Their usual distance from the mean: of so many directions most two are nearly at right angles
+# Usual distance of a training shape from the mean, as in many dimensions most pairs of shapes are nearly orthogonal.
 _USUAL_LENGTH = MEDIAN / math.sqrt(2)
-# Exponent of the factor that turns from nothing of a distance to all of it
-_STEEPNESS = 10
-# Of the squared length of an embedding, what belongs to individuals, and from where on all of their weight counts
-_INDIVIDUAL_SHARE, _INDIVIDUAL_SCALE = 0.1, 0.3
+_STEEPNESS = 10  # exponent of the factor that rises from 0 to 1 at the scales of the body heads
+_INDIVIDUAL_SHARE = 0.1  # share of the squared length of an embedding that belongs to the individual head
+_INDIVIDUAL_SCALE = 0.3  # distance by the individual head at which most of its weight counts
 
 
 class TwoLevelHead(Head):
-    """Histograms to unit vectors, and a distance of them by which a body's other poses come first, then its class.
+    """Maps histograms to unit vectors, with a distance that ranks other poses of a body first, then its class.
 
-    An embedding is that of a class head, a `WCCNHead` fitted to classes, beside those of body heads, with lengths,
-    fitted to bodies, which tell whether two shapes are one body. The distance is the cosine distance of the former,
-    times 1 − exp(−Σ (dₖ / sₖ)¹⁰), with dₖ the distances by the body heads and sₖ their scales. Where all dₖ are below
-    their scales, as between poses of a body, nothing of the distance is left. Where any is above its scale, all of it
-    is left: how different two bodies are says nothing of their classes.
+    An embedding concatenates the embeddings of a class head, a `WCCNHead` fitted to classes, and of body heads, which
+    are `WCCNHead`s with `lengths`, fitted to bodies in several poses. The distance is the cosine distance of the class
+    embeddings, times the factor 1 − exp(−Σ (dₖ / sₖ)¹⁰), where dₖ are the distances by the body heads and sₖ their
+    scales. The factor is nearly 0 if all dₖ are below their scales, as between poses of a body, and nearly 1 if any is
+    above its scale. It saturates, because the size of the difference between two bodies does not predict their classes.
 
-    Far from the mean of the training shapes, other bodies come as near to a body as elsewhere its poses do. So the
-    scales are smaller there, by √(ℓ / ℓ₀): ℓ² is the product of the two shapes' distances from the mean, each in
-    quadratic mean over the body heads, and ℓ₀ the distance that is usual.
+    Far from the mean of the training shapes, distances between different bodies are as small as distances between poses
+    elsewhere. The scales are therefore multiplied by √(ℓ₀ / ℓ). Here ℓ² is the product of the distances of the two
+    shapes from the mean, each in quadratic mean over the body heads, and ℓ₀ is the usual distance.
 
-    Bodies may be nearly alike, as two people are. An individual head, with lengths, is fitted by `fit_individuals` to
-    individuals in poses, so that it knows what bending and triangles change and what not. With f its distance and w its
-    weight, the distance is (1 − w) times that above plus w (1 − exp(−(f / 0.3)²)): a small part of it, that orders what
-    the levels of bodies take for one.
+    Bodies can be nearly alike, such as two people. An individual head, a `WCCNHead` with `lengths`, is fitted by
+    `fit_individuals` to individuals in several poses, so that it ignores the effects of bending and triangulation. With
+    f its distance and w its weight, the distance is (1 − w) times the distance above plus w (1 − exp(−(f / 0.3)²)).
+    This small term orders the shapes that the body heads consider the same body.
 
-    The cosine distance of whole embeddings is nearly that of the classes. Engines that know no other distance find
-    candidates by it, which are then ranked by the distance itself; so does that of `short` vectors.
+    The cosine distance of whole embeddings is close to the cosine distance of the class embeddings. Search engines that
+    only support cosine distances find candidates by whole embeddings or by `short` vectors; the candidates are then
+    ranked by `distances`.
 
     Args:
-        class_head: of the classes.
-        body_heads: of the bodies, with lengths; one that sees the whole description if None.
-        scales: of each of these, in units of its distances (of which the median is 0.5).
-        share: of the squared length of an embedding that belongs to the bodies.
-        individual_head: of the individuals, with lengths; None for two levels.
-        weight: of the distance of individuals in the whole.
+        class_head: fitted to classes.
+        body_heads: fitted to bodies, with lengths; if None, a single head for the whole description.
+        scales: of the body heads, in units of their distances (with median 0.5).
+        share: share of the squared length of an embedding that belongs to the body heads.
+        individual_head: fitted to individuals, with lengths; None for two levels.
+        weight: weight w of the individual head.
 
     Raises:
-        ValueError: body heads or an individual head without lengths, not a positive scale for each, or a share or a
-            weight that is none.
+        ValueError: a body head or individual head without lengths, a scale that is missing or not positive, or a share
+            or weight that is not between 0 and 1.
     """
 
     scales: Tensor
@@ -76,11 +76,11 @@ class TwoLevelHead(Head):
         self.body_heads = nn.ModuleList(body_heads or [WCCNHead(n_directions=64, shrinkage=0.3, lengths=True)])
         if len(scales) != len(self.body_heads) or min(scales) <= 0 or not 0 < share < 1:
             raise ValueError(
-                f"scales, share: expected a positive number for each of {len(self.body_heads)} body heads, and one "
+                f"scales, share: expected a positive scale for each of {len(self.body_heads)} body heads, and a share "
                 f"between 0 and 1, got {tuple(scales)} and {share}."
             )
         self.individual_head = individual_head
-        if not all(bool(head.lengths) for head in (*self._bodies(), *([individual_head] if individual_head else []))):
+        if not all(bool(x.lengths) for x in (*self._body_heads(), *([individual_head] if individual_head else []))):
             raise ValueError(
                 "body_heads, individual_head: expected heads with lengths. Make them by WCCNHead(..., lengths=True)."
             )
@@ -103,17 +103,17 @@ class TwoLevelHead(Head):
 
         Args:
             descriptions, labels, part_cells: see `Head.fit`.
-            bodies: integers; the classes where None.
+            bodies: integers; if None, the classes.
         """
         self.class_head.fit(descriptions, labels, part_cells)
-        for head in self._bodies():
+        for head in self._body_heads():
             head.fit(descriptions, labels if bodies is None else bodies, part_cells)
         embeddings = self._two_levels(descriptions)
         self.principal = principal_directions(embeddings.double(), MOST_NUMBERS)[0].to(embeddings.dtype)
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, D) of length 1, the individuals' numbers last."""
+        """Map histograms (N, ...) to embeddings (N, D) of length 1, with the columns of the individual head last."""
         levels = self._two_levels(descriptions)
         if self.individual_head is None:
             return levels
@@ -124,24 +124,24 @@ class TwoLevelHead(Head):
     def fit_individuals(
         self, descriptions: Tensor, individuals: Tensor, part_cells: Sequence[int] | None = None
     ) -> Self:
-        """Fit the individual head, if there is one, to histograms (N, ...) of individuals (N,) in poses."""
+        """Fit the individual head to histograms (N, ...) of individuals (N,) in several poses."""
         if self.individual_head is None:
             raise ValueError("individual_head: expected a head to fit, got None.")
         self.individual_head.fit(descriptions, individuals, part_cells)
         return self
 
     def within_class(self, embeddings: Tensor) -> Tensor:
-        """The numbers of bodies and individuals in (N, D) embeddings.
+        """Return the columns of the body heads and the individual head in embeddings (N, D).
 
-        Between bodies that are nearly alike those of classes hold little but the scatter of the samples.
+        Between bodies that are nearly alike, the columns of the class head differ mostly by the scatter of the samples.
         """
         return embeddings[:, self.class_head.n_numbers :]
 
     def short(self, embeddings: Tensor) -> Tensor:
-        """(N, D) embeddings to (N, ≤ 256) of length 1, along the principal directions of those of the training shapes.
+        """Project embeddings (N, D) to (N, ≤ 256) of length 1, on the principal directions of the training shapes.
 
-        For engines that take no more numbers: their cosines are nearly those of the embeddings without the individuals,
-        farther from them the less a shape is like those of training. A ValueError of other embeddings than its own.
+        The cosines are close to those of the embeddings without individuals; the error grows with the difference
+        between a shape and the training shapes. Raises a ValueError for embeddings of other heads.
         """
         if not len(self.principal):
             raise self._not_fitted()
@@ -152,50 +152,50 @@ class TwoLevelHead(Head):
         return functional.normalize(levels @ self.principal.T, dim=1)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, D) and (G, D) embeddings to (Q, G) distances from 0 to 2."""
+        """Return distances (Q, G), from 0 to 2, between embeddings (Q, D) and (G, D)."""
         (queries, query_individuals), (gallery, gallery_individuals) = self._split(queries), self._split(gallery)
         n = self.class_head.n_numbers
         classes = cosine(queries[:, :n], gallery[:, :n])
-        of_queries, of_gallery = self._of_bodies(queries), self._of_bodies(gallery)
-        apart = torch.zeros_like(classes)
-        for query, other, scale in zip(of_queries, of_gallery, self.scales, strict=True):
-            apart = apart + (euclidean(query, other) / scale).pow(_STEEPNESS)
-        lengths = _mean_lengths(of_queries)[:, None] * _mean_lengths(of_gallery)
-        found = classes * -torch.expm1(-apart * (lengths / _USUAL_LENGTH**2).pow(_STEEPNESS / 4))
+        query_bodies, gallery_bodies = self._bodies(queries), self._bodies(gallery)
+        exponent = torch.zeros_like(classes)
+        for query, other, scale in zip(query_bodies, gallery_bodies, self.scales, strict=True):
+            exponent = exponent + (euclidean(query, other) / scale).pow(_STEEPNESS)
+        lengths = _mean_lengths(query_bodies)[:, None] * _mean_lengths(gallery_bodies)
+        distances = classes * -torch.expm1(-exponent * (lengths / _USUAL_LENGTH**2).pow(_STEEPNESS / 4))
         if self.individual_head is None:
-            return found
-        near = (euclidean(query_individuals, gallery_individuals) / _INDIVIDUAL_SCALE).square()
-        return (1 - self.weight) * found - self.weight * torch.expm1(-near)
+            return distances
+        individuals = (euclidean(query_individuals, gallery_individuals) / _INDIVIDUAL_SCALE).square()
+        return (1 - self.weight) * distances - self.weight * torch.expm1(-individuals)
 
     def _two_levels(self, descriptions: Tensor) -> Tensor:
-        """(N, D) of length 1, of classes and bodies alone, without individuals."""
+        """Return embeddings (N, D) of length 1 from the class head and the body heads, without individuals."""
         classes = (1 - self.share).sqrt() * self.class_head(descriptions)
-        return torch.cat([classes, *(self._root_share * head(descriptions) for head in self._bodies())], dim=1)
+        return torch.cat([classes, *(self._root_share * head(descriptions) for head in self._body_heads())], dim=1)
 
     def _split(self, embeddings: Tensor) -> tuple[Tensor, Tensor]:
-        """The numbers of classes and bodies in (N, D) embeddings, and those of individuals, each in its own units."""
+        """Split embeddings (N, D) into classes with bodies, and individuals, each with its weight in D undone."""
         if self.individual_head is None:
             return embeddings, embeddings[:, :0]
         n = self.individual_head.n_numbers
         levels, individuals = embeddings[:, :-n], embeddings[:, -n:-1]
         return levels / math.sqrt(1 - _INDIVIDUAL_SHARE), individuals / math.sqrt(_INDIVIDUAL_SHARE)
 
-    def _bodies(self) -> Iterator[WCCNHead]:
+    def _body_heads(self) -> Iterator[WCCNHead]:
         return (head for head in self.body_heads if isinstance(head, WCCNHead))
 
-    def _of_bodies(self, embeddings: Tensor) -> list[Tensor]:
-        """The numbers of each body head in (N, D) embeddings, in its own units, without the one for the length 1."""
-        start, found = self.class_head.n_numbers, []
-        for head in self._bodies():
-            found.append(embeddings[:, start : start + head.n_compared] / self._root_share)
+    def _bodies(self, embeddings: Tensor) -> list[Tensor]:
+        """Return the `n_compared` columns of each body head in embeddings (N, D), with its weight undone."""
+        start, bodies = self.class_head.n_numbers, []
+        for head in self._body_heads():
+            bodies.append(embeddings[:, start : start + head.n_compared] / self._root_share)
             start += head.n_numbers
-        return found
+        return bodies
 
     @property
     def _root_share(self) -> Tensor:
         return (self.share / len(self.body_heads)).sqrt()
 
 
-def _mean_lengths(of_bodies: Sequence[Tensor]) -> Tensor:
-    """(N,) distances of shapes from the mean, in quadratic mean over the body heads."""
-    return square_root(torch.stack([one.square().sum(dim=1) for one in of_bodies]).mean(dim=0))
+def _mean_lengths(bodies: Sequence[Tensor]) -> Tensor:
+    """Return the distances (N,) of shapes from the mean, in quadratic mean over the body heads."""
+    return square_root(torch.stack([x.square().sum(dim=1) for x in bodies]).mean(dim=0))

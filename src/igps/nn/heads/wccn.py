@@ -1,4 +1,4 @@
-"""A head whitened within classes, which keeps what tells classes apart."""
+"""A head that whitens within classes and projects on the directions that distinguish classes."""
 
 import math
 from collections.abc import Sequence
@@ -22,28 +22,26 @@ from igps.nn.heads.base import (
 )
 from igps.retrieval.distances import square_root
 
-# Of a part so many principal directions are whitened; what is beyond them is discretisation
-_PRINCIPAL = 500
-# Where lengths count: the median distance of training shapes, so that all find room in a sphere of radius 1; and how
-# many of the shapes the median is taken over
-MEDIAN, _SAMPLED = 0.5, 1000
+_N_PRINCIPAL = 500  # principal directions of a part that are whitened; the others contain discretisation errors
+MEDIAN = 0.5  # median distance of training shapes, with lengths, so that all shapes fit in a sphere of radius 1
+_N_MEDIAN_SHAPES = 1000  # number of training shapes, about, that the median is computed from
 
 
 class WCCNHead(Head):
-    """Histograms to unit vectors, whitened within classes and reduced to the directions that tell classes apart.
+    """Maps histograms to unit vectors, whitened within classes and reduced to directions that distinguish classes.
 
     The square roots of each part are centred and whitened, see `within_class_whitening`, then projected on the
-    directions in which the means of the classes vary most. The parts, each brought to one length, are joined.
+    directions in which the class means vary most. The parts are normalised to equal lengths and concatenated.
 
-    By `lengths`, the parts keep their lengths, so that distances are Mahalanobis': two shapes that both hardly differ
-    from the mean are close, where the angle between them may be anything. One more number, the last, makes the vectors
-    unit vectors, and is no part of those distances.
+    With `lengths`, the parts keep their lengths, so that distances are Mahalanobis distances: two shapes near the mean
+    are close, although the angle between them is arbitrary. An additional last column makes the vectors unit vectors,
+    and is not part of these distances.
 
     Args:
-        parts: which parts of a description it looks at; all if None.
-        n_directions: numbers of each part in a vector, at most as many as the part has cells.
+        parts: indices of the parts of a description that the head uses; all if None.
+        n_directions: columns of each part in a vector, at most the number of its cells.
         shrinkage: added to the covariance within classes, in units of its mean eigenvalue.
-        lengths: whether lengths count beside directions.
+        lengths: whether vectors keep their lengths.
     """
 
     mean: Tensor
@@ -72,75 +70,76 @@ class WCCNHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take mean and directions from the training shapes, see `Head.fit`."""
+        """Fit mean and directions to the training shapes, see `Head.fit`."""
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
         self.part_cells = checked_parts(roots, part_cells)
         self._note_buffers()
         n_parts = len(self.part_cells)
         if self._parts is not None and not set(self._parts) <= set(range(n_parts)):
-            raise ValueError(f"parts: expected some of 0 to {n_parts - 1}, got {self._parts}.")
-        seen = self._seen(roots)
-        self.mean = seen.mean(dim=0)
-        self.directions = seen.new_zeros(self.n_directions, len(self.mean))
-        for part, directions in self._by_part(seen):
-            found = self._directions(part.double(), members)
-            directions[: len(found)] = found
+            raise ValueError(f"parts: expected indices from 0 to {n_parts - 1}, got {self._parts}.")
+        used = self._select_parts(roots)
+        self.mean = used.mean(dim=0)
+        self.directions = used.new_zeros(self.n_directions, len(self.mean))
+        for part, directions in self._by_part(used):
+            own_directions = self._directions(part.double(), members)
+            directions[: len(own_directions)] = own_directions
             if self.lengths:
-                some = part[:: max(1, len(part) // _SAMPLED)] @ directions.T
-                median = torch.pdist(some).median().clamp_min(torch.finfo(some.dtype).tiny)
+                vectors = part[:: max(1, len(part) // _N_MEDIAN_SHAPES)] @ directions.T
+                median = torch.pdist(vectors).median().clamp_min(torch.finfo(vectors.dtype).tiny)
                 directions *= MEDIAN / (median * math.sqrt(len(self._sizes())))
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, D) of length 1."""
+        """Map histograms (N, ...) to vectors (N, D) of length 1."""
         roots = square_roots(descriptions)
         if not len(self.mean):
             raise self._not_fitted()
         check_cells(roots, sum(self._noted["part_cells"]))
-        projected = [part @ directions[: part.shape[1]].T for part, directions in self._by_part(self._seen(roots))]
+        parts = self._by_part(self._select_parts(roots))
+        projected = [part @ directions[: part.shape[1]].T for part, directions in parts]
         if not self._noted["lengths"]:
             projected = [functional.normalize(part, dim=1) for part in projected]
             return functional.normalize(torch.cat(projected, dim=1), dim=1)
         vectors = torch.cat(projected, dim=1)
-        # What is farther from the mean than any training shape is put on the sphere
+        # Shapes farther from the mean than any training shape are moved onto the sphere.
         vectors = vectors / torch.linalg.norm(vectors, dim=1, keepdim=True).clamp_min(1)
         height = (1 - vectors.square().sum(dim=1, keepdim=True)).clamp_min(0)
         return torch.cat([vectors, square_root(height)], dim=1)
 
     @property
     def n_compared(self) -> int:
-        """How many numbers of a vector distances use, once fitted: all but the one that makes the length 1."""
+        """The number of columns that distances use, once fitted: without the column that makes the length 1."""
         return sum(min(len(self.directions), size) for size in self._sizes())
 
     @property
     def n_numbers(self) -> int:
-        """D of the vectors, once fitted."""
+        """The width D of the vectors, once fitted."""
         return self.n_compared + self._noted["lengths"]
 
     def _directions(self, part: Tensor, members: Tensor) -> Tensor:
-        """(k, cells) that whiten a centred part (N, cells) and keep what tells classes apart."""
-        principal, _ = principal_directions(part, _PRINCIPAL)
-        found = part @ principal.T
-        means = class_means(found, members)
-        rank, width = min(len(found) - len(means), len(principal)), len(principal)
-        whitening = within_class_whitening(found - means[members], rank, self.shrinkage, width)
-        kept, _ = principal_directions(damped(means, *whitening), self.n_directions)
-        return damped(kept, *whitening) @ principal
+        """Return directions (k, cells) that whiten a centred part (N, cells) and distinguish the classes."""
+        principal, _ = principal_directions(part, _N_PRINCIPAL)
+        projected = part @ principal.T
+        means = class_means(projected, members)
+        rank, width = min(len(projected) - len(means), len(principal)), len(principal)
+        whitening = within_class_whitening(projected - means[members], rank, self.shrinkage, width)
+        between_classes, _ = principal_directions(damped(means, *whitening), self.n_directions)
+        return damped(between_classes, *whitening) @ principal
 
     def _sizes(self) -> list[int]:
-        """Cells of each part that it looks at."""
+        """Return the number of cells of each part that is used."""
         cells: list[int] = self._noted["part_cells"]
         return cells if self._parts is None else [cells[i] for i in self._parts]
 
-    def _by_part(self, seen: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """(N, cells) centred, and the (n_directions, cells) directions, of each part in `_seen` roots."""
+    def _by_part(self, used: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return the centred cells (N, cells) and the directions (n_directions, cells) of each part that is used."""
         sizes = self._sizes()
-        centred = seen - self.mean
+        centred = used - self.mean
         return list(zip(centred.split(sizes, 1), self.directions.to(centred.dtype).split(sizes, 1), strict=True))
 
-    def _seen(self, roots: Tensor) -> Tensor:
-        """(N, cells) of the parts that it looks at."""
+    def _select_parts(self, roots: Tensor) -> Tensor:
+        """Return the cells (N, cells) of the parts that are used."""
         if self._parts is None:
             return roots
         parts = roots.split(self._noted["part_cells"], dim=1)

@@ -1,4 +1,4 @@
-"""Joint histograms over the samples of a body, and over their pairs, as products of axes."""
+"""Joint histograms of the samples of a body, or of their pairs, along one or several axes."""
 
 from igps.nn.histograms.base import DescriptionPart, SampleHistogram
 from igps.nn.histograms.pairs import PairHistogram, joint_histogram, pair_histogram

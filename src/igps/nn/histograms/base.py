@@ -1,4 +1,4 @@
-"""What the parts of a description share, and the histograms of samples among them."""
+"""Base classes of the parts of a description, and of histograms of samples."""
 
 import math
 from abc import ABC, abstractmethod
@@ -19,10 +19,10 @@ from igps.signature.signature import SAMPLE_KINDS, SampleKind
 
 
 class DescriptionPart(Specified, ABC):
-    """A module that makes one part of a description: non-negative numbers of sum 1 for each body.
+    """A module that computes one part of a description: non-negative numbers of sum 1 for each body.
 
-    A part of your own defines `shape`, `requirements` and `of_features`, and, where it heeds the `weights` of samples,
-    `degree`: a part is as many times as large, to that power, where all samples weigh as many times as much.
+    A part of your own defines `shape`, `requirements` and `of_features`. If it uses the `weights` of samples, it also
+    defines `degree`: multiplying all weights by t multiplies the part by t to this power.
     """
 
     degree: int = 1
@@ -30,42 +30,42 @@ class DescriptionPart(Specified, ABC):
     @property
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Of a body's part."""
+        """The shape of the part of one body."""
 
     @property
     @abstractmethod
     def requirements(self) -> Requirements:
-        """What it needs of a body."""
+        """What a body must have."""
 
     @abstractmethod
     def of_features(self, features: BatchFeatures) -> Tensor:
-        """(N, ...) parts of N shapes."""
+        """Return the parts (N, ...) of N shapes."""
 
     @property
     def n_cells(self) -> int:
-        """Numbers of a body's part."""
+        """The number of entries of the part of one body."""
         return math.prod(self.shape)
 
     def forward(self, batch: SignatureBatch | BatchFeatures) -> Tensor:
-        """(N, ...) parts of N shapes, of a batch or of features that several parts share.
+        """Return the parts (N, ...) of N shapes, from a batch or from features that several parts share.
 
         Raises:
-            ValueError: a body without two samples, attributes that are missing, or values that are not finite.
+            ValueError: a body has fewer than two samples, an attribute is missing, or values are not finite.
         """
         return self.of_features(batch if isinstance(batch, BatchFeatures) else BatchFeatures(batch, self.training))
 
 
 class SampleHistogram(DescriptionPart):
-    """A histogram of some samples of each body, whose cells sum to 1.
+    """A histogram of the samples of each body, whose cells sum to 1.
 
     Args:
         samples: "interior" or "surface".
-        n_samples: of a body with more samples, a subset of so many that is always the same; None uses all.
-        n_training_samples: in training mode, a random subset of so many, another one each time: it is faster, and a
-            head cannot learn the samples by heart. None uses the same as in evaluation.
+        n_samples: size of a fixed subset, for bodies with more samples; None uses all samples.
+        n_training_samples: size of a subset that is drawn at random at each step in training mode, which is faster and
+            prevents a head from memorising the samples. None uses the same samples as in evaluation mode.
 
     Raises:
-        ValueError: an unknown kind of samples, or fewer than two.
+        ValueError: an unknown kind of samples, or a number of samples below two.
     """
 
     embedding: nn.Module
@@ -82,48 +82,48 @@ class SampleHistogram(DescriptionPart):
 
     @property
     def requirements(self) -> Requirements:
-        """Those of the embedding."""
+        """The requirements of the embedding."""
         return embedding_requirements(self.embedding)
 
     @abstractmethod
     def of_samples(self, features: SampleFeatures) -> Tensor:
-        """(N, ...) histograms of some samples of N shapes."""
+        """Return histograms (N, ...) of the samples of N shapes."""
 
     def of_features(self, features: BatchFeatures) -> Tensor:
-        """(N, ...) histograms of N shapes."""
+        """Return histograms (N, ...) of N shapes."""
         return self.of_samples(features.of(self.samples, self.n_samples, self.n_training_samples))
 
 
 class AxesHistogram(SampleHistogram):
-    """A histogram along some axes."""
+    """A histogram along one or several axes."""
 
     axes: nn.ModuleList
 
     @property
     def point_axes(self) -> list[PointAxis]:
         """The axes of points."""
-        return [one for one in self.axes if isinstance(one, PointAxis)]
+        return [axis for axis in self.axes if isinstance(axis, PointAxis)]
 
     @property
     def pair_axes(self) -> list[PairAxis]:
-        """The axes of pairs in the order of the histogram's dimensions: distances before cosines."""
-        axes = [one for one in self.axes if isinstance(one, PairAxis)]
-        return sorted(axes, key=lambda one: not isinstance(one, DistanceAxis))
+        """The axes of pairs in the order of the histogram's dimensions: distances before others."""
+        axes = [axis for axis in self.axes if isinstance(axis, PairAxis)]
+        return sorted(axes, key=lambda axis: not isinstance(axis, DistanceAxis))
 
     @property
     def requirements(self) -> Requirements:
-        """What all axes together need of a body."""
+        """The union of the requirements of all axes."""
         axes: list[PointAxis | PairAxis] = [*self.point_axes, *self.pair_axes]
         return reduce(or_, (axis.requirements(self.embedding) for axis in axes))
 
 
 def joint(memberships: list[Tensor]) -> Tensor:
-    """(..., P, C) memberships of points in all combinations of classes, from those in classes of several kinds."""
-    return reduce(lambda one, other: (one[..., :, None] * other[..., None, :]).flatten(-2), memberships)
+    """Return memberships (..., P, C) in all combinations of classes, from the memberships along several axes."""
+    return reduce(lambda first, second: (first[..., :, None] * second[..., None, :]).flatten(-2), memberships)
 
 
-def counted(one: Tensor, other: Tensor, n_points: Tensor) -> Tensor:
-    """(..., C, D) shares of points, at least one, in combinations of classes (..., P, C) and (..., P, D)."""
+def counted(first: Tensor, second: Tensor, n_points: Tensor) -> Tensor:
+    """Return the shares (..., C, D) of at least one point in combinations of classes (..., P, C) and (..., P, D)."""
     if not torch.compiler.is_compiling() and int(n_points.min()) < 1:
         raise ValueError("samples: expected at least one of each body, got none.")
-    return one.mT @ other / n_points[..., None, None]
+    return first.mT @ second / n_points[..., None, None]

@@ -1,4 +1,4 @@
-"""Joint histograms over all pairs of the samples of a body, as products of axes."""
+"""Joint histograms of all pairs of samples of a body, along one or several axes."""
 
 import math
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ from igps.signature.signature import SampleKind
 
 
 class PairHistogram(AxesHistogram):
-    """The joint histogram of all pairs of samples of each body, along some axes.
+    """The joint histogram of all pairs of samples of each body, along one or several axes.
 
-    Axes of points sort the samples into classes: their combinations are C classes, and the histogram has a row for
-    every unordered pair of them. Axes of pairs are the other dimensions. Each unordered pair of distinct samples counts
-    once; all cells of a body sum to 1. The paper's histogram is the product of a potential and an interior distance.
+    The axes of points sort the samples into C classes, the combinations of the classes of each axis. The histogram has
+    a row for every unordered pair of classes; the axes of pairs are the other dimensions. Each unordered pair of
+    distinct samples counts once, and the cells of a body sum to 1. The default axes are those of Rustamov (2010).
 
     Example:
         >>> import trimesh
@@ -35,14 +35,14 @@ class PairHistogram(AxesHistogram):
         ((1, 10, 64), 1.0)
 
     Args:
-        axes: `PointAxis` and `PairAxis` modules, or names of `igps.nn.axes.AXES`; at least one of pairs. The class
-            along the first axis of points changes slowest.
-        embedding: eigenfunctions (N, P, K), eigenvalues (N, K) and areas (N,) to coordinates (N, P, D), for the axes
-            that have none of their own; the commute time if None.
+        axes: `PointAxis` and `PairAxis` modules, or names in `igps.nn.axes.AXES`; at least one axis of pairs. The class
+            along the first axis of points varies slowest.
+        embedding: maps eigenfunctions (N, P, K), eigenvalues (N, K) and areas (N,) to coordinates (N, P, D), for the
+            axes without an embedding of their own; the commute time if None.
         samples, n_samples, n_training_samples: see `SampleHistogram`.
 
     Raises:
-        ValueError: an unknown axis or kind of samples, no axis of pairs, or too few samples to form a pair.
+        ValueError: an unknown axis or kind of samples, no axis of pairs, or a number of samples below two.
     """
 
     degree = 2
@@ -57,59 +57,59 @@ class PairHistogram(AxesHistogram):
         n_training_samples: int | None = None,
     ) -> None:
         super().__init__(samples, n_samples, n_training_samples)
-        given = [axis_of(one) if isinstance(one, str) else one for one in axes]
-        if unknown := [one for one in given if not isinstance(one, PointAxis | PairAxis)]:
+        modules = [axis_of(axis) if isinstance(axis, str) else axis for axis in axes]
+        if unknown := [axis for axis in modules if not isinstance(axis, PointAxis | PairAxis)]:
             raise ValueError(f"axes: expected axes of points or of pairs, got {type(unknown[0]).__name__}.")
-        self.axes = nn.ModuleList(given)
+        self.axes = nn.ModuleList(modules)
         if not self.pair_axes:
             raise ValueError("axes: expected at least one of pairs, such as 'interior_distance', got none.")
         self.embedding = embedding or SpectralEmbedding()
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of a body's histogram: pairs of classes, and bins along each axis of pairs."""
-        bins = [n for one in self.pair_axes for n in one.shape]
-        return (len(class_pairs(math.prod(one.n_classes for one in self.point_axes))), *bins)
+        """The shape of one histogram: the number of pairs of classes, and of bins along each axis of pairs."""
+        bins = [n for axis in self.pair_axes for n in axis.shape]
+        return (len(class_pairs(math.prod(axis.n_classes for axis in self.point_axes))), *bins)
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
-        """(N, C(C+1)/2, B, ...) histograms of some samples of N shapes."""
+        """Return histograms (N, C(C+1)/2, B, ...) of the samples of N shapes."""
         mask = features.samples.mask
-        pairs = [one.pairs(features, self.embedding) for one in self.pair_axes]
+        pairs = [axis.pairs(features, self.embedding) for axis in self.pair_axes]
         check_pairs(pairs, mask)
         classes = torch.zeros(*mask.shape, 1, dtype=torch.long, device=mask.device)
         weights = torch.ones_like(classes, dtype=pairs[0].inputs[0].dtype)
         n_classes = 1
         for axis in self.point_axes:
-            own, shares = axis.members(axis.values(features, self.embedding), mask)
-            classes = (classes.unsqueeze(3) * axis.n_classes + own.unsqueeze(2)).flatten(2)
-            weights = (weights.unsqueeze(3) * shares.unsqueeze(2)).flatten(2)
+            axis_classes, axis_weights = axis.members(axis.values(features, self.embedding), mask)
+            classes = (classes.unsqueeze(3) * axis.n_classes + axis_classes.unsqueeze(2)).flatten(2)
+            weights = (weights.unsqueeze(3) * axis_weights.unsqueeze(2)).flatten(2)
             n_classes *= axis.n_classes
-        if (own_weights := features.weights()) is not None:
-            weights = weights * own_weights.unsqueeze(2)
+        if (sample_weights := features.weights()) is not None:
+            weights = weights * sample_weights.unsqueeze(2)
         return count_pairs(classes, weights, n_classes, pairs, mask)
 
 
 def joint_histogram(memberships: Tensor, pairs: Sequence[PairValues], mask: Tensor | None = None) -> Tensor:
-    """The joint histogram of all pairs of points, by the classes of their ends and the bins of their values.
+    """Return the joint histogram of all pairs of points, by the classes of the two points and the bins of their values.
 
     Args:
         memberships: (P, C) of the points in classes, rows of sum 1; or (N, P, C) of N shapes.
-        pairs: the values of their pairs, such as `euclidean_distances` or `oriented_pairs`.
+        pairs: the values of pairs, such as `euclidean_distances` or `oriented_pairs`.
         mask: (N, P) true where a point is real; all if None.
 
     Returns:
         (C(C+1)/2, B, ...) of sum 1, or (N, C(C+1)/2, B, ...), in the type of the first inputs, float32 at least.
 
     Raises:
-        ValueError: fewer than two points, shapes that do not match, values that are not finite, memberships that are
-            negative or do not sum to 1, or centres that do not ascend.
+        ValueError: there are fewer than two points, shapes of tensors do not match, values are not finite, memberships
+            are negative or do not sum to 1, or centres do not ascend.
     """
     if memberships.ndim == 2:
-        batched = [replace(one, inputs=tuple(x[None] for x in one.inputs)) for one in pairs]
+        batched = [replace(pair, inputs=tuple(x[None] for x in pair.inputs)) for pair in pairs]
         return joint_histogram(memberships[None], batched, None if mask is None else mask[None])[0]
     mask = torch.ones_like(memberships[..., 0], dtype=torch.bool) if mask is None else mask
     check_pairs(pairs, mask)
-    for centres in (one for pair in pairs for one in pair.centres):
+    for centres in (centres for pair in pairs for centres in pair.centres):
         if centres.ndim != 1 or len(centres) < 2 or not bool(((centres.diff() > 0) & centres[1:].isfinite()).all()):
             raise ValueError(
                 f"centres: expected at least two finite values in ascending order, got {centres.tolist()}."
@@ -131,12 +131,12 @@ def pair_histogram(
     n_classes: int = 4,
     n_bins: int = 64,
 ) -> Tensor:
-    """Histogram of pairwise distances for every unordered pair of potential classes (Rustamov 2010, section 4).
+    """Return the histogram of distances for every unordered pair of potential classes (Rustamov 2010, section 4).
 
-    Each unordered pair of distinct points counts once, in the row of the classes of its ends. Classes are `n_classes`
-    equal intervals of [0, `potential_range`]. Bins have their centres in the middle of `n_bins` equal intervals of
-    [0, `distance_range`]; a distance counts in the two bins whose centres surround it, in linear proportion. What lies
-    beyond a range counts in its last class or bin.
+    Each unordered pair of distinct points counts once, in the row of the classes of the two points. The classes are
+    `n_classes` equal intervals of [0, `potential_range`]. The centres of the bins are in the middle of `n_bins` equal
+    intervals of [0, `distance_range`]; a distance counts in the two bins whose centres surround it, in linear
+    proportion. Values beyond a range count in its last class or bin.
 
     Args:
         embedding: (P, D) points; their Euclidean distances are counted.
@@ -150,13 +150,13 @@ def pair_histogram(
         (C(C+1)/2, B) in the embedding's type, float32 at least, of sum 1; row order (0,0), (0,1), … (0,C−1), (1,1), …
 
     Raises:
-        ValueError: fewer than two points, shapes that do not match, or values that are not finite.
+        ValueError: there are fewer than two points, shapes of tensors do not match, or values are not finite.
     """
     if embedding.ndim != 2:
         raise ValueError(f"embedding: expected shape (P, D), got {tuple(embedding.shape)}.")
     if potential.shape != embedding.shape[:1]:
         raise ValueError(
-            f"potential: expected shape {tuple(embedding.shape[:1])}, one of each point, got {tuple(potential.shape)}."
+            f"potential: expected shape {tuple(embedding.shape[:1])}, one per point, got {tuple(potential.shape)}."
         )
     if not bool(((potential >= 0) & torch.isfinite(potential)).all()):
         raise ValueError("potential: expected non-negative, finite values, got others.")

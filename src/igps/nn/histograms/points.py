@@ -1,4 +1,4 @@
-"""Joint histograms over the samples of a body, as products of axes of points."""
+"""Joint histograms of the samples of a body, along one or several axes of points."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from igps.signature.signature import SampleKind
 
 
 class PointHistogram(AxesHistogram):
-    """The joint histogram of the samples of each body along some axes of points: how much of it is of each kind.
+    """The joint histogram of the samples of each body along one or several axes of points.
 
     Example:
         >>> from igps.nn.axes import BallRadius, Potential
@@ -26,7 +26,7 @@ class PointHistogram(AxesHistogram):
         samples, n_samples, n_training_samples: see `SampleHistogram`.
 
     Raises:
-        ValueError: no axis, or one that is not of points.
+        ValueError: there is no axis, or one that is not of points.
     """
 
     def __init__(
@@ -39,9 +39,9 @@ class PointHistogram(AxesHistogram):
         n_training_samples: int | None = None,
     ) -> None:
         super().__init__(samples, n_samples, n_training_samples)
-        if not axes or not all(isinstance(one, PointAxis) for one in axes):
+        if not axes or not all(isinstance(axis, PointAxis) for axis in axes):
             raise ValueError(
-                f"axes: expected at least one, and all of points, got {[type(one).__name__ for one in axes]}. Axes of "
+                f"axes: expected one or several axes of points, got {[type(axis).__name__ for axis in axes]}. Axes of "
                 "pairs belong to a PairHistogram."
             )
         self.axes = nn.ModuleList(axes)
@@ -49,37 +49,37 @@ class PointHistogram(AxesHistogram):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Classes along each axis."""
-        return tuple(one.n_classes for one in self.point_axes)
+        """The number of classes along each axis."""
+        return tuple(axis.n_classes for axis in self.point_axes)
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
-        """(N, C, ...) histograms of some samples of N shapes."""
+        """Return histograms (N, C, ...) of the samples of N shapes."""
         mask = features.samples.mask
         memberships = []
         for axis in self.point_axes:
             values = axis.values(features, self.embedding)
-            # Padding may hold anything, and counts nowhere
-            real = mask.view(*mask.shape, *[1] * (values.ndim - 2))
-            memberships.append(axis.memberships(torch.where(real, values, 0)))
+            # Padding may hold NaN, which `memberships` refuses.
+            is_real = mask.view(*mask.shape, *[1] * (values.ndim - 2))
+            memberships.append(axis.memberships(torch.where(is_real, values, 0)))
         return point_histogram(memberships, mask, features.weights())
 
 
 def point_histogram(memberships: Sequence[Tensor], mask: Tensor, weights: Tensor | None = None) -> Tensor:
-    """The joint histogram of the samples of each body, from their memberships in the classes of each axis.
+    """Return the joint histogram of the samples of each body, from their memberships in the classes of each axis.
 
     Args:
-        memberships: (N, P, C) of one axis after the other, such as `soft_memberships` gives.
-        mask: (N, P) which samples are there.
-        weights: (N, P) what each counts; 1 if None.
+        memberships: (N, P, C) for each axis, such as the result of `soft_memberships`.
+        mask: (N, P) true where a sample is real.
+        weights: (N, P) of the samples; 1 if None.
 
     Returns:
-        (N, C, ...) shares of the samples, of sum 1 where memberships sum to 1 and samples count 1.
+        (N, C, ...) shares of the samples, of sum 1 if memberships sum to 1 and weights are 1.
 
     Raises:
-        ValueError: a body without samples.
+        ValueError: a body has no samples.
     """
     first, *others = memberships
-    rest = joint([torch.ones_like(first[..., :1]), *others])
+    other_classes = joint([torch.ones_like(first[..., :1]), *others])
     counts = mask if weights is None else mask * weights
-    shares = counted(first * counts.unsqueeze(2), rest, mask.sum(dim=1))
-    return shares.view(mask.shape[0], *(one.shape[-1] for one in memberships))
+    shares = counted(first * counts.unsqueeze(2), other_classes, mask.sum(dim=1))
+    return shares.view(mask.shape[0], *(x.shape[-1] for x in memberships))

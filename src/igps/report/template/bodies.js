@@ -1,10 +1,10 @@
 "use strict";
-// Bodies: surfaces as the page holds them, small pictures of them, and one that turns under the mouse.
+// Bodies: their surfaces, small pictures of them, and a picture that can be rotated.
 
-// From the least potential to the largest; every kind of colour vision tells the order (viridis, van der Walt and Smith).
+// From the smallest to the largest potential; the order is visible to colour-blind readers (viridis, van der Walt and Smith).
 const COLOURS = ["#482878", "#3e4989", "#31688e", "#26828e", "#1f9e89", "#35b779", "#6ece58", "#b5de2b", "#fde725"];
 const FIELD_OF_VIEW = 26;
-const MILLISECONDS_A_FRAME = 12;
+const MILLISECONDS_PER_FRAME = 12;
 
 const packedSurfaces = document.getElementById("surfaces").textContent.trim().split("\n");
 
@@ -12,19 +12,19 @@ function bytesOf(letters) {
   return Uint8Array.from(atob(letters), (letter) => letter.charCodeAt(0));
 }
 
-// The 256 colours of the potential, as three numbers each in the linear space that three.js computes in.
+// The 256 colours of the potential, as RGB triples in the linear colour space of three.js.
 const colourTable = (() => {
   const stops = COLOURS.map((colour) => new THREE.Color(colour));
   const table = new Float32Array(3 * 256);
   for (let i = 0; i < 256; i++) {
-    const place = (i / 255) * (stops.length - 1);
-    const first = Math.min(Math.floor(place), stops.length - 2);
-    stops[first].clone().lerp(stops[first + 1], place - first).toArray(table, 3 * i);
+    const position = (i / 255) * (stops.length - 1);
+    const first = Math.min(Math.floor(position), stops.length - 2);
+    stops[first].clone().lerp(stops[first + 1], position - first).toArray(table, 3 * i);
   }
   return table;
 })();
 
-// The 256 colours of a difference: blue, grey where there is none, red.
+// The 256 colours of a difference: blue for negative, grey for zero, red for positive.
 const differenceTable = (() => {
   const [less, none, more] = ["#0059b3", "#e6e6e6", "#d64000"].map((colour) => new THREE.Color(colour));
   const table = new Float32Array(3 * 256);
@@ -35,10 +35,10 @@ const differenceTable = (() => {
   return table;
 })();
 
-// The geometry of [place among the surfaces, vertices, faces], in a box around the origin whose longest side is 1;
-// coloured by the potential, or by other values of the vertices.
-function geometryOf([place, nVertices, nFaces], values = null) {
-  const { buffer } = bytesOf(packedSurfaces[place]);
+// The geometry of a surface [index, number of vertices, number of faces], centred at the origin with a longest side of 1,
+// coloured by the potential or by other values of the vertices.
+function geometryOf([index, nVertices, nFaces], values = null) {
+  const { buffer } = bytesOf(packedSurfaces[index]);
   const steps = new Uint16Array(buffer, 0, 3 * nVertices);
   const faces = new Uint16Array(buffer, 6 * nVertices, 3 * nFaces);
   const potential = new Uint8Array(buffer, 6 * (nVertices + nFaces), nVertices);
@@ -55,7 +55,7 @@ function geometryOf([place, nVertices, nFaces], values = null) {
   return geometry;
 }
 
-// One body before a camera, drawn without a background.
+// A scene with one body, drawn on a transparent background.
 class Stage {
   constructor(canvas) {
     this.renderer = new THREE.WebGLRenderer({ canvas, alpha: true, antialias: true });
@@ -76,7 +76,7 @@ class Stage {
     const { center, radius } = this.body.geometry.boundingSphere;
     this.body.position.copy(center).negate();
     this.distance = radius / Math.sin((FIELD_OF_VIEW * Math.PI) / 360);
-    // From the front, a little from the right and above, where a body is seen to be one.
+    // From the front, a little from the right and from above, which shows depth
     this.camera.position.set(0.46, 0.26, 0.85).setLength(this.distance);
     this.camera.lookAt(0, 0, 0);
   }
@@ -86,7 +86,7 @@ class Stage {
   }
 }
 
-// Null where the browser has no WebGL.
+// A stage on a canvas; null if the browser has no WebGL.
 function stageOn(canvas) {
   try {
     return new Stage(canvas);
@@ -96,13 +96,13 @@ function stageOn(canvas) {
   }
 }
 
-// Small pictures, each drawn once it comes near the window.
+// Small pictures, each drawn when it comes near the visible part of the page.
 class Pictures {
   constructor(shapes) {
     this.shapes = shapes;
     this.source = document.createElement("canvas");
     this.stage = stageOn(this.source);
-    this.drawn = new Map(); // shape: a canvas that shows it
+    this.drawn = new Map(); // from shapes to canvases that show them
     this.waiting = new Set();
     this.isPlanned = false;
     this.watcher = new IntersectionObserver((entries) => this.#arrived(entries), { rootMargin: "300px" });
@@ -113,14 +113,14 @@ class Pictures {
     window.addEventListener("beforeprint", () => this.drawAll());
   }
 
-  // A canvas that will show a shape.
+  // Draws a shape on a canvas when the canvas comes near the visible part of the page.
   watch(canvas) {
     if (this.stage && this.shapes[canvas.dataset.shape].surface) {
       this.watcher.observe(canvas);
     }
   }
 
-  // A canvas that shows a shape with other values of its vertices, from the front or from behind.
+  // Draws a shape, coloured by values of its vertices, from the front or from behind.
   paint(canvas, shape, values, isBehind) {
     if (!this.stage) return;
     this.stage.show(this.shapes[shape].surface, values);
@@ -155,7 +155,7 @@ class Pictures {
   }
 
   #work() {
-    const end = performance.now() + MILLISECONDS_A_FRAME;
+    const end = performance.now() + MILLISECONDS_PER_FRAME;
     for (const canvas of this.waiting) {
       this.waiting.delete(canvas);
       this.#draw(canvas);
@@ -182,7 +182,7 @@ class Pictures {
   }
 }
 
-// The body that turns: dragged with the mouse or a finger, or by the arrow keys.
+// A body that can be rotated with the mouse, a finger or the arrow keys.
 class Turntable {
   constructor(canvas) {
     this.canvas = canvas;
@@ -213,7 +213,7 @@ class Turntable {
     this.stage.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
     this.stage.renderer.setSize(clientWidth, clientHeight, false);
     this.stage.camera.aspect = clientWidth / clientHeight;
-    // In a narrow frame the width must hold the body.
+    // In a narrow frame, the body must fit the width
     this.stage.camera.zoom = Math.min(1, this.stage.camera.aspect);
     this.stage.camera.updateProjectionMatrix();
     this.stage.draw();
@@ -221,7 +221,7 @@ class Turntable {
 
   #pressed(event) {
     const step = Math.PI / 18;
-    const turns = {
+    const actions = {
       ArrowLeft: () => this.controls.rotateLeft(step),
       ArrowRight: () => this.controls.rotateLeft(-step),
       ArrowUp: () => this.controls.rotateUp(step),
@@ -230,9 +230,9 @@ class Turntable {
       "-": () => this.controls.dollyIn(1 / 0.9),
       Home: () => this.controls.reset(),
     };
-    if (!turns[event.key] || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!actions[event.key] || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
-    event.stopPropagation(); // the arrows lead to other shapes elsewhere
-    turns[event.key]();
+    event.stopPropagation(); // elsewhere, the arrow keys lead to other shapes
+    actions[event.key]();
   }
 }

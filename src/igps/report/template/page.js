@@ -1,5 +1,5 @@
 "use strict";
-// What happens on the page: search, the choice of a descriptor, and the window of one shape.
+// Behaviour of the page: the search, the choice of a descriptor, and the dialog of a shape.
 
 const byId = (id) => document.getElementById(id);
 const data = JSON.parse(byId("data").textContent);
@@ -10,43 +10,43 @@ const buttonOf = new Map(wall.map((button) => [Number(button.dataset.shape), but
 const dialog = byId("shape");
 let turntable = null; // made when the first body is opened
 let system = 0;
-let current = null; // the shape in the window
-const MOST_SELECTED = 120; // pictures beside the map
-let opener = null; // the picture that opened the window, if it is not on the wall
+let current = null; // the shape in the dialog
+const MAX_SELECTED = 120; // pictures below the map
+let opener = null; // the picture that opened the dialog, if it is not on the wall
 
-for (const one of systems) {
-  one.row = new Map(one.shapes.map((shape, row) => [shape, row]));
-  one.ranked = new Uint32Array(bytesOf(one.ranked).buffer);
-  one.distances = new Float32Array(bytesOf(one.distances).buffer);
+for (const descriptor of systems) {
+  descriptor.row = new Map(descriptor.shapes.map((shape, row) => [shape, row]));
+  descriptor.ranked = new Uint32Array(bytesOf(descriptor.ranked).buffer);
+  descriptor.distances = new Float32Array(bytesOf(descriptor.distances).buffer);
 }
 
-// The shapes nearest to one, nearest first; null where the descriptor does not know it.
+// The shapes nearest to a shape, nearest first; null if the descriptor does not describe it.
 function rankingOf(shape) {
-  const one = systems[system];
-  const row = one?.row.get(shape);
+  const chosen = systems[system];
+  const row = chosen?.row.get(shape);
   if (row === undefined) return null;
-  const places = Array.from({ length: one.top }, (_, i) => row * one.top + i);
-  return places.map((place) => ({ shape: one.ranked[place], distance: one.distances[place] }));
+  const indices = Array.from({ length: chosen.top }, (_, i) => row * chosen.top + i);
+  return indices.map((i) => ({ shape: chosen.ranked[i], distance: chosen.distances[i] }));
 }
 
-// True, false, or null where it cannot be told.
+// Whether the nearest shape is of the same class; null if the classes do not tell.
 function isNearestRight(shape) {
   const first = rankingOf(shape)?.[0];
   const isScored = systems[system]?.per_query?.nn[systems[system].row.get(shape)] != null;
   return first && isScored ? shapes[first.shape].label === shapes[shape].label : null;
 }
 
-// A mark that is told by its form and its words, too. The words are for those who hear the page.
-function setMark(place, isRight, words) {
-  place.replaceChildren();
+// A mark that does not depend on colour: a sign, and words for screen readers.
+function setMark(container, isRight, words) {
+  container.replaceChildren();
   if (isRight === null) return;
-  place.append(
+  container.append(
     element("span", { "aria-hidden": "true" }, isRight ? "✓" : "✗"),
     element("span", { class: "unseen" }, isRight ? words[0] : words[1]),
   );
 }
 
-function setKind(button, isRight) {
+function setHit(button, isRight) {
   button.classList.toggle("hit", isRight === true);
   button.classList.toggle("miss", isRight === false);
 }
@@ -55,17 +55,17 @@ function chooseSystem(chosen) {
   system = chosen;
   for (const [shape, button] of buttonOf) {
     const isRight = isNearestRight(shape);
-    setKind(button, isRight);
+    setHit(button, isRight);
     setMark(button.querySelector(".mark"), isRight, ["nearest is of the same class", "nearest is of another class"]);
   }
-  const one = systems[system];
-  if (one && systems.length > 1) {
-    document.querySelectorAll(".of-system").forEach((place) => (place.textContent = `, ${one.name}`));
-    document.querySelectorAll("[data-system]").forEach((place) => {
-      place.classList.toggle("chosen", Number(place.dataset.system) === system);
+  const descriptor = systems[system];
+  if (descriptor && systems.length > 1) {
+    document.querySelectorAll(".of-system").forEach((span) => (span.textContent = `, ${descriptor.name}`));
+    document.querySelectorAll("[data-system]").forEach((curve) => {
+      curve.classList.toggle("chosen", Number(curve.dataset.system) === system);
     });
   }
-  if (byId("class-scores")) showClassScores(byId("class-scores"), classes, shapes, one?.per_class ?? []);
+  if (byId("class-scores")) showClassScores(byId("class-scores"), classes, shapes, descriptor?.per_class ?? []);
   showChosenConfusion();
   showWorst();
   showMap();
@@ -78,7 +78,7 @@ function showChosenConfusion() {
   showConfusion(byId("confusion-table"), classes, counts);
 }
 
-const searched = shapes.map((shape) => [shape.name, classes[shape.label] ?? "", ...shape.notes].join(" ").toLowerCase());
+const searchTexts = shapes.map((shape) => [shape.name, classes[shape.label] ?? "", ...shape.notes].join(" ").toLowerCase());
 
 function filter() {
   const words = byId("search").value.toLowerCase().split(/\s+/).filter(Boolean);
@@ -86,7 +86,7 @@ function filter() {
   let count = 0;
   for (const [shape, button] of buttonOf) {
     const isShown =
-      words.every((word) => searched[shape].includes(word)) &&
+      words.every((word) => searchTexts[shape].includes(word)) &&
       (only !== "missed" || isNearestRight(shape) === false) &&
       (only !== "found" || isNearestRight(shape) === true) &&
       (only !== "repaired" || shapes[shape].notes.length > 0);
@@ -110,7 +110,7 @@ function factsOf(shape) {
   const scores = systems[system]?.per_query;
   const row = systems[system]?.row.get(shape);
   const facts = [];
-  if (part) facts.push(fact("body of its file", part));
+  if (part) facts.push(fact("part of the file", part));
   if (label >= 0) facts.push(fact("class", classes[label]));
   if (scores && row !== undefined && scores.nn[row] !== null) {
     facts.push(fact("first tier", `${percent(scores.ft[row])} %`));
@@ -123,12 +123,12 @@ function factsOf(shape) {
     facts.push(fact("area, volume", units.join(", ")));
     facts.push(fact("potential", `${potential[0]} to ${potential[1]} on the surface`));
   }
-  const done = notes.map((note) => element("div", {}, note));
-  facts.push(fact("repaired", ...(done.length ? done : ["nothing had to be done"])));
+  const repairs = notes.map((note) => element("div", {}, note));
+  facts.push(fact("repairs", ...(repairs.length ? repairs : ["no repair was needed"])));
   return facts;
 }
 
-// A picture with name and class, which opens the shape.
+// A button with picture, name and class that opens a shape.
 function picture(shape) {
   const canvas = element("canvas", { "data-shape": shape, width: 1, height: 1, "aria-hidden": "true" });
   const button = element(
@@ -152,23 +152,23 @@ function card(query, { shape, distance }, rank) {
     element("span", { class: "about" }, element("span", { class: "unseen" }, "distance "), distance.toPrecision(3)),
     mark,
   );
-  setKind(button, isRight);
+  setHit(button, isRight);
   return element("li", {}, button);
 }
 
-// A query beside the wrong shapes that are too near to it.
+// A query beside the shapes of other classes that are ranked too high.
 function confusion({ query, rank, wrong }) {
   const ranking = rankingOf(query);
-  const one = systems[system];
+  const descriptor = systems[system];
   const button = picture(query);
   button.append(element("span", { class: "about" }, "query"));
-  const tier = percent(one.per_query.ft[one.row.get(query)]);
+  const tier = percent(descriptor.per_query.ft[descriptor.row.get(query)]);
   return element(
     "li",
     {},
     button,
-    element("ol", { class: "wall" }, ...wrong.map((place) => card(query, ranking[place - 1], place))),
-    element("p", {}, `First of the same class at rank ${rank} of ${one.shapes.length - 1}. First tier: ${tier} %.`),
+    element("ol", { class: "wall" }, ...wrong.map((position) => card(query, ranking[position - 1], position))),
+    element("p", {}, `First of the same class at rank ${rank} of ${descriptor.shapes.length - 1}. First tier: ${tier} %.`),
   );
 }
 
@@ -181,15 +181,15 @@ function plainPicture(shape) {
 
 const bodyMap = byId("map")
   ? new BodyMap(byId("map-plot"), byId("map-tip"), byId("map-legend"), {
-      told: (shape) => shapes[shape].name,
+      nameOf: (shape) => shapes[shape].name,
       open: (shape, mark) => {
         opener = mark;
         goTo(shape);
       },
       picture: plainPicture,
-      changed: (selected) => {
+      onSelect: (selected) => {
         byId("map-chosen").textContent = selected.length ? `${selected.length} selected` : "";
-        byId("map-selected").replaceChildren(...selected.slice(0, MOST_SELECTED).map((shape) => element("li", {}, picture(shape))));
+        byId("map-selected").replaceChildren(...selected.slice(0, MAX_SELECTED).map((shape) => element("li", {}, picture(shape))));
         tree.mark(new Set(selected));
       },
     })
@@ -197,11 +197,11 @@ const bodyMap = byId("map")
 
 const tree = bodyMap
   ? new ClusterTree(byId("tree-plot"), {
-      told: (selected, height) => {
+      titleOf: (selected, height) => {
         const { map, row } = systems[system];
         const numbers = new Set(selected.map((shape) => map.cluster[row.get(shape)]));
         const [number] = numbers;
-        const isCluster = numbers.size === 1 && map.cluster.filter((one) => one === number).length === selected.length;
+        const isCluster = numbers.size === 1 && map.cluster.filter((cluster) => cluster === number).length === selected.length;
         const parts = [`${selected.length} shapes`, `distance ${Number(height.toPrecision(3))}`];
         return [...parts, ...(isCluster ? [`cluster ${number + 1}${stabilityOf(number)}`] : [])].join(", ");
       },
@@ -216,24 +216,24 @@ function stabilityOf(cluster) {
 
 function showMap() {
   if (!bodyMap) return;
-  const one = systems[system];
-  const { points, stress, tree: joinings, stability, n_stable } = one.map ?? { points: [], tree: [] };
-  for (const name of ["map-plot", "tree-plot"]) byId(name).toggleAttribute("hidden", !one.map);
-  byId("map-stress").textContent = one.map
-    ? `Its stress is ${stress.toFixed(2)}: 0 would tell every distance, above 0.2 much is distorted.`
+  const { map, shapes: described } = systems[system];
+  const { points, stress, tree: nodes, stability, n_stable } = map ?? { points: [], tree: [] };
+  for (const name of ["map-plot", "tree-plot"]) byId(name).toggleAttribute("hidden", !map);
+  byId("map-stress").textContent = map
+    ? `The stress of the map is ${stress.toFixed(2)} (0: exact distances; above 0.2: strong distortion).`
     : "There is no map of these shapes.";
-  byId("tree-told").textContent = one.map ? `${n_stable} of ${stability.length} clusters are stable.` : "";
-  tree.show(one.map ? one.shapes : [], joinings);
-  bodyMap.show(points.map(([x, y], row) => ({ shape: one.shapes[row], x, y })));
+  byId("tree-told").textContent = map ? `${n_stable} of ${stability.length} clusters are stable.` : "";
+  tree.show(map ? described : [], nodes);
+  bodyMap.show(points.map(([x, y], row) => ({ shape: described[row], x, y })));
   colourMap();
 }
 
 function colourMap() {
-  const one = systems[system];
+  const { map, row } = systems[system];
   const kind = byId("map-colour").value;
   const values = shapes.map((shape, i) => {
     if (kind === "class") return classes[shape.label];
-    if (kind === "cluster") return one.map?.cluster[one.row.get(i)] ?? null;
+    if (kind === "cluster") return map?.cluster[row.get(i)] ?? null;
     return kind === "volume" ? (shape.mesh?.[3] ?? null) : data.columns[kind.slice("column ".length)][i];
   });
   const titles = {
@@ -244,18 +244,18 @@ function colourMap() {
   tree.colour(new Map(bodyMap.points.map(({ shape, mark }) => [shape, mark])));
 }
 
-// A shape and its nearest, painted from two sides.
+// A shape and its nearest, painted with their differences, from the front and from behind.
 function showExplained(shape) {
   const { other, told, values } = shapes[shape].explained ?? {};
   byId("explained").hidden = !told;
   if (!told) return;
   byId("explained-heading").textContent = `Where it differs from its nearest, ${shapes[other].name}`;
-  byId("explained-told").textContent = `${told}. Red: unlike what corresponds to it in the other body; grey: alike.`;
-  const painted = [shape, other].flatMap((one, place) =>
+  byId("explained-told").textContent = `${told}. Red: differs from the corresponding place of the other body; grey: does not.`;
+  const painted = [shape, other].flatMap((body, i) =>
     ["front", "back"].map((side) => {
-      const canvas = element("canvas", { width: 1, height: 1, role: "img", "aria-label": `${shapes[one].name}, ${side}` });
-      pictures.paint(canvas, one, bytesOf(values[place]), side === "back");
-      return element("li", { class: "painted" }, canvas, element("span", { class: "about" }, `${shapes[one].name}, ${side}`));
+      const canvas = element("canvas", { width: 1, height: 1, role: "img", "aria-label": `${shapes[body].name}, ${side}` });
+      pictures.paint(canvas, body, bytesOf(values[i]), side === "back");
+      return element("li", { class: "painted" }, canvas, element("span", { class: "about" }, `${shapes[body].name}, ${side}`));
     }),
   );
   byId("explained-list").replaceChildren(...painted);
@@ -268,7 +268,7 @@ function showWorst() {
   byId("worst-some").hidden = !worst?.length;
   byId("worst-none").hidden = Boolean(worst?.length);
   byId("worst-none").textContent = worst
-    ? "There are no confusions: every shape finds all others of its class first."
+    ? "There are no confusions: for every query, all shapes of its class are ranked first."
     : `${systems[system].name} describes no two shapes of one class.`;
 }
 
@@ -281,49 +281,49 @@ function openShape(shape) {
   const name = systems[system]?.name;
   byId("ranking").hidden = !systems.length;
   byId("ranking-heading").textContent = ranking
-    ? `Nearest to it by ${name}, ${ranking.length} of ${systems[system].shapes.length - 1}`
-    : `${name} could not describe this shape; the section Not used tells why.`;
-  byId("ranking-list").replaceChildren(...(ranking ?? []).map((found, i) => card(shape, found, i + 1)));
+    ? `Nearest shapes by ${name}, ${ranking.length} of ${systems[system].shapes.length - 1}`
+    : `${name} could not describe this shape; see the reason in the section Not used.`;
+  byId("ranking-list").replaceChildren(...(ranking ?? []).map((neighbour, i) => card(shape, neighbour, i + 1)));
   const together = shapes[shape].together ?? [];
   byId("together").hidden = !together.length;
-  byId("together-list").replaceChildren(...together.map((one) => element("li", {}, picture(one))));
+  byId("together-list").replaceChildren(...together.map((body) => element("li", {}, picture(body))));
   showExplained(shape);
-  const moves = Object.keys(data.movements).length > 0;
-  byId("moved").hidden = !moves;
-  if (moves) showMovements(byId("moved-table"), shapes[shape].name, data.movements);
+  const hasMovements = Object.keys(data.movements).length > 0;
+  byId("moved").hidden = !hasMovements;
+  if (hasMovements) showMovements(byId("moved-table"), shapes[shape].name, data.movements);
   if (!dialog.open) dialog.showModal();
   turntable ??= new Turntable(byId("turntable"));
   turntable.show(shapes[shape].surface);
   byId("turntable-hint").textContent = byId("turntable").hidden
     ? "There is no picture of this body."
-    : "Drag or use the arrow keys to turn, wheel or + and − to come closer.";
+    : "Drag or use the arrow keys to rotate, the wheel or + and − to zoom.";
   dialog.scrollTop = 0;
-  // The card that was chosen is gone; who holds a button or the body keeps it.
+  // A card that had the focus was replaced; a button or the picture of the body keeps the focus.
   if (!dialog.contains(document.activeElement) || document.activeElement === dialog) byId("shape-name").focus();
 }
 
-// The shape in the window is part of the address, so that Back goes back and a link leads to it.
+// The shape in the dialog is part of the address, so that the Back button and links work.
 function goTo(shape) {
   location.hash = `shape-${shape}`;
 }
 
 function followAddress() {
-  const found = location.hash.match(/^#shape-(\d+)$/);
-  if (found) openShape(Number(found[1]));
+  const match = location.hash.match(/^#shape-(\d+)$/);
+  if (match) openShape(Number(match[1]));
   else if (dialog.open) dialog.close();
 }
 
-// The next shape that the search lets through.
+// Opens the next or previous shape among those that match the search.
 function step(by) {
   const shown = wall.filter((button) => !button.parentElement.hidden).map((button) => Number(button.dataset.shape));
-  const place = shown.indexOf(current);
-  if (shown.length) goTo(shown[(Math.max(place, 0) + by + shown.length) % shown.length]);
+  const index = shown.indexOf(current);
+  if (shown.length) goTo(shown[(Math.max(index, 0) + by + shown.length) % shown.length]);
 }
 
 function setTheme(theme) {
   document.documentElement.dataset.theme = theme;
   byId("theme").textContent = `Colours: ${theme}`;
-  byId("theme").setAttribute("aria-label", `Colours: ${theme === "system" ? "as the system" : theme}`);
+  byId("theme").setAttribute("aria-label", `Colours: ${theme === "system" ? "system setting" : theme}`);
 }
 
 byId("theme").addEventListener("click", () => {
@@ -347,7 +347,7 @@ byId("previous").addEventListener("click", () => step(-1));
 byId("next").addEventListener("click", () => step(1));
 byId("close").addEventListener("click", () => dialog.close());
 dialog.addEventListener("click", (event) => {
-  if (event.target === dialog) dialog.close(); // beside the window
+  if (event.target === dialog) dialog.close(); // a click outside the dialog
 });
 dialog.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
@@ -355,7 +355,7 @@ dialog.addEventListener("keydown", (event) => {
   if (event.key === "ArrowRight") step(1);
 });
 dialog.addEventListener("close", () => {
-  if (dialog.open) return; // the browser tells of it late, when the next shape may be open already
+  if (dialog.open) return; // the event comes late, when the next shape may be open already
   if (location.hash.startsWith("#shape-")) history.pushState(null, "", location.pathname + location.search);
   (opener ?? buttonOf.get(current))?.focus();
   opener = null;

@@ -1,33 +1,33 @@
 "use strict";
-// Tables of the chosen descriptor: scores of each class, confusion between classes, movements of a shape.
+// Tables of the selected descriptor: scores per class, confusion between classes, movements of a shape.
 
 function element(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
+  const created = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) {
-    if (value !== null && value !== undefined) made.setAttribute(key, value);
+    if (value !== null && value !== undefined) created.setAttribute(key, value);
   }
-  made.append(...children);
-  return made;
+  created.append(...children);
+  return created;
 }
 
 function percent(share, digits = 1) {
   return share === null || share === undefined ? "–" : (100 * share).toFixed(digits);
 }
 
-// Tints a cell by a share between 0 and 1.
+// Colours a cell by a share between 0 and 1.
 function tint(cell, share) {
   if (Number.isFinite(share)) cell.style.setProperty("--share", `${Math.round(100 * share)}%`);
 }
 
 const CLASS_COLUMNS = { nn: "NN", ft: "FT", st: "ST", dcg: "DCG", adr: "ADR", map: "mAP" };
 
-// Rows that a click on a heading sorts, classes in their order at first.
+// A table that is sorted by a click on a heading, and in the order of the classes at first.
 function showClassScores(table, classes, shapes, perClass) {
-  const rows = classes.map((name, place) => ({
+  const rows = classes.map((name, index) => ({
     name,
-    place,
-    size: shapes.filter((shape) => shape.label === place).length,
-    ...(perClass[place] ?? {}),
+    index,
+    size: shapes.filter((shape) => shape.label === index).length,
+    ...(perClass[index] ?? {}),
   }));
   const body = element("tbody");
   const columns = { name: "class", size: "shapes", ...CLASS_COLUMNS };
@@ -36,13 +36,13 @@ function showClassScores(table, classes, shapes, perClass) {
     const heading = element("th", { scope: "col", "aria-sort": key === "name" ? "ascending" : "none" }, button);
     button.addEventListener("click", () => {
       const ascending = heading.getAttribute("aria-sort") !== "ascending";
-      headings.forEach((one) => one.setAttribute("aria-sort", one === heading ? (ascending ? "ascending" : "descending") : "none"));
+      headings.forEach((other) => other.setAttribute("aria-sort", other === heading ? (ascending ? "ascending" : "descending") : "none"));
       sort(key, ascending);
     });
     return heading;
   });
   function sort(key, ascending) {
-    const value = (row) => (key === "name" ? row.place : (row[key] ?? -1));
+    const value = (row) => (key === "name" ? row.index : (row[key] ?? -1));
     rows.sort((one, other) => (ascending ? 1 : -1) * (value(one) - value(other)));
     body.replaceChildren(...rows.map(line));
   }
@@ -52,7 +52,7 @@ function showClassScores(table, classes, shapes, perClass) {
       tint(cell, row[key]);
       return cell;
     });
-    const name = element("a", { href: `#class-${row.place}` }, row.name);
+    const name = element("a", { href: `#class-${row.index}` }, row.name);
     return element("tr", {}, element("th", { scope: "row" }, name), element("td", {}, String(row.size)), ...cells);
   }
   sort("name", true);
@@ -65,8 +65,8 @@ function showConfusion(table, classes, counts) {
     const total = row.reduce((sum, count) => sum + count, 0);
     const cells = row.map((count, found) => {
       if (!count) return element("td");
-      const told = `${classes[query]}: ${count} of ${total} are ${classes[found]}`;
-      const cell = element("td", { title: told, class: query === found ? "hit" : "miss" }, percent(count / total, 0));
+      const title = `${classes[query]}: ${count} of ${total} are ${classes[found]}`;
+      const cell = element("td", { title, class: query === found ? "hit" : "miss" }, percent(count / total, 0));
       tint(cell, count / total);
       return cell;
     });
@@ -76,16 +76,16 @@ function showConfusion(table, classes, counts) {
   table.replaceChildren(element("thead", {}, element("tr", {}, corner, ...headings)), element("tbody", {}, ...rows));
 }
 
-// Of one mesh: descriptors down, disturbances across. A missing value has its reason as a tip.
+// Movements of one mesh: a row per descriptor, a column per disturbance. A missing value has its reason as a tooltip.
 function showMovements(table, name, movements) {
   const columns = Object.entries(Object.values(movements)[0] ?? {})
     .filter(([, movement]) => name in movement.each || name in movement.notes)
     .map(([column]) => column);
   const headings = ["descriptor", ...columns].map((title) => element("th", { scope: "col" }, title));
-  const rows = Object.entries(movements).map(([descriptor, of]) => {
+  const rows = Object.entries(movements).map(([descriptor, byColumn]) => {
     const cells = columns.map((column) => {
-      const share = of[column].each[name];
-      const cell = element("td", { title: of[column].notes[name] }, percent(share));
+      const share = byColumn[column].each[name];
+      const cell = element("td", { title: byColumn[column].notes[name] }, percent(share));
       tint(cell, Math.min(1, share));
       return cell;
     });
