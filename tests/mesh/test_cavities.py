@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import ndimage
 import torch
 import trimesh
+from scipy import ndimage
 
 from igps import LoadOptions, Mesh, MeshError, SignatureConfig, collate, compute_signature, descriptor, load_mesh
 from igps.descriptors.interior import interior
