@@ -22,7 +22,7 @@ from igps.cli import COMMANDS, main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.descriptors.fingerprint import fingerprint
-from igps.gallery._moments import least_distances
+from igps.gallery._moments import distance_bounds
 from igps.gallery.calibration import Calibration, calibration_params
 from igps.gallery.duplicates import _around_the_finest, body_distance, duplicates
 from igps.gallery.gallery import Gallery
@@ -401,5 +401,5 @@ def test_other_lengths_are_no_candidates(tmp_path: Path) -> None:
     moments, failures = Surfaces(dataset).moments(most, 1)
     assert not failures
     # in order of names: ball, copy, longer
-    near = least_distances(moments, moments) <= most
+    near = distance_bounds(moments, moments) <= most
     assert near.tolist() == [[True, True, False], [True, True, False], [False, False, True]]

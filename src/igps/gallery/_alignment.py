@@ -18,10 +18,8 @@ from igps._arrays import Floats, Integers
 from igps.mesh.surface import area_vectors, unit
 
 # Lengths are over √area.
-# Weight of normals in the search for the nearest sample, so that the two sides of a thin sheet are not confused
-_NORMAL_WEIGHT = 0.1
-# Distance within which the nearest sample may lie aside of a sample, in steps between neighbouring samples
-_GAP = 2.5
+_NORMAL_WEIGHT = 0.1  # of normals in the search for the nearest sample, to tell apart the two sides of a thin sheet
+_GAP = 2.5  # lateral distance of the nearest sample that does not count, in steps between neighbouring samples
 # Principal axes whose extents differ by a smaller factor are ambiguous: starts from other rotations are tried as well
 _AMBIGUITY = 1.1
 _N_ROTATIONS = 300
@@ -29,11 +27,10 @@ _N_SCORED, _N_FITTED = 60, 250  # samples
 _N_STARTS, _N_COARSE_STEPS, _N_FINE_STEPS, _N_LAST_STEPS = 12, 6, 4, 10
 # Poses that fit up to this factor worse than the best by samples alone are fitted to the surface itself
 _CLOSE_FIT = 1.5
-# After the fine steps the limit for hopeless distances is divided by this. If it was 0.03, 99 % of copies of generated
-# bodies are within 0.006 then, well below 0.02; the others are found from other starts.
+# After the fine steps, `hopeless` is divided by this factor. With 0.03, it is then 0.02, while 99 % of the copies of
+# generated bodies are within 0.006; the others are found from other starts.
 _FINE_FACTOR = 1.5
-# Upper bound of what the last steps gain; they brought copies of generated bodies nearer by up to 0.0001
-_LAST_GAIN = 0.004
+_LAST_GAIN = 0.004  # upper bound of the decrease of a distance by the last steps; 0.0001 for copies of generated bodies
 _PATCH_SIZE = 10  # neighbouring samples whose offsets are averaged
 MOST_SCALED = math.log(1.1)
 """Largest logarithm of the scale of an alignment."""
@@ -54,10 +51,8 @@ class SurfaceSamples:
     def of(cls, points: Floats, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
         """Normalise points (P, 3), a length, with outward normals (P, 3), by the area of the surface, a length²."""
         if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
-            raise ValueError(
-                f"points, normals: expected both (P, 3) with P ≥ 4, got {tuple(points.shape)} and "
-                f"{tuple(normals.shape)}."
-            )
+            shapes = f"{tuple(points.shape)} and {tuple(normals.shape)}"
+            raise ValueError(f"points, normals: expected both (P, 3) with P ≥ 4, got {shapes}.")
         return cls((points - points.mean(axis=0)) / math.sqrt(area), np.asarray(normals, dtype=np.float64))
 
     @cached_property
@@ -76,7 +71,7 @@ class SurfaceSamples:
         return 1 / math.sqrt(len(self.points))
 
     def nearest(self, samples: SurfaceSamples) -> tuple[Floats, Floats]:
-        """Return the nearest of these samples to each of other samples (P), with similar normals: points, normals."""
+        """Return points and normals of these samples: the nearest, with similar normals, to each of the given ones."""
         nearest = self.tree.query(_with_normals(samples))[1]
         return self.points[nearest], self.normals[nearest]
 
@@ -113,7 +108,7 @@ def surface_distance(
     Offsets are averaged over patches of ten neighbours, a twentieth of √area across. Relief that a coarse mesh lacks,
     and the roughness of triangles, have offsets of either sign and cancel; another shape or pose moves whole patches.
 
-    The result is symmetric except for where the search stops.
+    The result is symmetric, except that the search may stop at different distances.
 
     Args:
         one: samples of the surface that is moved.
@@ -175,8 +170,8 @@ def _two_way_distance(
 
 def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch: int = _PATCH_SIZE) -> float:
     """Return the mean square offset of patches, or the largest square offset if a patch is one sample."""
-    among = np.arange(1, min(patch, len(samples.points)) + 1)
-    neighbours = samples.tree.query(_with_normals(samples), k=among)[1]
+    ranks = np.arange(1, min(patch, len(samples.points)) + 1)
+    neighbours = samples.tree.query(_with_normals(samples), k=ranks)[1]
     means = _offsets(samples, target)[neighbours].mean(axis=1)
     squares = np.einsum("ni,ni->n", means, means)
     return float(squares.max() if patch == 1 else squares.mean())

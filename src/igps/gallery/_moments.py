@@ -17,8 +17,7 @@ from igps.mesh.surface import area_vectors, directed_edges, face_areas
 _INNER, _OUTER = 0.445948490915965, 0.091576213509771
 _NODES = np.concatenate([np.full((3, 3), x) + np.eye(3) * (1 - 3 * x) for x in (_INNER, _OUTER)])  # barycentric
 _WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
-# Second-order terms over first-order terms: a move of √area / 100 where the radius of curvature is √area / 3
-_SECOND_ORDER = 0.03
+_SECOND_ORDER = 0.03  # over first-order terms: a move of √area / 100 where the radius of curvature is √area / 3
 
 
 def moments(vertices: Floats, faces: Integers, most: float) -> Floats:
@@ -26,8 +25,8 @@ def moments(vertices: Floats, faces: Integers, most: float) -> Floats:
 
     The first row has the logarithms of the volume V, of the second central moments along the principal axes, and of
     ∫ |x|⁴ dV, which all grow with scale or thickness, and |∫ x |x|² dV| / ((∫ |x|² dV)^(3/2) / √V). The other rows are
-    the map. It holds for moves up to `most`, and ignores a scaling by up to a tenth. It is zero, and the bound with it,
-    if the moments are not those of a solid. Holes of an open surface are closed by cones over its centroid.
+    the map. It holds for moves up to `most`, and ignores a scaling by up to a tenth. If the moments are not those of a
+    solid, the map and thus the bound are zero. Holes of an open surface are closed by cones over its centroid.
     """
     start, end = directed_edges(faces)
     is_open = ~np.isin(start * len(vertices) + end, end * len(vertices) + start)
@@ -63,7 +62,7 @@ def moments(vertices: Floats, faces: Integers, most: float) -> Floats:
     return np.vstack([[*np.log(even), scale * length], to_moves])
 
 
-def least_distances(one: Tensor, other: Tensor) -> Tensor:
+def distance_bounds(one: Tensor, other: Tensor) -> Tensor:
     """Return lower bounds (M, N) of the distances of surfaces, over √area, from `moments` (M, 7, 6) and (N, 7, 6)."""
 
     def bounds(own: Tensor, others: Tensor) -> Tensor:
