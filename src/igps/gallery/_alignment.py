@@ -32,7 +32,7 @@ _CLOSE_FIT = 1.5
 _FINE_FACTOR = 1.5
 _LAST_GAIN = 0.004  # upper bound of the decrease of a distance by the last steps; 0.0001 for copies of generated bodies
 _PATCH_SIZE = 10  # neighbouring samples whose offsets are averaged
-MOST_SCALED = math.log(1.1)
+MAX_LOG_SCALE = math.log(1.1)
 """Largest logarithm of the scale of an alignment."""
 
 
@@ -96,8 +96,8 @@ class TriangleSurface:
 
 
 def surface_distance(
-    one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, hopeless: float = math.inf,
-    most: float = math.inf, patch: int = _PATCH_SIZE,
+    one: SurfaceSamples, other: SurfaceSamples, *, stop_at: float = 0.0, hopeless: float = math.inf,
+    max_distance: float = math.inf, patch_size: int = _PATCH_SIZE,
 ) -> float:  # fmt: skip
     """Return the distance of two surfaces after alignment, over √area: root mean square over patches, both ways.
 
@@ -113,13 +113,13 @@ def surface_distance(
     Args:
         one: samples of the surface that is moved.
         other: samples of the other surface.
-        enough: distance at which the search stops.
+        stop_at: distance at which the search stops.
         hopeless: distance beyond which the result need not be precise. If a subset of the samples is farther after the
             coarse steps, the other surface itself is not loaded; if the subset is farther than two thirds of
             `hopeless` after the fine steps, the remaining samples are not used.
-        most: distance beyond which the result is only a lower bound, for which one direction may be enough.
-        patch: samples in a patch. With 1, for surfaces known to be the same, lost relief counts, and the largest offset
-            is returned instead of the root mean square.
+        max_distance: distance beyond which the result is only a lower bound, for which one direction may be enough.
+        patch_size: samples in a patch. With 1, for surfaces known to be the same, lost relief counts, and the largest
+            offset is returned instead of the root mean square.
     """
     best = math.inf
     is_ambiguous = min(_min_extent_ratio(one), _min_extent_ratio(other)) < _AMBIGUITY
@@ -135,46 +135,46 @@ def surface_distance(
             fine = [_fit(samples, finest, alignment, _N_FINE_STEPS) for alignment in close]
             distance, alignment = min(fine, key=itemgetter(0))
             if distance <= hopeless / _FINE_FACTOR:
-                distance = _two_way_distance(one, other, alignment, patch, most)
+                distance = _two_way_distance(one, other, alignment, patch_size, max_distance)
         best = min(best, distance)
         # A body may nearly be its own mirror image, so a small distance need not be the smallest. For surfaces known to
         # be the same, unambiguous axes are enough.
-        if best <= enough or ((best > hopeless or patch == 1) and not is_ambiguous):
+        if best <= stop_at or ((best > hopeless or patch_size == 1) and not is_ambiguous):
             break
     return best
 
 
 def offset_in_place(samples: SurfaceSamples, surface: TriangleSurface) -> float:
     """Return the root mean square over patches, as in `surface_distance`, without alignment."""
-    return math.sqrt(_mean_square(samples, surface))
+    return math.sqrt(_mean_square(samples, surface, _PATCH_SIZE))
 
 
 def _two_way_distance(
-    one: SurfaceSamples, other: SurfaceSamples, alignment: _Alignment, patch: int, most: float
+    one: SurfaceSamples, other: SurfaceSamples, alignment: _Alignment, patch_size: int, max_distance: float
 ) -> float:
-    """Return the root mean square over the patches of both surfaces, or a lower bound of it above `most`."""
+    """Return the root mean square over the patches of both surfaces, or a lower bound of it above `max_distance`."""
     squares = []
     for samples, target, initial in ((one, other, alignment), (other, one, alignment.inverse())):
         finest = target if target.surface is None else target.surface()
-        if most < math.inf:
-            bound = math.sqrt(_mean_square(initial(samples), finest, patch) / initial.scale) - _LAST_GAIN
-            if bound > most:
+        if max_distance < math.inf:
+            bound = math.sqrt(_mean_square(initial(samples), finest, patch_size) / initial.scale) - _LAST_GAIN
+            if bound > max_distance:
                 return bound
         _, fitted = _fit(samples, finest, initial, _N_LAST_STEPS)
         # In the unit of the geometric mean of both, so that neither is favoured
-        squares.append(_mean_square(fitted(samples), finest, patch) / fitted.scale)
-        if sum(squares) / 2 > most**2:
+        squares.append(_mean_square(fitted(samples), finest, patch_size) / fitted.scale)
+        if sum(squares) / 2 > max_distance**2:
             break
     return math.sqrt(sum(squares) / 2)
 
 
-def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch: int = _PATCH_SIZE) -> float:
+def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch_size: int) -> float:
     """Return the mean square offset of patches, or the largest square offset if a patch is one sample."""
-    ranks = np.arange(1, min(patch, len(samples.points)) + 1)
+    ranks = np.arange(1, min(patch_size, len(samples.points)) + 1)
     neighbours = samples.tree.query(_with_normals(samples), k=ranks)[1]
     means = _offsets(samples, target)[neighbours].mean(axis=1)
     squares = np.einsum("ni,ni->n", means, means)
-    return float(squares.max() if patch == 1 else squares.mean())
+    return float(squares.max() if patch_size == 1 else squares.mean())
 
 
 def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) -> Floats:
@@ -214,7 +214,7 @@ class _Alignment:
     def then(self, step: Floats) -> _Alignment:
         """Compose with a small step (7,): a rotation vector, a shift, and the logarithm of a scale."""
         rotation = Rotation.from_rotvec(step[:3]).as_matrix()
-        log_scale = np.clip(math.log(self.scale) + step[6], -MOST_SCALED, MOST_SCALED)
+        log_scale = np.clip(math.log(self.scale) + step[6], -MAX_LOG_SCALE, MAX_LOG_SCALE)
         factor = math.exp(log_scale) / self.scale
         shift = factor * rotation @ np.broadcast_to(self.shift, 3) + step[3:6]
         return _Alignment(rotation @ self.rotation, shift, math.exp(log_scale))

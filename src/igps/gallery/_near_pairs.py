@@ -18,7 +18,7 @@ _FIRST_TOP = 32  # neighbours in a gallery that are searched first; four times a
 # Bodies of one size differ by less in the logarithm of √area; levels of detail of a body differ by up to half of this
 _SIZE_TOLERANCE = 0.05
 
-NearPairs = Iterator[tuple[int, int, float]]
+NearPairs = Iterator[tuple[int, int, float]]  # indices i < j and distance
 
 
 def near_pairs(descriptions: Tensor, distance: Distance, limit: float, progress: bool) -> NearPairs:

@@ -52,12 +52,12 @@ _HANDLE_PRESERVING: set[Step] = {"welded", "smoothed", "subdivided"}  # steps of
 
 
 def distance_if_alike(
-    one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, most: float = math.inf
+    one: SurfaceSamples, other: SurfaceSamples, *, stop_at: float = 0.0, max_distance: float = math.inf
 ) -> float:
     """`surface_distance`, or infinity if the extents of the two surfaces differ too much."""
     if np.abs(np.log(one.extents / other.extents)).max() > _MAX_STRETCH:
         return math.inf
-    return surface_distance(one, other, enough=enough, hopeless=_HOPELESS, most=most)
+    return surface_distance(one, other, stop_at=stop_at, hopeless=_HOPELESS, max_distance=max_distance)
 
 
 class Surfaces:
@@ -106,13 +106,13 @@ class Surfaces:
         """Return the distance of two bodies over √area, or infinity if they differ or one of them cannot be read."""
         with contextlib.suppress(MeshError):  # recorded in `failures`
             one, other = self._cached_samples(i), self._cached_samples(j)
-            most, limit = max(calibration.same.distance, self._tolerance), 0.0
-            distance = distance_if_alike(one, other, enough=calibration.same.distance, most=most)
+            max_distance, limit = max(calibration.same.distance, self._tolerance), 0.0
+            distance = distance_if_alike(one, other, stop_at=calibration.same.distance, max_distance=max_distance)
             if distance <= calibration.same.distance:
                 limit = self.limit(i, j, calibration)
                 if distance > limit > 0:
                     # The search stopped below `same`. A longer search may get below the limit
-                    distance = distance_if_alike(one, other, enough=limit, most=max(limit, self._tolerance))
+                    distance = distance_if_alike(one, other, stop_at=limit, max_distance=max(limit, self._tolerance))
             if distance <= limit:
                 return distance
             if distance <= self._tolerance:
@@ -132,7 +132,7 @@ class Surfaces:
         if (deviation := self._vertex_deviation(i, j)) <= _SAME_SURFACE:
             return "same mesh", deviation
         samples = map(self._cached_samples, (i, j))
-        deviation = surface_distance(*samples, enough=_SAME_SURFACE, hopeless=_HOPELESS, patch=1)
+        deviation = surface_distance(*samples, stop_at=_SAME_SURFACE, hopeless=_HOPELESS, patch_size=1)
         return ("same surface" if deviation <= _SAME_SURFACE else "same at another level of detail"), deviation
 
     def length(self, i: int) -> tuple[float, str | None]:
@@ -153,7 +153,7 @@ class Surfaces:
         return calibration.limit(max(coarseness_i, coarseness_j))
 
     def moments(
-        self, most: float, n_workers: int | None = None, progress: bool = False
+        self, max_move: float, n_workers: int | None = None, progress: bool = False
     ) -> tuple[Tensor, list[Failure]]:
         """Return the `moments` (M, 7, 6) of the bodies that can be read, in order, and the failures of the others.
 
@@ -163,7 +163,7 @@ class Surfaces:
         def moments_of(i: int) -> Floats | None:
             with contextlib.suppress(MeshError):  # recorded in `failures`
                 mesh = self._mesh(i)
-                return moments(self._placed(i, mesh), mesh.faces, most)
+                return moments(self._placed(i, mesh), mesh.faces, max_move)
             return None
 
         results = on_threads(moments_of, range(len(self._dataset)), n_workers)
