@@ -106,8 +106,10 @@ class FileAttribute(ABC):
             values = self.values(body, file, name, points)
         except MemoryError:
             raise
-        except MeshError as error:  # name the body, which may be one of thousands
-            raise error if str(body) in str(error) else MeshError(f"{body}: its attribute file {error}") from error
+        except MeshError as error:
+            if str(body) in str(error):
+                raise
+            raise MeshError(f"{body}: its attribute file {error}") from error  # the body may be one of thousands
         except Exception as error:  # the readers of the formats raise exceptions of many types
             raise MeshError(
                 f"{body}: its attribute file {file} is not readable ({type(error).__name__}: "
