@@ -1,8 +1,8 @@
 """Functions that Numba compiles when they are first called. Importing them does not import Numba.
 
-Numba caches compiled functions that are called from Python on disk, together with the compiled functions that they call
-themselves, so each machine compiles once per version. Compiled code releases the global interpreter lock (GIL) and uses
-one thread; `igps._threads` decides how many run side by side.
+A function that Python calls is cached on disk, with the compiled functions that it calls, so each machine compiles once
+per version. Compiled code releases the global interpreter lock (GIL) and uses one thread; `igps._threads` sets how many
+threads run side by side.
 """
 
 import gc
@@ -15,10 +15,9 @@ from typing import Any, Generic, ParamSpec, TypeVar
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-# Value of `fastmath` that allows sums in any order, and thus vector instructions
-SUMS = {"contract", "reassoc", "nsz"}
-# Value of `fastmath` that allows fused multiply-add: a product and its sum are rounded once instead of twice
-CONTRACTED = {"contract"}
+# Values of `fastmath`
+SUMS = {"contract", "reassoc", "nsz"}  # allows sums in any order, and thus vector instructions
+CONTRACTED = {"contract"}  # allows fused multiply-add: a product and its sum are rounded once instead of twice
 
 
 class Lazy:
@@ -40,7 +39,7 @@ class Compiled(Lazy, Generic[Arguments, Result]):
     The function may call other `Compiled` and `Lazy` functions of its module. These are compiled without a wrapper for
     Python, which saves a tenth of the time. Division by 0 gives the result of NumPy, without an error. The options are
     those of `numba.njit`. With `inline="always"`, the function is compiled as part of each caller, which saves time if
-    there is only one.
+    it has only one caller.
     """
 
     def __init__(self, function: Callable[Arguments, Result], **options: Any) -> None:
@@ -52,7 +51,9 @@ class Compiled(Lazy, Generic[Arguments, Result]):
         dispatcher: Any = self._entry.dispatcher
         try:
             return dispatcher(*args, **kwargs)
-        except AttributeError:  # a cached file names a class of an earlier version; compiled code raises none itself
+        except (
+            AttributeError
+        ):  # from a cached file that refers to a class of an earlier version, not from compiled code
             dispatcher._cache.flush()
             return dispatcher(*args, **kwargs)
 
@@ -83,7 +84,7 @@ def _numba() -> ModuleType:
     was_enabled: list[bool] = []  # a stack, as compiling a function compiles the functions that it calls
 
     class GarbageCollectionOff(event.Listener):
-        """Garbage collection would take a tenth of the time of compiling, which creates many objects."""
+        """Turns off garbage collection, which would take a tenth of the time of compiling with its many objects."""
 
         def on_start(self, event: object) -> None:
             was_enabled.append(gc.isenabled())

@@ -1,8 +1,8 @@
 """Parallel jobs in processes or threads. A job that fails, or kills its process, does not affect the other jobs.
 
-Each worker is a `ProcessPoolExecutor` with one process. Thus the job of a process that dies is known, and a job that
-takes too long is stopped by killing its process. Alternatively, any other `concurrent.futures.Executor`, such as that
-of a cluster, runs the jobs.
+Each worker is a `ProcessPoolExecutor` with one process. So if a process dies, its job is known, and a job that takes
+too long is stopped by killing its process. Any other `concurrent.futures.Executor`, such as that of a cluster, can run
+the jobs instead.
 """
 
 import errno
@@ -27,12 +27,10 @@ from igps._threads import Job, Result, n_cores, one_thread, stay_on_one_thread
 from igps._threads import n_threads as available_threads
 from igps._workers import MachineError, Worker, workers_environment
 
-# A job whose process died is tried once more: an administrator or another program may be the cause.
-_MAX_ATTEMPTS = 2
+_MAX_ATTEMPTS = 2  # of a job whose process died: an administrator or another program may be the cause
 _KILLED = "its process was killed twice. It may need more memory: use fewer workers, or set a memory limit to find out."
 _KILLED_ON_CLUSTER = "several workers that had it were killed. It may need more memory: start workers with more memory."
-# Jobs that an executor holds at a time: enough for the workers of a large cluster, and not too many for the memory.
-_MAX_SUBMITTED = 10_000
+_MAX_SUBMITTED = 10_000  # jobs in an executor: enough for the workers of a large cluster, few enough for the memory
 _MACHINE_ERRORS = {
     "Free disk space": ("ENOSPC", "EDQUOT", "EFBIG"),
     "Choose a writable folder": ("EROFS", "EACCES", "EPERM"),
@@ -85,27 +83,24 @@ def run(
     """
     check_at_least(1, n_workers=n_workers)
     limits = limits or Limits()
-    limited = limits != Limits()
+    n_workers = min(n_workers or n_cores(), len(jobs))
     if executor is not None:
-        if limited:
+        if limits != Limits():
             raise ValueError("limits: expected None with an executor, which sets its own limits.")
         yield from _run_on_executor(executor, function, jobs)
-        return
-    n_workers = min(n_workers or n_cores(), len(jobs))
-    if n_workers > 1 or (limited and jobs):
+    elif n_workers > 1 or (jobs and limits != Limits()):
         yield from _run_on_workers(function, jobs, n_workers, limits)
-        return
-    for i, job in enumerate(jobs):
-        yield i, attempt(lambda job=job: function(job), limits)  # type: ignore[misc]
+    else:
+        for i, job in enumerate(jobs):
+            yield i, attempt(lambda job=job: function(job), limits)  # type: ignore[misc]
 
 
 def on_threads(
     function: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int | None = None
 ) -> Iterator[Result]:
-    """Yield the result of every job in order. Each job computes on one thread.
+    """Yield the result of every job in order. Each job computes on one thread, see `igps._threads`.
 
-    Splitting each small product over all cores instead would make every core wait for the slowest one. On a busy
-    machine, the wait takes many times as long as the product. If None, `n_threads` is `igps._threads.n_threads()`.
+    The number of threads is `igps._threads.n_threads()` by default.
     """
     n_threads = min(available_threads() if n_threads is None else n_threads, len(jobs))
     on_one_thread = one_thread()(function)

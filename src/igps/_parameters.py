@@ -1,4 +1,4 @@
-"""Checks of parameters, with uniform messages. None passes where its type is allowed."""
+"""Checks of parameters, with uniform messages. None is accepted where the type allows it."""
 
 import math
 from collections.abc import Collection

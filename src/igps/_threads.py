@@ -32,11 +32,11 @@ def n_cores() -> int:
 
 
 def n_threads() -> int:
-    """Return the number of Python threads for this call: the cores, but at most torch's threads before the call."""
+    """Return the number of Python threads for a call: the cores, but at most torch's threads outside `one_thread`."""
     if _state.max_threads is not None:
         return _state.max_threads
     n_torch = _get_torch_threads()
-    return min(n_cores(), n_torch) if n_torch > 1 else n_torch  # `n_cores` reads files
+    return min(n_cores(), n_torch) if n_torch > 1 else n_torch  # `n_cores` is slow, as it reads files
 
 
 @contextlib.contextmanager
@@ -55,7 +55,7 @@ def one_thread() -> Iterator[None]:
                 _set_torch_threads(1)
             yield
     finally:
-        if before > 1:  # even if torch reports `before`, which may be MKL's threads while new Python threads get one
+        if before > 1:  # do not check what torch reports: it may be MKL's number, while new Python threads get one
             _set_torch_threads(before)
         _state.max_threads = outside
 
@@ -71,8 +71,8 @@ class Team:
     """Threads for a computation of many short steps, each with a few jobs.
 
     The threads live as long as the context, because starting threads takes longer than a step. The thread that calls
-    `each` takes jobs as well, and waits only for jobs that another thread has begun. So a thread without a core delays
-    nothing. `max_threads` includes the calling thread; it is `n_threads()` if None.
+    `each` takes jobs as well, and waits only for jobs that another thread has begun. So a thread that gets no core
+    delays nothing. `max_threads` includes the calling thread; it is `n_threads()` if None.
     """
 
     def __init__(self, max_threads: int | None = None) -> None:
@@ -126,7 +126,6 @@ _state = _ThreadState()
 
 
 def _at_fork(**hooks: Callable[[], object]) -> None:
-    """Call `os.register_at_fork` on systems that have it."""
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(**hooks)
 
@@ -198,7 +197,6 @@ def _set_torch_threads(n: int) -> None:
 
 
 def _in_new_thread(function: Callable[[], Result]) -> Result:
-    """Return the result of a function that runs in a new thread."""
     results: SimpleQueue[Result] = SimpleQueue()
     start_new_thread(lambda: results.put(function()), ())  # `Thread.start` would wait until the thread runs
     return results.get()
@@ -211,10 +209,7 @@ def _libraries(n_modules: int) -> threadpoolctl.ThreadpoolController:
 
 
 def _blas_to_one_thread() -> Callable[[], None]:
-    """Limit the BLAS libraries of NumPy and SciPy to one thread, and return a function that lifts the limit.
-
-    While a thread is alive, threadpoolctl lets no other thread lift its limit, unless the thread gives up control.
-    """
+    """Limit the BLAS libraries of NumPy and SciPy to one thread, and return a function that lifts the limit."""
     limits = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
     _release_control()
 
@@ -226,7 +221,7 @@ def _blas_to_one_thread() -> Callable[[], None]:
 
 
 def _release_control() -> None:
-    """Let other threads set and lift limits, as every thread could before threadpoolctl 3.8."""
+    """Let other threads lift the limit. Since threadpoolctl 3.8, only the thread that set it may, while it is alive."""
     clear = getattr(getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", None)
     if clear is not None:
         clear()

@@ -19,8 +19,7 @@ _ENVIRONMENT = {
     "MALLOC_MMAP_THRESHOLD_": str(2**26),
     "MALLOC_TRIM_THRESHOLD_": str(2**28),
 }
-# A process that is killed while it starts is started once more: an administrator or another program may be the cause.
-_MAX_STARTS = 2
+_MAX_STARTS = 2  # of a process that is killed while it starts: an administrator or another program may be the cause
 
 
 class MachineError(RuntimeError):

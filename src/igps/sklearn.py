@@ -106,8 +106,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
                 part = next(name for name in dataset.bodies.names if name not in set(map(str, shapes)))
                 raise ValueError(f"X: expected files of one body, got several, such as {part}. Name each as FILE#PART.")
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
-            tag = cache_tag(chosen)
-            features = describe(dataset, chosen, cache_tag=tag, n_workers=self.n_workers)
+            features = describe(dataset, chosen, cache_tag=cache_tag(chosen), n_workers=self.n_workers)
         cells = features.flatten(1)
         if self.square_root and isinstance(chosen, HistogramDescriptor):
             cells[:, : sum(chosen.part_cells)].sqrt_()  # not the size of molecules, which follows the cells

@@ -187,7 +187,7 @@ class Nowhere:
 def test_a_cluster_that_fails_is_told(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor: Executor, words: str
 ) -> None:
-    monkeypatch.setattr("igps.data.filling._SHARED_WITHIN", 0.2)
+    monkeypatch.setattr("igps.data.filling._MAX_DELAY", 0.2)
     with pytest.raises(MachineError, match=words):
         SignatureDataset(root, CONFIG, tmp_path / "cache").precompute(executor, progress=False)
 

@@ -28,7 +28,7 @@ def dataset(tmp_path: Path) -> SignatureDataset:
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """The time at which names and rights changed cannot be set: let a moment be long ago."""
-    monkeypatch.setattr("igps.data.file_stat_cache._YOUNG", 0)
+    monkeypatch.setattr("igps.data.file_stat_cache.MIN_AGE", 0)
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_a_file_that_changed_is(dataset: SignatureDataset, read: list[str], tmp_
 def test_a_file_that_changed_a_moment_ago_is_not_remembered(
     dataset: SignatureDataset, read: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("igps.data.file_stat_cache._YOUNG", 1000 * 10**9)
+    monkeypatch.setattr("igps.data.file_stat_cache.MIN_AGE", 1000 * 10**9)
     dataset.precompute(n_workers=1, progress=False)
     read.clear()
     dataset.precompute(n_workers=1, progress=False)

@@ -197,7 +197,7 @@ def test_thin_sheets_of_other_widths_are_told_apart() -> None:
 def test_the_search_ends_where_it_is_enough() -> None:
     one, other = ellipsoid((1.0, 0.6, 0.4)), ellipsoid((1.0, 0.5, 0.4), seed=2)
     best = surface_distance(one, other)
-    assert best <= surface_distance(one, other, enough=2 * best) <= 2 * best
+    assert best <= surface_distance(one, other, stop_at=2 * best) <= 2 * best
 
 
 def test_what_is_hopeless_stays_beyond_that() -> None:
@@ -215,5 +215,5 @@ def test_samples_that_do_not_fit_are_refused() -> None:
 def test_what_is_farther_than_asked_for_is_told_to_be() -> None:
     one, other = bumpy(0.0), bumpy(0.1, seed=5)
     far = surface_distance(one, other)
-    assert far / 3 < surface_distance(one, other, most=far / 3) <= far
-    assert surface_distance(one, other, most=1.01 * far) == far
+    assert far / 3 < surface_distance(one, other, max_distance=far / 3) <= far
+    assert surface_distance(one, other, max_distance=1.01 * far) == far

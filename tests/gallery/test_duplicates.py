@@ -22,9 +22,9 @@ from igps.cli import COMMANDS, main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.descriptors.fingerprint import fingerprint
-from igps.gallery._moments import least_distances
+from igps.gallery._moments import distance_bounds
 from igps.gallery.calibration import Calibration, calibration_params
-from igps.gallery.duplicates import _around_the_finest, body_distance, duplicates
+from igps.gallery.duplicates import _regroup, body_distance, duplicates
 from igps.gallery.gallery import Gallery
 from igps.gallery.surfaces import Surfaces
 from igps.signature.signature import SignatureConfig
@@ -226,11 +226,11 @@ def test_each_file_of_a_group_has_one_finer_file_beside_it() -> None:
             return apart.get((min(i, j), max(i, j)), math.inf)
 
     calibration, joined = Calibration.load(), {(0, 1): 0.1, (1, 2): 0.05, (2, 3): 0.3, (3, 4): 0.1, (5, 6): 0.4}
-    found = _around_the_finest(joined, Table(), calibration, 1, progress=False)  # type: ignore[arg-type]
+    found = _regroup(joined, Table(), calibration, 1, progress=False)  # type: ignore[arg-type]
     # 3 is as fine as 0 and leads; 2 is the same as 3, which leads, and as 1, which does not.
     assert found == {(5, 6): 0.4, (0, 1): 0.1, (3, 2): 0.3, (3, 4): 0.1}
     del apart[2, 3]
-    found = _around_the_finest(joined, Table(), calibration, 1, progress=False)  # type: ignore[arg-type]
+    found = _regroup(joined, Table(), calibration, 1, progress=False)  # type: ignore[arg-type]
     assert found == {(5, 6): 0.4, (0, 1): 0.1, (1, 2): 0.05, (3, 4): 0.1}
 
 
@@ -401,5 +401,5 @@ def test_other_lengths_are_no_candidates(tmp_path: Path) -> None:
     moments, failures = Surfaces(dataset).moments(most, 1)
     assert not failures
     # in order of names: ball, copy, longer
-    near = least_distances(moments, moments) <= most
+    near = distance_bounds(moments, moments) <= most
     assert near.tolist() == [[True, True, False], [True, True, False], [False, False, True]]

@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from igps.gallery._moments import least_distances, moments
+from igps.gallery._moments import distance_bounds, moments
 
 Array = NDArray[np.float64]
 MOST = 0.002
@@ -23,7 +23,7 @@ def of(body: trimesh.Trimesh, scale: float = 1.0) -> Array:
 
 def apart(one: trimesh.Trimesh, other: trimesh.Trimesh, scale: float = 1.0) -> float:
     some, others = (torch.from_numpy(found)[None] for found in (of(one), of(other, scale)))
-    return float(least_distances(some, others))
+    return float(distance_bounds(some, others))
 
 
 def lump(stretch: tuple[float, float, float], bumps: float = 0.0, subdivisions: int = 3) -> trimesh.Trimesh:
@@ -105,7 +105,7 @@ def test_the_least_move_of_a_difference_is_told_as_far_as_it_is() -> None:
         move = gradients @ which / shares
         move *= far / np.sqrt(shares @ move**2)
         some = [moments(one, faces, MOST) for one in (vertices, vertices + move[:, None] * normals)]
-        found = least_distances(*(torch.from_numpy(one)[None] for one in some))
+        found = distance_bounds(*(torch.from_numpy(one)[None] for one in some))
         assert float(found) == pytest.approx(far, rel=0.04), which
 
 

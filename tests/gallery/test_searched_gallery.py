@@ -202,9 +202,12 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
     Gallery.build(index, dataset, INTERIOR, n_workers=1)
     query = ["query", mesh, "--gallery", index, "--cache_dir", tmp_path / "cache"]
     for options, words in (
-        (["--descriptor", "rich"], f'another descriptor: it has "{INTERIOR}", not "rich"'),
-        (["--signature.n_eigenpairs", 20, "--signature.resolution", 12], "another signature."),
-        (["--mend", "never"], 'another reading.mend: it has "auto", not "never"'),
+        (
+            ["--descriptor", "rich"],
+            f'expected a gallery with descriptor "rich", got "{INTERIOR}". Use the parameters of',
+        ),
+        (["--signature.n_eigenpairs", 20, "--signature.resolution", 12], "expected a gallery with signature."),
+        (["--mend", "never"], 'expected a gallery with reading.mend "never", got "auto"'),
         (["--where", "weight > 3"], "where: expected a condition on the columns id, name, class, file, part"),
     ):
         assert words in error_of(monkeypatch, capsys, *query, *options)
@@ -222,7 +225,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
     changed = small_interior()
     next(changed.buffers()).add_(1e-3)
     changed.name = INTERIOR
-    with pytest.raises(ValueError, match="another model"):
+    with pytest.raises(ValueError, match=r"expected a gallery with model .*, got "):
         Gallery(index, changed)
     assert len(Gallery(index)) == 6
 
@@ -257,7 +260,7 @@ def test_rows_tell_size_class_and_what_labels_tell(root: Path, tmp_path: Path) -
 def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Afterwards it is what building makes; what has not changed is neither described nor written."""
     cache = tmp_path / "cache"
-    monkeypatch.setattr(rows, "_CLOCK_RESOLUTION", 10**18)  # however busy the machine, no file is old
+    monkeypatch.setattr(rows, "MIN_AGE", 10**18)  # however busy the machine, no file is old
     gallery, _ = Gallery.build(
         tmp_path / "g.igps", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1
     )
@@ -267,7 +270,7 @@ def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path, mon
     version = gallery.versions()[-1]["version"]
     assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
     assert gallery.versions()[-1]["version"] == version
-    monkeypatch.setattr(rows, "_CLOCK_RESOLUTION", 0)
+    monkeypatch.setattr(rows, "MIN_AGE", 0)
     sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
     with monkeypatch.context() as context:
         context.setattr(SignatureDataset, "key", lambda *_: pytest.fail("a file was read"))
@@ -372,7 +375,7 @@ def test_sync_notices_a_table_of_names_that_was_edited(tmp_path: Path, monkeypat
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "scan.nii.gz")
     table = tmp_path / "names.json"
     table.write_text('{"1": "block", "2": "bar"}')
-    monkeypatch.setattr(rows, "_CLOCK_RESOLUTION", 0)
+    monkeypatch.setattr(rows, "MIN_AGE", 0)
 
     def now() -> SignatureDataset:
         reading = LoadOptions(bodies="labels", names=str(table))

@@ -220,7 +220,7 @@ def test_each_change_is_a_version_to_return_to(tmp_path: Path) -> None:
 def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
     table = written(tmp_path / "g.igps", units(10), "cosine")
     other = {"descriptor": "test", "signature": {"resolution": 20}}
-    with pytest.raises(ValueError, match=r"g\.igps: the gallery is of another signature.resolution: it has 32, not 20"):
+    with pytest.raises(ValueError, match=r"g\.igps: expected a gallery with signature\.resolution 20, got 32"):
         check_alike(table.path, table.about, other)
     with pytest.raises(ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(5,\)"):
         nearest_rows(table, units(1, 5), cosine, top=1)

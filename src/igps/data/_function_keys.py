@@ -16,15 +16,14 @@ from pathlib import Path, PurePath
 from types import FunctionType
 from typing import Any
 
-# Types with the same representation in every process, which keys can hold, besides None
-_PLAIN_TYPES = (bool, int, float, str, PurePath)
+_PLAIN_TYPES = (bool, int, float, str, PurePath)  # keys can hold their values, which all processes represent equally
 _REMEDY = "Pass a callable object with a method cache_tag(body), see igps.data.attributes.AttributeSource."
 
 
 def function_key(function: Callable[..., Any]) -> str:
     """Return a key of a function; raise a ValueError if it uses values or code that a key cannot hold."""
     used = [function]
-    for item in used:  # which grows
+    for item in used:  # the list grows during the loop
         used += [helper for helper in dict.fromkeys(_global_references(item)[1]) if helper not in used]
     return " ".join(map(_key_without_helpers, used))
 
@@ -47,7 +46,7 @@ def _key_without_helpers(item: Callable[..., Any]) -> str:
 
 
 def _global_references(item: Callable[..., Any]) -> tuple[list[Any], list[Callable[..., Any]]]:
-    """Return the constants, and the user's functions and classes, that a function or class finds in its module."""
+    """Return the constants, and the user's functions and classes, that the code of a function or class refers to."""
     constants, helpers = list[Any](), list[Callable[..., Any]]()
     if inspect.isclass(item):
         helpers += [base for base in item.__mro__[1:] if _is_own(base.__module__)]
@@ -79,9 +78,9 @@ def _global_values(function: FunctionType) -> list[Any]:
 
 
 def _instructions(function: Callable[..., Any]) -> Iterator[dis.Instruction]:
-    """Yield the byte code of a function, and of the functions and comprehensions inside it."""
+    """Yield the byte code instructions of a function, and of the functions and comprehensions inside it."""
     codes = [function.__code__]
-    for code in codes:  # which grows
+    for code in codes:  # the list grows during the loop
         codes += filter(inspect.iscode, code.co_consts)
         yield from dis.get_instructions(code)
 

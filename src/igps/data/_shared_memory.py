@@ -20,9 +20,9 @@ from torch.utils.data import get_worker_info
 
 from igps.data.batch import SignatureBatch
 
-# Bytes to which arrays are aligned. A block starts with as many bytes: the first is 1 while the consumer uses the block
+# Alignment of arrays in bytes, and size of the header of a block: its first byte is 1 while the consumer uses the block
 _ALIGNMENT = 64
-_MAX_FREE_BLOCKS = 4  # that a worker keeps
+_MAX_FREE_BLOCKS = 4  # larger numbers of free blocks in a worker are closed
 
 
 class _Block:
@@ -41,7 +41,7 @@ class _Block:
 
     @property
     def is_free(self) -> bool:
-        # In this order, because a batch is marked as sent before the last reference to it in this process goes
+        # In this order, because a batch is marked as sent before its last reference in this process is dropped
         return self._lent() is None and not self.memory[0]
 
     def close(self) -> None:

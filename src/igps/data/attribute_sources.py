@@ -34,11 +34,9 @@ from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES, residue_attrib
 
 logger = logging.getLogger(__name__)
 
-# Larger values are placeholders for missing values, such as 7e18 at the border of some grids
-_MAX_VALUE = 1e15
+_MAX_VALUE = 1e15  # larger values are placeholders for missing values, such as 7e18 at the border of some grids
 _MAX_MISSING_SHARE = 0.1
-# A point outside a tetrahedron belongs to it up to this share of its heights, for rounding and curved surfaces
-_TOLERANCE = 0.05
+_TOLERANCE = 0.05  # share of its height by which a point may lie outside a tetrahedron: rounding, curved surfaces
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ class ResidueAttribute:
 def _molecule(body: BodyRef) -> Molecule:
     """Return the atoms and residues of a body: of a chain, an assembly or a model, or of all models."""
     part, stamp = body.part or "", stamp_of(body.path)
-    words = part.split()  # in a file of several structures, the name of one comes first
+    words = part.split()  # in a file of several structures, the first is the name of a structure
     kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
     for kind in (*(kinds[word] for word in kinds if word in words), "models"):
         molecules = molecules_by_part(body.path, stamp, kind)
@@ -108,8 +106,10 @@ class FileAttribute(ABC):
             values = self.values(body, file, name, points)
         except MemoryError:
             raise
-        except MeshError as error:  # name the body, which may be one of thousands
-            raise error if str(body) in str(error) else MeshError(f"{body}: its attribute file {error}") from error
+        except MeshError as error:
+            if str(body) in str(error):
+                raise
+            raise MeshError(f"{body}: its attribute file {error}") from error  # the body may be one of thousands
         except Exception as error:  # the readers of the formats raise exceptions of many types
             raise MeshError(
                 f"{body}: its attribute file {file} is not readable ({type(error).__name__}: "
@@ -233,7 +233,7 @@ class TetAttribute(FileAttribute):
         # Tetrahedron of each point, barycentric coordinates in it, and the smallest of them, which is negative outside
         n = len(points)
         owner, weights, smallest = np.zeros(n, int), np.zeros((n, 4)), np.full(n, -np.inf)
-        # A point lies within the largest distance of a corner from the centre of its tetrahedron
+        # No point of a tetrahedron is farther from its centre than a corner
         centres = corners.mean(axis=1)
         radius = np.linalg.norm(corners - centres[:, None], axis=2).max()
         for i, near in enumerate(cKDTree(centres).query_ball_point(points, radius * (1 + _TOLERANCE))):
@@ -258,7 +258,7 @@ def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
 
 
 def with_load_options(source: AttributeSource, options: LoadOptions) -> AttributeSource:
-    """Return a source for bodies that are read with these options, except that `VertexAttribute` closes surfaces."""
+    """Return a `VertexAttribute` with these options, but with open surfaces closed; return others unchanged."""
     closed = replace(options, allow_open=False, mend="auto")
     return replace(source, reading=closed) if isinstance(source, VertexAttribute) else source
 

@@ -76,8 +76,10 @@ def split_attributes(
     functions: dict[str, PointFunction] = {}
     for name, value in attributes.items():
         if not callable(value) or name in get_args(AttributeName):
-            own = f"the library's own, {', '.join(get_args(AttributeName))}, are set in SignatureConfig(attributes=...)"
-            raise ValueError(f"attributes: expected functions or sources by other names, got {name}={value!r}: {own}.")
+            raise ValueError(
+                f"attributes: expected functions or sources by names other than {', '.join(get_args(AttributeName))}, "
+                f"got {name}={value!r}. These attributes of the library are set by SignatureConfig(attributes=...)."
+            )
         if isinstance(value, AttributeSource):
             sources[name] = value
         elif _takes_body(value):

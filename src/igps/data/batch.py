@@ -67,7 +67,6 @@ class SampleBatch:
             steps = (n_present.double() / n_samples).clamp(min=1) * (numbers + start)
             index = torch.searchsorted(self.mask.cumsum(dim=1), steps.long().clamp(max=n_present - 1) + 1)
         index = index.masked_fill(~mask, 0)
-
         rows = (index + n_padded * torch.arange(n_shapes, device=index.device)[:, None]).flatten()
         padding = None if not torch.compiler.is_compiling() and bool(mask.all()) else ~mask
 
@@ -84,8 +83,7 @@ def _random_start(seed: int) -> float:
     return torch.rand(1, generator=generator, dtype=torch.float64, device="cpu").item()
 
 
-# All descriptors use seed 0, and `torch.compile` cannot trace a generator
-_START_OF_SEED_0 = _random_start(0)
+_START_OF_SEED_0 = _random_start(0)  # the seed of all descriptors; `torch.compile` cannot trace a generator
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +100,7 @@ class Body:
 
     @property
     def mesh(self) -> Mesh:
-        """The surface; a ValueError if the batch has no meshes."""
+        """The surface; raises a ValueError if the batch has no meshes."""
         if self.surface_mesh is None:
             raise ValueError(f"{self.id}: expected a batch with meshes, got one without. See SignatureDataset.batch.")
         return self.surface_mesh
@@ -199,10 +197,7 @@ class SignatureBatch:
 
     @staticmethod
     def concatenate(batches: Sequence[SignatureBatch]) -> SignatureBatch:
-        """Concatenate batches on one device into one batch.
-
-        Their samples must have the same attributes, and all batches must have meshes or none.
-        """
+        """Concatenate batches with the same device and sample attributes, and with meshes in all of them or in none."""
         if not batches:
             raise ValueError("batches: expected at least one, got none.")
         meshes = [batch.meshes for batch in batches if batch.meshes is not None]

@@ -67,10 +67,7 @@ class FileCache(Generic[T]):
         return self._read(key, lambda file, metadata: True) is not None
 
     def get(self, key: str) -> T | None:
-        """Return the value stored under `key`; None if there is none, or if it is damaged, which is logged.
-
-        The arrays are views of the memory-mapped file.
-        """
+        """Return the value of a key, in views of the memory-mapped file; None if missing, or damaged (logged)."""
         return self._read(key, self._decode_checked)
 
     def _decode_checked(self, file: Any, metadata: Mapping[str, str]) -> T:
@@ -204,7 +201,7 @@ def _remove_abandoned(partials: Iterable[Path]) -> None:
 def checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
     """Return the hexadecimal CRC-32 of tensors and metadata.
 
-    To be as fast as reading memory, the CRC takes column sums of each tensor, as a matrix of 512 8-byte columns.
+    For speed, a tensor enters the CRC by its column sums, as a matrix with 512 columns of 8 bytes.
     """
     crc = 0
     for name, value in sorted(metadata.items()):

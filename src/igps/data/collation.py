@@ -18,7 +18,7 @@ from igps.signature.signature import Samples, Signature
 def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mesh] | None = None) -> SignatureBatch:
     """Pad Signatures and collate them to a batch.
 
-    The default `collate_fn` of a `DataLoader` does the same, also for Signatures inside of tuples or dictionaries. In a
+    The default `collate_fn` of a `DataLoader` does the same, also for Signatures inside tuples or dictionaries. In a
     worker process of a DataLoader, the batch lies in shared memory.
 
     Example:
@@ -44,13 +44,13 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     labelled = [x if isinstance(x, LabelledSignature) else LabelledSignature(x, -1, x.name) for x in items]
     signatures = [item.signature for item in labelled]
     n_eigenpairs = max(len(s.eigenvalues) for s in signatures)
-    # Padded by infinity, so that every spectral weight of the padding is zero
-    padding = [(0, n_eigenpairs - len(s.eigenvalues)) for s in signatures]
     columns: list[list[Any]] = [
-        [np.pad(s.eigenvalues, n, constant_values=np.inf) for s, n in zip(signatures, padding, strict=True)]
+        # Padded by infinity, so that every spectral weight of the padding is zero
+        [np.pad(s.eigenvalues, (0, n_eigenpairs - len(s.eigenvalues)), constant_values=np.inf) for s in signatures],
+        [np.float64(s.area) for s in signatures],
+        [np.float64(s.volume) for s in signatures],
+        [np.int64(item.label) for item in labelled],
     ]
-    columns += [[np.float64(getattr(s, name)) for s in signatures] for name in ("area", "volume")]
-    columns.append([np.int64(item.label) for item in labelled])
     samples_by_kind = [[s.interior for s in signatures], [s.surface for s in signatures]]
     for samples in samples_by_kind:
         columns += _sample_columns(samples)

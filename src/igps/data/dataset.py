@@ -100,8 +100,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         self.config, self.reading = config.resolved(), reading
         self.pipeline = SignaturePipeline(self.config, reading, directory, sources, pre_transform, meshes)
         self.transform = transform
-        # Cache entries that `precompute` found; Signatures that replace the cache, and the index of each body in them
-        self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)
+        self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)  # known cache entries
+        # Signatures that are used instead of the cache, and the index of each body in them
         self._loaded: CollectionFile | list[Signature] | None = None
         self._loaded_indices: tuple[int, ...] = tuple(range(len(self.bodies)))
 
@@ -218,12 +218,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
         Signatures that are not cached are computed. If given, `change` is applied to each; `FewerSamples` saves memory.
         """
-        chosen = copy.copy(self)
-        chosen._loaded = [copy.deepcopy(s if change is None else change(s)) for s in self.signatures()]
+        dataset = copy.copy(self)
+        dataset._loaded = [copy.deepcopy(s if change is None else change(s)) for s in self.signatures()]
         if change is not None:  # the cache entries no longer belong to the Signatures
-            chosen._hits = (None,) * len(self)
-        chosen._loaded_indices = tuple(range(len(self)))
-        return chosen
+            dataset._hits = (None,) * len(self)
+        dataset._loaded_indices = tuple(range(len(self)))
+        return dataset
 
     def to_file(self, path: str | Path) -> None:
         """Write all Signatures, before `transform`, to a file that `from_file` reads without the meshes.

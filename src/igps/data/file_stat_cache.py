@@ -21,12 +21,12 @@ logger = logging.getLogger(__name__)
 
 _FILE = "known_files.sqlite"
 _LOCK_TIMEOUT = 30.0  # seconds; a writer holds the lock of the database for milliseconds
-# Nanoseconds. Younger files are not recorded, because they may change again without a change of their time stamps
-_YOUNG = 2 * 10**9
+MIN_AGE = 2 * 10**9  # nanoseconds; a file that was changed more recently may change again without a new time stamp
 _TABLE = (
     "CREATE TABLE IF NOT EXISTS body (pipeline TEXT, path TEXT, part TEXT, size INTEGER, mtime INTEGER, ctime INTEGER, "
     "key TEXT, bytes INTEGER, notes TEXT, PRIMARY KEY (pipeline, path, part)) WITHOUT ROWID"
 )
+_QUERY = "SELECT size, mtime, ctime, key, bytes, notes FROM body WHERE pipeline = ? AND path = ? AND part = ?"
 
 
 class FileStatCache:
@@ -40,7 +40,7 @@ class FileStatCache:
         self._path = pipeline.cache_dir / _FILE
         tag = pipeline.pre_transform.cache_tag if pipeline.pre_transform else None
         fields = [pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION, tag]
-        fields += [pipeline.reading.names] if pipeline.reading.names else []  # another table may have the same stamp
+        fields += [pipeline.reading.names] if pipeline.reading.names else []  # tables of names may have equal stamps
         self._pipeline_id = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:32]
         # A transform may depend on attributes, whose sources can change while the file of the body does not
         self._is_enabled = not (pipeline.attributes and pipeline.pre_transform)
@@ -54,11 +54,7 @@ class FileStatCache:
         current_stamp = lru_cache(maxsize=1)(lambda path: stamp_of(*files_read(path, self._pipeline.reading)))
         with self._tolerate_database_errors(), contextlib.closing(self._database()) as database:
             for body in bodies:
-                row = database.execute(
-                    "SELECT size, mtime, ctime, key, bytes, notes FROM body "
-                    "WHERE pipeline = ? AND path = ? AND part = ?",
-                    (self._pipeline_id, *_row_key(body)),
-                ).fetchone()
+                row = database.execute(_QUERY, (self._pipeline_id, *_row_key(body))).fetchone()
                 if row is None:
                     continue
                 *stamp, key, n_bytes, notes = row
@@ -71,12 +67,12 @@ class FileStatCache:
         return hits
 
     def remember(self, hits: Mapping[BodyRef, CacheHit]) -> None:
-        """Record the cache entries of bodies, except for files that changed just now."""
+        """Record the cache entries of bodies, except for files that were changed just now."""
         now = time.time_ns()
         rows = [
             (self._pipeline_id, *_row_key(body), *hit.stamp, hit.key, hit.n_bytes, json.dumps(hit.notes))
             for body, hit in hits.items()
-            if now - max(hit.stamp[1:]) > _YOUNG
+            if now - max(hit.stamp[1:]) > MIN_AGE
         ]
         if rows and self._is_enabled:
             with self._tolerate_database_errors(), contextlib.closing(self._database()) as database, database:

@@ -24,9 +24,8 @@ from igps.mesh.mesh import MeshError
 logger = logging.getLogger(__name__)
 
 _RECORDS_PER_WRITE = 1000  # to the database of `FileStatCache`
-# Bodies of one job. The file is read again for each job, and the results of a job arrive together
-_MAX_BODIES_PER_JOB = 64
-_SHARED_WITHIN = 60.0  # seconds until a shared file system shows a file that another machine wrote
+_MAX_BODIES_PER_JOB = 64  # each job reads the file again, and its results arrive together
+_MAX_DELAY = 60.0  # seconds until a shared file system shows a file that another machine wrote
 
 
 @dataclass(frozen=True)
@@ -84,14 +83,9 @@ def fill(
 
 
 def find_cached(pipeline: SignaturePipeline, bodies: Bodies, read_files: bool = True) -> list[CacheHit | None]:
-    """Return the cache entry of each body, None where there is none.
-
-    Files that are new or have changed since the last run are read to compute their keys. If not `read_files`, their
-    bodies have no entry.
-    """
+    """Return the cache entry of each body, or None. Files that are new or changed are read only if `read_files`."""
     records = FileStatCache(pipeline)
-    ready = records.ready(bodies)
-    hits = [ready.get(body) for body in bodies]
+    hits = list(map(records.ready(bodies).get, bodies))
     new: dict[BodyRef, CacheHit] = {}
     for group in group_by_file(bodies, (i for i, hit in enumerate(hits) if hit is None and read_files)):
         with contextlib.suppress(MeshError):  # which the computation reports
@@ -103,15 +97,9 @@ def find_cached(pipeline: SignaturePipeline, bodies: Bodies, read_files: bool = 
 
 
 def compute(
-    pipeline: SignaturePipeline,
-    bodies: Bodies,
-    indices: Sequence[int],
-    *,
-    n_workers: int | None,
-    executor: Executor | None,
-    limits: Limits,
-    max_per_job: int | None = None,
-) -> Generator[tuple[int, CacheHit | Failed], None, None]:
+    pipeline: SignaturePipeline, bodies: Bodies, indices: Sequence[int], *, n_workers: int | None,
+    executor: Executor | None, limits: Limits, max_per_job: int | None = None,
+) -> Generator[tuple[int, CacheHit | Failed], None, None]:  # fmt: skip
     """Compute Signatures into the cache, and yield the index and the cache entry or failure of each body.
 
     A job computes several bodies of one file, which it reads once. If the process of a job dies, each of its bodies is
@@ -125,8 +113,7 @@ def compute(
     function: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     if executor is not None:  # its workers may run in another folder, so all paths must be absolute
         function = partial(fill_elsewhere, replace(pipeline, cache_dir=pipeline.cache_dir.absolute()).fill, version())
-        in_memory = pipeline.meshes  # bodies without a file
-        jobs = [[b if b in in_memory else replace(b, path=b.path.absolute()) for b in job] for job in jobs]
+        jobs = [[b if b in pipeline.meshes else replace(b, path=b.path.absolute()) for b in job] for job in jobs]
     lost: list[int] = []
     results = run(function, jobs, n_workers=n_workers, executor=executor, limits=limits)
     with contextlib.closing(results):
@@ -145,7 +132,7 @@ def compute(
 def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
     """Wait until the file that a worker wrote appears in the cache; raise a MachineError if it does not."""
     path = SignatureCache(pipeline.cache_dir).path(hit.key)
-    deadline = time.monotonic() + _SHARED_WITHIN
+    deadline = time.monotonic() + _MAX_DELAY
     while not path.exists():
         if time.monotonic() > deadline:
             cause = f"{pipeline.cache_dir}: the workers' signatures do not appear there"

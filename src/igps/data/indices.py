@@ -14,7 +14,7 @@ Indices = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDAr
 
 
 def scalar_index(index: Any) -> Any:
-    """Return the integer in an array without dimensions, such as an element of a permutation, or else the index."""
+    """Convert an array without dimensions, such as an element of a permutation, to an integer; return others as is."""
     return operator.index(index) if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 else index
 
 

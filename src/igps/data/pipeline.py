@@ -62,7 +62,7 @@ class CacheHit:
 
 @dataclass(frozen=True)
 class SignaturePipeline:
-    """Computation of the Signatures of bodies through a cache; small, because it is sent to workers."""
+    """Computation of the Signatures of bodies through a cache. It is sent to workers, so it holds little data."""
 
     config: SignatureConfig
     reading: LoadOptions

@@ -202,14 +202,15 @@ def bodies_of(
 def file_and_part(path: Path) -> tuple[Path, str | None]:
     """Split ``FILE#PART``; the part is None if the whole path exists, or if no file precedes a "#"."""
     name = str(path)
-    for i in [] if os.path.exists(path) else [j for j, letter in enumerate(name) if letter == "#"]:
+    marks = [] if os.path.exists(path) else [i for i, letter in enumerate(name) if letter == "#"]
+    for i in marks:
         if name[i + 1 :] and (file := Path(name[:i])).is_file():
             return file, name[i + 1 :]
     return path, None
 
 
 def is_number(value: str | float | None) -> bool:
-    """Return whether a value is missing or a finite number. 01_02, which Python reads as a number, is none."""
+    """Return whether a value is missing or a finite number, without the underscores that Python allows (01_02)."""
     try:
         return value is None or ("_" not in str(value) and math.isfinite(float(value)))
     except ValueError:

@@ -33,7 +33,7 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
     """
     _check(n_validation, n_train)
     generator = torch.Generator().manual_seed(seed)
-    parts: tuple[list[int], list[int], list[int]] = ([], [], [])
+    train, validation, test = list[int](), list[int](), list[int]()
     for label in labels.unique().tolist():
         members = torch.nonzero(labels == label).flatten()
         n_fit = _count(n_train, len(members), 3, 2)
@@ -43,11 +43,10 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
             raise ValueError(f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}.")
         n_held_out = _count(n_validation, n_fit, 2)
         shuffled = members[torch.randperm(len(members), generator=generator)].tolist()
-        chosen = shuffled[n_held_out:n_fit], shuffled[:n_held_out], shuffled[n_fit:]
-        for part, indices in zip(parts, chosen, strict=True):
-            part.extend(indices)
-    train, validation, test = (tuple(sorted(part)) for part in parts)
-    return Split(train, validation, test)
+        train += shuffled[n_held_out:n_fit]
+        validation += shuffled[:n_held_out]
+        test += shuffled[n_fit:]
+    return Split(*(tuple(sorted(part)) for part in (train, validation, test)))
 
 
 def split_unseen(

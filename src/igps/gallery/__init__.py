@@ -1,1 +1,1 @@
-"""Collections that are asked again and again: kept, searched, and freed of duplicates."""
+"""Databases of described bodies: storage, search, and detection of duplicates."""

@@ -18,10 +18,8 @@ from igps._arrays import Floats, Integers
 from igps.mesh.surface import area_vectors, unit
 
 # Lengths are over √area.
-# Weight of normals in the search for the nearest sample, so that the two sides of a thin sheet are not confused
-_NORMAL_WEIGHT = 0.1
-# Distance within which the nearest sample may lie aside of a sample, in steps between neighbouring samples
-_GAP = 2.5
+_NORMAL_WEIGHT = 0.1  # of normals in the search for the nearest sample, to tell apart the two sides of a thin sheet
+_GAP = 2.5  # lateral distance of the nearest sample that does not count, in steps between neighbouring samples
 # Principal axes whose extents differ by a smaller factor are ambiguous: starts from other rotations are tried as well
 _AMBIGUITY = 1.1
 _N_ROTATIONS = 300
@@ -29,13 +27,12 @@ _N_SCORED, _N_FITTED = 60, 250  # samples
 _N_STARTS, _N_COARSE_STEPS, _N_FINE_STEPS, _N_LAST_STEPS = 12, 6, 4, 10
 # Poses that fit up to this factor worse than the best by samples alone are fitted to the surface itself
 _CLOSE_FIT = 1.5
-# After the fine steps the limit for hopeless distances is divided by this. If it was 0.03, 99 % of copies of generated
-# bodies are within 0.006 then, well below 0.02; the others are found from other starts.
+# After the fine steps, `hopeless` is divided by this factor. With 0.03, it is then 0.02, while 99 % of the copies of
+# generated bodies are within 0.006; the others are found from other starts.
 _FINE_FACTOR = 1.5
-# Upper bound of what the last steps gain; they brought copies of generated bodies nearer by up to 0.0001
-_LAST_GAIN = 0.004
+_LAST_GAIN = 0.004  # upper bound of the decrease of a distance by the last steps; 0.0001 for copies of generated bodies
 _PATCH_SIZE = 10  # neighbouring samples whose offsets are averaged
-MOST_SCALED = math.log(1.1)
+MAX_LOG_SCALE = math.log(1.1)
 """Largest logarithm of the scale of an alignment."""
 
 
@@ -54,10 +51,8 @@ class SurfaceSamples:
     def of(cls, points: Floats, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
         """Normalise points (P, 3), a length, with outward normals (P, 3), by the area of the surface, a length²."""
         if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
-            raise ValueError(
-                f"points, normals: expected both (P, 3) with P ≥ 4, got {tuple(points.shape)} and "
-                f"{tuple(normals.shape)}."
-            )
+            shapes = f"{tuple(points.shape)} and {tuple(normals.shape)}"
+            raise ValueError(f"points, normals: expected both (P, 3) with P ≥ 4, got {shapes}.")
         return cls((points - points.mean(axis=0)) / math.sqrt(area), np.asarray(normals, dtype=np.float64))
 
     @cached_property
@@ -76,7 +71,7 @@ class SurfaceSamples:
         return 1 / math.sqrt(len(self.points))
 
     def nearest(self, samples: SurfaceSamples) -> tuple[Floats, Floats]:
-        """Return the nearest of these samples to each of other samples (P), with similar normals: points, normals."""
+        """Return points and normals of these samples: the nearest, with similar normals, to each of the given ones."""
         nearest = self.tree.query(_with_normals(samples))[1]
         return self.points[nearest], self.normals[nearest]
 
@@ -101,8 +96,8 @@ class TriangleSurface:
 
 
 def surface_distance(
-    one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, hopeless: float = math.inf,
-    most: float = math.inf, patch: int = _PATCH_SIZE,
+    one: SurfaceSamples, other: SurfaceSamples, *, stop_at: float = 0.0, hopeless: float = math.inf,
+    max_distance: float = math.inf, patch_size: int = _PATCH_SIZE,
 ) -> float:  # fmt: skip
     """Return the distance of two surfaces after alignment, over √area: root mean square over patches, both ways.
 
@@ -113,18 +108,18 @@ def surface_distance(
     Offsets are averaged over patches of ten neighbours, a twentieth of √area across. Relief that a coarse mesh lacks,
     and the roughness of triangles, have offsets of either sign and cancel; another shape or pose moves whole patches.
 
-    The result is symmetric except for where the search stops.
+    The result is symmetric, except that the search may stop at different distances.
 
     Args:
         one: samples of the surface that is moved.
         other: samples of the other surface.
-        enough: distance at which the search stops.
+        stop_at: distance at which the search stops.
         hopeless: distance beyond which the result need not be precise. If a subset of the samples is farther after the
             coarse steps, the other surface itself is not loaded; if the subset is farther than two thirds of
             `hopeless` after the fine steps, the remaining samples are not used.
-        most: distance beyond which the result is only a lower bound, for which one direction may be enough.
-        patch: samples in a patch. With 1, for surfaces known to be the same, lost relief counts, and the largest offset
-            is returned instead of the root mean square.
+        max_distance: distance beyond which the result is only a lower bound, for which one direction may be enough.
+        patch_size: samples in a patch. With 1, for surfaces known to be the same, lost relief counts, and the largest
+            offset is returned instead of the root mean square.
     """
     best = math.inf
     is_ambiguous = min(_min_extent_ratio(one), _min_extent_ratio(other)) < _AMBIGUITY
@@ -140,46 +135,46 @@ def surface_distance(
             fine = [_fit(samples, finest, alignment, _N_FINE_STEPS) for alignment in close]
             distance, alignment = min(fine, key=itemgetter(0))
             if distance <= hopeless / _FINE_FACTOR:
-                distance = _two_way_distance(one, other, alignment, patch, most)
+                distance = _two_way_distance(one, other, alignment, patch_size, max_distance)
         best = min(best, distance)
         # A body may nearly be its own mirror image, so a small distance need not be the smallest. For surfaces known to
         # be the same, unambiguous axes are enough.
-        if best <= enough or ((best > hopeless or patch == 1) and not is_ambiguous):
+        if best <= stop_at or ((best > hopeless or patch_size == 1) and not is_ambiguous):
             break
     return best
 
 
 def offset_in_place(samples: SurfaceSamples, surface: TriangleSurface) -> float:
     """Return the root mean square over patches, as in `surface_distance`, without alignment."""
-    return math.sqrt(_mean_square(samples, surface))
+    return math.sqrt(_mean_square(samples, surface, _PATCH_SIZE))
 
 
 def _two_way_distance(
-    one: SurfaceSamples, other: SurfaceSamples, alignment: _Alignment, patch: int, most: float
+    one: SurfaceSamples, other: SurfaceSamples, alignment: _Alignment, patch_size: int, max_distance: float
 ) -> float:
-    """Return the root mean square over the patches of both surfaces, or a lower bound of it above `most`."""
+    """Return the root mean square over the patches of both surfaces, or a lower bound of it above `max_distance`."""
     squares = []
     for samples, target, initial in ((one, other, alignment), (other, one, alignment.inverse())):
         finest = target if target.surface is None else target.surface()
-        if most < math.inf:
-            bound = math.sqrt(_mean_square(initial(samples), finest, patch) / initial.scale) - _LAST_GAIN
-            if bound > most:
+        if max_distance < math.inf:
+            bound = math.sqrt(_mean_square(initial(samples), finest, patch_size) / initial.scale) - _LAST_GAIN
+            if bound > max_distance:
                 return bound
         _, fitted = _fit(samples, finest, initial, _N_LAST_STEPS)
         # In the unit of the geometric mean of both, so that neither is favoured
-        squares.append(_mean_square(fitted(samples), finest, patch) / fitted.scale)
-        if sum(squares) / 2 > most**2:
+        squares.append(_mean_square(fitted(samples), finest, patch_size) / fitted.scale)
+        if sum(squares) / 2 > max_distance**2:
             break
     return math.sqrt(sum(squares) / 2)
 
 
-def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch: int = _PATCH_SIZE) -> float:
+def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch_size: int) -> float:
     """Return the mean square offset of patches, or the largest square offset if a patch is one sample."""
-    among = np.arange(1, min(patch, len(samples.points)) + 1)
-    neighbours = samples.tree.query(_with_normals(samples), k=among)[1]
+    ranks = np.arange(1, min(patch_size, len(samples.points)) + 1)
+    neighbours = samples.tree.query(_with_normals(samples), k=ranks)[1]
     means = _offsets(samples, target)[neighbours].mean(axis=1)
     squares = np.einsum("ni,ni->n", means, means)
-    return float(squares.max() if patch == 1 else squares.mean())
+    return float(squares.max() if patch_size == 1 else squares.mean())
 
 
 def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) -> Floats:
@@ -219,7 +214,7 @@ class _Alignment:
     def then(self, step: Floats) -> _Alignment:
         """Compose with a small step (7,): a rotation vector, a shift, and the logarithm of a scale."""
         rotation = Rotation.from_rotvec(step[:3]).as_matrix()
-        log_scale = np.clip(math.log(self.scale) + step[6], -MOST_SCALED, MOST_SCALED)
+        log_scale = np.clip(math.log(self.scale) + step[6], -MAX_LOG_SCALE, MAX_LOG_SCALE)
         factor = math.exp(log_scale) / self.scale
         shift = factor * rotation @ np.broadcast_to(self.shift, 3) + step[3:6]
         return _Alignment(rotation @ self.rotation, shift, math.exp(log_scale))

@@ -1,13 +1,13 @@
 """Compressed short vectors, by which the nearest few hundred of a million rows are found in milliseconds.
 
-The short vector of a description (see `VectorMap`) is rotated at random and encoded by RaBitQ (Gao and Long 2024): the
-number of the nearest centroid, and one bit for each component of the difference r from it, its sign. Inner products are
-estimated as ⟨q, r⟩ ≈ |r|² Σ qᵢ sign rᵢ / Σ |rᵢ|. The components of a query q are rounded to four bits, so that
-inner products become counts of bits.
+The short vector of a description (see `VectorMap`) is rotated at random and encoded by RaBitQ (Gao and Long 2024). The
+code is the number of the nearest centroid and the signs of the components of r, the difference from the centroid. Inner
+products are estimated as ⟨q, r⟩ ≈ |r|² Σ qᵢ sign rᵢ / Σ |rᵢ|. The components of a query q are rounded to four bits, so
+that inner products become counts of bits.
 
 Other engines were measured. On a million rows LanceDB 0.40's IVF_SQ took up to twice the processor time, and its IVF_RQ
-found 60 % of the nearest ten after rows had been added. Faiss takes 3.3 ms in place of 2.3, and its wheels end the
-process on macOS where PyTorch is loaded, too (pytorch/pytorch#149201).
+found 60 % of the nearest ten after rows had been added. Faiss takes 3.3 ms instead of 2.3, and on macOS its wheels
+crash a process that loads PyTorch, too (pytorch/pytorch#149201).
 """
 
 import warnings
@@ -29,7 +29,7 @@ _N_BITS = 256  # of the code of a rotated vector
 _N_QUERY_BITS = 4  # of each component of a query
 _MAX_CENTROIDS = 1024
 _KMEANS_ROUNDS = 5
-# At least this share of the codes is compared, and at least this many codes for each row that is asked for
+# At least this share of the codes is compared, and at least this many codes for each requested row
 _MIN_SHARE, _CODES_PER_RESULT = 0.25, 64
 _BLOCK_SIZE = 1024  # codes that are compared at once
 _TINY = np.finfo(np.float32).tiny
@@ -155,7 +155,7 @@ def _lowest(values: Singles, n: int) -> Integers:
 
 @compiled(inline="always")
 def _popcount(word: np.uint64) -> np.uint64:
-    """Count the bits that are set. LLVM makes one instruction of this form."""
+    """Count the bits that are set. LLVM compiles this form to one instruction."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -167,18 +167,14 @@ def _estimate(
     signs: Words, square: Singles, scale: Singles, starts: Integers, ends: Integers, planes: Words, step: Singles,
     to_centroid: Singles, distances: Singles,
 ) -> None:  # fmt: skip
-    """Write the estimated squared distances between a query and codes into `distances` (N,), for some centroids.
+    """Write the estimated squared distances between a query and the codes of C centroids into `distances` (N,).
 
     Args:
-        signs: (4, N) the bits of the codes, in words.
-        square: (N,) as in `CODE`.
-        scale: (N,) as in `CODE`.
-        starts: (C,) position of the first code of each centroid.
-        ends: (C,) position after its last code.
-        planes: (C, 4, 4) for each bit, four words of the query's difference from the centroid.
+        signs, square, scale: (4, N) words, (N,) and (N,), see `CODE`.
+        starts, ends: (C,) positions of the first code of each centroid, and after its last.
+        planes: (C, 4, 4) for each of four bits, four words of the query's rounded difference from each centroid.
         step: (C,) size of a unit of the rounded difference.
         to_centroid: (C,) squared length of the difference.
-        distances: output.
     """
     for centroid in range(len(ends)):
         for start in range(starts[centroid], ends[centroid], _BLOCK_SIZE):
@@ -196,5 +192,5 @@ def _estimate(
                     )
             squares, scales, estimates = square[block], scale[block], distances[block]
             for i in range(len(n_different)):
-                product = step[centroid] * np.float32(1920 - np.int64(n_different[i]))
+                product = step[centroid] * np.float32(1920 - np.int64(n_different[i]))  # 1920 is 256 times 7.5
                 estimates[i] = to_centroid[centroid] + squares[i] - 2 * scales[i] * product

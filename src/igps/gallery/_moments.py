@@ -10,24 +10,23 @@ import torch
 from torch import Tensor
 
 from igps._arrays import Floats, Integers
-from igps.gallery._alignment import MOST_SCALED
+from igps.gallery._alignment import MAX_LOG_SCALE
 from igps.mesh.surface import area_vectors, directed_edges, face_areas
 
 # Quadrature with six nodes, exact for polynomials of degree four on a triangle (Dunavant 1985)
 _INNER, _OUTER = 0.445948490915965, 0.091576213509771
 _NODES = np.concatenate([np.full((3, 3), x) + np.eye(3) * (1 - 3 * x) for x in (_INNER, _OUTER)])  # barycentric
 _WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
-# Second-order terms over first-order terms: a move of √area / 100 where the radius of curvature is √area / 3
-_SECOND_ORDER = 0.03
+_SECOND_ORDER = 0.03  # over first-order terms: a move of √area / 100 where the radius of curvature is √area / 3
 
 
-def moments(vertices: Floats, faces: Integers, most: float) -> Floats:
+def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
     """Return six moments of a body, in units of √area, and the map from their differences to a distance: (7, 6).
 
     The first row has the logarithms of the volume V, of the second central moments along the principal axes, and of
     ∫ |x|⁴ dV, which all grow with scale or thickness, and |∫ x |x|² dV| / ((∫ |x|² dV)^(3/2) / √V). The other rows are
-    the map. It holds for moves up to `most`, and ignores a scaling by up to a tenth. It is zero, and the bound with it,
-    if the moments are not those of a solid. Holes of an open surface are closed by cones over its centroid.
+    the map. It holds for moves up to `max_move`, and ignores a scaling by up to a tenth. If the moments are not those
+    of a solid, the map and thus the bound are zero. Holes of an open surface are closed by cones over its centroid.
     """
     start, end = directed_edges(faces)
     is_open = ~np.isin(start * len(vertices) + end, end * len(vertices) + start)
@@ -58,12 +57,12 @@ def moments(vertices: Floats, faces: Integers, most: float) -> Floats:
     weights = np.outer(np.linalg.norm(vectors, axis=1), _WEIGHTS).ravel()
     gram = (weights[:, None] * h).T @ h
     gram[np.diag_indices(6)] *= 1 + _SECOND_ORDER**2
-    scaling = np.array([3, 5, 5, 5, 7, 0]) * MOST_SCALED / most
+    scaling = np.array([3, 5, 5, 5, 7, 0]) * MAX_LOG_SCALE / max_move
     to_moves = np.linalg.inv(np.linalg.cholesky(gram + np.outer(scaling, scaling)))
     return np.vstack([[*np.log(even), scale * length], to_moves])
 
 
-def least_distances(one: Tensor, other: Tensor) -> Tensor:
+def distance_bounds(one: Tensor, other: Tensor) -> Tensor:
     """Return lower bounds (M, N) of the distances of surfaces, over √area, from `moments` (M, 7, 6) and (N, 7, 6)."""
 
     def bounds(own: Tensor, others: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ _FIRST_TOP = 32  # neighbours in a gallery that are searched first; four times a
 # Bodies of one size differ by less in the logarithm of √area; levels of detail of a body differ by up to half of this
 _SIZE_TOLERANCE = 0.05
 
-NearPairs = Iterator[tuple[int, int, float]]
+NearPairs = Iterator[tuple[int, int, float]]  # indices i < j and distance
 
 
 def near_pairs(descriptions: Tensor, distance: Distance, limit: float, progress: bool) -> NearPairs:
@@ -35,17 +35,17 @@ def near_pairs(descriptions: Tensor, distance: Distance, limit: float, progress:
 
 
 def near_in_gallery(gallery: Gallery, limit: float, progress: bool) -> NearPairs:
-    """Yield such pairs of the bodies of a gallery, numbered in order of their ids."""
+    """Do the same as `near_pairs` for the bodies of a gallery; i and j are positions in its sorted ids."""
     numbers = {name: i for i, name in enumerate(sorted(row["id"] for row in gallery.rows("id")))}
     with tqdm(desc="compared", total=len(gallery), disable=not progress) as bar:
         for batch in gallery.table.batches():
             for description, row in zip(*gallery.table.decoded(batch), strict=True):
                 top = min(_FIRST_TOP, len(gallery))
-                found, distances, _ = gallery.search(description[None], top=top)
+                neighbours, distances, _ = gallery.search(description[None], top=top)
                 while float(distances[-1]) <= limit and top < len(gallery):
                     top = min(4 * top, len(gallery))
-                    found, distances, _ = gallery.search(description[None], top=top)
-                for other, distance in zip(found, distances.tolist(), strict=True):
+                    neighbours, distances, _ = gallery.search(description[None], top=top)
+                for other, distance in zip(neighbours, distances.tolist(), strict=True):
                     if numbers[row["id"]] < numbers[other["id"]] and distance <= limit:
                         yield numbers[row["id"]], numbers[other["id"]], distance
                 bar.update()

@@ -33,7 +33,8 @@ _BODIES, _MAP, _ABOUT = "bodies", "map-", b"gallery"
 _MIN_ROWS_FOR_CODES = 4096  # the rows of a smaller table are all compared
 _REFIT_FACTOR = 8  # the encoder is fitted again whenever the table has grown by this factor
 _INDEX_INTERVAL = 32  # versions after which new rows are added to the indices of columns
-_MAX_SINGLE, _BATCH_SIZE = 1024, 1024  # longer descriptions are stored in half precision; rows in a batch
+_MAX_SINGLE = 1024  # numbers; longer descriptions are stored in half precision
+_BATCH_SIZE = 1024  # rows
 _ARROW_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bytes: pa.binary()}
 
 
@@ -80,7 +81,7 @@ class BodyTable:
     def _request(self, where: str | None, *columns: str) -> Any:
         request = self.table.search().select([*columns])
         if where is not None:
-            # LanceDB ignores text after a complete condition. Within a cast it has to parse the whole of it.
+            # LanceDB ignores text after a complete condition, but inside a cast it has to parse all of it
             self.table.search().where(f"CAST({where}\nAS BOOLEAN)").explain_plan()
             request = request.where(where)
         return request.with_row_id("_rowid" in columns)
@@ -113,10 +114,7 @@ class BodyTable:
             return self.table.take_row_ids(np.asarray(row_ids).tolist()).with_row_id().select([*columns]).to_arrow()
 
     def add(self, descriptions: Tensor, rows: Sequence[Row], further: Mapping[str, type]) -> None:
-        """Add rows with distinct ids; they replace rows with the same ids.
-
-        `further` maps the names of columns other than `KNOWN` to their types.
-        """
+        """Add rows with distinct ids, in place of rows of these ids. `further` has types of columns beside `KNOWN`."""
         with self.changing():
             self.check_shape(descriptions)
             n_before = len(self)
@@ -154,8 +152,8 @@ class BodyTable:
                 raise ValueError(f"{name}: expected numbers as in {self.path}, got text. Correct the labels.")
 
     def check_shape(self, descriptions: Tensor) -> None:
-        if (found := tuple(descriptions.shape[1:])) != self.shape:
-            raise ValueError(f"descriptions: expected shape {self.shape} as in {self.path}, got {found}.")
+        if (shape := tuple(descriptions.shape[1:])) != self.shape:
+            raise ValueError(f"descriptions: expected shape {self.shape} as in {self.path}, got {shape}.")
 
     def _translated_errors(self, where: str | None) -> contextlib.AbstractContextManager[None]:
         if where is None:
@@ -185,14 +183,14 @@ def write(
         first.append(batch)
     if not first:
         raise ValueError("descriptions: expected at least one for the gallery, got none.")
-    sample = torch.cat([some for some, _ in first])
+    sample = torch.cat([descriptions for descriptions, _ in first])
     head = {"about": dict(about), "shape": list(sample.shape[1:]), "searched_by": searched_by}
     with write_lock(path):
         _index(_overwrite(path, head, chain(first, batches), {**KNOWN, **further}, sample))
 
 
 def _overwrite(path: Path, head: Row, batches: Iterable[Batch], columns: Mapping[str, type], sample: Tensor) -> Any:
-    """Write a version with these rows alone, under the lock; a large sample has an encoder fitted to it."""
+    """Write a version with only these rows, under the lock; fit an encoder to the sample if it is large enough."""
     coder, name = None, None
     if head["searched_by"] and len(sample) >= _MIN_ROWS_FOR_CODES:
         coder = Coder.fit(sample.flatten(1).float().numpy(), head["searched_by"])
@@ -226,7 +224,7 @@ def _encoded(batch: Batch, columns: Mapping[str, type], coder: Coder | None) -> 
     descriptions, rows = batch
     values = descriptions.flatten(1).cpu().float().numpy()
     if not np.isfinite(values).all():
-        raise ValueError("descriptions: expected finite numbers, got others. Look for the mesh that gives them.")
+        raise ValueError("descriptions: expected finite numbers, got NaN or infinity. Find the mesh that causes them.")
     metadata = {name: pa.array([None if row.get(name) is None else kind(row[name]) for row in rows], _ARROW_TYPES[kind])
                 for name, kind in columns.items()}  # fmt: skip
     is_long = values.shape[1] > _MAX_SINGLE
@@ -245,5 +243,5 @@ def exists(path: Path) -> bool:
 def write_lock(path: Path) -> FileLock:
     """Lock a gallery for other writers. The operating system releases the lock of a killed process."""
     path.mkdir(parents=True, exist_ok=True)
-    # Polled often: a process that writes again and again releases the lock for a millisecond only.
+    # Polled often, because a process that writes repeatedly releases the lock only for a millisecond
     return FileLock(path / "lock", is_singleton=True, poll_interval=0.001)

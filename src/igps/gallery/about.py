@@ -1,4 +1,4 @@
-"""Metadata of a gallery: the columns of each body, and how descriptions were made, so that only like is compared."""
+"""Metadata of a gallery: columns, and the parameters of its descriptions, which must be equal to compare them."""
 
 import contextlib
 import json
@@ -17,8 +17,7 @@ from igps.mesh.options import LoadOptions
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
 
-# Place in LanceDB's source code, at the end of its error messages
-_SOURCE_LOCATION = re.compile(r", /\S+\.rs:.*")
+_SOURCE_LOCATION = re.compile(r", /\S+\.rs:.*")  # at the end of LanceDB's error messages
 
 KNOWN: dict[str, type] = {"id": str, "name": str, "class": str, "file": str, "part": str, "checksum": str,
                           "bytes": int, "modified": int, "area": float, "volume": float, "unit": str,
@@ -51,8 +50,8 @@ def check_alike(path: str | Path, found: Mapping[str, Any], wanted: Mapping[str,
     for name, value in _flat(json.loads(json.dumps(dict(wanted)))).items():
         if known.get(name) != value:
             raise ValueError(
-                f"{path}: the gallery is of another {name}: it has {_short(known.get(name))}, not {_short(value)}. "
-                "Query it with its own, or build another."
+                f"{path}: expected a gallery with {name} {_short(value)}, got {_short(known.get(name))}. Use the "
+                "parameters of the gallery, or build another gallery."
             )
 
 
@@ -78,7 +77,7 @@ def engine_errors_as(sentence: str) -> Iterator[None]:
 
 
 def is_gallery(path: str | Path) -> bool:
-    """Whether a folder is a gallery, or an index of version 0.2.0, which `open_table` refuses."""
+    """Return whether a folder is a gallery, or an index of version 0.2.0, which `open_table` refuses."""
     return any((Path(path) / name).exists() for name in ("bodies.lance", MANIFEST))
 
 

@@ -29,9 +29,8 @@ LEVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, *(i / 10 for i in range(1,
 """Levels of the quantiles of distances that are stored."""
 
 FINEST = 1e-5
-"""Lower bound of a coarseness, over √area: 2,000 samples may miss the little of a surface that is not flat."""
+"""Lower bound of a coarseness, over √area: 2,000 samples may miss small parts of a surface that are not flat."""
 
-# Parameters of the Signatures that distances depend on
 _SIGNATURE_PARAMS = ("algorithm_version", "resolution", "min_samples", "n_surface_samples")
 
 
@@ -56,17 +55,17 @@ class Calibration:
     made_of: str  # the bodies that were measured, in words
     distances: Mapping[str, Sequence[float]]  # quantiles at `LEVELS` of the descriptor's distance, for each of `KINDS`
     n_pairs: Mapping[str, int]  # for each of `KINDS`
-    near: float  # descriptor's distance of candidates for copies: twice the largest between copies
-    same: Threshold  # largest `surface_distance` of copies at any level of detail
-    detail: Threshold  # largest ratio of `surface_distance` to the larger `coarseness` of two copies
-    pose: Threshold  # largest descriptor's distance of poses of one body
+    near: float  # limit of the descriptor's distance for candidates: twice the largest between copies
+    same: Threshold  # limit of `surface_distance` for copies at any level of detail
+    detail: Threshold  # limit, for copies, of the ratio of `surface_distance` to the larger `coarseness` of the two
+    pose: Threshold  # limit of the descriptor's distance for poses of one body
 
     def share_closer(self, kind: str, distance: float) -> float:
         """Return the share of the pairs of a kind that are closer than a distance, interpolated between quantiles."""
         quantiles = np.asarray(self.distances[kind])
         if distance < quantiles[0]:
             return 0.0
-        # Of equal quantiles the last level is returned: pairs at just this distance count as closer
+        # If quantiles are equal, the last of their levels is returned: pairs at exactly this distance count as closer
         return float(np.interp(distance, np.maximum.accumulate(quantiles), LEVELS))
 
     def words(self, distance: float) -> str:
@@ -79,10 +78,7 @@ class Calibration:
         return ", ".join(phrases)
 
     def limit(self, coarseness: float) -> float:
-        """Return the `surface_distance` up to which two bodies are copies, given the larger coarseness of the two.
-
-        See `igps.gallery.surfaces.Surfaces.coarseness`.
-        """
+        """Return the largest `surface_distance` of copies, given the larger `Surfaces.coarseness` of the two bodies."""
         return min(self.same.distance, self.detail.distance * max(coarseness, FINEST))
 
     def check(self, descriptor: str | Descriptor, module: Descriptor, config: SignatureConfig) -> None:
@@ -92,10 +88,8 @@ class Calibration:
             expected = f"expected {self.descriptor}, whose distances are calibrated, got {name}"
             raise ValueError(f"descriptor: {expected}. For a gallery, build it with --size ignore.")
         if fingerprint(module) != self.model:
-            raise ValueError(
-                f"{self.descriptor}: its calibration was made for other parameters. Make a new one with "
-                "training/calibrate.py."
-            )
+            remedy = "Make a new calibration with training/calibrate.py"
+            raise ValueError(f"{self.descriptor}: its calibration was made for other parameters. {remedy}.")
         params = calibration_params(config)
         for name, value in self.signatures.items():
             if params[name] != value:

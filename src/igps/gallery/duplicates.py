@@ -22,7 +22,7 @@ from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Size, keeps_size
 from igps.gallery._alignment import surface_distance
-from igps.gallery._moments import least_distances
+from igps.gallery._moments import distance_bounds
 from igps.gallery._near_pairs import NearPairs, near_in_gallery, near_pairs, of_one_size
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
@@ -31,7 +31,7 @@ from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 
 _BATCH_SIZE = 256  # pairs that are aligned at once
-# Candidates are pairs whose `least_distances` are below this many times the limit. The bound holds to first order only,
+# Candidates are pairs whose `distance_bounds` are below this many times the limit. The bounds hold to first order only,
 # and details that cancel in a distance of surfaces do not cancel in moments: copies reached 1.3 times the limit.
 _CANDIDATE_FACTOR = 2.0
 
@@ -62,23 +62,16 @@ class BodyDistance:
 
     distance: float  # by the descriptor
     surfaces: float  # of the aligned surfaces: root mean square over √area
-    limit: float  # of that distance, below which the bodies have the same shape, see `Surfaces.limit`
+    limit: float  # largest such distance of bodies of the same shape, see `Surfaces.limit`
     meaning: str  # of the descriptor's distance, in words
     same: bool  # whether the bodies have the same shape
 
 
 def duplicates(
-    source: SignatureDataset | Gallery,
-    descriptor: str | Descriptor = "pretrained",
-    *,
-    poses: bool = False,
-    size: Size = "auto",
-    tolerance: float = 0.0,
-    cache_dir: str | Path | None = None,
-    calibration: Calibration | None = None,
-    n_workers: int | None = None,
-    progress: bool = False,
-) -> Duplicates:
+    source: SignatureDataset | Gallery, descriptor: str | Descriptor = "pretrained", *, poses: bool = False,
+    size: Size = "auto", tolerance: float = 0.0, cache_dir: str | Path | None = None,
+    calibration: Calibration | None = None, n_workers: int | None = None, progress: bool = False,
+) -> Duplicates:  # fmt: skip
     """Find groups of files that show the same body in the same shape.
 
     Args:
@@ -87,7 +80,7 @@ def duplicates(
         descriptor: a calibrated descriptor; ignored for a gallery, which has its own.
         poses: whether other poses of a body count as the same body. Then only descriptions are compared, which finds
             more false pairs.
-        size: whether files of different size are different, see `keeps_size`.
+        size: whether bodies of different size are different, see `keeps_size`.
         tolerance: distance over √area, up to 0.02. Pairs of different bodies within it are returned as `nearly`; in a
             gallery only those with near descriptions.
         cache_dir: cache of Signatures for a gallery; the user's cache directory if None.
@@ -114,14 +107,14 @@ def duplicates(
         else:
             limit = max(calibration.same.distance, tolerance)
             moments, failures = Surfaces(source).moments(limit, n_workers, progress)
-            near = near_pairs(moments, least_distances, _CANDIDATE_FACTOR * limit, progress)
+            near = near_pairs(moments, distance_bounds, _CANDIDATE_FACTOR * limit, progress)
         dataset = source.usable(failures)
     if keeps_size(size, dataset.units())[0]:
         near = of_one_size(near, dataset)
     surfaces = None if poses else Surfaces(dataset, tolerance)
-    joined = _joined(near, surfaces, calibration, n_workers, progress)
+    joined = _join(near, surfaces, calibration, n_workers, progress)
     if surfaces is not None:
-        joined = _around_the_finest(joined, surfaces, calibration, n_workers, progress)
+        joined = _regroup(joined, surfaces, calibration, n_workers, progress)
         failures = [*failures, *surfaces.failures.values()]
     names, groups = dataset.bodies.names, _groups(joined)
     grades: dict[tuple[str, str], Grade] = {}
@@ -148,12 +141,12 @@ def duplicates(
     )
 
 
-def _joined(
+def _join(
     near: NearPairs, surfaces: Surfaces | None, calibration: Calibration, n_workers: int | None, progress: bool
 ) -> _Pairs:
-    """Return the candidate pairs that are the same, as a spanning forest: pairs of one group already are skipped.
+    """Return the candidate pairs that are the same, as a spanning forest: pairs that a group has already are skipped.
 
-    Pairs are compared by their surfaces; without `surfaces`, all candidates count as the same.
+    Pairs are compared by their surfaces; if `surfaces` is None, all candidates count as the same.
     """
     group = DisjointSet()
     joined: _Pairs = {}
@@ -173,7 +166,7 @@ def _joined(
     return joined
 
 
-def _around_the_finest(
+def _regroup(
     joined: _Pairs, surfaces: Surfaces, calibration: Calibration, n_workers: int | None, progress: bool
 ) -> _Pairs:
     """Split groups that a coarse file has merged, and return the pairs that form the new groups, with distances.
@@ -215,16 +208,13 @@ def _groups(joined: _Pairs) -> list[list[int]]:
 
 
 def body_distance(
-    dataset: SignatureDataset,
-    descriptor: str | Descriptor = "pretrained",
-    *,
-    calibration: Calibration | None = None,
-    progress: bool = False,
-) -> BodyDistance:
+    dataset: SignatureDataset, descriptor: str | Descriptor = "pretrained", *,
+    calibration: Calibration | None = None, progress: bool = False,
+) -> BodyDistance:  # fmt: skip
     """Return the distance between the two bodies of a dataset, and its meaning. For the arguments see `duplicates`.
 
     Raises:
-        ValueError: the dataset has not two bodies, or the calibration belongs to another descriptor.
+        ValueError: the dataset does not have two bodies, or the calibration belongs to another descriptor.
         MeshError: a mesh cannot be used.
     """
     if len(dataset) != 2:

@@ -66,18 +66,15 @@ class Gallery:
     ) -> None:
         self.path, self.table = Path(path), open_table(path, version)
         about = self.about
-        given = about["descriptor"] if descriptor is None else descriptor
-        if isinstance(given, Descriptor) or not is_file(given):  # a file may have moved
-            check_alike(path, about, {"descriptor": name_of(given)})
-        self.descriptor = descriptor_of(given)
+        descriptor = about["descriptor"] if descriptor is None else descriptor
+        if isinstance(descriptor, Descriptor) or not is_file(descriptor):  # a file may have moved
+            check_alike(path, about, {"descriptor": name_of(descriptor)})
+        self.descriptor = descriptor_of(descriptor)
         check_alike(path, about, {"model": fingerprint(self.descriptor)})
-        here = SignatureConfig.ALGORITHM_VERSION
-        if about["signature"]["algorithm_version"] != here:
-            raise ValueError(
-                f"{path}: the gallery is of version {about['signature']['algorithm_version']} of the signatures, this "
-                f"library computes version {here}. Build it again."
-            )
-        parameters = {name: value for name, value in about["signature"].items() if name != "algorithm_version"}
+        parameters = dict(about["signature"])
+        version, current = parameters.pop("algorithm_version"), SignatureConfig.ALGORITHM_VERSION
+        if version != current:
+            raise ValueError(f"{path}: expected signatures of version {current}, got {version}. Build it again.")
         self.config = SignatureConfig(**{**parameters, "attributes": tuple(parameters["attributes"])})
         self.reading = LoadOptions(**about["reading"], names=about.get("names"))
 
@@ -117,14 +114,9 @@ class Gallery:
         return self.nearest(descriptions, top=top, exact=exact, rerank=rerank, where=where)[0]
 
     def nearest(
-        self,
-        descriptions: Tensor,
-        *,
-        top: int = 10,
-        exact: bool = False,
-        rerank: bool = False,
+        self, descriptions: Tensor, *, top: int = 10, exact: bool = False, rerank: bool = False,
         where: str | None = None,
-    ) -> list[list[Match]]:
+    ) -> list[list[Match]]:  # fmt: skip
         """Return the bodies closest to each description (Q, ...), closest first. For the options see `query`."""
         check_at_least(1, top=top)
         matches = []
@@ -148,23 +140,17 @@ class Gallery:
         # The cosine distance, which finds the candidates, only approximates the distance of a head
         n = 4 * CANDIDATES if isinstance(self.descriptor, EmbeddedDescriptor) else CANDIDATES
         with torch.inference_mode():
-            distances = self.descriptor.distances
-            return nearest_rows(self.table, query, distances, top=top, exact=exact, candidates=n, where=where)
+            distance = self.descriptor.distances
+            return nearest_rows(self.table, query, distance, top=top, exact=exact, candidates=n, where=where)
 
     @classmethod
     def build(
-        cls,
-        path: str | Path,
-        dataset: SignatureDataset,
-        descriptor: str | Descriptor = "pretrained",
-        *,
-        n_workers: int | None = None,
-        strict: bool = False,
-        progress: bool = False,
-    ) -> tuple[Self, list[Failure]]:
+        cls, path: str | Path, dataset: SignatureDataset, descriptor: str | Descriptor = "pretrained", *,
+        n_workers: int | None = None, strict: bool = False, progress: bool = False,
+    ) -> tuple[Self, list[Failure]]:  # fmt: skip
         """Describe the bodies of a dataset and write a gallery. Return the gallery and the bodies that failed.
 
-        A gallery that exists at `path` is unchanged until the new one is complete; then it is an earlier version of it.
+        A gallery that exists at `path` is unchanged until the new one is complete, and then becomes a version of it.
         Signatures that are not cached are computed one by one; `dataset.precompute()` computes them on all cores.
 
         Args:
@@ -212,13 +198,9 @@ class Gallery:
 
     @classmethod
     def merge(
-        cls,
-        path: str | Path,
-        others: Sequence[str | Path],
-        descriptor: str | Descriptor | None = None,
-        *,
+        cls, path: str | Path, others: Sequence[str | Path], descriptor: str | Descriptor | None = None, *,
         progress: bool = False,
-    ) -> Self:
+    ) -> Self:  # fmt: skip
         """Add the bodies of other galleries to the gallery at `path`, which is created if it does not exist.
 
         The other galleries stay as they are.
@@ -276,16 +258,16 @@ class Gallery:
             return int(table.update(where=where, values=typed).rows_updated)
 
     def versions(self) -> list[dict[str, Any]]:
-        """Number, time and count of bodies of each version, oldest first. Versions are kept for a month."""
+        """Return number, time and count of bodies of each version, oldest first. Versions are kept for a month."""
         return [
-            {"version": one["version"], "time": f"{one['timestamp']:%Y-%m-%d %H:%M:%S}",
-             "bodies": int(one["metadata"]["total_rows"])}
-            for one in self.table.table.list_versions()
+            {"version": version["version"], "time": f"{version['timestamp']:%Y-%m-%d %H:%M:%S}",
+             "bodies": int(version["metadata"]["total_rows"])}
+            for version in self.table.table.list_versions()
         ]  # fmt: skip
 
     def restore(self, version: int) -> None:
         """Return to an earlier version, as a new version with its content."""
-        open_table(self.path, version)
+        open_table(self.path, version)  # raises an error for an unknown version
         with self.table.changing() as table:
             table.restore(version)
 

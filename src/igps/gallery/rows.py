@@ -13,6 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
+from igps.data.file_stat_cache import MIN_AGE
 from igps.data.sources import LABELS_FILE, Bodies, is_number
 from igps.gallery.about import KNOWN, Batch
 from igps.mesh.formats import files_read, stamp_of
@@ -24,8 +25,6 @@ from igps.signature.signature import Signature
 
 _BATCH_SIZE = 256  # descriptions in memory at once
 _THUMBNAIL_SIZE = 40  # pixels
-# A file that was changed less than this many nanoseconds ago may change again without a new time stamp
-_CLOCK_RESOLUTION = 2 * 10**9
 
 
 def described_rows(
@@ -37,11 +36,11 @@ def described_rows(
     bodies = dataset.bodies
     with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _BATCH_SIZE):
-            numbers = range(start, min(start + _BATCH_SIZE, len(dataset)))
+            indices = range(start, min(start + _BATCH_SIZE, len(dataset)))
             # Time stamps are taken before files are read: a file that changes meanwhile is described again next time
-            metadata = dict(zip(numbers, known_rows(bodies.subset(numbers), kinds, dataset.reading), strict=True))
-            checksums = {i: checksum_of(dataset, i) for i in numbers}
-            new = [i for i in numbers if not checksums[i] or known.get(metadata[i]["id"]) != checksums[i]]
+            metadata = dict(zip(indices, known_rows(bodies.subset(indices), kinds, dataset.reading), strict=True))
+            checksums = {i: checksum_of(dataset, i) for i in indices}
+            new = [i for i in indices if not checksums[i] or known.get(metadata[i]["id"]) != checksums[i]]
             failed: list[Failure] = []
             descriptions = _described(dataset.subset(new), descriptor, None if strict else failed, n_workers)
             failed_names = {failure.id for failure in failed}
@@ -50,16 +49,14 @@ def described_rows(
                 rows = [{**metadata[i], **_measured(dataset, i), "checksum": checksums[i]} for i in described]
                 yield descriptions, rows
             failures += failed
-            bar.update(len(numbers))
+            bar.update(len(indices))
 
 
 def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[str, type]:
     """Return the names and types of the further columns of the table of labels.
 
-    A column is of numbers if all of its values are numbers and the gallery does not have it as text already.
-
-    Raises:
-        ValueError: a name that the gallery uses itself, or that is not allowed.
+    A column is numeric if all of its values are numbers, and if the gallery does not have it as text already. A
+    ValueError is raised for a name that the gallery uses itself or does not allow.
     """
     # LanceDB has a column _rowid itself, and reads a dot as a field within a column
     if invalid := [name for name in bodies.columns if name.startswith("_") or "." in name]:
@@ -67,10 +64,10 @@ def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[s
         raise ValueError(f"{LABELS_FILE}: {expected}, got {invalid[0]!r}. Rename the column.")
     if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
         raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
-    texts = {
-        name for name, values in bodies.columns.items() if there.get(name) is str or not all(map(is_number, values))
+    return {
+        name: float if there.get(name) is not str and all(map(is_number, values)) else str
+        for name, values in bodies.columns.items()
     }
-    return {name: str if name in texts else float for name in bodies.columns}
 
 
 def known_rows(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> list[dict[str, Any]]:
@@ -108,11 +105,11 @@ def _stamp(file: Path, reading: LoadOptions) -> dict[str, int]:
     except (OSError, MeshError):  # the description will fail with the reason
         return {"bytes": -1, "modified": -1}
     modified = max(times)
-    return {"bytes": n_bytes, "modified": modified if time.time_ns() - modified > _CLOCK_RESOLUTION else -1}
+    return {"bytes": n_bytes, "modified": modified if time.time_ns() - modified > MIN_AGE else -1}
 
 
 def checksum_of(dataset: SignatureDataset, i: int) -> str:
-    """Return a checksum of a body and of all parameters of its Signature, or "" if the body cannot be read."""
+    """Return the cache key of a Signature, a checksum of the body and all parameters; "" if the body is unreadable."""
     try:
         return dataset.key(i)
     except MeshError:  # the description will fail with the reason

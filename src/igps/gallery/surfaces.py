@@ -37,8 +37,7 @@ _N_CACHED_SAMPLES, _N_CACHED_MESHES = 512, 64
 _NORMALS: AttributeName = "surface_direction"
 # Lengths are over √area.
 _HOPELESS = 0.03  # distance at which an alignment is given up; a tenth of it is large between copies
-# Copies differ by up to 0.045 in the logarithms of their extents; bodies that differ by more than this are not aligned
-_MAX_STRETCH = 0.1
+_MAX_STRETCH = 0.1  # difference of log extents above which bodies are not aligned; copies differ by up to 0.045
 MOST_TOLERATED = 0.02
 """Largest `tolerance`, over √area."""
 _ROUNDING = 5e-4  # largest displacement of a vertex by rounding of the coordinates in a file
@@ -47,19 +46,18 @@ _ROUNDING = 5e-4  # largest displacement of a vertex by rounding of the coordina
 _SAME_SURFACE = 2.5e-5
 
 Grade = Literal["same file", "same mesh", "same surface", "same at another level of detail"]
-"""What two files of one body have in common, most first. The vertices of the same mesh have the same numbers."""
+"""Agreement of two files of one body, from the closest to the loosest. The same mesh has the same order of vertices."""
 
-# Steps of mending that do not change the number of handles
-_HANDLE_PRESERVING: set[Step] = {"welded", "smoothed", "subdivided"}
+_HANDLE_PRESERVING: set[Step] = {"welded", "smoothed", "subdivided"}  # steps of mending
 
 
 def distance_if_alike(
-    one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, most: float = math.inf
+    one: SurfaceSamples, other: SurfaceSamples, *, stop_at: float = 0.0, max_distance: float = math.inf
 ) -> float:
     """`surface_distance`, or infinity if the extents of the two surfaces differ too much."""
     if np.abs(np.log(one.extents / other.extents)).max() > _MAX_STRETCH:
         return math.inf
-    return surface_distance(one, other, enough=enough, hopeless=_HOPELESS, most=most)
+    return surface_distance(one, other, stop_at=stop_at, hopeless=_HOPELESS, max_distance=max_distance)
 
 
 class Surfaces:
@@ -91,12 +89,7 @@ class Surfaces:
         self._cached_coarseness = lru_cache(None)(self._coarseness_and_handles)
 
     def samples(self, i: int) -> SurfaceSamples:
-        """Return the surface samples of a body.
-
-        Raises:
-            MeshError: the body cannot be used.
-            ValueError: its samples have no normals.
-        """
+        """Return the surface samples of a body; raise a MeshError if it is unusable, a ValueError without normals."""
         signature = self._signature(i)
         samples = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
         return replace(samples, surface=partial(self._cached_triangles, i))
@@ -104,29 +97,27 @@ class Surfaces:
     def coarseness(self, i: int) -> float:
         """Return the distance, over √area, between a mesh and the mesh with vertices at the means of their neighbours.
 
-        It measures what the level of detail leaves open: chords cut off round parts, and other triangles cut off sharp
-        edges. Near neighbours weigh more, see `mean_of_neighbours`. Raises a MeshError if the body cannot be used.
+        The distance measures the loss of detail, such as round parts and sharp edges that triangles cut off. Near
+        neighbours weigh more, see `mean_of_neighbours`. Raises a MeshError if the body cannot be used.
         """
         return self._cached_coarseness(i)[0]
 
     def distance(self, i: int, j: int, calibration: Calibration) -> float:
         """Return the distance of two bodies over √area, or infinity if they differ or one of them cannot be read."""
-        try:
+        with contextlib.suppress(MeshError):  # recorded in `failures`
             one, other = self._cached_samples(i), self._cached_samples(j)
-            most, limit = max(calibration.same.distance, self._tolerance), 0.0
-            distance = distance_if_alike(one, other, enough=calibration.same.distance, most=most)
+            max_distance, limit = max(calibration.same.distance, self._tolerance), 0.0
+            distance = distance_if_alike(one, other, stop_at=calibration.same.distance, max_distance=max_distance)
             if distance <= calibration.same.distance:
                 limit = self.limit(i, j, calibration)
                 if distance > limit > 0:
-                    # The search stopped at a distance that was small enough: a longer search may get below the limit.
-                    distance = distance_if_alike(one, other, enough=limit, most=max(limit, self._tolerance))
+                    # The search stopped below `same`. A longer search may get below the limit
+                    distance = distance_if_alike(one, other, stop_at=limit, max_distance=max(limit, self._tolerance))
             if distance <= limit:
                 return distance
             if distance <= self._tolerance:
                 self.nearly[min(i, j), max(i, j)] = distance
-            return math.inf
-        except MeshError:
-            return math.inf
+        return math.inf
 
     def grade(self, i: int, j: int) -> tuple[Grade, float]:
         """Return the grade of two copies and their largest deviation, over √area.
@@ -141,7 +132,7 @@ class Surfaces:
         if (deviation := self._vertex_deviation(i, j)) <= _SAME_SURFACE:
             return "same mesh", deviation
         samples = map(self._cached_samples, (i, j))
-        deviation = surface_distance(*samples, enough=_SAME_SURFACE, hopeless=_HOPELESS, patch=1)
+        deviation = surface_distance(*samples, stop_at=_SAME_SURFACE, hopeless=_HOPELESS, patch_size=1)
         return ("same surface" if deviation <= _SAME_SURFACE else "same at another level of detail"), deviation
 
     def length(self, i: int) -> tuple[float, str | None]:
@@ -152,8 +143,8 @@ class Surfaces:
     def limit(self, i: int, j: int, calibration: Calibration) -> float:
         """Return the largest distance of two bodies that are the same, see `Calibration.limit`.
 
-        The limit is 0 if the bodies have different numbers of handles, or if their faces join vertices of the same
-        numbers that lie elsewhere. Raises a MeshError if a body cannot be used.
+        The limit is 0 if the bodies have different numbers of handles, or if their meshes have the same faces, but
+        vertices at other places. Raises a MeshError if a body cannot be used.
         """
         (coarseness_i, handles_i), (coarseness_j, handles_j) = self._cached_coarseness(i), self._cached_coarseness(j)
         differ = None not in (handles_i, handles_j) and handles_i != handles_j
@@ -162,7 +153,7 @@ class Surfaces:
         return calibration.limit(max(coarseness_i, coarseness_j))
 
     def moments(
-        self, most: float, n_workers: int | None = None, progress: bool = False
+        self, max_move: float, n_workers: int | None = None, progress: bool = False
     ) -> tuple[Tensor, list[Failure]]:
         """Return the `moments` (M, 7, 6) of the bodies that can be read, in order, and the failures of the others.
 
@@ -172,7 +163,7 @@ class Surfaces:
         def moments_of(i: int) -> Floats | None:
             with contextlib.suppress(MeshError):  # recorded in `failures`
                 mesh = self._mesh(i)
-                return moments(self._placed(i, mesh), mesh.faces, most)
+                return moments(self._placed(i, mesh), mesh.faces, max_move)
             return None
 
         results = on_threads(moments_of, range(len(self._dataset)), n_workers)
@@ -183,7 +174,7 @@ class Surfaces:
         return torch.from_numpy(np.stack(usable)), [self.failures[i] for i in sorted(self.failures)]
 
     def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
-        """The number of handles is None for an open mesh, and where mending may have changed it."""
+        """Return coarseness and number of handles: None for an open mesh, or if mending may have changed it."""
         mesh = self._cached_mesh(i)
         smoothed = TriangleSurface(mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces)
         handles = None
@@ -193,9 +184,9 @@ class Surfaces:
         return offset_in_place(self._cached_samples(i), smoothed), handles
 
     def _vertex_deviation(self, i: int, j: int) -> float:
-        """Return the largest distance of vertices of the same number, or infinity if the faces of the meshes differ.
+        """Return the largest distance of vertices of the same index, or infinity if the faces of the meshes differ.
 
-        If the faces are the same, the level of detail is, too, and cannot explain a vertex that has moved.
+        Meshes with the same faces have the same level of detail, which therefore cannot explain a moved vertex.
         """
         (one, faces_i), (other, faces_j) = self._cached_vertices(i), self._cached_vertices(j)
         if not np.array_equal(faces_i, faces_j):
@@ -228,9 +219,9 @@ class Surfaces:
         with self._record_failure(i):
             signature = self._dataset[i].signature
         if _NORMALS not in signature.surface.attributes:
+            names = sorted(signature.surface.attributes)
             raise ValueError(
-                f"attributes: expected {_NORMALS!r} among those of the surface samples, got "
-                f"{sorted(signature.surface.attributes)}. Name it in SignatureConfig(attributes=...)."
+                f"attributes: expected {_NORMALS!r}, got {names}. Name it in SignatureConfig(attributes=...)."
             )
         return signature
 

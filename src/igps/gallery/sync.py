@@ -14,14 +14,9 @@ _ROWS_PER_COMMIT = 1000
 
 
 def sync(
-    gallery: Gallery,
-    dataset: SignatureDataset,
-    root: str | Path,
-    *,
-    n_workers: int | None = None,
-    strict: bool = False,
-    progress: bool = False,
-) -> tuple[int, int, list[Failure]]:
+    gallery: Gallery, dataset: SignatureDataset, root: str | Path, *,
+    n_workers: int | None = None, strict: bool = False, progress: bool = False,
+) -> tuple[int, int, list[Failure]]:  # fmt: skip
     """Bring a gallery up to date with a folder: describe new and changed files, remove deleted ones, update columns.
 
     Files whose size and modification time have not changed are not read. If the description of a body fails, its old
@@ -31,9 +26,7 @@ def sync(
         gallery: the gallery to change.
         dataset: all bodies below the folder; missing Signatures are computed.
         root: the folder.
-        n_workers: see `Gallery.build`.
-        strict: see `Gallery.build`.
-        progress: see `Gallery.build`.
+        n_workers, strict, progress: see `Gallery.build`.
 
     Returns:
         The number of bodies that were described, the number that were removed, and the bodies that failed.
@@ -74,7 +67,7 @@ def sync(
 
 
 def _is_hidden(file: str) -> bool:
-    """Whether a file may exist in a folder that this user may not read."""
+    """Return whether a file may exist, but in a folder that this user may not read."""
     try:
         os.lstat(file)
     except OSError as error:
