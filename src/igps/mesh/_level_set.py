@@ -140,7 +140,6 @@ def _is_solid(inside: Booleans, at: tuple[Integers, ...], foot: NDArray[Any], no
 
 
 def _nearest_values(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
-    """Return the values at the grid points nearest to `points`."""
     index = np.clip(np.round(points).astype(np.int64), 0, np.array(values.shape) - 1)
     return np.asarray(values[tuple(index.T)])
 

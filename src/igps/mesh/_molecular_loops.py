@@ -138,7 +138,7 @@ def distances_outside(
     """Return the distance of each grid point inside the balls from the space outside all balls.
 
     The nearest point of that space lies on a sphere, on an arc of two, or at the end of an arc. If it lies on a sphere,
-    this is the sphere of the ball in which the grid point is deepest: all others end further out.
+    this is the sphere of the ball in which the grid point is deepest: any point nearer than its sphere lies inside it.
 
     For the arguments see `depths` and `exposed_arcs`. Distances are cut at `reach`; outside the balls they are `depth`,
     which is negative.

@@ -34,8 +34,7 @@ _NEARLY_CLOSED, _N_PROBES = 0.05, 1500
 _MAX_REVERSED, _MIN_REVERSED_AREA = 8, 0.01
 # Hidden faces, with the inside on both sides, are removed if they are at least this share and the faces not too many.
 _MIN_HIDDEN, _MAX_FACES_FOR_HIDDEN = 0.02, 200_000
-# Winding numbers are exact up to this number of points times faces, and approximate beyond.
-_MAX_EXACT_PAIRS = 10**7
+_MAX_EXACT_PAIRS = 10**7  # points times faces up to which winding numbers are exact
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertig
 MENDING_VERSION = 8
 """Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
 
-# First words of the notes of each step.
-_STARTS: dict[str, Step] = {step: step for step in get_args(Step)}
+_STARTS: dict[str, Step] = {step: step for step in get_args(Step)}  # steps by the first words of their notes
 _STARTS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
 # A mesh with too few vertices is subdivided to this multiple of the minimum: with just enough vertices the last
 # eigenfunctions would depend on the triangles.

@@ -67,9 +67,8 @@ class ArticulatedShapes:
         return self.n_classes * self.n_per_class
 
     def __repr__(self) -> str:
-        return (
-            f"ArticulatedShapes({self.n_classes}, {self.n_per_class}, seed={self.seed}, n_vertices={self.n_vertices})"
-        )
+        sizes = f"{self.n_classes}, {self.n_per_class}"
+        return f"ArticulatedShapes({sizes}, seed={self.seed}, n_vertices={self.n_vertices})"
 
     @property
     def class_names(self) -> list[str]:

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 SUFFIXES = frozenset({".pdb", ".ent", ".cif", ".mmcif", ".pqr"})
 """Suffixes of structure files; ".gz" may follow."""
 
-# Twice the largest structures of the Protein Data Bank.
-_MAX_BYTES = 2**31
+_MAX_BYTES = 2**31  # twice the largest structures of the Protein Data Bank
 _ATOM_LINE = re.compile(rb"^(?:ATOM  |HETATM)[^\r\n]*", re.MULTILINE)
 # Columns of _atom_site without which gemmi reads no atoms.
 _REQUIRED_COLUMNS = ("id", "type_symbol", "label_asym_id", "label_alt_id", "Cartn_x", "Cartn_y", "Cartn_z")

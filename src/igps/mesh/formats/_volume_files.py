@@ -16,8 +16,7 @@ from igps.mesh.formats.label_names import names_in_extensions, names_in_tags
 from igps.mesh.limits import check_fits
 from igps.mesh.mesh import MILLIMETRES, MeshError
 
-# Working memory for holding and counting labels, bytes a voxel beyond those of the file.
-_WORK_BYTES = 4
+_WORK_BYTES = 4  # bytes a voxel to hold and count labels, beyond those of the file
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # DICOM and ITK use LPS
 _EXPORT = "Export the labels."
 _NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")

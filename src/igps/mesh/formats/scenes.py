@@ -101,6 +101,5 @@ def _converted(path: Path) -> bytes:
 
 GLTF = Format("glTF", (".glb", ".gltf"), read_gltf, bodies=("whole", "objects"), beside=_buffers)
 STEP = Format("STEP", (".step", ".stp"), read_step, bodies=("whole", "objects"), extra="cad")
-OTHERS = Format(
-    "COLLADA, 3DXML or XAML", (".dae", ".zae", ".3dxml", ".xaml"), read, bodies=("whole", "objects"), extra="formats"
-)
+_SUFFIXES = (".dae", ".zae", ".3dxml", ".xaml")
+OTHERS = Format("COLLADA, 3DXML or XAML", _SUFFIXES, read, bodies=("whole", "objects"), extra="formats")

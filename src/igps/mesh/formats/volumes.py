@@ -28,8 +28,7 @@ from igps.mesh.options import LoadOptions
 # Volumes with more values than _MAX_LABELS are refused as images. So are those with more than _MAX_UNCHECKED values if
 # less than a share _MIN_EQUAL of adjacent voxels are equal; labels as thin as two voxels have a share of one half.
 _MAX_LABELS, _MAX_UNCHECKED, _MIN_EQUAL = 20_000, 50, 0.3
-# Tolerance of labels that should be whole numbers: NIfTI may store them as scaled integers.
-_LABEL_TOLERANCE = 0.01
+_LABEL_TOLERANCE = 0.01  # distance of a label from a whole number: NIfTI may store labels as scaled integers
 
 Box = tuple[slice, slice, slice]
 
@@ -210,16 +209,12 @@ def _integer_labels(values: NDArray[Any], name: str, threshold: float, notes: li
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
             return (values >= threshold).astype(np.uint8)
         if len(odd):
-            raise MeshError(
-                f"{name}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}. Resample labels to the nearest "
-                "neighbour, or give probabilities between 0 and 1."
-            )
+            fault = f"{name}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}."
+            raise MeshError(f"{fault} Resample to the nearest neighbour, or give probabilities between 0 and 1.")
     low, high = (int(np.rint(values.min())), int(np.rint(values.max()))) if values.size else (0, 0)
     if low < 0:
-        raise MeshError(
-            f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}; expected 0 "
-            "for the background and positive numbers. Export the labels if it is an image."
-        )
+        fault = f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}"
+        raise MeshError(f"{fault}; expected 0 and positive numbers. Export the labels if it is an image.")
     if high >= 2**31:
         raise MeshError(f"{name}: label {high} is too large, expected less than 2³¹. Renumber the labels.")
     if values.dtype.kind != "f":

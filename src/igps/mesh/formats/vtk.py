@@ -202,7 +202,6 @@ class _Xml:
         self._compressor = None if name is None else _COMPRESSORS[name]
 
     def geometry(self, piece: Element) -> tuple[Floats, list[Cells]]:
-        """Read the points and cells of a piece."""
         points = piece.find("Points/DataArray")
         if points is None:
             raise ValueError("no points in it")
