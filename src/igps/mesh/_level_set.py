@@ -1,7 +1,4 @@
-"""Compute a function on a grid that is negative inside one body and zero on its surface. Lengths are in cells.
-
-The function is made of the exact distances of the grid points to the triangles.
-"""
+"""Compute the signed distances of grid points to the surface of one body, negative inside. Lengths are in cells."""
 
 import math
 from dataclasses import dataclass

@@ -124,10 +124,7 @@ def tidy(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
 
 def _drop_fins(vertices: Floats, faces: Integers) -> Integers:
-    """Drop fins: faces with a boundary edge and an edge that two other faces share. Keep all if fins have much area.
-
-    A part of a larger fin may remain; it shares no edge with two other faces, and does no harm.
-    """
+    """Drop fins: faces with a boundary edge and an edge that two other faces share. Keep all if fins have much area."""
     remaining = faces
     while len(remaining):
         _, edge_of_side = undirected_edges(remaining, len(vertices))

@@ -140,10 +140,7 @@ def remove_noise(vertices: Floats, faces: Integers) -> Floats:
 
 
 def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats:
-    """Return unit normals (F, 3): means over the faces that share a vertex, by area and similarity of guide normals.
-
-    Guide normals are those of the smooth surface, and in later runs the result of the previous run.
-    """
+    """Return unit normals (F, 3): means over the faces that share a vertex, by area and similarity of guide normals."""
     n_around = np.bincount(faces.ravel(), minlength=len(vertices))
     incidence = _incidence(faces, len(vertices))[:, n_around <= _MAX_FACES_AT_VERTEX]
     areas = area_vectors(smooth, faces)
@@ -159,7 +156,7 @@ def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats
             half_squares = 1 - np.einsum("ij,ij->i", here, guide[weights.indices])
             weights.data = size[weights.indices] * np.exp(-half_squares / _WIDTH**2)
             means[part] = weights @ normals
-        normals = guide = unit(means)
+        normals = guide = unit(means)  # after the smooth surface, each result is the guide of the next run
     return normals
 
 

@@ -126,12 +126,10 @@ def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, caviti
 
 
 def _remake(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
-    """Weld and smooth a surface, and make it watertight only if that gives no body, or one that crosses itself.
-
-    A grid would join parts that are nearer than a cell, such as the coils of a spring.
-    """
+    """Weld and smooth a surface, and make it watertight only if that gives no body, or one that crosses itself."""
     notes: list[str] = []
     surface = vertices, faces
+    # The grid is the last resort: it would join parts that are nearer than a cell, such as the coils of a spring.
     for step in (None, weld):
         if step is not None:
             surface = step(vertices, faces, notes)

@@ -104,16 +104,15 @@ class Mesh:
         volume = signed_volume(vertices, faces)
         if abs(volume) <= _MIN_VOLUME * diagonal(vertices) ** 3:
             sizes = f"{volume:.3g} for a bounding box diagonal of {diagonal(vertices):.3g}"
-            raise MeshError(f"{self.name}: expected a body, encloses no volume ({sizes}). Give sheets some thickness.")
+            raise MeshError(f"{self.name}: expected a body, but it encloses no volume ({sizes}). Thicken flat sheets.")
         if volume < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
-            object.__setattr__(self, "notes", (*self.notes, "was inside out: all faces turned"))
+            vars(self).update(notes=(*self.notes, "was inside out: all faces turned"))
             logger.info("%s: was inside out, all faces turned", self.name)
         if self.cavities:
             _check_cavities(vertices, faces, self.name)
         vertices.flags.writeable = faces.flags.writeable = False
-        object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "faces", faces)
+        vars(self).update(vertices=vertices, faces=faces)  # the class is frozen
 
     @classmethod
     def of(cls, body: Any, spacing: Sequence[float] | None = None) -> Self:
@@ -151,8 +150,7 @@ class Mesh:
 
     def _changed(self, **fields: object) -> Self:
         other = copy.copy(self)
-        for name, value in fields.items():
-            object.__setattr__(other, name, value)
+        vars(other).update(fields)
         return other
 
     def outer(self) -> tuple[Self, Booleans]:

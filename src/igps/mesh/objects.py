@@ -25,7 +25,7 @@ def bodies_of_object(thing: Any, name: str, options: LoadOptions = LoadOptions()
 
 
 def raw_of(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, RawBody]:
-    """Return the name and the unchecked surface of a body; for the types see `Mesh.of`, a TypeError for any other."""
+    """Return the name and the unchecked surface of a body; a TypeError unless it has a type listed in `Mesh.of`."""
     if _is_volume(thing):
         bodies = bodies_of_object((thing, spacing), "volume")
         if len(bodies) > 1:

@@ -7,8 +7,8 @@ al. 2003), and quadrics simplify it (Garland and Heckbert 1997).
 
 **Several pieces** become one body: pieces of less than 1/500 of the volume are dropped, and the others are joined by
 straight bars of about a cell's radius where the gaps are narrowest (a minimum spanning tree of the gaps). Retrieval
-with joined pieces is nearly as good as with the whole body. The spectra of all pieces side by side depend on how the
-body was cut, and the largest piece alone is another body: both retrieve far worse.
+with joined pieces is nearly as good as with the whole body. With the spectra of all pieces side by side, or with the
+largest piece alone, it is far worse.
 """
 
 from dataclasses import replace

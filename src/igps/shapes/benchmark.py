@@ -150,7 +150,7 @@ def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
 
 
 def off_text(vertices: Floats, faces: Integers) -> str:
-    """Write a mesh in the Object File Format; 17 digits preserve float64 values exactly."""
+    """Return a mesh as text in the Object File Format; 17 digits preserve float64 values exactly."""
     lines = [f"OFF\n{len(vertices)} {len(faces)} 0"]
     lines += [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in vertices.tolist()]
     lines += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]

@@ -148,13 +148,13 @@ class _Builder:
         self._count: Counter[str] = Counter()
 
     def molecule(self, name: str, notes: list[str]) -> Molecule:
-        own = ["radii and charges are those of the PQR file"] if self.is_pqr else []
+        origin = ["radii and charges are those of the PQR file"] if self.is_pqr else []
         counted = [text.format(self._count[key]) for key, text in _NOTES.items() if self._count[key]]
         positions, radii, charges, residue_of = map(np.array, zip(*self.balls, strict=True))
         names, centres, b_factors = zip(*self._residues, strict=True)
         return Molecule(
             name, positions, radii, charges, residue_of, names, np.array(centres), np.array(b_factors),
-            (*notes, *own, *counted),
+            (*notes, *origin, *counted),
         )  # fmt: skip
 
     def add_chain(self, chain: gemmi.Chain) -> None:

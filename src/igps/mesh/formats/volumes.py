@@ -72,14 +72,13 @@ class LabelVolume:
     def __post_init__(self) -> None:
         checked_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
         if not self.bodies:
-            fault = f"{self.name}: no voxel has a label, all are 0"
-            fault += f" ({'; '.join(self.notes)})" if self.notes else ""
-            raise MeshError(f"{fault}. Check that the right file was exported.")
+            notes = f" ({'; '.join(self.notes)})" if self.notes else ""
+            raise MeshError(f"{self.name}: no voxel has a label, all are 0{notes}. Check the export.")
         seen: dict[str, int] = {}  # a given name may equal one that was made distinct by its number
         for body in self.bodies:
             if (other := seen.setdefault(body.name, body.label)) != body.label:
-                fault = f"{self.name}: labels {other} and {body.label} are both named {body.name!r}."
-                raise MeshError(f"{fault} Rename one, or give names by a table.")
+                both = f"labels {other} and {body.label} are both named {body.name!r}"
+                raise MeshError(f"{self.name}: {both}. Rename one, or give names by a table.")
 
     @cached_property
     def bodies(self) -> tuple[LabelBody, ...]:
@@ -257,7 +256,6 @@ def _is_speckled(labels: NDArray[Any], most_frequent: int) -> bool:
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """Read the labels of a volume as bodies; see `label_bodies`."""
     return label_bodies(read_label_volume(path, options), options, part)
 
 
@@ -287,7 +285,7 @@ def _in_pieces(volume: LabelVolume) -> LabelVolume:
 
 
 def _beside(path: Path, options: LoadOptions) -> list[Path]:
-    """Return the files of the voxels, if they are others, and the table of names."""
+    """Return the separate files of the voxels, if any, and the table of names."""
     table = table_beside(path) if options.names is None else Path(options.names)
     return [*detached(path), *([table] if table else [])]
 

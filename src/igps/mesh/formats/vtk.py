@@ -181,7 +181,7 @@ def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody
 
 
 class _Xml:
-    """An XML file; the raw bytes that may be appended to it are no XML."""
+    """An XML file, to which raw bytes may be appended."""
 
     def __init__(self, path: Path, options: LoadOptions) -> None:
         content = path.read_bytes()
