@@ -71,9 +71,8 @@ def write_unusable(folder: Path) -> dict[str, str]:
         "empty.stl": "the file is empty (0 bytes). Export it again.",
         "nothing.off": "the file is empty: no vertices and no faces. Export it again.",
         "triangle.off": "expected a closed surface, got a single triangle. Export it again.",
-        "line.obj": "no triangle has an area; a surface was expected. If the file holds lines, give them thickness.",
-        "five.xyz": "expected at least 10 points for a surface, got 5. "
-        "Check that the file holds faces, or scan more points.",
+        "line.obj": "expected a surface, but no triangle has an area. Give lines some thickness.",
+        "five.xyz": "expected at least 10 points for a surface, got 5. Export or scan more.",
         "part.dae": "COLLADA, 3DXML or XAML needs a module that is not installed (No module named 'collada'). "
         'Install it: pip install "interior-gps[formats]"; or convert the file to OFF, OBJ, PLY or STL.',
     }

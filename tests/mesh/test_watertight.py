@@ -279,7 +279,7 @@ def test_inputs_stay_as_they_are() -> None:
 
 
 def test_what_is_no_surface_is_refused() -> None:
-    with pytest.raises(MeshError, match=r"line\.obj: no triangle has an area"):
+    with pytest.raises(MeshError, match=r"line\.obj: expected a surface, but no triangle has an area"):
         watertight(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), name="line.obj")
     with pytest.raises(MeshError, match=r"five\.xyz: expected at least 10 points for a surface, got 5"):
         watertight(np.random.default_rng(0).random((5, 3)), name="five.xyz")

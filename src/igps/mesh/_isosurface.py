@@ -16,8 +16,7 @@ def level_surface(field: Singles, name: str) -> Surface:
 
     for _ in range(20):
         if not (field.min() < 0 < field.max()):
-            thin = "no grid point lies inside the body, which is everywhere too thin for its length"
-            raise MeshError(f"{name}: {thin}. Give it some thickness.")
+            raise MeshError(f"{name}: no grid point lies inside the body, which is too thin. Give it some thickness.")
         vertices, faces, _, _ = marching_cubes(field, 0.0, allow_degenerate=True)
         faces = faces.astype(np.int64)
         bad_edges = _non_manifold_edges(faces, len(vertices))
@@ -33,7 +32,7 @@ def level_surface(field: Singles, name: str) -> Surface:
 
 
 def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Surface:
-    """Simplify a closed surface to about `max_vertices` vertices at its volume; unchanged if that gives no surface."""
+    """Simplify a closed surface to about `max_vertices` vertices of the same volume, or return it if that fails."""
     if len(vertices) <= max_vertices:
         return vertices, faces
     import igl

@@ -24,13 +24,11 @@ _MIN_ABS_VALUES, _STIFFNESS = (0.05, 0.3), (1.0, 0.1)
 # Excess of the first solution's Laplacian over its surroundings: up to the first value a place is smooth, from the
 # second on it is an edge. An edge bends more than the faces beside it; a thin round body bends everywhere.
 _BEND_LIMITS = (0.05, 0.2)
-# Standard deviations of the Gaussian windows of the Laplacian and of its surroundings, in voxels.
-_WINDOW, _WIDE_WINDOW = 0.7, 3.0
+_WINDOW, _WIDE_WINDOW = 0.7, 3.0  # standard deviations of the means of the Laplacian and of its surroundings, voxels
 # Weight of the deviation from a signed distance to the voxels of the other side; the second derivatives have weight 1.
 _DISTANCE_WEIGHT = 0.01
 _RELAXATION = 1.4
-# Sweeps of either solution. With 15 and 10, a ball keeps bumps that affect descriptors.
-_N_SWEEPS = 20
+_N_SWEEPS = 20  # of either solution; with 15 and 10, a ball keeps bumps that affect descriptors
 _BAND = 2  # voxels from the border within which the function is free
 
 PAD = _BAND + 2

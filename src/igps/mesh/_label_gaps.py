@@ -14,7 +14,7 @@ _MIN_PLANE_SHARE = 0.8  # share of the lines across a gap that must cross one pl
 
 
 def fill_missed_slices(mask: Booleans, notes: list[str]) -> Booleans:
-    """Return the mask with the slices filled that separate two pieces along one plane; specks are no pieces.
+    """Return the mask, with slices filled that separate two pieces along one plane. Specks do not count as pieces.
 
     Nothing is filled between pieces that are near but face each other at a slant, as vertebrae do.
     """

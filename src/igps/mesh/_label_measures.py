@@ -10,14 +10,13 @@ from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers
 
-# No part is thinner than a diameter if this share of the voxels lies near balls of that diameter which fit inside.
+# A label is as thick as a ball if balls of that size that fit inside it cover this share of its voxels.
 _MIN_COVERED = 0.95
-# Squared distance from a ball's centre, in squared radii, that counts as near: 3 reaches the corners of a box as thick.
+# Squared distance from a ball's centre, in squared radii, that it covers: 3 reaches the corners of a cube around it.
 _NEAR = 3
 _MAX_DIAMETER = 10  # voxels
 _MIN_WHOLE_VOXELS = 1 << 20  # smaller masks are measured in half voxels
-# Side of the blocks that are measured one by one, in voxels: their distances stay in the processor's cache.
-_BLOCK = 96
+_BLOCK = 96  # voxels a side of the blocks that are measured one by one; their distances fit into the processor's cache
 
 
 @dataclass(frozen=True)
@@ -90,13 +89,13 @@ def _squared_distances(mask: Booleans, max_value: int) -> NDArray[np.unsignedint
 
     Integers of one or two bytes and bounded distances take a tenth of the time of a full distance transform.
     """
-    kind = np.min_scalar_type(2 * max_value)
-    squares = np.where(mask, kind.type(max_value), kind.type(0))
+    number = np.min_scalar_type(2 * max_value).type
+    squares = np.where(mask, number(max_value), number(0))
     for axis in range(3):
         lines = np.moveaxis(squares, axis, 0)
         nearest = lines.copy()
         for step in range(1, min(math.isqrt(max_value - 1) + 1, len(lines))):
-            moved = lines + kind.type(step**2)
+            moved = lines + number(step**2)
             np.minimum(nearest[step:], moved[:-step], out=nearest[step:])
             np.minimum(nearest[:-step], moved[step:], out=nearest[:-step])
         squares = np.moveaxis(nearest, 0, axis)

@@ -1,7 +1,4 @@
-"""Compute a function on a grid that is negative inside one body and zero on its surface. Lengths are in cells.
-
-The function is made of the exact distances of the grid points to the triangles.
-"""
+"""Compute the signed distances of grid points to the surface of one body, negative inside. Lengths are in cells."""
 
 import math
 from dataclasses import dataclass
@@ -140,7 +137,6 @@ def _is_solid(inside: Booleans, at: tuple[Integers, ...], foot: NDArray[Any], no
 
 
 def _nearest_values(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
-    """Return the values at the grid points nearest to `points`."""
     index = np.clip(np.round(points).astype(np.int64), 0, np.array(values.shape) - 1)
     return np.asarray(values[tuple(index.T)])
 

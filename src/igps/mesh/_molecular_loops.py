@@ -19,8 +19,7 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
     Columns of the arcs (N, 12): centre of the circle (3), first axis (3), normal (3), radius, angle of the start from
     the first axis, and angle from start to end, up to 2π. Exposed balls (1, else 0) have an arc or no neighbours.
     """
-    capacity = 256
-    arcs = np.empty((capacity, 12))
+    arcs = np.empty((256, 12))
     n_arcs = 0
     exposed = np.zeros(len(radii), np.int64)
     max_intervals = 2 * np.max(np.diff(first))  # an interval may be split in two
@@ -82,14 +81,10 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
             order = np.argsort(starts[:n_covered])
             covered_to = 0.0
             for position in range(n_covered + 1):
-                start = _TURN if position == n_covered else starts[order[position]]
-                start = min(start, _TURN)
+                start = min(starts[order[position]], _TURN) if position < n_covered else _TURN
                 if start > covered_to:
-                    if n_arcs == capacity:
-                        capacity *= 2
-                        larger = np.empty((capacity, 12))
-                        larger[:n_arcs] = arcs
-                        arcs = larger
+                    if n_arcs == len(arcs):
+                        arcs = np.concatenate((arcs, np.empty_like(arcs)))
                     arcs[n_arcs] = (mx, my, mz, ax, ay, az, ux, uy, uz, radius, covered_to, start - covered_to)
                     n_arcs += 1
                     exposed[i] = exposed[j] = 1
@@ -138,7 +133,7 @@ def distances_outside(
     """Return the distance of each grid point inside the balls from the space outside all balls.
 
     The nearest point of that space lies on a sphere, on an arc of two, or at the end of an arc. If it lies on a sphere,
-    this is the sphere of the ball in which the grid point is deepest: all others end further out.
+    this is the sphere of the ball in which the grid point is deepest: any point nearer than its sphere lies inside it.
 
     For the arguments see `depths` and `exposed_arcs`. Distances are cut at `reach`; outside the balls they are `depth`,
     which is negative.

@@ -34,13 +34,12 @@ _NEARLY_CLOSED, _N_PROBES = 0.05, 1500
 _MAX_REVERSED, _MIN_REVERSED_AREA = 8, 0.01
 # Hidden faces, with the inside on both sides, are removed if they are at least this share and the faces not too many.
 _MIN_HIDDEN, _MAX_FACES_FOR_HIDDEN = 0.02, 200_000
-# Winding numbers are exact up to this number of points times faces, and approximate beyond.
-_MAX_EXACT_PAIRS = 10**7
+_MAX_EXACT_PAIRS = 10**7  # points times faces up to which winding numbers are exact
 
 
 @dataclass(frozen=True)
 class OrientedSurface:
-    """Surface whose connected parts are each oriented outward, for winding numbers."""
+    """Surface whose connected parts are oriented for winding numbers: outward, as far as that is known."""
 
     vertices: Floats
     faces: Integers
@@ -99,10 +98,7 @@ class OrientedSurface:
         return np.asarray(number(self.vertices, self.faces, points.astype(np.float64)))
 
     def _drop_hidden_faces(self) -> Self:
-        """Drop the faces with the inside on both sides, such as walls between solids that were put together.
-
-        Where solids share some of their outer surface, each of them is open, which distorts the winding numbers around.
-        """
+        """Drop the faces with the inside on both sides, such as walls between solids that were put together."""
         normals, middle = unit(area_vectors(self.vertices, self.faces)), self.vertices[self.faces].mean(axis=1)
         lower = np.minimum(*(self.winding(middle + side * normals) for side in (0.25, -0.25)))
         faces = self.faces[lower <= 0.5]
@@ -168,10 +164,7 @@ def _outside_by_winding(outside: Booleans, distance: Singles, surface: OrientedS
 
 
 def _cavities(outside: Booleans, surface: OrientedSurface) -> Booleans:
-    """Return the cores of the spaces behind holes, found by balls of growing radius.
-
-    A space lies behind a hole if only passages of less than half its width connect it with the outside.
-    """
+    """Return the cores of the spaces behind holes, found by balls of growing radius."""
     depth = ndimage.distance_transform_edt(outside)
     cavities = np.zeros_like(outside)
     radius = 1.0

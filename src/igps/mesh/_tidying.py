@@ -16,7 +16,7 @@ from igps.mesh.winding import winding_number
 _WELD = 1e-8  # vertices closer than this share of the bounding box's diagonal are welded
 # Width of a crack, in diagonals: in single precision the corners on its two sides differ in the last digits.
 _CRACK = 1e-6
-# With more such neighbours per vertex on average, the surface is tiny in its bounding box, and there are no cracks.
+# With more neighbours this near per vertex on average, the surface is tiny in its bounding box, and cracks stay open.
 _MAX_CRACK_NEIGHBOURS = 50
 # Parts of less than this share of the area are specks, unless all of them together have ten times as much.
 SPECK = 2e-3
@@ -70,15 +70,15 @@ def weld_boundaries(vertices: Floats, faces: Integers) -> Integers:
 
 
 def _close_cracks(vertices: Floats, faces: Integers) -> Integers:
-    """Return, for each vertex (V,), the vertex that it becomes when cracks as narrow as single precision are closed."""
-    free, index = _boundary_vertices(vertices, faces), np.arange(len(vertices))
-    tree, near = cKDTree(vertices[free]), _CRACK * diagonal(vertices)
-    if tree.count_neighbors(tree, near) > _MAX_CRACK_NEIGHBOURS * len(free):
+    """Return, for each vertex (V,), the vertex into which it is merged to close cracks between boundaries."""
+    boundary, index = _boundary_vertices(vertices, faces), np.arange(len(vertices))
+    tree, width = cKDTree(vertices[boundary]), _CRACK * diagonal(vertices)
+    if tree.count_neighbors(tree, width) > _MAX_CRACK_NEIGHBOURS * len(boundary):
         return index
-    pairs = tree.query_pairs(near, output_type="ndarray")
-    graph = sparse.coo_array((np.ones(len(pairs), dtype=np.int8), tuple(pairs.T)), shape=(len(free), len(free)))
+    pairs = tree.query_pairs(width, output_type="ndarray")
+    graph = sparse.coo_array((np.ones(len(pairs), dtype=np.int8), tuple(pairs.T)), shape=(len(boundary),) * 2)
     _, first, group = np.unique(connected_components(graph, directed=False)[1], return_index=True, return_inverse=True)
-    index[free] = free[first[group]]
+    index[boundary] = boundary[first[group]]
     return index
 
 
@@ -124,10 +124,7 @@ def tidy(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
 
 def _drop_fins(vertices: Floats, faces: Integers) -> Integers:
-    """Drop fins: faces with a boundary edge and an edge that two other faces share. Keep all if fins have much area.
-
-    A part of a larger fin may remain; it shares no edge with two other faces, and does no harm.
-    """
+    """Drop fins: faces with a boundary edge and an edge that two other faces share. Keep all if fins have much area."""
     remaining = faces
     while len(remaining):
         _, edge_of_side = undirected_edges(remaining, len(vertices))
@@ -161,16 +158,16 @@ def drop_hidden_parts(vertices: Floats, faces: Integers, notes: list[str], *, ca
         return vertices, faces
     if cavities:
         faces = faces.copy()
-        kept: list[Mesh] = []
+        hollows: list[Mesh] = []
         for k in sorted(np.flatnonzero(is_hidden), key=lambda k: -areas[k]):
             surface = compact(vertices, faces[part == k])
             try:
-                cavity = Mesh(*surface)
+                hollow = Mesh(*surface)
             except MeshError:
                 continue
-            if any((winding_number(other.vertices, other.faces, cavity.vertices) > 0.5).any() for other in kept):
+            if any((winding_number(other.vertices, other.faces, hollow.vertices) > 0.5).any() for other in hollows):
                 continue
-            kept.append(cavity)
+            hollows.append(hollow)
             is_hidden[k] = False
             # Compare signs, because the largest part may be inside out itself.
             if signed_volume(*surface) * signed_volume(vertices, faces[part == largest]) > 0:
@@ -260,7 +257,7 @@ def _circle(turns: Floats, radius: float) -> Floats:
 
 
 def _solve_umbrella(points: Floats, faces: Integers, n_fixed: int, order: int) -> Floats:
-    """Return the free points, those after the first `n_fixed`, at which the umbrella operator's power `order` is 0."""
+    """Return the points after the first `n_fixed`, placed so that the umbrella operator to the power `order` is 0."""
     edges, _ = undirected_edges(faces, len(points))
     size, ends = len(points), (edges.T.ravel(), edges[:, ::-1].T.ravel())
     graph = sparse.coo_array((np.ones(2 * len(edges)), ends), shape=(size, size)).tocsr()

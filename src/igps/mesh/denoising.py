@@ -1,9 +1,9 @@
 """Detect noise on a surface, and remove it.
 
 Scanner noise moves neighbouring vertices independently; shape does not. The test uses residuals: the height of a vertex
-over its neighbours, minus the mean of their heights. On a clean shape residuals are small, and neighbours mostly have
-the same sign. On noise they are large, and neighbours have opposite signs more often. A surface is changed only if most
-of it has both properties of noise. It is smoothed, and the normals of the smooth surface guide a filter of the noisy
+over its neighbours, minus the mean of their heights. Without noise, residuals are small, and those of neighbours mostly
+have the same sign. With noise, they are large, and have opposite signs more often. A surface is changed only if most of
+it has both properties of noise. It is smoothed, and the normals of the smooth surface guide a filter of the noisy
 normals, which restores edges and volume.
 
 On the long thin triangles of turned and drawn parts, neighbours are weighted by the inverse square of their distances.
@@ -35,8 +35,7 @@ _MAX_FLAT, _FLAT_ANGLE = 0.1, np.radians(0.1)
 # parts of thin triangles, the same with noise.
 _THIN = 2.0
 _VERY_THIN = 8.0  # stretch at single vertices of other surfaces, such as on the rim of a fan of thousands of faces
-# Shorter edges count as this long, in longest sides of the body, so that no weight is infinite.
-_MIN_LENGTH = 1e-9
+_MIN_LENGTH = 1e-9  # of an edge, in longest sides of the body; bounds the weights
 # Surfaces of fewer vertices are rough by design; those with a smaller share of edges at two faces lack clear normals.
 _MIN_VERTICES, _MIN_REGULAR = 1000, 0.97
 _SHRINK, _GROW = 0.5, -0.53  # Taubin's two steps
@@ -65,9 +64,9 @@ def is_noisy(vertices: Floats, faces: Integers) -> bool:
     around = Neighbours.of(vertices, faces)
     if (around.faces_at_sides == 2).mean() < _MIN_REGULAR:
         return False
-    # Normals of the averaged surface, because noise larger than the triangles makes their own normals useless.
-    normals = vertex_normals(around.averaging @ (around.averaging @ vertices), faces)
     edges, averaging = around.edges, around.averaging
+    # Normals of the averaged surface, because noise larger than the triangles makes their own normals useless.
+    normals = vertex_normals(averaging @ (averaging @ vertices), faces)
     height = np.einsum("ij,ij->i", vertices - averaging @ vertices, normals)
     residual = (height - averaging @ height) / np.maximum(around.length, np.finfo(float).tiny)
     weights = averaging[edges[:, 0], edges[:, 1]] + averaging[edges[:, 1], edges[:, 0]]
@@ -141,10 +140,7 @@ def remove_noise(vertices: Floats, faces: Integers) -> Floats:
 
 
 def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats:
-    """Return unit normals (F, 3): means over the faces that share a vertex, by area and similarity of guide normals.
-
-    Guide normals are those of the smooth surface, and in later runs the result of the previous run.
-    """
+    """Return unit normals (F, 3): means over the faces that share a vertex, by area and similarity of guide normals."""
     n_around = np.bincount(faces.ravel(), minlength=len(vertices))
     incidence = _incidence(faces, len(vertices))[:, n_around <= _MAX_FACES_AT_VERTEX]
     areas = area_vectors(smooth, faces)
@@ -160,7 +156,7 @@ def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats
             half_squares = 1 - np.einsum("ij,ij->i", here, guide[weights.indices])
             weights.data = size[weights.indices] * np.exp(-half_squares / _WIDTH**2)
             means[part] = weights @ normals
-        normals = guide = unit(means)
+        normals = guide = unit(means)  # after the smooth surface, each result is the guide of the next run
     return normals
 
 
@@ -198,7 +194,7 @@ def noise_and_edge(vertices: Floats, faces: Integers, around: Neighbours) -> tup
 
 
 def _unit_of_length(vertices: Floats) -> float:
-    """Return the longest side, down to a power of two: division is exact, and squares of lengths do not overflow."""
+    """Return the longest side, rounded down to a power of two: division is exact, and squares do not overflow."""
     _, exponent = np.frexp(max(longest_side(vertices), np.finfo(float).tiny))
     return float(np.ldexp(1.0, int(exponent) - 1))
 
@@ -208,5 +204,5 @@ def _share_of_flat_edges(vertices: Floats, faces: Integers, edge_of: Integers) -
     normals = unit(area_vectors(vertices, faces))
     order = np.argsort(edge_of, kind="stable")
     pairs = np.flatnonzero(edge_of[order[1:]] == edge_of[order[:-1]])
-    difference = np.linalg.norm(normals[order[pairs] // 3] - normals[order[pairs + 1] // 3], axis=1)
-    return float((difference < _FLAT_ANGLE).mean())
+    angles = np.linalg.norm(normals[order[pairs] // 3] - normals[order[pairs + 1] // 3], axis=1)
+    return float((angles < _FLAT_ANGLE).mean())

@@ -78,8 +78,8 @@ def voxel_surface(
     spacing = checked_spacing(matrix, name)
     n_voxels = int(np.count_nonzero(mask))
     if n_voxels < LEAST_VOXELS:
-        few = f"{name}: expected at least {LEAST_VOXELS} voxels, got {n_voxels}, which have no shape."
-        raise MeshError(f"{few} Leave out the label, or segment it on a finer grid.")
+        few = f"expected at least {LEAST_VOXELS} voxels, got {n_voxels}, which have no shape"
+        raise MeshError(f"{name}: {few}. Leave out the label, or segment it on a finer grid.")
     (box,) = ndimage.find_objects(mask.view(np.uint8))
     low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
@@ -125,8 +125,7 @@ def checked_spacing(affine: Floats, name: str) -> Floats:
         raise MeshError(f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}.")
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not spacing.all() or abs(np.linalg.det(affine[:3, :3] / np.where(spacing, spacing, 1))) < 1e-6:
-        singular = f"{name}: the affine is singular, so the voxels have no volume."
-        raise MeshError(f"{singular} Write the file again with the spacing and the directions of its axes.")
+        raise MeshError(f"{name}: the affine is singular. Write the file again with spacing and axes of the voxels.")
     return spacing
 
 
@@ -149,10 +148,10 @@ def _clean(mask: Booleans, notes: list[str], min_hole: int | None, name: str) ->
     outside, hollow = hollow[0, 0, 0], hollow[1:-1, 1:-1, 1:-1]
     size = np.bincount(hollow.reshape(-1))
     size[[0, outside]] = 0
-    kept = [] if min_hole is None else np.flatnonzero(size >= min_hole).tolist()
-    if n_filled := int(size.sum() - size[kept].sum()):
+    cavities = [] if min_hole is None else np.flatnonzero(size >= min_hole).tolist()
+    if n_filled := int(size.sum() - size[cavities].sum()):
         notes.append(f"filled holes of {n_filled} voxels")
-    return np.asarray(hollow != outside), [hollow == k for k in kept]
+    return np.asarray(hollow != outside), [hollow == k for k in cavities]
 
 
 def _n_nearly_enclosed(mask: Booleans) -> int:
@@ -229,10 +228,7 @@ def _is_thick(mask: Booleans, axes: Booleans) -> bool:
 
 
 def _refine(field: Floats | Singles, share: Singles, n_parts: Integers, sides: Floats) -> Floats | Singles:
-    """Interpolate the field between the centres of the voxels, and shift it to the level that gives their volume.
-
-    The field is made negative between neighbours in the body, so that they stay connected.
-    """
+    """Interpolate the field between the centres of the voxels, and shift it to the level that gives their volume."""
     from scipy.interpolate import CubicSpline
 
     inside = share >= 0.5
@@ -245,6 +241,7 @@ def _refine(field: Floats | Singles, share: Singles, n_parts: Integers, sides: F
     for _ in range(_N_LEVELS):
         filled, slope = filled_volume(field, float(sides.sum()))
         field -= (volume - filled) / max(slope, 1e-9)
+    # Make the field negative between neighbours in the body, so that they stay connected.
     for axis, n in enumerate(n_parts.tolist()):
         both = inside & np.roll(inside, -1, axis)
         for part in range(n):

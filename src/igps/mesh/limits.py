@@ -10,8 +10,7 @@ _BYTES_PER_FACE = 1000
 # File size of a triangle in formats whose header has no number of triangles: OBJ, and text STL.
 _OBJ_BYTES, _TEXT_STL_BYTES = 35, 200
 _BYTES_PER_CELL = 40  # memory per grid cell while the cells inside a body are found
-# Smaller files and grids are not checked, in bytes.
-_MIN_CHECKED_FILE, _MIN_CHECKED_GRID = 1 << 20, 1 << 26
+_MIN_CHECKED_FILE, _MIN_CHECKED_GRID = 1 << 20, 1 << 26  # bytes; smaller files and grids are not checked
 
 
 def check_memory(path: Path) -> None:
@@ -33,8 +32,8 @@ def check_fits(n_bytes: int, subject: str, remedy: str) -> None:
     """Raise a MeshError, "SUBJECT 3.0 GB of memory, and 2.0 GB are free. REMEDY", if `n_bytes` are not available."""
     free = available_memory()
     if free is not None and n_bytes > free:
-        needed = f"{n_bytes / 1e9:,.1f} GB of memory"
-        raise MeshError(f"{subject} {needed}, and {max(free, 0) / 1e9:.1f} GB are free. {remedy}")
+        sizes = f"{n_bytes / 1e9:,.1f} GB of memory, and {max(free, 0) / 1e9:.1f} GB are free"
+        raise MeshError(f"{subject} {sizes}. {remedy}")
 
 
 def expected_faces(path: Path) -> int:
@@ -70,7 +69,7 @@ def _memory_in_limits() -> int | None:
     except ImportError:  # Windows has no such limits
         return None
     available = []
-    # Limits of the address space, and of data alone, which `igps._parallel` sets.
+    # Limits of the address space, and of data alone (set by `igps._parallel`), and the columns of their use in statm.
     for kind, column in ((resource.RLIMIT_AS, 0), (resource.RLIMIT_DATA, 5)):
         limit, _ = resource.getrlimit(kind)
         pages = _number(Path("/proc/self/statm"), rf"^(?:\d+ ){{{column}}}")

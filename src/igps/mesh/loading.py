@@ -145,9 +145,8 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
         connected = faces if options.mend == "never" else weld_boundaries(vertices, faces)
         part, areas = face_parts(vertices, connected)
         if len(areas) > 1:
-            n_before = len(vertices)
             vertices, faces = compact(vertices, faces[part == int(np.argmax(areas))])
-            counts = f"{len(vertices)} of {n_before} vertices"
+            counts = f"{len(vertices)} of {len(raw.vertices)} vertices"
             notes = (*notes, f"kept the largest of {len(areas)} components ({counts})")
     notes = (*notes, *_rounding_notes(vertices, name))
     if options.allow_open and options.mend != "always":

@@ -30,8 +30,7 @@ Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertig
 MENDING_VERSION = 8
 """Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
 
-# First words of the notes of each step.
-_STARTS: dict[str, Step] = {step: step for step in get_args(Step)}
+_STARTS: dict[str, Step] = {step: step for step in get_args(Step)}  # steps by the first words of their notes
 _STARTS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
 # A mesh with too few vertices is subdivided to this multiple of the minimum: with just enough vertices the last
 # eigenfunctions would depend on the triangles.
@@ -127,12 +126,10 @@ def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, caviti
 
 
 def _remake(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
-    """Weld and smooth a surface, and make it watertight only if that gives no body, or one that crosses itself.
-
-    A grid would join parts that are nearer than a cell, such as the coils of a spring.
-    """
+    """Weld and smooth a surface, and make it watertight only if that gives no body, or one that crosses itself."""
     notes: list[str] = []
     surface = vertices, faces
+    # The grid is the last resort: it would join parts that are nearer than a cell, such as the coils of a spring.
     for step in (None, weld):
         if step is not None:
             surface = step(vertices, faces, notes)

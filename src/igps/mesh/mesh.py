@@ -40,12 +40,10 @@ def millimetres(unit: str | None) -> float:
 
 
 _REPAIR = 'LoadOptions(mend="auto"), on the command line --mend auto,'
-# A closed surface with less volume, as a share of its diagonal's cube, is a folded sheet, not a body.
-_MIN_VOLUME = 1e-10
+_MIN_VOLUME = 1e-10  # of a body, over the cube of its diagonal; surfaces with less are folded sheets
 # Between these diagonals, areas, volumes and eigenfunctions in single precision neither overflow nor lose digits.
 _MIN_DIAGONAL, _MAX_DIAGONAL = 1e-30, 1e30
-# Maximal distance from the origin, in diagonals. A mesh there keeps nine digits of its coordinates, which suffice.
-_MAX_DISTANCE = 1e6
+_MAX_DISTANCE = 1e6  # from the origin, in diagonals; the mesh keeps nine digits of its coordinates, which suffice
 
 
 class MeshError(ValueError):
@@ -106,17 +104,15 @@ class Mesh:
         volume = signed_volume(vertices, faces)
         if abs(volume) <= _MIN_VOLUME * diagonal(vertices) ** 3:
             sizes = f"{volume:.3g} for a bounding box diagonal of {diagonal(vertices):.3g}"
-            flat = f"{self.name}: the surface encloses no volume ({sizes}); a body was expected."
-            raise MeshError(f"{flat} Give a flat sheet some thickness.")
+            raise MeshError(f"{self.name}: expected a body, but it encloses no volume ({sizes}). Thicken flat sheets.")
         if volume < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
-            object.__setattr__(self, "notes", (*self.notes, "was inside out: all faces turned"))
+            vars(self).update(notes=(*self.notes, "was inside out: all faces turned"))
             logger.info("%s: was inside out, all faces turned", self.name)
         if self.cavities:
             _check_cavities(vertices, faces, self.name)
         vertices.flags.writeable = faces.flags.writeable = False
-        object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "faces", faces)
+        vars(self).update(vertices=vertices, faces=faces)  # the class is frozen
 
     @classmethod
     def of(cls, body: Any, spacing: Sequence[float] | None = None) -> Self:
@@ -154,8 +150,7 @@ class Mesh:
 
     def _changed(self, **fields: object) -> Self:
         other = copy.copy(self)
-        for name, value in fields.items():
-            object.__setattr__(other, name, value)
+        vars(other).update(fields)
         return other
 
     def outer(self) -> tuple[Self, Booleans]:
@@ -218,10 +213,8 @@ def check_places(vertices: NDArray[Any], name: str) -> None:
         raise MeshError(f"{name}: vertices: expected shape (V, 3), got {vertices.shape}.")
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
-        raise MeshError(
-            f"{name}: {int((~finite).sum())} vertices have NaN or infinite coordinates, the first is vertex "
-            f"{int(np.argmin(finite))}. Remove them or export the file again."
-        )
+        fault = f"{name}: {int((~finite).sum())} vertices have NaN or infinite coordinates"
+        raise MeshError(f"{fault}, the first is vertex {int(np.argmin(finite))}. Remove them or export the file again.")
 
 
 def check_size(vertices: Floats, name: str) -> None:
@@ -229,16 +222,12 @@ def check_size(vertices: Floats, name: str) -> None:
     with np.errstate(over="ignore"):
         length, distance = diagonal(vertices), float(np.abs(vertices).max())
     if not _MIN_DIAGONAL <= length <= _MAX_DIAGONAL:
-        raise MeshError(
-            f"{name}: expected a bounding box diagonal from {_MIN_DIAGONAL:g} to {_MAX_DIAGONAL:g}, for which areas "
-            f"stay in floating-point range, got {length:.3g}. Scale the mesh, or remove stray vertices."
-        )
+        fault = f"{name}: expected a bounding box diagonal from {_MIN_DIAGONAL:g} to {_MAX_DIAGONAL:g}"
+        raise MeshError(f"{fault}, got {length:.3g}. Scale the mesh, or remove stray vertices.")
     if distance > _MAX_DISTANCE * length:
-        raise MeshError(
-            f"{name}: the mesh lies {distance / length:.3g} times its own size away from the origin, where its "
-            f"coordinates are mostly rounded off; at most {_MAX_DISTANCE:g} times is expected. Move the mesh to the "
-            "origin before writing the file."
-        )
+        fault = f"{name}: expected a distance from the origin of at most {_MAX_DISTANCE:g} times the size of the mesh"
+        rounded = f"got {distance / length:.3g} times, where coordinates are mostly rounded off"
+        raise MeshError(f"{fault}, {rounded}. Move the mesh to the origin before writing the file.")
 
 
 def _check_topology(faces: Integers, n_vertices: int, name: str, allow_open: bool, cavities: bool) -> None:
@@ -283,7 +272,6 @@ def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
         around = {i: winding_number(*surface, points) for i, surface in enumerate(surfaces) if i != k}
         lies_inside = around.pop(outer).min() >= 0.5
         if is_outward or not lies_inside or any(abs(winding).max() > 0.5 for winding in around.values()):
-            raise MeshError(
-                f"{name}: one of {len(surfaces)} closed surfaces bounds no cavity: it is oriented outward, outside the "
-                f"largest surface, or inside another cavity. Read the file with {_REPAIR} or without cavities."
-            )
+            reasons = "it is oriented outward, outside the largest surface, or inside another cavity"
+            fault = f"{name}: one of {len(surfaces)} closed surfaces bounds no cavity: {reasons}."
+            raise MeshError(f"{fault} Read the file with {_REPAIR} or without cavities.")

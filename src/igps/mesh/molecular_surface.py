@@ -25,8 +25,7 @@ from igps.mesh.surface import connected, face_areas, signed_volume, stacked, sum
 
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 
-# Distances are computed up to this many cells around the balls, and on both sides of the surface.
-_MARGIN = 2.5
+_MARGIN = 2.5  # cells around the balls, and on both sides of the surface, in which distances are computed
 _MAX_CELLS = 2**28
 _MAX_STEP = 0.3  # maximal step of vertices towards the surface, in cells
 # Maximal share of the area that threads between pieces add, and maximal width of a thread's end over its triangle's.
@@ -186,38 +185,35 @@ def _mean_at_vertices(values: Floats, vertices: Floats, faces: Integers) -> Floa
 
 
 def _join(parts: Sequence[Surface]) -> Surface:
-    """Join closed, outward oriented parts, none inside another, by threads to one closed surface.
-
-    A thread is a tube of triangular section between the largest triangles at the two nearest vertices of two parts.
-    """
-    starts = np.cumsum([0, *(len(points) for points, _ in parts)])
+    """Join closed, outward oriented parts, none inside another, by threads to one closed surface."""
     vertices, faces = stacked(parts)
-    links = [(starts[i] + a, starts[j] + b) for i, j, a, b in _shortest_links([points for points, _ in parts])]
+    links = _shortest_links([points for points, _ in parts])
     length = sum(float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in links)
     girth = _MAX_THREADS * float(face_areas(vertices, faces).sum()) / max(length, 1e-300)
     for a, b in links:
-        vertices, faces = _add_thread(vertices, faces, int(a), int(b), girth)
+        vertices, faces = _add_thread(vertices, faces, a, b, girth)
     return vertices, faces
 
 
-def _shortest_links(parts: Sequence[Floats]) -> list[tuple[int, int, int, int]]:
-    """Return two parts and a vertex of each, for every edge of the minimum spanning tree of the parts (Prim)."""
+def _shortest_links(parts: Sequence[Floats]) -> list[tuple[int, int]]:
+    """Return the minimum spanning tree of the parts (Prim) as pairs of vertices, numbered through all parts."""
     trees, links = [cKDTree(points) for points in parts], []
-    best = dict.fromkeys(range(1, len(parts)), (np.inf, 0, 0, 0))
+    starts = np.cumsum([0, *map(len, parts)]).tolist()
+    best = dict.fromkeys(range(1, len(parts)), (np.inf, 0, 0))  # shortest link of each part that is not yet in the tree
     new = 0
     while best:
         for j in best:
             distance, vertex = trees[new].query(parts[j])
-            if distance.min() < best[j][0]:
-                best[j] = (float(distance.min()), new, int(vertex[distance.argmin()]), int(distance.argmin()))
+            nearest = int(distance.argmin())
+            if distance[nearest] < best[j][0]:
+                best[j] = (float(distance[nearest]), starts[new] + int(vertex[nearest]), starts[j] + nearest)
         new = min(best, key=lambda j: best[j][0])
-        _, old, a, b = best.pop(new)
-        links.append((old, new, a, b))
+        links.append(best.pop(new)[1:])
     return links
 
 
 def _add_thread(vertices: Floats, faces: Integers, a: int, b: int, girth: float) -> Surface:
-    """Add a tube of this girth between the largest triangles at two vertices."""
+    """Add a thread, a tube of triangular section, between the largest triangles at two vertices."""
     areas = face_areas(vertices, faces)
     ends = [int(at[areas[at].argmax()]) for at in (np.flatnonzero((faces == v).any(axis=1)) for v in (a, b))]
     rims, new = [], []

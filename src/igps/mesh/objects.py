@@ -25,7 +25,7 @@ def bodies_of_object(thing: Any, name: str, options: LoadOptions = LoadOptions()
 
 
 def raw_of(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, RawBody]:
-    """Return the name and the unchecked surface of a body; for the types see `Mesh.of`, a TypeError for any other."""
+    """Return the name and the unchecked surface of a body; a TypeError unless it has a type listed in `Mesh.of`."""
     if _is_volume(thing):
         bodies = bodies_of_object((thing, spacing), "volume")
         if len(bodies) > 1:
@@ -52,11 +52,9 @@ def raw_of(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, Raw
         unit = getattr(thing, "units", None) or getattr(thing, "unit", None)
         vertices, triangles = np.asarray(thing.vertices, np.float64), np.asarray(thing.faces, np.int64)
         return name, RawBody(vertices, triangles, unit=unit, notes=getattr(thing, "notes", ()))
-    kind = f"{type(thing).__module__}.{type(thing).__qualname__}"
-    raise TypeError(
-        f"mesh: expected a Mesh, a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage or labels, got {kind}. "
-        "Read a file with igps.load_mesh, or pass Mesh(vertices, faces)."
-    )
+    expected = "a Mesh, a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage or labels"
+    got = f"{type(thing).__module__}.{type(thing).__qualname__}"
+    raise TypeError(f"mesh: expected {expected}, got {got}. Read a file with igps.load_mesh, or pass Mesh(...).")
 
 
 def _is_volume(thing: Any) -> bool:

@@ -30,10 +30,8 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     points = np.asfortranarray((mesh.vertices - centre) / scale)
     points, faces, *_ = igl.qslim(points, np.asfortranarray(mesh.faces), max(len(mesh.faces) - 2 * surplus, 4))
     if len(points) > max_vertices:
-        raise MeshError(
-            f"{mesh.name}: simplification reached only {len(points)} vertices, expected {max_vertices}; fewer would "
-            "change the topology. Raise max_vertices."
-        )
+        fault = f"{mesh.name}: simplification reached only {len(points)} vertices, expected {max_vertices}"
+        raise MeshError(f"{fault}; fewer would change the topology. Raise max_vertices.")
     note = f"simplified from {len(mesh.vertices)} to {len(points)} vertices"
     try:
         return replace(mesh, vertices=points * scale + centre, faces=faces, notes=(*mesh.notes, note))
@@ -67,7 +65,7 @@ def _cut(vertices: Floats, faces: Integers, edges: Integers, edge_of_side: Integ
     pieces = [faces[n_cut == 0]]
     for n in (1, 2, 3):
         f, k = faces[n_cut == n], middle_of_side[n_cut == n]
-        # Rotated so that the cut sides come first.
+        # The corners are rotated so that the cut sides come first.
         turn = np.argmax(k >= 0, axis=1) if n == 1 else (np.argmin(k >= 0, axis=1) + 1 if n == 2 else 0)
         order = (np.arange(3) + np.reshape(turn, (-1, 1))) % 3
         a, b, c = np.take_along_axis(f, np.broadcast_to(order, f.shape), axis=1).T

@@ -7,8 +7,8 @@ al. 2003), and quadrics simplify it (Garland and Heckbert 1997).
 
 **Several pieces** become one body: pieces of less than 1/500 of the volume are dropped, and the others are joined by
 straight bars of about a cell's radius where the gaps are narrowest (a minimum spanning tree of the gaps). Retrieval
-with joined pieces is nearly as good as with the whole body. The spectra of all pieces side by side depend on how the
-body was cut, and the largest piece alone is another body: both retrieve far worse.
+with joined pieces is nearly as good as with the whole body. With the spectra of all pieces side by side, or with the
+largest piece alone, it is far worse.
 """
 
 from dataclasses import replace
@@ -31,11 +31,9 @@ _SPECK_AREA, _SPECK_CELLS = 2e-3, 64
 # Thickness (volume over area, half a rod's radius) in cells: the grid is refined up to the first as far as its size
 # allows, and bodies below the second get a note that they are coarse.
 _FINE, _COARSE = 1.5, 0.75
-# The vertices of meshes with more faces are first merged within quarters of a cell, to bound time and memory.
-_MAX_FACES = 400_000
+_MAX_FACES = 400_000  # in larger meshes, vertices are first merged within quarters of a cell, to bound time and memory
 _MAX_POINTS = 200_000  # larger clouds are thinned out first
-# Points with a smaller ratio of spread across to spread along lie on a line, up to single precision.
-_LINE = 1e-5
+_LINE = 1e-5  # points on a line in single precision have a smaller ratio of spread across to spread along
 
 
 def watertight(
@@ -70,8 +68,7 @@ def watertight(
     faces = np.asarray(faces, dtype=np.int64)
     faces = faces[face_areas(vertices, faces) > 1e-14 * diagonal(vertices[faces].reshape(-1, 3)) ** 2]
     if not len(faces):
-        flat = f"{name}: no triangle has an area; a surface was expected."
-        raise MeshError(f"{flat} If the file holds lines, give them thickness.")
+        raise MeshError(f"{name}: expected a surface, but no triangle has an area. Give lines some thickness.")
     faces = _drop_specks(vertices, faces, notes)
     default_size, min_size = cell_sizes(vertices, faces, resolution, spacing)
     grid = Grid.around(vertices, faces, min_size)
@@ -146,16 +143,14 @@ def _sample_triangles(corners: Floats, spacing: float) -> tuple[Floats, Integers
 def splats(points: Floats, normals: Floats | None, resolution: int, name: str) -> tuple[Floats, Integers, float]:
     """Return the vertices and faces of hexagonal discs around the points of a cloud, and the spacing of the points."""
     if len(points) < 10:
-        few = f"{name}: expected at least 10 points for a surface, got {len(points)}."
-        raise MeshError(f"{few} Check that the file holds faces, or scan more points.")
+        raise MeshError(f"{name}: expected at least 10 points for a surface, got {len(points)}. Export or scan more.")
     side = longest_side(points)
     if side == 0:
         raise MeshError(f"{name}: expected a surface, but all points coincide. Check the file.")
     centred = points - points.mean(axis=0)
     _, across, along = np.linalg.eigvalsh(centred.T @ centred)
     if across < _LINE**2 * along:
-        line = f"{name}: expected a surface, but all {len(points)} points lie on one line."
-        raise MeshError(f"{line} If the file holds lines, give them thickness.")
+        raise MeshError(f"{name}: expected a surface, but all {len(points)} points lie on one line. Check the file.")
     if len(points) > _MAX_POINTS:
         # Keep one point in each quarter of a cell.
         lattice = np.floor((points - points.min(axis=0)) / (side / (4 * resolution))).astype(np.int64)

@@ -67,9 +67,8 @@ class ArticulatedShapes:
         return self.n_classes * self.n_per_class
 
     def __repr__(self) -> str:
-        return (
-            f"ArticulatedShapes({self.n_classes}, {self.n_per_class}, seed={self.seed}, n_vertices={self.n_vertices})"
-        )
+        sizes = f"{self.n_classes}, {self.n_per_class}"
+        return f"ArticulatedShapes({sizes}, seed={self.seed}, n_vertices={self.n_vertices})"
 
     @property
     def class_names(self) -> list[str]:
@@ -151,7 +150,7 @@ def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
 
 
 def off_text(vertices: Floats, faces: Integers) -> str:
-    """Write a mesh in the Object File Format; 17 digits preserve float64 values exactly."""
+    """Return a mesh as text in the Object File Format; 17 digits preserve float64 values exactly."""
     lines = [f"OFF\n{len(vertices)} {len(faces)} 0"]
     lines += [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in vertices.tolist()]
     lines += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]

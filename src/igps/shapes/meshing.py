@@ -18,7 +18,7 @@ _RELAXATION_STEPS = 10
 
 
 def mesh(body: Sequence[Placed], target: int) -> tuple[Floats, Integers, float]:
-    """Mesh a body: vertices (V,3), V within about a tenth of ``target``, outward faces (F,3) and the grid spacing."""
+    """Return about ``target`` vertices (V,3), within a tenth, outward faces (F,3), and the grid spacing."""
     from skimage.measure import marching_cubes
 
     # Vertices are crossings of the surface with grid lines: on average 1.5 of them in an area of spacing².
@@ -39,7 +39,7 @@ def mesh(body: Sequence[Placed], target: int) -> tuple[Floats, Integers, float]:
 
 
 def roughen(vertices: Floats, faces: Integers, amplitude: float, wavelength: float, rng: np.random.Generator) -> Floats:
-    """Move vertices (V,3) along their normals by a band-limited random field."""
+    """Move vertices (V,3) along their normals by random waves; ``amplitude`` is the standard deviation."""
     waves = rng.normal(size=(12, 3)) * (2.0 * np.pi / wavelength / np.sqrt(3.0))
     phases = rng.uniform(0.0, 2.0 * np.pi, 12)
     noise = np.zeros(len(vertices))

@@ -106,8 +106,6 @@ def limb(
     """Return a chain of tapered capsules with the parts ``tip`` at its end.
 
     Args:
-        group: the group of all segments.
-        lengths: lengths of the segments.
         radii: radii where segments begin, meet and end, one more than ``lengths``.
         bends: (raise, swing) limits of the joints; further joints have the limits of the last pair.
         tip: parts on the last segment.

@@ -1,7 +1,4 @@
-"""The solids of which bodies consist, each in its own frame and defined by a signed distance function.
-
-Distance functions broadcast their coordinates, so that a grid is evaluated from its three axes.
-"""
+"""The solids of which bodies consist."""
 
 from __future__ import annotations
 
@@ -26,7 +23,7 @@ class Solid(ABC):
 
     @abstractmethod
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        """Return the signed distance (exact or a good approximation), negative inside."""
+        """Return the signed distance (exact or a good approximation), negative inside; coordinates are broadcast."""
 
     @abstractmethod
     def box(self) -> tuple[Floats, Floats]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -117,16 +116,14 @@ def pieces(whole: RawBody) -> list[RawBody]:
 
 def distinct(names: Iterable[str]) -> list[str]:
     """Make names distinct by numbers: a second "part" becomes "part (2)"."""
-    result: list[str] = []
-    taken: Counter[str] = Counter()
+    counts: dict[str, int] = {}
     for name in names:
         new = name
-        while new in taken:
-            taken[name] += 1
-            new = f"{name} ({taken[name]})"
-        taken[new] += 1
-        result.append(new)
-    return result
+        while new in counts:
+            counts[name] += 1
+            new = f"{name} ({counts[name]})"
+        counts[new] = 1
+    return list(counts)
 
 
 def stamp_of(*paths: Path) -> tuple[int, int, int]:
@@ -178,7 +175,6 @@ def faults(path: object, kind: Format) -> Iterator[None]:
 def check_unpacked(n_bytes: int, path: Path, limit: int) -> None:
     """Raise a MeshError if the content of a file unpacks to more than `limit` bytes."""
     if n_bytes > limit:
-        raise MeshError(
-            f"{path}: unpacks to {n_bytes / 1e9:.2g} GB or more, expected at most {limit / 1e9:.2g} GB. If you trust "
-            "the file, raise LoadOptions(max_unpacked=...), on the command line --max_unpacked."
-        )
+        fault = f"{path}: unpacks to {n_bytes / 1e9:.2g} GB or more, expected at most {limit / 1e9:.2g} GB."
+        remedy = "If you trust the file, raise LoadOptions(max_unpacked=...), on the command line --max_unpacked."
+        raise MeshError(f"{fault} {remedy}")

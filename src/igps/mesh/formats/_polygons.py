@@ -4,8 +4,7 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 
-# Larger polygons are cut into fans without regard to folds: ear clipping takes time quadratic in the corners, or worse.
-_MAX_EAR_CORNERS = 2000
+_MAX_EAR_CORNERS = 2000  # larger polygons are cut into fans: ear clipping takes quadratic time or worse
 
 
 def triangles(corners: Integers, n_corners: Integers) -> Integers:

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 SUFFIXES = frozenset({".pdb", ".ent", ".cif", ".mmcif", ".pqr"})
 """Suffixes of structure files; ".gz" may follow."""
 
-# Twice the largest structures of the Protein Data Bank.
-_MAX_BYTES = 2**31
+_MAX_BYTES = 2**31  # twice the largest structures of the Protein Data Bank
 _ATOM_LINE = re.compile(rb"^(?:ATOM  |HETATM)[^\r\n]*", re.MULTILINE)
 # Columns of _atom_site without which gemmi reads no atoms.
 _REQUIRED_COLUMNS = ("id", "type_symbol", "label_asym_id", "label_alt_id", "Cartn_x", "Cartn_y", "Cartn_z")
@@ -110,11 +109,8 @@ def _read_text(path: Path) -> bytes:
 
 
 def _pdb(text: bytes) -> gemmi.Structure:
-    """Parse a PDB file, and mark residues as parts of polymers only if the file lists the polymers' sequences.
-
-    Gemmi takes every residue before TER for a part of a polymer, but some programs write ligands there, too.
-    """
     structure = gemmi_module().read_pdb_string(text)
+    # Without the sequences of polymers, gemmi takes each residue before TER for a part of one, but it may be a ligand.
     if not any(entity.full_sequence for entity in structure.entities):
         for residue in (residue for model in structure for chain in model for residue in chain):
             residue.entity_type = gemmi_module().EntityType.Unknown
@@ -152,10 +148,7 @@ def _mark_unknown(block: gemmi.cif.Block) -> None:
 
 
 def _pqr(text: bytes, path: Path) -> gemmi.Structure:
-    """Parse a PQR file: lines of type, serial number, atom, residue, [chain,] number, x, y, z, charge and radius.
-
-    Fields are separated by blanks, but some programs leave none before long numbers behind "HETATM" or the chain.
-    """
+    """Parse a PQR file: lines of type, serial number, atom, residue, [chain,] number, x, y, z, charge and radius."""
     gemmi = gemmi_module()
     structure = gemmi.Structure()
     chains: dict[str, list[Any]] = {}
@@ -164,6 +157,7 @@ def _pqr(text: bytes, path: Path) -> gemmi.Structure:
             _add_model(structure, chains)
         if not line.startswith(("ATOM", "HETATM")):
             continue
+        # Some programs leave no blank before long numbers behind HETATM or the chain.
         fields = line.replace("HETATM", "HETATM ", 1).split()
         try:
             x, y, z, charge, radius = map(float, fields[-5:])

@@ -1,4 +1,4 @@
-"""Formats that trimesh reads; it gets bytes, and other files only from the same folder."""
+"""Reading by trimesh, which gets bytes, and other files only from the same folder."""
 
 from __future__ import annotations
 
@@ -57,8 +57,6 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
     bodies = []
     for part, (_, matrix, name) in zip(distinct(str(node) for node, _, _ in nodes), nodes, strict=True):
         geometry = scene.geometry[name]
-        if not isinstance(geometry, trimesh.Trimesh | trimesh.PointCloud):
-            continue
         vertices = np.asarray(geometry.vertices, dtype=np.float64)
         if not np.array_equal(matrix, np.eye(4)):
             vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
@@ -66,10 +64,10 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
             columns = ply_columns(scene)
             normals = [columns[name].astype(np.float64) for name in ("nx", "ny", "nz") if name in columns]
             bodies.append(RawBody(vertices, part=part, normals=np.hstack(normals) if len(normals) == 3 else None))
-            continue
-        faces = np.asarray(geometry.faces, dtype=np.int64)
-        faces = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces  # turned back if mirrored
-        bodies.append(RawBody(vertices, np.ascontiguousarray(faces), part))
+        elif isinstance(geometry, trimesh.Trimesh):
+            faces = np.asarray(geometry.faces, dtype=np.int64)
+            faces = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces  # turned back if mirrored
+            bodies.append(RawBody(vertices, np.ascontiguousarray(faces), part))
     if not bodies:
         raise ValueError("it holds no surface")
     return bodies

@@ -16,8 +16,7 @@ from igps.mesh.formats.label_names import names_in_extensions, names_in_tags
 from igps.mesh.limits import check_fits
 from igps.mesh.mesh import MILLIMETRES, MeshError
 
-# Working memory for holding and counting labels, bytes a voxel beyond those of the file.
-_WORK_BYTES = 4
+_WORK_BYTES = 4  # bytes a voxel to hold and count labels, beyond those of the file
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # DICOM and ITK use LPS
 _EXPORT = "Export the labels."
 _NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")
@@ -63,8 +62,7 @@ def check_voxels(path: str | Path, shape: Sequence[int], n_bytes: int, n_compone
         size.pop()
     shown = " × ".join(map(str, size))
     if len(size) != 3:
-        axes = f"{path}: expected an array of three axes, got {len(size)} axes, {shown}."
-        raise MeshError(f"{axes} Export each volume to a separate file.")
+        raise MeshError(f"{path}: expected three axes, got {len(size)} axes, {shown}. Export each volume to a file.")
     if min(size) < 2:
         raise MeshError(f"{path}: {shown} voxels are a single slice, which has no volume. Export the whole stack.")
     remedy = "Crop or resample the volume; if it is smaller, its header is damaged."
@@ -165,14 +163,13 @@ def _segments(metadata: dict[str, str]) -> list[tuple[str, int, int]]:
 
 
 def detached(path: Path) -> list[Path]:
-    """Return the files of the voxels if the header of a volume names others; a MeshError if outside its folder."""
+    """Return the files of voxels that the header of a volume names, if any; a MeshError if outside its folder."""
     if suffix_of(path) not in (*_NRRD, *_META):
         return []
     names = [line.decode("utf-8", "replace") for line in _DATA_FILE.findall(_header(path))]
     for name in names:
         if "/" in name or "\\" in name or name.upper().startswith("LIST"):
-            fault = f"{path}: expected voxels in a file of the same folder, got {name!r}."
-            raise MeshError(f"{fault} Save the volume as one file.")
+            raise MeshError(f"{path}: expected voxels in a file of the same folder, got {name!r}. Save it as one file.")
     return [path.with_name(name) for name in names if name and name != "LOCAL"]
 
 
@@ -192,8 +189,7 @@ def _highdicom(path: Path) -> RawVolume:
 
     dataset = pydicom.dcmread(path)
     if (modality := dataset.get("Modality", "none")) != "SEG":
-        fault = f"{path}: expected DICOM of modality SEG, got {modality}."
-        raise MeshError(f"{fault} Export the segmentation as DICOM SEG.")
+        raise MeshError(f"{path}: expected DICOM of modality SEG, got {modality}. Export the labels as DICOM SEG.")
     segmentation = Segmentation.from_dataset(dataset, copy=False)
     geometry = segmentation.get_volume_geometry()
     if geometry is None:

@@ -15,8 +15,7 @@ _SIDES: dict[int, tuple[tuple[int, ...], ...]] = {
     13: ((0, 1, 2), (3, 5, 4), (0, 3, 4, 1), (1, 4, 5, 2), (2, 5, 3, 0)),
     14: ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
 }
-# Empty cells, points and lines.
-_WITHOUT_AREA = (0, 1, 2, 3, 4)
+_WITHOUT_AREA = (0, 1, 2, 3, 4)  # empty cells, points and lines
 
 
 def surface(corners: Integers, n_corners: Integers, kinds: Integers, vertices: Floats) -> Integers:

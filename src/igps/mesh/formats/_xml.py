@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 def parse(content: bytes) -> ElementTree.Element:
     """Parse a document into a tree; prefixes of element names are removed."""
     builder = ElementTree.TreeBuilder()
-    parser = _parser(lambda name, attributes: builder.start(name, attributes))
+    parser = _parser(builder.start)
     parser.EndElementHandler = builder.end
     parser.CharacterDataHandler = builder.data
     parser.Parse(content, True)

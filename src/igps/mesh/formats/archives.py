@@ -112,11 +112,6 @@ def _copy(stream: Any, target: Path) -> None:
         shutil.copyfileobj(stream, out)
 
 
-ARCHIVE = Format(
-    "an archive",
-    (".zip", ".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz"),
-    read,
-    bodies=("whole", "objects"),
-    is_searched=False,
-)
+_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
+ARCHIVE = Format("an archive", _SUFFIXES, read, bodies=("whole", "objects"), is_searched=False)
 COMPRESSED = Format("a compressed file", tuple(_OPENERS), read_compressed, is_searched=False)

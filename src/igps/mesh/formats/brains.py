@@ -18,13 +18,13 @@ _TYPES = {"NIFTI_TYPE_FLOAT32": "f4", "NIFTI_TYPE_FLOAT64": "f8", "NIFTI_TYPE_IN
 _POINTS, _TRIANGLES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
 _MAX_AXES = 6
 _MAGIC = b"\xff\xff\xfe"
-# A tag behind the triangles of FreeSurfer files whose points are in the coordinates of images.
-_SCANNER_TAG = np.array([2, 1], ">i4").tobytes()
+_SCANNER_TAG = np.array([2, 1], ">i4").tobytes()  # behind the triangles if the points are in the coordinates of images
 # Lines at the end of a FreeSurfer file: axes and centre of the volume from which the surface was made.
 _VOLUME_AXES = re.compile(rb"^[xyzc]ras\s*=\s*(\S+)\s+(\S+)\s+(\S+)", re.MULTILINE)
 # The axes of that volume in the coordinates of the surface.
 _SURFACE_AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-_SURFACES = ("pial", "white", "inflated", "orig", "smoothwm", "sphere", "sphere.reg")
+_KINDS = ("pial", "white", "inflated", "orig", "smoothwm", "sphere", "sphere.reg")
+_SUFFIXES = tuple(f"{side}.{kind}" for side in ("lh", "rh") for kind in _KINDS)
 
 
 def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -89,7 +89,7 @@ def in_scanner(path: Path, points: Floats) -> Floats:
     FreeSurfer's triangle files have their origin in the centre of a volume, whose position and axes stand at the end of
     the file. The points of other files are returned unchanged: they are in the coordinates of images.
     """
-    if not path.name.lower().endswith(FREESURFER.suffixes):
+    if not path.name.lower().endswith(_SUFFIXES):
         return points
     content = path.read_bytes()
     at = content.find(b"\n\n") + 2
@@ -101,6 +101,4 @@ def in_scanner(path: Path, points: Floats) -> Floats:
 
 
 GIFTI = Format("GIFTI", (".gii",), read_gifti, ignored=(".func.gii", ".label.gii", ".shape.gii", ".time.gii"))
-FREESURFER = Format(
-    "FreeSurfer", tuple(f"{side}.{kind}" for side in ("lh", "rh") for kind in _SURFACES), read_freesurfer
-)
+FREESURFER = Format("FreeSurfer", _SUFFIXES, read_freesurfer)

@@ -15,9 +15,7 @@ from igps.mesh.mesh import MeshError
 
 _GRIDS = (".dx", ".mrc", ".map", ".ccp4")
 SUFFIXES = (*_volume_files.READERS, *_GRIDS)
-
-# Bytes of a value by the mode of an MRC map (MRC2014).
-_MODE_BYTES = {0: 1, 1: 2, 2: 4, 4: 8, 6: 2, 12: 2}
+_MODE_BYTES = {0: 1, 1: 2, 2: 4, 4: 8, 6: 2, 12: 2}  # of a value, by the mode of an MRC map (MRC2014)
 
 
 @lru_cache(maxsize=1)

@@ -53,10 +53,9 @@ def read_label_names(path: str | Path) -> dict[int, str]:
         raise MeshError(f"{path}: the table of names is not readable ({error}). Check the path.") from error
     names = _parse_json(text) if path.suffix.lower() == ".json" else _parse_csv(text) or _parse_lines(text)
     if not names:
-        raise MeshError(
-            f"{path}: names no label. Expected label descriptions of ITK-SNAP, a colour table of 3D Slicer, "
-            "FreeSurfer or FSLeyes, CSV with the columns label,name, or JSON from numbers to names."
-        )
+        tables = "label descriptions of ITK-SNAP, a colour table of 3D Slicer, FreeSurfer or FSLeyes"
+        formats = f"{tables}, CSV with the columns label,name, or JSON from numbers to names"
+        raise MeshError(f"{path}: names no label. Expected {formats}.")
     return names
 
 

@@ -28,8 +28,7 @@ logger = logging.getLogger(__name__)
 
 MoleculeBodies = Literal["chains", "models", "assembly"]
 
-# Elements that are inferred from the first letter of an atom's name if the file states none.
-_INFERRED_ELEMENTS = frozenset("HCNOSP")
+_INFERRED_ELEMENTS = frozenset("HCNOSP")  # by the first letter of an atom's name, if the file states no element
 # Elements of residues with standard names; selenium is that of selenomethionine.
 _STANDARD_ELEMENTS = frozenset({*_INFERRED_ELEMENTS, "D", "Se"})
 _UNKNOWN_RADIUS = 1.7  # Å, of atoms of unknown elements: that of carbon
@@ -142,8 +141,6 @@ def _molecules(
 
 
 class _Builder:
-    """Builder of a molecule from its chains."""
-
     def __init__(self, ligands: bool, hydrogens: bool, is_pqr: bool) -> None:
         self.ligands, self.hydrogens, self.is_pqr = ligands, hydrogens, is_pqr
         self.balls: list[tuple[Floats, float, float, int]] = []  # position, radius, charge, residue
@@ -151,13 +148,13 @@ class _Builder:
         self._count: Counter[str] = Counter()
 
     def molecule(self, name: str, notes: list[str]) -> Molecule:
-        own = ["radii and charges are those of the PQR file"] if self.is_pqr else []
+        origin = ["radii and charges are those of the PQR file"] if self.is_pqr else []
         counted = [text.format(self._count[key]) for key, text in _NOTES.items() if self._count[key]]
         positions, radii, charges, residue_of = map(np.array, zip(*self.balls, strict=True))
         names, centres, b_factors = zip(*self._residues, strict=True)
         return Molecule(
             name, positions, radii, charges, residue_of, names, np.array(centres), np.array(b_factors),
-            (*notes, *own, *counted),
+            (*notes, *origin, *counted),
         )  # fmt: skip
 
     def add_chain(self, chain: gemmi.Chain) -> None:

@@ -46,10 +46,10 @@ def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBod
     for primitive in (item for mesh in scene.get("meshes", []) for item in mesh["primitives"]):
         if primitive.get("mode") == _FAN:  # trimesh would skip it
             raise ValueError("it holds fans of triangles, which are not supported; export it as plain triangles")
-        used = ((primitive["attributes"].get("POSITION"), 24), (primitive.get("indices"), 8))
-        arrays = [scene["accessors"][number] for number, _ in used if number is not None]
-        n_bytes += sum(size * abs(scene["accessors"][number]["count"]) for number, size in used if number is not None)
-        if any("sparse" in array or array.get("normalized") for array in arrays):  # trimesh would misread it
+        sizes = ((primitive["attributes"].get("POSITION"), 24), (primitive.get("indices"), 8))
+        used = [(scene["accessors"][number], size) for number, size in sizes if number is not None]
+        n_bytes += sum(size * abs(array["count"]) for array, size in used)
+        if any("sparse" in array or array.get("normalized") for array, _ in used):  # trimesh would misread it
             raise ValueError("its coordinates are sparse or normalized, which is not supported; export it uncompressed")
     check_unpacked(n_bytes, path, options.max_unpacked)
     return [replace(body, unit="m") for body in objects(path, options)]
@@ -101,6 +101,5 @@ def _converted(path: Path) -> bytes:
 
 GLTF = Format("glTF", (".glb", ".gltf"), read_gltf, bodies=("whole", "objects"), beside=_buffers)
 STEP = Format("STEP", (".step", ".stp"), read_step, bodies=("whole", "objects"), extra="cad")
-OTHERS = Format(
-    "COLLADA, 3DXML or XAML", (".dae", ".zae", ".3dxml", ".xaml"), read, bodies=("whole", "objects"), extra="formats"
-)
+_SUFFIXES = (".dae", ".zae", ".3dxml", ".xaml")
+OTHERS = Format("COLLADA, 3DXML or XAML", _SUFFIXES, read, bodies=("whole", "objects"), extra="formats")

@@ -108,8 +108,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     items = model.items or [_Placed(key, np.eye(4, 3)) for key, obj in model.objects.items() if obj.triangles]
     budget = [options.max_unpacked]
     leaves = [list(model.leaves(item, budget)) for item in items]
-    if budget[0] < 0:
-        check_unpacked(options.max_unpacked - budget[0], path, options.max_unpacked)
+    check_unpacked(options.max_unpacked - budget[0], path, options.max_unpacked)
     names = distinct(item.name or model.objects[item.key].name for item in items)
     parts = [(name, joined(surfaces)) for name, surfaces in zip(names, leaves, strict=True) if surfaces]
     return [RawBody(body.vertices, body.faces, name, _UNITS.get(model.unit)) for name, body in parts]

@@ -16,9 +16,6 @@ from igps.mesh.options import LoadOptions
 
 Arrays = Mapping[str, Floats]
 
-_MAGIC = b"\xff\xff\xff"
-_VTK = (".vtk", ".vtp", ".vtu")
-
 
 def read(path: Path) -> Arrays:
     """Read the arrays (V,) or (V, C) of values at vertices by name; a ValueError if there are none.
@@ -26,7 +23,7 @@ def read(path: Path) -> Arrays:
     Formats are PLY, VTK, GIFTI, and FreeSurfer's files of thickness, curvature and the like.
     """
     name = path.name.lower()
-    if name.endswith(_VTK):
+    if name.endswith((".vtk", ".vtp", ".vtu")):
         arrays = vtk.point_values(path, LoadOptions()).values
     elif name.endswith(".gii"):
         arrays = brains.gifti_values(path, LoadOptions())
@@ -68,9 +65,9 @@ def _ply(path: Path) -> dict[str, NDArray[np.generic]]:
 
 def _freesurfer(path: Path) -> NDArray[np.generic]:
     content = path.read_bytes()
-    if not content.startswith(_MAGIC) or len(content) < 15:
+    if not content.startswith(b"\xff\xff\xff") or len(content) < 15:
         raise ValueError("expected PLY, VTK or GIFTI by its suffix, or a file of values of FreeSurfer")
     n, _, n_values = (int(x) for x in np.frombuffer(content, ">i4", 3, 3))
     if n < 1 or n_values != 1 or len(content) < 15 + 4 * n:
-        raise ValueError(f"expected {n} vertices in {4 * n} bytes, got {n_values} values each in {len(content) - 15}")
+        raise ValueError(f"expected {n} values in {4 * n} bytes, got {n_values} a vertex in {len(content) - 15} bytes")
     return np.frombuffer(content, ">f4", n, 15)

@@ -28,8 +28,7 @@ from igps.mesh.options import LoadOptions
 # Volumes with more values than _MAX_LABELS are refused as images. So are those with more than _MAX_UNCHECKED values if
 # less than a share _MIN_EQUAL of adjacent voxels are equal; labels as thin as two voxels have a share of one half.
 _MAX_LABELS, _MAX_UNCHECKED, _MIN_EQUAL = 20_000, 50, 0.3
-# Tolerance of labels that should be whole numbers: NIfTI may store them as scaled integers.
-_LABEL_TOLERANCE = 0.01
+_LABEL_TOLERANCE = 0.01  # distance of a label from a whole number: NIfTI may store labels as scaled integers
 
 Box = tuple[slice, slice, slice]
 
@@ -73,14 +72,13 @@ class LabelVolume:
     def __post_init__(self) -> None:
         checked_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
         if not self.bodies:
-            fault = f"{self.name}: no voxel has a label, all are 0"
-            fault += f" ({'; '.join(self.notes)})" if self.notes else ""
-            raise MeshError(f"{fault}. Check that the right file was exported.")
+            notes = f" ({'; '.join(self.notes)})" if self.notes else ""
+            raise MeshError(f"{self.name}: no voxel has a label, all are 0{notes}. Check the export.")
         seen: dict[str, int] = {}  # a given name may equal one that was made distinct by its number
         for body in self.bodies:
             if (other := seen.setdefault(body.name, body.label)) != body.label:
-                fault = f"{self.name}: labels {other} and {body.label} are both named {body.name!r}."
-                raise MeshError(f"{fault} Rename one, or give names by a table.")
+                both = f"labels {other} and {body.label} are both named {body.name!r}"
+                raise MeshError(f"{self.name}: {both}. Rename one, or give names by a table.")
 
     @cached_property
     def bodies(self) -> tuple[LabelBody, ...]:
@@ -210,16 +208,12 @@ def _integer_labels(values: NDArray[Any], name: str, threshold: float, notes: li
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
             return (values >= threshold).astype(np.uint8)
         if len(odd):
-            raise MeshError(
-                f"{name}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}. Resample labels to the nearest "
-                "neighbour, or give probabilities between 0 and 1."
-            )
+            fault = f"{name}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}."
+            raise MeshError(f"{fault} Resample to the nearest neighbour, or give probabilities between 0 and 1.")
     low, high = (int(np.rint(values.min())), int(np.rint(values.max()))) if values.size else (0, 0)
     if low < 0:
-        raise MeshError(
-            f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}; expected 0 "
-            "for the background and positive numbers. Export the labels if it is an image."
-        )
+        fault = f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}"
+        raise MeshError(f"{fault}; expected 0 and positive numbers. Export the labels if it is an image.")
     if high >= 2**31:
         raise MeshError(f"{name}: label {high} is too large, expected less than 2³¹. Renumber the labels.")
     if values.dtype.kind != "f":
@@ -262,7 +256,6 @@ def _is_speckled(labels: NDArray[Any], most_frequent: int) -> bool:
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """Read the labels of a volume as bodies; see `label_bodies`."""
     return label_bodies(read_label_volume(path, options), options, part)
 
 
@@ -292,7 +285,7 @@ def _in_pieces(volume: LabelVolume) -> LabelVolume:
 
 
 def _beside(path: Path, options: LoadOptions) -> list[Path]:
-    """Return the files of the voxels, if they are others, and the table of names."""
+    """Return the separate files of the voxels, if any, and the table of names."""
     table = table_beside(path) if options.names is None else Path(options.names)
     return [*detached(path), *([table] if table else [])]
 

@@ -181,7 +181,7 @@ def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody
 
 
 class _Xml:
-    """An XML file; the raw bytes that may be appended to it are no XML."""
+    """An XML file, to which raw bytes may be appended."""
 
     def __init__(self, path: Path, options: LoadOptions) -> None:
         content = path.read_bytes()
@@ -202,7 +202,6 @@ class _Xml:
         self._compressor = None if name is None else _COMPRESSORS[name]
 
     def geometry(self, piece: Element) -> tuple[Floats, list[Cells]]:
-        """Read the points and cells of a piece."""
         points = piece.find("Points/DataArray")
         if points is None:
             raise ValueError("no points in it")
