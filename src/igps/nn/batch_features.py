@@ -16,11 +16,9 @@ from igps.signature.signature import SampleKind
 WEIGHT = "weight"
 """Name of the attribute with the weights of samples in histograms; by default, all samples have equal weights."""
 
-# Coordinates of padded targets: farther than any real target, with a square that does not overflow.
-_FAR_AWAY = 1e18
-# Targets whose mean gives the direction to the surface in the embedding.
-_N_NEAREST = 8
-# Neighbours in graphs of samples. More than 12 make no difference; with 8, limbs fall apart where samples are sparse.
+_FAR_AWAY = 1e18  # coordinates of padded targets: beyond any real target, with a square that does not overflow
+_N_NEAREST = 8  # targets whose mean gives the direction to the surface in the embedding
+# Neighbours in graphs of samples. 12 or more make no difference; with 8, limbs fall apart where samples are sparse.
 N_NEIGHBOURS = 16
 
 

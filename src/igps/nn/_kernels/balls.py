@@ -12,8 +12,7 @@ from igps.nn._precision import full_precision
 
 # Sine of the smallest angle to the tangent plane. Below it, the error of the sampled normal determines the radius.
 _MIN_SINE = 0.1
-# The third smallest radius is taken, so that a single sample with a wrong direction cannot make a ball small.
-_RANK = 3
+_RANK = 3  # the third smallest radius is taken, so that no single sample with a wrong direction makes a ball small
 # Bounds of radii, in the unit of the points: smaller radii are finer than any sampling, larger ones are flat.
 _MIN_RADIUS, _MAX_RADIUS = 1e-3, 10.0
 _MIN_NORMAL = 2.0**-126  # smallest normal number of single precision
@@ -23,9 +22,9 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     """Return the radii of the largest balls that touch the surface at each sample and contain no other sample.
 
     A ball with centre x − r n touches the surface at x, and passes through another point y if
-    r = |x − y|² / (2 n·(x − y)). The largest empty ball has the smallest of these radii; the third smallest is taken,
-    which tolerates two outliers. The centres of inner balls lie on the medial axis (Ma, Bae and Choi 2012), so that
-    their radii measure the local thickness.
+    r = |x − y|² / (2 n·(x − y)). The largest empty ball has the smallest radius; for robustness, the third
+    smallest is returned. The centres of inner balls lie on the medial axis (Ma, Bae and Choi 2012), so that their radii
+    measure the local thickness.
 
     Args:
         points: (N, P, 3), in units of the body's size.

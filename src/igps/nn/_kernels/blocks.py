@@ -20,7 +20,7 @@ def map_bodies(function: Callable[..., Tensor], points: Tensor, others: Tensor, 
     """Apply a function to tensors of N bodies, (N, P, ...), (N, T, ...) and more, in batches of bodies.
 
     The function takes memory for P·T pairs of each body. On the CPU a batch is one body, whose pairs then stay in the
-    cache; on other devices a batch has about `BLOCK` pairs. Traced code processes all bodies at once.
+    cache; on other devices a batch has up to `BLOCK` pairs. Traced code processes all bodies at once.
     """
     tensors = (points, others, *more)
     if torch.compiler.is_compiling():

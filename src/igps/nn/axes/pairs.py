@@ -17,7 +17,7 @@ from igps.nn.specification import Specified
 
 
 class PairAxis(Specified, ABC):
-    """Base class of axes of pairs: a pair counts linearly in the two bins whose centres surround its value.
+    """Base class of axes of pairs: a pair is shared linearly between the two bins whose centres surround its value.
 
     An axis of your own defines `shape` and `pairs`, and `requirements` if it needs more than the samples. `pairs`
     returns features of the samples and a function that computes values from them, as `euclidean_distances` does.
@@ -55,7 +55,7 @@ class PairAxis(Specified, ABC):
         """The number of bins along each dimension that this axis adds to the histogram."""
 
     def requirements(self, embedding: nn.Module) -> Requirements:
-        """Return what a body must have, given the embedding of the histogram."""
+        """Return the requirements for a body, given the embedding of the histogram."""
         return Requirements()
 
     @abstractmethod
@@ -153,7 +153,7 @@ class EmbeddedPairCosines(_CosineAxes):
     """`PairCosines` of the embedded samples; they depend only on interior distances, and so hardly change with pose.
 
     The direction at an interior sample points to the nearest embedded surface samples; the direction at a surface
-    sample points away from the nearest interior samples. Only `torch.func` computes second derivatives.
+    sample points away from the nearest interior samples. Second derivatives are available only through `torch.func`.
     """
 
     def requirements(self, embedding: nn.Module) -> Requirements:

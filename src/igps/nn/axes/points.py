@@ -44,7 +44,7 @@ class PointAxis(Specified, ABC):
         return len(self.centres.start)
 
     def requirements(self, embedding: nn.Module) -> Requirements:
-        """Return what a body must have, given the embedding of the histogram."""
+        """Return the requirements for a body, given the embedding of the histogram."""
         return Requirements()
 
     @abstractmethod
@@ -145,7 +145,7 @@ class Attribute(PointAxis):
     Args:
         name: of the attribute.
         centres: of the classes, ascending, in the attribute's unit; None with `quantiles`.
-        quantiles: number of classes, whose centres `fit_centres` sets to quantiles of a collection.
+        quantiles: number of classes; `fit_centres` sets their centres, which are saved, to quantiles of a collection.
         soft, learnable: see `PointAxis`.
 
     Raises:
@@ -207,7 +207,7 @@ class Attribute(PointAxis):
 
 
 def attribute_requirements(name: str) -> Requirements:
-    """Return what an attribute of samples requires of a body: nothing for an attribute that users supply."""
+    """Return the requirements of an attribute of samples; attributes that users supply have none."""
     if name in RESIDUE_ATTRIBUTES:
         return Requirements(sources={name: ResidueAttribute(name)})
     return Requirements(attributes=tuple(x for x in get_args(AttributeName) if x == name))

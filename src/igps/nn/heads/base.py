@@ -70,7 +70,7 @@ class Head(Specified, ABC):
 
 
 def square_roots(histograms: Tensor) -> Tensor:
-    """Return the square roots (N, cells) of histograms (N, ...), with finite gradients; raise a ValueError below 0."""
+    """Return the square roots (N, cells) of histograms (N, ...), with finite gradients; a ValueError if any is < 0."""
     cells = histograms.flatten(1)
     if not torch.compiler.is_compiling() and bool((cells < 0).any()):
         raise ValueError("descriptions: expected histograms, entries ≥ 0, got a negative one.")
@@ -93,7 +93,8 @@ def checked_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
 
 def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
     """Return the labels (N,) on the device of the descriptions (N, ...); raise a ValueError for another shape."""
-    if labels.shape != (n := len(descriptions),):
+    n = len(descriptions)
+    if labels.shape != (n,):
         raise ValueError(f"labels: expected one for each of {n} descriptions, got shape {tuple(labels.shape)}.")
     return labels.to(descriptions.device)
 

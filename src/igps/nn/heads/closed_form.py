@@ -51,7 +51,7 @@ class WhitenedHead(Head):
         [[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
 
     Args:
-        n_directions: number of directions, of the largest variance, that are damped in each part.
+        n_directions: number of directions that are damped in each part: those of the largest variance.
         shrinkage: s of the whitening; with a large value, only the centring remains.
         prior: a fitted head, which is not changed; None for no prior.
         prior_share: weight of the prior, between 0 and 1.
@@ -150,9 +150,8 @@ class KernelHead(Head):
 
     The kernel is exp(−d/m), where d is the cosine distance of the whitened histograms and m its median between training
     shapes. With several parts, the kernel is the mean of the kernels of the parts. The targets of the regression are
-    the indicators of the classes. A prior (see `WhitenedHead`) adds the kernel of its distance, with the weight
-    `prior_share`. This is the best head of the library for classes in the training set; for other classes use the
-    `WhitenedHead`.
+    the indicators of the classes. A prior (see `WhitenedHead`) adds the kernel of its distance, with weight
+    `prior_share`. This is the library's best head for classes in the training set; for others use the `WhitenedHead`.
 
     An embedding consists of two halves of equal weight: the scores minus their mean, which show how similar a shape is
     to each class, and the square roots of the softmax of the scores, which show its class. With only the second half,

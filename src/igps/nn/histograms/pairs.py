@@ -133,8 +133,8 @@ def pair_histogram(
 
     Each unordered pair of distinct points counts once, in the row of the classes of the two points. The classes are
     `n_classes` equal intervals of [0, `potential_range`]. The bins have their centres in the middle of `n_bins` equal
-    intervals of [0, `distance_range`]; a distance counts linearly in the two bins whose centres surround it. Values
-    beyond a range count in its last class or bin.
+    intervals of [0, `distance_range`]; a distance is shared linearly between the two bins whose centres surround it.
+    Values beyond a range count in its last class or bin.
 
     Args:
         embedding: (P, D) points; their Euclidean distances are counted.
