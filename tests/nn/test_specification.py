@@ -189,7 +189,7 @@ def test_a_head_whose_sizes_do_not_fit_is_refused(parameter: str, shape: tuple[i
     state = load_file(path)
     state[f"head.{parameter}"] = torch.zeros(shape, dtype=state[f"head.{parameter}"].dtype)
     save_file(state, path, metadata=words)
-    with pytest.raises(ValueError, match=r"mine\.safetensors: expected a (descriptor|head of 4 cells)"):
+    with pytest.raises(ValueError, match=r"mine\.safetensors: expected a (descriptor|head for 4 cells)"):
         igps.load(path)
 
 

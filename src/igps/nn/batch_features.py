@@ -14,12 +14,10 @@ from igps.retrieval.distances import row_distances
 from igps.signature.signature import SampleKind
 
 WEIGHT = "weight"
-"""Name of the attribute that holds the weights of samples in histograms; without it, all weights are equal."""
+"""Name of the attribute with the weights of samples in histograms; by default, all samples have equal weights."""
 
-# Coordinates of padded targets: farther than any real target, with a square that does not overflow.
-_FAR_AWAY = 1e18
-# Targets whose mean gives the direction to the surface in the embedding.
-_N_NEAREST = 8
+_FAR_AWAY = 1e18  # coordinates of padded targets: beyond any real target, with a square that does not overflow
+_N_NEAREST = 8  # targets whose mean gives the direction to the surface in the embedding
 # Neighbours in graphs of samples. 12 or more make no difference; with 8, limbs fall apart where samples are sparse.
 N_NEIGHBOURS = 16
 
@@ -47,7 +45,7 @@ class SampleFeatures:
         return points / self.batch.area.sqrt().to(points.dtype)[:, None, None]
 
     def attribute(self, name: str) -> Tensor:
-        """Return an attribute (N, P) or (N, P, 3) of the samples; raise a ValueError if they do not have it."""
+        """Return an attribute (N, P) or (N, P, 3) of the samples; raise a ValueError if it is missing."""
         if name not in self.samples.attributes:
             raise ValueError(
                 f"attributes: expected the {self.kind} samples to have {name!r}, got "
@@ -57,11 +55,11 @@ class SampleFeatures:
         return _at_least_single(self.samples.attributes[name])
 
     def weights(self) -> Tensor | None:
-        """Return the weights (N, P) of the samples, or None if all are equal; derivatives by them give shares."""
+        """Return the weights (N, P) of the samples, or None if all are equal."""
         return self.samples.attributes.get(WEIGHT)
 
     def weights_or_ones(self, values: Tensor) -> Tensor:
-        """Return the weights (N, P) of the samples, or ones in the type of `values` (N, P) if all are equal."""
+        """Return the weights (N, P) of the samples, or ones like `values` (N, P) if all are equal."""
         weights = self.weights()
         return torch.ones_like(values) if weights is None else weights
 
@@ -79,8 +77,8 @@ class SampleFeatures:
     def neighbours(self, embedding: nn.Module) -> Tensor:
         """Return the `nearest_neighbours` (N, P, k) of each sample in the embedding."""
         if embedding not in self._neighbours:
-            inputs = self.embedded(embedding), self.samples.mask
-            self._neighbours[embedding] = map_bodies(lambda x, mask: nearest_neighbours(x, mask=mask), *inputs)
+            points, mask = self.embedded(embedding), self.samples.mask
+            self._neighbours[embedding] = map_bodies(lambda x, m: nearest_neighbours(x, mask=m), points, mask)
         return self._neighbours[embedding]
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
@@ -122,7 +120,7 @@ def _at_least_single(values: Tensor) -> Tensor:
 def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest: int = _N_NEAREST) -> Tensor:
     """Return unit vectors (..., P, D) from points to the mean of the nearest targets (..., T, D) in the mask (..., T).
 
-    All targets are averaged if there are fewer than `n_nearest`. A vector is zero if the mean is the point itself.
+    All targets are averaged if there are fewer than `n_nearest`. If the mean is the point itself, the vector is zero.
     """
     with full_precision():
         real = targets.detach().masked_fill(~mask.unsqueeze(-1), _FAR_AWAY)
@@ -138,8 +136,8 @@ def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest:
 def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS, mask: Tensor | None = None) -> Tensor:
     """Return the indices (..., P, k) of the nearest other points to each of points (..., P, D), nearest first.
 
-    Only points in the mask (..., P) are neighbours; all are if it is None. A point with fewer than k neighbours has its
-    own index in the remaining places. Raises a ValueError if there is no point.
+    Only points in the mask (..., P), by default all, are neighbours. If a point has fewer than k neighbours, its own
+    index fills the remaining places. Raises a ValueError if there is no point.
     """
     if not (n_points := points.shape[-2]):
         raise ValueError("samples: expected at least one of each body, got none.")

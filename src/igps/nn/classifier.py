@@ -21,7 +21,7 @@ class Classifier(nn.Module):
         1923
 
     Args:
-        descriptor: gives histograms, or other numbers ≥ 0.
+        descriptor: its descriptions are histograms, or other numbers ≥ 0.
         n_classes: number of logits.
         dropout: share of cells dropped in training.
     """
@@ -31,7 +31,7 @@ class Classifier(nn.Module):
         check_at_least(2, n_classes=n_classes)
         self.descriptor = descriptor
         n = descriptor.n_features
-        # Normalised cell by cell: with one scale for all, most cells would have no influence.
+        # Each cell is normalised separately: with a common scale, most cells would have no influence.
         self.layers = nn.Sequential(nn.BatchNorm1d(n, affine=False), nn.Dropout(dropout), nn.Linear(n, n_classes))
 
     def forward(self, batch: SignatureBatch) -> Tensor:

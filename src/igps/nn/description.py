@@ -23,7 +23,7 @@ from igps.nn.descriptor import BodyDescriptor, Descriptor
 
 logger = logging.getLogger(__name__)
 
-_Described = Generator[tuple[Sequence[int], Sequence[Singles | Failure]], None, None]
+_Outcomes = Generator[tuple[Sequence[int], Sequence[Singles | Failure]], None, None]
 
 
 def describe(
@@ -36,7 +36,7 @@ def describe(
     n_workers: int | None = None,
     progress: bool = False,
 ) -> Tensor:
-    """Describe the meshes of a dataset, in evaluation mode, without gradients, on the descriptor's device.
+    """Describe the meshes of a dataset on the descriptor's device, in evaluation mode, without gradients.
 
     Signatures that are not cached are computed first; `dataset.precompute()` does this on all cores.
 
@@ -58,10 +58,9 @@ def describe(
         failures: a list that receives the meshes that cannot be described, in order; they have no row in the result,
             see `SignatureDataset.usable`. If None, the first failure raises an error.
         cache_tag: identifies everything but the Signatures that descriptions depend on, see
-            `igps.descriptors.fingerprint.cache_tag`. Descriptions are read from the cache under this tag, and new ones
-            are written to it. None disables the cache.
+            `igps.descriptors.fingerprint.cache_tag`. Descriptions are cached under this tag; None disables the cache.
         batch_size: number of shapes that are described at once.
-        n_workers: threads, or processes for descriptors that work in NumPy; all cores if None.
+        n_workers: number of threads, or of processes for a `BodyDescriptor`; all cores if None.
         progress: show a progress bar.
 
     Returns:
@@ -111,9 +110,10 @@ def describe(
 
 
 def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
-    """Fit the centres of quantile axes to the samples of a collection, and return whether any axis needed it.
+    """Fit the centres of quantile axes to the samples of a collection, and return whether any axis was fitted.
 
-    Fitted axes stay unchanged. Each body contributes its first 500 samples. A missing attribute raises a ValueError.
+    Axes that are fitted already stay unchanged. Each body contributes its first 500 interior samples. Raises a
+    ValueError if a body does not have the attribute of an axis.
     """
     axes = [axis for axis in descriptor.modules() if isinstance(axis, Attribute) and not axis.is_fitted]
     values: list[list[Singles]] = [[] for _ in axes]
@@ -157,8 +157,8 @@ def evaluation_mode(module: nn.Module) -> Iterator[None]:
 
 def _on_threads(
     dataset: SignatureDataset, descriptor: nn.Module, chunks: Sequence[Sequence[int]], n_workers: int | None
-) -> _Described:
-    """Yield chunks of indices with the outcomes of their meshes, on threads; on a GPU, one chunk at a time."""
+) -> _Outcomes:
+    """Yield chunks of indices and the outcomes of their meshes, from several threads; on a GPU, from one."""
     device = next(descriptor.parameters(), next(descriptor.buffers(), torch.empty(0))).device
 
     def outcomes(indices: Sequence[int]) -> Sequence[Singles | Failure]:
@@ -175,8 +175,8 @@ def _on_threads(
 
 def _on_processes(
     dataset: SignatureDataset, descriptor: nn.Module, indices: Sequence[int], n_workers: int | None
-) -> _Described:
-    """Yield indices with their outcomes, one mesh at a time on processes: a crash affects no other mesh."""
+) -> _Outcomes:
+    """Yield each index and its outcome; a process describes one mesh, so that a crash affects no other."""
     jobs = [(descriptor, dataset.subset([i]), torch.device("cpu")) for i in indices]
     for number, result in run(describe_timed, jobs, n_workers=n_workers):
         i = indices[number]
@@ -190,7 +190,7 @@ def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tup
     The time includes reading the meshes, if the descriptor needs them, but not computing the Signatures.
     """
     descriptor, dataset, device = job
-    with one_thread(), torch.inference_mode():  # both apply only to the thread that enters them
+    with one_thread(), torch.inference_mode():  # both apply only to the current thread
         batch = dataset.batch(range(len(dataset)))
         start = time.process_time()
         if isinstance(descriptor, Descriptor) and descriptor.requirements.mesh:
@@ -213,12 +213,12 @@ class _DescriptionStore:
         self._is_writable = True
 
     def read(self) -> dict[int, Singles]:
-        """Return the descriptions that are cached, by the index of the mesh."""
+        """Return the cached descriptions by the index of the mesh."""
         values = {i: self._cache.get(self._key(key)) for i, key in enumerate(self._keys) if key is not None}
         return {i: x for i, x in values.items() if x is not None}
 
     def write(self, i: int, values: Singles) -> None:
-        """Cache the description of mesh i, unless its file has changed since the dataset was read."""
+        """Cache the description of mesh i, unless its file changed since the dataset was read."""
         key = self._keys[i]
         if key is None or not self._is_writable or self._dataset.subset([i]).cached_keys() != [key]:
             return

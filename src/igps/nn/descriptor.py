@@ -1,4 +1,4 @@
-"""Base classes of descriptors: how bodies are described, what this requires, and how descriptions are compared."""
+"""Base classes of descriptors: description of bodies, requirements, and distances between descriptions."""
 
 import contextlib
 import re
@@ -31,7 +31,7 @@ from igps.retrieval.vectors import MOST_NUMBERS, SearchDistance
 from igps.signature.signature import SignatureConfig, compute_signature
 
 NAME = re.compile(r"\w{1,100}(\+\w{1,40}(=[\d.e-]{1,10})?){0,9}")
-"""Pattern of the names of descriptors that can be saved, as names of files are derived from them."""
+"""Pattern for the names of descriptors that can be saved, as file names are derived from these names."""
 
 
 class Descriptor(Specified, ABC):
@@ -63,13 +63,13 @@ class Descriptor(Specified, ABC):
         source: author, year.
         invariant_to: which of "motion" (rotation, translation, reflection), "scale" and "pose" (isometric bending)
             leave descriptions unchanged, apart from discretisation.
-        requirements: what a body must have; by default, all eigenpairs.
+        requirements: data that a body must have; by default, all eigenpairs.
         searched_by: the distance by which an index finds candidates, "cosine" for unit vectors or "chi_square" for
             histograms. The nearest bodies by `distances` must be among the few hundred nearest bodies by this distance.
             If None, an index compares a query with all bodies.
         card: facts about a fitted descriptor, by name.
-        scale: median distance between bodies of one class, against which `IndividualDescriptor` weighs size and side;
-            None if unknown.
+        scale: median distance between bodies of one class, from which `IndividualDescriptor` derives the weights
+            of size and side; None if unknown.
         description_shape: shape of one description, as `distances` takes it; (-1,) if it is a vector.
     """
 
@@ -99,7 +99,7 @@ class Descriptor(Specified, ABC):
         Args:
             path: such as ``mine.safetensors``; an existing file is overwritten. A path without this suffix is a folder,
                 which gets the files ``model.safetensors`` and ``README.md`` (the card) that model hubs expect.
-            card: facts about the descriptor, for JSON; its own `card` if None.
+            card: facts about the descriptor that JSON can represent; its own `card` if None.
 
         Raises:
             ValueError: the descriptor contains modules of other packages, or its name is not of letters, digits and _.
@@ -110,33 +110,30 @@ class Descriptor(Specified, ABC):
 
     @abstractmethod
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """Return descriptions (N, ...) of N shapes that meet the requirements; finite numbers."""
+        """Return finite descriptions (N, ...) of N shapes that meet the requirements."""
 
     def forward(self, batch: SignatureBatch) -> Tensor:
         """Return descriptions (N, ...) of N shapes; raise a ValueError if the batch does not meet the requirements."""
         self.requirements.check(batch)
-        # On other devices a limit on threads has no advantage, and traced code runs later.
+        # On other devices, a limit on threads has no advantage; traced code runs later, without the limit.
         with one_thread() if blocks.uses_loops(batch.device) else contextlib.nullcontext():
             return self.describe(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """Return distances (Q, G) ≥ 0 between descriptions (Q, ...) and (G, ...); smaller is closer; default χ²."""
+        """Return distances (Q, G) ≥ 0 between descriptions (Q, ...) and (G, ...); by default, χ² distances."""
         return chi_square(queries, gallery)
 
     def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
         """Map descriptions (N, ...) to vectors (N, D) for statistics by Euclidean distance.
 
-        By default, these are the square roots of histograms (Hellinger distance), and other descriptions unchanged.
-
-        Args:
-            descriptions: (N, ...).
-            of_one_kind: whether all bodies are of one kind, such as an organ; entries for kinds may then be left out.
+        By default, histograms are mapped to their square roots (Hellinger distance), other descriptions to themselves.
+        If all bodies are `of_one_kind`, such as an organ, entries that distinguish kinds may be left out.
         """
         rows = descriptions.flatten(1)
         return rows.sqrt() if self.searched_by == "chi_square" else rows
 
     def short(self, descriptions: Tensor) -> Tensor:
-        """Map descriptions (N, D) to (N, ≤ 256) for engines with cosine distances; by default, raise a ValueError."""
+        """Map descriptions (N, D) to (N, ≤ 256) for engines with cosine distances; by default, a ValueError."""
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {self.name!r}.")
 
 
@@ -175,9 +172,9 @@ class BodyDescriptor(Descriptor):
 class HistogramDescriptor(Descriptor):
     """One or several histograms of samples or of their pairs, compared by χ².
 
-    Several histograms are flattened and joined into one histogram of sum 1. All parts have equal shares in it, and so
-    have all histograms within a part; the χ² distance is the mean of the distances of the parts. Histograms that use
-    the same embedding module, or the same subset of samples, share the computation.
+    Several histograms are flattened and concatenated to one histogram of sum 1. All parts have equal shares, and within
+    a part all histograms; the χ² distance is the mean of the distances of the parts. Histograms that use the same
+    embedding module, or the same subset of samples, share the computation.
 
     Example:
         >>> from igps.nn.histograms.pairs import PairHistogram
@@ -186,7 +183,7 @@ class HistogramDescriptor(Descriptor):
         ((640, 64), [[0.0, 1.0, 1.0]])
 
     Args:
-        histograms: one `DescriptionPart`, such as a `PairHistogram`; or a list of parts, each one or several of them.
+        histograms: a `DescriptionPart`, such as a `PairHistogram`; or a list of parts, each of one or several of them.
         name, source, invariant_to: see `Descriptor`.
 
     Raises:
@@ -233,7 +230,7 @@ class HistogramDescriptor(Descriptor):
         return sum(self.part_cells)
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """Return histograms of sum 1: (N, C(C+1)/2, B, ...) of a single one, (N, cells) of several."""
+        """Return descriptions of sum 1: of a single histogram in its shape (N, ...), of several as (N, cells)."""
         features = BatchFeatures(batch, self.training)
         if self._sizes is None:
             return self.parts[0][0](features)
@@ -248,7 +245,7 @@ class EmbeddedDescriptor(Descriptor):
         descriptor: maps a `SignatureBatch` to descriptions.
         head: fitted to these descriptions.
         name, source: see `Descriptor`.
-        invariant_to: see `Descriptor`; if None, that of `descriptor`, although the head may have learned more.
+        invariant_to: see `Descriptor`; if None, as of `descriptor`, although the head may have learned more.
     """
 
     searched_by: SearchDistance | None = "cosine"
@@ -284,9 +281,9 @@ class EmbeddedDescriptor(Descriptor):
         return self.head.distances(queries, gallery)
 
     def coordinates(self, embeddings: Tensor, *, of_one_kind: bool = False) -> Tensor:
-        """Return embeddings (N, D) unchanged, or for bodies of one kind reduced by `Head.within_class`."""
+        """Return embeddings (N, D), for bodies of one kind reduced by `Head.within_class`."""
         return self.head.within_class(embeddings) if of_one_kind else embeddings
 
     def short(self, embeddings: Tensor) -> Tensor:
-        """Map embeddings (N, D) to (N, ≤ 256) of length 1: unchanged if short enough, otherwise by `Head.short`."""
+        """Return embeddings (N, D) with D ≤ 256 unchanged, others shortened by `Head.short`."""
         return embeddings if embeddings.shape[1] <= MOST_NUMBERS else self.head.short(embeddings)

@@ -11,7 +11,7 @@ from igps.nn.specification import Specified
 from igps.retrieval.distances import row_distances
 
 EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
-_KINDS = get_args(EmbeddingKind)  # a constant, as older versions of torch.compile cannot trace get_args
+_KINDS = get_args(EmbeddingKind)  # not in `_check_kind`, as older versions of torch.compile cannot trace get_args
 
 # Range of λ·area: from below the smallest of elongated bodies to beyond the 250th of any body (4π·250, Weyl's law).
 _FILTER_RANGE = (2.0, 5000.0)
@@ -117,12 +117,11 @@ class SpectralEmbedding(Specified):
         if n_knots < 0 or n_knots == 1:
             raise ValueError(f"n_knots: expected 0 for a fixed filter or at least 2, got {n_knots}.")
         self.kind: EmbeddingKind = kind
-        self.time = time
-        self.n_eigenpairs = n_eigenpairs
+        self.time, self.n_eigenpairs = time, n_eigenpairs
         self.log_gain = nn.Parameter(torch.zeros(n_knots)) if n_knots else None
 
     def weights(self, eigenvalues: Tensor, area: Tensor) -> Tensor:
-        """Return the factors (..., K) of the eigenfunctions, length; for an area of 1, the filter g(λ)."""
+        """Return the factors (..., K) of the eigenfunctions, length; with an area of 1, they are the filter g(λ)."""
         weights = spectral_weights(eigenvalues, area, self.kind, self.time)
         if self.log_gain is None:
             return weights

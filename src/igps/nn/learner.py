@@ -28,9 +28,9 @@ _TRUSTED = ("igps", "torch", "pytorch_lightning", "pytorch_metric_learning")
 class RetrievalLearner(LightningModule):
     """Trains the parameters of a descriptor and a distance, by a loss on the head's embeddings.
 
-    It takes any DataLoader of `SignatureBatch`es with labels. The head is fitted to the descriptions of the training
+    Any DataLoader of `SignatureBatch`es with labels can be used. The head is fitted to the descriptions of the training
     shapes before the first step. A head in closed form, such as a `WhitenedHead`, is fitted again before each
-    validation and after each epoch; gradients then train bins and filters through it.
+    validation and after each epoch, and passes the gradients on to bins and filters.
 
     Validation and test log retrieval scores, with each shape as a query against all other shapes of the split. A
     distance without a head cannot be trained, but `Trainer.test` gives the scores of the plain descriptor.
@@ -58,13 +58,13 @@ class RetrievalLearner(LightningModule):
 
     Args:
         descriptor: a `Descriptor`, or any module from `SignatureBatch` to histograms (N, ...).
-        distance: between descriptions; its head is trained.
+        distance: between descriptions, with the head to train.
         loss: maps embeddings (N, D) and labels (N,) to a scalar; supervised contrastive (Khosla et al. 2020) if None,
             which needs `pytorch-metric-learning`.
-        learning_rate: of the head, with cosine decay over the epochs.
-        bin_rate: learning rate of the descriptor's parameters.
+        learning_rate: initial learning rate of the head; decays along a cosine over the epochs.
+        bin_rate: the same for the descriptor's parameters.
         weight_decay: of the head only.
-        miner: of `pytorch-metric-learning`, selects the pairs or triplets that the loss uses; if None, it uses all.
+        miner: of `pytorch-metric-learning`; selects the pairs or triplets for the loss, which uses all if None.
 
     Raises:
         ValueError: the descriptor has entries other than histograms, such as `molecular` with size.
@@ -81,28 +81,24 @@ class RetrievalLearner(LightningModule):
         miner: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        # Modules are rebuilt from a configuration, or passed to load_from_checkpoint; the state holds their parameters.
+        # Without a configuration, modules are passed to load_from_checkpoint; the state contains their parameters.
         self.save_hyperparameters(ignore=() if has_configuration() else ("descriptor", "distance", "loss", "miner"))
-        self.descriptor = descriptor
-        self.distance = distance
-        self.loss = loss if loss is not None else _supervised_contrastive()
-        self.miner = miner
-        self.learning_rate = learning_rate
-        self.bin_rate = bin_rate
-        self.weight_decay = weight_decay
+        self.descriptor, self.distance, self.miner = descriptor, distance, miner
+        self.loss = _supervised_contrastive() if loss is None else loss
+        self.learning_rate, self.bin_rate, self.weight_decay = learning_rate, bin_rate, weight_decay
         self.part_cells = descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
         if isinstance(descriptor, HistogramDescriptor) and descriptor.n_features != sum(descriptor.part_cells):
             raise ValueError(
                 f"descriptor: expected only histograms, got {descriptor.name} with size. Use without_size()."
             )
         if distance.head is not None and self.part_cells is not None and any(map(is_lazy, distance.parameters())):
-            # A first call gives lazy parameters the sizes that the optimiser needs.
+            # A first call sets the sizes of lazy parameters, which the optimiser needs.
             with torch.no_grad():
                 distance.head.eval()(torch.ones(1, sum(self.part_cells)))
             distance.head.train()
-        # A method, not the module: otherwise the checkpoint would hold its parameters twice.
+        # A method, as with the module the checkpoint would contain its parameters twice.
         self.scores = RetrievalScoresMetric(self.distances)
-        self._fitted_at = -1
+        self._fitted_step = -1
 
     @classmethod
     def load_from_checkpoint(
@@ -110,12 +106,12 @@ class RetrievalLearner(LightningModule):
     ) -> Self:
         """Load a learner as `LightningModule.load_from_checkpoint` does, on the CPU by default.
 
-        A checkpoint of training/train.py holds its configuration; for one of another script, pass `descriptor=` and
-        `distance=`. No code of the file is run: its configuration may name only classes of this library, of torch,
-        Lightning and pytorch-metric-learning, and of the packages in `trusted`.
+        A checkpoint of training/train.py contains its configuration; for a checkpoint of another script, pass
+        `descriptor=` and `distance=`. No code of the file runs: its configuration may only name classes of this
+        library, torch, Lightning, pytorch-metric-learning and the packages in `trusted`.
 
         Raises:
-            ValueError: the file is no checkpoint or damaged, or it names a class of another package.
+            ValueError: the file is not a checkpoint, is damaged, or names a class of another package.
         """
         options.setdefault("map_location", "cpu")
         options.setdefault("weights_only", True)
@@ -154,7 +150,7 @@ class RetrievalLearner(LightningModule):
             _ = self._head
 
     def on_train_start(self) -> None:
-        """Fit the head to the training shapes, or centre its inputs on them; a resumed run is fitted already."""
+        """Fit the head to the training shapes, or centre its inputs on them; skipped in a resumed run."""
         if self.global_step == 0:
             self._fit(calibrate=False)
 
@@ -163,7 +159,7 @@ class RetrievalLearner(LightningModule):
         self._fit()
 
     def on_validation_epoch_start(self) -> None:
-        """Fit the head and calibrate the distance, as both changed in training."""
+        """Fit the head and calibrate the distance, as the bins changed in training."""
         if not self.trainer.sanity_checking and self.trainer.state.fn == "fit":
             self._fit()
 
@@ -224,7 +220,7 @@ class RetrievalLearner(LightningModule):
 
         A head that is trained by gradients is fitted only once, before training, which centres its inputs.
         """
-        if self._fitted_at == self.global_step:
+        if self._fitted_step == self.global_step:
             return
         head = self._head
         with evaluation_mode(self):
@@ -233,7 +229,7 @@ class RetrievalLearner(LightningModule):
                 head.fit(descriptions, labels, self.part_cells)
             if calibrate:
                 self.distance.calibrate(descriptions)
-                self._fitted_at = self.global_step
+                self._fitted_step = self.global_step
 
     @torch.no_grad()
     def _training_descriptions(self) -> tuple[Tensor, Tensor]:
@@ -248,7 +244,7 @@ class RetrievalLearner(LightningModule):
 
 
 def _known_labels(batch: SignatureBatch) -> Tensor:
-    """Return the labels (N,) of a batch; raise a ValueError for −1, which would otherwise count as a class."""
+    """Return the labels (N,) of a batch; raise a ValueError for −1, which would count as a class."""
     if bool((batch.labels < 0).any()):
         raise ValueError(
             "labels: expected the class of each body, got −1 (unknown). Give folders of classes, a labels.csv, or "

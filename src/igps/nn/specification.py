@@ -1,4 +1,4 @@
-"""Modules in files: their constructor arguments as JSON, and their parameters. Reading a file runs no code of it."""
+"""Saving and loading of modules: constructor arguments as JSON, and parameters. Loading a file runs no code of it."""
 
 import importlib
 import inspect
@@ -17,8 +17,7 @@ from torch import nn
 from igps._files import whole_file, with_ordered_metadata
 
 _FORMAT = "igps-descriptor-1"
-# File name in a folder that is shared as a whole, beside its card.
-IN_FOLDER = "model.safetensors"
+IN_FOLDER = "model.safetensors"  # file name in a folder, beside the card README.md
 _README = """---
 library_name: igps
 tags: [3d, shape-descriptor]
@@ -32,8 +31,8 @@ A descriptor of bodies: `igps.load("FOLDER")`, or `igps retrieve ROOT --descript
 |---|---|
 {rows}"""
 _CLASS = re.compile(r"igps\.(?:nn|descriptors)(?:\.[a-z0-9_]+)*\.[A-Z][A-Za-z0-9]*")
-# Limits on what a hostile file can allocate: modules, a single number, and the product of the numbers of a head, whose
-# memory can exceed the size of the file.
+# Limits on what a hostile file can allocate: the number of modules, the largest argument, and the product of the
+# arguments of a head, whose memory can exceed the size of the file.
 _MAX_MODULES, _MAX_NUMBER, _MAX_PARAMETERS = 200, 100_000, 1_000_000
 # Errors that a damaged file can raise.
 _UNREADABLE = (SafetensorError, OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ImportError)
@@ -53,14 +52,14 @@ class Specified(nn.Module):
         return inspect.signature(type(self)).bind(*arguments, **options).arguments
 
     def extra_repr(self) -> str:
-        """Return the arguments that are numbers or strings; PyTorch shows the modules."""
+        """Return the arguments that are numbers or strings, for `repr`; PyTorch adds the submodules."""
         return ", ".join(f"{name}={x!r}" for name, x in self.made_with().items() if isinstance(x, int | float | str))
 
 
 def specification(module: nn.Module) -> dict[str, Any]:
     """Return a module of the library as `class_path` and `init_args`, for JSON or YAML, without its parameters.
 
-    A module that occurs again is written as `same_as`, the number of its first occurrence.
+    A module that occurs again is written as `same_as`, with the position of the module in the order of occurrence.
 
     Example:
         >>> from igps.nn.embedding import SpectralEmbedding
@@ -68,7 +67,7 @@ def specification(module: nn.Module) -> dict[str, Any]:
         {'class_path': 'igps.nn.embedding.SpectralEmbedding', 'init_args': {'n_eigenpairs': 50}}
 
     Raises:
-        ValueError: the module, or one of its arguments, is not of the library.
+        ValueError: the module, or a module among its arguments, does not belong to the library.
     """
     modules: list[nn.Module] = []
 
@@ -93,7 +92,7 @@ def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
     """Build the module of a `specification`, whose saved parameters take `n_bytes` bytes.
 
     Raises:
-        ValueError: it contains anything but modules of the library, or a module that is too large.
+        ValueError: the specification contains other things than modules of the library, or a module that is too large.
     """
     modules: list[nn.Module] = []
 
@@ -111,7 +110,7 @@ def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
         if max(sizes, default=0) > _MAX_NUMBER or ("Head" in name and math.prod(sizes) > max(_MAX_PARAMETERS, n_bytes)):
             raise ValueError(f"{name} of {sizes} is too large")
         position = len(modules)
-        modules.append(nn.Identity())  # keeps the position, as the arguments may hold modules
+        modules.append(nn.Identity())  # placeholder, as the arguments may contain modules with later positions
         modules[position] = cls(**{name: decode(x) for name, x in arguments.items()})
         return modules[position]
 
@@ -132,7 +131,7 @@ def _integers(values: Any) -> Iterator[int]:
 
 
 def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) -> None:
-    """Write a module of the library with its parameters and its card to a safetensors file or a folder."""
+    """Write a module of the library, its parameters and its card to a safetensors file or a folder."""
     if Path(path).suffix != ".safetensors":
         save_module(module, path := Path(path) / IN_FOLDER, card)
         rows = (f"| {name} | `{json.dumps(value)}` |\n" for name, value in card.items())
@@ -154,15 +153,12 @@ def _check_unchanged(module: nn.Module, rebuilt: nn.Module) -> None:
     for path, submodule in module.named_modules():
         original, changed = rebuilt_modules.get(path), [""]
         if type(original) is type(submodule):
-            plain = {name: value for name, value in vars(original).items() if _is_plain(name, value)}
-            changed = [name for name, value in plain.items() if getattr(submodule, name, value) != value]
+            public = {name: x for name, x in vars(original).items() if name[0] != "_" and name != "training"}
+            plain = {name: x for name, x in public.items() if isinstance(x, int | float | str | tuple)}
+            changed = [name for name, x in plain.items() if getattr(submodule, name, x) != x]
         if changed:
             name = ".".join(filter(None, (path, changed[0])))
             raise ValueError(f"{name}: expected its initial value, got another, which is not saved. Make a new module.")
-
-
-def _is_plain(name: str, value: Any) -> bool:
-    return not name.startswith("_") and name != "training" and isinstance(value, bool | int | float | str | tuple)
 
 
 def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
@@ -170,8 +166,7 @@ def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
 
     Raises a FileNotFoundError for a missing file, and a ValueError for a damaged file or another format.
     """
-    path = Path(path)
-    path = path / IN_FOLDER if path.is_dir() else path
+    path = Path(path) / IN_FOLDER if Path(path).is_dir() else Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file. Check the path.")
     try:

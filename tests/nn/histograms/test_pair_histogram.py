@@ -524,7 +524,7 @@ def test_impossible_histograms_are_refused() -> None:
     with pytest.raises(ValueError, match="axes: expected axes of points or of pairs, got SpectralEmbedding"):
         PairHistogram([SpectralEmbedding()])  # type: ignore[list-item]
     for axes in ([], ["potential"]):
-        with pytest.raises(ValueError, match="axes: expected at least one of pairs, such as 'interior_distance'"):
+        with pytest.raises(ValueError, match="axes: expected at least one axis of pairs, such as 'interior_distance'"):
             PairHistogram(axes)
     with pytest.raises(ValueError, match="samples: expected one of interior, surface, got 'volume'"):
         PairHistogram(samples="volume")  # type: ignore[arg-type]

@@ -450,7 +450,7 @@ def good() -> dict[str, Tensor]:
     ("change", "message"),
     [
         ({name: value[:1] for name, value in some(5, 2).items()}, "two points to form a pair, got 1"),
-        ({"points": torch.zeros(4, 3)}, r"expected values for each of the 5 points, got shape \(4, 3\)"),
+        ({"points": torch.zeros(4, 3)}, r"expected values for each of 5 points, got shape \(4, 3\)"),
         ({"points": torch.full((5, 3), torch.nan)}, "expected finite values, got NaN or infinity"),
         ({"coordinates": torch.full((5, 3), torch.inf)}, "expected finite values, got NaN or infinity"),
         ({"points": torch.tensor([[-1e19], [1e19]] * 2 + [[0.0]])}, "expected distances that can be squared"),
@@ -472,7 +472,7 @@ def test_bad_points_are_refused(
 def test_bad_centres_are_refused(layout: list[float]) -> None:
     points, bins = torch.rand(5, 3), torch.tensor(layout)
     for pairs in ([euclidean_distances(points, bins)], [oriented_pairs(points, points, bins, torch.rand(2).sort()[0])]):
-        with pytest.raises(ValueError, match="centres: expected at least two finite values in ascending order"):
+        with pytest.raises(ValueError, match="centres: expected two or more finite, ascending values"):
             joint_histogram(torch.ones(5, 1), pairs)
 
 

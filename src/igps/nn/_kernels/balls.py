@@ -10,11 +10,10 @@ from igps._compiled import compiled
 from igps.nn._kernels import blocks
 from igps.nn._precision import full_precision
 
-# Sine of the angle to the tangent plane. Points below it are ignored, as there the error of the sampled normal decides.
+# Sine of the smallest angle to the tangent plane. Below it, the error of the sampled normal determines the radius.
 _MIN_SINE = 0.1
-# The third smallest radius is taken, so that a single sample with a wrong direction cannot make a ball small.
-_RANK = 3
-# Bounds of radii, in the unit of the points: below is finer than any sampling, above is flat.
+_RANK = 3  # the third smallest radius is taken, so that no single sample with a wrong direction makes a ball small
+# Bounds of radii, in the unit of the points: smaller radii are finer than any sampling, larger ones are flat.
 _MIN_RADIUS, _MAX_RADIUS = 1e-3, 10.0
 _MIN_NORMAL = 2.0**-126  # smallest normal number of single precision
 
@@ -23,8 +22,9 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     """Return the radii of the largest balls that touch the surface at each sample and contain no other sample.
 
     A ball with centre x − r n touches the surface at x, and passes through another point y if
-    r = |x − y|² / (2 n·(x − y)). The largest empty ball has the smallest of these radii. The centres of inner balls lie
-    on the medial axis (Ma, Bae and Choi 2012), so that their radii measure the local thickness.
+    r = |x − y|² / (2 n·(x − y)). The largest empty ball has the smallest radius; for robustness, the third
+    smallest is returned. The centres of inner balls lie on the medial axis (Ma, Bae and Choi 2012), so that their radii
+    measure the local thickness.
 
     Args:
         points: (N, P, 3), in units of the body's size.
@@ -32,7 +32,7 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
         mask: (N, P) true where a sample is real.
 
     Returns:
-        (N, P, 2) radii inside and outside, from 0.001 to 10; 10 if there is no sample on that side, 1 where padded.
+        (N, P, 2) radii inside and outside, from 0.001 to 10; 10 for fewer than three samples on a side, 1 where padded.
 
     Raises:
         ValueError: a shape has fewer than three points, or values are not finite.
@@ -49,10 +49,10 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
         radii = blocks.map_bodies(_radii, points, directions, mask)
     else:
         radii = torch.ones_like(points[..., :2])
-        for of_body, x, n, real in zip(radii, points, directions, mask, strict=True):
-            curvatures = np.zeros((int(real.sum()), 2), of_body.numpy().dtype)
+        for body_radii, x, n, real in zip(radii, points, directions, mask, strict=True):
+            curvatures = np.zeros((int(real.sum()), 2), body_radii.numpy().dtype)
             write_curvatures(_columns(x[real]), _columns(n[real]), _MIN_SINE, curvatures)
-            of_body[real] = 1 / torch.from_numpy(curvatures)
+            body_radii[real] = 1 / torch.from_numpy(curvatures)
     return torch.where(mask[:, :, None], radii.clamp(_MIN_RADIUS, _MAX_RADIUS), 1)
 
 
@@ -83,14 +83,9 @@ def _columns(vectors: Tensor) -> Singles:
 
 @compiled()
 def write_curvatures(points: NDArray[Real], directions: NDArray[Real], min_sine: float, out: NDArray[Real]) -> None:
-    """Write 1 / radius of each point's balls, of the third smallest radius on each side; 0 if there is none.
+    """Write 1 / third smallest radius inside and outside at each point to (P, 2); 0 if there are fewer than three.
 
-    Pairs are processed row by row, without a matrix of all pairs.
-
-    Args:
-        points, directions: (3, P).
-        min_sine: points at a smaller angle to the tangent plane are ignored.
-        out: (P, 2) to write, inside and outside; must be 0.
+    Points and directions are (3, P). Pairs are processed row by row, without a matrix of all pairs.
     """
     n = points.shape[1]
     one = points.dtype.type(1)

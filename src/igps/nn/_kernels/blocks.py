@@ -8,11 +8,11 @@ from torch import Tensor
 from igps.retrieval.distances import in_transforms
 
 BLOCK = 2**25
-"""Numbers in a block: enough to keep a GPU busy."""
+"""Number of entries in a block; enough to keep a GPU busy."""
 
 
 def uses_loops(device: torch.device) -> bool:
-    """Whether tensors of a device are processed by compiled loops, or by operations of PyTorch, which can be traced."""
+    """Whether tensors of a device are processed by compiled loops; otherwise operations of PyTorch are used."""
     return device.type == "cpu" and not torch.compiler.is_compiling() and not in_transforms()
 
 
@@ -20,7 +20,7 @@ def map_bodies(function: Callable[..., Tensor], points: Tensor, others: Tensor, 
     """Apply a function to tensors of N bodies, (N, P, ...), (N, T, ...) and more, in batches of bodies.
 
     The function takes memory for P·T pairs of each body. On the CPU a batch is one body, whose pairs then stay in the
-    cache; on other devices it fills the device. Traced code takes all bodies at once.
+    cache; on other devices a batch has up to `BLOCK` pairs. Traced code processes all bodies at once.
     """
     tensors = (points, others, *more)
     if torch.compiler.is_compiling():

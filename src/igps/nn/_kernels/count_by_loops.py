@@ -19,12 +19,12 @@ from igps.nn._kernels.pair_loops import count_block, gradient_block
 from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
 from igps.nn._precision import full_precision
 
-# Maximum number of values in a block, so that they stay in a core's second-level cache, and of its columns. A larger
-# block could overflow the integers of `pair_sums`.
+# Maximum numbers of values and of columns in a block, which then stays in a core's second-level cache. A larger block
+# could overflow the integers of `pair_sums`.
 _BLOCK_SIZE, _MAX_COLUMNS = 2**18, 2048
 _STRIP_ROWS = 128  # rows of a block whose inner products are computed by one matrix product
-# Shares of the blocks that threads process in parallel. Each share has its own counts; with more counts than the
-# maximum, there is only one share, as several would take gigabytes.
+# Number of shares of the blocks, which threads process in parallel. Each share has its own counts; with more counts
+# than the maximum, there is only one share, as several would take gigabytes.
 _N_SHARES, _MAX_COUNTS = 4, 2**24
 
 Blocks = Sequence[tuple[int, int]]
@@ -86,7 +86,7 @@ class CompiledCount(torch.autograd.Function):
 
 
 def _map_shapes(task: Callable[[int, Team], Result], n_shapes: int) -> list[Result]:
-    """Run a task for each shape: in parallel if there are enough shapes for all threads, else one by one in a team."""
+    """Run a task for each shape: on parallel threads if there are enough shapes, else one by one with a team."""
     with full_precision(), Team() as team:
         if n_shapes >= team.n_threads:
             return team.each(lambda number: task(number, ALONE), range(n_shapes))
@@ -94,9 +94,9 @@ def _map_shapes(task: Callable[[int, Team], Result], n_shapes: int) -> list[Resu
 
 
 def _sum_shares(shape: _Shape, task: Callable[[Blocks], list[Tensor]], team: Team) -> list[Tensor]:
-    """Return the sum of the results of a task for the shares of a shape's blocks."""
+    """Return the sum of a task's results for the shares of a shape's blocks."""
     total, *others = team.each(task, shape.shares)
-    # The shares are added in order, so that the result is the same, bit by bit, for any number of threads.
+    # The shares are added in order, so that the number of threads does not change any bit of the result.
     for other in others:
         for tensor, part in zip(total, other, strict=True):
             tensor += part
@@ -118,14 +118,14 @@ class _Members:
         self._n_points = layout.mask.sum(dim=1).tolist()
 
     def of(self, number: int) -> tuple[Tensor, tuple[Indices, Floats]]:
-        """Return the order (P,) of the real points of a shape, and their classes and weights (M, P) in this order."""
+        """Return the order (P,) of a shape's real points, and their classes and weights (M, P) in this order."""
         n = self._n_points[number]
         classes, weights = (np.ascontiguousarray(x[number, :, :n]) for x in (self._classes, self._weights))
         return self.order[number, :n], (classes, weights)
 
 
 class _Shape:
-    """The real points of one shape as arguments of the loops, and for a gradient the derivatives by its counts."""
+    """The arguments of the loops for one shape, without padding; for a gradient also the derivatives by its counts."""
 
     def __init__(
         self, layout: Layout, number: int, members: _Members, tensors: Sequence[Tensor], upstream: Tensor | None = None
@@ -174,7 +174,7 @@ class _Shape:
         return [total]
 
     def gradients(self, blocks: Blocks) -> list[Tensor]:
-        """Return the derivatives by the weights, by the centres, and by the inputs of each axis."""
+        """Return the derivatives by the weights, the centres, and the inputs of each axis."""
         by_weights = torch.zeros(self.members[1].shape, dtype=torch.float64, device="cpu")
         by_centres = torch.zeros(self.axes.centres.shape, dtype=torch.float64, device="cpu")
         by_inputs = [[torch.zeros_like(x) for x in pair.inputs] for pair in self.pairs]
@@ -211,13 +211,13 @@ class _Shape:
         return torch.empty(n_matrices * math.prod(self.block), dtype=self.dtype, device="cpu")
 
     def _view(self, buffer: Tensor, row: int, column: int) -> Tensor:
-        """Return a view (R, I, J) of a buffer, in the size of the block that starts at a row and column."""
+        """Return a view (R, I, J) of a buffer for the block that starts at a row and column."""
         n_matrices = len(buffer) // math.prod(self.block)
         n = [min(size, len(self.order) - first) for size, first in zip(self.block, (row, column), strict=True)]
         return buffer[: n_matrices * math.prod(n)].view(n_matrices, *n)
 
     def _write_values(self, values: Tensor, row: int, column: int) -> None:
-        """Write the values of a block, or for distances the inner products, as `count_block` takes them."""
+        """Write the values of a block, or the inner products for distances, as `count_block` takes them."""
         rows, columns = slice(row, row + values.shape[1]), slice(column, column + values.shape[2])
         matrices = iter(values)
         for pair, centred in zip(self.pairs, self.centred, strict=True):
@@ -246,8 +246,7 @@ def _inverse_gaps(centres: Numbers, bins: Sequence[int]) -> tuple[Numbers, Boole
 def _centre(points: Tensor) -> Tensor:
     """Return points (P, D) relative to their mean, without trailing coordinates that are 0 for all points.
 
-    Centring preserves digits in the squares. Trailing zeros, which padding leaves, would change the rounding of
-    products.
+    Centring preserves digits in the squares. Trailing zeros, which come from padding, would change the rounding.
     """
     mean = points.mean(dim=0)
     if not bool(mean[-1:].all()):
@@ -258,7 +257,7 @@ def _centre(points: Tensor) -> Tensor:
 
 
 def _write_products(points: Tensor, rows: slice, columns: slice, out: Tensor) -> None:
-    """Write the inner products of rows and columns, strip by strip, from the first pair of each strip that is counted.
+    """Write the inner products of rows and columns, strip by strip, from the first counted pair of each strip on.
 
     In a block on the diagonal, half of the pairs are not counted, and products take more time than the loops.
     """
@@ -269,7 +268,7 @@ def _write_products(points: Tensor, rows: slice, columns: slice, out: Tensor) ->
 
 
 def _add_by_points(by_squares: Tensor, points: Tensor, rows: slice, columns: slice, total: Tensor) -> None:
-    """Add the derivatives by points (P, D) to a total, from those by the squared distances of rows and columns."""
+    """Add the derivatives by points (P, D) to a total, from the derivatives by squared distances (I, J)."""
     x, y = points[rows], points[columns]
     total[rows] += 2 * (x * by_squares.sum(dim=1, keepdim=True) - by_squares @ y)
     total[columns] += 2 * (y * by_squares.sum(dim=0).unsqueeze(1) - by_squares.T @ x)
@@ -280,13 +279,13 @@ def _add_corners_to_bins(total: Tensor, bins: Sequence[int]) -> Tensor:
     counts = total.view(-1, *bins, *(2,) * len(bins))
     for axis in range(len(bins)):
         lower, upper = counts.unbind(1 + len(bins))
-        # The upper corners of the last cell are 0, so that nothing is rolled over the end.
+        # The upper corners of the last cell are 0, so that rolling moves nothing to the first bin.
         counts = lower + upper.roll(1, dims=1 + axis)
     return counts
 
 
 def _copy_bins_to_corners(upstream: Tensor) -> Tensor:
-    """Return the derivatives (rows, cells·2^K) by the counts of corners, from those (rows, B, ...) by the bins."""
+    """Return derivatives (rows, cells·2^K) by the counts of corners from derivatives (rows, B, ...) by bins."""
     n_axes = upstream.ndim - 1
     for axis in range(n_axes):
         upstream = torch.stack([upstream, upstream.roll(-1, dims=1 + axis)], dim=-1)

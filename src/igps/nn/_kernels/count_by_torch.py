@@ -14,7 +14,7 @@ from igps.nn._kernels.pair_values import PairValues, centres_of, with_tensors
 from igps.nn._precision import full_precision
 from igps.retrieval.distances import in_transforms
 
-# Shapes are counted together if each has at least this share of the points of the largest, to which all are padded.
+# Shapes are counted together, padded to the largest, if each has at least this share of the points of the largest.
 _MIN_RELATIVE_SIZE = 0.8
 
 
@@ -53,12 +53,12 @@ def _count_together(
         n_rows = max(1, _BLOCK // (n_shapes * max(n_cells, n_points * n_members * 2 ** len(bins))))
         firsts = range(0, n_points - 1, n_rows)
     for first in firsts:
-        task = partial(_count_rows, first, first + n_rows, classes, n_classes, bins, pairs)
-        # The gradient computes the values of pairs again, as they need much more memory than the points.
-        differentiable = torch.is_grad_enabled() and not in_transforms()
-        total = total + (
-            checkpoint(task, weights, *tensors, use_reentrant=False) if differentiable else task(weights, *tensors)
-        )
+        task = partial(_count_rows, first, first + n_rows, classes, n_classes, pairs)
+        # The gradient computes the values of pairs again, as storing them takes much more memory than the points.
+        if torch.is_grad_enabled() and not in_transforms():
+            total = total + checkpoint(task, weights, *tensors, use_reentrant=False)
+        else:
+            total = total + task(weights, *tensors)
     total = total.view(n_shapes, n_classes, n_classes, *bins)
     total = total + total.transpose(1, 2)
     a, b = torch.triu_indices(n_classes, n_classes, device=classes.device)
@@ -66,22 +66,15 @@ def _count_together(
 
 
 def _count_rows(
-    first: int,
-    last: int,
-    classes: Tensor,
-    n_classes: int,
-    bins: Sequence[int],
-    pairs: Sequence[PairValues],
-    weights: Tensor,
-    *tensors: Tensor,
+    first: int, end: int, classes: Tensor, n_classes: int, pairs: Sequence[PairValues], weights: Tensor, *others: Tensor
 ) -> Tensor:
-    """Return counts (N, C, C·cells), by both classes, of pairs of the points `first` to `last` with later points."""
-    pairs = with_tensors(pairs, tensors)
+    """Return counts (N, C, C·cells), by both classes, of pairs of the points [first, end) with later points."""
+    pairs = with_tensors(pairs, others)
+    bins = [len(centres) for centres in centres_of(pairs)]
     with full_precision():
-        values = [p.between([x[:, first:last] for x in p.inputs], [x[:, first:] for x in p.inputs]) for p in pairs]
-    # Each row is first counted separately, by the class of the column's point only: there are fewer numbers to add, and
-    # few of them into the same cell. Indices and weights are (N, I, J, M), finally (N, I, J, M·2^K), one for each
-    # corner of the pair's cell.
+        values = [p.between([x[:, first:end] for x in p.inputs], [x[:, first:] for x in p.inputs]) for p in pairs]
+    # Each row is first counted separately, by the class of the column's point only, as this adds fewer numbers, and few
+    # to the same cell. Indices and weights are (N, I, J, M), finally (N, I, J, M·2^K), for the corners of each cell.
     index = classes[:, None, first:]
     # Pairs of a point with itself or with an earlier point have weight 0.
     weight = weights[:, None, first:] * torch.ones_like(values[0][0, 0]).triu(1).unsqueeze(2)
@@ -94,13 +87,11 @@ def _count_rows(
     for share, n_bins in zip(shares, bins, strict=True):
         stride //= n_bins
         upper = weight * share.unsqueeze(3)
-        # Not weight·(1 − share), nor a difference of sums, which rounding could make negative.
+        # Not weight·(1 − share), nor a difference of sums, as rounding could make them negative.
         weight = torch.cat([weight - upper, upper], dim=3)
         index = torch.cat([index, index + stride], dim=3)
-    own, classes = weights[:, first:last].double(), classes[:, first:last]
-    n_shapes, n_rows, _ = own.shape
+    own = weights[:, first:end].double()
     n_cells = n_classes * math.prod(bins)
-    rows = torch.zeros(n_shapes, n_rows, n_cells, dtype=torch.float64, device=own.device)
-    rows = rows.scatter_add(2, index.flatten(2), weight.double().flatten(2))
-    memberships = torch.zeros(n_shapes, n_rows, n_classes, dtype=torch.float64, device=own.device)
-    return memberships.scatter_add(2, classes, own).mT @ rows
+    rows = own.new_zeros(*own.shape[:2], n_cells).scatter_add(2, index.flatten(2), weight.double().flatten(2))
+    memberships = own.new_zeros(*own.shape[:2], n_classes).scatter_add(2, classes[:, first:end], own)
+    return memberships.mT @ rows

@@ -1,4 +1,4 @@
-"""The smallest entries of each row, for the nearest of many points."""
+"""The smallest entries of each row of a matrix, as for nearest neighbours."""
 
 import numpy as np
 import torch

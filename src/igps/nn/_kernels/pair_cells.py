@@ -1,4 +1,4 @@
-"""Compiled loops that compute the cells of a row of pairs, and their shares along each axis."""
+"""Compiled loops that compute the cells of a row of pairs, and the shares of the pairs along each axis."""
 
 from typing import Any, NamedTuple
 
@@ -11,9 +11,9 @@ from igps._compiled import compiled
 Numbers = NDArray[Any]
 Indices = NDArray[np.int32]
 
-# Kinds of axes: values that are passed in; distances, from inner products; three cosines at once, from oriented points.
+# Kinds of axes: values given as numbers; distances, from inner products; three cosines at once, from oriented points.
 VALUES, DISTANCES, COSINES = 0, 1, 2
-_MAX_VECTOR = 32  # upper bound of the numbers that a compiled loop processes at once
+_MAX_VECTOR = 32  # upper bound of the number of entries that a compiled loop processes at once
 
 
 class Axes(NamedTuple):
@@ -21,7 +21,7 @@ class Axes(NamedTuple):
 
     kinds: Integers  # `VALUES`, `DISTANCES`, or `COSINES` (three axes), in the order of the axes
     norms: Numbers  # (R, P) squared lengths of the points; 0 for axes of values
-    oriented: Numbers  # (S, 2, D, P) points and their directions of length 1, for each triple of cosines
+    oriented: Numbers  # (S, 2, D, P) points and directions of length 1, for each triple of cosines
     centres: Numbers  # (K, B) ascending; the number of centres differs between axes
     n_centres: Integers  # (K,) number of centres of each axis
     inverse_gaps: Numbers  # (K, B − 1) 1 / gap between centres; for equal gaps, the first entry is 1 / mean gap
@@ -50,13 +50,13 @@ def new_row(axes: Axes, n_columns: int, values: Numbers) -> Row:
 
 @compiled()
 def whole_vectors(first: int, n_columns: int) -> int:
-    """Return the column to start at, at most ``first``, so that loops process whole vectors: a remainder is slower."""
+    """Return the column to start at, ``first`` or less, so that loops process whole vectors: a remainder is slower."""
     return max(0, n_columns - (n_columns - first + _MAX_VECTOR - 1) // _MAX_VECTOR * _MAX_VECTOR)
 
 
 @compiled(inline="always")
 def locate_row(values: Numbers, i: int, axes: Axes, point: int, column: int, start: int, result: Row) -> None:
-    """Fill in the result of row i of a block, which belongs to a point, from column ``start`` on; see `count_block`."""
+    """Fill in the result for row i of a block, the row of a point, from column ``start`` on; see `count_block`."""
     result.cells[start:] = 0
     k = r = s = np.int64(0)  # with a literal 0, `locate` would be compiled a second time
     for kind in axes.kinds:
@@ -92,7 +92,7 @@ def cosines(points: Numbers, directions: Numbers, point: int, column: int, start
     the line. Points and directions are (D, P).
     """
     minus_one, zero, one = features.dtype.type(-1), features.dtype.type(0), features.dtype.type(1)
-    # Slices of single rows: for a slice of the matrix the compiler would not know that rows are contiguous.
+    # Slices of single rows: in a slice of the matrix, the compiler would not know that rows are contiguous.
     larger, smaller, between = features[0, start:], features[1, start:], features[2, start:]
     length, own = features[3, start:], features[4, start:]
     n = len(length)
@@ -121,7 +121,7 @@ def cosines(points: Numbers, directions: Numbers, point: int, column: int, start
 
 @compiled()
 def locate(values: Numbers, axes: Axes, k: Any, start: int, result: Row) -> None:
-    """Find the intervals of values (n,), from column ``start`` on, along axis k, and refine the cells by them."""
+    """Find the intervals of values (n,) along axis k, from column ``start`` on, and subdivide the cells by them."""
     centres, inverse_gaps = axes.centres[k, : axes.n_centres[k]], axes.inverse_gaps[k]
     cell, share, interval = result.cells[start:], result.shares[k, start:], result.interval[start:]
     zero, one, end = values.dtype.type(0), values.dtype.type(1), values.dtype.type(len(centres) - 1)

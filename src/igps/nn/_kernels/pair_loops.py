@@ -1,12 +1,12 @@
 """Loops over pairs of points that Numba compiles: the counts of `igps.nn._kernels.pairs`, and their gradient.
 
-A block of pairs has rows and columns. Row i is point ``row + i`` and column j is point ``column + j``, with
-row ≤ column. Only pairs whose second point comes after the first are counted, so that each unordered pair counts once.
+In a block of pairs, row i is point ``row + i`` and column j is point ``column + j``, with row ≤ column. A pair is
+counted if its second point comes after the first, so that each unordered pair counts once.
 
 Along each of K axes, a pair lies between the centres of two bins; these intervals form its cell. The pair is shared
-between the 2^K corners of the cell, whose counts are stored side by side and only added to their bins at the end. For
+between the 2^K corners of the cell, whose counts are stored side by side and added to their bins only at the end. For
 each row, vectorised loops first compute the cells of all pairs and their shares along each axis (`pair_cells`). Each
-pair is then added to the corners of its cell (`pair_sums`), or, for the gradient, reads their values.
+pair is then added to the corners of its cell (`pair_sums`); for the gradient, it reads the values at the corners.
 """
 
 from typing import Any
@@ -26,7 +26,7 @@ from igps.nn._kernels.pair_sums import (
     pack_pairs,
     pair_row,
     unpack,
-)  # fmt: skip
+)
 
 
 @compiled()
@@ -36,7 +36,7 @@ def count_block(
     """Count a block of pairs.
 
     Args:
-        values: (R, I, J) of the axes other than cosines, in order; overwritten. For distances, the inner products.
+        values: (R, I, J) of the axes other than cosines, in order; inner products for distances. Overwritten.
         axes: see `Axes`.
         row, column: first point of the rows and of the columns.
         classes, weights: (M, P) classes of each point, and its weights in them.
@@ -48,13 +48,16 @@ def count_block(
     n_corners = 1 << n_axes
     n_cells = total.shape[1] // n_corners
     n_classes = int(np.sqrt(2.0 * len(total)))
-    # Sums of consecutive rows in the same classes, by the class of the column's point, whose cells start at its home.
+    # Sums of consecutive rows in the same classes, by the class of the column's point; its cells start at `home`.
     sums = np.zeros((n_classes * n_cells, n_corners))
     by_class = sums.reshape((n_classes, n_cells * n_corners))
     home = (classes[:, column : column + n_columns] * n_cells).astype(np.int32)
     result = new_row(axes, n_columns, values)
     packed = np.zeros((n_classes * n_cells if packs else 0) * LANES, np.int64)
-    lowest, highest = initial_range(n_cells, n_members)
+    # Range of cells with counts. With one class for each point, it is all cells: many rows are then flushed together,
+    # and adding empty cells takes less time than tracking the range.
+    empty_range = (n_cells, -1) if n_members > 1 else (0, n_cells - 1)
+    lowest, highest = empty_range
     for i in range(n_rows):
         point = row + i
         first = max(point + 1 - column, 0)
@@ -66,7 +69,7 @@ def count_block(
             if not is_same:
                 unpack(packed, sums)
                 flush(by_class, lowest * n_corners, (highest + 1) * n_corners, classes, weights, point - 1, total)
-                lowest, highest = initial_range(n_cells, n_members)
+                lowest, highest = empty_range
         locate_row(values, i, axes, point, column, start, result)
         cell, shares = result.cells[first:], result.shares
         if n_members > 1:
@@ -92,10 +95,10 @@ def gradient_block(
     values: Numbers, axes: Axes, row: int, column: int, classes: Indices, weights: Floats, upstream: Numbers,
     by_cosines: Numbers, by_weights: Floats, by_centres: Floats,
 ) -> None:  # fmt: skip
-    """Compute the gradient of `count_block`, which takes the same first arguments.
+    """Compute the gradient of `count_block`, which has the same first arguments.
 
     Args:
-        values: overwritten with the derivatives by them, or by squared distances; 0 where there is no pair.
+        values: overwritten with derivatives by the values, or by squared distances; 0 where no pair is counted.
         upstream: (C(C+1)/2, cells·2^K) derivatives by the counts.
         by_cosines: (S, 4, I, J) to fill, for each triple of cosines, with the derivatives by u·(y − x), v·(x − y), u·v
             and |y − x|², where x and u are the point and direction of the row, y and v those of the column.
@@ -134,7 +137,7 @@ def gradient_block(
             for k in range(n_axes - 1, -1, -1):
                 share, width = np.float64(shares[k, j]), np.uint32(axes.n_centres[k])
                 q, cell = np.uint32(cell % width), np.uint32(cell // width)
-                is_inside = share < 1 and (share > 0 or q > 0)  # on a centre, the slope above it is taken
+                is_inside = share < 1 and (share > 0 or q > 0)  # on a centre, the slope of the interval above is taken
                 gap = np.uint32(0) if axes.has_equal_gaps[k] else q
                 slope = slopes[k] * axes.inverse_gaps[k, gap] if is_inside else 0.0
                 by_centres[k, q] -= slope * (1 - share)
@@ -167,8 +170,8 @@ def interpolate(upstream: Numbers, start: Any, shares: Numbers, j: int, weight: 
     """Return the mean of upstream derivatives (cells·2^K,) at the corners of the cell of pair j, by its shares (K, J).
 
     The corners begin at index ``start``. The derivatives of the mean by the shares, times the weight, are added to the
-    slopes (K,). For the last two axes, the four corners are read together and stay in registers; the loop is over the
-    corners of the other, outer axes.
+    slopes (K,). The loop is over the corners of the outer axes; the four corners along the last two axes are read
+    together and stay in registers.
     """
     n_outer = len(shares) - 2
     if n_outer < 0:
@@ -197,14 +200,5 @@ def interpolate(upstream: Numbers, start: Any, shares: Numbers, j: int, weight: 
 
 @compiled(inline="always")
 def corner_share(share: Any, is_upper: int) -> float:
-    """Return the part of a pair that an upper or lower corner gets along an axis."""
+    """Return the share of a pair that counts at an upper or lower corner along an axis."""
     return np.float64(share) if is_upper else 1.0 - np.float64(share)
-
-
-@compiled()
-def initial_range(n_cells: int, n_members: int) -> tuple[int, int]:
-    """Return the initial range of cells with counts: empty, or all cells if each point has one class.
-
-    In that case many rows are flushed together, and adding empty cells takes less time than tracking the range.
-    """
-    return (n_cells, -1) if n_members > 1 else (0, n_cells - 1)

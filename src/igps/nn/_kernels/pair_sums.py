@@ -11,8 +11,8 @@ from igps._arrays import Floats, Integers
 from igps._compiled import CONTRACTED, compiled
 from igps.nn._kernels.pair_cells import Indices, Numbers
 
-# Scales of a share and of the number of pairs, which are packed in one integer. The shares of 2¹⁸ pairs, the maximum of
-# a block, do not overflow into the number; shares in single precision lose no digit, except in the first interval.
+# Scales of shares and of the number of pairs, which are packed in one integer. The shares of 2¹⁸ pairs, the maximum of
+# a block, do not overflow into the number. Shares in single precision lose no digit, except in the first interval.
 _SHARE_SCALE, _PAIR_SCALE = 2**24, 2**44
 # Copies of each cell. Consecutive pairs often fall into the same cell, but into different copies, so that no addition
 # waits for the previous one.
@@ -29,7 +29,7 @@ def pack_pairs(cell: Indices, home: Indices, share: Numbers, integer_shares: Ind
 
 @compiled()
 def add_whole_pairs(cell: Indices, integer_shares: Indices, packed: Integers) -> None:
-    """`add_one_axis` for weights of 1, into integers (cells·LANES,): a single store for both corners, no rounding."""
+    """`add_one_axis` for weights of 1, to integers (cells·LANES,): one store for both corners, without rounding."""
     for j in range(len(cell)):
         packed[np.uint32(cell[j])] += _PAIR_SCALE + np.int64(integer_shares[j])
 
@@ -65,7 +65,7 @@ def add_one_axis(cell: Indices, home: Indices, share: Numbers, weights: Floats, 
 def add_two_axes(
     cell: Indices, home: Indices, first: Numbers, second: Numbers, weights: Floats, sums: Floats, corner: Any
 ) -> None:
-    """`add_one_axis` for the shares along two axes, into four corners starting at ``corner``."""
+    """`add_one_axis` for the shares along two axes, to the four corners from ``corner`` on."""
     for j in range(len(cell)):
         i = np.uint32(cell[j] + home[j])
         a, b, c, d = quarters(weights[j], first[j], second[j])
@@ -86,7 +86,7 @@ def quarters(weight: float, first: float, second: float) -> tuple[float, float, 
 
 @compiled(fastmath=CONTRACTED)
 def add_four_axes(cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
-    """`add_axes` for four axes, a distance and three cosines; a single pass takes half of the time."""
+    """`add_axes` for four axes, as of a distance and three cosines; a single pass takes half of the time."""
     one, two, three, four = shares[0, first:], shares[1, first:], shares[2, first:], shares[3, first:]
     for j in range(len(cell)):
         i = np.uint32(cell[j] + home[j])
@@ -101,7 +101,7 @@ def add_four_axes(cell: Indices, home: Indices, shares: Numbers, first: int, wei
 
 @compiled(fastmath=CONTRACTED)
 def add_corners(sums: Floats, cell: Any, corner: Any, weight: float, parts: tuple[float, float, float, float]) -> None:
-    """Add the parts of a weight to four corners of a cell, starting at ``corner``."""
+    """Add the parts of a weight to the four corners of a cell from ``corner`` on."""
     sums[cell, corner] += weight * parts[0]
     sums[cell, corner + 1] += weight * parts[1]
     sums[cell, corner + 2] += weight * parts[2]
@@ -135,10 +135,7 @@ def pair_row(first: int, second: int, n_classes: int) -> int:
 
 @compiled()
 def flush(sums: Floats, start: int, end: int, classes: Indices, weights: Floats, point: int, total: Floats) -> None:
-    """Add the sums (C, cells·corners) of a row to the total, with the weights (M, P) of its point, and clear them.
-
-    Only the range from ``start`` to before ``end`` contains counts.
-    """
+    """Add columns [start, end) of the sums (C, cells·corners) to the total, by a point's weights (M, P); clear them."""
     n_classes = len(sums)
     for other in range(n_classes):
         for m in range(len(classes)):

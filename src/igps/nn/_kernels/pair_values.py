@@ -52,10 +52,8 @@ def oriented_pairs(points: Tensor, directions: Tensor, towards: Tensor, among: T
     Raises:
         ValueError: points and directions have different shapes.
     """
-    if points.shape != directions.shape:
-        raise ValueError(
-            f"directions: expected the shape of the points, {tuple(points.shape)}, got {tuple(directions.shape)}."
-        )
+    if (shape := directions.shape) != points.shape:
+        raise ValueError(f"directions: expected the shape of the points, {tuple(points.shape)}, got {tuple(shape)}.")
     return PairValues((points, directions), (towards, towards, among), _cosines, (COSINES,))
 
 
@@ -73,8 +71,8 @@ def pair_twists(points: Tensor, directions: Tensor, centres: Tensor) -> PairValu
 def cosine_factors(points: Tensor, directions: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Return factors of the matrices u·(y − x), v·(x − y) and u·v of points x and y with directions u and v.
 
-    There is a pair of factors for each matrix: the product of the first factor of the rows (x, u) with the transposed
-    second factor of the columns (y, v).
+    Each matrix is the product of its first factor for the rows (x, u) with its transposed second factor for the columns
+    (y, v).
     """
     own, ones = (directions * points).sum(dim=-1, keepdim=True), torch.ones_like(points[..., :1])
     extended_points, extended_directions = torch.cat([points, ones], dim=-1), torch.cat([directions, -own], dim=-1)
@@ -84,8 +82,8 @@ def cosine_factors(points: Tensor, directions: Tensor) -> list[tuple[Tensor, Ten
 def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return three cosines of each pair of oriented points (Wahl et al. 2003; Drost et al. 2010).
 
-    With u the unit vector from point i to point j and n their directions, the cosines are the larger and the smaller of
-    nᵢ·u and −nⱼ·u, and nᵢ·nⱼ. The first two are 1 for a direction that points to the other point. All three are
+    With u the unit vector from point i to point j, and nᵢ and nⱼ the directions, the cosines are the larger and the
+    smaller of nᵢ·u and −nⱼ·u, and nᵢ·nⱼ. The first two are 1 if a direction points to the other point. All three are
     symmetric in i and j.
 
     Args:
@@ -93,8 +91,7 @@ def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Ten
         directions: (P, D) of length 1.
 
     Returns:
-        Three tensors (P(P−1)/2,), with pairs in the order of `torch.triu_indices`. The first two are 0 for points that
-        coincide.
+        Three tensors (P(P−1)/2,), in the order of `torch.triu_indices`. The first two are 0 for coinciding points.
     """
     i, j = torch.triu_indices(len(points), len(points), 1, device=points.device)
     first, second, among = _cosines((points, directions), (points, directions))[:, i, j]
@@ -111,10 +108,10 @@ def _distances(rows: Inputs, columns: Inputs) -> Tensor:
 
 def _cosines(rows: Inputs, columns: Inputs) -> Tensor:
     factors = zip(cosine_factors(*rows), cosine_factors(*columns), strict=True)
-    of_row, of_column, among = (left @ right.mT for (left, _), (_, right) in factors)
+    *products, among = (left @ right.mT for (left, _), (_, right) in factors)
     inverse = _inverse_distances(rows[0], columns[0])
-    of_row, of_column = (of_row * inverse).clamp(-1, 1), (of_column * inverse).clamp(-1, 1)
-    return torch.stack([torch.maximum(of_row, of_column), torch.minimum(of_row, of_column), among], dim=-3)
+    by_row, by_column = ((x * inverse).clamp(-1, 1) for x in products)
+    return torch.stack([torch.maximum(by_row, by_column), torch.minimum(by_row, by_column), among], dim=-3)
 
 
 def _twists(rows: Inputs, columns: Inputs) -> Tensor:

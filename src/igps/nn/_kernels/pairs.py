@@ -1,10 +1,10 @@
 """The count of pairs of points in a product of classes and bins, with two back ends.
 
-All histograms of pairs are computed by `count_pairs`. On the CPU it uses compiled loops with their own gradient
-(`count_by_loops`); on other devices, in programs of `torch.export`, and for second derivatives, it uses operations of
-PyTorch (`count_by_torch`). Both back ends count in double precision, do not store a matrix of all pairs, and have
-gradients by the inputs of the values, the weights and the centres. For `torch.compile` the count is a single operator,
-as it would take minutes to compile the blocks of a few large bodies.
+All histograms of pairs are computed by `count_pairs`. On the CPU, compiled loops count, with their own gradient
+(`count_by_loops`); on other devices, in programs of `torch.export`, and for second derivatives, operations of PyTorch
+(`count_by_torch`). Both back ends count in double precision, do not store a matrix of all pairs, and have gradients by
+the inputs of the values, the weights and the centres. For `torch.compile` the count is a single operator, as compiling
+the blocks of a few large bodies would take minutes.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from igps.nn._kernels.count_by_torch import count_by_torch
 from igps.nn._kernels.pair_cells import VALUES
 from igps.nn._kernels.pair_values import TEMPLATES, PairValues, centres_of, with_tensors
 
-# Exists since PyTorch 2.7. An exported program must run without this library, and so without its operator.
+# Exists since PyTorch 2.7. Exported programs must run without this library, and therefore without its operator.
 _is_exporting = getattr(torch.compiler, "is_exporting", lambda: False)
 
 
@@ -33,8 +33,8 @@ def count_pairs(classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequenc
     """Return the share of all pairs of points in each pair of classes and in each bin, for N shapes.
 
     An unordered pair of distinct points counts once. Each point belongs to M classes, with weights of sum 1; the pair
-    counts in every combination of the classes of its points, with the product of their weights. Along each axis, it is
-    shared linearly between the two bins whose centres surround its value; beyond the outer centres, it counts there.
+    counts in all combinations of the classes of its points, with the product of their weights. Along each axis, it is
+    shared linearly between the two bins whose centres surround its value; the outer bins count all values beyond them.
 
     Args:
         classes: (N, P, M) integers from 0 to C − 1.
@@ -44,8 +44,7 @@ def count_pairs(classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequenc
         mask: (N, P) true where a point is real; each shape has at least two points.
 
     Returns:
-        (N, C(C+1)/2, B, ...) of sum 1 each, in the type of the first inputs, float32 at least; row order (0,0), (0,1),
-        … (0,C−1), (1,1), …
+        (N, C(C+1)/2, B, ...) of sum 1 each, in the type of the first inputs, float32 at least; rows by `class_pairs`.
     """
     dtype = torch.promote_types(pairs[0].inputs[0].dtype, torch.float32)
     tensors = [weights, *(tensor for pair in pairs for tensor in (*pair.inputs, *pair.centres))]
@@ -132,24 +131,20 @@ def check_pairs(pairs: Sequence[PairValues], mask: Tensor) -> None:
     """
     for x in (x for pair in pairs for x in pair.inputs):
         if x.shape[:2] != mask.shape:
-            raise ValueError(
-                f"points: expected values for each of the {mask.shape[1]} points, got shape {tuple(x.shape[1:])}."
-            )
+            n, shape = mask.shape[1], tuple(x.shape[1:])
+            raise ValueError(f"points: expected values for each of {n} points, got shape {shape}.")
     if torch.compiler.is_compiling():
         return
     if (n_points := int(mask.sum(dim=1).min())) < 2:
         raise ValueError(f"points: expected at least two points to form a pair, got {n_points}.")
-    for pair in pairs:
-        for x in pair.inputs:
-            dtype = torch.promote_types(x.dtype, torch.float32)
-            max_square = torch.finfo(dtype).max / 8
-            # Point by point only if the norm of all inputs is too large, or padding holds infinity or NaN.
-            if float(torch.linalg.vector_norm(x.detach(), dtype=dtype)) ** 2 < max_square:
-                continue
-            real = x.detach()[mask]
-            if not bool(torch.isfinite(real).all()):
-                raise ValueError("points: expected finite values, got NaN or infinity.")
-            if VALUES not in pair.kinds and not bool((real.square().sum(dim=-1) < max_square).all()):
-                raise ValueError(
-                    "points: expected distances that can be squared, got larger ones. Choose a larger unit."
-                )
+    for pair, x in ((p, x) for p in pairs for x in p.inputs):
+        dtype = torch.promote_types(x.dtype, torch.float32)
+        max_square = torch.finfo(dtype).max / 8
+        # Point by point only if the norm of all inputs is too large, or padding holds infinity or NaN.
+        if float(torch.linalg.vector_norm(x.detach(), dtype=dtype)) ** 2 < max_square:
+            continue
+        real = x.detach()[mask]
+        if not bool(torch.isfinite(real).all()):
+            raise ValueError("points: expected finite values, got NaN or infinity.")
+        if VALUES not in pair.kinds and not bool((real.square().sum(dim=-1) < max_square).all()):
+            raise ValueError("points: expected distances that can be squared, got larger ones. Choose a larger unit.")

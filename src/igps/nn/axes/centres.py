@@ -15,8 +15,8 @@ _MIN_GAP = 1e-3
 
 
 def interval_centres(n: int, reach: float, name: str) -> Tensor:
-    """Return the centres (n,) of n equal intervals of [0, reach]; a ValueError of n_`name` if there are none."""
-    check_at_least(1, **{f"n_{name}": n})
+    """Return the centres (n,) of n ≥ 1 equal intervals of [0, reach]; error messages call n `name`."""
+    check_at_least(1, **{name: n})
     check_positive(reach=reach)
     return (torch.arange(n) + 0.5) * (reach / n)
 
@@ -24,7 +24,7 @@ def interval_centres(n: int, reach: float, name: str) -> Tensor:
 class OrderedCentres(Specified):
     """Ascending centres of bins or classes, fixed or learned.
 
-    Learned centres are running sums of positive gaps, so that they ascend for all parameters. Each gap is its start
+    Learned centres are cumulative sums of positive gaps, so that they ascend for all parameters. Each gap is its start
     value times softplus(θ)/log 2, where the parameter θ starts at 0. Centres that start positive stay positive.
 
     Args:

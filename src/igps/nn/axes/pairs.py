@@ -1,7 +1,7 @@
 """Axes of pairs: bins for the pairs of samples of a body.
 
-Pairs are sorted by interior distance, by Euclidean distance, by the cosines between two directions and the line that
-connects the samples, or by their twist, which is the only axis that distinguishes left from right.
+Pairs are sorted by interior distance, Euclidean distance, the cosines between two directions and the line that
+connects the samples, or their twist. Only the twist distinguishes left from right.
 """
 
 from abc import ABC, abstractmethod
@@ -17,7 +17,7 @@ from igps.nn.specification import Specified
 
 
 class PairAxis(Specified, ABC):
-    """Base class of axes of pairs: a pair counts in the two bins whose centres surround its value, linearly.
+    """Base class of axes of pairs: a pair is shared linearly between the two bins whose centres surround its value.
 
     An axis of your own defines `shape` and `pairs`, and `requirements` if it needs more than the samples. `pairs`
     returns features of the samples and a function that computes values from them, as `euclidean_distances` does.
@@ -55,7 +55,7 @@ class PairAxis(Specified, ABC):
         """The number of bins along each dimension that this axis adds to the histogram."""
 
     def requirements(self, embedding: nn.Module) -> Requirements:
-        """Return what a body must have, given the embedding of the histogram."""
+        """Return the requirements for a body, given the embedding of the histogram."""
         return Requirements()
 
     @abstractmethod
@@ -65,7 +65,7 @@ class PairAxis(Specified, ABC):
 
 def _bin_centres(n_bins: int, reach: float) -> Tensor:
     check_at_least(2, n_bins=n_bins)
-    return interval_centres(n_bins, reach, "bins")
+    return interval_centres(n_bins, reach, "n_bins")
 
 
 class DistanceAxis(PairAxis):
@@ -136,8 +136,8 @@ class PairCosines(_CosineAxes):
     """Bins of the three cosines of point pair features in space (Wahl et al. 2003; Drost et al. 2010).
 
     The direction at an interior sample points to the nearest point of the surface; the direction at a surface sample is
-    the outward normal. The cosines detect corners, hollows and symmetry, of which distances contain little. Each
-    cosine has A bins.
+    the outward normal. The cosines detect corners, hollows and symmetry, which distances hardly show. Each cosine has
+    A bins.
     """
 
     def requirements(self, embedding: nn.Module) -> Requirements:
@@ -153,7 +153,7 @@ class EmbeddedPairCosines(_CosineAxes):
     """`PairCosines` of the embedded samples; they depend only on interior distances, and so hardly change with pose.
 
     The direction at an interior sample points to the nearest embedded surface samples; the direction at a surface
-    sample points away from the nearest interior samples. Second derivatives exist only by `torch.func`.
+    sample points away from the nearest interior samples. Second derivatives are available only through `torch.func`.
     """
 
     def requirements(self, embedding: nn.Module) -> Requirements:
@@ -174,7 +174,7 @@ class PairTwist(PairAxis):
 
     Args:
         n_bins: B.
-        reach: the outer bins end at ±`reach`; larger twists count in them.
+        reach: the outer bins end at ±`reach`, and also count larger twists.
         learnable: whether the centres are parameters.
     """
 

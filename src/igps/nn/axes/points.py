@@ -1,4 +1,4 @@
-"""Axes of points: classes of the samples of a body, by potential, by the radius of touching balls, or by attribute."""
+"""Axes of points: classes of the samples of a body, by potential, radius of touching balls, or attribute."""
 
 import math
 from abc import ABC, abstractmethod
@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from igps._parameters import check_one_of
+from igps._parameters import check_at_least, check_one_of
 from igps.data.attribute_sources import ResidueAttribute
 from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn._kernels.intervals import find_intervals
@@ -44,7 +44,7 @@ class PointAxis(Specified, ABC):
         return len(self.centres.start)
 
     def requirements(self, embedding: nn.Module) -> Requirements:
-        """Return what a body must have, given the embedding of the histogram."""
+        """Return the requirements for a body, given the embedding of the histogram."""
         return Requirements()
 
     @abstractmethod
@@ -52,15 +52,15 @@ class PointAxis(Specified, ABC):
         """Return the values (N, P) of the samples."""
 
     def memberships(self, values: Tensor) -> Tensor:
-        """Return weights (..., P, C) ≥ 0, with rows of sum 1, of values (..., P); a ValueError if any is not finite."""
+        """Return weights (..., P, C) ≥ 0, rows of sum 1, of finite values (..., P); raise a ValueError for others."""
         classes, weights = self.members(values, torch.ones_like(values, dtype=torch.bool))
         return weights.new_zeros(*values.shape, self.n_classes).scatter_add(-1, classes, weights)
 
     def members(self, values: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return the classes of values (..., P) and their weights, that is, `memberships` in sparse form.
 
-        Both are (..., P, M): integers, and weights of sum 1, with M = 2 for soft classes and M = 1 for hard ones.
-        Raises a ValueError if a value in the mask (..., P) is not finite.
+        Both are (..., P, M): integers, and weights of sum 1, with M = 2 for soft and M = 1 for hard classes. Raises a
+        ValueError if a value in the mask (..., P) is not finite.
         """
         # Code traced by `torch.compile` cannot raise.
         if not torch.compiler.is_compiling() and not torch.isfinite(torch.where(mask, values, 0)).all():
@@ -93,7 +93,7 @@ class Potential(PointAxis):
         soft: bool = False,
         learnable: bool = False,
     ) -> None:
-        super().__init__(interval_centres(n_classes, reach, "classes"), soft, learnable)
+        super().__init__(interval_centres(n_classes, reach, "n_classes"), soft, learnable)
         self.embedding = embedding
 
     def requirements(self, embedding: nn.Module) -> Requirements:
@@ -122,11 +122,9 @@ class BallRadius(PointAxis):
         self, side: Side = "inside", smallest: float = 0.022, largest: float = 0.25, n_classes: int = 4
     ) -> None:
         check_one_of(_SIDES, side=side)
-        if not 0 < smallest < largest < math.inf or n_classes < 2:
-            raise ValueError(
-                f"smallest, largest, n_classes: expected 0 < smallest < largest, and at least two classes, got "
-                f"{smallest}, {largest} and {n_classes}."
-            )
+        check_at_least(2, n_classes=n_classes)
+        if not 0 < smallest < largest < math.inf:
+            raise ValueError(f"smallest, largest: expected 0 < smallest < largest, got {smallest} and {largest}.")
         super().__init__(torch.linspace(math.log(smallest), math.log(largest), n_classes), soft=True, learnable=False)
         self.side = side
 
@@ -147,7 +145,7 @@ class Attribute(PointAxis):
     Args:
         name: of the attribute.
         centres: of the classes, ascending, in the attribute's unit; None with `quantiles`.
-        quantiles: number of classes with quantiles of a collection as centres, see `fit_centres`; they are saved.
+        quantiles: number of classes; `fit_centres` sets their centres, which are saved, to quantiles of a collection.
         soft, learnable: see `PointAxis`.
 
     Raises:
@@ -174,7 +172,7 @@ class Attribute(PointAxis):
 
     @property
     def is_fitted(self) -> bool:
-        """Whether the centres are known."""
+        """Whether the centres are set."""
         return self.quantiles is None or bool(self.fitted)
 
     def fit(self, values: Tensor) -> None:
@@ -191,9 +189,8 @@ class Attribute(PointAxis):
         """Raise a ValueError if the centres have not been fitted."""
         if not self.is_fitted:
             raise ValueError(
-                f"{self.name}: expected centres, got {self.quantiles} quantiles that are not fitted. "
-                "Call igps.nn.fit_centres(descriptor, dataset), or use the file descriptor.safetensors that `igps "
-                "retrieve --out` writes."
+                f"{self.name}: expected centres, got {self.quantiles} quantiles that are not fitted. Call "
+                "igps.nn.fit_centres(descriptor, dataset), or use descriptor.safetensors from `igps retrieve --out`."
             )
 
     def requirements(self, embedding: nn.Module) -> Requirements:
@@ -210,7 +207,7 @@ class Attribute(PointAxis):
 
 
 def attribute_requirements(name: str) -> Requirements:
-    """Return what an attribute of samples requires of a body: nothing for an attribute that users supply."""
+    """Return the requirements of an attribute of samples; attributes that users supply have none."""
     if name in RESIDUE_ATTRIBUTES:
         return Requirements(sources={name: ResidueAttribute(name)})
     return Requirements(attributes=tuple(x for x in get_args(AttributeName) if x == name))
@@ -221,7 +218,7 @@ def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:
 
     Values below the first or above the last centre belong only to that class. Differentiable in both arguments.
     """
-    # Position of a value between each centre and the next, from 0 to 1; the hats are the successive differences.
+    # Position of a value between each centre and the next, from 0 to 1; the hats are differences of these positions.
     position = ((values.unsqueeze(-1) - centres[:-1]) / centres.diff()).clamp(0, 1)
     ones, zeros = torch.ones_like(values).unsqueeze(-1), torch.zeros_like(values).unsqueeze(-1)
     return torch.cat([ones, position], dim=-1) - torch.cat([position, zeros], dim=-1)

@@ -10,30 +10,28 @@ from torch import Tensor
 from igps.nn.specification import Specified
 from igps.retrieval.distances import cosine, square_root
 
-# Relative to the largest sum of squares; directions with a smaller sum are rounding errors.
-_MIN_RELATIVE_SQUARE = 1e-10
+_MIN_RELATIVE_SQUARE = 1e-10  # directions with smaller sums of squares, over the largest sum, are rounding errors
 
 
 class Head(Specified, ABC):
     """A module from descriptions to embeddings of length 1, with a distance between embeddings.
 
     A head of your own defines `fit` and `forward`, and overrides `distances` if it does not use the cosine distance.
-    The sizes of its buffers follow from the training shapes, and are restored on loading. A head that needs fitting
-    raises a RuntimeError if it is used before.
+    The sizes of its buffers depend on the training shapes, and are restored on loading. A head that needs fitting
+    raises a RuntimeError if it is used unfitted.
     """
 
     @abstractmethod
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Fit everything that is not learned by gradients to the training shapes.
+        """Fit everything that is not trained by gradients to the training shapes.
 
         Args:
             descriptions: (N, ...), histograms for all heads of the library.
             labels: (N,) classes, integers.
-            part_cells: cells of each part of a description, see `HistogramDescriptor.part_cells`; if None, a
-                description is a single part.
+            part_cells: number of cells of each part, see `HistogramDescriptor.part_cells`; None for a single part.
 
         Raises:
-            ValueError: the shapes of tensors do not match, or there are too few classes, or too few shapes in a class.
+            ValueError: the shapes of tensors do not match, or there are too few classes or shapes in a class.
         """
 
     @abstractmethod
@@ -50,10 +48,8 @@ class Head(Specified, ABC):
 
     def short(self, embeddings: Tensor) -> Tensor:
         """Map embeddings (N, D) to (N, ≤ 256) of length 1 with nearly the same cosines; by default, a ValueError."""
-        raise ValueError(
-            f"short: expected a head that shortens its embeddings, as the TwoLevelHead of pretrained does, got "
-            f"{type(self).__name__} and embeddings of {embeddings.shape[1]} numbers."
-        )
+        got = f"{type(self).__name__} and embeddings of {embeddings.shape[1]} numbers"
+        raise ValueError(f"short: expected a head that shortens its embeddings, such as TwoLevelHead, got {got}.")
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
         for name, buffer in self.named_buffers(recurse=False):
@@ -64,7 +60,7 @@ class Head(Specified, ABC):
         self._note_buffers()
 
     def _note_buffers(self) -> None:
-        """Copy the buffers `part_cells` and `lengths` to numbers: reading a GPU is slow, and impossible in tracing."""
+        """Copy `part_cells` and `lengths` to Python: reading buffers of a GPU is slow, and impossible in tracing."""
         buffers = self.named_buffers(recurse=False)
         # A dictionary, as fingerprints ignore dictionaries.
         self._noted: dict[str, Any] = {name: x.tolist() for name, x in buffers if name in ("part_cells", "lengths")}
@@ -74,7 +70,7 @@ class Head(Specified, ABC):
 
 
 def square_roots(histograms: Tensor) -> Tensor:
-    """Return the square roots (N, cells) of histograms (N, ...), with a finite gradient; a ValueError if any is < 0."""
+    """Return the square roots (N, cells) of histograms (N, ...), with finite gradients; a ValueError if any is < 0."""
     cells = histograms.flatten(1)
     if not torch.compiler.is_compiling() and bool((cells < 0).any()):
         raise ValueError("descriptions: expected histograms, entries ≥ 0, got a negative one.")
@@ -82,13 +78,13 @@ def square_roots(histograms: Tensor) -> Tensor:
 
 
 def check_cells(cells: Tensor, n_expected: int) -> None:
-    """Raise a ValueError unless descriptions (N, cells) have as many cells as those that the head was fitted to."""
+    """Raise a ValueError unless descriptions (N, cells) have as many cells as the training shapes."""
     if cells.shape[1] != n_expected:
         raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
 
 
 def checked_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
-    """Return the cells (parts,) of each part, or all (N, cells) as one part if None; a ValueError for a wrong sum."""
+    """Return `part_cells` as a tensor, by default one part of all cells; raise a ValueError for a wrong sum."""
     sizes = list(part_cells or (cells.shape[1],))
     if min(sizes) < 1 or sum(sizes) != cells.shape[1]:
         raise ValueError(f"part_cells: expected cells that add up to {cells.shape[1]}, got {sizes}.")
@@ -96,16 +92,15 @@ def checked_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
 
 
 def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
-    """Return the labels (N,) on the device of the descriptions (N, ...); raise a ValueError if they do not match."""
-    if labels.shape != descriptions.shape[:1]:
-        raise ValueError(
-            f"labels: expected one for each of {len(descriptions)} descriptions, got shape {tuple(labels.shape)}."
-        )
+    """Return the labels (N,) on the device of the descriptions (N, ...); raise a ValueError for another shape."""
+    n = len(descriptions)
+    if labels.shape != (n,):
+        raise ValueError(f"labels: expected one for each of {n} descriptions, got shape {tuple(labels.shape)}.")
     return labels.to(descriptions.device)
 
 
 def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
-    """Return the classes (N,) of descriptions (N, ...), numbered from 0; a ValueError if no class has two members."""
+    """Return the classes (N,) of descriptions, numbered from 0; raise a ValueError if no class has two members."""
     _, members = checked_labels(descriptions, labels).unique(return_inverse=True)
     if int(members.max()) + 1 == len(members):
         raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
@@ -121,7 +116,7 @@ def class_means(rows: Tensor, members: Tensor) -> Tensor:
 def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """Return the first k ≤ n principal directions of rows (N, D) about the origin, and the sums of squares along them.
 
-    The orthonormal directions (k, D) and the sums (k,) are in descending order. Directions without extent are left out.
+    The directions (k, D) are orthonormal, the sums (k,) descend. Directions without extent are left out.
     """
     n_rows, width = rows.shape
     is_wide = width > n_rows
@@ -134,9 +129,9 @@ def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
 def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: int) -> tuple[Tensor, Tensor]:
     """Return the directions along which shapes of one class differ most, and the gains that whiten them, for `damped`.
 
-    With W the covariance within classes over its mean eigenvalue, and s the shrinkage, (W + s·I)^(−1/2) is, up to a
-    factor, the identity except for a gain along each eigenvector of W. Source: within-class covariance normalisation,
-    Hatch, Kajarekar and Stolcke 2006.
+    Let W be the covariance within classes over its mean eigenvalue, and s the shrinkage. Up to a factor,
+    (W + s·I)^(−1/2) is the identity except for a gain along each eigenvector of W (within-class covariance
+    normalisation, Hatch, Kajarekar and Stolcke 2006).
 
     Residuals (N, D) are rows of the training shapes minus the mean of their class. The mean eigenvalue is taken over
     `rank` eigenvalues. Returns k ≤ n orthonormal directions (k, D), of the largest eigenvalues, and gains (k,) ≤ 1.
@@ -147,6 +142,6 @@ def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: in
 
 
 def damped(rows: Tensor, directions: Tensor, gains: Tensor) -> Tensor:
-    """Return rows (N, D) with their component along each orthonormal direction (k, D) multiplied by its gain (k,)."""
+    """Return rows (N, D) whose component along each orthonormal direction (k, D) is multiplied by a gain (k,)."""
     directions = directions.to(rows.dtype)  # the head may be in half precision
     return rows - ((rows @ directions.T) * (1 - gains)) @ directions

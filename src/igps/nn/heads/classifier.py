@@ -15,7 +15,7 @@ from igps.nn.heads.closed_form import KernelHead
 _MAX_FOLDS = 5
 _TEMPERATURES = torch.logspace(-2.5, 0, 60)  # candidates of the calibration
 _N_NEAREST = 2  # training shapes of the predicted class that strangeness is computed from
-_FALSE_UNKNOWN_RATE = 0.05  # share of the shapes of known classes that are called unknown
+_FALSE_UNKNOWN_RATE = 0.05  # share of held-out shapes of known classes that are classified as unknown
 
 
 class ClassifierHead(KernelHead):
@@ -23,8 +23,8 @@ class ClassifierHead(KernelHead):
 
     Probabilities are the softmax of the scores divided by a temperature, which maximises the likelihood of held-out
     shapes (Guo, Pleiss, Sun and Weinberger 2017). The strangeness of a shape is its mean distance to the two nearest
-    training shapes of its predicted class, with each part in units of its median, minus its score for this class. A
-    shape is unknown if its strangeness is at least the 95th percentile of held-out shapes.
+    training shapes of its predicted class, with each part in units of its median, minus its score for this class. The
+    class of a shape is unknown if its strangeness is at least the 95th percentile of held-out shapes.
 
     Args:
         prior, n_directions, shrinkage, ridge, prior_share, temperature: see `KernelHead`.
@@ -87,10 +87,10 @@ class ClassifierHead(KernelHead):
         return (self.scores(descriptions) / self.calibration).softmax(dim=1)
 
     def strangeness(self, descriptions: Tensor) -> Tensor:
-        """Return the strangeness (N,) of histograms (N, ...); shapes with at least `strange_from` are unknown."""
+        """Return the strangeness (N,) of histograms (N, ...); classes are unknown from `strange_from` on."""
         scores, predicted = self.scores(descriptions).max(dim=1)
-        of_parts = self._distances(self._vectors(descriptions)) / self.medians[:, None, None]
-        distances = torch.einsum("k,kij->ij", self.shares, of_parts)
+        part_distances = self._distances(self._vectors(descriptions)) / self.medians[:, None, None]
+        distances = torch.einsum("k,kij->ij", self.shares, part_distances)
         other = self.members != predicted[:, None]
         nearest = distances.masked_fill(other, math.inf).topk(min(_N_NEAREST, len(self.members)), largest=False).values
         is_real = torch.isfinite(nearest)  # a class may have fewer shapes
@@ -98,9 +98,9 @@ class ClassifierHead(KernelHead):
 
 
 def folds(labels: Tensor, n_folds: int = _MAX_FOLDS) -> Iterator[Tensor]:
-    """Yield masks (N,) of held-out folds, which never hold out all shapes of a class.
+    """Yield masks (N,) of held-out folds, which never contain all shapes of a class.
 
-    Each shape of a class with two or more shapes is held out once. There are fewer folds if all classes are smaller.
+    Each shape of a class with two or more shapes is held out once. There may be fewer folds if all classes are smaller.
     """
     generator = torch.Generator().manual_seed(0)
     fold = torch.full(labels.shape, -1)

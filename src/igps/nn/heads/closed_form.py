@@ -1,4 +1,4 @@
-"""Heads fitted in closed form: within seconds, deterministically, and without learning rates or stopping rules."""
+"""Heads fitted in closed form: within seconds, deterministically, without learning rates or stopping rules."""
 
 from collections.abc import Sequence
 from typing import Self
@@ -29,18 +29,18 @@ class WhitenedHead(Head):
     """Maps histograms to unit vectors, damped along the directions in which shapes of one class differ.
 
     The square roots of histograms are centred on the training shapes and whitened within classes, see
-    `within_class_whitening`. Changes of pose have similar effects on the histograms of all classes. This head therefore
-    also applies to classes that are not in the training set, unlike a head with free parameters. Before it is fitted,
-    it returns the square roots of histograms, normalised to length 1.
+    `within_class_whitening`. Changes of pose have similar effects on the histograms of all classes, so that this head,
+    unlike a head with free parameters, also suits classes that are not in the training set. Before it is fitted, it
+    returns the square roots of histograms, normalised to length 1.
 
     The parts of a `HistogramDescriptor` can be treated separately: each part is whitened and normalised, so that the
     cosine distance is the mean of the distances of the parts.
 
-    A prior is another head for the same descriptions, fitted elsewhere, such as that of `pretrained`. With a prior, the
-    distance is the weighted mean of the head's own distance and the prior's. As not all parts of such descriptions
-    distinguish the given classes, the parts are then weighted by Fisher's discriminant (1936) of pairs,
-    (m − m′) / (v + v′). Here m and v are the mean and variance of a part's distances between shapes of different
-    training classes, m′ and v′ between shapes of the same class.
+    A prior is another head for the same descriptions, fitted elsewhere, such as the head of `pretrained`. With a prior,
+    the distance is the weighted mean of the head's own distance and the prior's. The parts are then weighted, as not
+    all of them distinguish the training classes, by Fisher's discriminant (1936) of pairs, (m − m′) / (v + v′). Here m
+    and v are the mean and variance of a part's distances between training shapes of different classes, m′ and v′ those
+    between shapes of the same class.
 
     Example:
         >>> import torch
@@ -51,7 +51,7 @@ class WhitenedHead(Head):
         [[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
 
     Args:
-        n_directions: number of directions, those of the largest variance, that are damped in each part.
+        n_directions: number of directions that are damped in each part: those of the largest variance.
         shrinkage: s of the whitening; with a large value, only the centring remains.
         prior: a fitted head, which is not changed; None for no prior.
         prior_share: weight of the prior, between 0 and 1.
@@ -88,8 +88,7 @@ class WhitenedHead(Head):
         self.centre(descriptions, part_cells)
         residuals = self.parts((roots - means[members]).double())
         for part, directions, gains in zip(residuals, self.parts(self.directions), self.gains, strict=True):
-            # Residuals of N shapes in C classes have at most N − C eigenvalues above 0, which the mean is taken over.
-            rank = len(roots) - len(means)
+            rank = len(roots) - len(means)  # the maximum for residuals of N shapes in C classes: N − C
             own_directions, own_gains = within_class_whitening(part, rank, self.shrinkage, self.n_directions)
             directions[: len(own_directions)] = own_directions
             gains[: len(own_gains)] = own_gains
@@ -132,8 +131,8 @@ class WhitenedHead(Head):
         if not len(self.mean):
             raise self._not_fitted()
         own, priors = zip(*(x.tensor_split([len(self.mean)], dim=1) for x in (queries, gallery)), strict=True)
-        of_prior = self.prior.distances(*(x / self.prior_share.sqrt() for x in priors))
-        return (1 - self.prior_share) * cosine(*own) + self.prior_share * of_prior
+        prior_distances = self.prior.distances(*(x / self.prior_share.sqrt() for x in priors))
+        return (1 - self.prior_share) * cosine(*own) + self.prior_share * prior_distances
 
     def whitened_parts(self, roots: Tensor) -> list[Tensor]:
         """Return the whitened unit vectors (N, cells) of each part, from the square roots (N, D) of histograms."""
@@ -151,11 +150,11 @@ class KernelHead(Head):
 
     The kernel is exp(−d/m), where d is the cosine distance of the whitened histograms and m its median between training
     shapes. With several parts, the kernel is the mean of the kernels of the parts. The targets of the regression are
-    the indicators of the classes. A prior (see `WhitenedHead`) adds the kernel of its distance, with a weight of its
-    own. This is the best head of the library for classes in the training set; for other classes use the `WhitenedHead`.
+    the indicators of the classes. A prior (see `WhitenedHead`) adds the kernel of its distance, with weight
+    `prior_share`. This is the library's best head for classes in the training set; for others use the `WhitenedHead`.
 
-    An embedding consists of two halves of equal weight: the scores minus their mean, which tell how similar a shape is
-    to each class, and the square roots of the softmax of the scores, which tell its class. With only the second half,
+    An embedding consists of two halves of equal weight: the scores minus their mean, which show how similar a shape is
+    to each class, and the square roots of the softmax of the scores, which show its class. With only the second half,
     shapes of one class would coincide.
 
     Example:
@@ -246,8 +245,8 @@ class KernelHead(Head):
         similarity = functional.normalize(scores - 1 / len(self.classes), dim=1)
         # With few shapes per class, the scores of other classes are nearly as large, so the temperature is raised.
         class_size = len(self.anchors) / len(self.classes)
-        likely = (scores / (self.temperature * max(1, _MIN_CLASS_SIZE / class_size))).softmax(dim=1).sqrt()
-        return torch.cat([similarity, likely], dim=1) / 2**0.5
+        temperature = self.temperature * max(1, _MIN_CLASS_SIZE / class_size)
+        return torch.cat([similarity, (scores / temperature).softmax(dim=1).sqrt()], dim=1) / 2**0.5
 
     def _kernel(self, vectors: Tensor) -> Tensor:
         kernels = (-self._distances(vectors) / self.medians[:, None, None]).exp()
@@ -255,16 +254,16 @@ class KernelHead(Head):
 
     def _vectors(self, descriptions: Tensor) -> Tensor:
         """Return the unit vectors of the parts and of the prior, concatenated."""
-        own = self.whitened.whitened_parts(square_roots(descriptions))
-        return torch.cat(own if self.prior is None else [*own, self.prior(descriptions)], dim=1)
+        parts = self.whitened.whitened_parts(square_roots(descriptions))
+        return torch.cat(parts if self.prior is None else [*parts, self.prior(descriptions)], dim=1)
 
     def _distances(self, vectors: Tensor) -> Tensor:
         """Return distances (kernels, N, n_shapes) to the training shapes: cosine for each part, then the prior's."""
         sizes, both = self.whitened._noted["part_cells"], (vectors, self.anchors.to(vectors.dtype))
-        own, anchors = (x.split([*sizes, x.shape[1] - sum(sizes)], dim=1) for x in both)
-        distances = [1 - own[k] @ anchors[k].T for k in range(len(sizes))]
+        parts, anchors = (x.split([*sizes, x.shape[1] - sum(sizes)], dim=1) for x in both)
+        distances = [1 - parts[k] @ anchors[k].T for k in range(len(sizes))]
         if self.prior is not None:
-            distances.append(self.prior.distances(own[-1], anchors[-1]))
+            distances.append(self.prior.distances(parts[-1], anchors[-1]))
         return torch.stack(distances)
 
 

@@ -15,8 +15,8 @@ from igps.retrieval.distances import Distance, chi_square
 class ProjectionHead(Head):
     """One or two layers from histograms to unit vectors, trained by gradients.
 
-    The inputs are the square roots of histograms, which are unit vectors with Hellinger distances; the root reduces the
-    influence of the largest cells. The first layer takes its size from the first descriptions.
+    The inputs are the square roots of histograms, whose Euclidean distances are Hellinger distances; the root reduces
+    the influence of the largest cells. The first layer takes its size from the first descriptions.
 
     Args:
         width: embedding width D.
@@ -65,13 +65,12 @@ class BlendedDistance(nn.Module):
     """A weighted sum of a plain distance and a head's distance, each in units of its median between training shapes.
 
     A head with free parameters specialises in the training classes; the sum with the plain distance can also improve
-    the distances of other classes. Without a head, it is the plain distance.
+    the distances of other classes. Without a head, the plain distance is used alone.
 
     Args:
-        head: of the descriptions, or None.
+        head: maps descriptions to embeddings; None for the plain distance.
         plain: maps descriptions (Q, ...) and (G, ...) to distances (Q, G), such as `Descriptor.distances`; χ² if None.
-        share: weight of the head's distance, from 0 (only the plain distance) to 1 (only the head's distance, which
-            then differs from that of an `EmbeddedDescriptor` by its unit).
+        share: weight of the head's distance, from 0 (only the plain distance) to 1 (only the head's, over its median).
     """
 
     plain_unit: Tensor

@@ -14,7 +14,7 @@ from igps.nn.heads.wccn import MEDIAN, WCCNHead
 from igps.retrieval.distances import cosine, euclidean, square_root
 from igps.retrieval.vectors import MOST_NUMBERS
 
-# Usual distance of a training shape from the mean, as in many dimensions most pairs of shapes are nearly orthogonal.
+# Usual distance of a training shape from the mean: in many dimensions, most pairs of shapes are nearly orthogonal.
 _USUAL_LENGTH = MEDIAN / math.sqrt(2)
 _STEEPNESS = 10  # exponent of the factor that rises from 0 to 1 at the scales of the body heads
 _INDIVIDUAL_SHARE = 0.1  # share of the squared length of an embedding that belongs to the individual head
@@ -24,11 +24,11 @@ _INDIVIDUAL_SCALE = 0.3  # distance by the individual head at which most of its 
 class TwoLevelHead(Head):
     """Maps histograms to unit vectors, with a distance that ranks other poses of a body first, then its class.
 
-    An embedding concatenates the embeddings of a class head, a `WCCNHead` fitted to classes, and of body heads, which
+    An embedding concatenates the embeddings by a class head, a `WCCNHead` fitted to classes, and by body heads, which
     are `WCCNHead`s with `lengths`, fitted to bodies in several poses. The distance is the cosine distance of the class
     embeddings, times the factor 1 − exp(−Σ (dₖ / sₖ)¹⁰), where dₖ are the distances by the body heads and sₖ their
     scales. The factor is nearly 0 if all dₖ are below their scales, as between poses of a body, and nearly 1 if any is
-    above its scale. It saturates, because the size of the difference between two bodies does not predict their classes.
+    above its scale. The factor saturates, as the amount by which two bodies differ does not predict their classes.
 
     Far from the mean of the training shapes, distances between different bodies are as small as distances between poses
     elsewhere. The scales are therefore multiplied by √(ℓ₀ / ℓ). Here ℓ² is the product of the distances of the two
@@ -37,7 +37,7 @@ class TwoLevelHead(Head):
     Bodies can be nearly alike, such as two people. An individual head, a `WCCNHead` with `lengths`, is fitted by
     `fit_individuals` to individuals in several poses, so that it ignores the effects of bending and triangulation. With
     f its distance and w its weight, the distance is (1 − w) times the distance above plus w (1 − exp(−(f / 0.3)²)).
-    This small term orders the shapes that the body heads consider the same body.
+    The second term orders the shapes that the body heads consider the same body.
 
     The cosine distance of whole embeddings is close to the cosine distance of the class embeddings. Search engines that
     only support cosine distances find candidates by whole embeddings or by `short` vectors; the candidates are then
@@ -52,8 +52,8 @@ class TwoLevelHead(Head):
         weight: weight w of the individual head.
 
     Raises:
-        ValueError: a body head or individual head without lengths, a scale that is missing or not positive, or a share
-            or weight that is not between 0 and 1.
+        ValueError: a body head or individual head has no lengths, a scale is missing or not positive, or share or
+            weight is not between 0 and 1.
     """
 
     scales: Tensor
@@ -81,9 +81,7 @@ class TwoLevelHead(Head):
             )
         self.individual_head = individual_head
         if not all(bool(x.lengths) for x in (*self._body_heads(), *([individual_head] if individual_head else []))):
-            raise ValueError(
-                "body_heads, individual_head: expected heads with lengths. Make them by WCCNHead(..., lengths=True)."
-            )
+            raise ValueError("body_heads, individual_head: expected heads with lengths. Use WCCNHead(lengths=True).")
         check_share(weight=weight)
         self.register_buffer("scales", torch.tensor(list(scales)))
         self.register_buffer("share", torch.tensor(share))
@@ -99,12 +97,7 @@ class TwoLevelHead(Head):
         *,
         bodies: Tensor | None = None,
     ) -> Self:
-        """Fit both levels to the histograms (N, ...), classes (N,) and bodies (N,) of the training shapes.
-
-        Args:
-            descriptions, labels, part_cells: see `Head.fit`.
-            bodies: integers; if None, the classes.
-        """
+        """Fit both levels to the training shapes, see `Head.fit`; `bodies` (N,) are integers, by default the labels."""
         self.class_head.fit(descriptions, labels, part_cells)
         for head in self._body_heads():
             head.fit(descriptions, labels if bodies is None else bodies, part_cells)
@@ -131,17 +124,17 @@ class TwoLevelHead(Head):
         return self
 
     def within_class(self, embeddings: Tensor) -> Tensor:
-        """Return the columns of the body heads and the individual head in embeddings (N, D).
+        """Return the columns of embeddings (N, D) by the body heads and the individual head.
 
-        Between bodies that are nearly alike, the columns of the class head differ mostly by the scatter of the samples.
+        In the columns of the class head, bodies that are nearly alike differ mostly by the scatter of the samples.
         """
         return embeddings[:, self.class_head.n_numbers :]
 
     def short(self, embeddings: Tensor) -> Tensor:
         """Project embeddings (N, D) to (N, ≤ 256) of length 1, on the principal directions of the training shapes.
 
-        The cosines are close to those of the embeddings without individuals; the error grows with the difference
-        between a shape and the training shapes. Raises a ValueError for embeddings of other heads.
+        The cosines are close to those without the individual head, with larger errors for shapes unlike the training
+        shapes. Raises a ValueError for embeddings of other heads.
         """
         if not len(self.principal):
             raise self._not_fitted()
@@ -173,7 +166,7 @@ class TwoLevelHead(Head):
         return torch.cat([classes, *(self._root_share * head(descriptions) for head in self._body_heads())], dim=1)
 
     def _split(self, embeddings: Tensor) -> tuple[Tensor, Tensor]:
-        """Split embeddings (N, D) into classes with bodies, and individuals, each with its weight in D undone."""
+        """Split embeddings (N, D) into columns of both levels and columns of individuals, without their weights."""
         if self.individual_head is None:
             return embeddings, embeddings[:, :0]
         n = self.individual_head.n_numbers
@@ -184,7 +177,7 @@ class TwoLevelHead(Head):
         return (head for head in self.body_heads if isinstance(head, WCCNHead))
 
     def _bodies(self, embeddings: Tensor) -> list[Tensor]:
-        """Return the `n_compared` columns of each body head in embeddings (N, D), with its weight undone."""
+        """Return the `n_compared` columns of embeddings (N, D) by each body head, without its weight."""
         start, bodies = self.class_head.n_numbers, []
         for head in self._body_heads():
             bodies.append(embeddings[:, start : start + head.n_compared] / self._root_share)

@@ -24,7 +24,7 @@ from igps.retrieval.distances import square_root
 
 _N_PRINCIPAL = 500  # principal directions of a part that are whitened; the others contain discretisation errors
 MEDIAN = 0.5  # median distance of training shapes, with lengths, so that all shapes fit in a sphere of radius 1
-_N_MEDIAN_SHAPES = 1000  # number of training shapes, about, that the median is computed from
+_N_MEDIAN_SHAPES = 1000  # approximate number of training shapes that the median is computed from
 
 
 class WCCNHead(Head):
@@ -34,12 +34,12 @@ class WCCNHead(Head):
     directions in which the class means vary most. The parts are normalised to equal lengths and concatenated.
 
     With `lengths`, the parts keep their lengths, so that distances are Mahalanobis distances: two shapes near the mean
-    are close, although the angle between them is arbitrary. An additional last column makes the vectors unit vectors,
-    and is not part of these distances.
+    are close, although the angle between them is arbitrary. An additional last column, which these distances do not
+    use, makes the vectors unit vectors.
 
     Args:
         parts: indices of the parts of a description that the head uses; all if None.
-        n_directions: columns of each part in a vector, at most the number of its cells.
+        n_directions: number of columns of each part in a vector, at most the number of its cells.
         shrinkage: added to the covariance within classes, in units of its mean eigenvalue.
         lengths: whether vectors keep their lengths.
     """
@@ -109,7 +109,7 @@ class WCCNHead(Head):
 
     @property
     def n_compared(self) -> int:
-        """The number of columns that distances use, once fitted: without the column that makes the length 1."""
+        """The number of columns that distances use, once fitted: all but the column that makes the length 1."""
         return sum(min(len(self.directions), size) for size in self._sizes())
 
     @property
@@ -128,18 +128,18 @@ class WCCNHead(Head):
         return damped(between_classes, *whitening) @ principal
 
     def _sizes(self) -> list[int]:
-        """Return the number of cells of each part that is used."""
+        """Return the number of cells of each used part."""
         cells: list[int] = self._noted["part_cells"]
         return cells if self._parts is None else [cells[i] for i in self._parts]
 
     def _by_part(self, used: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the centred cells (N, cells) and the directions (n_directions, cells) of each part that is used."""
+        """Return the centred cells (N, cells) and the directions (n_directions, cells) of each used part."""
         sizes = self._sizes()
         centred = used - self.mean
         return list(zip(centred.split(sizes, 1), self.directions.to(centred.dtype).split(sizes, 1), strict=True))
 
     def _select_parts(self, roots: Tensor) -> Tensor:
-        """Return the cells (N, cells) of the parts that are used."""
+        """Return the cells (N, cells) of all used parts."""
         if self._parts is None:
             return roots
         parts = roots.split(self._noted["part_cells"], dim=1)

@@ -22,7 +22,7 @@ class DescriptionPart(Specified, ABC):
     """A module that computes one part of a description: non-negative numbers of sum 1 for each body.
 
     A part of your own defines `shape`, `requirements` and `of_features`. If it uses the `weights` of samples, it also
-    defines `degree`: multiplying all weights by t multiplies the part by t to this power.
+    defines `degree`: if all weights are multiplied by t, the part is multiplied by t to the power `degree`.
     """
 
     degree: int = 1
@@ -35,7 +35,7 @@ class DescriptionPart(Specified, ABC):
     @property
     @abstractmethod
     def requirements(self) -> Requirements:
-        """What a body must have."""
+        """The data that a body must have."""
 
     @abstractmethod
     def of_features(self, features: BatchFeatures) -> Tensor:
@@ -61,8 +61,8 @@ class SampleHistogram(DescriptionPart):
     Args:
         samples: "interior" or "surface".
         n_samples: size of a fixed subset, for bodies with more samples; None uses all samples.
-        n_training_samples: size of a subset that is drawn at random at each step in training mode, which is faster and
-            prevents a head from memorising the samples. None uses the same samples as in evaluation mode.
+        n_training_samples: size of a random subset, drawn at each step in training mode, which is faster and prevents a
+            head from memorising the samples. None uses the same samples as in evaluation mode.
 
     Raises:
         ValueError: an unknown kind of samples, or a number of samples below two.
@@ -77,8 +77,7 @@ class SampleHistogram(DescriptionPart):
         check_one_of(SAMPLE_KINDS, samples=samples)
         check_at_least(2, n_samples=n_samples, n_training_samples=n_training_samples)
         self.samples: SampleKind = samples
-        self.n_samples = n_samples
-        self.n_training_samples = n_training_samples
+        self.n_samples, self.n_training_samples = n_samples, n_training_samples
 
     @property
     def requirements(self) -> Requirements:
@@ -118,7 +117,7 @@ class AxesHistogram(SampleHistogram):
 
 
 def joint(memberships: list[Tensor]) -> Tensor:
-    """Return memberships (..., P, C) in all combinations of classes, from the memberships along several axes."""
+    """Return memberships (..., P, C) in all combinations of the classes of several axes."""
     return reduce(lambda first, second: (first[..., :, None] * second[..., None, :]).flatten(-2), memberships)
 
 

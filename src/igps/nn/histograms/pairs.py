@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
-from igps.nn._kernels.pair_values import PairValues, euclidean_distances
+from igps._parameters import check_at_least, check_positive
+from igps.nn._kernels.pair_values import PairValues, centres_of, euclidean_distances
 from igps.nn._kernels.pairs import check_pairs, class_pairs, count_pairs
 from igps.nn.axes import PairAxis, PointAxis, axis_of
 from igps.nn.axes.points import largest_members
@@ -62,7 +63,7 @@ class PairHistogram(AxesHistogram):
             raise ValueError(f"axes: expected axes of points or of pairs, got {type(unknown[0]).__name__}.")
         self.axes = nn.ModuleList(modules)
         if not self.pair_axes:
-            raise ValueError("axes: expected at least one of pairs, such as 'interior_distance', got none.")
+            raise ValueError("axes: expected at least one axis of pairs, such as 'interior_distance', got none.")
         self.embedding = embedding or SpectralEmbedding()
 
     @property
@@ -90,7 +91,7 @@ class PairHistogram(AxesHistogram):
 
 
 def joint_histogram(memberships: Tensor, pairs: Sequence[PairValues], mask: Tensor | None = None) -> Tensor:
-    """Return the joint histogram of all pairs of points, by the classes of the two points and the bins of their values.
+    """Return the joint histogram of all pairs of points by the classes of the points and the bins of the pairs' values.
 
     Args:
         memberships: (P, C) of the points in classes, rows of sum 1; or (N, P, C) of N shapes.
@@ -109,17 +110,14 @@ def joint_histogram(memberships: Tensor, pairs: Sequence[PairValues], mask: Tens
         return joint_histogram(memberships[None], batched, None if mask is None else mask[None])[0]
     mask = torch.ones_like(memberships[..., 0], dtype=torch.bool) if mask is None else mask
     check_pairs(pairs, mask)
-    for centres in (centres for pair in pairs for centres in pair.centres):
+    for centres in centres_of(pairs):
         if centres.ndim != 1 or len(centres) < 2 or not bool(((centres.diff() > 0) & centres[1:].isfinite()).all()):
-            raise ValueError(
-                f"centres: expected at least two finite values in ascending order, got {centres.tolist()}."
-            )
+            raise ValueError(f"centres: expected two or more finite, ascending values, got {centres.tolist()}.")
     real = memberships[mask]
     # Both comparisons are false for NaN.
     if not bool((real >= 0).all() & ((real.sum(dim=1) - 1).abs() < 1e-3).all()):
         raise ValueError("memberships: expected non-negative rows of sum 1, got others; divide each row by its sum.")
-    n_classes = memberships.shape[2]
-    return count_pairs(*largest_members(memberships, mask), n_classes, pairs, mask)
+    return count_pairs(*largest_members(memberships, mask), memberships.shape[2], pairs, mask)
 
 
 def pair_histogram(
@@ -134,9 +132,9 @@ def pair_histogram(
     """Return the histogram of distances for every unordered pair of potential classes (Rustamov 2010, section 4).
 
     Each unordered pair of distinct points counts once, in the row of the classes of the two points. The classes are
-    `n_classes` equal intervals of [0, `potential_range`]. The centres of the bins are in the middle of `n_bins` equal
-    intervals of [0, `distance_range`]; a distance counts in the two bins whose centres surround it, in linear
-    proportion. Values beyond a range count in its last class or bin.
+    `n_classes` equal intervals of [0, `potential_range`]. The bins have their centres in the middle of `n_bins` equal
+    intervals of [0, `distance_range`]; a distance is shared linearly between the two bins whose centres surround it.
+    Values beyond a range count in its last class or bin.
 
     Args:
         embedding: (P, D) points; their Euclidean distances are counted.
@@ -155,16 +153,12 @@ def pair_histogram(
     if embedding.ndim != 2:
         raise ValueError(f"embedding: expected shape (P, D), got {tuple(embedding.shape)}.")
     if potential.shape != embedding.shape[:1]:
-        raise ValueError(
-            f"potential: expected shape {tuple(embedding.shape[:1])}, one per point, got {tuple(potential.shape)}."
-        )
+        raise ValueError(f"potential: expected shape ({len(embedding)},), one per point, got {tuple(potential.shape)}.")
     if not bool(((potential >= 0) & torch.isfinite(potential)).all()):
         raise ValueError("potential: expected non-negative, finite values, got others.")
-    if n_classes < 1 or n_bins < 2 or distance_range <= 0 or potential_range <= 0:
-        raise ValueError(
-            "expected n_classes >= 1, n_bins >= 2 and positive ranges, got "
-            f"{n_classes=}, {n_bins=}, {distance_range=}, {potential_range=}."
-        )
+    check_at_least(1, n_classes=n_classes)
+    check_at_least(2, n_bins=n_bins)
+    check_positive(distance_range=distance_range, potential_range=potential_range)
     classes = (potential * (n_classes / potential_range)).long().clamp_(max=n_classes - 1)
     dtype = torch.promote_types(embedding.dtype, torch.float32)
     centres = (torch.arange(n_bins, dtype=dtype, device=embedding.device) + 0.5) * (distance_range / n_bins)

@@ -26,7 +26,7 @@ class PointHistogram(AxesHistogram):
         samples, n_samples, n_training_samples: see `SampleHistogram`.
 
     Raises:
-        ValueError: there is no axis, or one that is not of points.
+        ValueError: there is no axis, or an axis that is not of points.
     """
 
     def __init__(
@@ -40,10 +40,8 @@ class PointHistogram(AxesHistogram):
     ) -> None:
         super().__init__(samples, n_samples, n_training_samples)
         if not axes or not all(isinstance(axis, PointAxis) for axis in axes):
-            raise ValueError(
-                f"axes: expected one or several axes of points, got {[type(axis).__name__ for axis in axes]}. Axes of "
-                "pairs belong to a PairHistogram."
-            )
+            names = [type(axis).__name__ for axis in axes]
+            raise ValueError(f"axes: expected axes of points, got {names}. Axes of pairs belong to a PairHistogram.")
         self.axes = nn.ModuleList(axes)
         self.embedding = embedding or SpectralEmbedding()
 
