@@ -38,7 +38,7 @@ from igps.mesh.mesh import Mesh
 from igps.mesh.winding import winding_number
 from igps.nn import axes
 from igps.nn.axes import InteriorDistance, Potential
-from igps.nn.axes.centres import middles
+from igps.nn.axes.centres import interval_centres
 from igps.nn.histograms import joint_histogram, pair_histogram
 from igps.retrieval import chi_square, euclidean
 from igps.signature.laplacian import laplacian
@@ -312,8 +312,8 @@ def oriented_pairs(data: Path | None) -> Figure:
     points = torch.rand(1000, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=generator), dim=1)
     one_class = torch.ones(1000, 1)
-    distances = axes.euclidean_distances(points, middles(6, 1.0, "bins"))
-    cosines = middles(5, 2.0, "bins") - 1
+    distances = axes.euclidean_distances(points, interval_centres(6, 1.0, "bins"))
+    cosines = interval_centres(5, 2.0, "bins") - 1
     oriented = axes.oriented_pairs(points, directions, cosines, cosines)
     x, n = points.double().numpy(), directions.double().numpy()
     i, j = np.triu_indices(1000, 1)

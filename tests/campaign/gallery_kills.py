@@ -15,6 +15,7 @@ import torch
 from outcome import Row
 
 import igps.gallery.gallery  # before the forks; this does not import LanceDB, whose threads do not survive a fork
+from igps.gallery._search import nearest_rows
 from igps.gallery.about import about_of
 from igps.mesh.options import LoadOptions
 from igps.retrieval import cosine
@@ -59,7 +60,9 @@ def _tables() -> Any:
     torch.set_num_threads(1)
     from igps.gallery import _table
 
-    _table._FEWEST_FOR_CODES, _table._CHANGES = N_UNCHANGED // 2, 8
+    for name, value in {"_MIN_ROWS_FOR_CODES": N_UNCHANGED // 2, "_INDEX_INTERVAL": 8}.items():
+        assert hasattr(_table, name)
+        setattr(_table, name, value)
     return _table
 
 
@@ -98,7 +101,7 @@ def _read(path: Path, out: Path) -> None:
     rows = {row["id"]: (row["volume"], vectors) for batch in table.batches()
             for vectors, row in zip(*table.decoded(batch), strict=True)}  # fmt: skip
     ids = sorted(rows)[:: max(len(rows) // 10, 1)]
-    are_nearest = all(table.search(rows[id_][1][None], cosine, top=1)[0][0]["id"] == id_ for id_ in ids)
+    are_nearest = all(nearest_rows(table, rows[id_][1][None], cosine, top=1)[0][0]["id"] == id_ for id_ in ids)
     arrays = {id_: (volume, values.numpy()) for id_, (volume, values) in rows.items()}
     out.write_bytes(pickle.dumps((arrays, are_nearest)))
 

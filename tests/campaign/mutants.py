@@ -79,7 +79,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         # The order of the points affects only the time.
         ("src/igps/nn/_kernels/count_by_loops.py", "key = key * layout.n_classes - torch.where(share > 0, classes, 0)"),
         # No resolution is above the finest: larger arguments are refused before, and increments are clipped.
-        ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == finest:"),
+        ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == max_resolution:"),
         # No code compares two instances.
         ("src/igps/signature/sampling.py", "@dataclass(frozen=True, eq=True)"),
         # NumPy accepts any negative number for an unknown length.
@@ -91,7 +91,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "src/igps/retrieval/graph_reranking.py",
             "return (1 - factor[:, None] * sums[:, 1:] * factor[neighbours]).clip( -1)",
         ),
-        ("src/igps/retrieval/graph_reranking.py", "return (1 - common / (2 - common)).clip( -1)"),
+        ("src/igps/retrieval/graph_reranking.py", "return np.subtract(1, common, out=common).clip( -1, out=common)"),
     }
 )
 

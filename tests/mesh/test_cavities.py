@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy import ndimage
 
 from igps import LoadOptions, Mesh, MeshError, SignatureConfig, collate, compute_signature, descriptor, load_mesh
 from igps.descriptors.interior import interior
@@ -140,6 +141,17 @@ def test_a_label_keeps_its_cavities() -> None:
     full = voxel_surface(mask)
     assert signed_volume(*full[:2]) == pytest.approx(np.count_nonzero(radius < 16), rel=0.01)
     assert notes != full[2]
+
+
+def test_a_cavity_behind_a_wall_with_gaps_is_noted() -> None:
+    """As of a wall thinner than a voxel. A closed wall, and a cup, get no note."""
+    offset = np.indices((40, 40, 40)) - 19.7
+    radius = np.linalg.norm(offset, axis=0)
+    thin, closed = np.abs(radius - 14) < 0.45, np.abs(radius - 14) < 0.75
+    assert ndimage.label(np.pad(~thin, 1, constant_values=True))[1] == 1  # the cavity is open
+    assert [("gaps of up to two voxels" in note) for note in voxel_surface(thin, cavities=True)[2]] == [True]
+    for mask in (closed, (radius < 14) & (radius > 11) & (offset[2] < 3)):
+        assert voxel_surface(mask, cavities=True)[2] == ()
 
 
 def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path: Path) -> None:

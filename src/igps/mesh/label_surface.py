@@ -28,6 +28,7 @@ LEAST_VOXELS = 8
 """Minimal number of voxels of a label; fewer have no shape."""
 
 _ISLAND = 0.02  # separate pieces of less than this share of the voxels are dropped
+_MIN_OPEN_CAVITY = 0.1  # share of the voxels from which an open cavity is noted
 _SPECK = 0.005  # pieces of the surface of less than this share of the volume are artefacts between voxels
 _MAX_SURPLUS = 4  # the grid may make this many times `max_vertices`, before simplification
 _MIN_VERTICES = 1500  # the field is interpolated until the grid makes about as many
@@ -84,6 +85,8 @@ def voxel_surface(
     notes: list[str] = []
     mask = fill_missed_slices(mask[box], notes) if joins else mask[box]
     mask, hollows = _clean(mask, notes, LEAST_VOXELS if cavities else None, name)
+    if cavities and (n_open := _n_nearly_enclosed(mask)) > _MIN_OPEN_CAVITY * np.count_nonzero(mask):
+        notes.append(f"a cavity of about {n_open} voxels is open through gaps of up to two voxels in its wall")
     share, factor = _coarsen(mask, spacing, max_vertices)
     mask = _thicken_contacts(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
@@ -150,6 +153,13 @@ def _clean(mask: Booleans, notes: list[str], min_hole: int | None, name: str) ->
     if n_filled := int(size.sum() - size[kept].sum()):
         notes.append(f"filled holes of {n_filled} voxels")
     return np.asarray(hollow != outside), [hollow == k for k in kept]
+
+
+def _n_nearly_enclosed(mask: Booleans) -> int:
+    """Count the voxels outside a body that it encloses if it is thickened by one voxel."""
+    label, _ = ndimage.label(~ndimage.binary_dilation(np.pad(mask, 2), TOUCHING))
+    size = np.bincount(label.reshape(-1))
+    return int(size[1:].sum() - size[label[0, 0, 0]])
 
 
 def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
