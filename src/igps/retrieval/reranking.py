@@ -66,7 +66,7 @@ def rerank(
     if distances.ndim != 2 or distances.shape[0] != distances.shape[1]:
         raise ValueError(f"distances: expected (N, N), of a collection to itself, got {tuple(distances.shape)}.")
     if not bool((distances >= 0).all() and torch.isfinite(distances).all()):
-        raise ValueError("distances: expected finite numbers ≥ 0.")
+        raise ValueError("distances: expected finite numbers ≥ 0, got others.")
     check_at_least(1, n_neighbours=n_neighbours, n_expanded=n_expanded)
     if not (0 <= share <= 1 and 0 <= diffusion < 1):
         raise ValueError(f"share, diffusion: expected 0 to 1, and 0 to less than 1, got {share} and {diffusion}.")

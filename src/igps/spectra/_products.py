@@ -4,8 +4,8 @@ A BLAS is made for matrices with many rows and columns: it first copies its oper
 products of the eigensolver are different, and take most of its time.
 
 *Fronts of some tens of unknowns, and solves with few right-hand sides* (`product`). A tile of the result, ROWS by
-COLUMNS, stays in the processor's registers until it is complete, and takes a third of the time. Numba's compiler does
-not find this by itself: with loops that it arranges over rows of four, all of `eigenpairs` takes 1.9 times as long at
+COLUMNS, stays in the processor's registers until it is complete. This takes a third of the time of a BLAS. Numba does
+not find it by itself: with loops that it arranges over rows of four, all of `eigenpairs` takes 1.9 times as long at
 10,000 vertices. The tile is therefore written in LLVM instructions (`_tile`); everything around it is plain Numba.
 
 *A few long rows with many* (`overlaps`), for the Krylov basis. On AMD processors compiled loops take down to half the
