@@ -245,6 +245,7 @@ def test_per_class_means_are_those_of_the_members() -> None:
         (torch.ones(2, 2), [torch.tensor(0), torch.tensor(0)], None, "query_labels: expected an integer tensor"),
         (torch.ones(2, 2), torch.tensor([-1, -1]), None, "query_labels: .* got −1, which means unknown"),
         (torch.ones(2, 2), "aa", None, "query_labels: expected an integer tensor"),
+        (torch.ones(2, 2), [0.5] * 1000, None, r"got \[0\.5, (0\.5, ){5}\.\.\.\]$"),  # long sequences are cut
         (torch.ones(2, 2), ["a", "b"], None, "nothing to score"),
         (torch.ones(1, 2), ["1"], [1, 1], "nothing to score"),
         (torch.ones(1, 1), ["a"], None, "nothing to score"),

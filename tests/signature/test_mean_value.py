@@ -263,7 +263,7 @@ def test_read_only_and_single_precision_input_is_accepted_and_kept() -> None:
         ({"functions": np.ones((7, 2))}, "functions: expected shape"),
         ({"functions": np.full((8, 2), np.nan)}, "functions: expected finite"),
         ({"functions": np.array([[1.0, np.inf]] * 4 + [[1.0, -np.inf]] * 4)}, "functions: expected finite"),
-        ({"divisors": np.ones(3)}, "divisors: expected one for each of 2 functions"),
+        ({"divisors": np.ones(3)}, r"divisors: expected shape \(2,\), one per function, got \(3,\)"),
         ({"accuracy": 0.0}, "accuracy: expected"),
         ({"accuracy": float("nan")}, "accuracy: expected"),
         ({"dtype": np.float16}, "dtype: expected"),

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from igps._arrays import Real
 from igps._compiled import SUMS, compiled
 
-# Rows of the gallery in a tile. With some hundred cells a row, a tile stays in the second-level cache for all queries.
+# Rows of the gallery in a tile: with some hundred cells per row, it stays in the second-level cache for all queries.
 TILE = 64
 
 
@@ -16,10 +16,8 @@ def fill(queries: NDArray[Real], gallery: NDArray[Real], is_chi_square: bool, di
     for begin in range(0, len(gallery), TILE):
         for q in range(len(queries)):
             for g in range(begin, min(begin + TILE, len(gallery))):
-                if is_chi_square:
-                    distances[q, g] = chi_square(queries[q], gallery[g])
-                else:
-                    distances[q, g] = square(queries[q], gallery[g])
+                a, b = queries[q], gallery[g]
+                distances[q, g] = chi_square(a, b) if is_chi_square else square(a, b)
 
 
 @compiled(fastmath=SUMS)

@@ -4,9 +4,8 @@ Smaller is closer, identical descriptors have distance exactly 0, and a distance
 symmetric. All dimensions after the first are cells of a histogram or entries of a vector.
 
 All functions run on the device of their inputs, and in float32 for inputs in half precision. They are differentiable:
-χ² any number of times, the others once, or any number of times under `torch.func`. They raise a ValueError for shapes,
-dtypes or devices that do not match, for NaN or infinite entries, and χ² for negative entries. This check synchronises
-with the device once per argument.
+χ² any number of times, the others once, or any number of times under `torch.func`. They raise a ValueError for
+unsuitable shapes, dtypes or devices, for NaN or infinity, and χ² for negative entries; the check waits for the device.
 """
 
 import math
@@ -28,7 +27,7 @@ Distance = Callable[[Tensor, Tensor], Tensor]
 _CPU_TILE_BYTES = 2**20
 _DEVICE_TILE_BYTES = 48 * 2**20
 _CELLS_PER_TILE = 4096
-# Minimum of triples for each thread of the compiled loops: some milliseconds
+# Smallest number of triples per thread of the compiled loops, which takes some milliseconds.
 _TRIPLES_PER_THREAD = 2**24
 # Squared distances below this share of the sum of the two squared lengths are rounding errors of double precision.
 _CANCELLATION = 1e-14
@@ -40,8 +39,7 @@ def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
     The distance of two histograms of sum 1 lies in [0, 1], and is 1 if no cell is filled in both. To weight a cell,
     multiply its entries in both histograms by the weight. A cell that is empty in both adds nothing; its gradients are
     set to zero, because the function has no derivative there. Memory beyond inputs, result and gradients stays below
-    256 MiB, but derivatives of gradients hold all triples of query, gallery and cell. Source: Rustamov 2010 (comparison
-    of histograms by χ²).
+    256 MiB, but derivatives of gradients hold all triples of query, gallery and cell. Source: Rustamov 2010.
 
     Example:
         >>> import torch
@@ -125,7 +123,7 @@ def in_transforms() -> bool:
 
 
 def _sums_by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
-    """(Q, G) sums by `distance_loops.fill`. The longer one of queries and gallery is divided among threads."""
+    """Sums (Q, G) of `distance_loops.fill`; the longer one of queries and gallery is divided among threads."""
     sums = a.new_empty(len(a), len(b))
     queries, gallery, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, sums))
 
@@ -151,7 +149,7 @@ def _ratio(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
-    """Slices of queries, gallery and cells of tiles of bounded size that cover all triples."""
+    """Slices (queries, gallery, cells) of tiles of bounded size that cover all triples."""
     (n_queries, n_cells), n_gallery = a.shape, len(b)
     n_bytes = _CPU_TILE_BYTES if a.device.type == "cpu" else _DEVICE_TILE_BYTES
     cells = min(n_cells, _CELLS_PER_TILE)
@@ -230,9 +228,7 @@ def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[T
             f"{tuple(gallery.shape[1:])}; compute both with the same configuration"
         )
     if queries.device != gallery.device:
-        raise ValueError(
-            f"gallery: expected on {queries.device} like the queries, got {gallery.device}; move one of them"
-        )
+        raise ValueError(f"gallery: expected the queries' device {queries.device}, got {gallery.device}; move one")
     dtype = torch.promote_types(torch.promote_types(queries.dtype, gallery.dtype), torch.float32)
     return queries.flatten(1).to(dtype), gallery.flatten(1).to(dtype)
 
@@ -246,6 +242,4 @@ def _check_entries(name: str, tensor: Tensor, *, non_negative: bool) -> None:
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ValueError(f"{name}: expected finite entries, got NaN or infinity; look for the descriptor with them")
     if non_negative and low < 0:
-        raise ValueError(
-            f"{name}: expected entries ≥ 0, the smallest is {low:g}; compare embeddings by euclidean or cosine"
-        )
+        raise ValueError(f"{name}: expected entries ≥ 0, got {low:g}; compare embeddings by euclidean or cosine")

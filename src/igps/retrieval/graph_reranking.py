@@ -12,9 +12,9 @@ from igps.retrieval.ranking import SearchResult
 MAX_DENSE = 2000
 """Largest number of shapes for which all pairs are used, and walks are summed by a matrix inverse."""
 
-# Maximum of iterations of conjugate gradients; the condition number of the matrices is below 40.
+# Largest number of iterations of conjugate gradients; the condition number of the matrices is below 40.
 _MAX_ITERATIONS = 40
-# Rows of the graph that are compared at a time
+# Number of rows of the graph that are compared at a time.
 _BLOCK_ROWS = 20
 _TINY = np.finfo(np.float64).tiny
 
@@ -163,7 +163,6 @@ def _reciprocal(neighbours: Integers) -> sparse.csr_array:
 
 
 def _with_values(graph: sparse.csr_array, values: Floats) -> sparse.csr_array:
-    """A matrix with the structure of a graph and other values."""
     return sparse.csr_array((values, graph.indices, graph.indptr), shape=graph.shape)
 
 
@@ -173,23 +172,24 @@ def _rows(graph: sparse.csr_array) -> Integers:
 
 
 def _with_nearest_first(values: Floats, graph: sparse.csr_array, nearest: Integers) -> Floats:
-    """Values of the pairs in which pairs of nearest neighbours come before all others, in the order of the graph."""
+    """Values of the pairs, changed so that pairs of nearest neighbours come first, in the order of the graph."""
     nearest = nearest.astype(graph.indices.dtype)
     rows = _rows(graph)
     is_nearest = (nearest[rows] == graph.indices) | (nearest[graph.indices] == rows)
     smallest = values.min(where=~is_nearest & (values > 0), initial=np.inf)
     result, distances = values.copy(), graph.data[is_nearest]
-    # Half of the smallest value, so that rounding to single precision makes no ties
+    # At most half of the smallest other value, so that rounding to single precision makes no ties.
     result[is_nearest] = 0.5 * (smallest if np.isfinite(smallest) else 1.0) * distances / max(distances.max(), _TINY)
     return result
 
 
 @compiled()
 def walks(lists: Integers, starts: Integers, columns: Integers, steps: Floats, n_rounds: int, sums: Floats) -> None:
-    """Add the sums over all walks from each shape to the members of its list that stay in the list to `sums` (N, L).
+    """Add to `sums` (N, L), for each member of each shape's list, the sum over all walks from shape to member.
 
-    A list (N, L) starts with its own shape. For each list, (I - S) x = e is solved by conjugate gradients, where S, the
-    matrix of single steps, is restricted to the members; `starts`, `columns` and `steps` are its CSR form.
+    Walks stay in the list. A list (N, L) starts with its own shape. For each list, (I - S) x = e is solved by conjugate
+    gradients, where S, the matrix of single steps, is restricted to the members; `starts`, `columns` and `steps` are
+    its CSR form.
     """
     position = np.full(len(lists), -1)
     for i in range(len(lists)):

@@ -34,9 +34,8 @@ class RetrievalScoresMetric(Metric):
     def __init__(self, distance: Distance = chi_square, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.distance = distance
-        self.add_state("descriptors", default=[], dist_reduce_fx="cat")
-        self.add_state("labels", default=[], dist_reduce_fx="cat")
-        self.add_state("ids", default=[], dist_reduce_fx="cat")
+        for name in ("descriptors", "labels", "ids"):
+            self.add_state(name, default=[], dist_reduce_fx="cat")
 
     def update(self, descriptors: Tensor, labels: Tensor, ids: Sequence[str] | None = None) -> None:
         """Add descriptors (N, ...), integer labels (N,) and unique names of shapes; a ValueError if lengths differ."""
@@ -66,5 +65,5 @@ class RetrievalScoresMetric(Metric):
 
 
 def _hash64(name: str) -> int:
-    """A 64-bit hash of a name, the same in every process, because processes can gather numbers but no strings."""
+    """A 64-bit hash, the same in every process: processes can exchange numbers, but no strings."""
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little", signed=True)

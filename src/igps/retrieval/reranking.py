@@ -32,8 +32,7 @@ def rerank(
 
     *Diffusion* (Zhou, Weston, Gretton, Bousquet and Schölkopf 2004): each shape is linked to its k/2 nearest, with
     weights exp(−d² / σσ′), where σ is the mean distance to them (Zelnik-Manor and Perona 2004). With S = D^−½ W D^−½,
-    the similarity of two shapes is the sum over all walks between them, (I − diffusion · S)⁻¹, scaled to ones on the
-    diagonal.
+    the similarity of two shapes is the sum over all walks between them, (I − diffusion · S)⁻¹, with a unit diagonal.
 
     *k-reciprocal neighbours* (Zhong, Zheng, Cao and Li 2017), by the distances after diffusion: the neighbourhood of a
     shape consists of those of its k nearest that have the shape among their k nearest. The neighbourhood of a member,
@@ -44,14 +43,14 @@ def rerank(
     The result of each step is mixed with the distances before it. It depends on the whole collection: without one of
     the shapes, the others may rank differently. Common neighbours indicate the class of a shape rather than its body,
     so each shape keeps its nearest one. In collections of more than 2,000 shapes, each shape has a list of its nearest
-    1,000 shapes, of more than 10,000 of its nearest 300, see `rerank_graph`. Two shapes of which neither is in the list
-    of the other count as having no common neighbours.
+    shapes, see `rerank_graph`: 1,000, but fewer from 3,000 shapes on, down to 300 from 10,000 on. Two shapes of which
+    neither is in the list of the other count as having no common neighbours.
 
     Args:
         distances: (N, N) of a collection to itself, symmetric, ≥ 0.
         n_neighbours: k, at most N − 1.
         n_expanded: number of nearest shapes, the shape itself included, over which weights are averaged.
-        share: of the distances before a step, in units of their mean, in the mixture after it.
+        share: weight of the distances before a step, in units of their mean, in its result.
         diffusion: factor for each step of a walk, at least 0 and less than 1; 0 leaves diffusion out.
         keep_nearest: after each step, put all pairs in which one shape is the nearest of the other before all other
             pairs, in their original order; the papers do not do so.
@@ -67,7 +66,7 @@ def rerank(
     if distances.ndim != 2 or distances.shape[0] != distances.shape[1]:
         raise ValueError(f"distances: expected (N, N), of a collection to itself, got {tuple(distances.shape)}.")
     if not bool((distances >= 0).all() and torch.isfinite(distances).all()):
-        raise ValueError("distances: expected finite numbers ≥ 0.")
+        raise ValueError("distances: expected finite numbers ≥ 0, got others.")
     check_at_least(1, n_neighbours=n_neighbours, n_expanded=n_expanded)
     if not (0 <= share <= 1 and 0 <= diffusion < 1):
         raise ValueError(f"share, diffusion: expected 0 to 1, and 0 to less than 1, got {share} and {diffusion}.")

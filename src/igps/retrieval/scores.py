@@ -6,6 +6,7 @@ relevant entries in the gallery. Scores of a query with R = 0 are undefined: the
 """
 
 import numbers
+import reprlib
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -204,13 +205,10 @@ def _label_tuple(name: str, labels: Labels, n_expected: int) -> tuple[Hashable, 
             raise ValueError(f"{name}: expected shape (N,), got {tuple(labels.shape)}")
         labels = labels.tolist()
     if isinstance(labels, str) or not all(isinstance(label, str | numbers.Integral) for label in labels):
-        raise ValueError(
-            f"{name}: expected an integer tensor (N,) or a sequence of integers or strings, got {labels!r}"
-        )
+        shown = reprlib.repr(labels)
+        raise ValueError(f"{name}: expected an integer tensor or a sequence of integers or strings, got {shown}")
     if -1 in labels:
         raise ValueError(f"{name}: expected known classes, got −1, which means unknown. Leave such shapes out.")
     if len(labels) != n_expected:
-        raise ValueError(
-            f"{name}: expected {n_expected} labels, one for each row or column of the distances, got {len(labels)}"
-        )
+        raise ValueError(f"{name}: expected {n_expected} labels, one per row or column of distances, got {len(labels)}")
     return tuple(labels)

@@ -13,8 +13,7 @@ SearchDistance = Literal["cosine", "chi_square"]
 MOST_NUMBERS = 256
 """The largest width of a short vector."""
 
-# With two steps, the squared Euclidean distance of the features is a fifth to a third below 2 χ², in nearly the same
-# order.
+# With two steps, squared Euclidean distances of features are a fifth to a third below 2 χ², in nearly the same order.
 _SAMPLE_STEPS = 2
 _BLOCK_ROWS = 512
 
@@ -62,8 +61,8 @@ class VectorMap:
     @classmethod
     def of_arrays(cls, arrays: Any) -> Self:
         """Restore a map from its `arrays`."""
-        names = [name for name in ("mean", "components") if name in arrays]
-        return cls(str(arrays["searched_by"]), **{name: arrays[name] for name in names})  # type: ignore[arg-type]
+        fields = {name: arrays[name] for name in ("mean", "components") if name in arrays}
+        return cls(str(arrays["searched_by"]), **fields)  # type: ignore[arg-type]
 
 
 def _features(descriptions: Singles, searched_by: SearchDistance) -> Singles:
@@ -71,5 +70,4 @@ def _features(descriptions: Singles, searched_by: SearchDistance) -> Singles:
         return descriptions
     from sklearn.kernel_approximation import AdditiveChi2Sampler
 
-    features: Singles = AdditiveChi2Sampler(sample_steps=_SAMPLE_STEPS).fit_transform(descriptions)
-    return features
+    return AdditiveChi2Sampler(sample_steps=_SAMPLE_STEPS).fit_transform(descriptions)

@@ -1,8 +1,7 @@
 """Mean value weights of a surface: in closed form face by face near it, by series of hats and of clusters far from it.
 
 The weight of a vertex at a point x is ∫ λ h/r⁴ dS over its hat function λ, where r is the distance from x to a surface
-point y, and h the distance from x to the tangent plane at y. Far from the surface the kernel is expanded in a Taylor
-series:
+point y, and h the distance from x to the tangent plane at y. Far away the kernel is expanded in a Taylor series:
 
 * The series of a hat is taken about its centroid p, to first order; the second order treats the hat as flat. Let n be
   the normal and v a vertex of the face that contains y, C the covariance of y under λ, and r = |p − x|. Then the weight
@@ -35,22 +34,21 @@ _HALF_DIAGONAL = 1 - np.eye(3) / 2  # halves the diagonal of a matrix plus its t
 
 
 class HatSurface:
-    """A scaled mesh for the evaluation of mean value weights, without flat faces and unused vertices.
+    """Tables of a scaled mesh for the evaluation of mean value weights, without flat faces and unused vertices.
 
-    Vertices with close numbers are close in space. The coordinates are rotated to the principal axes, so that bounding
+    Vertices with close indices are close in space. The coordinates are rotated to the principal axes, so that bounding
     boxes turn with the body. A ValueError is raised if no face has an area.
 
     Attributes:
         axes: (3, 3) principal axes as columns; points x are rotated by x @ axes.
         order: (V,) index of each vertex in the original mesh.
         faces: (F, 3).
-        table: (F, 22) of each face: corners, unit normal, two inward vectors in its plane that are perpendicular to its
-            first two sides and as long as these, squared side lengths, twice the area. Side i is opposite corner i.
+        table: (F, 22) for each face: corners, unit normal, two inward vectors in its plane that are perpendicular to
+            its first two sides and as long as these, squared side lengths, twice the area. Side i is opposite corner i.
         face_starts: (V + 1,) start of the faces of each vertex in `incident_faces`.
         incident_faces: (3 F,) faces around the vertices, vertex by vertex.
-        hats: (V, 24) of each vertex: centroid p of its hat, radius of a ball about p that contains its faces, and the
-            coefficients of L (4), S (10) and B (6) as polynomials in p − x; quadratic coefficients are in the order
-            xx, xy, xz, yy, yz, zz.
+        hats: (V, 24) for each vertex: centroid p of its hat, radius of a ball about p that contains its faces, and the
+            coefficients of L (4), S (10) and B (6) as polynomials in p − x, quadratic ones as xx, xy, xz, yy, yz, zz.
     """
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
@@ -75,10 +73,8 @@ class HatSurface:
         columns = corners.reshape(-1, 9), normals, inward.reshape(-1, 6), squared_sides, double_areas
         self.table = np.concatenate(columns, axis=1)
         n_corners = 3 * len(faces)
-        corner_vertices = sparse.csr_matrix(
-            (np.ones(n_corners), self.faces.ravel(), np.arange(n_corners + 1)), shape=(n_corners, len(vertices))
-        )
-        incidence = corner_vertices.T.tocsr()
+        arrays = np.ones(n_corners), self.faces.ravel(), np.arange(n_corners + 1)
+        incidence = sparse.csc_matrix(arrays, shape=(len(vertices), n_corners)).tocsr()
         self.hats = _hats(vertices, incidence, corners, normals, double_areas / 6, squared_sides)
         self.face_starts = incidence.indptr.astype(np.int64)
         self.incident_faces = incidence.indices.astype(np.int64) // 3
@@ -87,8 +83,7 @@ class HatSurface:
         """Fill the last rows of `out` (…, n) with the weights of hats (h,) at points x (3, n).
 
         The series is used where a point is `ratio` or more radii from a hat, the closed form elsewhere. For a point on
-        the surface all rows are filled: with barycentric coordinates for the corners of its face, and with zeros for
-        all others.
+        the surface all rows are filled: with barycentric coordinates at the corners of its face, with zeros elsewhere.
         """
         near = np.zeros((len(hats) + 1, x.shape[1]), dtype=bool)
         fill_hats(x, hats, self.hats, ratio, out[len(out) - len(hats) :], near)
@@ -99,7 +94,7 @@ def _hats(
     vertices: Floats, incidence: sparse.csr_matrix, corners: Floats, normals: Floats, third_areas: Floats,
     squared_sides: Floats,
 ) -> Floats:  # fmt: skip
-    """Return `HatSurface.hats`, with `incidence` (V, 3 F) as the sum over corners and third_areas (F, 1).
+    """Return `HatSurface.hats`, from third_areas (F, 1) and `incidence` (V, 3 F), which sums over the corners.
 
     Over a face with corners v, a, b and t = v + a + b the hat of v has the mean (v + t)/4 and the second moment
     (2vvᵀ + vtᵀ + tvᵀ + ttᵀ + aaᵀ + bbᵀ + vvᵀ)/20.
@@ -140,12 +135,12 @@ def _entries(forms: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class HatClusters:
-    """Sums of functions over clusters of hats: of 32 hats, and on each further level of four clusters."""
+    """Sums of functions over clusters: of 32 hats on the first level, of four clusters on each further level."""
 
     centres: Floats  # (C, 3), level by level
     radii: Floats  # (C,) of balls about the centres that contain the balls of the hats
     level_starts: Integers  # (n_levels + 1,) first cluster of each level, and C
-    sums: NDArray[np.floating]  # (C, 19, K) the 19 sums of each function f, see above
+    sums: NDArray[np.floating]  # (C, 19, K) the 19 sums of each function, see the docstring of the module
     n_hats: int  # V
 
     @classmethod

@@ -7,7 +7,7 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 
-_TINY = math.ulp(1.0) ** 2  # keeps the logarithm of a side finite on that side, where its factor is 0
+_TINY = math.ulp(1.0) ** 2  # keeps the logarithm of a side finite at points on the side, where its factor is 0
 
 
 @compiled()
@@ -15,19 +15,18 @@ def fill_potentials(
     points: Floats, block: int, patches: Floats, min_distances: Floats, level_starts: Integers, branching: int,
     squared_limits: Floats, faces: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Fill `out` with the potentials at points, one block of neighbouring points at a time.
+    """Fill `out` (n,) with the potentials at points, one block of neighbouring points at a time.
 
     Args:
         points: (n, 3) in spatial order.
         block: number of points for which the same patches are far.
         patches: (N, 10) of all levels, beginning with the faces: centre c, area A, and the quadratic form
             A·(3/2 C − ½ tr C·1) with C the covariance, as xx, yy, zz, 2xy, 2xz, 2yz.
-        min_distances: (N,) smallest distance from its centre at which the series of a patch is used.
+        min_distances: (N,) smallest distance from the centre of each patch at which its series is used.
         level_starts: (n_levels + 1,) first patch of each level, and N.
         branching: number of patches that are merged into a patch of the next level.
-        squared_limits: (F,) squared distance from a face's centre from which on the series of its quarters are used.
+        squared_limits: (F,) squared distance from the centre of each face beyond which its quarters' series are used.
         faces: (F, 25), see `near_potential`.
-        out: (n,).
     """
     n_levels = len(level_starts) - 1
     x, is_far = np.empty((3, block)), np.empty(block)
@@ -69,15 +68,13 @@ def fill_potentials(
 def add_series(
     patch: Floats, scale: float, share: float, target: Floats, points: Floats, is_far: Floats, sums: Floats
 ) -> None:
-    """Add the series of a patch (10,), A/r + A (3/2 dᵀCd − ½ tr C r²)/r⁵, times `is_far` (n,) at points (3, n).
+    """Add the series of a patch (10,), A/r + A (3/2 dᵀCd − ½ tr C r²)/r⁵, where points (3, n) have `is_far` (n,) = 1.
 
     The patch is first scaled by `scale` about its centre, and moved by `share` of the way to the point `target` (3,).
     """
-    c0, c1, c2 = (
-        patch[0] + share * (target[0] - patch[0]),
-        patch[1] + share * (target[1] - patch[1]),
-        patch[2] + share * (target[2] - patch[2]),
-    )
+    c0 = patch[0] + share * (target[0] - patch[0])
+    c1 = patch[1] + share * (target[1] - patch[1])
+    c2 = patch[2] + share * (target[2] - patch[2])
     area = patch[3] * scale**2
     f0, f1, f2 = patch[4] * scale**4, patch[5] * scale**4, patch[6] * scale**4
     f3, f4, f5 = patch[7] * scale**4, patch[8] * scale**4, patch[9] * scale**4

@@ -30,7 +30,7 @@ _ARCTAN = tuple(
 def find_far_clusters(
     low: Floats, high: Floats, centres: Floats, radii: Floats, starts: Integers, ratio: float, leaf: int, n_hats: int
 ) -> tuple[Integers, Integers]:
-    """Return the clusters that are `ratio` radii or more from a box, and, ascending, the hats in none of these."""
+    """Return the clusters that are `ratio` or more radii from a box, and the hats in none of these, ascending."""
     clusters, hats = np.empty(len(radii), np.int64), np.empty(n_hats, np.int64)
     n_clusters, n_near, n_stacked = 0, 0, 0
     n_levels = len(starts) - 1
@@ -63,7 +63,7 @@ def find_far_clusters(
 
 @compiled(fastmath=CONTRACTED)
 def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: Floats, near: Booleans) -> None:
-    """Fill the weights (h, n) of the chosen hats (h,): 0 where a point is `near`, within `ratio` radii of the hat."""
+    """Fill the weights (h, n) of the chosen hats (h,), 0 at points within `ratio` radii; mark those in `near`."""
     n = x.shape[1]
     squared = np.empty(n)
     for k in range(len(chosen)):
@@ -109,10 +109,10 @@ def fill_clusters(x: Floats, chosen: Integers, centres: Floats, radii: Floats, t
 
 @compiled()
 def add_near_faces(x: Floats, chosen: Integers, near: Booleans, surface: SurfaceArrays, weights: Floats) -> None:
-    """Add the closed form to the weights (…, n), whose last rows are those of the chosen hats (h,).
+    """Add the closed form to the weights (…, n), whose last h rows are those of the chosen hats (h,).
 
-    It is added where a hat is `near` a point (h + 1, n); the last row of `near` is False. Points on the surface get the
-    barycentric coordinates in their face, and zero everywhere else.
+    It is added where a hat is `near` a point (h + 1, n); the last row of `near` is False. For points on the surface all
+    weights are replaced: by the barycentric coordinates in their face, and by zero elsewhere.
     """
     faces, table, face_starts, incident_faces = surface
     n, n_chosen = x.shape[1], len(chosen)
@@ -133,7 +133,7 @@ def add_near_faces(x: Floats, chosen: Integers, near: Booleans, surface: Surface
             continue
         for j in range(face_starts[hat], face_starts[hat + 1]):
             face = incident_faces[j]
-            # Each face is added once: at its near corner of lowest number. Look up the corners below this one.
+            # Each face is added once: at its near corner of lowest index. Are corners of lower index near, too?
             row_1, row_2 = n_chosen, n_chosen
             for corner in range(3):
                 if faces[face, corner] < hat:
@@ -161,14 +161,13 @@ def add_faces(
 ) -> None:  # fmt: skip
     """Add the closed form for pairs (2, m) of a face and a point, accurate up to the surface.
 
-    For a point on the surface, face_at (n,) records the first face that contains it, and barycentric (n, 3) the
-    coordinates.
+    If a point is on the surface, the first face that contains it is written to face_at (n,), and its barycentric
+    coordinates there to barycentric (n, 3).
 
     Let λ be the barycentric coordinates of the projection of x, h its distance to the plane, e_l the sides, N_l the
     cross product of the vectors from x to the ends of side l, and θ_l the angle between these. The published
     N_i·m / (N_i·v_i) becomes ½ [λ_i s/h + h Σ_l g_l e_l·e_i / |n|²] |n|, with g_l = θ_l/|N_l| and s = Σ_l g_l λ_l,
-    because N_l = λ_l n + h n̂×e_l. The length of N_l is also taken from this identity, so that all terms agree near a
-    side.
+    because N_l = λ_l n + h n̂×e_l. The length of N_l is taken from this identity, too: all terms agree near a side.
     """
     n_pairs = pairs.shape[1]
     projections, squares, cosines = np.empty((n_pairs, 4)), np.empty(3 * n_pairs), np.empty(3 * n_pairs)
@@ -196,7 +195,7 @@ def add_faces(
         g, sides = squares[3 * m : 3 * m + 3], table[face, 18:21]
         half = (sides[0] + sides[1] + sides[2]) / 2
         s = g[0] * areas[0] + g[1] * areas[1] + g[2] * areas[2]
-        # In the plane of a face but outside the face, s vanishes like h² and the weight like h: s/h is only rounding.
+        # In the plane of a face but outside the face, s vanishes like h² and s/h like h: only rounding errors are left.
         s_over_h = 0.0 if abs(height) < _ON_SURFACE and s < 1e-2 else s / height
         on_face, total_area = abs(height) <= _ON_SURFACE and face_at[i] < 0, 0.0
         for corner in range(3):
@@ -246,9 +245,8 @@ def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, 
         f0, f1, f2 = cubed * p[5], cubed * p[6], cubed * p[7]
         # S is −4 dᵀTd, and B is 12 dᵀCd; entries off the diagonal count twice.
         tilt, spread = -squared * squared / 4, squared / 12
-        t00, t01, t02, t11, t12, t22 = (
-            tilt * p[12], tilt * p[13], tilt * p[14], tilt * p[15], tilt * p[16], tilt * p[17]
-        )  # fmt: skip
+        t00, t01, t02 = tilt * p[12], tilt * p[13], tilt * p[14]
+        t11, t12, t22 = tilt * p[15], tilt * p[16], tilt * p[17]
         e00, e11, e22 = spread * p[18] + s0 * s0, spread * p[21] + s1 * s1, spread * p[23] + s2 * s2
         e01, e02, e12 = spread * p[19] + 2 * s0 * s1, spread * p[20] + 2 * s0 * s2, spread * p[22] + 2 * s1 * s2
         out[0], out[1], out[2] = f0, f1, f2

@@ -14,13 +14,13 @@ AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 
 def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
-    """Return attributes of interior points (P, 3), independent of scale and place: each (P,), or a direction (P, 3)."""
+    """Return the named attributes (P,), or (P, 3) for a direction, of interior points (P, 3); none depends on scale."""
     functions = {function.__name__: function for function in (depth, electrostatic_potential, surface_direction)}
     return {name: functions[name](mesh, points).astype(np.float32) for name in names}
 
 
 def surface_attributes(mesh: Mesh, faces: Integers, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
-    """Return the named attributes of points on faces (P,): at most "surface_direction", the outward normal (P, 3)."""
+    """Return the named attributes of points on faces (P,): only "surface_direction", here the outward normal (P, 3)."""
     if "surface_direction" not in names:
         return {}
     normals = area_vectors(mesh.vertices, mesh.faces)[faces]
@@ -54,8 +54,8 @@ def electrostatic_potential(mesh: Mesh, points: Floats) -> Floats:
     """Return the potentials (P,) of a uniform unit charge on the surface, (1/√area) ∫ dS/|x − s|, at points x (P, 3).
 
     It is √4π in a ball. It is high where much surface is near, as deep in thick parts and among folds, and low in thin
-    limbs and at their tips. Rustamov 2010, section 4, names electrostatic potentials as a further dimension; if a body
-    has charges of its own (a protein), pass their potential as an attribute instead. The potential does not depend on
-    the triangulation, and is finite on the surface. See `surface_potential` for the method and its error.
+    limbs and at their tips. It does not depend on the triangulation, and is finite on the surface. Rustamov 2010,
+    section 4, names electrostatic potentials as a further dimension; if a body has charges of its own (a protein), pass
+    their potential as an attribute instead. See `surface_potential` for the method and its error.
     """
     return surface_potential(mesh.vertices, mesh.faces, points) / np.sqrt(mesh.area)

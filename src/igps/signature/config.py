@@ -1,4 +1,4 @@
-"""Every parameter that a Signature depends on."""
+"""Configuration of a Signature."""
 
 import math
 from collections.abc import Iterator
@@ -9,8 +9,8 @@ from igps._parameters import check_at_least, check_one_of, check_share
 from igps.signature.attributes import AttributeName
 from igps.signature.laplacian import Backend
 
-# Number of eigenpairs that determines the order of the samples, see `ordering_keys`. Configurations with at least as
-# many give the samples of a body the same order, up to rounding.
+# Number of eigenpairs on which the order of the samples depends, see `ordering_keys`. All configurations with at least
+# as many give the samples of a body the same order, up to rounding.
 _N_ORDERING_EIGENPAIRS = 64
 
 
@@ -18,9 +18,9 @@ _N_ORDERING_EIGENPAIRS = 64
 class SignatureConfig:
     """Every parameter that a Signature depends on.
 
-    From 64 eigenpairs on, the samples of a Signature and their first eigenfunctions do not depend on the number of
+    With 64 eigenpairs or more, the samples of a Signature and their first eigenfunctions do not depend on the number of
     eigenpairs. A Signature is then the beginning of one with more eigenpairs, see `larger` and `Signature.truncated`.
-    This requires the same mesh for both: one with fewer vertices than `least_vertices` is subdivided.
+    This requires the same mesh for both: a mesh with fewer vertices than `least_vertices` is subdivided.
 
     Example:
         >>> SignatureConfig(n_eigenpairs=50).min_samples, SignatureConfig.paper().min_samples
@@ -35,8 +35,7 @@ class SignatureConfig:
         backend: "cotangent" or "robust", see `laplacian`. If the eigenpairs of the cotangent matrices do not reach the
             tolerance, the robust matrices are used, and a note of the Signature says so.
         max_vertices: meshes with more vertices are simplified first; None keeps them.
-        accuracy: bound on the relative error of 99 % of the interior distances, which makes the mean value coordinates
-            faster; None evaluates them exactly.
+        accuracy: bound on the relative error of 99 % of the interior distances; None for exact, slower evaluation.
         attributes: of the samples: "depth" and "electrostatic_potential" (interior only) and "surface_direction", see
             `interior_attributes` and `surface_attributes`.
         seed: of the surface samples and of the eigensolver's start vectors.
@@ -63,8 +62,8 @@ class SignatureConfig:
     least_vertices: int | None = None
 
     def __post_init__(self) -> None:
-        counts = {"resolution": self.resolution, "n_surface_samples": self.n_surface_samples}
-        check_at_least(1, n_eigenpairs=self.n_eigenpairs, **counts)
+        check_at_least(1, n_eigenpairs=self.n_eigenpairs, resolution=self.resolution)
+        check_at_least(1, n_surface_samples=self.n_surface_samples)
         check_at_least(0, min_samples=self.min_samples, least_vertices=self.least_vertices, seed=self.seed)
         check_one_of(get_args(Backend), backend=self.backend)
         if self.max_vertices is not None and self.max_vertices <= self.n_kept + 1:
@@ -97,10 +96,10 @@ class SignatureConfig:
         return replace(self, n_eigenpairs=self.n_kept)
 
     def with_eigenpairs(self, n_eigenpairs: int) -> Self:
-        """Return a configuration with at least n_eigenpairs, or this one if its own number is set.
+        """Return a configuration with at least `n_eigenpairs`, or this one if its own number is set.
 
-        At least 64 are computed, and meshes are subdivided as for the default number, so that the Signature is the
-        beginning of the default one.
+        It has at least 64, and meshes are subdivided as for the default number, so that its Signature is the beginning
+        of the default one.
         """
         if self.n_eigenpairs is not None:
             return self
@@ -110,9 +109,9 @@ class SignatureConfig:
         return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
 
     def larger(self) -> Iterator[Self]:
-        """Yield configurations that caches may hold and whose Signatures begin with this one's, the smallest first.
+        """Yield the configurations, smallest first, that caches may hold and whose Signatures begin with this one's.
 
-        For a mesh that is subdivided, this is true only of configurations with the same `n_vertices_read`.
+        If a mesh is subdivided, only Signatures with the same `n_vertices_read` begin with this one's.
         """
         all_attributes: tuple[AttributeName, ...] = get_args(AttributeName)
         sizes, n_vertices = [self.n_kept], self.n_vertices_read
@@ -127,7 +126,7 @@ class SignatureConfig:
                     yield candidate
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the parameters and the algorithm's version by name; an implied `least_vertices` is left out."""
+        """Return the parameters and the algorithm's version by name, without `least_vertices` if it has its default."""
         parameters = {**asdict(self), "n_eigenpairs": self.n_kept, "algorithm_version": self.ALGORITHM_VERSION}
         if self.n_vertices_read == self.n_kept + 2:
             del parameters["least_vertices"]

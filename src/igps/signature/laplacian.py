@@ -12,9 +12,9 @@ from igps.mesh.surface import longest_side
 
 Backend = Literal["cotangent", "robust"]
 
-# Thinner faces (twice the area over the squared longest edge) get mollified edge lengths.
+# Smallest thickness, twice the area over the squared longest edge, of a face without mollified edge lengths.
 _MIN_THICKNESS = 1e-8
-# Added to each edge of such a face, in units of its longest edge: limits its cotangents to about a thousand.
+# Length added to each edge of a thinner face, in units of its longest edge: limits its cotangents to about a thousand.
 _MOLLIFIER = 1e-6
 
 
@@ -65,9 +65,8 @@ def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
         double_area[is_thin] = 2 * (np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4)
     # cot at corner i = (b·b + c·c − a·a) / (4 area), where a is the edge opposite corner i.
     cotangents = (squared.sum(axis=1, keepdims=True) - 2 * squared) / (2 * double_area[:, None])
-    return _stiffness(mesh.faces, cotangents, len(mesh.vertices)), _mixed_voronoi_mass(
-        mesh.faces, cotangents, squared, double_area / 2, len(mesh.vertices)
-    )
+    mass = _mixed_voronoi_mass(mesh.faces, cotangents, squared, double_area / 2, len(mesh.vertices))
+    return _stiffness(mesh.faces, cotangents, len(mesh.vertices)), mass
 
 
 def _stiffness(faces: Integers, cotangents: Floats, n_vertices: int) -> sparse.csr_matrix:

@@ -34,27 +34,24 @@ _BLOCK_BYTES = 256 * 2**20  # largest block of weights
 _GROUP_SIZE = 192  # points for which the same clusters are far
 _COPY_ROWS = 2**10  # rows of the functions copied at a time: source and copy then fit into the processor's cache
 _REGISTER_SIZE = 16  # single-precision numbers in a register
-_MIN_TEAM_VERTICES = 2**14  # a second thread pays from here on
+_MIN_TEAM_VERTICES = 2**14  # smallest mesh for which several threads pay
 _MIN_FAR_RATIO = 1.1  # smallest distance, in radii, at which a series is used
 _HAT_ERROR = 3.5e-3  # error of the hats' series one radius away; it falls with the third power of the distance
 _CLUSTER_ERROR = 2.2e-3  # error of the clusters' series one radius from the cluster's ball; it falls likewise
-_MIN_FINE_VERTICES = 2000  # on coarser meshes errors were up to three times larger,
-_COARSE_GAIN = 3  # so that they are evaluated more accurately by this factor
-_MIN_CLUSTER_VERTICES = 2**13  # clusters pay from here on; without them a value depends on its own point alone
-_MIN_FLOAT32_ACCURACY = 1e-4  # single precision is enough for the product with the functions from here on
+_MIN_FINE_VERTICES = 2000  # on coarser meshes errors were up to three times larger:
+_COARSE_GAIN = 3  # the target for their accuracy is divided by this factor
+_MIN_CLUSTER_VERTICES = 2**13  # smallest mesh for which clusters pay; without them a value depends only on its point
+_MIN_FLOAT32_ACCURACY = 1e-4  # smallest accuracy for which the product with the functions may be in single precision
 _N_CHECKED = 12  # points that are also evaluated exactly, to check the approximation
 _N_CHECK_PARTNERS = 64  # points whose distances from the checked ones are compared
-_CHECK_LINE = (0.11, 0.37, 1.0)  # in principal axes, the longest last; oblique, so that points have distinct places
+_CHECK_LINE = (0.11, 0.37, 1.0)  # in principal axes, the longest last; oblique, to give points distinct positions
 _MAX_APPROXIMATIONS = 2  # then the closed form is used
 
 
 def extend(
-    vertices: NDArray[np.floating],
-    faces: NDArray[np.integer],
-    functions: NDArray[np.floating],
-    points: NDArray[np.floating],
-    **options: Any,
-) -> Floats:
+    vertices: NDArray[np.floating], faces: NDArray[np.integer], functions: NDArray[np.floating],
+    points: NDArray[np.floating], **options: Any,
+) -> Floats:  # fmt: skip
     """Extend surface functions (V, K) to points (P, 3); options and errors are those of `Extension`.
 
     The result is (P, K). For the identity (V, V) as functions it is the mean value coordinates, whose rows sum to 1.
@@ -63,7 +60,7 @@ def extend(
 
 
 class Extension:
-    """Surface functions that are extended to points: `extend` in two steps. The functions are copied.
+    """Extension of surface functions, which are copied, to points: `extend` in two steps.
 
     Memory beyond the arguments and the result: at most 256 MiB of weights per thread, and three times the functions.
 
@@ -73,9 +70,9 @@ class Extension:
         functions: (V, K).
         divisors: (K,) the functions are divided by these while they are copied, which saves a second copy.
         accuracy: bound on the relative error of 99 % of the interior distances (Euclidean distances between rows of the
-            result, for points inside a closed surface); None for the closed form everywhere. Some points of each mesh
-            are also evaluated exactly; where their distances miss the accuracy, a finer approximation is used, or the
-            closed form. On large meshes a value depends, within the accuracy, on the other points of the call.
+            result, for points inside a closed surface); None for the closed form everywhere. Some points of each call
+            are also evaluated exactly. If their distances miss the accuracy, all points are evaluated again, more
+            finely or in closed form. On large meshes a value depends, within the accuracy, on the other points.
         dtype: float32 or float64, of the product with the functions; None for the cheapest that keeps the accuracy.
 
     Raises:
@@ -83,15 +80,9 @@ class Extension:
     """
 
     def __init__(
-        self,
-        vertices: NDArray[np.floating],
-        faces: NDArray[np.integer],
-        functions: NDArray[np.floating],
-        *,
-        divisors: NDArray[np.floating] | None = None,
-        accuracy: float | None = None,
-        dtype: DTypeLike | None = None,
-    ) -> None:
+        self, vertices: NDArray[np.floating], faces: NDArray[np.integer], functions: NDArray[np.floating], *,
+        divisors: NDArray[np.floating] | None = None, accuracy: float | None = None, dtype: DTypeLike | None = None,
+    ) -> None:  # fmt: skip
         check_share(accuracy=accuracy)
         if dtype is None:
             dtype = np.float32 if accuracy is not None and accuracy >= _MIN_FLOAT32_ACCURACY else np.float64
@@ -106,13 +97,10 @@ class Extension:
             )
         with np.errstate(over="ignore", invalid="ignore"):
             # A finite sum implies finite values, and is many times faster to check.
-            is_finite = bool(np.isfinite(values.sum())) or bool(np.isfinite(values).all())
-        if not is_finite:
-            raise ValueError("functions: expected finite values, got NaN or infinity")
+            if not (np.isfinite(values.sum()) or np.isfinite(values).all()):
+                raise ValueError("functions: expected finite values, got NaN or infinity")
         if divisors is not None and np.shape(divisors) != values.shape[1:]:
-            raise ValueError(
-                f"divisors: expected one for each of {values.shape[1]} functions, got shape {np.shape(divisors)}"
-            )
+            raise ValueError(f"divisors: expected shape {values.shape[1:]}, one per function, got {np.shape(divisors)}")
         self._surface = HatSurface(scaled, scaled_faces)
         order = self._surface.order
         self._n_functions = values.shape[1]
@@ -128,8 +116,7 @@ class Extension:
     def __call__(self, points: NDArray[np.floating]) -> Floats:
         """Return the values (P, K) at points (P, 3); a ValueError if a sum of weights is zero."""
         x = _scaled(self._vertices, self._faces, points)[2] @ self._surface.axes
-        accuracy = self._accuracy
-        target = accuracy
+        accuracy = target = self._accuracy
         if accuracy is not None and len(self._columns) < _MIN_FINE_VERTICES:
             target = accuracy / _COARSE_GAIN
         for attempt in range(_MAX_APPROXIMATIONS + 1):
@@ -151,9 +138,7 @@ class Extension:
     def _values(self, sums: NDArray[np.floating]) -> NDArray[np.floating]:
         totals = sums[:, -1:]
         if not (np.isfinite(totals) & (totals != 0)).all():
-            raise ValueError(
-                "points: expected mean value weights with a non-zero sum, got zero or infinity; close the mesh"
-            )
+            raise ValueError("points: expected mean value weights with a non-zero sum, got 0 or inf; close the mesh")
         return sums[:, : self._n_functions] / totals
 
     def _weighted_sums(self, x: Floats, target: float | None) -> Iterator[tuple[Integers, NDArray[np.floating]]]:
@@ -186,12 +171,12 @@ class Extension:
                 yield from results
 
     def _sampled_error(self, x: Floats, values: Floats) -> float:
-        """Estimate the relative error that 99 % of the distances between points have, from their values (P, K).
+        """Estimate a bound on the relative error of 99 % of the distances between points, from their values (P, K).
 
-        A few points are also evaluated exactly, which gives the errors of their distances from many others. Errors of
-        the others are similar in size but not in direction, so the errors of the two ends of a distance add up in
-        squares. In 95 of 100 draws of 12 points the estimate was at least 0.4 of the true error (median of 18 SHREC'07
-        models; 0.15 for the worst). The distances among 24 exact points give no better estimate, at twice the cost.
+        A few points are also evaluated exactly, which gives the errors of their distances from many others. The errors
+        of the other points are similar in size but not in direction, so the squares of the errors at the two ends of a
+        distance add up. In 95 of 100 draws of 12 points the estimate was at least 0.4 of the true error (median of 18
+        SHREC'07 models; 0.15 for the worst). Distances among 24 exact points cost twice as much for no better estimate.
         """
         # Points at equal steps along a line that turns with the body: the choice must not depend on their order.
         order = np.argsort(x @ np.array(_CHECK_LINE))
@@ -212,7 +197,7 @@ class Extension:
 
 
 def _far_ratios(accuracy: float | None) -> tuple[float, float]:
-    """Return the distances, in radii, from which on hats and clusters are far; a far cluster has no near hat."""
+    """Return the smallest distances, in radii, of far hats and far clusters; a far cluster contains no near hat."""
     if accuracy is None:
         return math.inf, math.inf
     hats = max(_MIN_FAR_RATIO, (_HAT_ERROR / accuracy) ** (1 / 3))

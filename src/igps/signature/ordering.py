@@ -1,8 +1,8 @@
 """An order of the points of a body that depends only on its shape, and selections by that order.
 
-Samples are numbered by a grid, and faces and vertices by a file. A selection by such numbers changes when the body is
+Samples are numbered by a grid, and faces and vertices by a file. A selection by such numbers changes if the body is
 turned or its mesh renumbered. Here each point gets a key, which is computed from distances in a spectral embedding, or
-in space. It is therefore independent of position, numbering, and the signs and bases of eigenfunctions.
+in space. Keys are therefore independent of position, numbering, and the signs and bases of eigenfunctions.
 """
 
 import math
@@ -48,9 +48,9 @@ def ordering_keys(
 
 
 def spatial_ordering_keys(mesh: Mesh) -> Floats:
-    """Return keys (V,) as `ordering_keys` for the vertices of a mesh, from Euclidean distances.
+    """Return keys (V,) for the vertices of a mesh, from Euclidean distances to the surface's centroid and to anchors.
 
-    These are the distances from the centroid of the surface and from anchors. The keys change with pose.
+    Unlike `ordering_keys`, they change with pose.
     """
     areas = face_areas(mesh.vertices, mesh.faces)
     centres = mesh.vertices[mesh.faces].mean(axis=1)
@@ -83,7 +83,7 @@ def _keys(embedding: Floats, tie_breakers: Floats | float) -> Floats:
 
 
 def nearest_spacing(points: Floats) -> Floats:
-    """Return the mean distance of each point (P, 3) from its neighbours, over the mean of all: tie-breakers (P,)."""
+    """Return each point's (P, 3) mean distance from its neighbours, over the mean of all: tie-breakers (P,)."""
     n_neighbours = min(_N_NEIGHBOURS + 1, len(points))
     distance = cKDTree(points).query(points, n_neighbours)[0].reshape(len(points), n_neighbours).mean(axis=1)
     return distance / max(distance.mean(), np.finfo(float).tiny)
@@ -107,14 +107,14 @@ def systematic_sample(sizes: Floats, n: int, generator: np.random.Generator) -> 
 
 
 def spatial_order(points: Floats, size: int) -> Integers:
-    """Return an order (n,) of points (n, 3) in which all runs of size·2ᵏ points from the start are compact in space.
+    """Return an order (n,) of points (n, 3) whose consecutive blocks of size·2ᵏ points are compact in space, for all k.
 
-    It is found by median cuts: bounding boxes are repeatedly cut in half along their longest side.
+    It is found by median cuts: the points of each bounding box are repeatedly halved along its longest side.
     """
     n_points = len(points)
     n_cuts = max(0, math.ceil(math.log2(max(1, n_points) / size)))
     order = np.minimum(np.arange(size << n_cuts), n_points)
-    # Index n_points is padding: boxes count it as the mean point, cuts put it behind all others.
+    # Index n_points is padding: the mean point for bounding boxes, behind all others for cuts.
     padded = np.ascontiguousarray(np.vstack([points, points.mean(axis=0) if n_points else np.zeros(3)]).T)
     for cut in range(n_cuts):
         boxes = padded.take(order, axis=1).reshape(3, 1 << cut, -1)

@@ -1,6 +1,6 @@
 """Attributes of samples from the residues of a molecule around them: charge, hydropathy, kinds, ...
 
-All but the screened potential are means over the residues, weighted by a Gaussian of their distance. They are therefore
+All but the screened potential are means over the residues, weighted by a Gaussian of the distance. They are therefore
 defined everywhere inside, and change little when atoms move.
 """
 
@@ -25,7 +25,7 @@ BJERRUM_LENGTH = 7.14
 DEBYE_LENGTH = 7.85
 """Distance over which salt water screens a charge, Å, at 0.15 mol/l."""
 
-# Largest number of entries of a matrix of points by residues.
+# Largest number of entries of a matrix of points by residues
 _BLOCK_SIZE = 2**22
 
 
@@ -55,7 +55,7 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
     means = np.empty((len(points), values.shape[1]))
     for block in _blocks(len(points), len(values)):
         squares = cdist(points[block], molecule.residue_positions, "sqeuclidean")
-        # Relative to the nearest residue: far outside only this one has a weight, but not all weights vanish.
+        # Relative to the weight of the nearest residue, so that not all weights vanish far outside.
         weights = np.exp((squares.min(axis=1, keepdims=True) - squares) / (2 * WIDTH**2))
         total = weights @ known.astype(float)
         means[block] = np.where(total > 0, weights @ filled / np.where(total > 0, total, 1), np.nan)

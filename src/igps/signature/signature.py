@@ -85,8 +85,7 @@ class Samples:
 class Signature:
     """Eigenvalues of one mesh, and its eigenfunctions at samples: the input of all descriptors.
 
-    The eigenfunctions are stored unscaled, so that every spectral embedding can be derived without computing them
-    again.
+    The eigenfunctions are stored unscaled, so that every spectral embedding can be derived from them.
 
     Example:
         >>> import trimesh
@@ -133,7 +132,7 @@ class Signature:
         return replace(self, interior=change(self.interior), surface=change(self.surface))
 
     def truncated(self, config: SignatureConfig) -> Signature:
-        """Return the Signature of a smaller configuration; the `larger` ones of that must include the present one."""
+        """Return the Signature of a smaller configuration, whose `larger` ones must include the present `config`."""
 
         def cut(samples: Samples) -> Samples:
             items = samples.attributes.items()
@@ -152,8 +151,7 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
     The eigenfunctions of a body with cavities are those of its outer surface. Mean value coordinates of the outer
     surface extend them to the wall and to the surfaces of the cavities. A cavity is thus a missing part of the
     interior: as it shrinks, the Signature tends to that of the full body, and the two sides of a thin wall lie side by
-    side. If each surface had eigenfunctions of its own, the surfaces would be orthogonal to each other, at an infinite
-    commute time.
+    side. With eigenfunctions of their own, the surfaces would be orthogonal, at an infinite commute time.
 
     Example:
         The first eigenvalues of the unit sphere are l (l + 1), each 2 l + 1 times.
@@ -169,7 +167,7 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
         config: `SignatureConfig()` if None.
 
     Raises:
-        TypeError: the mesh is no object that `Mesh.of` accepts.
+        TypeError: `Mesh.of` does not accept the mesh.
         MeshError: the mesh has too few vertices for the eigenpairs, or no interior sample.
         ConvergenceError: the eigensolver failed.
     """
@@ -187,15 +185,15 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
     spectrum, notes = _spectrum(outer, config)
     eigenvalues, functions, residual = spectrum.eigenvalues, spectrum.eigenfunctions, spectrum.residual
     roots = np.sqrt(eigenvalues)
-    # `accuracy` is that of interior distances, which are distances between rows of eigenfunctions over √λ.
-    extension = Extension(outer.vertices, outer.faces, functions, divisors=roots, accuracy=config.accuracy)
+    # The accuracy is that of interior distances, which are distances between rows of eigenfunctions over √λ.
+    extend = Extension(outer.vertices, outer.faces, functions, divisors=roots, accuracy=config.accuracy)
     if not is_outer.all():
         functions = np.empty((len(mesh.vertices), len(eigenvalues)))
         functions[is_outer] = spectrum.eigenfunctions
-        functions[~is_outer] = extension(mesh.vertices[~is_outer]) * roots
+        functions[~is_outer] = extend(mesh.vertices[~is_outer]) * roots
     surface = _surface(mesh, functions, eigenvalues, config)
     del spectrum, functions  # on a large mesh they take more memory than all else
-    interior = _interior(mesh, extension, eigenvalues, points, config)
+    interior = _interior(mesh, extend, eigenvalues, points, config)
     for where, samples in (("interior", interior), ("surface", surface)):
         if not np.isfinite(samples.eigenfunctions).all():
             raise MeshError(
@@ -212,10 +210,8 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
     """Compute the eigenpairs; if the cotangent matrices fail, use the intrinsic-Delaunay ones and return a note."""
 
     def solve(config: SignatureConfig) -> Spectrum:
-        stiffness, mass = laplacian(mesh, config.backend)
-        return eigenpairs(
-            stiffness, mass, config.n_kept, positions=mesh.vertices, tolerance=_MAX_RESIDUAL, seed=config.seed
-        )
+        matrices = laplacian(mesh, config.backend)
+        return eigenpairs(*matrices, config.n_kept, positions=mesh.vertices, tolerance=_MAX_RESIDUAL, seed=config.seed)
 
     try:
         return solve(config), ()
@@ -236,11 +232,9 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
         return spectrum, (note,)
 
 
-def _interior(
-    mesh: Mesh, extension: Extension, eigenvalues: Floats, points: Floats, config: SignatureConfig
-) -> Samples:
-    """Return the samples at the points, where `extension` is that of the eigenfunctions over √λ."""
-    values = extension(points)
+def _interior(mesh: Mesh, extend: Extension, eigenvalues: Floats, points: Floats, config: SignatureConfig) -> Samples:
+    """Return the samples at interior points (P, 3), by the extension of the eigenfunctions over √λ."""
+    values = extend(points)
     values *= np.sqrt(eigenvalues)
     order = np.argsort(ordering_keys(values, eigenvalues, mesh.area, nearest_spacing(points)), kind="stable")
     points, values = points[order], values[order]

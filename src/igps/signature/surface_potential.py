@@ -4,11 +4,9 @@ Near triangles are integrated in closed form (Wilton, Rao, Glisson, Schaubert, A
 triangles and clusters of triangles are replaced by the Taylor series of 1/r about their centroid up to second order;
 the first-order term is zero. Let a patch have area A, radius R and mean squared distance σ² from its centroid. At a
 distance d from the centroid, the remainder is at most A/d · Rσ²/d³ / (1 − R/d). The series is used only where this is
-less than a given fraction of A/d. Since all contributions are positive, that fraction also bounds the relative error of
-the sum.
+less than a given fraction of A/d. All contributions are positive, so it also bounds the relative error of the sum.
 
-A near face is first cut into quarters. Where their series is accurate enough it replaces the closed form, which is then
-needed at half the distance only.
+The series of the quarters of a near face replaces the closed form down to about half the distance.
 """
 
 from __future__ import annotations
@@ -94,7 +92,7 @@ class _Patches:
     def min_distances(self, accuracy: float) -> Floats:
         """Return the distances (n,) from the centroids beyond which the series has this relative accuracy."""
         variances = np.trace(self.covariances, axis1=1, axis2=2)
-        # (g + R/2)² (g − R/2) ≥ g³ for g ≥ R.
+        # With d = g + R/2, d² (d − R) = (g + R/2)² (g − R/2) ≥ g³ for g ≥ R.
         bounds = np.cbrt(self.radii * variances / accuracy)
         return np.maximum(bounds, 1.5 * self.radii) + self.radii / 2
 
@@ -115,5 +113,4 @@ def _face_table(corners: Floats) -> Floats:
     normals = normals / double_areas
     lengths = np.linalg.norm(sides, axis=2)
     outward = np.cross(sides / lengths[..., None], normals[:, None])
-    parts = [corners.reshape(-1, 9), normals, outward.reshape(-1, 9), lengths, double_areas]
-    return np.concatenate(parts, axis=1)
+    return np.concatenate([corners.reshape(-1, 9), normals, outward.reshape(-1, 9), lengths, double_areas], axis=1)

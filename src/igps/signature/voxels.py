@@ -76,12 +76,11 @@ def grid_axes(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Floats]:
 
 
 def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
-    """Return booleans (X, Y, Z): whether the winding number is above one half at the points of a grid.
+    """Return booleans (X, Y, Z): whether points of a grid are inside the surface, with a winding number above one half.
 
     Along each axis, the signed crossings of every grid line are summed from both ends. On a closed mesh the six sums
     agree with the winding number. If a line passes through a hole, the other five sums outvote its sum; if more
-    disagree, the winding number is computed from solid angles (Jacobson et al. 2013). Points on the surface are not
-    inside.
+    disagree, the winding number is computed from solid angles (Jacobson et al. 2013). Surface points are outside.
     """
     shape = tuple(len(axis) for axis in axes)
     votes = np.zeros(shape, dtype=np.int8)

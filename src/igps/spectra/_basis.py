@@ -8,10 +8,10 @@ import torch
 
 from igps._threads import ALONE, Team
 
-# Largest basis that has a copy in single precision, which then takes 1 GiB.
+# Entries of the largest basis that has a copy in single precision, of 1 GiB.
 MAX_SINGLE_ENTRIES = 2**28
-# Largest basis, 128 MiB, that NumPy allocates with huge pages: they make it faster, but on larger ones waiting for them
-# costs more.
+# Entries of the largest basis, 128 MiB, that NumPy allocates with huge pages. They make products faster, but for a
+# larger basis it costs more to wait for them.
 MAX_HUGE_PAGE_ENTRIES = 2**24
 # Smallest piece of the columns, and largest number of pieces; a thread works on one piece at a time.
 MIN_PIECE_COLUMNS, MAX_PIECES = 2**12, 8
@@ -37,12 +37,12 @@ class Basis:
         if self._single is not None:
             self._single[0] = self._basis[0]
         self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64, device="cpu")
-        # Rows before _stop are filled. Rows before _n_orthogonal are orthogonal to all rows before, later rows only
-        # to the neighbouring rows.
+        # Rows before _stop are filled. Rows before _n_orthogonal are orthogonal to all rows before them, later rows
+        # only to the neighbouring blocks.
         self._stop = self._n_orthogonal = 1
 
     def _allocate(self, n_rows: int, n_columns: int) -> None:
-        """Allocate a new basis. Part of the memory of a NumPy array can be given back later."""
+        """Allocate a new basis. Memory of NumPy, unlike that of PyTorch, can be released in part later."""
         shape = n_rows, n_columns
         self._memory = np.empty(shape if self.overwrites_basis else (0, n_columns))
         if self.overwrites_basis:
@@ -62,7 +62,7 @@ class Basis:
         return totals
 
     def _next_rows(self, n_rows: int) -> torch.Tensor:
-        """Return the free rows after the last, for a block to append; the basis is enlarged if necessary."""
+        """Return the free rows to which the next block is written; the basis is enlarged if necessary."""
         stop = self._stop + n_rows
         if stop > len(self._basis):
             capacity = len(self._basis) * 3 // 2 + n_rows

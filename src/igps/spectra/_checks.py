@@ -28,7 +28,7 @@ def checked_entries(matrix: sparse.csr_array, indptr: np.ndarray, indices: np.nd
 
 
 def checked_mass(mass: np.ndarray | sparse.sparray | sparse.spmatrix) -> np.ndarray:
-    """Return the mass as a new float64 vector (V,), if it is a vector or a diagonal sparse matrix."""
+    """Return the mass, a vector or a diagonal sparse matrix, as a new float64 vector (V,)."""
     if not sparse.issparse(mass):
         return np.array(mass, dtype=np.float64)
     entries = sparse.coo_array(mass)
@@ -57,13 +57,9 @@ def checked_stiffness(
         )
     stiffness = canonical(sparse.csr_array(stiffness, dtype=np.float64))
     if not np.isfinite(stiffness.data).all():
-        raise ValueError(
-            "stiffness: expected finite entries, got NaN or infinity. Repair degenerate triangles of the surface."
-        )
+        raise ValueError("stiffness: expected finite entries, got NaN or infinity. Repair degenerate triangles.")
     if not np.isfinite(mass).all() or mass.min() <= 0:
-        raise ValueError(
-            "mass: expected finite positive entries, got others. Remove unreferenced vertices and empty triangles."
-        )
+        raise ValueError("mass: expected finite entries > 0, got others. Remove unused vertices and empty triangles.")
     if stiffness.trace() < 0:
         raise ValueError(
             "stiffness: expected a positive semi-definite matrix, got a negative trace. Pass -stiffness if your "
@@ -98,7 +94,4 @@ def _significant(stiffness: sparse.csr_array) -> sparse.csr_array:
     large = np.abs(entries.data) > ROUNDING * np.minimum(diagonal[entries.row], diagonal[entries.col])
     if large.all():
         return stiffness
-    return sparse.csr_array(
-        (entries.data[large], (entries.row[large], entries.col[large])),
-        shape=stiffness.shape,
-    )
+    return sparse.csr_array((entries.data[large], (entries.row[large], entries.col[large])), shape=stiffness.shape)

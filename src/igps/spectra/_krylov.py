@@ -36,7 +36,7 @@ class RitzPairs:
 
     eigenvalues: torch.Tensor  # (m,) of A
     residuals: torch.Tensor  # (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator
-    coefficients: torch.Tensor  # (m + b, m) of these Ritz vectors, not normalised, in the basis with its next block
+    coefficients: torch.Tensor  # (m + b, m) of these vectors, not normalised, in the basis including its next block
     below_shift: torch.Tensor  # (m,) whether θ < 0
 
     def leading(self, n_below: int, tolerance: float) -> torch.Tensor:
@@ -58,18 +58,11 @@ class Krylov(Basis):
     """
 
     def __init__(
-        self,
-        factors: Factors,
-        zero_mode: np.ndarray,
-        block_size: int,
-        capacity: int,
-        generator: np.random.Generator,
+        self, factors: Factors, zero_mode: np.ndarray, block_size: int, capacity: int, generator: np.random.Generator,
         team: Team = ALONE,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(zero_mode, capacity, team)
-        self._factors = factors
-        self._generator = generator
-        self._block_size = block_size
+        self._factors, self._generator, self._block_size = factors, generator, block_size
         # Rows _previous:_current and _current:_stop of the basis are the last two blocks; the last awaits `expand`.
         self._previous = self._current = 1
         self._interval = INTERVAL
@@ -178,10 +171,9 @@ class Krylov(Basis):
 
         The recurrence leaves components along older rows: the rounding errors in the last two blocks, times the ratio
         of the largest θ to the spread of the others. They grow by a factor of some hundred with each block. They are
-        removed after two blocks, from both at once, because products of the basis with twice as many columns take less
-        than twice the time. The error of the projection is then the square of the loss (Simon 1984), which is below
-        rounding. A loss up to MAX_SINGLE_LOSS is removed in single precision, and the rows are mostly still orthonormal
-        afterwards.
+        removed from two blocks at a time, because products of the basis with twice as many columns take less than twice
+        the time. The error of the projection is then the square of the loss (Simon 1984), which is below rounding. A
+        loss up to MAX_SINGLE_LOSS is removed in single precision; the rows are mostly still orthonormal afterwards.
         """
         old, new = self._basis[: self._n_orthogonal], self._basis[self._n_orthogonal : self._stop]
         if not len(new):
@@ -204,11 +196,10 @@ class Krylov(Basis):
     def _orthonormal(
         self, block: torch.Tensor, near: int, scale: float | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return rows Q, orthonormal and orthogonal to the basis, and R; blockᵀ is Qᵀ R and a combination of the basis.
+        """Return rows Q, orthonormal and orthogonal to the basis, and R: blockᵀ − Qᵀ R is in the span of the basis.
 
-        According to the recurrence, only rows of the basis from ``near`` on contribute; the full pass after it removes
-        rounding errors. Both together cost one product with the basis and one back. ``scale`` is the length of the
-        longest row before components along the basis were removed.
+        According to the recurrence, only rows of the basis from ``near`` on contribute. A second pass, over all rows,
+        removes rounding errors. ``scale`` is the length of the longest row before anything was subtracted from it.
         """
         scale = float(torch.linalg.norm(block, dim=1).max()) if scale is None else scale
         coupling = torch.eye(len(block), dtype=torch.float64, device="cpu")
@@ -234,9 +225,9 @@ class Krylov(Basis):
     def _factor_quickly(
         self, block: torch.Tensor, squares: torch.Tensor, scale: float
     ) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """Factor rows as `_factor_rows`, given their products, into the next rows of the basis; None for a small pivot.
+        """Factor rows as `_factor_rows`, given their products with each other; return None if a pivot is too small.
 
-        The factorization is repeated if rounding requires it.
+        Q is written to the next rows of the basis. The factorization is repeated if rounding requires it.
         """
         first, failed = torch.linalg.cholesky_ex(squares)
         smallest, largest = torch.aminmax(torch.diagonal(first))

@@ -25,7 +25,7 @@ SHIFT_BELOW = -1.0
 # Number of vectors in a block. Small blocks make a small basis, large ones fast products. Small ones are better for few
 # eigenpairs, and for results with very many numbers, where the basis takes gigabytes.
 SMALL_BLOCK, LARGE_BLOCK, MAX_SMALL_BLOCK_PAIRS, MAX_LARGE_BLOCK_RESULT = 8, 12, 128, 2**27
-# Basis size at which mostly all pairs have converged, as measured on bodies of 11,000 vertices: vectors per eigenpair
+# Basis size at which usually all pairs have converged, as measured on bodies of 11,000 vertices: vectors per eigenpair
 # with the shift inside or below, plus a number of blocks, which grows with the decades of the number of eigenpairs and
 # with the digits of the tolerance beyond seven.
 BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW = 1.35, 2.35
@@ -36,8 +36,8 @@ MAX_BASIS_FACTOR, MAX_BASIS_EXTRA = 3, 600
 MIN_TEAM_RESULT = 2**21
 # Largest error of the factorization, relative to the tolerance: the lowest modes magnify it some 1000 times.
 MAX_DEFECT = 2e-4
-# Gaps, relative to the eigenvalue: the first one above WIDE_GAP is used, or else the widest one above MIN_GAP. There is
-# no gap inside a multiplet.
+# Gaps, relative to the eigenvalue: the first above WIDE_GAP is used, or else the widest above MIN_GAP. A multiplet has
+# none.
 WIDE_GAP, MIN_GAP = 1e-4, 1e-7
 
 
@@ -46,15 +46,10 @@ class ConvergenceError(RuntimeError):
 
 
 def lanczos(
-    matrix: sparse.csr_array,
-    zero_mode: np.ndarray,
-    n_eigenpairs: int,
-    positions: np.ndarray | None,
-    tolerance: float,
-    seed: int,
-    inside: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix; its single zero mode (V,) has length 1.
+    matrix: sparse.csr_array, zero_mode: np.ndarray, n_eigenpairs: int, positions: np.ndarray | None, tolerance: float,
+    seed: int, inside: bool,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix with one zero mode (V,), of length 1.
 
     A shift inside the spectrum is fast. With a shift below it, A − σI is definite, and its factors are accurate.
     """
@@ -84,7 +79,6 @@ def lanczos(
             ritz = krylov.ritz_pairs(shift)
             converged = ritz.leading(n_below, tolerance)
             gap = gap_after(ritz.eigenvalues[converged], n_eigenpairs)
-            is_incomplete = False
             if gap is not None:
                 n_found, bound = gap
                 wanted = converged[:n_eigenpairs]
@@ -102,15 +96,12 @@ def lanczos(
                     return ritz.eigenvalues[wanted].numpy(), vectors
                 if n_present < n_found:
                     raise ConvergenceError(
-                        f"found {n_found} eigenvalues below {bound:.6g} / area, where there are {n_present}"
+                        f"found {n_found} instead of {n_present} eigenvalues below {bound:.6g} / area"
                     )
                 logger.debug("found %d of %d eigenvalues below %g", n_found, n_present, bound)
-                is_incomplete = True
             if krylov.size > max_size:
-                raise ConvergenceError(
-                    f"found {len(converged)} of {n_eigenpairs} eigenpairs with {krylov.size} basis vectors"
-                )
-            if is_incomplete or krylov.size > max_size / 2:
+                raise ConvergenceError(f"found {len(converged)} of {n_eigenpairs} pairs with a basis of {krylov.size}")
+            if gap is not None or krylov.size > max_size / 2:  # pairs are missing, or convergence is slow
                 krylov.widen()
             for _ in range(2):
                 krylov.expand()
@@ -146,7 +137,7 @@ def _factorize_inside(
 
 
 def gap_after(eigenvalues: torch.Tensor, n_eigenpairs: int) -> tuple[int, float] | None:
-    """Return the number of eigenvalues up to a gap after the ``n_eigenpairs``-th or a later one, and a value inside."""
+    """Return the number of eigenvalues before a gap, at least ``n_eigenpairs``, and a value in the gap, or None."""
     values = eigenvalues[n_eigenpairs - 1 :]
     if len(values) < 2:
         return None

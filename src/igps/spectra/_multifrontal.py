@@ -86,7 +86,7 @@ class Tree:
         return replace(self, structure=structure), matrix, order
 
     def _eliminate(self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None) -> int:
-        """Eliminate all nodes, with their blocks written if given; return the number of negative eigenvalues."""
+        """Eliminate all nodes, write to `blocks` if given, and return the number of negative eigenvalues."""
         matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)
         n_updates = (self.structure.update_start + np.diff(self.structure.boundary_start) ** 2).max()
         values, updates = matrix.data.astype(np.float64, copy=False), np.empty(n_updates)
@@ -99,7 +99,7 @@ class Tree:
     def _eliminate_range(
         self, nodes: Nodes, values: Floats, shift: float, updates: Floats, blocks: Floats | None, team: Team
     ) -> int:
-        """Eliminate a range of nodes, as `_eliminate`; complements for later nodes are written to updates."""
+        """Eliminate a range of nodes as `_eliminate`, and write the complements for later nodes to `updates`."""
         (begin, end), structure = nodes, self.structure
         own_sizes = np.diff(structure.own_start[begin : end + 1])
         boundary_sizes = np.diff(structure.boundary_start[begin : end + 1])
@@ -210,7 +210,6 @@ def _invert(pivot: torch.Tensor) -> tuple[torch.Tensor, int]:
     if failed:
         raise SingularMatrixError("shift: expected regular pivot blocks, got a singular one. Change it slightly.")
     inverse = torch.linalg.ldl_solve(factor, order, torch.eye(len(pivot), dtype=pivot.dtype, device="cpu"))
-    # Bunch–Kaufman pivots: a 1×1 pivot counts by its sign; a 2×2 pivot, marked by negative indices, has one eigenvalue
-    # of each sign.
+    # Bunch–Kaufman: a 1×1 pivot counts by its sign; a 2×2 pivot, of negative indices, has an eigenvalue of each sign.
     n_negative = ((order > 0) & (factor.diagonal() < 0)).sum() + (order < 0).sum() // 2
     return (inverse + inverse.T) / 2, int(n_negative)

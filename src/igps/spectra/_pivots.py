@@ -118,11 +118,11 @@ def residual_norm(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, s
 
 @compiled(inline="always")
 def invert_front(scratch: Scratch, n: int, front_width: int, width: int) -> int:
-    """Invert the pivot block (n, width) of a front; return its number of negative eigenvalues, or -1 on failure.
+    """Write the inverse (n, width) of a front's pivot block to `scratch`; return the number of its negative pivots.
 
-    A definite block is inverted accurately with its pivots in any order. An indefinite block may lose digits in one
-    order, rarely also in the reverse order; the norm of I − A X measures the loss. Where it is small, the signs of the
-    pivots are also right: no eigenvalue crosses zero between A and the matrix whose exact inverse is X.
+    Return -1 on failure. A definite block is inverted accurately with its pivots in any order. An indefinite block may
+    lose digits in one order, rarely also in the reverse order; the norm of I − A X measures the loss. If it is small,
+    the signs of the pivots are right, too: no eigenvalue crosses zero between A and the matrix whose inverse is X.
     """
     inverse = scratch.inverse
     for is_reversed in (False, True):

@@ -4,8 +4,8 @@ A BLAS is made for matrices with many rows and columns: it first copies its oper
 products of the eigensolver are different, and take most of its time.
 
 *Fronts of some tens of unknowns, and solves with few right-hand sides* (`product`). A tile of the result, ROWS by
-COLUMNS, stays in the processor's registers until it is complete, and takes a third of the time. Numba's compiler does
-not find this by itself: with loops that it arranges over rows of four, all of `eigenpairs` takes 1.9 times as long at
+COLUMNS, stays in the processor's registers until it is complete. This takes a third of the time of a BLAS. Numba does
+not find it by itself: with loops that it arranges over rows of four, all of `eigenpairs` takes 1.9 times as long at
 10,000 vertices. The tile is therefore written in LLVM instructions (`_tile`); everything around it is plain Numba.
 
 *A few long rows with many* (`overlaps`), for the Krylov basis. On AMD processors compiled loops take down to half the
@@ -79,13 +79,13 @@ def _tile(n_columns: int) -> Any:
         context: Any,
         a: Any, a_at: Any, a_step: Any, a_stride: Any,
         x: Any, x_at: Any, x_step: Any,
-        keep: Any, source: Any, source_at: Any, source_step: Any,
+        add: Any, source: Any, source_at: Any, source_step: Any,
         out: Any, out_at: Any, out_step: Any,
-        n_rows: Any, n_terms: Any, factor: Any,
+        n_rows: Any, n_terms: Any, scale: Any,
     ) -> Any:  # fmt: skip
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            names = ("a", "a_at", "a_step", "a_stride", "x", "x_at", "x_step", "keep", "source", "source_at",
-                     "source_step", "out", "out_at", "out_step", "n_rows", "n_terms", "factor")  # fmt: skip
+            names = ("a", "a_at", "a_step", "a_stride", "x", "x_at", "x_step", "add", "source", "source_at",
+                     "source_step", "out", "out_at", "out_step", "n_rows", "n_terms", "scale")  # fmt: skip
             arguments = dict(zip(names, values, strict=True))
             for numba_type, name in zip(signature.args, names, strict=True):
                 if isinstance(numba_type, types.Array):
@@ -115,9 +115,9 @@ def _tile(n_columns: int) -> Any:
                 for column, total in zip(columns_of_a, sums, strict=True):
                     term = builder.fmul(broadcast(builder.load(builder.gep(column, [offset]))), x_row, flags=fused)
                     builder.store(builder.fadd(builder.load(total), term, flags=fused), total)
-            factor = broadcast(arguments["factor"])
-            products = [builder.fmul(builder.load(total), factor, flags=fused) for total in sums]
-            with builder.if_else(arguments["keep"]) as (added, alone):
+            scale = broadcast(arguments["scale"])
+            products = [builder.fmul(builder.load(total), scale, flags=fused) for total in sums]
+            with builder.if_else(arguments["add"]) as (added, alone):
                 with added:
                     source_rows = [builder.load(row("source", i), align=8) for i in rows]
                     for i, source_row, result in zip(rows, source_rows, products, strict=True):
@@ -141,10 +141,8 @@ narrow_tile: Any = Lazy(partial(_tile, 1))
 
 
 @compiled()
-def product(
-    shape: tuple[int, int, int], factor: float, a: Strided, x: Rows, keep: bool, source: Rows, out: Rows
-) -> None:
-    """Compute out ← factor · Aᵀ X, plus the source if `keep`; shape is (m, n, k) for out (m, n), A (k, m) and X (k, n).
+def product(shape: tuple[int, int, int], scale: float, a: Strided, x: Rows, add: bool, source: Rows, out: Rows) -> None:
+    """Compute out ← scale · Aᵀ X, plus the source if `add`; shape is (m, n, k) for out (m, n), A (k, m) and X (k, n).
 
     Rows of n numbers are written once or twice: ``out`` may not be the source, unless n is a multiple of COLUMNS.
     """
@@ -154,15 +152,14 @@ def product(
         if n < COLUMNS:
             for j in range(n):
                 narrow_tile(
-                    a[0], a[1] + i * a[3], a[2], a[3], x[0], x[1] + j, x[2], keep, source[0],
-                    source[1] + i * source[2] + j, source[2], out[0], out[1] + i * out[2] + j, out[2], n_rows, k,
-                    factor,
+                    a[0], a[1] + i * a[3], a[2], a[3], x[0], x[1] + j, x[2], add, source[0],
+                    source[1] + i * source[2] + j, source[2], out[0], out[1] + i * out[2] + j, out[2], n_rows, k, scale,
                 )  # fmt: skip
         for begin in range(0, n if n >= COLUMNS else 0, COLUMNS):
             j = min(begin, n - COLUMNS)
             tile(
-                a[0], a[1] + i * a[3], a[2], a[3], x[0], x[1] + j, x[2], keep, source[0],
-                source[1] + i * source[2] + j, source[2], out[0], out[1] + i * out[2] + j, out[2], n_rows, k, factor,
+                a[0], a[1] + i * a[3], a[2], a[3], x[0], x[1] + j, x[2], add, source[0],
+                source[1] + i * source[2] + j, source[2], out[0], out[1] + i * out[2] + j, out[2], n_rows, k, scale,
             )  # fmt: skip
 
 

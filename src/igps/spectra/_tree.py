@@ -36,10 +36,9 @@ class Structure(NamedTuple):
 def tree_structure(
     node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.ndarray
 ) -> tuple[Structure, list[Nodes], list[Nodes]]:
-    """Return the structure of a full binary tree, its `parallel_subtrees`, and the nodes above these.
+    """Return the structure of a full binary tree, its `parallel_subtrees`, and the nodes above these, each a range.
 
-    The vertices (V,) are assigned to the places of a heap. The nodes above are ranges of one node, each after its
-    children.
+    The tree is given by the node (V,) of each vertex, numbered as in a heap.
     """
     n_nodes = 2**n_levels - 1
     node_at = np.full(n_nodes, n_nodes - 1)  # node at each place of the heap

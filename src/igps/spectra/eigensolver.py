@@ -39,13 +39,14 @@ from igps.spectra._multifrontal import SingularMatrixError, analyse
 
 logger = logging.getLogger(__name__)
 
-# Number of extra pairs that ARPACK computes, to find a gap after the last wanted one.
+# Number of extra pairs that ARPACK computes, to find a gap after the last wanted pair.
 N_GUARDS = 16
 # Largest residual that is accepted because of rounding.
 RESIDUAL_LIMIT = 1e-4
 # Number of rows of the eigenvectors that are reordered at a time.
 REORDERED_ROWS = 2**12
-# Largest problem for the dense solver, which is then as fast; or else the basis would span most of the space.
+# Largest problems for the dense solver: for few vertices it is as fast, and for few vertices per eigenpair the Lanczos
+# basis would span most of the space.
 MAX_DENSE_VERTICES, MAX_DENSE_VERTICES_PER_EIGENPAIR = 1000, 4
 
 Solver = Callable[[], tuple[np.ndarray, np.ndarray]]
@@ -198,13 +199,11 @@ def _residual(
 ) -> tuple[float, np.ndarray]:
     """Return the largest relative residual, and corrections (K,) that turn the eigenvalues into Rayleigh quotients.
 
-    A ConvergenceError is raised if a residual is above the tolerance though rounding allows a smaller one, or above
-    RESIDUAL_LIMIT.
+    A ConvergenceError is raised if a residual exceeds the tolerance by more than rounding, or exceeds RESIDUAL_LIMIT.
     """
     largest = 0.0
-    squares, corrections = _defects(
-        matrix.data, matrix.indptr, matrix.indices, eigenvalues, np.ascontiguousarray(vectors)
-    )
+    y = np.ascontiguousarray(vectors)
+    squares, corrections = _defects(matrix.data, matrix.indptr, matrix.indices, eigenvalues, y)
     for start in range(0, len(eigenvalues), 64):
         part = slice(start, start + 64)
         values = eigenvalues[part]
