@@ -110,7 +110,7 @@ def outliers(
         scores[name], usual[name] = _deviations(measure, codes, name, n_together)
     result = []
     for i, label in enumerate(labels):
-        deviations = {name: float(np.nan_to_num(of_bodies[i], nan=0.0)) for name, of_bodies in scores.items()}
+        deviations = {name: float(np.nan_to_num(column[i], nan=0.0)) for name, column in scores.items()}
         score = float(np.linalg.norm(np.maximum(list(deviations.values()), 0)))
         among = str(names[nearest[i]]) if own[i] > other[i] else None
         reasons = []
@@ -216,7 +216,7 @@ def _measure(pipeline: SignaturePipeline, body: BodyRef, raw: RawBody) -> tuple[
 
 
 def _class_distances(distances: Floats, codes: Integers) -> tuple[Floats, Floats, Integers]:
-    """Return the log mean distances to the nearest bodies of the own and of the nearest other class, and its code."""
+    """Return the log mean distances to the nearest bodies of the own and of the nearest other class; and that class."""
     n, n_classes = len(codes), int(codes.max()) + 1
     own, other, nearest = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=np.int64)
     members = [np.flatnonzero(codes == code) for code in range(n_classes)]
@@ -271,7 +271,7 @@ def _deviations(values: Floats, codes: Integers, name: str, n_together: int) -> 
                 usual[i] = usual[i] if len(own) else np.median(others)
         if deviations:
             result[i] = min(np.abs(deviations) if name in _TWO_SIDED else deviations)
-    if (count := np.isfinite(result).sum()) > _MAX_WITHOUT_TAIL:  # without the largest, which may be the outlier
+    if (count := np.isfinite(result).sum()) > _MAX_WITHOUT_TAIL:
         level = min(0.95, max(1 - 1 / _MIN_SUBJECTS, 1 - n_together / (count - 1)))
         result /= max(1.0, np.nanquantile(result, level) / NormalDist().inv_cdf(level))
     return result, usual
@@ -287,7 +287,10 @@ def _scatter(values: Floats, minimum: float, use_tail: bool = True) -> float:
 
 
 def _rare_repairs(notes: Sequence[Sequence[str]]) -> tuple[Floats, list[list[str]]]:
-    """Return twice the number of rare notes of each body (N,), and these notes: fewer than a quarter have the like."""
+    """Return twice the number of rare notes of each body (N,), and these notes.
+
+    A note is rare if fewer than a quarter of the bodies have it, whatever its numbers.
+    """
     kinds = [[re.sub(r"[\d.,]+", "n", note) for note in notes_of_body] for notes_of_body in notes]
     counts = Counter(kind for kinds_of_body in kinds for kind in set(kinds_of_body))
     rare = [

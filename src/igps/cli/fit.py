@@ -78,7 +78,7 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
 
     Args:
         meshes: mesh files, or one folder.
-        model: a file that igps fit wrote.
+        model: file or folder that igps fit wrote.
         out: CSV file for the probabilities of all classes; the column class is empty for a mesh that fits no class.
     """
     module = load(model)
