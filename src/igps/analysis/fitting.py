@@ -48,9 +48,8 @@ class Classification:
     @property
     def predicted(self) -> list[str | None]:
         """The most probable class of each body; None for an unknown body."""
-        best = self.probabilities.argmax(dim=1).tolist()
-        unknown = self.unknown.tolist()
-        return [None if is_unknown else self.classes[i] for i, is_unknown in zip(best, unknown, strict=True)]
+        best = zip(self.probabilities.argmax(dim=1).tolist(), self.unknown.tolist(), strict=True)
+        return [None if is_unknown else self.classes[i] for i, is_unknown in best]
 
 
 def histograms_and_prior(which: str | Descriptor) -> tuple[Descriptor, Head | None]:

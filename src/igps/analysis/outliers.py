@@ -117,12 +117,9 @@ def outliers(
         ordered = sorted(deviations, key=lambda name: -deviations[name])
         for name in [name for k, name in enumerate(ordered) if k == 0 or deviations[name] > LIMIT]:
             value, centre = (float(table[name][i]) if name in table else 0.0 for table in (values, usual))
-            reasons.append(
-                _REASONS[name].format(
-                    value=value, usual=centre, square=value**2, common=centre**2,
-                    ratio=np.exp(min(value - centre, 50)), notes="; ".join(rare_notes[i]) if name == "repairs" else "",
-                )
-            )  # fmt: skip
+            notes_text = "; ".join(rare_notes[i]) if name == "repairs" else ""
+            numbers = {"value": value, "usual": centre, "square": value**2, "common": centre**2}
+            reasons.append(_REASONS[name].format(**numbers, ratio=np.exp(min(value - centre, 50)), notes=notes_text))
         if score <= LIMIT:
             reasons = []
         if among is not None:
