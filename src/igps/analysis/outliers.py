@@ -96,8 +96,8 @@ def outliers(
     """
     names, codes = np.unique(np.asarray(labels), return_inverse=True)
     own, other, nearest = _class_distances(np.asarray(distances, dtype=float), codes)
-    n_together = _max_bodies_of_subject(subjects or range(len(codes)), codes)
-    scores = {"shape": np.fmax(*(_deviations(shape, codes, "shape", n_together)[0] for shape in (own, own - other)))}
+    n_per_subject = _max_bodies_of_subject(subjects or range(len(codes)), codes)
+    scores = {"shape": np.fmax(*(_deviations(shape, codes, "shape", n_per_subject)[0] for shape in (own, own - other)))}
     values = dict(measures or {})
     if "overlap" in values:
         values["overlap"] = np.sqrt(values["overlap"].max(axis=1))
@@ -107,7 +107,7 @@ def outliers(
             values["repairs"][np.isfinite(values["stray"])] = 0
     usual: dict[str, Floats] = {}
     for name, measure in values.items():
-        scores[name], usual[name] = _deviations(measure, codes, name, n_together)
+        scores[name], usual[name] = _deviations(measure, codes, name, n_per_subject)
     result = []
     for i, label in enumerate(labels):
         deviations = {name: float(np.nan_to_num(column[i], nan=0.0)) for name, column in scores.items()}
@@ -239,7 +239,7 @@ def _max_bodies_of_subject(subjects: Sequence[object], codes: Integers) -> int:
     return max(counts.values()) if is_usable else 1
 
 
-def _deviations(values: Floats, codes: Integers, name: str, n_together: int) -> tuple[Floats, Floats]:
+def _deviations(values: Floats, codes: Integers, name: str, n_per_subject: int) -> tuple[Floats, Floats]:
     """Return how many robust standard deviations values (N,) exceed the usual value, and the usual value.
 
     The usual value is the median of the other bodies of the class; for a class of one, the median of the other classes.
@@ -269,7 +269,7 @@ def _deviations(values: Floats, codes: Integers, name: str, n_together: int) -> 
         if deviations:
             result[i] = min(np.abs(deviations) if name in _TWO_SIDED else deviations)
     if (count := np.isfinite(result).sum()) > _MAX_WITHOUT_TAIL:
-        level = min(0.95, max(1 - 1 / _MIN_SUBJECTS, 1 - n_together / (count - 1)))
+        level = min(0.95, max(1 - 1 / _MIN_SUBJECTS, 1 - n_per_subject / (count - 1)))
         result /= max(1.0, np.nanquantile(result, level) / NormalDist().inv_cdf(level))
     return result, usual
 
