@@ -104,7 +104,7 @@ def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(dataset
     said = {name: igps.fit(dataset, small_interior(), goal="new", head=name).card for name in ("whitened", "as_is")}  # type: ignore[arg-type]
     best = max(card["held_out_scores"]["ft"] for card in said.values())
     assert said[model.card["head"]]["held_out_scores"]["ft"] == pytest.approx(best, abs=0.1)
-    with pytest.raises(ValueError, match="model: expected one with a classifier, got interior"):
+    with pytest.raises(ValueError, match="model: expected a classifier, got interior"):
         classify(dataset, model)
 
 

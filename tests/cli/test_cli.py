@@ -430,7 +430,7 @@ def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
     monkeypatch.setattr(cli, "COMMANDS", {"ask": ask})
     with pytest.raises(SystemExit, match="2"):
         igps(monkeypatch, "ask")
-    assert re.fullmatch(r"igps: out of memory \(.*1.00 PiB.*\). Ask for less, .*\n", capsys.readouterr().err)
+    assert re.fullmatch(r"igps: out of memory \(.*1.00 PiB.*\). Reduce the input, .*\n", capsys.readouterr().err)
 
 
 def test_the_version_is_that_of_the_distribution(
@@ -621,9 +621,9 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
         (
             ["duplicates", "ROOT", "--poses", "--tolerance", "0.01"],
-            "tolerance: expected 0 beside poses, got 0.01.",
+            "tolerance: expected 0 with poses, got 0.01.",
         ),
-        (["classify", "ROOT", "--model", "plain.safetensors"], "model: expected one with a classifier, got d2."),
+        (["classify", "ROOT", "--model", "plain.safetensors"], "model: expected a classifier, got d2."),
     ],
 )
 def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(

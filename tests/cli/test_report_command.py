@@ -140,7 +140,7 @@ def test_a_page_with_the_difference_of_each_body_from_its_nearest(
     assert [one.other for one in kept.values()] == [names[1], names[0], names[3], names[2]]
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     found = explain(small_interior(), dataset.batch([2]), dataset.batch([3]))
-    assert kept[names[2]].told == found.summary()
+    assert kept[names[2]].summary == found.summary()
     mesh, signature, values = dataset.mesh(3), dataset[3].signature, []
     for vertex in mesh.vertices:  # so few that the picture has them all
         value = 0.0

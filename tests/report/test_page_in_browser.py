@@ -272,7 +272,7 @@ def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answer
     page.locator("#tree-plot").scroll_into_view_if_needed()
     stability = clusters_of(distances, n_resamples=50).stability
     told = f"{np.count_nonzero(np.array(stability) >= 0.75)} of {len(stability)} clusters are stable."
-    assert page.locator("#tree-told").inner_text() == told
+    assert page.locator("#tree-summary").inner_text() == told
     branches = page.locator("#tree-plot .branch").all()[::-1]
     assert len(branches) == len(expected)
     for branch, (members, distance) in zip(branches, expected, strict=True):
@@ -361,7 +361,7 @@ def test_groups_and_outliers_of_the_same_folder_are_told(answers: Visit) -> None
 
 def test_the_difference_from_the_nearest_is_painted(answers: Visit) -> None:
     dialog = answers.open(0)
-    assert dialog.locator("#explained-told").inner_text().startswith("60% <i>thickness</i>. Red")
+    assert dialog.locator("#explained-summary").inner_text().startswith("60% <i>thickness</i>. Red")
     assert NAMES[1] in dialog.locator("#explained-heading").inner_text()
     assert dialog.locator("#explained-list canvas").count() == 4
     means = answers.page.evaluate(

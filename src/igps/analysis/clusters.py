@@ -14,7 +14,7 @@ from igps.analysis.map import checked_distances
 Linkage = Literal["average", "complete", "single"]
 STABLE = 0.75
 """Clusters with a lower stability are not reliable (Hennig 2007)."""
-_MAX_CLUSTERS = 30  # largest number of clusters that is tried
+_MAX_CLUSTERS = 30  # largest number of clusters that is tried by default
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +23,8 @@ class Clusters:
 
     labels: Integers  # (N,) cluster of each body, 0 for the largest cluster
     medoids: tuple[int, ...]  # body of each cluster with the smallest sum of distances to the others
-    # How well each cluster is found again in random halves of the bodies: the largest Jaccard index with a cluster of
-    # the half, averaged over the halves with at least two bodies of the cluster; NaN if there is no such half
+    # Largest Jaccard index of each cluster with the clusters of a random half of the bodies, averaged over the halves
+    # with at least two bodies of the cluster; NaN if there is no such half
     stability: tuple[float, ...]
     tree: Floats  # (N − 1, 4) result of `scipy.cluster.hierarchy.linkage`
 
@@ -68,8 +68,8 @@ def clusters_of(
     _, labels = np.unique(np.argsort(np.argsort(-np.bincount(labels), kind="stable"))[labels], return_inverse=True)
     members = [np.flatnonzero(labels == number) for number in range(labels.max() + 1)]
     medoids = tuple(int(own[square[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members)
-    random, scores_of_halves = np.random.default_rng(seed), np.full((n_resamples, len(members)), np.nan)
-    for row in scores_of_halves if n > max(3, 2 * len(members)) else ():  # half of three bodies cannot be clustered
+    random, jaccard = np.random.default_rng(seed), np.full((n_resamples, len(members)), np.nan)
+    for row in jaccard if n > max(3, 2 * len(members)) else ():  # half of three bodies cannot be clustered
         half = np.sort(random.choice(n, n // 2, replace=False))
         resampled = np.eye(n, dtype=np.int64)[_cut(_tree(square[np.ix_(half, half)], linkage), len(members))]
         original = np.eye(len(members), dtype=np.int64)[labels[half]]
@@ -78,8 +78,8 @@ def clusters_of(
         union = n_drawn[:, None] + resampled.sum(axis=0) - intersection
         # A single body does not count: it would be found again in any clustering
         row[:] = np.where(n_drawn > 1, (intersection / np.maximum(union, 1)).max(axis=1), np.nan)
-    n_scores = np.isfinite(scores_of_halves).sum(axis=0)
-    stability = np.where(n_scores, np.nansum(scores_of_halves, axis=0) / np.maximum(n_scores, 1), np.nan)
+    n_halves = np.isfinite(jaccard).sum(axis=0)
+    stability = np.where(n_halves, np.nansum(jaccard, axis=0) / np.maximum(n_halves, 1), np.nan)
     return Clusters(labels, medoids, tuple(stability.tolist()), tree)
 
 

@@ -23,8 +23,7 @@ from igps.retrieval.scores import SCORE_NAMES, RetrievalScores, retrieval_scores
 logger = logging.getLogger(__name__)
 
 _Description = tuple[Singles, float]  # a description (1, ...), and the seconds that it took
-# Size of a block of distances: queries × bodies × entries of a description, which some descriptors hold in memory
-_BLOCK_ENTRIES = 2**26
+_BLOCK_ENTRIES = 2**26  # queries × bodies × entries of a description, which some descriptors hold in memory at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +80,7 @@ def compare(
     if dataset.bodies.labels is None:
         raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
     check_descriptors(descriptors, dataset)
-    n = len(dataset)
-    cpu = torch.device("cpu")
+    n, cpu = len(dataset), torch.device("cpu")
     jobs = [(descriptor, dataset.subset([i]), cpu) for descriptor in descriptors for i in range(n)]
     pending: dict[int, _Description | Failure] = {}  # outcomes of descriptors that are not complete, by job
     n_done = 0
@@ -145,11 +143,10 @@ def _result(
 
 def pair_distances(descriptor: Descriptor, descriptions: Tensor, *, progress: bool = False) -> Tensor:
     """Return the distances (N, N) of descriptions (N, ...), computed in blocks of queries to limit memory."""
-    rows = max(1, _BLOCK_ENTRIES // max(1, descriptions.numel()))
-    blocks = []
+    n_queries, blocks = max(1, _BLOCK_ENTRIES // max(1, descriptions.numel())), []
     bar = tqdm(total=len(descriptions), desc=f"distances by {descriptor.name}", disable=not progress)
     with torch.inference_mode(), one_thread(), bar:
-        for block in descriptions.split(rows):
+        for block in descriptions.split(n_queries):
             blocks.append(descriptor.distances(block, descriptions).cpu())
             bar.update(len(block))
     return torch.cat(blocks)

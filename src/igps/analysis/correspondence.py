@@ -10,7 +10,7 @@ from igps.data.batch import SignatureBatch
 # small times depends on the surface around it
 _LARGE_TIMES, _SMALL_TIMES = 0.01 * 2.0 ** np.arange(6), 0.0008 * 2.0 ** np.arange(5)
 _N_CORRESPONDING = 10  # samples of the other body that correspond to a sample
-_N_NEAREST = 4  # samples of the other body whose distance counts
+_N_NEAREST = 4  # samples of the other body over which the distance is averaged
 _MIN_DEVIATION = 0.1  # smallest standard deviation at a place, as a fraction of that of the whole body
 _SMOOTHING = 0.06  # standard deviation of the smoothing kernel, over the square root of the area
 
@@ -18,10 +18,10 @@ _SMOOTHING = 0.06  # standard deviation of the smoothing kernel, over the square
 def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     """Return how much each surface sample of a body differs from the corresponding samples of another body.
 
-    Samples correspond where their heat kernels (Sun, Ovsjanikov and Guibas 2009) at large times, which do not depend on
-    the pose, are nearest. Two measures are combined: the squared deviation of the heat kernel at small times from that
-    of the ten corresponding samples, over their variance; and the mean distance to the four samples that are nearest by
-    the kernels at all times. The logarithm of each is smoothed on the surface and standardised.
+    The ten corresponding samples are the nearest by the heat kernels (Sun, Ovsjanikov and Guibas 2009) at large times,
+    which do not depend on the pose. Two measures are combined: the squared deviation of the kernels at small times from
+    their mean over the corresponding samples, divided by their variance; and the mean distance to the four samples that
+    are nearest by the kernels at all times. The logarithm of each is smoothed on the surface and standardised.
 
     Args:
         body, other: batches of one body each.
@@ -39,8 +39,7 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     scale = kernels[1].std(axis=0) + 1e-9
     distances, _ = cKDTree(kernels[1] / scale).query(kernels[0] / scale, min(_N_NEAREST, len(kernels[1])))
     points = body.surface.points[0][body.surface.mask[0]].double().numpy()
-    width = _SMOOTHING * float(body.area[0]) ** 0.5
-    total = np.zeros(len(points))
+    width, total = _SMOOTHING * float(body.area[0]) ** 0.5, np.zeros(len(points))
     for values in (np.log1p(deviations.mean(axis=1)), np.log(distances.reshape(len(points), -1).mean(axis=1) + 1e-6)):
         smoothed = _smoothed(values, points, width)
         total += (smoothed - smoothed.mean()) / (smoothed.std() + 1e-12)

@@ -55,9 +55,9 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     nonlinear head such as that of `pretrained`. For the χ² distance, the share is the term of the cell; for a squared
     Euclidean distance under a linear head, it is the product of its two factors.
 
-    The share of a cell divided by the difference of its two contents is the share of one unit of content, positive in
-    the one body and negative in the other. It is passed on to the pairs of samples in the cell, half to each sample of
-    a pair, and from a limb, a piece or an eigenvalue to the samples that it is computed from.
+    The share of a cell divided by the difference of its two contents is the share of one unit of content, of opposite
+    sign in the two bodies. It goes to the pairs of samples in the cell, half to each sample of a pair; the share of a
+    limb, a piece or an eigenvalue goes to the samples from which that is computed.
 
     Between poses, most pairs change a little, and these shares spread over the whole body. The field `places` locates
     small differences better: each body has half of the distance, divided among its surface samples in proportion to
@@ -72,7 +72,7 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
         ValueError: another kind of descriptor, or a batch of several bodies.
     """
     if len(one) != 1 or len(other) != 1:
-        raise ValueError(f"one, other: expected a body each, got {len(one)} and {len(other)}.")
+        raise ValueError(f"one, other: expected batches of one body, got {len(one)} and {len(other)} bodies.")
     descriptor = copy.deepcopy(descriptor).double().eval()
     headless, pair = without_head(descriptor), (_with_weights(one), _with_weights(other))
     first, second = torch.cat([headless(batch).detach().flatten(1) for batch in pair])
@@ -103,7 +103,7 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
         one, other: (cells,) contents, see `without_head`. Side and size vary linearly on the line of `explain`.
 
     Returns:
-        (cells,) shares of a unit in the first body (negated: in the second), and the distance.
+        (cells,) shares of a unit in the first body, those in the second being the negatives; and the distance.
     """
     n = _n_cells(descriptor)
     inner = descriptor.descriptor if isinstance(descriptor, IndividualDescriptor) else descriptor
@@ -169,7 +169,7 @@ def _n_cells(descriptor: Descriptor) -> int:
 
 
 def _part_shares(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
-    """Sum shares of cells to shares of histograms, and of side and size if the descriptor keeps these."""
+    """Sum the shares of cells for each histogram, and those of side and of size if the descriptor keeps these."""
     parts = [part for group in _histograms(descriptor).parts for part in group]
     cells, sums = shares[: _n_cells(descriptor)].split([part.n_cells for part in parts]), dict[str, float]()
     for part, values in zip(parts, cells, strict=True):
@@ -268,7 +268,7 @@ def explain_groups(
     """Divide the distance of the mean descriptions of two groups among histograms, and among samples of two bodies.
 
     Only cells that differ significantly have shares, see `significant_cells`; the distance is the sum of these shares.
-    The shares of the samples sum to it only if the descriptions of both bodies are the means of their groups.
+    Shares of samples sum to this distance only if the descriptions of both bodies are the means of their groups.
 
     Args:
         descriptor: see `explain`.

@@ -48,9 +48,8 @@ class Classification:
     @property
     def predicted(self) -> list[str | None]:
         """The most probable class of each body; None for an unknown body."""
-        best = self.probabilities.argmax(dim=1).tolist()
-        unknown = self.unknown.tolist()
-        return [None if is_unknown else self.classes[i] for i, is_unknown in zip(best, unknown, strict=True)]
+        best = zip(self.probabilities.argmax(dim=1).tolist(), self.unknown.tolist(), strict=True)
+        return [None if is_unknown else self.classes[i] for i, is_unknown in best]
 
 
 def histograms_and_prior(which: str | Descriptor) -> tuple[Descriptor, Head | None]:
@@ -93,9 +92,9 @@ def fit(
             metric that also serves other classes, scored by holding out whole classes.
         head: "classifier" (`ClassifierHead`), "whitened" (`WhitenedHead`), or "as_is" for the descriptor itself; "auto"
             takes the head with the largest FT score on held-out bodies.
-        prior: whether the descriptor's own head is used beside the new head.
+        prior: whether the new head also uses the descriptor's own head.
         failures: list to which bodies that cannot be described are appended; None raises for the first such body.
-        n_workers: number of threads that describe bodies; all cores if None.
+        n_workers: threads or processes that describe bodies; all cores if None.
         progress: whether to show a progress bar.
 
     Raises:
@@ -131,10 +130,8 @@ def fit(
         masks = [out for out in _held_out(y, goal, _N_INNER_FOLDS) if _has_pair(y[out]) and _has_pair(y[~out])]
 
         def mean_ft(name: HeadName) -> float:
-            heads = (fit_head(name, x[~out], y[~out], False) for out in masks)
-            return fmean(
-                _retrieval_means(fitted, x[out], y[out])["ft"] for fitted, out in zip(heads, masks, strict=True)
-            )
+            heads = ((fit_head(name, x[~out], y[~out], False), out) for out in masks)
+            return fmean(_retrieval_means(fitted, x[out], y[out])["ft"] for fitted, out in heads)
 
         return max(_CANDIDATES[goal], key=mean_ft) if masks else _CANDIDATES[goal][0]
 
@@ -208,7 +205,7 @@ def classifier_of(model: str | Descriptor) -> tuple[Descriptor, ClassifierHead]:
     module = descriptor_of(model)
     module = module.descriptor if isinstance(module, IndividualDescriptor) else module
     if not isinstance(module, EmbeddedDescriptor) or not isinstance(module.head, ClassifierHead):
-        raise ValueError(f"model: expected one with a classifier, got {module.name}. Fit one with head='classifier'.")
+        raise ValueError(f"model: expected a classifier, got {module.name}. Fit one with head='classifier'.")
     return module.descriptor, module.head
 
 
@@ -251,7 +248,7 @@ def _held_out_scores(
     choose_head: Callable[[Tensor, Tensor], HeadName],
     fit_head: Callable[..., Head | None],
 ) -> dict[str, float]:
-    """Return means over held-out folds of the retrieval scores, and of classification scores for a classifier."""
+    """Return the means over held-out folds of the retrieval scores and, for a classifier, classification scores."""
     from torchmetrics.functional.classification import binary_auroc, multiclass_calibration_error
 
     retrieval: list[dict[str, float]] = []
@@ -269,7 +266,7 @@ def _held_out_scores(
         if isinstance(head, ClassifierHead):
             probabilities_of_folds.append(head.probabilities(histograms[out]))
             targets_of_folds.append(torch.searchsorted(head.classes, labels[out]))
-            is_new = torch.isin(labels, classes[number::_N_FOLDS])  # classes that a second classifier is not fitted to
+            is_new = torch.isin(labels, classes[number::_N_FOLDS])  # left out of the fit of a second classifier
             unknown, known, fit_to = out & is_new, out & ~is_new, ~out & ~is_new
             if bool(unknown.any() and known.any()) and len(labels[fit_to].unique()) > 1:
                 partial = fit_head(name, histograms[fit_to], labels[fit_to], False)

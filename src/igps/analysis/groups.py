@@ -66,9 +66,9 @@ def group_test(
     Covariates and the means of strata are regressed out of the vectors and of the group indicators. The residuals of
     the vectors are permuted within strata (Freedman and Lane 1983; for distances, McArdle and Anderson 2001).
 
-    PERMANOVA uses the pseudo-F of the residuals, and detects differences that are large beside the usual variation. The
-    kernel test also detects small differences. It whitens the residuals by their covariance, with a ridge that leaves
-    one degree of freedom for every ten bodies (Harchaoui, Bach and Moulines 2008, but with the covariance of all
+    PERMANOVA uses the pseudo-F of the residuals, and detects differences that are large compared with the variation.
+    The kernel test also detects small differences. It whitens the residuals by their covariance, with a ridge that
+    leaves one degree of freedom for every ten bodies (Harchaoui, Bach and Moulines 2008, but with the covariance of all
     bodies, which is the same for all permutations), and uses a Gaussian kernel with the median distance as width. Its
     statistic is divided by the share of the group indicators that covariates do not explain. A p-value is
     (1 + permutations as extreme) / (1 + permutations) (Phipson and Smyth 2010).
@@ -101,13 +101,13 @@ def group_test(
     untested = GroupTest(body, dict(sorted(Counter(groups).items())))
     if reason := _obstacle(untested.sizes, group, stratum):
         return replace(untested, refused=reason)
-    # Orthonormal bases: of the nuisance terms (means of strata, then covariates), and of what the groups add to these.
-    # A permutation within strata changes the covariates, but not the means of strata
-    means = _orthonormal(_indicators(stratum), _ROUNDING)
+    # Orthonormal bases of the means of strata, of what covariates add to these, and of what groups add to both. A
+    # permutation within strata changes the covariates, but not the means of strata
+    stratum_basis = _orthonormal(_indicators(stratum), _ROUNDING)
     design = design / np.maximum(np.abs(design).max(axis=0, initial=0), np.finfo(float).tiny)  # whatever the units
     design = _orthonormal(design - design.mean(axis=0), _ROUNDING)
-    permuted = _orthonormal(design - means @ (means.T @ design), _ROUNDING)
-    nuisance = np.column_stack([means, permuted])
+    covariate_basis = _orthonormal(design - stratum_basis @ (stratum_basis.T @ design), _ROUNDING)
+    nuisance = np.column_stack([stratum_basis, covariate_basis])
     indicators = _indicators(group)
     added = _orthonormal(indicators - nuisance @ (nuisance.T @ indicators), 1e-6)
     if added.shape[1] < len(untested.sizes) - 1:
@@ -127,20 +127,22 @@ def group_test(
     kernel = residual @ np.exp(-whitened / (2 * width)) @ residual
 
     random = np.random.default_rng(seed)
-    of_groups, of_covariates, of_kernel, overlap = np.empty((4, n_permutations + 1))
+    group_traces, covariate_traces, kernel_traces, overlap = np.empty((4, n_permutations + 1))
     block = max(1, _BLOCK // (n * (nuisance.shape[1] + added.shape[1])))
     for first in range(0, n_permutations + 1, block):
         orders = _permutations(stratum, min(block, n_permutations + 1 - first), random)
         if first == 0:
             orders[0] = np.arange(n)
         part = slice(first, first + len(orders))
-        of_groups[part], of_covariates[part] = _traces(gram, added, orders), _traces(gram, permuted, orders)
-        of_kernel[part], overlap[part] = _traces(kernel, added, orders), _traces(permuted @ permuted.T, added, orders)
-    share = of_groups / np.maximum(np.trace(gram) - of_covariates, np.finfo(float).tiny)  # grows with pseudo-F, to 1
+        group_traces[part] = _traces(gram, added, orders)
+        covariate_traces[part] = _traces(gram, covariate_basis, orders)
+        kernel_traces[part] = _traces(kernel, added, orders)
+        overlap[part] = _traces(covariate_basis @ covariate_basis.T, added, orders)
+    share = group_traces / np.maximum(np.trace(gram) - covariate_traces, np.finfo(float).tiny)  # grows with pseudo-F
     # Covariates explain a share of the permuted groups, which the kernel of the residuals cannot contain
     unexplained = np.maximum(1 - overlap / added.shape[1], _ROUNDING)
-    # For the effect, the added part is rotated to the group means, and the remainder is scaled up to the variance
-    # before strata and covariates took their degrees of freedom: matched pairs keep half of it
+    # For the effect, the part that groups add is rotated to the group means, and the remainder is scaled up to the
+    # variance before strata and covariates took their degrees of freedom: matched pairs keep half of it
     sizes = np.bincount(group)
     at_means = _orthonormal(indicators - indicators.mean(axis=0), 1e-6)
     left, _, right = np.linalg.svd(at_means.T @ added)
@@ -155,8 +157,8 @@ def group_test(
         untested,
         permanova_f=float(share[0] / max(1 - share[0], np.finfo(float).eps) * freedom / added.shape[1]),
         permanova_p=_p_value(share),
-        kernel=float(of_kernel[0] * (n / np.prod(sizes) if len(sizes) == 2 else 1 / n)),
-        kernel_p=_p_value(of_kernel / unexplained),
+        kernel=float(kernel_traces[0] * (n / np.prod(sizes) if len(sizes) == 2 else 1 / n)),
+        kernel_p=_p_value(kernel_traces / unexplained),
         effect=float(_effects(squares, group, [np.ones((1, k)) for k in sizes])[0]),
         effect_low=None if low is None else float(low),
         effect_high=None if high is None else float(high),
@@ -217,8 +219,7 @@ def _whitened(gram: Floats) -> Floats:
     # Bracket of the root: at the first every term exceeds the share of the rank, at the second the sum is below freedom
     ridges = values[0] * (1 / _MAX_RANK_SHARE - 1) / 2, 2 * values.sum() / freedom
     ridge = np.exp(brentq(excess, *np.log(ridges)))
-    result: Floats = (axes * (values / (values + ridge))) @ axes.T
-    return result
+    return np.asarray((axes * (values / (values + ridge))) @ axes.T)
 
 
 def _squares(gram: Floats) -> Floats:
@@ -258,15 +259,13 @@ def _effects(squares: Floats, group: Integers, weights: Sequence[Any]) -> Floats
     def mean(a: int, b: int) -> Floats:
         total = np.einsum("ni,ij,nj->n", weights[a], squares[np.ix_(members[a], members[b])], weights[b], optimize=True)
         n_pairs = weights[a].sum(axis=1) * weights[b].sum(axis=1)
-        result: Floats = total / (n_pairs - np.square(weights[a]).sum(axis=1) if a == b else n_pairs)
-        return result
+        return np.asarray(total / (n_pairs - np.square(weights[a]).sum(axis=1) if a == b else n_pairs))
 
     variances = [mean(a, a) / 2 for a in range(len(members))]
     pairs = combinations(range(len(members)), 2)
     between: Any = sum(shares[a] * shares[b] * (mean(a, b) - variances[a] - variances[b]) for a, b in pairs)
     within: Any = sum(share * variance for share, variance in zip(shares, variances, strict=True))
-    effects: Floats = between / (between + within)
-    return effects
+    return np.asarray(between / (between + within))
 
 
 def _auc(gram: Floats, nuisance: Floats, group: Integers, n_repeats: int, seed: int) -> float:

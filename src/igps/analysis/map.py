@@ -14,8 +14,8 @@ from igps._parameters import check_one_of
 
 Layout = Literal["mds", "umap"]
 
-# Limits of SMACOF: entries of distance matrices, summed over the iterations, which keeps it to seconds; and iterations
-_MAX_ENTRIES, _MAX_ITERATIONS = 10**9, 300
+_MAX_ITERATIONS = 300  # of SMACOF
+_MAX_ENTRIES = 10**9  # of the distance matrix times the iterations of SMACOF, which then take seconds
 
 
 @dataclass(frozen=True, eq=False)

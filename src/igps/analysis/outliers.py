@@ -96,8 +96,8 @@ def outliers(
     """
     names, codes = np.unique(np.asarray(labels), return_inverse=True)
     own, other, nearest = _class_distances(np.asarray(distances, dtype=float), codes)
-    n_together = _max_bodies_of_subject(subjects or range(len(codes)), codes)
-    scores = {"shape": np.fmax(*(_deviations(shape, codes, "shape", n_together)[0] for shape in (own, own - other)))}
+    n_per_subject = _max_bodies_of_subject(subjects or range(len(codes)), codes)
+    scores = {"shape": np.fmax(*(_deviations(shape, codes, "shape", n_per_subject)[0] for shape in (own, own - other)))}
     values = dict(measures or {})
     if "overlap" in values:
         values["overlap"] = np.sqrt(values["overlap"].max(axis=1))
@@ -107,22 +107,19 @@ def outliers(
             values["repairs"][np.isfinite(values["stray"])] = 0
     usual: dict[str, Floats] = {}
     for name, measure in values.items():
-        scores[name], usual[name] = _deviations(measure, codes, name, n_together)
+        scores[name], usual[name] = _deviations(measure, codes, name, n_per_subject)
     result = []
     for i, label in enumerate(labels):
-        deviations = {name: float(np.nan_to_num(of_bodies[i], nan=0.0)) for name, of_bodies in scores.items()}
+        deviations = {name: float(np.nan_to_num(column[i], nan=0.0)) for name, column in scores.items()}
         score = float(np.linalg.norm(np.maximum(list(deviations.values()), 0)))
         among = str(names[nearest[i]]) if own[i] > other[i] else None
         reasons = []
         ordered = sorted(deviations, key=lambda name: -deviations[name])
         for name in [name for k, name in enumerate(ordered) if k == 0 or deviations[name] > LIMIT]:
             value, centre = (float(table[name][i]) if name in table else 0.0 for table in (values, usual))
-            reasons.append(
-                _REASONS[name].format(
-                    value=value, usual=centre, square=value**2, common=centre**2,
-                    ratio=np.exp(min(value - centre, 50)), notes="; ".join(rare_notes[i]) if name == "repairs" else "",
-                )
-            )  # fmt: skip
+            notes_text = "; ".join(rare_notes[i]) if name == "repairs" else ""
+            numbers = {"value": value, "usual": centre, "square": value**2, "common": centre**2}
+            reasons.append(_REASONS[name].format(**numbers, ratio=np.exp(min(value - centre, 50)), notes=notes_text))
         if score <= LIMIT:
             reasons = []
         if among is not None:
@@ -216,7 +213,7 @@ def _measure(pipeline: SignaturePipeline, body: BodyRef, raw: RawBody) -> tuple[
 
 
 def _class_distances(distances: Floats, codes: Integers) -> tuple[Floats, Floats, Integers]:
-    """Return the log mean distances to the nearest bodies of the own and of the nearest other class, and its code."""
+    """Return the log mean distances to the nearest bodies of the own and of the nearest other class; and that class."""
     n, n_classes = len(codes), int(codes.max()) + 1
     own, other, nearest = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=np.int64)
     members = [np.flatnonzero(codes == code) for code in range(n_classes)]
@@ -242,7 +239,7 @@ def _max_bodies_of_subject(subjects: Sequence[object], codes: Integers) -> int:
     return max(counts.values()) if is_usable else 1
 
 
-def _deviations(values: Floats, codes: Integers, name: str, n_together: int) -> tuple[Floats, Floats]:
+def _deviations(values: Floats, codes: Integers, name: str, n_per_subject: int) -> tuple[Floats, Floats]:
     """Return how many robust standard deviations values (N,) exceed the usual value, and the usual value.
 
     The usual value is the median of the other bodies of the class; for a class of one, the median of the other classes.
@@ -271,8 +268,8 @@ def _deviations(values: Floats, codes: Integers, name: str, n_together: int) -> 
                 usual[i] = usual[i] if len(own) else np.median(others)
         if deviations:
             result[i] = min(np.abs(deviations) if name in _TWO_SIDED else deviations)
-    if (count := np.isfinite(result).sum()) > _MAX_WITHOUT_TAIL:  # without the largest, which may be the outlier
-        level = min(0.95, max(1 - 1 / _MIN_SUBJECTS, 1 - n_together / (count - 1)))
+    if (count := np.isfinite(result).sum()) > _MAX_WITHOUT_TAIL:
+        level = min(0.95, max(1 - 1 / _MIN_SUBJECTS, 1 - n_per_subject / (count - 1)))
         result /= max(1.0, np.nanquantile(result, level) / NormalDist().inv_cdf(level))
     return result, usual
 
@@ -287,7 +284,10 @@ def _scatter(values: Floats, minimum: float, use_tail: bool = True) -> float:
 
 
 def _rare_repairs(notes: Sequence[Sequence[str]]) -> tuple[Floats, list[list[str]]]:
-    """Return twice the number of rare notes of each body (N,), and these notes: fewer than a quarter have the like."""
+    """Return twice the number of rare notes of each body (N,), and these notes.
+
+    A note is rare if fewer than a quarter of the bodies have it, whatever its numbers.
+    """
     kinds = [[re.sub(r"[\d.,]+", "n", note) for note in notes_of_body] for notes_of_body in notes]
     counts = Counter(kind for kinds_of_body in kinds for kind in set(kinds_of_body))
     rare = [

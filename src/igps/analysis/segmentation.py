@@ -109,9 +109,9 @@ def overlaps(places: Sequence[Place | None], labels: Sequence[str] | None = None
         if place is not None:
             grids[place.grid].append((i, place))
     for same_grid in grids.values():
-        for (i, one), (j, other) in combinations(same_grid, 2):
-            low, high = np.maximum(one.low, other.low), np.minimum(one.low + one.shape, other.low + other.shape)
+        for (i, a), (j, b) in combinations(same_grid, 2):
+            low, high = np.maximum(a.low, b.low), np.minimum(a.low + a.shape, b.low + b.shape)
             if (low < high).all() and (labels is None or labels[i] != labels[j]):
-                n_shared = np.count_nonzero(one.mask(low, high) & other.mask(low, high))
-                shares[i, j], shares[j, i] = n_shared / one.n_voxels, n_shared / other.n_voxels
+                n_shared = np.count_nonzero(a.mask(low, high) & b.mask(low, high))
+                shares[i, j], shares[j, i] = n_shared / a.n_voxels, n_shared / b.n_voxels
     return shares

@@ -72,7 +72,6 @@ COMMANDS: Commands = {
 A command that prints a table returns the same data, for `--json`. Commands of `figure` write to `figures` by default.
 """
 
-
 ENDINGS: Mapping[Command, Sequence[str]] = {
     extract: (*SUFFIXES, ".npz"), fit: (".safetensors", ""), cache_export: (".igps",), classify: (".csv",),
     duplicates: (".csv",), doctor: (), report: (),
@@ -86,7 +85,7 @@ def faults_in_a_sentence() -> Iterator[None]:
     try:
         yield
     except MemoryError as error:
-        print(f"igps: out of memory ({error}). Ask for less, or set a memory limit for each body.", file=sys.stderr)
+        print(f"igps: out of memory ({error}). Reduce the input, or set a memory limit for each body.", file=sys.stderr)
         sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         is_system = isinstance(error, OSError) and is_machine_error(error)
@@ -135,7 +134,7 @@ def main(
 
 
 def check_place(name: str, place: Path | None, endings: Sequence[str] | None) -> None:
-    """Raise a ValueError if a file with one of the suffixes (see `ENDINGS`), or a folder if None, cannot be written."""
+    """Raise a ValueError if a file with one of `endings`, see `ENDINGS`, cannot be written; if None, a folder."""
     if place is None:
         return
     if endings and place.suffix.lower() not in endings:
@@ -154,9 +153,8 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
 def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:
     """Return the parser of all commands; for the arguments see `main`."""
     parser = ArgumentParser(prog=program, description="Volumetric shape retrieval by interior Global Point Signatures.")
-    parser.add_argument(
-        "--version", action="version", version=f"%(prog)s {version()}", help="show the version and exit"
-    )
+    text = f"%(prog)s {version()}"
+    parser.add_argument("--version", action="version", version=text, help="show the version and exit")
     _add_commands(parser, COMMANDS if commands is None else commands)
     return parser
 
@@ -199,13 +197,13 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
                 parser.add_argument(f"--{name}", nargs="+", action="extend", help=help_text)
     if types["return"] is not type(None):
         switches[JSON] = "print the table as JSON, and everything else to standard error"
-    custom: set[str | int] = {*switches, *LISTS}  # jsonargparse would write these in another way
+    custom: set[str | int] = {*switches, *LISTS}  # their syntax differs from jsonargparse's
     for position, (name, parameter) in enumerate(parameters.items()):
         is_positional = position == 0 and parameter.default is parameter.empty
         item = _list_item(types[name])
         if is_positional or item is not None:
             option, settings = (name, {}) if is_positional else (f"--{name}", {"default": parameter.default})
-            if not is_positional and parameter.default is parameter.empty:
+            if settings.get("default") is parameter.empty:
                 settings = {"required": True}
             if item is not None and settings.get("default") is None:
                 settings["action"] = "extend"  # a repeated option adds to the list

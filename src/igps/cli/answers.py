@@ -42,8 +42,8 @@ def groups(
 ) -> list[dict[str, Any]]:
     """Test whether groups of bodies differ in shape, separately for each named body of the files, such as an organ.
 
-    Two permutation tests are run, PERMANOVA and a kernel two-sample test. Also reported are the effect size with a 95 %
-    interval, the cross-validated area under the curve of a classifier, and false discovery rates over the bodies.
+    Two permutation tests are run, PERMANOVA and a kernel two-sample test. The table also has false discovery rates over
+    the bodies, the effect size with a 95 % interval, and the cross-validated area under the curve of a classifier.
 
     Args:
         root: folder with one subfolder per group, or with files and a labels.csv (columns file,label and more).
@@ -55,7 +55,6 @@ def groups(
         n_permutations: number of random permutations.
         seed: seed of the permutations, bootstraps and folds.
     """
-
     check_at_least(1, n_permutations=n_permutations)
     check_at_least(0, seed=seed)
 
@@ -81,17 +80,17 @@ def groups(
     n_pairs = len(set(zip(bodies.parts, labels, strict=True)))
     is_named_by_file = n_pairs == len(bodies) and all(map(is_named_after_file, bodies.names, bodies.parts))
     if is_named_by_file or n_pairs == len(members) in (len(set(labels)), len(bodies)):
-        # These names do not tell organs apart: they are the groups, or the file names of single masks, which may repeat
-        # in each group
+        # The parts are not organs: they are the groups, or the names of files with one mask each, which may repeat in
+        # each group
         members = {"all": list(range(len(bodies)))}
-    jobs = [(body + suffix, own, rows[own]) for body, own in members.items() for suffix, rows in vectors.items()]
+    jobs = [(body + suffix, i, rows[i]) for body, i in members.items() for suffix, rows in vectors.items()]
     tests = with_q_values([
         group_test(
-            rows, labels[own].tolist(), body=body, n_permutations=n_permutations, seed=seed,
-            strata=None if stratum is None else stratum[own].tolist(),
-            covariates=None if covariates is None else covariates[own],
+            rows, labels[i].tolist(), body=body, n_permutations=n_permutations, seed=seed,
+            strata=None if stratum is None else stratum[i].tolist(),
+            covariates=None if covariates is None else covariates[i],
         )
-        for body, own, rows in tqdm(jobs, desc="tests")
+        for body, i, rows in tqdm(jobs, desc="tests")
     ])  # fmt: skip
     print(groups_table(tests))
     print_failures(result.failures, len(bodies))
@@ -119,14 +118,14 @@ def outliers(
 
     Each body is compared with the others of its class by its shape, volume and resolution; a mesh also by its handles,
     flat sides and repairs; a label also by detached pieces, cavities, holes, gaps, cut ends, and overlap with other
-    labels. A score counts robust standard deviations; a body with a score above 3.5 is an outlier. The list also tells
-    where a body is nearer to another class than to its own.
+    labels. A score counts robust standard deviations; a body with a score above 3.5 is an outlier. The list also names
+    the bodies that are nearer to another class than to their own.
 
     Args:
         root: folder with one subfolder per class, or with files and a labels.csv (columns file,label).
         top: number of bodies to list.
         out: folder for outliers.csv and outliers.json with all bodies, and outliers.svg and outliers.png with pictures
-            of the first.
+            of the highest-scoring bodies.
     """
     check_at_least(0, top=top)
     result = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **reading)
@@ -224,7 +223,7 @@ def _painted(dataset: SignatureDataset, i: int, explanation: Explanation, side: 
 
 
 def _extent(values: Any, areas: Any) -> str:
-    """Say how small a part of the surface holds half of the positive shares, given shares and areas (F,) of faces."""
+    """Return as text how much of the surface holds half of the positive shares, from shares and areas (F,) of faces."""
     order = np.argsort(-values)
     cumulative = np.cumsum(np.maximum(values, 0)[order] * areas[order])
     if not cumulative[-1]:

@@ -29,11 +29,11 @@ def clusters(
     out: Path | None = None,
     **reading: Any,
 ) -> list[dict[str, Any]]:
-    """Find clusters of similar bodies without using classes, and tell how stable each cluster is.
+    """Find clusters of similar bodies without using classes, and measure how stable each cluster is.
 
     The descriptor's distances are clustered hierarchically. The table shows the bodies of each cluster, its medoid, its
     classes where they are known, and its stability from 0 to 1: how well the cluster is found again when only a random
-    half of the bodies is clustered. Clusters with a stability below 0.75 are not reliable; a single body has none.
+    half of the bodies is clustered. Clusters with a stability below 0.75 are not reliable. A single body has none.
 
     Args:
         n_clusters: number of clusters; by default the number with the largest mean silhouette.
@@ -95,7 +95,7 @@ def map_bodies(
     """
 
     def column_values(bodies: Bodies) -> list[str] | list[float]:
-        """Return the column of labels.csv that `colour` names; empty if the colour is no column."""
+        """Return the column of labels.csv with the name `colour`; an empty list if the colour is not a column."""
         if colour in ("class", "cluster", "volume"):
             return []
         try:

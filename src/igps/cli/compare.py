@@ -87,12 +87,9 @@ def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) ->
     (out / "compare.json").write_text(json.dumps([result.row() for result in results], indent=2) + "\n")
     last = results[-1]
     if last.distances is not None:
-        arrays: dict[str, Any] = {
-            "distances": last.distances.numpy(),
-            "names": np.array(last.names),
-            "labels": np.array(last.labels),
-        }
-        np.savez_compressed(out / "distances" / f"{last.descriptor.name}.npz", **arrays)
+        path = out / "distances" / f"{last.descriptor.name}.npz"
+        names, labels = np.array(last.names), np.array(last.labels)
+        np.savez_compressed(path, distances=last.distances.numpy(), names=names, labels=labels)
     rows = [("all", failure.id, failure.error) for failure in failures]
     for result in results:
         rows += [(result.descriptor.name, failure.id, failure.error) for failure in result.failures]

@@ -35,7 +35,7 @@ def duplicates(
 
     Args:
         root: folder of meshes, or a gallery, see igps gallery.
-        poses: also count other poses of a body as duplicates; more of the similar bodies are then mistaken for it
+        poses: also count other poses of a body as duplicates; more bodies that are only similar are then listed too
         size: keep treats bodies of different size as different, ignore does not; auto is keep where all files have a
             unit.
         tolerance: also list pairs that are not duplicates but no farther apart than this fraction of the square root of
@@ -43,7 +43,7 @@ def duplicates(
         out: CSV file for the groups.
     """
     if not 0 <= tolerance <= (0 if poses else MOST_TOLERATED):
-        expected = "0 beside poses" if poses else f"0 to {MOST_TOLERATED}"
+        expected = "0 with poses" if poses else f"0 to {MOST_TOLERATED}"
         raise ValueError(f"tolerance: expected {expected}, got {tolerance}.")
     source: Any
     unread: list[Failure] = []
@@ -85,7 +85,7 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     if len(meshes) != 2:
         raise ValueError(f"meshes: expected two files, got {len(meshes)}.")
     check_files(meshes)
-    reading["strict"] = True  # an item and no argument: the parser finds its options in `**reading`
+    reading["strict"] = True  # not in the call, where the parser looks for plain `**reading` to find the options
     dataset, _ = signatures(meshes, [descriptor_of(DESCRIPTOR)], **reading)
     result = body_distance(dataset, DESCRIPTOR, progress=True)
     print(f"{result.distance:.4g} by {DESCRIPTOR}: {result.meaning}")

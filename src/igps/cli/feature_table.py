@@ -46,8 +46,8 @@ def wide_table(metadata: Table, measured: Table) -> Table:
     Metadata that all bodies of each file share is one column; everything else is a column per body: `PART.volume`,
     `PART.v0` and so on. A body that is missing in a file, or could not be used, has no values.
 
-    Where each file is the mask of one organ, a row is a folder of such files instead: if the bodies have the names of
-    their files, or their names repeat in several folders. Files that are only numbered stay one row each.
+    Where each file is the mask of one organ, a row is a folder of files instead. This is assumed if bodies are named
+    after their files, or if the same names occur in several folders. Files that are only numbered stay one row each.
     """
     folders = [PurePath(file).parent.as_posix() for file in metadata["file"]]
     n, parts = len(folders), set(metadata["part"])
@@ -85,8 +85,8 @@ def write_table(path: Path, table: Table) -> None:
             raise ImportError('out: Parquet needs pyarrow: pip install "interior-gps[table]". Or write CSV.') from error
         arrays = {name: pyarrow.array(_typed(name, values)) for name, values in table.items()}
         pyarrow.parquet.write_table(pyarrow.table(arrays), path)
-        return
-    write_rows(path, table, zip(*table.values(), strict=True))
+    else:
+        write_rows(path, table, zip(*table.values(), strict=True))
 
 
 def _typed(column: str, values: Sequence[Any]) -> list[Any]:

@@ -78,7 +78,7 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
 
     Args:
         meshes: mesh files, or one folder.
-        model: a file that igps fit wrote.
+        model: file or folder that igps fit wrote.
         out: CSV file for the probabilities of all classes; the column class is empty for a mesh that fits no class.
     """
     module = load(model)
@@ -107,7 +107,6 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
 
 
 def _card(model: Descriptor, path: Path) -> str:
-    """Return the model card of a fitted model, in Markdown."""
     card = model.card
     scores = "\n".join(f"| {_TITLES[name]} | {100 * value:.1f} |" for name, value in card["held_out_scores"].items())
     scores = scores or "| none: no class is large enough to hold bodies out | |"

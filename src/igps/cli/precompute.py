@@ -111,9 +111,9 @@ def dask_executor(address: str) -> Iterator[Executor]:
             "worker` and its address."
         ) from error
     with client:
-        for worker, found in client.run(version, on_error="return").items():
-            if found != version():
-                shown = found if isinstance(found, str) else f"of another version ({type(found).__name__})"
+        for worker, answer in client.run(version, on_error="return").items():
+            if answer != version():
+                shown = answer if isinstance(answer, str) else f"of another version ({type(answer).__name__})"
                 raise MachineError(
                     f"cluster: expected igps {version()} on every worker, the one at {worker} has igps {shown}. "
                     "Install one version everywhere and run again."

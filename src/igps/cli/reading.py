@@ -37,7 +37,7 @@ FLAGS = {
     "allow_open": "accept surfaces with holes",
     "strict": "stop at the first mesh that cannot be used instead of skipping it",
 }
-"""Help of the switches that every command has which passes its `**reading` on to `signatures`."""
+"""Help of the switches of every command that takes `**reading`."""
 
 LISTS = {
     "attribute": "values inside the bodies, such as ct=images/{stem}.nii.gz: a file below the folder with an image, a "
@@ -181,20 +181,19 @@ def is_named_after_file(name: str, part: str | None) -> bool:
 
 def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
     """Return the limits of one body; raise a ValueError that names the option if a number is not positive."""
-    options = {"time_limit": seconds, "memory_limit": gigabytes}
-    check_positive(**{name: value for name, value in options.items() if value is not None})
+    limits = {"time_limit": seconds, "memory_limit": gigabytes}
+    check_positive(**{name: limit for name, limit in limits.items() if limit is not None})
     return Limits(seconds, None if gigabytes is None else int(gigabytes * 1e9))
 
 
 def print_failures(failures: Sequence[Failure], n_used: int) -> None:
     """Print how many bodies could not be used, and the reason of the first; print nothing if there are none."""
-    if failures:
-        n_total = n_used + len(failures)
-        print(f"{len(failures)} of {n_total} meshes could not be used. The first: {failures[0].error}")
+    if n := len(failures):
+        print(f"{n} of {n_used + n} meshes could not be used. The first: {failures[0].error}")
 
 
 def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
-    """Return the name, with +side if `mirror` is "distinct"; raise a ValueError if name and options contradict."""
+    """Return the name, with +side if `mirror` is "distinct"; raise a ValueError if an option contradicts the name."""
     for option, value, excluded, suffix in (("size", size, "ignore", SIZE), ("mirror", mirror, "same", SIDE)):
         if value == excluded and suffix in (name := descriptor_of(descriptor).name):
             raise ValueError(f"{option}: expected no {value!r} with {name}, which has {suffix}. Leave one of them out.")
@@ -204,7 +203,7 @@ def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
 
 
 def with_size(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
-    """Return the name, with +size if size counts by the option and the units; print a warning if that is unclear."""
+    """Return the name, with +size if size counts; print a warning if the option and the units do not decide this."""
     module = descriptor_of(descriptor)
     if SIZE in module.name or "scale" not in module.invariant_to:
         if size != "auto" and SIZE not in module.name:
@@ -219,7 +218,7 @@ def with_size(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
 
 
 def print_unit_warning(descriptor: Descriptor, dataset: SignatureDataset) -> None:
-    """Print how many bodies have no unit and count as in millimetres, if the descriptor keeps size."""
+    """Print how many bodies have no unit and are read as millimetres, if the descriptor keeps size."""
     n_unknown = sum(unit not in MILLIMETRES for unit in dataset.units()) if SIZE in descriptor.name else 0
     if n_unknown:
         print(f"size is kept: {n_unknown} of {len(dataset)} bodies have no unit; their numbers count as millimetres")
@@ -296,5 +295,5 @@ def mending_summary(dataset: SignatureDataset, n_total: int) -> str:
 
 def write_notes(path: Path, dataset: SignatureDataset) -> None:
     """Write the notes on how each mesh was mended, as a table."""
-    notes_of_meshes = zip(dataset.bodies.names, dataset.all_notes(), strict=True)
-    write_rows(path, ("name", "note"), [(name, note) for name, notes in notes_of_meshes for note in notes])
+    meshes = zip(dataset.bodies.names, dataset.all_notes(), strict=True)
+    write_rows(path, ("name", "note"), [(name, note) for name, notes in meshes for note in notes])

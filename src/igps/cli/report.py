@@ -20,13 +20,13 @@ def report(
 
     The page shows rankings, scores, a map of the bodies, and the results of igps groups and igps outliers in the same
     folder. Simplified surfaces for the pictures are stored in the folder, in surfaces.npz; a mesh that no longer exists
-    when they are made has no picture.
+    when they are computed has no picture.
 
     Args:
         results: folder that igps retrieve, igps compare or python -m training.study robustness wrote (--out).
         out: the page; default: report.html in the folder of results.
         meshes: folder of the meshes, if they were moved since.
-        explain: paint where each body differs from its nearest, stored in explanations.npz; takes seconds per body
+        explain: paint where each body differs from its nearest; takes seconds per body, and writes explanations.npz
         n_workers: number of processes that make the pictures; default: all cores.
     """
     if meshes is not None and not meshes.is_dir():

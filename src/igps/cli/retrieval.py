@@ -157,29 +157,29 @@ def query(
     check_files([mesh])
     if is_gallery(gallery):
         opened = Gallery(gallery, descriptor)
-        wanted = _describe_one(mesh, opened.descriptor, **gallery_options(opened, reading))
-        matches = opened.nearest(wanted, top=top, rerank=rerank, where=where, exact=exact)[0]
+        description = _describe_body(mesh, opened.descriptor, **gallery_options(opened, reading))
+        matches = opened.nearest(description, top=top, rerank=rerank, where=where, exact=exact)[0]
         n_missing = sum(not match.path.exists() for match in matches)
         nearest = [(match.name, match.label, match.distance) for match in matches]
     elif where is not None:
         raise ValueError(f"where: expected a gallery, {gallery} is a folder of meshes. See igps gallery build.")
     else:
         known, n_missing = described(Folder(gallery), descriptor or "pretrained", **reading), 0
-        # The options that describe the query are those of the folder, which may be a file of signatures
-        same = {"paper": False, "signature": known.dataset.config, **asdict(known.dataset.reading)}
-        wanted = _describe_one(mesh, known.descriptor, **{**reading, **same})
+        # The query is described with the options of the folder, which may be a file of signatures
+        options = {"paper": False, "signature": known.dataset.config, **asdict(known.dataset.reading)}
+        description = _describe_body(mesh, known.descriptor, **{**reading, **options})
         bodies, distance = known.dataset.bodies, known.descriptor.distances
         n_listed = min(top, len(bodies))
         n_candidates = min(max(top, N_RERANKED), len(bodies)) if rerank else n_listed
-        ranking = search(wanted, known.descriptions, top=n_candidates, distance=distance)
+        ranking = search(description, known.descriptions, top=n_candidates, distance=distance)
         if rerank:
-            ranking = rerank_found(wanted, ranking, lambda indices: known.descriptions[indices], distance, top=n_listed)
+            ranking = rerank_found(description, ranking, lambda i: known.descriptions[i], distance, top=n_listed)
         pairs = zip(ranking.indices[0].tolist(), ranking.distances[0].tolist(), strict=True)
         labels = bodies.labels or [None] * len(bodies)
-        nearest = [(bodies.names[i], labels[i], away) for i, away in pairs]
+        nearest = [(bodies.names[i], labels[i], value) for i, value in pairs]
     rows: list[dict[str, Any]] = [
-        {"rank": place, "distance": away, "name": name, "class": label}
-        for place, (name, label, away) in enumerate(nearest, 1)
+        {"rank": place, "distance": value, "name": name, "class": label}
+        for place, (name, label, value) in enumerate(nearest, 1)
     ]
     width = max((len(row["name"]) for row in rows), default=4)
     print(f"{'rank':>4}  {'distance':>9}  {'mesh':<{width}}  class")
@@ -190,7 +190,7 @@ def query(
     return rows
 
 
-def _describe_one(mesh: Path, descriptor: Descriptor, **reading: Any) -> Tensor:
+def _describe_body(mesh: Path, descriptor: Descriptor, **reading: Any) -> Tensor:
     """Return the description (1, ...) of a file with one body, or of one FILE#PART."""
     result = described([mesh], descriptor, **{**reading, "n_workers": 1})
     print_unit_warning(descriptor, result.dataset)
@@ -232,9 +232,9 @@ def _write_retrieval(out: Path, result: Described, summary: dict[str, Any], dist
 
     def ranking() -> Iterator[tuple[Any, ...]]:
         for i, order in enumerate(tqdm(rank(distances["distances"]), desc="rankings")):
-            away = distances["distances"][i].tolist()  # much faster than access to single entries of a tensor
+            row = distances["distances"][i].tolist()  # much faster than access to single entries of a tensor
             for place, j in enumerate(order[order != i].tolist(), 1):
-                yield names[i], place, names[j], f"{away[j]:.6g}", int(labels[i] == labels[j])
+                yield names[i], place, names[j], f"{row[j]:.6g}", int(labels[i] == labels[j])
 
     write_rows(out / "ranking.csv", ("query", "rank", "model", "distance", "relevant"), ranking())
     write_rows(out / "failures.csv", ("name", "error"), [(failure.id, failure.error) for failure in result.failures])

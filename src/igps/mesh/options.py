@@ -29,16 +29,16 @@ class LoadOptions:
 
     Args:
         mend: "auto" makes as few repairs as possible; "never" raises an error for a surface that bounds no body;
-            "always" makes every surface watertight that does not bound one body or crosses itself, for collections of
-            mixed quality.
+            "always" makes every surface watertight that crosses itself or does not bound a single body, for collections
+            of mixed quality.
         component: "largest" keeps only the connected component of the largest area.
         allow_open: accept open boundaries; the winding number then tells inside from outside.
-        bodies: what counts as a body. "whole": the whole file; "labels" of a volume; "objects" of a scene, solids of a
-            CAD file, files of an archive; "pieces": connected components; "chains", "models" or the "assembly" of a
-            molecule. None, or a kind that the format does not have: labels, chains, or else the whole file.
-        max_unpacked: maximal unpacked size of a file, in bytes.
+        bodies: what counts as a body: "whole" (the file), "labels" (of a volume), "objects" (of a scene, solids of a
+            CAD file, files of an archive), "pieces" (connected components), or "chains", "models" or "assembly" (of a
+            molecule). None, or a kind that the format does not have, selects labels, chains, or else the whole file.
+        max_unpacked: largest unpacked size of a file, in bytes.
         names: file with a table of label names, see `read_label_names`; None for the names in or beside the volume.
-        threshold: minimal probability of the voxels of a body, in volumes of probabilities.
+        threshold: smallest probability of the voxels of a body, in volumes of probabilities.
         cavities: "fill" fills hollow bodies; "keep" makes the surfaces of hollows part of their boundary.
 
     Raises:

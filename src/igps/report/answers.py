@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LEVEL = 0.05
-"""Bodies with a false discovery rate of at most this are marked."""
+"""Largest false discovery rate of bodies that are marked as significant."""
 _SIGNIFICANT, _OTHER = PALETTE[0], "#777777"
 
 
@@ -47,11 +47,11 @@ def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
         return None
     figure = new_figure(6.5, 1.2 + 0.24 * len(tested))
     axes = figure.add_subplot()
-    effects, lows, highs = (np.array([getattr(test, name) for test in tested]) for name in _INTERVAL)
-    for y, test in enumerate(tested):
+    intervals = np.array([(test.effect, test.effect_low, test.effect_high) for test in tested], dtype=float)
+    for y, (test, (effect, low, high)) in enumerate(zip(tested, intervals, strict=True)):
         colour = _SIGNIFICANT if (test.permanova_q or 0) <= LEVEL else _OTHER
-        axes.plot([lows[y], highs[y]], [y, y], color=colour, linewidth=1.6)
-        axes.plot(effects[y], y, "o" if colour == _SIGNIFICANT else "s", color=colour, markersize=5)
+        axes.plot([low, high], [y, y], color=colour, linewidth=1.6)
+        axes.plot(effect, y, "o" if colour == _SIGNIFICANT else "s", color=colour, markersize=5)
     axes.axvline(0, color="#BBBBBB", linewidth=0.8, zorder=0)
     axes.set_yticks(range(len(tested)), [shortened(test.body) for test in tested])
     axes.set_xlabel("share of squared distances that the groups explain, 95 % interval")
@@ -100,14 +100,8 @@ def map_figure(body_map: BodyMap, values: Sequence[str] | Sequence[float], title
             marker, colour = _MAP_MARKERS[number // len(PALETTE) % len(_MAP_MARKERS)], PALETTE[number % len(PALETTE)]
             handles.append(axes.scatter(x[own], y[own], s=20, label=name, linewidths=0.8, marker=marker, color=colour))
         if any(names):  # with explicit handles, because Matplotlib skips labels that begin with an underscore
-            figure.legend(
-                handles,
-                list(map(shortened, names)),
-                loc="outside right upper",
-                title=title,
-                fontsize=7,
-                ncols=1 + len(names) // 30,
-            )
+            labels, n_columns = list(map(shortened, names)), 1 + len(names) // 30
+            figure.legend(handles, labels, loc="outside right upper", title=title, fontsize=7, ncols=n_columns)
     else:
         figure.colorbar(axes.scatter(x, y, s=20, c=values, cmap="viridis"), label=title)
     axes.set(aspect="equal", xticks=[], yticks=[], xlabel=f"stress {body_map.stress:.2f}")
@@ -132,7 +126,7 @@ def clusters_figure(clustering: Clusters, names: Sequence[str]) -> Figure:
 
 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> None:
-    """Plot the precision of systems at equal levels of recall, both in percent, to a PNG file."""
+    """Plot the precision of descriptors at equal levels of recall, both in percent, to a PNG file."""
     figure = new_figure(8.5, 5.2)
     axes = figure.add_subplot()
     for i, (name, curve) in enumerate(curves.items()):
@@ -158,4 +152,3 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
 _STYLES, _MARKERS = ("-", "--", ":"), ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 _MAP_MARKERS = ("o", "s", "^", "x", "+", "D")
 _WHITE, _RED, _BLUE = (np.array(rgb) for rgb in ((0.9, 0.9, 0.9), (0.84, 0.25, 0.0), (0.0, 0.35, 0.7)))
-_INTERVAL = ("effect", "effect_low", "effect_high")

@@ -49,7 +49,7 @@ def paint(axis: Axes, vertices: Floats, faces: Integers, colour: Any) -> None:
 def axes_of(points: Floats) -> Floats:
     """Return a right-handed frame (3, 3) of points, columns x, y, z: y is the longest principal axis, x the next.
 
-    The slender end points down and the wide side left, so that similar bodies are drawn in the same orientation.
+    The slender end points down and the wide side to the left, so that similar bodies are drawn in the same orientation.
     """
     centred = points - points.mean(axis=0)
     axes: Floats = np.linalg.svd(centred, full_matrices=False)[2][:2]

@@ -23,7 +23,7 @@ class Painted:
     """Explanation of the distance between a body and its nearest, on the vertices of both surfaces."""
 
     other: str  # name of the nearest body
-    told: str  # the largest shares of the distance, as text
+    summary: str  # the largest shares of the distance, as text
     values: tuple[NDArray[np.uint8], NDArray[np.uint8]]  # (V,) of both surfaces: 128 for no share, larger for a share
 
 
@@ -54,7 +54,7 @@ def keep_explanations(
         path,
         names=np.array(list(results), dtype=str),
         others=np.array([painted.other for painted in results.values()], dtype=str),
-        told=np.array([painted.told for painted in results.values()], dtype=str),
+        told=np.array([painted.summary for painted in results.values()], dtype=str),
         counts=np.array([len(painted.values[0]) for painted in results.values()], dtype=np.int64),
         ends=np.cumsum([len(both) for both in values], dtype=np.int64),
         values=np.concatenate([np.empty(0, np.uint8), *values]),
@@ -63,7 +63,7 @@ def keep_explanations(
 
 
 def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[str, Painted]:
-    """Read the explanations of an archive whose surfaces are unchanged, by name; none if there is no file."""
+    """Read explanations from an archive, by name, if their surfaces have not changed; none if there is no file."""
     if not path.is_file():
         return {}
     with np.load(path) as archive:
@@ -71,10 +71,10 @@ def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[s
     results = {}
     columns = (arrays[name].tolist() for name in ("names", "others", "told", "counts"))
     split_values = np.split(arrays["values"], arrays["ends"])[:-1]
-    for name, other, told, count, values in zip(*columns, split_values, strict=True):
+    for name, other, summary, count, values in zip(*columns, split_values, strict=True):
         sizes = [len(surfaces[body].vertices) if body in surfaces else -1 for body in (name, other)]
         if sizes == [count, len(values) - count]:
-            results[name] = Painted(other, told, (values[:count], values[count:]))
+            results[name] = Painted(other, summary, (values[:count], values[count:]))
     return results
 
 
@@ -83,8 +83,8 @@ def _explain_pair(job: tuple[Descriptor, SignatureDataset, list[PageSurface]]) -
     with one_thread():
         explanation = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
     shares = explanation.places or explanation.samples
-    one, other = (_vertex_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i]) for i in (0, 1))
-    return Painted(dataset.bodies.names[1], explanation.summary(), (one, other))
+    first, second = (_vertex_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i]) for i in (0, 1))
+    return Painted(dataset.bodies.names[1], explanation.summary(), (first, second))
 
 
 def _vertex_values(mesh: Mesh, signature: Signature, shares: Shares, surface: PageSurface) -> NDArray[np.uint8]:

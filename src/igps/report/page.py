@@ -92,11 +92,9 @@ def _title(results: Results, data: Mapping[str, Any]) -> str:
 
 
 def _curve(i: int, system: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the precision–recall curve of the i-th system in SVG coordinates, with its style, name and values."""
+    """Return the precision–recall curve of the i-th descriptor in SVG coordinates, with its style, name and values."""
     values = list(zip(*system["curve"], strict=True))
-    points = [
-        (round(recall * _PLOT_WIDTH, 1), round((1 - precision) * _PLOT_HEIGHT, 1)) for recall, precision in values
-    ]
+    points = [(round(x * _PLOT_WIDTH, 1), round((1 - y) * _PLOT_HEIGHT, 1)) for x, y in values]
     path = "M" + " L".join(f"{x} {y}" for x, y in points)
     return {"style": i, "name": system["name"], "points": points, "path": path, "values": values}
 

@@ -17,8 +17,8 @@ from igps.report.surfaces import PageSurface
 from igps.retrieval import RetrievalScores, precision_recall_curve, retrieval_scores
 
 N_WORST = 20
-"""Largest number of worst confusions on the page."""
-_N_WRONG = 3  # wrong shapes that are shown for each of them
+"""Largest number of queries among the worst confusions on the page."""
+_N_WRONG = 3  # shapes of other classes that are shown for each of these queries
 _MIN_RANKED = 48  # shortest ranking of a query
 _DECIMALS = 5
 _QUERY_SCORES = ("nn", "ft", "st", "map")  # scores that are shown for each query
@@ -52,11 +52,11 @@ def _shapes(
 ) -> list[dict[str, Any]]:
     """Return the data of each body.
 
-    Every body has its `name`, `label` (index of its class), and `notes`; a body with a surface has `surface` (index
+    Every body has its `name`, `label` (index of its class), and `notes`. A body with a surface has `surface` (index
     among the surfaces, numbers of vertices and of faces), `mesh` (measures of the original mesh), `unit`, and the range
-    of the `potential`; one of several bodies in a file has its `part` and the indices of the others, `together`; and
-    an explained body has `explained`: its nearest (`other`), the largest shares (`told`), and the `values` of the
-    vertices of both surfaces.
+    of the `potential`. One of several bodies in a file has its `part` and the indices of the others, `together`. An
+    explained body has `explained`: its nearest (`other`), the largest shares as text (`summary`), and the `values` of
+    the vertices of both surfaces.
     """
     result, n_surfaces = [], 0
     files: dict[str, list[int]] = {}
@@ -84,7 +84,7 @@ def _shapes(
             painted = explanations[name]
             values = [base64_text(array.tobytes()) for array in painted.values]
             other = results.names.index(painted.other)
-            shape["explained"] = {"other": other, "told": painted.told, "values": values}
+            shape["explained"] = {"other": other, "summary": painted.summary, "values": values}
         result.append(shape)
     return result
 
@@ -144,7 +144,7 @@ def _map(system: System) -> dict[str, Any] | None:
         "cluster": clusters.labels.tolist(),
         "stability": finite(clusters.stability, _DECIMALS),
         "n_stable": sum(stability >= STABLE for stability in clusters.stability),
-        "tree": [[int(one), int(other), _significant(height)] for one, other, height, _ in clusters.tree.tolist()],
+        "tree": [[int(a), int(b), _significant(height)] for a, b, height, _ in clusters.tree.tolist()],
     }
 
 
@@ -164,12 +164,10 @@ def _confusion(order: Integers, labels: Sequence[str], classes: Sequence[str]) -
 def _worst(system: System, order: Integers, scores: RetrievalScores, indices: Integers) -> list[dict[str, Any]]:
     """Return the queries with the worst rankings, at most `N_WORST`, the worst first.
 
-    A ranking is worse the lower the first shape of the query's class is ranked; ties are ordered by the first tier,
-    then by name. Queries whose whole first tier is correct are left out.
-
-    Each has the `query` (index among all shapes), the `rank` of the first shape of its class, from 1, and the ranks of
-    at most three `wrong` shapes: those before the first shape of the class or, if this is the nearest, those in the
-    first tier.
+    The lower the first shape of the query's class is ranked, the worse is the ranking; ties are ordered by the first
+    tier, then by name. Queries whose whole first tier is correct are left out. Each has the `query` (index among all
+    shapes), the `rank` of the first shape of its class, from 1, and the ranks of at most three `wrong` shapes: those
+    before the first shape of the class or, if this is the nearest, those in the first tier.
     """
     _, codes = np.unique(np.asarray(system.labels), return_inverse=True)
     first_tier = scores.ft.numpy()  # NaN for a shape that is alone in its class

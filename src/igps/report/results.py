@@ -118,7 +118,7 @@ def write_sources(folder: Path, dataset: SignatureDataset) -> None:
 
 
 def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset | None:
-    """Return the dataset of a folder of results, None without meshes.json; `meshes` is where meshes were moved to.
+    """Return the dataset of a folder of results; None without meshes.json. Meshes that were moved lie in `meshes`.
 
     Raises:
         ValueError: meshes.json has another format.

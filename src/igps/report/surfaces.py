@@ -71,8 +71,7 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
     missing = [i for i, name in enumerate(names) if not _is_current(dataset.pipeline, bodies[i], stored.get(name))]
     if missing:
         make = partial(_surface_of_body, dataset.pipeline, fitting_vertices(len(names)))
-        jobs = {names[i]: bodies[i] for i in missing}
-        stored |= run_jobs(make, jobs, "picture", n_workers)
+        stored |= run_jobs(make, {names[i]: bodies[i] for i in missing}, "picture", n_workers)
     surfaces = {name: stored[name] for name in names if name in stored}
     if missing:
         write_surfaces(path, surfaces)
@@ -153,10 +152,7 @@ def read_surfaces(path: Path) -> dict[str, PageSurface]:
             raise ValueError(f"{path}: expected an archive of the format {_FORMAT}. Delete it and run again.")
         arrays = {name: archive[name] for name in archive}
     ends = np.cumsum(arrays["counts"], axis=0)
-    columns = [
-        np.split(arrays[name], ends[:, column])[:-1]
-        for name, column in (("vertices", 0), ("faces", 1), ("potential", 0))
-    ]
+    columns = [np.split(arrays[name], ends[:, i])[:-1] for name, i in (("vertices", 0), ("faces", 1), ("potential", 0))]
     columns += [arrays[name].tolist() for name in ("names", "measures", "mesh_counts", "keys", "units")]
     return {
         name: PageSurface(vertices, faces, potential, (low, high), n_v, n_f, area, volume, key, unit or None)
@@ -193,6 +189,6 @@ def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Float
     counts = np.bincount(cell_of)
     means = np.stack([np.bincount(cell_of, vertices[:, axis]) / counts for axis in range(3)], axis=1)
     clusters = cell_of[faces]
-    kept = clusters[(clusters != np.roll(clusters, 1, axis=1)).all(axis=1)]
-    _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
-    return compact(means, kept[np.sort(first)])
+    clusters = clusters[(clusters != np.roll(clusters, 1, axis=1)).all(axis=1)]  # without collapsed faces
+    _, first = np.unique(np.sort(clusters, axis=1), axis=0, return_index=True)
+    return compact(means, clusters[np.sort(first)])

@@ -35,10 +35,11 @@ class SignatureConfig:
         backend: "cotangent" or "robust", see `laplacian`. If the eigenpairs of the cotangent matrices do not reach the
             tolerance, the robust matrices are used, and a note of the Signature says so.
         max_vertices: meshes with more vertices are simplified first; None keeps them.
-        accuracy: bound on the relative error of 99 % of the interior distances; None for exact, slower evaluation.
-        attributes: of the samples: "depth" and "electrostatic_potential" (interior only) and "surface_direction", see
-            `interior_attributes` and `surface_attributes`.
-        seed: of the surface samples and of the eigensolver's start vectors.
+        accuracy: largest relative error of 99 % of the interior distances; mean value coordinates are approximated
+            within this bound to save time. None evaluates them exactly.
+        attributes: attributes of the samples: "depth" and "electrostatic_potential" (interior only) and
+            "surface_direction", see `interior_attributes` and `surface_attributes`.
+        seed: seed of the surface samples and of the eigensolver's start vectors.
         least_vertices: meshes with fewer vertices are subdivided when they are read, unless `mend` is "never"; None for
             two more than the number of eigenpairs, the fewest from which these can be computed.
     """

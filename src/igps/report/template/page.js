@@ -29,7 +29,7 @@ function rankingOf(shape) {
   return indices.map((i) => ({ shape: chosen.ranked[i], distance: chosen.distances[i] }));
 }
 
-// Whether the nearest shape is of the same class; null if the classes do not tell.
+// Whether the nearest shape is of the same class; null if this is unknown.
 function isNearestRight(shape) {
   const first = rankingOf(shape)?.[0];
   const isScored = systems[system]?.per_query?.nn[systems[system].row.get(shape)] != null;
@@ -222,7 +222,7 @@ function showMap() {
   byId("map-stress").textContent = map
     ? `The stress of the map is ${stress.toFixed(2)} (0: exact distances; above 0.2: strong distortion).`
     : "There is no map of these shapes.";
-  byId("tree-told").textContent = map ? `${n_stable} of ${stability.length} clusters are stable.` : "";
+  byId("tree-summary").textContent = map ? `${n_stable} of ${stability.length} clusters are stable.` : "";
   tree.show(map ? described : [], nodes);
   bodyMap.show(points.map(([x, y], row) => ({ shape: described[row], x, y })));
   colourMap();
@@ -246,11 +246,11 @@ function colourMap() {
 
 // A shape and its nearest, painted with their differences, from the front and from behind.
 function showExplained(shape) {
-  const { other, told, values } = shapes[shape].explained ?? {};
-  byId("explained").hidden = !told;
-  if (!told) return;
+  const { other, summary, values } = shapes[shape].explained ?? {};
+  byId("explained").hidden = !summary;
+  if (!summary) return;
   byId("explained-heading").textContent = `Where it differs from its nearest, ${shapes[other].name}`;
-  byId("explained-told").textContent = `${told}. Red: differs from the corresponding place of the other body; grey: does not.`;
+  byId("explained-summary").textContent = `${summary}. Red: differs from the corresponding place of the other body; grey: does not.`;
   const painted = [shape, other].flatMap((body, i) =>
     ["front", "back"].map((side) => {
       const canvas = element("canvas", { width: 1, height: 1, role: "img", "aria-label": `${shapes[body].name}, ${side}` });
@@ -265,7 +265,7 @@ function showWorst() {
   if (!byId("worst")) return;
   const worst = systems[system].worst;
   byId("worst-list").replaceChildren(...(worst ?? []).map(confusion));
-  byId("worst-some").hidden = !worst?.length;
+  byId("worst-rankings").hidden = !worst?.length;
   byId("worst-none").hidden = Boolean(worst?.length);
   byId("worst-none").textContent = worst
     ? "There are no confusions: for every query, all shapes of its class are ranked first."
