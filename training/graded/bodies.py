@@ -24,8 +24,7 @@ _MAX_POSES = 60
 _TRIAL_VERTICES = 2400
 _MAX_GRIDS = 6
 _MIN_ANGLE = 1.0  # smallest angle of a face at rest, degrees
-# Range of the strength of the changes from the skeleton of the class, from bodies as similar as two people to the
-# largest changes.
+# Range of the strength of all changes of a body; weak changes give bodies that are as similar as two people.
 _SPREAD = (0.3, 1.0)
 _ROLL = 230.0  # largest rolling of a sheet, degrees
 # Share of the poses in which limbs nearly touch: each is the closest of this number of poses.
@@ -57,7 +56,7 @@ class Warp:
 
 @dataclass(frozen=True)
 class Body:
-    """One body of a class."""
+    """A body of a class."""
 
     bones: Sequence[Bone]
     rig: Rig  # rods before the warp
@@ -108,7 +107,7 @@ def draw_body(body_class: BodyClass, kin: Sequence[int], seed: Sequence[int]) ->
         # Later draws deviate less: most failures are parts that meet, or parts that are too thin for the grid.
         rng = np.random.default_rng([*seed, draw])
         spread = rng.uniform(*_SPREAD) * (1.0 - 0.7 * draw / _MAX_DRAWS)
-        body = _draw_body(body_class, np.random.default_rng([*kin, draw]), rng, spread)
+        body = _draw_candidate(body_class, np.random.default_rng([*kin, draw]), rng, spread)
         for rotation in (np.eye(3), _random_rotation(rng)):
             vertices, faces = body.surface(_TRIAL_VERTICES, rotation)
             fault = _fault(body.warp(vertices), faces, body.genus, _TRIAL_VERTICES)
@@ -161,7 +160,7 @@ def draw_pose(body: Body, rng: np.random.Generator, target: int) -> Pose:
     return closest
 
 
-def _draw_body(body_class: BodyClass, kin: np.random.Generator, rng: np.random.Generator, spread: float) -> Body:
+def _draw_candidate(body_class: BodyClass, kin: np.random.Generator, rng: np.random.Generator, spread: float) -> Body:
     skeleton, motion = body_class.draw(kin)
     groups = sorted({part.group for part in skeleton.root.walk()})
     thickness = rng.uniform(-0.1, 0.22)

@@ -103,8 +103,7 @@ def centricity(mesh: Mesh, n_sources: int) -> Floats:
 
     The mean is over at most `n_sources` vertices by farthest-point sampling, each weighted by the area nearest to it.
     """
-    n_vertices = len(mesh.vertices)
-    distances = farthest_points(mesh, min(n_sources, n_vertices), _POINTS_PER_EDGE).distances
+    distances = farthest_points(mesh, min(n_sources, len(mesh.vertices)), _POINTS_PER_EDGE).distances
     area = vertex_areas(mesh.vertices, mesh.faces)
     weight = np.bincount(np.argmin(distances, axis=0), area, len(distances))
     return weight @ distances / weight.sum()
