@@ -15,7 +15,7 @@ from igps.data.datamodule import SignatureDataModule
 from igps.nn.learner import RetrievalLearner
 
 DEFAULTS = Path(__file__).parents[1] / "configs" / "default.yaml"
-_SHORT = {"root": ("data", "root"), "out": ("trainer", "default_root_dir"), "epochs": ("trainer", "max_epochs")}
+_SHORT_NAMES = {"root": ("data", "root"), "out": ("trainer", "default_root_dir"), "epochs": ("trainer", "max_epochs")}
 
 
 class Run(LightningCLI):
@@ -56,7 +56,7 @@ class Run(LightningCLI):
     def before_instantiate_classes(self) -> None:
         """Copy the values of short names to the options they stand for."""
         config = self.config[self.subcommand]
-        for name, (group, key) in _SHORT.items():
+        for name, (group, key) in _SHORT_NAMES.items():
             if config[name] is not None:
                 config[group][key] = config[name]
         last = Path(config.trainer.default_root_dir or ".") / "checkpoints" / "last.ckpt"

@@ -12,7 +12,8 @@ import trimesh
 from training.graded import GradedShape, GradedShapes, body_of
 from training.graded.bodies import Pose, draw_body, draw_pose
 from training.graded.kinds import KINDS, LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, body_classes
-from training.graded.plates import MACHINES, SHEETS, Helix, Plate, machine, sheet
+from training.graded.plates import MACHINES, SHEETS, Plate, machine, sheet
+from training.graded.springs import Helix
 
 from igps.data.sources import find_bodies
 from igps.mesh.loading import load_mesh

@@ -11,12 +11,12 @@ from training.studies import pages
 from igps.signature.signature import SignatureConfig
 
 PAGES = {page.relative_to(pages.DOCS).as_posix(): page.read_text("utf-8") for page in pages.DOCS.rglob("*.md")}
-SHOWN = [(page, name) for page, text in sorted(PAGES.items()) for name in pages.shown(text)]
+SHOWN = [(page, name) for page, text in sorted(PAGES.items()) for name in pages.table_names(text)]
 
 
 @pytest.mark.parametrize(("page", "name"), SHOWN)
 def test_a_table_is_of_the_signatures_of_today(page: str, name: str) -> None:
-    assert pages.kept(name)["signatures"] == SignatureConfig.ALGORITHM_VERSION, f"{page}: measure {name} again"
+    assert pages.load_results(name)["signatures"] == SignatureConfig.ALGORITHM_VERSION, f"{page}: measure {name} again"
 
 
 @pytest.mark.parametrize("page", sorted({page for page, _ in SHOWN}))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch.testing import assert_close
-from training.studies.set_encoder import N_SAMPLES, SetEncoder, features, trained
+from training.studies.set_encoder import N_SAMPLES, SetEncoder, features, train_encoder
 
 import igps
 
@@ -32,7 +32,7 @@ def test_it_learns_to_tell_sets_apart() -> None:
     torch.manual_seed(0)
     labels = torch.arange(4).repeat_interleave(12)
     sets = torch.randn(48, 2 * N_SAMPLES, 6) * (1 + labels[:, None, None])
-    encoder = trained(sets[::2], labels[::2], 20, seed=0)
+    encoder = train_encoder(sets[::2], labels[::2], 20, seed=0)
     with torch.no_grad():
         found, seen = encoder(sets[1::2]), encoder(sets[::2])
     nearest = labels[::2][(found @ seen.T).argmax(dim=1)]

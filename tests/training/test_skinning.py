@@ -8,8 +8,9 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from training.graded.kinds import KINDS
-from training.graded.rods import Binding, Rig, Rod, at_rest, bend, bind, carry, limbs
-from training.graded.skinning import Motions, after, motion, moved, normalized, product, turn_about
+from training.graded.rigging import bones_at_rest, limb_rig
+from training.graded.rods import Binding, Rig, Rod, bend, bind, rod_motions
+from training.graded.skinning import Motions, compose, motion, normalized, product, rotations_about, transform
 
 from igps.shapes.skeleton import Part, Skeleton, limb
 from igps.shapes.solids import Blob, Solid
@@ -34,33 +35,35 @@ def test_products_are_those_of_rotations() -> None:
 
 def test_a_motion_turns_and_then_moves() -> None:
     turns, steps = Rotation.random(50, rng=3), g.normal(size=(50, 3))
-    found = moved(motion(scalar_first(turns), steps), POINTS)
+    found = transform(motion(scalar_first(turns), steps), POINTS)
     np.testing.assert_allclose(found, turns.apply(POINTS) + steps, atol=1e-13)
 
 
 def test_a_turn_about_a_point_leaves_it_where_it_is() -> None:
     vectors, centres = g.normal(size=(50, 3)), g.normal(size=(50, 3))
-    turns = turn_about(centres, vectors)
-    np.testing.assert_allclose(moved(turns, centres), centres, atol=1e-13)
+    turns = rotations_about(centres, vectors)
+    np.testing.assert_allclose(transform(turns, centres), centres, atol=1e-13)
     expected = Rotation.from_rotvec(vectors).apply(POINTS - centres) + centres
-    np.testing.assert_allclose(moved(turns, POINTS), expected, atol=1e-13)
-    still = turn_about(centres, np.zeros((50, 3)))
-    np.testing.assert_allclose(moved(still, POINTS), POINTS, atol=1e-15)
+    np.testing.assert_allclose(transform(turns, POINTS), expected, atol=1e-13)
+    still = rotations_about(centres, np.zeros((50, 3)))
+    np.testing.assert_allclose(transform(still, POINTS), POINTS, atol=1e-15)
 
 
 def test_one_motion_after_another() -> None:
-    first, second = (turn_about(g.normal(size=(50, 3)), g.normal(size=(50, 3))) for _ in range(2))
-    np.testing.assert_allclose(moved(after(first, second), POINTS), moved(first, moved(second, POINTS)), atol=1e-13)
+    first, second = (rotations_about(g.normal(size=(50, 3)), g.normal(size=(50, 3))) for _ in range(2))
+    np.testing.assert_allclose(
+        transform(compose(first, second), POINTS), transform(first, transform(second, POINTS)), atol=1e-13
+    )
 
 
 def test_a_blend_is_rigid_and_half_way_between() -> None:
     """Of a rotation and no motion about the same point: half the angle."""
     axis = np.array([0.0, 0.0, 1.0])
     centre = np.array([1.0, 2.0, 3.0])
-    a, b = turn_about(centre, 0.0 * axis), turn_about(centre, 1.6 * axis)
+    a, b = rotations_about(centre, 0.0 * axis), rotations_about(centre, 1.6 * axis)
     half = normalized(Motions(0.5 * (a.real + b.real), 0.5 * (a.dual + b.dual)))
     expected = Rotation.from_rotvec(0.8 * axis).apply(POINTS - centre) + centre
-    np.testing.assert_allclose(moved(half, POINTS), expected, atol=1e-13)
+    np.testing.assert_allclose(transform(half, POINTS), expected, atol=1e-13)
 
 
 def cylinder(length: float, radius: float) -> trimesh.Trimesh:
@@ -88,7 +91,7 @@ def bent_bar(turns: Array) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
     bar, rod = cylinder(3.0, 0.2), straight_rod(3.0, 0.2, len(turns))
     rig = Rig((rod,), np.zeros(1, dtype=np.int64))
     binding = Binding(np.ones((len(bar.vertices), 1)), bar.vertices[:, 2:3])
-    vertices = bend(bar.vertices, rig, binding, carry(rig, [turns]))
+    vertices = bend(bar.vertices, rig, binding, rod_motions(rig, [turns]))
     return bar, trimesh.Trimesh(vertices, bar.faces, process=False)
 
 
@@ -123,8 +126,8 @@ def test_a_hinge_keeps_lengths_near_both_bones() -> None:
     rig = Rig((first, second), np.arange(2))
     share = np.clip((z - 1.2) / 0.6, 0.0, 1.0)
     binding = Binding(np.stack([1 - share, share], axis=1), np.zeros((len(z), 2)))
-    carried = carry(rig, [np.zeros((1, 3)), np.array([[1.2, 0.0, 0.0]])])
-    bent = bend(bar.vertices, rig, binding, carried)
+    motions = rod_motions(rig, [np.zeros((1, 3)), np.array([[1.2, 0.0, 0.0]])])
+    bent = bend(bar.vertices, rig, binding, motions)
     edges = bar.edges_unique
     outside = (np.abs(z[edges] - 1.5) > 0.31).all(axis=1)
     lengths = [np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1)[outside] for v in (bar.vertices, bent)]
@@ -140,10 +143,10 @@ def test_weights_are_shares_and_follow_the_nearest_rod() -> None:
     arm = limb("arm", [0.6, 0.6], [0.15, 0.13, 0.12], [(20, 10), (25, 0)])
     hub: Solid = Blob((0.4, 0.4, 0.4))
     skeleton = Skeleton(Part(hub, children=tuple(arm.joined((0, 0, 0.3 * s), (0, 0, s)) for s in (-1, 1))))
-    bones = at_rest(skeleton, {})
-    rig = limbs(bones)
+    bones = bones_at_rest(skeleton, {})
+    rig = limb_rig(bones)
     assert [rod.parent for rod in rig.rods] == [-1, 0, 0]  # the hub, and two arms of two bones each
-    assert rig.owner.tolist() == [0, 1, 1, 2, 2]
+    assert rig.rod_of_solid.tolist() == [0, 1, 1, 2, 2]
     bar = cylinder(1.6, 0.13)
     both = trimesh.util.concatenate([bar, trimesh.creation.icosphere(4, 0.4).apply_translation([2, 0, 0])])
     binding = bind(np.asarray(both.vertices), np.asarray(both.faces), rig, [bone.placed for bone in bones])
@@ -156,7 +159,7 @@ def test_weights_are_shares_and_follow_the_nearest_rod() -> None:
     assert (weights[:, 1] == 0.0).all()  # the other arm is nowhere near
     # Along the arm its arc length, which begins at its root 0.3 from the middle.
     middle = (z > 0.8) & (z < 1.3)
-    np.testing.assert_allclose(binding.along[: len(z)][middle, 2], z[middle] - 0.3, atol=0.02)
+    np.testing.assert_allclose(binding.arc_lengths[: len(z)][middle, 2], z[middle] - 0.3, atol=0.02)
     # From the hub to the arm the weights go over without a step.
     levels = np.unique(z)
     mean = np.array([weights[z == level, 2].mean() for level in levels])
@@ -166,8 +169,8 @@ def test_weights_are_shares_and_follow_the_nearest_rod() -> None:
 def test_trunks_bend_and_frames_do_not() -> None:
     """A wheel without limbs has no joint at all; the trunk of a four-legged animal is a rod, its legs too."""
     wheel = KINDS["wheel"].build(np.random.default_rng(0), 4, 3, "none", "plain")
-    assert all(len(rod.along) == 1 for rod in limbs(at_rest(wheel, {})).rods)
-    rods = limbs(at_rest(TEMPLATES["quadruped"](), {})).rods
+    assert all(len(rod.arc_lengths) == 1 for rod in limb_rig(bones_at_rest(wheel, {})).rods)
+    rods = limb_rig(bones_at_rest(TEMPLATES["quadruped"](), {})).rods
     assert len(rods[0].joints) == 1  # the spine
     knees = [rod for rod in rods if len(rod.joints) == 2 and not rod.joints[1].is_root]
     assert len(knees) >= 4

@@ -1,6 +1,7 @@
-"""Kinds of bodies that are made: vessels, furniture, tools.
+"""Builders of artefacts: vessels, wheels, tables, tools, tongs and stacks.
 
-A builder draws its proportions from ``g``; its other arguments are the structure that tells classes apart.
+A builder draws proportions from the random generator `g`. Its other arguments are the structural choices that
+distinguish classes.
 """
 
 from dataclasses import replace
@@ -14,7 +15,7 @@ from training.graded.polygons import Frame, Prism
 
 
 def vessel(g: np.random.Generator, body: str, handles: int, foot: str, extra: str) -> Skeleton:
-    """A hollow body of revolution with handles, feet and a spout."""
+    """Build a hollow body of revolution with handles, a foot, and a spout or knobs."""
     wide, high, wall = g.uniform(0.4, 0.6), g.uniform(0.95, 1.4), g.uniform(0.17, 0.21)
     profile = [(float(r), float(z)) for r, z in _profile(g, body, wide, high)]
     radii, heights = np.array(profile).T
@@ -24,7 +25,7 @@ def vessel(g: np.random.Generator, body: str, handles: int, foot: str, extra: st
         z = share * heights[-1]
         return float(np.interp(z, heights[rising], radii[rising])), float(z)
 
-    # Ears span a straight or hollow stretch of the wall: over a bulge nothing would be left of their opening.
+    # Handles span a straight or concave part of the wall, because a bulge would fill their opening.
     ends = {"bowl": (0.08, 0.93), "vase": (0.42, 0.98), "bottle": (0.35, 0.93)}.get(body, (0.18, 0.85))
     (r0, z0), (r1, z1) = (wall_at(share) for share in ends)
     rise = z1 - z0
@@ -53,7 +54,7 @@ def vessel(g: np.random.Generator, body: str, handles: int, foot: str, extra: st
 
 
 def _profile(g: np.random.Generator, body: str, wide: float, high: float) -> list[tuple[float, float]]:
-    """The wall of a vessel as (radius, height) from the bottom up."""
+    """The wall of a vessel: points (radius, height) from the bottom up."""
     match body:
         case "bowl":
             sweep = np.linspace(0.0, g.uniform(1.4, 1.9), 9)
@@ -71,7 +72,7 @@ def _profile(g: np.random.Generator, body: str, wide: float, high: float) -> lis
 
 
 def wheel(g: np.random.Generator, n: int, spokes: int, limbs: str, end: str) -> Skeleton:
-    """A rigid frame, with spokes inside and limbs at its corners."""
+    """Build a rigid frame with spokes inside and limbs at its corners."""
     radius = g.uniform(0.75, 0.95) * (1.0 + 0.07 * spokes)
     style = LimbStyle.draw(g, "jointed" if limbs == "rays" else "straight", end, 0.6, 0.11)
     corners = circle(n)
@@ -92,11 +93,11 @@ def wheel(g: np.random.Generator, n: int, spokes: int, limbs: str, end: str) -> 
 
 
 def table(g: np.random.Generator, top: str, legs: int, back: str) -> Skeleton:
-    """A plate on legs, with or without a back."""
+    """Build a plate on legs, with or without a back."""
     wide, thick = g.uniform(0.5, 0.75), g.uniform(0.17, 0.24)
     hoop, long = top == "hoop", top == "long"
     solid: Solid
-    match top:  # the plate, how far out its legs stand, and how far back its back
+    match top:  # the plate, and the distances of legs and back from its centre
         case "round":
             solid, reach, rear = Prism(24, wide, thick, 0.07), 0.72 * wide, 0.8 * wide
         case "square":
@@ -129,13 +130,13 @@ def table(g: np.random.Generator, top: str, legs: int, back: str) -> Skeleton:
             parts.append(limb("back", [0.8], [0.12, 0.11], [(12, 12)], knob).joined(place))
         case "horns":
             horn = limb("back", [0.5, 0.3], [0.12, 0.11, 0.1], [(12, 12)])
-            for s in (-1, 1):  # on a hoop, in front and behind, where its tube is
+            for s in (-1, 1):  # on a hoop, in front and behind, where it has its tube
                 parts.append(horn.joined((0, rear * s, 0) if hoop else (0.5 * wide * s, rear, 0), (0.3 * s, 0.1, 1)))
     return Skeleton(Part(solid, children=tuple(parts)))
 
 
 def tool(g: np.random.Generator, shaft: str, head: str, pommel: str) -> Skeleton:
-    """A shaft with a head and a pommel."""
+    """Build a shaft with a head and a pommel."""
     style = LimbStyle.draw(g, shaft, head, g.uniform(1.1, 1.9), 0.13, 12.0)
     root = replace(style, end=style.start * g.uniform(0.8, 1.25), curl=0.6 * style.curl).grow("shaft")
     butt = ending(pommel, 0.95 * style.start, "pommel", ORIGIN, aim(DOWN))
@@ -143,7 +144,7 @@ def tool(g: np.random.Generator, shaft: str, head: str, pommel: str) -> Skeleton
 
 
 def tongs(g: np.random.Generator, jaw: str, grip: str, arms: int) -> Skeleton:
-    """Two or three arms that cross at a pivot."""
+    """Build two or three arms that cross at a pivot."""
     front, rear = g.uniform(0.6 if jaw in ("plain", "hook") else 0.85, 1.1), g.uniform(0.85, 1.3)
     opening = g.uniform(26.0, 38.0) if arms == 2 else g.uniform(38.0, 48.0)
     r = g.uniform(0.11, 0.14)
@@ -159,7 +160,7 @@ def tongs(g: np.random.Generator, jaw: str, grip: str, arms: int) -> Skeleton:
 
 
 def stack(g: np.random.Generator, layers: tuple[str, ...], side: str) -> Skeleton:
-    """Layers on top of one another, with things at the side of the first."""
+    """Build layers on top of each other, with limbs at the sides of the first layer."""
     children: tuple[Part, ...] = ()
     for i, layer in reversed(list(enumerate(layers))):
         size = g.uniform(0.28, 0.5)
@@ -177,7 +178,7 @@ def stack(g: np.random.Generator, layers: tuple[str, ...], side: str) -> Skeleto
                 solid, high = Ring(size, 0.13), 2.0 * size + 0.1
         children = tuple(replace(child, at=(0, 0, high)) for child in children)
         if i == 0:
-            # A hoop carries its limbs left and right, where its tube is; a post is thin whatever its height.
+            # A hoop has its limbs on the left and right, where it has its tube. Posts are thin whatever their height.
             reach = {"hoop": size, "post": 0.12}.get(layer, 0.85 * size)
             count, kind, end, length = {
                 "bare": (0, "stub", "plain", 0.3),

@@ -1,6 +1,7 @@
-"""Kinds of bodies that grow: limbs around a hub, along a spine or out of a trunk.
+"""Builders of creatures: limbs around a hub, along a spine, or on a trunk.
 
-A builder draws its proportions from ``g``; its other arguments are the structure that tells classes apart.
+A builder draws proportions from the random generator `g`. Its other arguments are the structural choices that
+distinguish classes.
 """
 
 from dataclasses import replace
@@ -14,7 +15,7 @@ from training.graded.polygons import Frame, Prism
 
 
 def star(g: np.random.Generator, core: str, n: int, kind: str, end: str) -> Skeleton:
-    """Limbs around a hub, with n-fold symmetry."""
+    """Build a hub with `n` limbs, with n-fold symmetry."""
     style = LimbStyle.draw(g, kind, end, float(np.clip(6.5 / n, 0.8, 1.4)), 0.13)
     radius = max(0.36, 0.5 * n * style.start) * g.uniform(0.95, 1.3)
     rise = g.uniform(-0.8, 0.8)
@@ -38,7 +39,7 @@ def star(g: np.random.Generator, core: str, n: int, kind: str, end: str) -> Skel
 
 
 def tree(g: np.random.Generator, branches: int, twigs: int, end: str, base: str) -> Skeleton:
-    """A trunk that branches once or twice."""
+    """Build a trunk that branches once or twice."""
     style = LimbStyle.draw(g, "straight", end, 0.42 if twigs else 0.3, 0.1, 10.0)
     rise, spread = g.uniform(0.2, 1.3), g.uniform(0.6, 1.0)
     length = g.uniform(0.4, 0.75)
@@ -61,7 +62,7 @@ def tree(g: np.random.Generator, branches: int, twigs: int, end: str, base: str)
 
 
 def beast(g: np.random.Generator, pairs: int, stance: str, head: str, tail: str) -> Skeleton:
-    """A body with pairs of legs, a head and a tail: bilateral symmetry."""
+    """Build a body with bilateral symmetry: pairs of legs, a head and a tail."""
     half = 0.3 + 0.15 * pairs * g.uniform(0.9, 1.25)
     girth = g.uniform(0.22, 0.36)
     kind, end, length = ("straight", "paddle", 0.4) if stance == "fins" else ("jointed", "plain", 0.85)
@@ -90,15 +91,15 @@ def beast(g: np.random.Generator, pairs: int, stance: str, head: str, tail: str)
 
 
 def chain(g: np.random.Generator, n: int, link: str, end: str) -> Skeleton:
-    """Links in a row, with a joint between any two."""
+    """Build a row of `n` links with joints between them."""
     radius = g.uniform(0.22, 0.3)
-    stiff = link in ("boxes", "plates", "tubes")  # edges of neighbours must not meet when the chain bends
+    is_stiff = link in ("boxes", "plates", "tubes")  # their edges must not meet when the chain bends
     gap = g.uniform(0.08, 0.2) + {"boxes": 0.12, "plates": 0.16, "tubes": 0.14}.get(link, 0.0)
-    bow = g.uniform(-8.0, 8.0) if stiff else g.uniform(-16.0, 16.0)
+    bow = g.uniform(-8.0, 8.0) if is_stiff else g.uniform(-16.0, 16.0)
     side = g.uniform(0.0, 0.25)
-    if link in ("rings", "crossed"):  # they touch; the others are held apart by a bridge
+    if link in ("rings", "crossed"):  # rings touch; other links are connected by bridges
         gap = 0.0
-    limit = 10.0 if stiff else 16.0
+    limit = 10.0 if is_stiff else 16.0
     turn = turned("z", 90.0 if link == "crossed" else 0.0) @ turned("x", bow)
     children = ending(end, 0.12, "end")
     for i in range(n):
@@ -112,7 +113,7 @@ def chain(g: np.random.Generator, n: int, link: str, end: str) -> Skeleton:
 
 
 def _link(kind: str, radius: float, side: float, scale: float) -> tuple[Solid, float]:
-    """A link of a chain and its length; ``side`` draws out rings, ``scale`` is the size of a shrinking one."""
+    """A link of a chain, and its length; `side` elongates rings, and `scale` is the size of shrinking links."""
     match kind:
         case "beads":
             return Blob((radius,) * 3), 2.0 * radius
@@ -129,7 +130,7 @@ def _link(kind: str, radius: float, side: float, scale: float) -> tuple[Solid, f
 
 
 def comb(g: np.random.Generator, n: int, sides: str, end: str) -> Skeleton:
-    """A spine with teeth; a ladder where a second rail joins their ends."""
+    """Build a spine with `n` teeth, or a ladder with `n` rungs between two rails."""
     step = g.uniform(0.34, 0.44) + {"knob": 0.15, "disc": 0.35}.get(end, 0.0)
     reach = g.uniform(0.4, 0.7)
     if sides == "ladder":
@@ -139,7 +140,7 @@ def comb(g: np.random.Generator, n: int, sides: str, end: str) -> Skeleton:
         rungs = [replace(rung, at=(0, 0, i * step), children=() if i else (second,)) for i in range(n)]
         return Skeleton(Part(rail, children=(*rungs, *ending(end, 0.12, "end", (0, 0, rail.length)))), n - 1)
     tooth = LimbStyle.draw(g, "straight", end, reach, 0.1, 8.0).grow("tooth")
-    roll = 0.5 * np.pi if end == "hook" else 0.0  # flat endings stand across the spine
+    roll = 0.5 * np.pi if end == "hook" else 0.0  # hooks stand across the spine
     segments: tuple[Part, ...] = ()
     for i in reversed(range(n)):
         headings = {"one": [1], "both": [-1, 1], "zigzag": [1 if i % 2 else -1]}[sides]
@@ -150,7 +151,7 @@ def comb(g: np.random.Generator, n: int, sides: str, end: str) -> Skeleton:
 
 
 def serpent(g: np.random.Generator, n: int, ornament: str, head: str) -> Skeleton:
-    """A long body that bends, with an ornament on each second segment."""
+    """Build a long flexible body of `n` segments with ornaments: on every second segment, or on all if `n` < 5."""
     step, girth = g.uniform(0.3, 0.42), g.uniform(0.13, 0.2)
     radii = girth * np.interp(range(n + 1), [0, 0.5 * n, n], [g.uniform(0.6, 0.9), 1.0, 0.9])
     middle = (0, 0, 0.5 * step)

@@ -1,7 +1,7 @@
-"""The classes of the graded shapes: kinds of bodies, how they move, and which resemble the classes of SHREC'07.
+"""The classes of the graded shapes: kinds of bodies, their motion, and their resemblance to classes of SHREC'07.
 
-A class is a kind and some of its builder's structural choices. Its bodies draw the other choices and all proportions,
-so that two bodies of a class differ as two chairs do, and two poses of a body as a cat does from itself.
+A class is a kind with fixed structural choices, except at most one that each body draws for itself, together with all
+proportions. Two bodies of a class differ like two chairs, and two poses of a body like two postures of a cat.
 """
 
 import itertools
@@ -14,7 +14,8 @@ from igps.shapes.skeleton import Skeleton
 from igps.shapes.templates import TEMPLATES
 from training.graded.artefacts import stack, table, tongs, tool, vessel, wheel
 from training.graded.creatures import beast, chain, comb, serpent, star, tree
-from training.graded.plates import MACHINES, SHEETS, coil, machine, sheet
+from training.graded.plates import MACHINES, SHEETS, machine, sheet
+from training.graded.springs import coil
 
 Motion = Literal["limbs", "hinges", "sheet", "rigid"]
 
@@ -32,7 +33,7 @@ LOOK_ALIKE_TEMPLATES = {
     "fish": "fish",
     "bird": "bird, airplane",
 }
-"""The named templates, and the classes of SHREC'07 that each resembles."""
+"""Classes of SHREC'07 that each named template resembles."""
 
 LOOK_ALIKE_FAMILIES = {
     "star": "octopus",
@@ -43,56 +44,56 @@ LOOK_ALIKE_FAMILIES = {
     "machine": "mechanical part, bearing",
     "coil": "spring",
 }
-"""The families some of whose classes resemble classes of SHREC'07, and which."""
+"""Classes of SHREC'07 that some classes of each family resemble."""
 
 
 class Kind(NamedTuple):
-    """A way to build bodies."""
+    """A family of classes with the same builder."""
 
-    build: Callable[..., Skeleton]  # of a random generator and a structure
-    structures: Sequence[tuple[Any, ...]]  # all that can be built, in each of which two classes may differ
-    loose: int | None  # position of the choice in a structure that is a body's own and not its class's; None if none is
-    motion: Callable[[tuple[Any, ...]], Motion]  # how the bodies of a structure move
+    build: Callable[..., Skeleton]  # builder, called with a random generator and the choices of a structure
+    structures: Sequence[tuple[Any, ...]]  # valid combinations of structural choices
+    loose: int | None  # position of the choice that varies within a class; None if there is none
+    motion: Callable[[tuple[Any, ...]], Motion]  # motion of the bodies of a structure
 
 
 class BodyClass(NamedTuple):
-    """A class: its name, kind, and the structures that its bodies may have."""
+    """A class: its name, its kind, and the possible structures of its bodies."""
 
     name: str
     kind: Kind
     structures: Sequence[tuple[Any, ...]]
 
     def draw(self, g: np.random.Generator) -> tuple[Skeleton, Motion]:
-        """The skeleton of a body, and how it moves."""
+        """Draw the skeleton of a body, and return it with its motion."""
         structure = self.structures[int(g.integers(len(self.structures)))]
         return self.kind.build(g, *structure), self.kind.motion(structure)
 
 
 def body_classes(seed: int, look_alikes: bool = True) -> list[BodyClass]:
-    """All classes in order: the named templates, then the kinds in turn, each in an order of its own.
+    """Return all classes: the named templates, then one class of each kind in turn, in a random order within a kind.
 
     Args:
-        seed: of those orders.
-        look_alikes: with the templates and families that resemble classes of SHREC'07, or with others in their place.
+        seed: seed of the order.
+        look_alikes: whether to include the templates and families that resemble classes of SHREC'07.
     """
-    found: list[BodyClass] = []
+    classes: list[BodyClass] = []
     if look_alikes:
-        found += [BodyClass(name, _template(name), [()]) for name in TEMPLATES]
+        classes += [BodyClass(name, _template(name), [()]) for name in TEMPLATES]
     queues = []
-    for place, (name, kind) in enumerate(KINDS.items()):
+    for number, (name, kind) in enumerate(KINDS.items()):
         if not look_alikes and name in LOOK_ALIKE_FAMILIES:
             continue
         groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
         for structure in kind.structures:
             groups.setdefault(tuple(c for i, c in enumerate(structure) if i != kind.loose), []).append(structure)
-        order = np.random.default_rng([seed, place]).permutation(len(groups))
+        order = np.random.default_rng([seed, number]).permutation(len(groups))
         keys = list(groups)
         queues.append([(name, kind, keys[i], groups[keys[i]]) for i in order])
     for turn in itertools.zip_longest(*queues):
-        for name, kind, key, structures in (one for one in turn if one is not None):
+        for name, kind, key, structures in filter(None, turn):
             words = [str(word) for choice in key for word in (choice if isinstance(choice, tuple) else (choice,))]
-            found.append(BodyClass("-".join([name, *words, f"{len(found):03d}"]), kind, structures))
-    return found
+            classes.append(BodyClass("-".join([name, *words, f"{len(classes):03d}"]), kind, structures))
+    return classes
 
 
 def _template(name: str) -> Kind:
@@ -107,7 +108,7 @@ def _kind(
     motion: Motion | Callable[[tuple[Any, ...]], Motion] = "limbs",
     where: Callable[..., bool] = lambda *_: True,
 ) -> Kind:
-    """The kind of all combinations of structural choices that can be built; one of the choices may be loose."""
+    """Make a kind of all combinations of choices that meet `where`; `loose` is the position of the loose choice."""
     structures = [structure for structure in itertools.product(*choices) if where(*structure)]
     return Kind(build, structures, loose, motion if callable(motion) else lambda _: motion)
 
@@ -231,4 +232,4 @@ _ALL = (
     _kind(coil, (1.5, 2.5, 3.5, 4.5), ("plain", "knob", "disc")),
 )
 KINDS = {kind.build.__name__: kind for kind in _ALL}
-"""The kinds of bodies by name."""
+"""The kinds of bodies by the name of their builder."""

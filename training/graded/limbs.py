@@ -1,4 +1,4 @@
-"""The limbs of drawn bodies: their kinds, and what sits at their ends."""
+"""Limbs of generated bodies, and the parts at their ends."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from training.graded.polygons import Prism
 
 
 def ending(kind: str, r: float, group: str, at: Vector = ORIGIN, turn: Floats | None = None) -> tuple[Part, ...]:
-    """What sits at the end ``at`` of a limb of radius ``r``, in the frame ``turn`` of the limb (upright if None)."""
+    """Return the parts at the end `at` of a limb of radius `r` whose frame is `turn`, upright if None."""
     frame = np.eye(3) if turn is None else turn
 
     def part(solid: Solid, lift: float, heading: Vector = UP) -> Part:
@@ -48,27 +48,27 @@ def ending(kind: str, r: float, group: str, at: Vector = ORIGIN, turn: Floats | 
 
 @dataclass(frozen=True)
 class LimbStyle:
-    """What the limbs of one class have in common."""
+    """The common properties of the limbs of a body."""
 
     kind: str  # stub, straight, bent, jointed or tentacle
-    ending: str  # what sits at the end, see `ending`
-    length: float  # of the whole limb; a stub has 0.3 of it
-    start: float  # radius
-    end: float  # radius
-    curl: float  # radians; of a bent tube's sweep, or of a jointed limb's knee
-    swing: float  # limit of the first joint, degrees; later ones bend more
+    ending: str  # kind of the parts at the end, see `ending`
+    length: float  # of the whole limb; a stub is 0.3 times as long
+    start: float  # radius at the root
+    end: float  # radius at the end
+    curl: float  # angle at rest: of the arc of a bent limb, or of the joints of other limbs; radians
+    swing: float  # limit of the first joint, degrees; other joints bend more
 
     @classmethod
     def draw(
         cls, g: np.random.Generator, kind: str, ending: str, length: float, radius: float, swing: float = 14.0
     ) -> LimbStyle:
-        """Draw the proportions around the given ones."""
+        """Draw proportions near the given length and radius."""
         start = radius * g.uniform(0.95, 1.25)
         curl = g.uniform(0.8, 1.6) if kind == "bent" else g.choice([-1.0, 1.0]) * g.uniform(0.2, 0.9)
         return cls(kind, ending, length * g.uniform(0.8, 1.25), start, start * g.uniform(0.62, 0.95), curl, swing)
 
     def grow(self, group: str = "limb") -> Part:
-        """One limb, to be joined to a body; it curls towards its own y."""
+        """Return a limb that curls towards its own y, to be joined to a body."""
         if self.kind == "bent":
             arc = Arc(self.length / self.curl, self.curl, self.start, self.end)
             tangent = Rotation.from_euler("x", -self.curl).as_matrix()

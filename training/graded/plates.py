@@ -1,6 +1,7 @@
-"""Flat plates with thickness, and the families that are made of them: sheets that are rolled and folded, machine parts.
+"""Plates, and builders of sheets and of parts of machines.
 
-A builder draws its proportions from ``g``; its other arguments are the structure that tells classes apart.
+A builder draws proportions from the random generator `g`. Its other arguments are the structural choices that
+distinguish classes.
 """
 
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ import numpy as np
 
 from igps._arrays import Floats
 from igps.shapes.skeleton import Part, Skeleton, circle, turned
-from igps.shapes.solids import Blob, Cone, Ring, Shell, Solid, Vector
+from igps.shapes.solids import Cone, Ring, Shell, Solid, Vector
 from training.graded.polygons import Prism
 
 Bar = tuple[float, float, float, float, float, float]
@@ -20,11 +21,11 @@ Hole = tuple[float, float, float]
 class Plate(Solid):
     """A plate in the x-y plane, its outline a union of bars and discs, with round holes."""
 
-    bars: tuple[Bar, ...]  # (x, y) to (x, y) and the half widths at both ends; a disc is a bar without length
-    holes: tuple[Hole, ...]  # (x, y) and radius
-    thick: float  # the plate's thickness
-    loops: int = 0  # handles that bars make which meet again; holes come on top
-    fillet: float = 0.06  # how far corners between bars are filled
+    bars: tuple[Bar, ...]  # coordinates (x, y) and (x, y) of the ends, and half widths there; a disc has length 0
+    holes: tuple[Hole, ...]  # coordinates (x, y), and radius
+    thick: float  # thickness
+    loops: int = 0  # number of handles that bars form; holes are counted separately
+    fillet: float = 0.06  # distance within which corners between bars are filled
 
     @property
     def genus(self) -> int:
@@ -56,7 +57,7 @@ class Plate(Solid):
         return np.array([*low, -half]), np.array([*high, half])
 
     def stretched(self, thick: float, length: float) -> Solid:
-        wide = np.sqrt(thick / length)  # bars and holes become wider where the plate becomes thicker
+        wide = np.sqrt(thick / length)  # bars become wider as the plate becomes thicker
         bars = tuple((x0 * length, y0 * length, x1 * length, y1 * length, r0 * length * wide, r1 * length * wide)
                      for x0, y0, x1, y1, r0, r1 in self.bars)  # fmt: skip
         holes = tuple((x * length, y * length, r * length) for x, y, r in self.holes)
@@ -70,14 +71,14 @@ SHEETS = ("ribbon", "disc", "leaf", "cross", "star", "pelt", "shirt", "frame", "
 
 
 def sheet(g: np.random.Generator, outline: str, n_holes: int) -> Skeleton:
-    """A sheet with thickness: it bends in one direction at a time."""
+    """Build a sheet, which bends about one axis at a time."""
     bars, loops = _outline(g, outline)
     thick = g.uniform(0.1, 0.14)
     return Skeleton(Part(Plate(tuple(bars), _holes(g, bars[0], n_holes), thick, loops), "sheet"))
 
 
 def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:
-    """The bars of a sheet, the first of which is wide enough for holes; and the handles that they make."""
+    """The bars of a sheet, of which the first is wide enough for holes, and the number of handles that bars form."""
 
     def disc(x: float, y: float, r: float) -> Bar:
         return (x, y, x, y, r, r)
@@ -132,14 +133,14 @@ def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:
 
 
 def _holes(g: np.random.Generator, bar: Bar, count: int) -> tuple[Hole, ...]:
-    """Holes along the middle of a bar, with room between them."""
+    """Separate holes along the middle of a bar, or in a circle if there is no room in a row."""
     if not count:
         return ()
     x0, y0, x1, y1, r0, r1 = bar
     straight = float(np.hypot(x1 - x0, y1 - y0))
     length = straight + 0.5 * (r0 + r1)
     radius = min(0.45 * min(r0, r1), 0.26 * length / count) * g.uniform(0.85, 1.1)
-    if count > 1 and (straight == 0.0 or length < 3.2 * radius * count):  # around the middle without room in a row
+    if count > 1 and (straight == 0.0 or length < 3.2 * radius * count):
         return tuple((0.55 * r0 * c, 0.55 * r0 * s, 0.3 * min(r0, r1)) for c, s in circle(count, 0.4))
     ends = 0.25 * (r0 + r1) / max(straight, 1e-9)
     shares = np.linspace(-0.35 * ends, 1.0 + 0.35 * ends, count) if count > 1 else np.array([0.5])
@@ -150,7 +151,7 @@ MACHINES = ("gear", "flange", "lever", "triangle", "bracket", "cam", "clamp")
 
 
 def machine(g: np.random.Generator, kind: str, extra: str, n: int) -> Skeleton:
-    """A rigid part of a machine: a plate with holes or teeth, and what stands on it."""
+    """Build a rigid part of a machine: a plate with holes or teeth, and an attachment."""
     thick = g.uniform(0.18, 0.34)
     bars: list[Bar]
     holes: list[Hole]
@@ -202,7 +203,7 @@ def machine(g: np.random.Generator, kind: str, extra: str, n: int) -> Skeleton:
 def _attached(
     g: np.random.Generator, extra: str, kind: str, middle: tuple[float, float], holes: list[Hole], thick: float
 ) -> tuple[Part, ...]:
-    """What stands on a plate: a collar around its first hole, pins beside it, a second plate across."""
+    """The attachment of a plate, around or beside its first hole: a collar, a shaft, an ear, or pins."""
     x, y = (holes[0][0], holes[0][1]) if holes else middle
     bore = holes[0][2] if holes else 0.0
     seat: Vector = (x, y, 0.0)
@@ -234,7 +235,7 @@ def _attached(
 
 @dataclass(frozen=True)
 class _Sleeve(Solid):
-    """A tube that stands on a hole of a plate and leaves it open: no handle of its own."""
+    """A tube around a hole of a plate, which adds no handle."""
 
     tube: Shell
 
@@ -245,63 +246,6 @@ class _Sleeve(Solid):
         return self.tube.box()
 
     def stretched(self, thick: float, length: float) -> Solid:
-        found = self.tube.stretched(1.0, length)
-        assert isinstance(found, Shell)
-        return _Sleeve(found)
-
-
-def coil(g: np.random.Generator, turns: float, end: str) -> Skeleton:
-    """A wire wound around z, with something at its ends: a spring."""
-    solid = Helix(g.uniform(0.4, 0.6), g.uniform(0.34, 0.46), turns, g.uniform(0.1, 0.125))
-    children: tuple[Part, ...] = ()
-    if end != "plain":
-        spots = [solid.at(0.0), solid.at(1.0)]
-        make = {"knob": Blob((0.2, 0.2, 0.2)), "disc": Prism(16, 0.3, 0.2, 0.07)}[end]
-        children = tuple(Part(make, "end", at=spot) for spot in spots)
-    return Skeleton(Part(solid, "coil", children=children))
-
-
-@dataclass(frozen=True)
-class Helix(Solid):
-    """A tube around a helix: ``turns`` of radius ``radius``, ``pitch`` apart along z, from (radius, 0, 0) up."""
-
-    radius: float
-    pitch: float
-    turns: float
-    tube: float
-
-    def at(self, share: float) -> Vector:
-        """The centre line at a share of its length."""
-        angle = 2.0 * np.pi * self.turns * share
-        return (
-            self.radius * float(np.cos(angle)), self.radius * float(np.sin(angle)), self.pitch * self.turns * share
-        )  # fmt: skip
-
-    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        slope = self.pitch / (2.0 * np.pi * self.radius)
-        here = np.arctan2(y, x) / (2.0 * np.pi)
-        # The turns next above and below; the wire is cut across its direction.
-        squared = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), np.inf)
-        base = np.round(z / self.pitch - here)
-        for step in (-1.0, 0.0, 1.0):
-            turn = here + base + step
-            # The foot on a helix lies a little along from the point at the same angle.
-            turn = turn + (z - turn * self.pitch) * slope / (1.0 + slope**2) / (2.0 * np.pi * self.radius)
-            turn = np.clip(turn, 0.0, self.turns)
-            angle = 2.0 * np.pi * turn
-            gap = (x - self.radius * np.cos(angle)) ** 2 + (y - self.radius * np.sin(angle)) ** 2
-            squared = np.minimum(squared, gap + (z - turn * self.pitch) ** 2)
-        for end in (0.0, 1.0):
-            cx, cy, cz = self.at(end)
-            squared = np.minimum(squared, (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
-        return np.sqrt(squared) - self.tube
-
-    def box(self) -> tuple[Floats, Floats]:
-        wide = self.radius + self.tube
-        return np.array([-wide, -wide, -self.tube]), np.array([wide, wide, self.pitch * self.turns + self.tube])
-
-    def stretched(self, thick: float, length: float) -> Solid:
-        return Helix(self.radius * length, self.pitch * length, self.turns, min(self.tube * thick, 0.4 * self.pitch))
-
-    def factors(self, thick: float, length: float) -> Floats:
-        return np.full(3, length)
+        tube = self.tube.stretched(1.0, length)
+        assert isinstance(tube, Shell)
+        return _Sleeve(tube)

@@ -1,4 +1,4 @@
-"""Solids with corners: regular prisms and frames, which only drawn bodies have."""
+"""Solids with corners: regular prisms and frames."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from igps.shapes.solids import Solid
 
 @dataclass(frozen=True)
 class Prism(Solid):
-    """A regular prism or plate around the z axis: ``sides`` corners at ``radius``, ``height`` high, rounded edges."""
+    """A regular prism about the z axis, with rounded edges; `radius` is the distance of its corners from the axis."""
 
     sides: int
     radius: float
@@ -33,7 +33,7 @@ class Prism(Solid):
 
 @dataclass(frozen=True)
 class Frame(Solid):
-    """A tube of radius ``tube`` along a regular polygon around z with corners at ``radius``."""
+    """A tube of radius `tube` along a regular polygon about the z axis, with corners at the distance `radius`."""
 
     sides: int
     radius: float
@@ -59,7 +59,7 @@ class Frame(Solid):
 
 
 def _to_polygon(sides: int, radius: float, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """How far points lie outside the nearest side's line (negative inside), and along it beyond its corner."""
+    """Signed distances of points from the line of the nearest side (negative inside), and lengths beyond its corner."""
     sector = np.pi / sides
     folded = np.mod(np.arctan2(y, x), 2.0 * sector) - sector
     radial = np.hypot(x, y)

@@ -1,4 +1,4 @@
-"""Surfaces as they come: other triangles, simplified, noisy, mirrored, made watertight; turned, moved and scaled."""
+"""Surfaces as from scanners and files: simplified, noisy, mirrored, made watertight, rotated, moved and scaled."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.simplification import simplify
 from igps.mesh.watertight import watertight
 
-# Shares of the shapes to which each happens.
+# Probability of each change.
 _SIMPLIFIED, _NOISY, _MIRRORED, _WATERTIGHT = 0.4, 0.35, 0.25, 0.15
-# How many more vertices there are before a surface is simplified.
+# Ratio of the numbers of vertices before and after simplification.
 _SURPLUS = 1.6
-# Standard deviation of the noise, over the root of the mean area of a face: the triangles stay as they lie.
-_NOISE = 0.05
-_RESOLUTION = 72
+# Largest standard deviation of the noise, over the root of the mean area of a face; too small to flip triangles.
+_MAX_NOISE = 0.05
+_RESOLUTION = 72  # voxels along the longest side, to make a surface watertight
 
 
 @dataclass(frozen=True)
 class Scan:
-    """What happens to the surface of one pose."""
+    """Changes of the surface of a pose."""
 
-    n_vertices: int  # that it has afterwards, about
-    is_simplified: bool  # from more vertices; otherwise it is meshed with as many
-    noise: float  # standard deviation along the normals, over the root of the mean area of a face; 0 for none
-    is_mirrored: bool  # left and right are exchanged
-    is_watertight: bool  # it is made again from a grid of distances
-    motion: Floats  # (3,3) orthogonal: a rotation, of a mirrored surface with a reflection
+    n_vertices: int  # approximate number of vertices of the result
+    is_simplified: bool  # from a finer mesh; otherwise the surface is meshed with `n_vertices`
+    noise: float  # standard deviation along the normals, over the root of the mean area of a face; 0 for no noise
+    is_mirrored: bool
+    is_watertight: bool  # the surface is reconstructed from a grid of distances
+    motion: Floats  # (3,3) orthogonal: a rotation, with a reflection if the surface is mirrored
     scale: float  # factor of all lengths
-    offset: Floats  # (3,) in units of the scaled size
+    offset: Floats  # (3,) translation after the rotation and before the scaling
 
     @classmethod
     def draw(cls, rng: np.random.Generator, n_vertices: tuple[int, int]) -> Scan:
-        """Draw what happens; vertices between the two numbers, small ones as often as large ones by ratio."""
+        """Draw changes; the number of vertices is log-uniform between the two numbers."""
         low, high = np.log(n_vertices)
         chances = rng.uniform(size=4) < (_SIMPLIFIED, _NOISY, _MIRRORED, _WATERTIGHT)
         motion = np.asarray(Rotation.from_quat(rng.normal(size=4)).as_matrix())
         return cls(
             n_vertices=int(np.exp(rng.uniform(low, high))),
             is_simplified=bool(chances[0]),
-            noise=float(_NOISE * rng.uniform(0.2, 1.0) * chances[1]),
+            noise=float(_MAX_NOISE * rng.uniform(0.2, 1.0) * chances[1]),
             is_mirrored=bool(chances[2]),
             is_watertight=bool(chances[3]),
             motion=motion * (-1.0 if chances[2] else 1.0),
@@ -54,14 +54,14 @@ class Scan:
 
     @property
     def target(self) -> int:
-        """Vertices to mesh the body with."""
+        """Number of vertices to mesh the body with."""
         return int(self.n_vertices * (_SURPLUS if self.is_simplified else 1.0))
 
     def of(self, mesh: Mesh, rng: np.random.Generator) -> Mesh:
-        """The surface after all this.
+        """Return the surface after all changes.
 
         Raises:
-            MeshError: it is no body any more.
+            MeshError: the result is not a valid body, or has another genus.
         """
         genus = mesh.genus
         if self.is_simplified:
@@ -72,14 +72,14 @@ class Scan:
             vertices = mesh.vertices + steps * surface.vertex_normals(mesh.vertices, mesh.faces)
             mesh = Mesh(vertices, mesh.faces, mesh.name, notes=(*mesh.notes, "noise along the normals"))
         if self.is_watertight:
-            # Limbs that nearly touch grow together on a coarse grid: then the surface stays as it was.
+            # Limbs that nearly touch may merge on a coarse grid. In this case the surface is left unchanged.
             closed = watertight(
                 mesh.vertices, mesh.faces, resolution=_RESOLUTION, max_vertices=self.n_vertices, name=mesh.name
             )
             if closed.genus == genus:
                 mesh = Mesh(closed.vertices, closed.faces, mesh.name, notes=(*mesh.notes, *closed.notes))
         if mesh.genus != genus:
-            raise MeshError(f"{mesh.name}: genus {mesh.genus} in place of {genus}.")
+            raise MeshError(f"{mesh.name}: expected genus {genus}, got {mesh.genus}.")
         centred = mesh.vertices - mesh.vertices.mean(axis=0)
         turned = (centred[:, None] * self.motion[None]).sum(axis=2)
         faces = mesh.faces[:, ::-1] if self.is_mirrored else mesh.faces

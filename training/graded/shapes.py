@@ -1,4 +1,4 @@
-"""Graded shapes: classes of bodies, bodies in poses."""
+"""The benchmark of graded shapes: classes, bodies of a class, individuals of a body, and poses."""
 
 import contextlib
 import logging
@@ -22,54 +22,52 @@ from training.graded.individuals import individual
 from training.graded.kinds import LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, BodyClass, body_classes
 from training.graded.scans import Scan
 
-_VERSION = 2  # raised whenever the same arguments would give other meshes
+_VERSION = 2  # raised when the same arguments give other meshes
 _MAX_ATTEMPTS = 6
-_KIN, _BODY, _POSE, _INDIVIDUAL = 10, 11, 12, 13  # what a random stream is for: keeps the streams of one seed apart
-_SIBLINGS = 2  # bodies in a row with one skeleton, whose likeness makes bodies hard to tell apart
+_KIN, _BODY, _POSE, _INDIVIDUAL = 10, 11, 12, 13  # parts of seeds that make random streams of a seed independent
+_N_SIBLINGS = 2  # successive bodies with the same skeleton, which are hard to tell apart
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class GradedShape:
-    """One pose of one body of a class."""
+    """A pose of a body."""
 
     vertices: Floats  # (V,3) float64
     faces: Integers  # (F,3) int64, outward
     label: str  # name of the class
-    body: str  # name of the body, ``class/00``
-    name: str  # ``class/00/03``
+    body: str  # name of the body, such as `class/00`
+    name: str  # name of the shape, such as `class/00/03`
     genus: int  # number of handles of the surface
-    # (3,3) orthogonal, what turned, and perhaps mirrored, the shape out of its upright frame: ``vertices @ motion``
-    # stands upright again
-    motion: Floats
-    notes: tuple[str, ...]  # what was done to the surface, in words
+    motion: Floats  # (3,3) orthogonal, rotation and reflection of the shape; `vertices @ motion` is upright
+    notes: tuple[str, ...]  # descriptions of the changes of the surface
 
 
 class GradedShapes:
-    """A deterministic benchmark of levels: classes of bodies, perhaps individuals of each, and all in poses.
+    """A deterministic benchmark with several levels: classes, bodies, optionally individuals, and poses.
 
-    A class is a kind of body; its bodies differ in proportions, thickness, details and whatever else the class leaves
-    open, but every second is a sibling of the one before it, with the same skeleton in other proportions. The poses of
-    a body bend one surface, nearly isometrically, as far as animals and tools bend. Things that do not bend are the
-    same in every pose. Every pose has triangles of its own, and some are simplified, noisy, mirrored or made
-    watertight.
+    The bodies of a class differ in proportions, thickness, details and other choices that the class leaves open. Every
+    second body has the same skeleton as the body before it, in other proportions. The poses of a body bend the same
+    surface nearly isometrically, as far as animals and tools bend. Rigid bodies have the same shape in every pose.
+    Each pose has another triangulation, and some are simplified, noisy, mirrored or made watertight.
 
-    A shape depends on its class, body, individual, pose, ``seed``, ``n_vertices`` and ``look_alikes`` alone, so that
-    shapes may be made in any order and by many processes, and more of them later.
+    A shape depends only on its class, body, individual, pose, `seed`, `n_vertices` and `look_alikes`. Shapes can
+    therefore be made in any order and in parallel, and shapes can be added later.
 
     Args:
         n_classes: number of classes. The first twelve are named templates (`kinds.LOOK_ALIKE_TEMPLATES`).
-        n_bodies: bodies of each class.
-        n_poses: poses of each body.
+        n_bodies: number of bodies of each class.
+        n_poses: number of poses of each body.
         seed: seed of all random draws, not negative.
-        n_vertices: the least and the greatest number of vertices, each kept within a third.
-        look_alikes: with the templates, and the families, that resemble classes of SHREC'07 (see `kinds`);
-            without, other classes take their places.
-        n_individuals: of each body, nearly alike, each in ``n_poses`` poses (see `individuals`); 0 for the body itself.
+        n_vertices: smallest and largest number of vertices, with a tolerance of a third.
+        look_alikes: whether to include the templates and families that resemble classes of SHREC'07 (see `kinds`);
+            if not, other classes take their places.
+        n_individuals: number of similar individuals of each body, each in `n_poses` poses (see `individuals`); 0 for
+            the body itself.
 
     Raises:
-        ValueError: an argument is out of range, or (on access) a shape cannot be made at this resolution.
+        ValueError: an argument is out of range; or, on access, a shape cannot be made at this resolution.
     """
 
     def __init__(
@@ -93,7 +91,7 @@ class GradedShapes:
         self.n_individuals = n_individuals
         classes = body_classes(seed, look_alikes)
         if n_classes > len(classes):
-            raise ValueError(f"n_classes: expected at most {len(classes)}, which are all there are, got {n_classes}.")
+            raise ValueError(f"n_classes: expected at most {len(classes)}, the number of all classes, got {n_classes}.")
         self._classes: list[BodyClass] = classes[:n_classes]
         self._last: tuple[tuple[int, int], Body | ValueError] | None = None
         self._last_individual: tuple[tuple[int, int, int], Body] | None = None
@@ -107,7 +105,7 @@ class GradedShapes:
     @property
     def class_names(self) -> list[str]:
         """The unique names of the classes, in order."""
-        return [one.name for one in self._classes]
+        return [body_class.name for body_class in self._classes]
 
     @property
     def labels(self) -> list[str]:
@@ -116,68 +114,68 @@ class GradedShapes:
 
     @property
     def names(self) -> list[str]:
-        """The unique name of every shape, ``class/body/pose``, or ``class/body/individual/pose``."""
+        """The unique name of every shape, `class/body/pose` or `class/body/individual/pose`."""
         return [
-            f"{name}/{body:02d}/{one}{pose:02d}"
+            f"{name}/{body:02d}/{individual_prefix}{pose:02d}"
             for name in self.class_names
             for body in range(self.n_bodies)
-            for one in [f"{i:02d}/" for i in range(self.n_individuals)] or [""]
+            for individual_prefix in [f"{i:02d}/" for i in range(self.n_individuals)] or [""]
             for pose in range(self.n_poses)
         ]
 
     def __getitem__(self, index: int) -> GradedShape:
-        """Make one shape; the body of the last one is kept for the next of its poses.
+        """Make a shape; its body is kept for further poses.
 
         Raises:
             IndexError: there is no such shape.
-            ValueError: it cannot be made; names the shape and what went wrong.
+            ValueError: the shape cannot be made.
         """
-        body_class, number, one, pose = self._numbers(index)
+        body_class, number, individual_number, pose = self._numbers(index)
         name = self.names[operator.index(index)]
         try:
-            body = self._individual(body_class, number, one)
+            body = self._individual(body_class, number, individual_number)
         except ValueError as error:
-            raise self._impossible(name, str(error)) from error
-        found = ""
+            raise self._failure(name, str(error)) from error
+        reason = ""
         for attempt in range(_MAX_ATTEMPTS):
-            rng = self._draws_of_pose(body_class, number, one, pose, attempt)
+            rng = self._pose_generator(body_class, number, individual_number, pose, attempt)
             scan = Scan.draw(rng, self.n_vertices)
             try:
                 posed = draw_pose(body, rng, scan.target)
                 mesh = scan.of(Mesh(posed.bent, posed.faces, name), rng)
             except (MeshError, ValueError) as error:
-                found = str(error)
-                _log.debug("%s: attempt %d: %s", name, attempt + 1, found)
+                reason = str(error)
+                _log.debug("%s: attempt %d: %s", name, attempt + 1, reason)
                 continue
             label = self._classes[body_class].name
             vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
             return GradedShape(vertices, faces, label, body_of(name), name, mesh.genus, scan.motion, mesh.notes)
-        raise self._impossible(name, f"in {_MAX_ATTEMPTS} attempts, in the last {found}")
+        raise self._failure(name, f"{_MAX_ATTEMPTS} attempts failed, the last with: {reason}")
 
     def pose(self, index: int) -> Pose:
-        """The surface of one shape at rest and bent, with the same triangles, before anything else happens to it.
+        """Return the surface of a shape at rest and in its pose, with the same triangles, before the changes of `Scan`.
 
-        Of the first attempt at the shape, which is the shape's own unless that had to be made again.
+        The pose is that of the first attempt, which is the pose of the shape unless this attempt failed.
         """
-        body_class, number, one, pose = self._numbers(index)
-        rng = self._draws_of_pose(body_class, number, one, pose, 0)
+        body_class, number, individual_number, pose = self._numbers(index)
+        rng = self._pose_generator(body_class, number, individual_number, pose, 0)
         scan = Scan.draw(rng, self.n_vertices)
-        return draw_pose(self._individual(body_class, number, one), rng, scan.target)
+        return draw_pose(self._individual(body_class, number, individual_number), rng, scan.target)
 
     def write(self, root: str | os.PathLike[str], progress: bool = False, n_workers: int | None = 1) -> None:
-        """Write every shape to ``root/<class>/<body>/<pose>.off``, leaving out what is there already.
+        """Write every shape to `root/<class>/<body>/<pose>.off`, except shapes that are already there.
 
-        A folder that is read again (`igps.SignatureDataset`) has the classes as labels, and `body_of` tells the body of
-        a file. Each file appears whole or not at all, so that an interrupted run is resumed by the same call.
-        ``root/shapes.json`` records the settings; classes, bodies and poses may be added later.
+        If `igps.SignatureDataset` reads the folder, the labels are the classes, and `body_of` returns the body of a
+        file. Files are written atomically, and the same call resumes an interrupted run. The settings are saved in
+        `root/shapes.json`. Classes, bodies and poses can be added later.
 
         Args:
-            root: folder, made where absent.
+            root: folder, created if it does not exist.
             progress: show a progress bar.
-            n_workers: processes; all cores if None.
+            n_workers: number of processes; all cores if None.
 
         Raises:
-            ValueError: ``root`` holds other shapes, or a shape cannot be made; all others are written first.
+            ValueError: the folder holds other shapes, or a shape cannot be made; all others are written first.
         """
         folder = shapes_folder(
             root,
@@ -190,7 +188,7 @@ class GradedShapes:
         )
         names = self.names
         missing = [i for i, name in enumerate(names) if not is_whole_off(folder / f"{name}.off")]
-        # A body at a time, so that it is drawn once for all its poses.
+        # A job has all missing poses of a body, so that the body is drawn once.
         jobs: dict[int, list[int]] = {}
         for i in missing:
             jobs.setdefault(i // (self.n_poses * max(self.n_individuals, 1)), []).append(i)
@@ -205,48 +203,50 @@ class GradedShapes:
                 if isinstance(outcome, Failed):
                     failed.append(outcome.reason)
         if failed:
-            raise ValueError(f"{len(failed)} of {len(jobs)} bodies were not written whole: {failed[0]}")
+            raise ValueError(f"{len(failed)} of {len(jobs)} bodies are incomplete: {failed[0]}")
 
-    def _draws_of_pose(self, body_class: int, number: int, one: int, pose: int, attempt: int) -> np.random.Generator:
-        which = [_INDIVIDUAL, one] if self.n_individuals else []
-        return np.random.default_rng([self.seed, _POSE, body_class, number, pose, attempt, *which])
+    def _pose_generator(
+        self, body_class: int, number: int, individual_number: int, pose: int, attempt: int
+    ) -> np.random.Generator:
+        suffix = [_INDIVIDUAL, individual_number] if self.n_individuals else []
+        return np.random.default_rng([self.seed, _POSE, body_class, number, pose, attempt, *suffix])
 
     def _numbers(self, index: int) -> tuple[int, int, int, int]:
+        """The numbers of the class, body, individual and pose of a shape."""
         position = operator.index(index)
         if not -len(self) <= position < len(self):
-            raise IndexError(f"index: expected one in [{-len(self)}, {len(self)}), got {index}.")
-        rest, pose = divmod(position % len(self), self.n_poses)
-        rest, one = divmod(rest, max(self.n_individuals, 1))
-        body_class, body = divmod(rest, self.n_bodies)
-        return body_class, body, one, pose
+            raise IndexError(f"index: expected an index in [{-len(self)}, {len(self)}), got {index}.")
+        remainder, pose = divmod(position % len(self), self.n_poses)
+        remainder, individual_number = divmod(remainder, max(self.n_individuals, 1))
+        body_class, body = divmod(remainder, self.n_bodies)
+        return body_class, body, individual_number, pose
 
-    def _individual(self, body_class: int, number: int, one: int) -> Body:
+    def _individual(self, body_class: int, number: int, individual_number: int) -> Body:
         body = self._body(body_class, number)
         if not self.n_individuals:
             return body
-        place = (body_class, number, one)
-        if self._last_individual is None or self._last_individual[0] != place:
-            drawn = individual(body, np.random.default_rng([self.seed, _INDIVIDUAL, *place]))
-            self._last_individual = place, drawn
+        key = (body_class, number, individual_number)
+        if self._last_individual is None or self._last_individual[0] != key:
+            self._last_individual = key, individual(body, np.random.default_rng([self.seed, _INDIVIDUAL, *key]))
         return self._last_individual[1]
 
     def _body(self, body_class: int, number: int) -> Body:
         if self._last is None or self._last[0] != (body_class, number):
-            kin = [self.seed, _KIN, body_class, number // _SIBLINGS]
+            kin = [self.seed, _KIN, body_class, number // _N_SIBLINGS]
             drawn: Body | ValueError
             try:
                 drawn = draw_body(self._classes[body_class], kin, [self.seed, _BODY, body_class, number])
-            except ValueError as error:  # kept as well: no other pose of it can be made either
+            except ValueError as error:  # also stored, because no other pose of the body can be made either
                 drawn = error
             self._last = (body_class, number), drawn
         if isinstance(self._last[1], ValueError):
             raise self._last[1]
         return self._last[1]
 
-    def _impossible(self, name: str, reason: str) -> ValueError:
+    def _failure(self, name: str, reason: str) -> ValueError:
         return ValueError(
-            f"n_vertices={self.n_vertices}: {name} could not be made: {reason} "
-            "Thin parts need more vertices, another seed gives other bodies."
+            f"n_vertices={self.n_vertices}: {name} could not be made: {reason.removesuffix('.')}. "
+            "Raise n_vertices, because thin parts need more vertices, or take another seed."
         )
 
     def __getstate__(self) -> dict[str, object]:
@@ -260,27 +260,27 @@ _ARGUMENTS = ("n_classes", "n_bodies", "n_poses", "seed", "n_vertices", "look_al
 
 
 def body_of(name: str) -> str:
-    """The body of a shape by its name or its file's, ``class/body/pose`` or ``class/body/individual/pose``."""
+    """Return the body of a shape by the name of the shape or its file, see `GradedShapes.names`."""
     return "/".join(name.split("/")[:2])
 
 
 def individual_of(name: str) -> str:
-    """The individual of a shape by its name or its file's; the body where there are no individuals."""
+    """Return the individual of a shape by the name of the shape or its file; its body if there are no individuals."""
     return name.rsplit("/", 1)[0]
 
 
 def family_of(label: str) -> str:
-    """The family of a class by its name: the kind of its bodies, or the template itself."""
+    """Return the family of a class by its name: its kind, or its template."""
     return label.split("-")[0]
 
 
 def looks_alike(label: str) -> bool:
-    """Whether a class, by its name, resembles one of SHREC'07 (see `training.graded.kinds`)."""
+    """Return whether a class, given by its name, resembles a class of SHREC'07 (see `training.graded.kinds`)."""
     return label in LOOK_ALIKE_TEMPLATES or family_of(label) in LOOK_ALIKE_FAMILIES
 
 
 def _write(shapes: GradedShapes, folder: Path, indices: list[int]) -> None:
-    """Write some of the shapes; all of them are tried, and the first that fails is told."""
+    """Write the shapes of some indices; after trying all, raise the error of the first that failed."""
     failed: ValueError | None = None
     for index in indices:
         try:

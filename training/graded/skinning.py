@@ -1,8 +1,9 @@
 """Bending a surface by rigid motions that change smoothly over it: dual quaternion skinning.
 
-A rigid motion is a unit dual quaternion, a pair of quaternions (w, x, y, z): ``real`` turns, and ``dual`` is half the
-translation times ``real``. The weighted mean of several, over its length, is a rigid motion again, so that a joint
-neither collapses nor loses volume when it is twisted (Kavan, Collins, Žára and O'Sullivan 2007).
+A rigid motion is a unit dual quaternion, a pair of quaternions (w, x, y, z): `real` is the rotation, and `dual` is
+half the translation times `real`. The weighted mean of several motions, divided by its length, is again a rigid
+motion. A joint therefore neither collapses nor loses volume when it is twisted (Kavan, Collins, Žára and O'Sullivan
+2007).
 """
 
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from igps._arrays import Floats
 
 
 class Motions(NamedTuple):
-    """Rigid motions: real and dual parts, (..., 4) each; the real parts have length 1."""
+    """Rigid motions: real parts (..., 4) of length 1, and dual parts (..., 4)."""
 
     real: Floats
     dual: Floats
@@ -22,8 +23,8 @@ class Motions(NamedTuple):
 IDENTITY = Motions(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4))
 
 
-def turn_about(centre: Floats, rotation: Floats) -> Motions:
-    """Rotations by vectors (..., 3), radians, about points (..., 3)."""
+def rotations_about(centre: Floats, rotation: Floats) -> Motions:
+    """Return the rotations by vectors (..., 3), radians, about points (..., 3)."""
     angle = np.sqrt((rotation * rotation).sum(axis=-1, keepdims=True))
     real = np.concatenate([np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * rotation], axis=-1)
     # x ↦ R x + (c − R c).
@@ -31,34 +32,34 @@ def turn_about(centre: Floats, rotation: Floats) -> Motions:
 
 
 def motion(real: Floats, translation: Floats) -> Motions:
-    """Turn by unit quaternions (..., 4), then move by (..., 3)."""
+    """Return the motions that rotate by unit quaternions (..., 4) and then translate by (..., 3)."""
     half = np.concatenate([np.zeros_like(translation[..., :1]), 0.5 * translation], axis=-1)
     return Motions(real, product(half, real))
 
 
-def after(first: Motions, second: Motions) -> Motions:
-    """The motions that do ``second`` and then ``first``."""
+def compose(first: Motions, second: Motions) -> Motions:
+    """Return the motions that apply `second`, then `first`."""
     return Motions(
         product(first.real, second.real), product(first.real, second.dual) + product(first.dual, second.real)
     )
 
 
 def normalized(motions: Motions) -> Motions:
-    """Sums of dual quaternions made rigid motions again."""
+    """Return the rigid motions that are multiples of sums of dual quaternions."""
     length = np.sqrt((motions.real * motions.real).sum(axis=-1, keepdims=True))
     return Motions(motions.real / length, motions.dual / length)
 
 
-def moved(motions: Motions, points: Floats) -> Floats:
-    """Points (..., 3), each by its motion."""
-    # Twice the dual part times the conjugate of the real one is the translation, exactly so where a blend has left a
-    # component along the real part too.
+def transform(motions: Motions, points: Floats) -> Floats:
+    """Return points (..., 3) after one motion each."""
+    # The translation is twice the dual part times the conjugate of the real part. This also holds for blends, whose
+    # dual part may have a component along the real part.
     conjugate = motions.real * np.array([1.0, -1.0, -1.0, -1.0])
     return _rotated(motions.real, points) + 2.0 * product(motions.dual, conjugate)[..., 1:]
 
 
 def product(a: Floats, b: Floats) -> Floats:
-    """Products of quaternions (..., 4)."""
+    """Return the products of quaternions (..., 4)."""
     aw, ax, ay, az = (a[..., i] for i in range(4))
     bw, bx, by, bz = (b[..., i] for i in range(4))
     return np.stack(

@@ -15,8 +15,8 @@ from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import compute_signature
 
-Way = Callable[[Mesh], Mesh]
-"""Alters a mesh; picklable."""
+Alteration = Callable[[Mesh], Mesh]
+"""A picklable function that alters a mesh."""
 
 Answer = Singles | str
 """The description of a body, or the reason why there is none."""
@@ -24,7 +24,7 @@ Answer = Singles | str
 
 def describe_altered(
     dataset: SignatureDataset,
-    ways: Mapping[str, Way | None],
+    alterations: Mapping[str, Alteration | None],
     descriptors: Sequence[Descriptor],
     *,
     n_workers: int | None = None,
@@ -33,15 +33,15 @@ def describe_altered(
 
     Args:
         dataset: N meshes, with signatures that meet the requirements of the descriptors.
-        ways: alterations by name; None leaves the mesh unchanged and takes its signature from the cache.
+        alterations: alterations by name; None leaves the mesh unchanged and takes its signature from the cache.
         descriptors: descriptors with distinct names.
         n_workers: number of processes; all cores if None.
 
     Returns:
         N dicts: by alteration and by name of the descriptor, the description or the reason why there is none.
     """
-    jobs = [(dataset.subset([i]), way, descriptors) for i in range(len(dataset)) for way in ways.values()]
-    keys = [(i, name) for i in range(len(dataset)) for name in ways]
+    keys = [(i, name) for i in range(len(dataset)) for name in alterations]
+    jobs = [(dataset.subset([i]), alterations[name], descriptors) for i, name in keys]
     answers: list[dict[str, dict[str, Answer]]] = [{} for _ in range(len(dataset))]
     outcomes = run(_describe, jobs, n_workers=n_workers)
     with tqdm(total=len(jobs), desc="altered meshes") as bar, contextlib.closing(outcomes):
@@ -55,13 +55,13 @@ def describe_altered(
     return answers
 
 
-def _describe(job: tuple[SignatureDataset, Way | None, Sequence[Descriptor]]) -> dict[str, Answer]:
+def _describe(job: tuple[SignatureDataset, Alteration | None, Sequence[Descriptor]]) -> dict[str, Answer]:
     """Describe the only mesh of a dataset after an alteration."""
-    dataset, way, descriptors = job
-    if way is None:
+    dataset, alteration, descriptors = job
+    if alteration is None:
         batch = dataset.batch([0], meshes=any(x.requirements.mesh for x in descriptors))
     else:
-        mesh = way(dataset.mesh(0))
+        mesh = alteration(dataset.mesh(0))
         batch = collate([compute_signature(mesh, dataset.config)], [mesh])
     answers: dict[str, Answer] = {}
     for descriptor in descriptors:

@@ -77,7 +77,8 @@ def calibrate(
     failed = {failure.path for failure in failures}
     made = [copy for copy in made if copy[2] not in failed]
     copied, originals = copied.usable(failures), [i for i, _, _ in made]
-    is_copy = np.array([way != "longer" for _, way, _ in made])
+    alterations = [alteration for _, alteration, _ in made]
+    is_copy = np.array([x != "longer" for x in alterations])
 
     described, of_copies = (describe(data, descriptor, n_workers=n_workers) for data in (shapes, copied))
     with torch.inference_mode():
@@ -121,7 +122,7 @@ def calibrate(
         threshold_between(np.concatenate([by_kind["copies"], by_kind["poses"]]), by_kind["bodies"], pose_rate),
     )
     calibration.save(out)
-    _print(calibration, of_same, of_others, of_longer, [way for _, way, _ in made if way != "longer"], to_copies)
+    _print(calibration, of_same, of_others, of_longer, [x for x in alterations if x != "longer"], to_copies)
 
 
 def _rigid_classes(shapes: GradedShapes) -> list[str]:
@@ -146,24 +147,24 @@ def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: in
     chosen = [(body, i) for body, i in sorted(first.items()) if int(body.rsplit("/", 1)[1]) < n_bodies]
     made = []
     for number, (body, i) in enumerate(chosen):
-        for way in ("all", tuple(SUFFIXES)[number % 4], "longer"):
-            path = folder / way / f"{body.replace('/', '-')}{SUFFIXES[way]}"
+        for alteration in ("all", tuple(SUFFIXES)[number % 4], "longer"):
+            path = folder / alteration / f"{body.replace('/', '-')}{SUFFIXES[alteration]}"
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                copy = _copy(shapes.mesh(i), way, seed + number)
+                copy = _copy(shapes.mesh(i), alteration, seed + number)
                 trimesh.Trimesh(copy.vertices, copy.faces, process=False).export(path)
-            made.append((i, way, path))
+            made.append((i, alteration, path))
     return made
 
 
-def _copy(mesh: Mesh, way: str, seed: int) -> Mesh:
-    if way == "longer":
+def _copy(mesh: Mesh, alteration: str, seed: int) -> Mesh:
+    if alteration == "longer":
         mesh = _lengthened(mesh, seed)
-    if way in ("triangles", "all", "longer"):
+    if alteration in ("triangles", "all", "longer"):
         mesh = remesh(mesh)
-    if way in ("half", "all"):
+    if alteration in ("half", "all"):
         mesh = simplified(mesh, 0.5)
-    if way in ("motion", "all"):
+    if alteration in ("motion", "all"):
         mirrored = replace(mesh, vertices=mesh.vertices * [-1.0, 1.0, 1.0], faces=mesh.faces[:, ::-1])
         mesh = move(scale(mirrored, math.exp(np.random.default_rng(seed).uniform(-3, 3))), seed)
     return mesh
@@ -207,19 +208,20 @@ def _print(
     same: Floats,
     others: Floats,
     longer: Floats,
-    ways: list[str],
+    alterations: list[str],
     to_copies: Floats,
 ) -> None:
     print(calibration.made_of)
-    for way in SUFFIXES:
-        rows = np.array([k for k, name in enumerate(ways) if name == way], dtype=np.int64)
+    for alteration in SUFFIXES:
+        rows = np.array([k for k, name in enumerate(alterations) if name == alteration], dtype=np.int64)
         if len(rows):
             surfaces, detail = same[rows].max(axis=0)
             largest = (
                 f"distance ≤ {to_copies[rows].max():.4f}, surfaces ≤ {surfaces:.2%}, {detail:.1f} times coarseness"
             )
-            print(f"{way:>10}: {len(rows)} copies, {largest}")
-    for name, distances in (("poses of rigid bodies", same[len(ways) :]), ("others", others), ("longer", longer)):
+            print(f"{alteration:>10}: {len(rows)} copies, {largest}")
+    rigid = same[len(alterations) :]
+    for name, distances in (("poses of rigid bodies", rigid), ("others", others), ("longer", longer)):
         for column, unit in enumerate(("of √area", "times coarseness")):
             levels = 0, 0.001, 0.01, 0.1, 0.5, 0.99, 1
             row = ", ".join(f"{x:.4g}" for x in np.quantile(distances[:, column], levels, method="higher"))

@@ -19,7 +19,7 @@ from igps.mesh.mending import Mending, mend
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
 from igps.retrieval.scores import retrieval_scores
-from training.studies.altered import Answer, Way, describe_altered
+from training.studies.altered import Alteration, Answer, describe_altered
 from training.studies.damages import DAMAGES
 
 _CLEAN = "clean"
@@ -87,8 +87,10 @@ def damage(
     if unknown := [name for name in names if name not in DAMAGES]:
         raise ValueError(f"damages: expected some of {', '.join(DAMAGES)}, got {unknown[0]!r}.")
     least_vertices = dataset.config.n_vertices_read
-    ways: dict[str, Way | None] = {name: partial(damaged, name, seed, mending, least_vertices) for name in names}
-    answers = describe_altered(dataset, {_CLEAN: None, **ways}, descriptors, n_workers=n_workers)
+    alterations: dict[str, Alteration | None] = {
+        name: partial(damaged, name, seed, mending, least_vertices) for name in names
+    }
+    answers = describe_altered(dataset, {_CLEAN: None, **alterations}, descriptors, n_workers=n_workers)
     clean = [row[_CLEAN] for row in answers]
     return {
         descriptor.name: {name: _result(descriptor, dataset, clean, [row[name] for row in answers]) for name in names}
@@ -140,18 +142,18 @@ def damage_table(results: Mapping[str, Mapping[str, DamageResult]]) -> str:
     lines = [" " * width + "".join(f"{name:>24}" for name in names)]
     lines.append(" " * width + "".join(f"{'used':>10}{'NN':>7}{'FT':>7}" for _ in names))
     notes = []
-    for way in damages:
-        row = [results[name][way] for name in names]
+    for damage_name in damages:
+        row = [results[name][damage_name] for name in names]
         cells = [f"{100 * x.usable:>9.0f}%{100 * x.loss('nn'):>7.1f}{100 * x.loss('ft'):>7.1f}" for x in row]
-        lines.append(f"{way:<{width}}" + "".join(cells))
+        lines.append(f"{damage_name:<{width}}" + "".join(cells))
         for name, result in zip(names, row, strict=True):
             if result.notes:
                 first = next(iter(result.notes.values()))
-                notes.append(f"{name}, {way}: {len(result.notes)} of {result.n_given} missing; {first}")
+                notes.append(f"{name}, {damage_name}: {len(result.notes)} of {result.n_given} missing; {first}")
     lines.append(
         "used: share of the damaged meshes that could be described; NN, FT: points lost against the clean meshes"
     )
-    lines += [f"  {way}: {DAMAGES[way].description}" for way in damages]
+    lines += [f"  {damage_name}: {DAMAGES[damage_name].description}" for damage_name in damages]
     return "\n".join(lines + notes)
 
 
@@ -193,7 +195,7 @@ def damage_command(
         print(f"not used: {failure.error}")
     summary = {
         "damages": {name: kind.description for name, kind in DAMAGES.items()},
-        "results": {name: {way: x.as_dict() for way, x in row.items()} for name, row in results.items()},
+        "results": {name: {key: x.as_dict() for key, x in row.items()} for name, row in results.items()},
         "config": dataset.config.as_dict(),
     }
     if out is not None:

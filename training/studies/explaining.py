@@ -20,7 +20,7 @@ from igps.signature.signature import SAMPLE_KINDS, SignatureConfig, compute_sign
 from training.graded.shapes import GradedShapes
 
 ALTERATIONS = ("bump", "dent", "limb", "hole")
-# As shares of √area: the least radius of an alteration, and the range of its size
+# In units of √area: the smallest radius of an alteration, and the range of its size
 _REACH, _SIZES = 0.1, (0.005, 0.05)
 
 

@@ -42,14 +42,15 @@ def fit_individuals(
     shapes = GradedShapes(n_classes, n_bodies, n_poses, seed, n_vertices=_N_VERTICES, n_individuals=n_individuals)
     data = generated(shapes, root, descriptor, cache_dir, n_workers)
     histograms = describe(data, descriptor, progress=True, n_workers=n_workers)
-    individuals, bodies = (numbers([of(name) for name in data.bodies.names]) for of in (individual_of, body_of))
+    individuals, bodies = (number_names([of(name) for name in data.bodies.names]) for of in (individual_of, body_of))
 
     def fitted(chosen: Tensor) -> TwoLevelHead:
-        whole = pretrained_head()
-        whole.load_state_dict({**whole.state_dict(), **head.state_dict()})
-        return whole.fit_individuals(histograms[chosen], individuals[chosen], descriptor.part_cells)
+        complete_head = pretrained_head()
+        complete_head.load_state_dict({**complete_head.state_dict(), **head.state_dict()})
+        return complete_head.fit_individuals(histograms[chosen], individuals[chosen], descriptor.part_cells)
 
-    parts = [torch.isin(data.labels, part) for part in dealt([family_of(name) for name in data.classes], n_parts, seed)]
+    families = [family_of(name) for name in data.classes]
+    parts = [torch.isin(data.labels, part) for part in deal_families(families, n_parts, seed)]
 
     def score(name: str, distances: Sequence[Tensor]) -> None:
         """Print the scores of the distances of each part."""
@@ -57,44 +58,43 @@ def fit_individuals(
         level_scores(name, [(matrix, *labels) for matrix, labels in zip(distances, levels, strict=True)])
 
     print(f"{n_parts} parts of the families, each scored by a level of individuals that was fitted to the others:")
-    everything = torch.ones(len(data), dtype=torch.bool)
     for name, heads in (("pretrained", [fitted(~part) for part in parts]), ("two levels", [head] * n_parts)):
         vectors = [fitted_head(histograms[part]) for fitted_head, part in zip(heads, parts, strict=True)]
         score(name, [fitted_head.distances(x, x) for fitted_head, x in zip(heads, vectors, strict=True)])
     for name in plain:
         other = igps.descriptor(name)
-        described = describe(usable(root, other, cache_dir, n_workers), other, n_workers=n_workers)
+        described = describe(usable_shapes(root, other, cache_dir, n_workers), other, n_workers=n_workers)
         if len(described) == len(data):
             score(name, [other.distances(described[part], described[part]) for part in parts])
-    return fitted(everything)
+    return fitted(torch.ones(len(data), dtype=torch.bool))
 
 
 def generated(
     shapes: GradedShapes, root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None
 ) -> igps.SignatureDataset:
-    """Write generated shapes to a folder, unless they exist, and return their dataset; see `usable`."""
+    """Write generated shapes to a folder, unless they exist, and return their dataset; see `usable_shapes`."""
     try:
         shapes.write(root, progress=True, n_workers=n_workers)
     except ValueError as error:  # no grid resolves the thin parts of a body; the other shapes were written
         print(error)
-    return usable(root, descriptor, cache_dir, n_workers)
+    return usable_shapes(root, descriptor, cache_dir, n_workers)
 
 
-def usable(
-    root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, some: list[int] | None = None
+def usable_shapes(
+    root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, indices: list[int] | None = None
 ) -> igps.SignatureDataset:
-    """Return the dataset of meshes, or of `some` of them, whose signatures can be computed; print the failures."""
+    """Return the dataset of the meshes (of `indices`, if given) whose signatures can be computed; print failures."""
     data = igps.SignatureDataset(root, descriptor=descriptor, cache_dir=cache_dir)
-    if some is not None:
-        data = data.subset(some)
+    if indices is not None:
+        data = data.subset(indices)
     failures = data.precompute(n_workers=n_workers)
     for failure in failures:
         print(failure)
     return data.usable(failures)
 
 
-def dealt(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
-    """Deal whole families into parts; return the indices of the classes of each part."""
+def deal_families(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
+    """Deal whole families into parts at random; return the indices of the classes of each part."""
     names = sorted(set(families))
     random.Random(seed).shuffle(names)
     return [
@@ -102,7 +102,7 @@ def dealt(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
     ]
 
 
-def numbers(names: Sequence[str]) -> Tensor:
+def number_names(names: Sequence[str]) -> Tensor:
     """Number distinct names in sorted order; return the number of each name."""
     number = {name: i for i, name in enumerate(sorted(set(names)))}
     return torch.tensor([number[name] for name in names])

@@ -16,7 +16,7 @@ from igps.signature.signature import SignatureConfig
 DOCS = Path(__file__).parents[2] / "docs"
 RESULTS = DOCS / "benchmarks" / "results"
 _WIDTH = 120  # of lines of prose
-_PLACE = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
+_PLACEHOLDER = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 Table = tuple[list[str], list[list[str]]]
 """Titles of the columns, and the cells of each row."""
@@ -24,12 +24,12 @@ Table = tuple[list[str], list[list[str]]]
 
 def scores(source: Path) -> Table:
     """Read the results of `igps compare --out`: a row for each descriptor, scores in percent."""
-    shown = ("nn", "ft", "st", "dcg", "adr_self", "map")
+    columns = ("nn", "ft", "st", "dcg", "adr_self", "map")
     rows = [
-        [f"`{row['descriptor']}`", *(_percent(row[name]) for name in shown), f"{row['seconds_per_mesh']:.2f}"]
+        [f"`{row['descriptor']}`", *(_percent(row[name]) for name in columns), f"{row['seconds_per_mesh']:.2f}"]
         for row in _read(source, "compare.json")
     ]
-    return ["descriptor", *(TITLES[name] for name in shown), "s/body"], rows
+    return ["descriptor", *(TITLES[name] for name in columns), "s/body"], rows
 
 
 def splits(source: Path) -> Table:
@@ -85,16 +85,16 @@ def write_pages() -> None:
 
 
 def with_tables(text: str) -> str:
-    """Fill the places for results in a page, `<!-- results: NAME -->`, with the saved tables of these names."""
-    return _PLACE.sub(lambda place: f"{place[1]}\n{markdown(place[2])}\n{place[3]}", text)
+    """Fill the placeholders in a page, `<!-- results: NAME -->`, with the saved tables."""
+    return _PLACEHOLDER.sub(lambda match: f"{match[1]}\n{markdown(match[2])}\n{match[3]}", text)
 
 
-def shown(text: str) -> list[str]:
+def table_names(text: str) -> list[str]:
     """Return the names of the tables that a page shows."""
-    return [place[2] for place in _PLACE.finditer(text)]
+    return [match[2] for match in _PLACEHOLDER.finditer(text)]
 
 
-def kept(name: str) -> dict[str, Any]:
+def load_results(name: str) -> dict[str, Any]:
     """Load the results saved under a name, see `record`."""
     results: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     return results
@@ -102,7 +102,7 @@ def kept(name: str) -> dict[str, Any]:
 
 def markdown(name: str) -> str:
     """Format the table of a name, followed by a line about its origin."""
-    results = kept(name)
+    results = load_results(name)
     lines = [_row(results["columns"]), _row(["---"] * len(results["columns"])), *map(_row, results["rows"])]
     origin = (
         f"version {results['version']}, signatures {results['signatures']}, {results['date']}, {results['processor']}"

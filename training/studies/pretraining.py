@@ -14,7 +14,7 @@ from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
 from training.graded import GradedShapes, body_of, family_of, looks_alike
-from training.studies.individuals import dealt, fit_individuals, generated, numbers, usable
+from training.studies.individuals import deal_families, fit_individuals, generated, number_names, usable_shapes
 from training.studies.transfer import few_labels, level_scores, report
 
 # With two classes, each part has a single direction, and its vectors are signs, which may cancel.
@@ -40,7 +40,7 @@ def pretrain(
     """Generate shapes, score the metric on held-out families, fit it to all, and save it.
 
     Args:
-        root: folder of the generated meshes; those of individuals are written to ``ROOT-individuals``.
+        root: folder of the generated meshes; those of individuals are written to `ROOT-individuals`.
         n_classes, n_bodies, n_poses, seed: arguments of `GradedShapes`.
         n_parts: number of parts into which the families are dealt, by the seed. Whole families are held out, because
             classes of a fitted family are much easier to separate than the classes of users.
@@ -60,11 +60,11 @@ def pretrain(
 
     def save(head: TwoLevelHead) -> TwoLevelHead:
         """Add the level of individuals to a head, save it and return it."""
-        beside = root.with_name(f"{root.name}-individuals")
-        whole = fit_individuals(head, descriptor, individuals, beside, n_parts, seed, plain, cache_dir, n_workers)
-        save_pretrained(EmbeddedDescriptor(descriptor, whole), out)
+        folder = root.with_name(f"{root.name}-individuals")
+        complete = fit_individuals(head, descriptor, individuals, folder, n_parts, seed, plain, cache_dir, n_workers)
+        save_pretrained(EmbeddedDescriptor(descriptor, complete), out)
         print(f"written: {out}")
-        return whole
+        return complete
 
     if keep is not None:
         earlier = EmbeddedDescriptor(descriptor, pretrained_head(individuals=False))
@@ -76,37 +76,38 @@ def pretrain(
 
     shapes = generated(GradedShapes(n_classes, n_bodies, n_poses, seed), root, descriptor, cache_dir, n_workers)
     histograms, labels = describe(shapes, descriptor, progress=True, n_workers=n_workers), shapes.labels
-    bodies = numbers([body_of(name) for name in shapes.bodies.names])
-    parts = dealt([family_of(name) for name in shapes.classes], n_parts, seed)
+    bodies = number_names([body_of(name) for name in shapes.bodies.names])
+    parts = deal_families([family_of(name) for name in shapes.classes], n_parts, seed)
 
-    def fit(n: int, seed: int, among: Tensor) -> TwoLevelHead:
-        """Fit the metric to n classes drawn by the seed."""
-        chosen = torch.isin(labels, torch.tensor(_drawn(among.tolist(), n, seed)))
+    def fit(n: int, seed: int, classes: Tensor) -> TwoLevelHead:
+        """Fit the metric to n of some classes, drawn by the seed."""
+        chosen = torch.isin(labels, torch.tensor(_draw_classes(classes.tolist(), n, seed)))
         return pretrained_head(individuals=False).fit(
             histograms[chosen], labels[chosen], descriptor.part_cells, bodies=bodies[chosen]
         )
 
-    scored = [torch.isin(labels, torch.tensor(_drawn(part.tolist(), n_scored, seed))) for part in parts]
+    scored = [torch.isin(labels, torch.tensor(_draw_classes(part.tolist(), n_scored, seed))) for part in parts]
     others = [torch.cat([*parts[:i], *parts[i + 1 :]]) for i in range(n_parts)]
 
     def score(name: str, distances: Sequence[Tensor]) -> None:
         level_scores(name, [(d, bodies[chosen], labels[chosen]) for d, chosen in zip(distances, scored, strict=True)])
 
     print(f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:")
-    # Classes that resemble some of SHREC'07
-    is_look_alike = torch.tensor([looks_alike(name) for name in shapes.classes])
-    without = [among[~is_look_alike[among]] for among in others]
-    ways = [("pretrained", others, others)]
-    if min(len(among) for among in without) >= _MIN_CLASSES:
-        ways += [("without look-alikes", without, without), ("as many, with them", others, without)]
-    for name, pools, counted in ways:
-        heads = [fit(len(classes), seed, pool) for pool, classes in zip(pools, counted, strict=True)]
+    is_look_alike = torch.tensor([looks_alike(name) for name in shapes.classes])  # of a class of SHREC'07
+    unlike_others = [classes[~is_look_alike[classes]] for classes in others]
+    variants = [("pretrained", others, others)]
+    if min(map(len, unlike_others)) >= _MIN_CLASSES:
+        variants += [
+            ("without look-alikes", unlike_others, unlike_others), ("as many, with them", others, unlike_others)
+        ]  # fmt: skip
+    for name, pools, equally_many in variants:
+        heads = [fit(len(classes), seed, pool) for pool, classes in zip(pools, equally_many, strict=True)]
         score(name, [_distances(head, histograms[part]) for head, part in zip(heads, scored, strict=True)])
     for name in plain:
         other = igps.descriptor(name)
         described = [
             describe(
-                usable(root, other, cache_dir, n_workers, torch.nonzero(part).flatten().tolist()),
+                usable_shapes(root, other, cache_dir, n_workers, torch.nonzero(part).flatten().tolist()),
                 other,
                 n_workers=n_workers,
             )
@@ -114,21 +115,21 @@ def pretrain(
         ]
         score(name, [other.distances(x, x) for x in described])
 
-    everything = torch.arange(len(shapes.classes))
-    head = fit(len(everything), seed, everything)
-    print(f"fitted to all {len(everything)} classes")
+    all_classes = torch.arange(len(shapes.classes))
+    head = fit(len(all_classes), seed, all_classes)
+    print(f"fitted to all {len(all_classes)} classes")
     head = save(head)
     if data is None:
         return
 
-    real = usable(data, descriptor, cache_dir, n_workers)
+    real = usable_shapes(data, descriptor, cache_dir, n_workers)
     real_histograms, labels_of_real = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
     report(str(data), real_histograms, labels_of_real, head)
-    unlike = everything[~is_look_alike]
-    choices = (("without look-alikes", unlike), ("of all kinds", everything)) if len(unlike) >= _MIN_CLASSES else ()
-    for name, among in choices:
+    unlike = all_classes[~is_look_alike]
+    choices = (("without look-alikes", unlike), ("of all kinds", all_classes)) if len(unlike) >= _MIN_CLASSES else ()
+    for name, classes in choices:
         title = f"{data}, fitted to {len(unlike)} classes {name}"
-        report(title, real_histograms, labels_of_real, fit(len(unlike), seed, among))
+        report(title, real_histograms, labels_of_real, fit(len(unlike), seed, classes))
     # At least two shapes of each class remain to be scored against each other
     for n in (n for n in (1, 3, 5) if n + 2 <= int(labels_of_real.bincount().min())):
         few_labels(n, real_histograms, labels_of_real, head, descriptor.part_cells)
@@ -143,7 +144,7 @@ def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
     save_file(state, path)
 
 
-def _drawn(classes: Sequence[int], n: int, seed: int) -> list[int]:
+def _draw_classes(classes: Sequence[int], n: int, seed: int) -> list[int]:
     return random.Random(seed).sample(sorted(classes), min(n, len(classes)))
 
 

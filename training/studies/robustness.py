@@ -22,7 +22,7 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.nn.descriptor import Descriptor
 from igps.report.results import write_sources
 from igps.report.tables import write_rows
-from training.studies.altered import Answer, Way, describe_altered
+from training.studies.altered import Alteration, Answer, describe_altered
 from training.studies.disturbances import DISTURBANCES
 
 POSE = "pose"
@@ -95,8 +95,11 @@ def robustness(
     check_descriptors(descriptors, dataset)
     if gallery is None and len(dataset) < 2:
         raise ValueError("dataset: expected at least two meshes, each its own class, or a gallery. Give one of them.")
-    ways: dict[str, Way | None] = {_UNCHANGED: None, **{name: kind.apply for name, kind in DISTURBANCES.items()}}
-    answers = describe_altered(dataset, ways, descriptors, n_workers=n_workers)
+    alterations: dict[str, Alteration | None] = {
+        _UNCHANGED: None,
+        **{name: kind.apply for name, kind in DISTURBANCES.items()},
+    }
+    answers = describe_altered(dataset, alterations, descriptors, n_workers=n_workers)
     if gallery is None:
         units = {x.name: _between_meshes(x, [row[_UNCHANGED][x.name] for row in answers]) for x in descriptors}
     else:
@@ -116,16 +119,16 @@ def _movements(
 ) -> dict[str, Movement]:
     """Return the movement of a descriptor by each disturbance."""
     result = {}
-    for way in DISTURBANCES:
+    for disturbance in DISTURBANCES:
         distances: dict[str, float] = {}
         notes: dict[str, str] = {}
         for mesh, descriptions in zip(names, answers, strict=True):
-            before, after = descriptions[_UNCHANGED][descriptor.name], descriptions[way][descriptor.name]
+            before, after = descriptions[_UNCHANGED][descriptor.name], descriptions[disturbance][descriptor.name]
             if isinstance(before, str) or isinstance(after, str):
                 notes[mesh] = before if isinstance(before, str) else str(after)
             else:
                 distances[mesh] = _distance(descriptor, before, after)
-        result[way] = _movement(distances, notes, unit)
+        result[disturbance] = _movement(distances, notes, unit)
     return result
 
 

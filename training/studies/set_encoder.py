@@ -68,7 +68,7 @@ def potential(samples: SampleBatch, batch: SignatureBatch, n_eigenpairs: int) ->
     return barycentroid_potential(embedded).clamp_min(1e-6).log()
 
 
-def trained(sets: Tensor, labels: Tensor, n_epochs: int, seed: int) -> SetEncoder:
+def train_encoder(sets: Tensor, labels: Tensor, n_epochs: int, seed: int) -> SetEncoder:
     """Train an encoder by the supervised contrastive loss (Khosla et al. 2020), on batches of 8 shapes of 8 classes."""
     torch.manual_seed(seed)
     encoder = SetEncoder(sets.shape[2])
@@ -117,7 +117,7 @@ def study(
         seen = torch.tensor([families[c] in {order[i] for i in chosen} for c in labels.tolist()])
         centre, spread = sets[seen].mean(dim=(0, 1)), sets[seen].std(dim=(0, 1)).clamp_min(1e-6)
         scaled = (sets - centre) / spread
-        encoder = trained(scaled[seen], labels[seen], n_epochs, seed)
+        encoder = train_encoder(scaled[seen], labels[seen], n_epochs, seed)
         head = WhitenedHead().fit(histograms[seen], labels[seen], descriptor.part_cells)
         with torch.no_grad():
             embedded, whitened = encoder(scaled[~seen]), head(histograms[~seen])

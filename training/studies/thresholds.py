@@ -24,20 +24,21 @@ def threshold_between(same: ArrayLike, other: ArrayLike, rate: float) -> Thresho
         other: distances of other pairs.
         rate: largest rate of false pairs.
     """
-    largest, refused = float(np.max(same)), _first_refused(other, rate)
-    return _counted(math.sqrt(largest * refused) if largest < refused else math.nextafter(refused, 0), same, other)
+    largest, rejected = float(np.max(same)), _smallest_rejected(other, rate)
+    threshold = math.sqrt(largest * rejected) if largest < rejected else math.nextafter(rejected, 0)
+    return _with_counts(threshold, same, other)
 
 
 def threshold_at(same: ArrayLike, other: ArrayLike, rate: float) -> Threshold:
     """Return the largest threshold that the rate of false pairs allows; arguments are those of `threshold_between`."""
-    return _counted(math.nextafter(_first_refused(other, rate), 0), same, other)
+    return _with_counts(math.nextafter(_smallest_rejected(other, rate), 0), same, other)
 
 
-def _first_refused(other: ArrayLike, rate: float) -> float:
+def _smallest_rejected(other: ArrayLike, rate: float) -> float:
     other = np.sort(np.asarray(other, dtype=np.float64))
     return float(other[int(rate * len(other))])
 
 
-def _counted(distance: float, same: ArrayLike, other: ArrayLike) -> Threshold:
+def _with_counts(distance: float, same: ArrayLike, other: ArrayLike) -> Threshold:
     same, other = np.asarray(same), np.asarray(other)
     return Threshold(distance, len(other), int((other <= distance).sum()), len(same), int((same <= distance).sum()))

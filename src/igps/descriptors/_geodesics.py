@@ -19,8 +19,7 @@ from igps.mesh.simplification import simplify
 from igps.mesh.surface import undirected_edges
 from igps.signature.ordering import canonically_ordered, spatial_ordering_keys
 
-# Relative tolerance: distances that are closer to each other differ by rounding alone.
-_TIE = 1e-9
+_TIE_TOLERANCE = 1e-9  # relative; distances that differ by less are equal except for rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +51,8 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
 
     Each sample is the vertex that is farthest from all samples before it. The first sample is an end of a long
     geodesic: the search starts at the vertex with the largest of the `spatial_ordering_keys` and moves to the farthest
-    vertex, twice. Among equally far vertices, the one with the least sum of distances to the samples is taken, then the
-    one with the largest key. So the result does not depend on the order of the vertices.
+    vertex, twice. Among equally far vertices, the least sum of distances to the samples decides, then the largest key.
+    So the result does not depend on the order of the vertices.
 
     A ValueError is raised if there are fewer vertices than `n_samples`. For `points_per_edge` see `edge_graph`.
     """
@@ -69,8 +68,8 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
         return dijkstra(graph, indices=vertex)[:n_vertices]
 
     def farthest(distance: Floats, total: Floats) -> int:
-        tied = np.flatnonzero(distance >= (1 - _TIE) * distance.max())
-        tied = tied[total[tied] <= (1 + _TIE) * total[tied].min()]
+        tied = np.flatnonzero(distance >= (1 - _TIE_TOLERANCE) * distance.max())
+        tied = tied[total[tied] <= (1 + _TIE_TOLERANCE) * total[tied].min()]
         return int(tied[np.argmax(keys[tied])])
 
     keys = spatial_ordering_keys(mesh)
@@ -105,7 +104,6 @@ def edge_graph(mesh: Mesh, points_per_edge: int = 0) -> sparse.csr_array:
     share = (np.arange(1, n + 1) / (n + 1))[None, :, None]
     first, last = mesh.vertices[edges[:, :1]], mesh.vertices[edges[:, 1:]]
     positions = np.concatenate([mesh.vertices, ((1 - share) * first + share * last).reshape(-1, 3)])
-
     on_edge = n_vertices + np.arange(len(edges) * n).reshape(len(edges), n)
     chain = np.concatenate([edges[:, :1], on_edge, edges[:, 1:]], axis=1)
     tails, heads = [chain[:, :-1].ravel()], [chain[:, 1:].ravel()]

@@ -17,8 +17,7 @@ from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 
 _DIMENSION = 3
-# The iteration ends when a step reduces the stress by less than this share of it, or after the maximum of steps.
-_TOLERANCE = 1e-4
+_TOLERANCE = 1e-4  # relative reduction of the stress by a step, below which the iteration ends
 _MAX_STEPS = 300
 
 

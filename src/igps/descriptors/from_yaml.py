@@ -29,7 +29,6 @@ HISTOGRAMS: Mapping[str, type[DescriptionPart]] = {
 
 _MAX_BYTES = 100_000  # of a file
 _MAX_INTEGER = 10_000  # of any number in a file: files are untrusted, and must not ask for huge histograms
-_METADATA_KEYS = ("name", "source", "invariant_to", "scale")
 
 
 def load_yaml(path: str | Path) -> HistogramDescriptor:
@@ -55,7 +54,7 @@ def load_yaml(path: str | Path) -> HistogramDescriptor:
         if path.stat().st_size > _MAX_BYTES:
             raise ValueError(f"expected at most {_MAX_BYTES} bytes, got {path.stat().st_size}")
         spec = yaml.safe_load(path.read_text(encoding="utf-8"))
-        _check_keys(spec, ("parts", *_METADATA_KEYS), "a descriptor")
+        _check_keys(spec, ("parts", "name", "source", "invariant_to", "scale"), "a descriptor")
         if not isinstance(spec.get("parts"), list):
             raise ValueError("expected a list of `parts`, got none")
         embedding = cache(lambda n: SpectralEmbedding(n_eigenpairs=n))
@@ -86,13 +85,14 @@ def _axis(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> Any:
     name, options = next(iter(spec.items())) if isinstance(spec, Mapping) and len(spec) == 1 else (spec, {})
     if not isinstance(name, str) or not isinstance(options, Mapping | None):
         raise ValueError(f"axes: expected a name, or a name with its options, got {spec!r}")
-    if name not in AXES and not {"centres", "quantiles"} & set(options or {}):
+    options = dict(options or {})
+    if name in AXES:
+        return _build(AXES[name], options, embedding, name)
+    if not {"centres", "quantiles"} & set(options):
         raise ValueError(
             f"axes: expected one of {', '.join(AXES)}, or an attribute with centres or quantiles, got {name!r}"
         )
-    if name in AXES:
-        return _build(AXES[name], dict(options or {}), embedding, name)
-    return _build(Attribute, {"name": name, **(options or {})}, embedding, name)
+    return _build(Attribute, {"name": name, **options}, embedding, name)
 
 
 def _build(kind: type, options: dict[str, Any], embedding: Callable[[int], SpectralEmbedding], name: str) -> Any:

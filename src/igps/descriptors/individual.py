@@ -31,13 +31,13 @@ SCALES: Mapping[str, float] = {
 }  # fmt: skip
 """The median distance between generated bodies of one class, by descriptor, as `training.study scales` prints it."""
 
-# The usual distance between individuals of one body, as a share of the scale of the descriptor. `pretrained` has a
-# separate value, because its head reduces these distances to almost nothing.
+# Typical distance between individuals of one body, as a share of the scale of the descriptor. `pretrained` has its own
+# value, because its head reduces these distances to almost nothing.
 _INDIVIDUAL_SHARE, _INDIVIDUAL_DISTANCES = 0.25, {"pretrained": 0.0043}
 # A difference in size, in logarithms, adds at most _MAX_GAIN times the distance, and half of that at _HALF_SIZE.
 _MAX_GAIN, _HALF_SIZE = 2.0, 0.3
-# The usual differences in twist and in signed volumes between individuals of one body.
-_USUAL_TWIST, _USUAL_VOLUME = 0.002, 0.0085
+# Typical differences in twist and in signed volumes between individuals of one body.
+_TYPICAL_TWIST, _TYPICAL_VOLUME = 0.002, 0.0085
 # Vectors in `signed_volumes`, and their diffusion times over area
 _N_VECTORS, _TIMES = 7, (0.01, 0.04, 0.15)
 
@@ -50,11 +50,11 @@ class IndividualDescriptor(Descriptor):
     numbers with opposite signs. The size block holds log √area and log ∛volume, in millimetres if the unit is known.
 
     Let d be the distance by the descriptor, t the Euclidean distance of the side blocks, and s the sum of the
-    differences of the two logarithms. Let n be the usual distance between individuals of one body; if it is not known,
-    it is taken as a quarter of the descriptor's scale. The distance of two bodies is e + 2 (e + n) s / (0.3 + s) with
-    e = d + t. So size adds to the distance of bodies of nearly the same form, and multiplies other distances by up
-    to 3. The distance does not depend on the collection. Both blocks are scaled so that they count alike in Euclidean
-    distances of whole descriptions.
+    differences of the two logarithms. Let n be the typical distance between individuals of one body, by default a
+    quarter of the descriptor's scale. The distance of two bodies is e + 2 (e + n) s / (0.3 + s) with e = d + t. So size
+    adds to the distance of bodies of nearly the same form, and multiplies other distances by up to 3. The distance does
+    not depend on the collection. Both blocks are scaled so that they have about the same effect on Euclidean distances
+    of whole descriptions.
 
     Args:
         descriptor: any descriptor.
@@ -80,13 +80,11 @@ class IndividualDescriptor(Descriptor):
             )
         self.descriptor, self.scale, self.keeps_size = descriptor, scale, size
         self._unit = _INDIVIDUAL_DISTANCES.get(descriptor.name, _INDIVIDUAL_SHARE * scale)
-        embedding = SpectralEmbedding(n_eigenpairs=16)
-        axes = [InteriorDistance(6, 3.0), PairTwist()]
+        axes, embedding = [InteriorDistance(6, 3.0), PairTwist()], SpectralEmbedding(n_eigenpairs=16)
         self.twists = PairHistogram(axes, embedding) if side else None
         self.name, self.source = descriptor.name + SIDE * side + SIZE * size, descriptor.source
-        # "motion" includes reflections
-        lost = ["scale"] * size + ["motion"] * side
-        self.invariant_to = tuple(name for name in descriptor.invariant_to if name not in lost)
+        compared = ["scale"] * size + ["motion"] * side  # "motion" includes reflections
+        self.invariant_to = tuple(name for name in descriptor.invariant_to if name not in compared)
         self.requirements = descriptor.requirements
         if self.twists is not None:
             self.requirements |= self.twists.requirements
@@ -98,7 +96,7 @@ class IndividualDescriptor(Descriptor):
             counts = self.twists(BatchFeatures(batch, self.training))
             odd = (counts - counts.flip(-1))[..., counts.shape[-1] // 2 :] / 2
             volumes = signed_volumes(batch).to(odd)
-            parts += [self._unit / _USUAL_VOLUME * volumes, self._unit / _USUAL_TWIST * odd.flatten(1)]
+            parts += [self._unit / _TYPICAL_VOLUME * volumes, self._unit / _TYPICAL_TWIST * odd.flatten(1)]
         if self.keeps_size:
             factors = [millimetres(unit) for unit in batch.units or [None] * len(batch)]
             size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
@@ -129,17 +127,16 @@ class IndividualDescriptor(Descriptor):
 
     def wrap(self, descriptor: Descriptor) -> "IndividualDescriptor":
         """Return an `IndividualDescriptor` of another descriptor with the same options and scales."""
-        options = {"size": self.keeps_size, "side": self.twists is not None}
-        wrapped = IndividualDescriptor(descriptor, scale=self.scale, **options)
+        has_side = self.twists is not None
+        wrapped = IndividualDescriptor(descriptor, size=self.keeps_size, side=has_side, scale=self.scale)
         wrapped._unit = self._unit
         return wrapped
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Split descriptions (N, D) into the descriptor's own, in its shape, the side block and the size block."""
-        n_volumes = math.comb(_N_VECTORS, 3)
-        n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else n_volumes + self.twists.n_cells // 2
-        n_form = descriptions.shape[1] - n_side - n_size
-        form, side, size = descriptions.split([n_form, n_side, n_size], dim=1)
+        n_side = 0 if self.twists is None else math.comb(_N_VECTORS, 3) + self.twists.n_cells // 2
+        n_size = 2 * self.keeps_size
+        form, side, size = descriptions.split([descriptions.shape[1] - n_side - n_size, n_side, n_size], dim=1)
         return form.unflatten(1, self.descriptor.description_shape), side, size
 
 

@@ -24,8 +24,7 @@ from igps.nn.descriptor import BodyDescriptor
 METRICATION = 1.0495
 """Largest ratio of the shortest path along the links to the Euclidean distance of its ends, in free space."""
 
-# Tolerance for rounding: the largest distance of a sample from a grid point, in cells.
-_GRID_TOLERANCE = 1e-3
+_GRID_TOLERANCE = 1e-3  # largest distance of a sample from a grid point, in cells
 
 
 @dataclass(eq=False, repr=False)
@@ -60,7 +59,7 @@ class InnerDistance(BodyDescriptor):
         n_sources = min(self.n_sources, len(points))
         sources = np.random.default_rng(self.seed).permutation(len(points))[:n_sources]
         lengths = inner_distances(points, sources)
-        lengths[np.arange(n_sources), sources] = np.nan
+        lengths[np.arange(n_sources), sources] = np.nan  # a sample and itself are no pair
         ratio = lengths[~np.isnan(lengths)] / np.sqrt(body.area)
         return linear_histogram([ratio / self.max_distance], [self.n_bins]).astype(np.float32)
 
@@ -110,7 +109,9 @@ def _visible_links(cells: Integers) -> sparse.csr_array:
     sample_at[flat] = np.arange(len(cells))
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     rows, columns, lengths = [], [], []
-    for offset in _offsets():
+    # Steps of at most two cells along each axis, without multiples of shorter steps: 98 directions.
+    steps = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    for offset in steps[np.gcd.reduce(steps, axis=1) == 1]:
         target = sample_at[flat + offset @ strides]
         linked = target >= 0
         if np.abs(offset).max() == 2:
@@ -123,12 +124,6 @@ def _visible_links(cells: Integers) -> sparse.csr_array:
         lengths.append(np.full(linked.sum(), np.linalg.norm(offset)))
     entries = (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns)))
     return sparse.coo_array(entries, shape=(len(cells), len(cells))).tocsr()
-
-
-def _offsets() -> Integers:
-    """(98, 3) steps of at most two cells along each axis, without multiples of shorter steps."""
-    steps = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    return steps[np.gcd.reduce(steps, axis=1) == 1]
 
 
 def _connect(graph: sparse.csr_array, cells: Integers) -> sparse.csr_array:

@@ -83,16 +83,13 @@ def local_diameters(mesh: Mesh, face: Integers, weights: Floats, n_rays: int, op
     vertices = np.asfortranarray((mesh.vertices - centre) / size)
     faces = np.asfortranarray(mesh.faces)
     normals = unit(area_vectors(vertices, mesh.faces))
-
     # The frame of the rays contains an edge of the face, so that the rays rotate with the body.
     corner = vertices[faces[face]]
     inward = -normals[face]
     side = unit(corner[:, 1] - corner[:, 0])
-    along, across, ahead = _cone(n_rays, opening_angle).T
     frame = np.stack([side, np.cross(inward, side), inward], axis=1)
-    directions = np.einsum("rk,pkj->prj", np.stack([along, across, ahead], axis=1), frame)
+    directions = np.einsum("rk,pkj->prj", _cone(n_rays, opening_angle), frame)
     origins = np.einsum("pi,pij->pj", weights, corner) + _RAY_OFFSET * inward
-
     tree = igl.AABB()
     tree.init(vertices, faces)
     rays = directions.reshape(-1, 3)
@@ -106,8 +103,7 @@ def centricity(mesh: Mesh, n_sources: int) -> Floats:
 
     The mean is over at most `n_sources` vertices by farthest-point sampling, each weighted by the area nearest to it.
     """
-    n_vertices = len(mesh.vertices)
-    distances = farthest_points(mesh, min(n_sources, n_vertices), _POINTS_PER_EDGE).distances
+    distances = farthest_points(mesh, min(n_sources, len(mesh.vertices)), _POINTS_PER_EDGE).distances
     area = vertex_areas(mesh.vertices, mesh.faces)
     weight = np.bincount(np.argmin(distances, axis=0), area, len(distances))
     return weight @ distances / weight.sum()

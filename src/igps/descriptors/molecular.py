@@ -23,8 +23,7 @@ _CENTRES = {
 # Distances change with the conformation, so wide bins retrieve proteins better than narrow bins.
 _N_BINS = 4
 _N_SAMPLES = 2000
-# The difference in size, in logarithms, that halves the distance of two bodies.
-_HALF_SIZE = 0.3
+_HALF_SIZE = 0.3  # difference in size, in logarithms, at which half of the χ² distance counts
 
 
 class Shares(PointAxis):

@@ -41,10 +41,6 @@ def rich(*, learnable: bool = False, n_training_samples: int | None = None) -> H
     depth = partial(Attribute, "depth", _DEPTH, learnable=learnable)
     charge = Attribute("electrostatic_potential", _ELECTROSTATIC_POTENTIAL, learnable=learnable)
     n = N_ORIENTED_SAMPLES
-    oriented = histogram(50, distance(6, 3.0), cosines(), n_samples=n)
-    on_surface = PairHistogram(
-        [euclidean(6, 1.0), cosines()], fixed[50], "surface", n_samples=n, n_training_samples=n_training_samples
-    )
     return HistogramDescriptor(
         [
             [
@@ -55,8 +51,10 @@ def rich(*, learnable: bool = False, n_training_samples: int | None = None) -> H
                 histogram(50, potential(4), depth(), distance(32)),
                 histogram(50, potential(4), charge, distance(32)),
             ],
-            oriented,
-            on_surface,
+            histogram(50, distance(6, 3.0), cosines(), n_samples=n),
+            PairHistogram(
+                [euclidean(6, 1.0), cosines()], fixed[50], "surface", n_samples=n, n_training_samples=n_training_samples
+            ),
         ],
         name="rich",
         source="Rustamov 2010; Wahl, Hillenbrand and Hirzinger 2003",

@@ -36,14 +36,12 @@ Boundary = Literal["dirichlet", "neumann"]
 
 # Components with a smaller share of the volume are artefacts of the sampling, at tips and seams. Each adds a zero.
 _MIN_COMPONENT_SHARE = 0.01
-# Cells along the longest side: 3³ points for each cell must fit into memory.
-_MAX_RESOLUTION = 128
+_MAX_RESOLUTION = 128  # cells along the longest side; 3³ points for each cell must fit into memory
 # Shift of the inverse iteration, in units of volume^(-2/3): below the zero mode, and far from singular.
 _SHIFT = -1.0
 # Relative accuracy of the eigenvalues' distances from the shift, far below the error of the grid.
 _TOLERANCE = 1e-8
-# Number of eigenvalues in each search for missed copies of multiple eigenvalues.
-_N_RECHECKED = 3
+_N_RECHECKED = 3  # eigenvalues in each search for missed copies of multiple eigenvalues
 
 
 @dataclass(eq=False, repr=False)
@@ -98,12 +96,7 @@ def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels
 
 
 def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[Booleans, float]:
-    """Sample a grid of cells at 3³ points each.
-
-    Returns:
-        Whether each point is inside, (X, 3, Y, 3, Z, 3), with a margin of one layer of empty cells; and the side of a
-        cell, in units of length.
-    """
+    """Whether 3³ points per cell are inside, (X, 3, Y, 3, Z, 3), with a margin of empty cells; and the cell side."""
     longest = longest_side(mesh.vertices)
     resolution = int(np.clip(np.ceil(longest * (n_voxels / abs(mesh.volume)) ** (1 / 3)), 1, _MAX_RESOLUTION))
     cell = longest / resolution
@@ -136,8 +129,8 @@ def _neumann(inside: Booleans) -> tuple[sparse.csr_array, Floats]:
     graph = _symmetric(np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), len(mass))
     n_components, component = connected_components(graph, directed=False)
     share = np.bincount(component, weights=mass, minlength=n_components) / mass.sum()
-    kept = np.nonzero((share >= _MIN_COMPONENT_SHARE)[component])[0]
-    graph, mass = graph[kept][:, kept], mass[kept]
+    cells = np.nonzero((share >= _MIN_COMPONENT_SHARE)[component])[0]
+    graph, mass = graph[cells][:, cells], mass[cells]
     return sparse.diags_array(graph.sum(axis=1)) - graph, mass
 
 
@@ -164,8 +157,8 @@ def _dirichlet(inside: Booleans) -> tuple[sparse.csr_array, Floats]:
             if step == 1:
                 rows.append(cell[linked])
                 columns.append(np.roll(cell, -1, axis=0)[linked])
-    row, column = np.concatenate(rows), np.concatenate(columns)
-    graph = _symmetric(row, column, np.ones(len(row)), n_cells)
+    row = np.concatenate(rows)
+    graph = _symmetric(row, np.concatenate(columns), np.ones(len(row)), n_cells)
     return sparse.diags_array(diagonal[is_cell]) - graph, np.ones(n_cells)
 
 

@@ -17,8 +17,7 @@ from igps.signature.signature import SampleKind
 
 # The weight of a sample is this power of its potential, so that the trunk determines the axes rather than the limbs.
 _POWER = -4
-# Largest coordinate, in units of the root mean square distance from the centre
-_REACH = 2.2
+_REACH = 2.2  # largest coordinate, in units of the root mean square distance from the centre
 
 
 class AxialHistogram(SampleHistogram):

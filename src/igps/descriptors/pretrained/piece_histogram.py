@@ -12,12 +12,11 @@ from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram
 from igps.signature.signature import SampleKind
 
-# Centres of the bins, as logarithms to base 2. Sizes start at one sample in 64.
+# Centres of the first and last bins, as logarithms to base 2. Sizes start at one sample in 64. The length of a ball is
+# −0.8, and that of a rod a hundred times as long as it is thick is 2.5.
 _MIN_SIZE, _MAX_SIZE = -6.0, -0.5
-# The length of a ball is at −0.8, that of a rod a hundred times as long as it is thick at 2.5.
 _MIN_LENGTH, _MAX_LENGTH = -1.0, 2.5
-# Fewer samples determine no length.
-_MIN_SAMPLES = 4
+_MIN_SAMPLES = 4  # fewer samples do not determine a length
 
 
 class PieceHistogram(SampleHistogram):
