@@ -8,9 +8,9 @@ that part, and the test part is scored once.
 
 from jsonargparse import auto_cli
 
-from igps.cli import faults_in_a_sentence
+from igps.cli import errors_as_messages
 from training.studies.ablation import ablate
 
 if __name__ == "__main__":
-    with faults_in_a_sentence():
+    with errors_as_messages():
         auto_cli(ablate)

@@ -11,9 +11,9 @@ from that of pretrain.py.
 
 from jsonargparse import auto_cli
 
-from igps.cli import faults_in_a_sentence
+from igps.cli import errors_as_messages
 from training.studies.calibration import calibrate
 
 if __name__ == "__main__":
-    with faults_in_a_sentence():
+    with errors_as_messages():
         auto_cli(calibrate)

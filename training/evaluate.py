@@ -10,9 +10,9 @@ If a descriptor has a metric, as `pretrained` has, the metric is the prior of th
 
 from jsonargparse import auto_cli
 
-from igps.cli import faults_in_a_sentence
+from igps.cli import errors_as_messages
 from training.studies.learning import checkpoint, fitted, splits
 
 if __name__ == "__main__":
-    with faults_in_a_sentence():
+    with errors_as_messages():
         auto_cli([splits, fitted, checkpoint])

@@ -8,9 +8,9 @@ Every option of the learner, the data and the trainer can be set in the file or 
 holds the configuration: `RetrievalLearner.load_from_checkpoint` and `SignatureDataModule.load_from_checkpoint` read it.
 """
 
-from igps.cli import faults_in_a_sentence
+from igps.cli import errors_as_messages
 from training.running import Run
 
 if __name__ == "__main__":
-    with faults_in_a_sentence():
+    with errors_as_messages():
         Run()

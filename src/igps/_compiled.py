@@ -16,8 +16,8 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 # Values of `fastmath`
-SUMS = {"contract", "reassoc", "nsz"}  # allows sums in any order, and thus vector instructions
-CONTRACTED = {"contract"}  # allows fused multiply-add: a product and its sum are rounded once instead of twice
+REASSOCIATE = {"contract", "reassoc", "nsz"}  # allows sums in any order, and thus vector instructions
+FUSE = {"contract"}  # allows fused multiply-add: a product and its sum are rounded once instead of twice
 
 
 class Lazy:

@@ -13,7 +13,7 @@ PARTIAL = ".partial"
 
 
 @contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[IO[bytes]]:
+def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     """Open a temporary file for writing, which replaces `path` in one step when the context ends without an error."""
     # Plain `open` respects the umask; tempfile and safetensors create files that only their owner can read.
     partial = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(8)}{PARTIAL}")
@@ -26,7 +26,7 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
         raise
 
 
-def with_ordered_metadata(content: bytes) -> bytes:
+def sort_metadata(content: bytes) -> bytes:
     """Return a safetensors file with sorted metadata. The library writes them in an order that differs each time."""
     end = 8 + int.from_bytes(content[:8], "little")
     header: dict[str, Any] = json.loads(content[8:end])

@@ -20,7 +20,7 @@ def check_positive(**values: float) -> None:
             raise ValueError(f"{name}: expected a positive number, got {value}.")
 
 
-def check_share(**values: float | None) -> None:
+def check_fraction(**values: float | None) -> None:
     """Raise a ValueError for the first value that is not strictly between 0 and 1."""
     for name, value in values.items():
         if value is not None and not 0 < value < 1:

@@ -115,7 +115,7 @@ class Team:
         return results
 
 
-ALONE = Team(1)  # runs all jobs on the calling thread
+SERIAL = Team(1)  # runs all jobs on the calling thread
 
 
 class _ThreadState(threading.local):

@@ -11,7 +11,14 @@ import trimesh
 from sklearn.metrics import roc_auc_score
 
 from conftest import as_mesh
-from igps.analysis.explanation import explain, explain_groups, on_surface, significant_cells, unit_shares, without_head
+from igps.analysis.explanation import (
+    explain,
+    explain_groups,
+    share_density,
+    significant_cells,
+    unit_shares,
+    without_head,
+)
 from igps.data.batch import SignatureBatch
 from igps.data.collation import collate
 from igps.descriptors import descriptor
@@ -181,7 +188,7 @@ def test_a_bump_is_painted_where_it_is(name: str, signatures: list[Signature], b
     found = explain(descriptor(name), *batches)
     places = {kind: getattr(signatures[1], kind).points for kind in ("interior", "surface")}
     points = places["surface"]
-    values = on_surface(found.samples[1], places, points)  # type: ignore[arg-type]
+    values = share_density(found.samples[1], places, points)  # type: ignore[arg-type]
     at_bump = np.linalg.norm(points - points[points[:, 0].argmax()], axis=1) < 0.25
     assert values[at_bump].mean() > 2 * abs(values[~at_bump].mean())
 
@@ -202,7 +209,7 @@ def test_a_small_bump_is_painted_in_another_pose() -> None:
     true = np.linalg.norm(points - bent.vertices[away.argmin()], axis=1) < 0.4
     places = {"interior": pair[1].interior.points, "surface": points}
     assert found.places is not None
-    assert roc_auc_score(true, on_surface(found.places[1], places, points)) > 0.9  # type: ignore[arg-type]
+    assert roc_auc_score(true, share_density(found.places[1], places, points)) > 0.9  # type: ignore[arg-type]
 
 
 def test_bodies_that_are_alike_have_nothing_to_share(batches: list[SignatureBatch]) -> None:

@@ -10,7 +10,7 @@ import trimesh
 
 from conftest import as_mesh
 from igps.analysis.groups import squared_distances
-from igps.analysis.outliers import LIMIT, flat_share, measures_of, outliers
+from igps.analysis.outliers import LIMIT, flat_share, measure_bodies, outliers
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
 from igps.mesh.formats import volumes
@@ -30,7 +30,7 @@ def found_of(vectors: np.ndarray, **given: object) -> list:
 def test_what_is_usual_is_no_outlier() -> None:
     found = [one for seed in range(20) for one in found_of(usual(seed))]
     assert np.mean([one.is_outlier for one in found]) < 0.02
-    assert {one.lies_among for one in found} == {None}
+    assert {one.nearer_class for one in found} == {None}
 
 
 def test_a_body_alone_in_its_class_is_told_not_to_be_judged() -> None:
@@ -78,7 +78,7 @@ def test_a_wrong_label_is_told() -> None:
     vectors = usual()
     vectors[20] = vectors[:12].mean(axis=0)
     first = found_of(vectors)[0]
-    assert (first.body, first.lies_among) == (20, "a")
+    assert (first.body, first.nearer_class) == (20, "a")
     assert first.reason.endswith("labelled b, but nearer to a")
 
 
@@ -169,7 +169,7 @@ def test_measures_are_those_of_the_meshes(tmp_path: object) -> None:
     torus.copy().apply_scale(1e-3).export(f"{tmp_path}/metres.glb")
     paths = [path, f"{tmp_path}/missing.off", f"{tmp_path}/metres.glb"]
     dataset = SignatureDataset(paths, cache_dir=f"{tmp_path}/cache")
-    measures = measures_of(dataset, n_workers=1)
+    measures = measure_bodies(dataset, n_workers=1)
     assert measures["handles"][0] == 1
     assert measures["volume"][0] == pytest.approx(np.log(torus.volume))
     assert measures["spacing"][0] == pytest.approx(np.log(torus.area / len(torus.faces)) / 2)
@@ -187,7 +187,7 @@ def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path: Path) -> Non
         mask = ((places**2).sum(axis=0) < 14**2).astype(np.uint8)
         nibabel.save(nibabel.Nifti1Image(mask, np.diag([side, side, side, 1])), tmp_path / f"{name}.nii.gz")
     dataset = SignatureDataset([tmp_path / "fine.nii.gz", tmp_path / "coarse.nii.gz"], cache_dir=tmp_path)
-    spacing = measures_of(dataset, n_workers=1)["spacing"]
+    spacing = measure_bodies(dataset, n_workers=1)["spacing"]
     assert np.exp(spacing) == pytest.approx([1, 2], rel=0.01)
 
 
@@ -205,7 +205,7 @@ def test_labels_are_measured_in_their_grid(tmp_path: Path) -> None:
         nibabel.save(nibabel.Nifti1Image(mask.astype(np.uint8), np.eye(4)), tmp_path / f"{name}.nii.gz")
     files = [tmp_path / f"{name}.nii.gz" for name in masks]
     dataset = SignatureDataset(files, cache_dir=tmp_path, labels=["a", "b", "a", "c", "d"])
-    found = measures_of(dataset, n_workers=1)
+    found = measure_bodies(dataset, n_workers=1)
     assert found["overlap"][0, 1] == pytest.approx((masks["a"] & masks["b"]).sum() / masks["a"].sum())
     assert found["overlap"][0, 3] == pytest.approx((masks["a"] & masks["border"]).sum() / masks["a"].sum())
     assert found["overlap"][0, 2] == 0  # of one class, which may be another subject
@@ -223,7 +223,7 @@ def test_labels_of_other_subjects_in_the_same_standard_space_do_not_overlap(tmp_
         nibabel.save(nibabel.Nifti1Image(labels.astype(np.uint8), np.eye(4)), tmp_path / f"{name}.nii.gz")
     bodies = find_bodies(tmp_path, classes="body")
     assert bodies.labels == ("1", "2", "1", "2")
-    assert not measures_of(SignatureDataset(bodies, cache_dir=tmp_path), n_workers=1)["overlap"].any()
+    assert not measure_bodies(SignatureDataset(bodies, cache_dir=tmp_path), n_workers=1)["overlap"].any()
 
 
 def test_a_volume_is_read_once_for_all_its_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,6 +236,6 @@ def test_a_volume_is_read_once_for_all_its_labels(tmp_path: Path, monkeypatch: p
     dataset, reads = SignatureDataset(tmp_path, cache_dir=tmp_path / "cache"), []
     read = volumes.read_raw
     monkeypatch.setattr(volumes, "read_raw", lambda path: reads.append(path) or read(path))
-    found = measures_of(dataset, n_workers=1)
+    found = measure_bodies(dataset, n_workers=1)
     assert len(reads) == 1
     assert np.exp(found["volume"]) == pytest.approx([1440, 1440, 1440, np.nan], rel=0.01, nan_ok=True)

@@ -19,7 +19,7 @@ from igps.analysis.outliers import LIMIT
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
-from igps.report.answers import clusters_figure, map_figure, write_answer
+from igps.report.answers import clusters_figure, map_figure, write_analysis
 from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior, write_egg
@@ -266,7 +266,7 @@ def test_explain_tells_how_much_of_the_surface_differs(
     """One of 320 faces has all; or none has, as of a body that lacks what the other has. Both were 0 %."""
     areas = trimesh.load(root / "long3.off", process=False).area_faces
     told = told.format(f"{100 * areas[-1] / areas.sum():.2g}")
-    monkeypatch.setattr("igps.cli.answers.on_surface", lambda *_: np.append(np.full(319, -1.0), largest))
+    monkeypatch.setattr("igps.cli.answers.share_density", lambda *_: np.append(np.full(319, -1.0), largest))
     igps(monkeypatch, root, "explain", root / "short0.off", root / "long3.off", *OWN)
     assert capsys.readouterr().out.splitlines()[-1] == f"{root}/long3.off: {told}"
 
@@ -374,7 +374,7 @@ def test_a_column_called_as_the_coordinates_leaves_them_alone(
 
 
 def test_what_is_not_known_is_null_in_the_file(tmp_path: Path) -> None:
-    write_answer(tmp_path, "rows", [{"body": "é", "stability": float("nan")}])
+    write_analysis(tmp_path, "rows", [{"body": "é", "stability": float("nan")}])
     assert json.loads((tmp_path / "rows.json").read_text(), parse_constant=pytest.fail) == [
         {"body": "é", "stability": None}
     ]
@@ -389,7 +389,7 @@ def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None
         "map": map_figure(body_map(distances), names, "$a_{$"),
     }
     for name, figure in figures.items():
-        write_answer(tmp_path, name, [{"body": "a"}], figure)
+        write_analysis(tmp_path, name, [{"body": "a"}], figure)
         assert imread(tmp_path / f"{name}.png").std() > 0.02
         drawn = (tmp_path / f"{name}.svg").read_text()
         assert all(f"<!-- {one}" in drawn for one in names)
@@ -400,7 +400,7 @@ def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path: P
     distances = np.array([[0.0, 1, 3], [1, 0, 2], [3, 2, 0]])
     for folder in ("one", "other"):
         figure = clusters_figure(clusters_of(distances, 2), ["a", "b", "sub-01/" + "x" * 200 + ".off"])
-        write_answer(tmp_path / folder, "clusters", [{"body": "a"}], figure)
+        write_analysis(tmp_path / folder, "clusters", [{"body": "a"}], figure)
         assert figure.axes[0].get_window_extent().width > 0.4 * figure.bbox.width
     one, other = ((tmp_path / folder / "clusters.svg").read_bytes() for folder in ("one", "other"))
     assert one == other

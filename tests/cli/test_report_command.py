@@ -14,7 +14,7 @@ from igps.analysis.explanation import explain
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.report.explanations import read_explanations
-from igps.report.page import page_of
+from igps.report.page import render_page
 from igps.report.results import read_results
 from igps.report.surfaces import read_surfaces
 from igps.signature.signature import SignatureConfig
@@ -68,7 +68,7 @@ def test_retrieve_with_its_page(
         {name: value for name, value in json.loads((out / "scores.json").read_text()).items() if name in
          data["systems"][0]["scores"]}, abs=1e-5)  # fmt: skip
     kept = read_surfaces(out / "surfaces.npz")
-    assert (out / "report.html").read_text("utf-8") == page_of(read_results(out), kept)
+    assert (out / "report.html").read_text("utf-8") == render_page(read_results(out), kept)
     assert not re.search(re.escape(str(tmp_path)), (out / "report.html").read_text("utf-8"))
 
 

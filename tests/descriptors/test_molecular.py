@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from igps.analysis.explanation import explain
-from igps.analysis.fitting import histograms_and_prior
+from igps.analysis.fitting import split_head
 from igps.data.collation import collate
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.molecular import Shares, molecular
@@ -143,7 +143,7 @@ def test_a_head_is_fitted_to_the_histograms_and_an_explanation_holds_the_size() 
     """The logarithms of area and volume are no cells."""
     found = described(signature(0, 0), signature(1, 0))
     assert found.shape[1] == molecular().n_features
-    histograms, _ = histograms_and_prior("molecular")
+    histograms, _ = split_head("molecular")
     batch = collate([signature(0, 0), signature(1, 0)])
     torch.testing.assert_close(histograms(batch), found[:, :-2])
     assert histograms.n_features == found.shape[1] - 2

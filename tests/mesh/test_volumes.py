@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from igps.mesh.formats import files_read
+from igps.mesh.formats import dependencies_of
 from igps.mesh.formats._volume_files import _WORK_BYTES
 from igps.mesh.formats.label_names import read_label_names
 from igps.mesh.formats.volumes import LabelVolume, label_surface, read_label_volume, volume_in_memory
@@ -292,7 +292,7 @@ def test_voxels_beside_their_header(name: str, tmp_path: Path) -> None:
     volume = read_label_volume(tmp_path / "x.nhdr")
     assert label_bodies(volume) == [(3, "3", 384), (7, "7", 320)]
     assert label_surface(volume, 3).volume == pytest.approx(1440, rel=1e-3)
-    assert files_read(tmp_path / "x.nhdr") == [tmp_path / "x.nhdr", tmp_path / "x.raw"]
+    assert dependencies_of(tmp_path / "x.nhdr") == [tmp_path / "x.nhdr", tmp_path / "x.raw"]
 
 
 def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:

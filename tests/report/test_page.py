@@ -25,7 +25,7 @@ from pages import (
 )
 
 from igps.mesh.mesh import Mesh
-from igps.report.page import page_of
+from igps.report.page import render_page
 from igps.report.page_data import data_of
 from igps.report.results import read_results
 from igps.retrieval import precision_recall_curve, retrieval_scores
@@ -64,7 +64,7 @@ class Elements(HTMLParser):
 @pytest.fixture
 def page(tmp_path: Path, blob: Mesh) -> str:
     """A page of a labelled collection, with pictures."""
-    return page_of(read_results(retrieval_folder(tmp_path)), surfaces(blob))
+    return render_page(read_results(retrieval_folder(tmp_path)), surfaces(blob))
 
 
 def test_no_script_or_style_closes_its_own_element() -> None:
@@ -132,7 +132,7 @@ def test_nothing_is_loaded(page: str) -> None:
 
 def test_surfaces_lie_in_the_order_of_the_shapes(tmp_path: Path, blob: Mesh) -> None:
     pictures = surfaces(blob)
-    seen = Elements(page_of(read_results(retrieval_folder(tmp_path)), pictures))
+    seen = Elements(render_page(read_results(retrieval_folder(tmp_path)), pictures))
     lines = next(script for script in seen.scripts if script.startswith("\n")).strip().split("\n")
     assert len(lines) == len(NAMES) - 1
     for name, shape in zip(NAMES, seen.data()["shapes"], strict=True):
@@ -146,7 +146,7 @@ def test_surfaces_lie_in_the_order_of_the_shapes(tmp_path: Path, blob: Mesh) -> 
 
 def test_without_classes_only_rankings(tmp_path: Path) -> None:
     results = read_results(retrieval_folder(tmp_path, labels=()))
-    seen = Elements(page_of(results, {}))
+    seen = Elements(render_page(results, {}))
     (system,) = seen.data()["systems"]
     assert seen.data()["classes"] == []
     assert [system[name] for name in ("scores", "curve", "confusion", "per_query", "worst")] == [None] * 5
@@ -160,13 +160,13 @@ def test_without_classes_only_rankings(tmp_path: Path) -> None:
 def test_scores_and_confusions_need_classes(tmp_path: Path, kind: str) -> None:
     labels = {"classes of one": NAMES, "one class": ("egg",) * len(NAMES), "several": LABELS}[kind]
     results = read_results(retrieval_folder(tmp_path, labels=labels))
-    ids = {attributes.get("id") for _, attributes in Elements(page_of(results, {})).elements}
+    ids = {attributes.get("id") for _, attributes in Elements(render_page(results, {})).elements}
     assert ("scores" in ids) == (kind != "classes of one")
     assert ("worst" in ids) == (kind == "several")
 
 
 def test_a_comparison_has_all_descriptors(tmp_path: Path) -> None:
-    seen = Elements(page_of(read_results(comparison_folder(tmp_path / "compare")), {}))
+    seen = Elements(render_page(read_results(comparison_folder(tmp_path / "compare")), {}))
     systems = seen.data()["systems"]
     assert [system["name"] for system in systems] == ["interior", "gps"]
     assert [len(system["shapes"]) for system in systems] == [len(NAMES), len(NAMES) - 1]
@@ -177,7 +177,7 @@ def test_a_comparison_has_all_descriptors(tmp_path: Path) -> None:
 
 
 def test_a_robustness_study_has_its_movements(tmp_path: Path) -> None:
-    seen = Elements(page_of(read_results(robustness_folder(tmp_path / "robustness")), {}))
+    seen = Elements(render_page(read_results(robustness_folder(tmp_path / "robustness")), {}))
     assert [shape["name"] for shape in seen.data()["shapes"]] == list(NAMES[:3])
     assert "interior 12.5 –" in seen.text
     assert "noise: no surface left." in seen.text

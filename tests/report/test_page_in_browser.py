@@ -36,8 +36,8 @@ from igps.analysis.clusters import clusters_of
 from igps.analysis.map import body_map
 from igps.cli import main
 from igps.mesh.mesh import Mesh
-from igps.report.explanations import Painted
-from igps.report.page import page_of
+from igps.report.explanations import SurfaceExplanation
+from igps.report.page import render_page
 from igps.report.results import read_results
 from igps.shapes import ArticulatedShapes
 
@@ -75,14 +75,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "answers": answers_folder(root / "answers"),
     }
     for name, results in made.items():
-        page = page_of(read_results(results), pictures, EXPLAINED if name == "answers" else None)
+        page = render_page(read_results(results), pictures, EXPLAINED if name == "answers" else None)
         (root / f"{name}.html").write_text(page, encoding="utf-8")
     return root
 
 
 # The first body has all of the difference, its nearest all of the contrary.
 EXPLAINED = {
-    NAMES[0]: Painted(NAMES[1], "60% <i>thickness</i>", (np.full(300, 255, np.uint8), np.zeros(300, np.uint8)))
+    NAMES[0]: SurfaceExplanation(
+        NAMES[1], "60% <i>thickness</i>", (np.full(300, 255, np.uint8), np.zeros(300, np.uint8))
+    )
 }
 
 
@@ -153,7 +155,7 @@ def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(browser
     (tmp_path / "meshes.json").write_text(json.dumps({"meshes": files}))
     body = as_mesh(trimesh.creation.icosphere(subdivisions=2)).annotated(unit="mm")
     one = next(iter(surfaces(body).values()))
-    page = page_of(read_results(tmp_path), dict.fromkeys(names, one))
+    page = render_page(read_results(tmp_path), dict.fromkeys(names, one))
     (tmp_path / "page.html").write_text(page, encoding="utf-8")
     with Visit(browser, tmp_path / "page.html") as visit:
         dialog = visit.open(1)
@@ -632,7 +634,7 @@ def test_without_confusions_the_page_says_so(browser: Any, tmp_path: Path) -> No
             names=np.array(NAMES)[some],
             labels=np.array(LABELS)[some],
         )
-    (tmp_path / "right.html").write_text(page_of(read_results(results), {}), encoding="utf-8")
+    (tmp_path / "right.html").write_text(render_page(read_results(results), {}), encoding="utf-8")
     with Visit(browser, tmp_path / "right.html") as visit:
         worst = visit.page.locator("#worst")
         assert "There are no confusions" in worst.inner_text()

@@ -19,7 +19,7 @@ from igps.nn.axes import EuclideanDistance, InteriorDistance, Potential
 from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
 from igps.signature.ordering import (
-    canonically_ordered,
+    in_canonical_order,
     nearest_spacing,
     ordering_keys,
     systematic_sample,
@@ -166,15 +166,15 @@ def test_subsets_take_equal_steps() -> None:
 
 
 def test_the_order_of_form_takes_out_every_numbering(blob: Mesh) -> None:
-    expected = canonically_ordered(blob)
+    expected = in_canonical_order(blob)
     for seed in range(3):
-        found = canonically_ordered(renumbered(blob, seed))
+        found = in_canonical_order(renumbered(blob, seed))
         np.testing.assert_array_equal(found.vertices, expected.vertices)
         np.testing.assert_array_equal(found.faces, expected.faces)
 
 
 def test_the_order_of_form_keeps_the_surface(blob: Mesh) -> None:
-    found = canonically_ordered(blob)
+    found = in_canonical_order(blob)
 
     def corners(mesh: Mesh) -> set[bytes]:
         """Every face by its corners' places, from each of the three on, so that orientation counts."""
@@ -188,6 +188,6 @@ def test_the_order_of_form_keeps_the_surface(blob: Mesh) -> None:
 def test_the_order_of_form_does_not_depend_on_place_and_scale(blob: Mesh) -> None:
     turn = Rotation.from_rotvec([0.3, 1.1, -0.7]).as_matrix()
     moved = replace(blob, vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2])
-    expected, found = canonically_ordered(blob), canonically_ordered(moved)
+    expected, found = in_canonical_order(blob), in_canonical_order(moved)
     np.testing.assert_array_equal(found.faces, expected.faces)
     np.testing.assert_allclose(found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12)

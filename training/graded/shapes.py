@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
-from igps._files import whole_file
+from igps._files import atomic_write
 from igps._parallel import Failed, run
 from igps._parameters import check_at_least
 from igps.mesh.mesh import Mesh, MeshError
@@ -290,7 +290,7 @@ def _write(shapes: GradedShapes, folder: Path, indices: list[int]) -> None:
             continue
         path = folder / f"{shape.name}.off"
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as file:
+        with atomic_write(path) as file:
             file.write(off_text(shape.vertices, shape.faces).encode())
     if failed is not None:
         raise failed

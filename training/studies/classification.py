@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 import igps
-from igps.analysis.fitting import histograms_and_prior
+from igps.analysis.fitting import split_head
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, split_seen
 from igps.nn.description import describe
@@ -42,7 +42,7 @@ def classify(
     """
     prior: Head | None = None
     if checkpoint is None:
-        module, prior = histograms_and_prior(descriptor)
+        module, prior = split_head(descriptor)
         dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=module)
         dataset.precompute(strict=True)
         histograms, part_cells = describe(dataset, module, progress=True), part_cells_of(module)

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from igps._arrays import Floats
-from igps.analysis.explanation import explain, on_surface
+from igps.analysis.explanation import explain, share_density
 from igps.data.collation import collate
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors
-from igps.report.answers import write_answer
+from igps.report.answers import write_analysis
 from igps.signature.signature import SAMPLE_KINDS, SignatureConfig, compute_signature
 from training.graded.shapes import GradedShapes
 
@@ -64,7 +64,7 @@ def explaining(
         for name, descriptor in chosen.items():
             explanation = explain(descriptor, *batches)
             by_samples, by_place = (
-                float(roc_auc_score(true, on_surface(shares[1], samples, points)))
+                float(roc_auc_score(true, share_density(shares[1], samples, points)))
                 for shares in (explanation.samples, explanation.places or explanation.samples)
             )
             rows.append({
@@ -73,7 +73,7 @@ def explaining(
                 "told": explanation.summary(),
             })  # fmt: skip
             print(rows[-1], flush=True)
-        write_answer(out, "explaining", rows)
+        write_analysis(out, "explaining", rows)
     for name in descriptors:
         for how in ("all", *ALTERATIONS):
             own = [row for row in rows if row["descriptor"] == name and how in ("all", row["alteration"])]

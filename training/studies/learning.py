@@ -11,7 +11,7 @@ from torch import Tensor
 from torchmetrics.functional.classification import binary_auroc, multiclass_calibration_error
 
 import igps
-from igps.analysis.fitting import Goal, classify, fit, histograms_and_prior
+from igps.analysis.fitting import Goal, classify, fit, split_head
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
 from igps.descriptors.fingerprint import cache_tag
@@ -51,7 +51,7 @@ def splits(
         cache_dir: folder of cached signatures; the user's cache directory if not given.
         out: a JSON file to which the rows are added.
     """
-    module, prior = histograms_and_prior(descriptor)
+    module, prior = split_head(descriptor)
     cells = part_cells_of(module)
     dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=module)
     dataset.precompute(strict=True)
@@ -147,7 +147,7 @@ def _fitted(dataset: igps.SignatureDataset, descriptor: str, goal: Goal, n_train
 
 
 def _classifier(dataset: igps.SignatureDataset, descriptor: str) -> EmbeddedDescriptor:
-    base, prior = histograms_and_prior(descriptor)
+    base, prior = split_head(descriptor)
     histograms = describe(dataset, base, cache_tag=cache_tag(base)).flatten(1)
     head = ClassifierHead(prior).fit(histograms, dataset.labels, part_cells_of(base), calibrate=False)
     return EmbeddedDescriptor(base, head)

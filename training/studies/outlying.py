@@ -10,11 +10,11 @@ import numpy as np
 
 from igps._arrays import Booleans, Floats
 from igps.analysis.groups import squared_distances
-from igps.analysis.outliers import Outlier, measures_of, outliers
+from igps.analysis.outliers import Outlier, measure_bodies, outliers
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.nn.description import describe
-from igps.report.answers import write_answer
+from igps.report.answers import write_analysis
 from training.studies.mask_damages import DAMAGES, VARIED, damaged, varied
 
 _MIN_VOXELS = 50
@@ -59,7 +59,7 @@ def outlying(
     index = {path: i for i, path in enumerate(usable)}
     described = describe(dataset, chosen, progress=True)
     distances = squared_distances(chosen.coordinates(described).double().numpy()) ** 0.5
-    measures, notes = measures_of(dataset), dataset.all_notes()
+    measures, notes = measure_bodies(dataset), dataset.all_notes()
 
     def scored(chosen_paths: Sequence[Path], classes: Sequence[str]) -> list[Outlier]:
         rows = [index[path] for path in chosen_paths]
@@ -83,7 +83,7 @@ def outlying(
             label = str(random.choice([x for x in sorted(set(classes)) if x != label and classes.count(x) > 1]))
         outlier = scored([*files[:n], path, *files[n + 1 :]], [*classes[:n], label, *classes[n + 1 :]])[n]
         rows.append({"mask": names[i], "damage": damages[i], "score": outlier.score, "reason": outlier.reason})
-    write_answer(out, "outlying", rows)
+    write_analysis(out, "outlying", rows)
     print(json.dumps(areas(rows), indent=2))
 
 

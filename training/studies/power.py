@@ -14,7 +14,7 @@ from igps.analysis.groups import group_test
 from igps.data.collation import collate
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mesh import Mesh
-from igps.report.answers import write_answer
+from igps.report.answers import write_analysis
 from igps.signature.signature import SignatureConfig, compute_signature
 
 PROPORTIONS = ("width", "depth", "height", "waist")
@@ -55,7 +55,7 @@ def power(
         setting = {"proportion": proportion if difference else "none", "difference": difference}
         print(setting, flush=True)
         rows += [{**setting, **row} for row in shares(first, second, n_each, n_draws, seed)]
-    write_answer(out, "power", rows)
+    write_analysis(out, "power", rows)
 
 
 def shares(

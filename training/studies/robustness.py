@@ -12,8 +12,8 @@ import torch
 
 from igps._arrays import Singles
 from igps.analysis.comparison import check_descriptors, compare
-from igps.cli.reading import signatures, write_notes
-from igps.cli.report import check_report
+from igps.cli.reading import signatures, write_mending_notes
+from igps.cli.report import check_report_folder
 from igps.cli.report import report as write_report
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies, find_bodies
@@ -230,7 +230,7 @@ def robustness_command(
         report: make a page of the results in that folder, report.html, see `igps report`
         n_workers: number of processes; all cores if not given.
     """
-    check_report(report, out)
+    check_report_folder(report, out)
     chosen = [descriptor_of(name) for name in descriptors]
     reading["n_workers"] = n_workers
     dataset, failures = signatures(meshes, chosen, **reading)
@@ -250,7 +250,7 @@ def robustness_command(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "robustness.json").write_text(json.dumps(summary, indent=2) + "\n")
-        write_notes(out / "notes.csv", dataset)
+        write_mending_notes(out / "notes.csv", dataset)
         write_rows(out / "failures.csv", ("name", "error"), [(failure.id, failure.error) for failure in failures])
         write_sources(out, dataset)
         print(f"written to {out}")

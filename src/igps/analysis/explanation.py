@@ -135,7 +135,7 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
     return torch.cat([units, gradient[n:]]), distance
 
 
-def on_surface(shares: Shares, samples: Mapping[SampleKind, Floats], points: Floats) -> Any:
+def share_density(shares: Shares, samples: Mapping[SampleKind, Floats], points: Floats) -> Any:
     """Return the density of shares at points near the samples.
 
     Args:

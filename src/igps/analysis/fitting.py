@@ -52,7 +52,7 @@ class Classification:
         return [None if is_unknown else self.classes[i] for i, is_unknown in best]
 
 
-def histograms_and_prior(which: str | Descriptor) -> tuple[Descriptor, Head | None]:
+def split_head(which: str | Descriptor) -> tuple[Descriptor, Head | None]:
     """Return the histograms of a descriptor, to which heads are fitted, and its own head, if any."""
     module = descriptor_of(which)
     module = module.without_size() if isinstance(module, SizedHistograms) else module
@@ -107,7 +107,7 @@ def fit(
     if isinstance(module, IndividualDescriptor):
         individual = {"size": module.keeps_size, "side": module.twists is not None}
         module = module.descriptor
-    base, metric = histograms_and_prior(module)
+    base, metric = split_head(module)
     check_centres(base)
     check_classes(dataset.bodies, goal)
     base, metric = copy.deepcopy(base), metric if prior else None  # the caller's descriptor stays unchanged

@@ -63,7 +63,7 @@ class Outlier:
     label: str  # class of the body
     score: float  # root of the sum of squares of the positive `scores`
     scores: Mapping[str, float]  # robust standard deviations from the other bodies of the class, by measure
-    lies_among: str | None  # another class whose members are nearer than those of the own class; None if there is none
+    nearer_class: str | None  # another class whose members are nearer than those of the own class, if any
     reason: str  # explanation as text
 
     @property
@@ -89,7 +89,7 @@ def outliers(
     Args:
         distances: (N, N) distances between the bodies.
         labels: classes of the N bodies.
-        measures: measures of the N bodies by name, see `measures_of`; "volume" is compared only within classes.
+        measures: measures of the N bodies by name, see `measure_bodies`; "volume" is compared only within classes.
         notes: notes on the repairs of each body.
         subjects: subject of each body. All bodies of one subject may be unusual, as by a wrong unit. Used only if no
             subject has several bodies of one class.
@@ -130,7 +130,7 @@ def outliers(
     return sorted(result, key=lambda outlier: -outlier.score)
 
 
-def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Floats]:
+def measure_bodies(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Floats]:
     """Measure properties of each body in which segmentations often fail; NaN where its mesh cannot be read again.
 
     Args:

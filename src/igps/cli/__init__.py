@@ -80,7 +80,7 @@ ENDINGS: Mapping[Command, Sequence[str]] = {
 
 
 @contextlib.contextmanager
-def faults_in_a_sentence() -> Iterator[None]:
+def errors_as_messages() -> Iterator[None]:
     """Print an expected error as one sentence without its traceback, and exit with the status described in `main`."""
     try:
         yield
@@ -108,7 +108,7 @@ def main(
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     commands = COMMANDS if commands is None else commands
-    with faults_in_a_sentence():
+    with errors_as_messages():
         parser = command_parser(commands, program)
         parsed = parser.instantiate(parser.parse_args())
         command, options = _selected(parsed, commands)

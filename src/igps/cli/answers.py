@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from igps._parameters import check_at_least, check_share
-from igps.analysis.explanation import Explanation, explain_groups, on_surface, without_head
+from igps._parameters import check_at_least, check_fraction
+from igps.analysis.explanation import Explanation, explain_groups, share_density, without_head
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, with_q_values
-from igps.analysis.outliers import LIMIT, measures_of
+from igps.analysis.outliers import LIMIT, measure_bodies
 from igps.analysis.outliers import outliers as find_outliers
 from igps.cli.reading import Folder, check_files, described, files_or_folder, is_named_after_file, print_failures
 from igps.data.dataset import SignatureDataset
@@ -23,7 +23,7 @@ from igps.descriptors.individual import Size, keeps_size
 from igps.mesh.mesh import Mesh, millimetres
 from igps.mesh.surface import face_areas
 from igps.nn.description import describe
-from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_answer
+from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_analysis
 from igps.report.tables import groups_table
 from igps.signature.signature import SAMPLE_KINDS
 
@@ -98,7 +98,7 @@ def groups(
         rows = [asdict(test) for test in tests]
         for row in rows:
             row["sizes"] = " ".join(f"{name}:{count}" for name, count in row["sizes"].items())
-        write_answer(out, "groups", rows, groups_figure(tests))
+        write_analysis(out, "groups", rows, groups_figure(tests))
         print(f"written to {out}")
     return [asdict(test) for test in tests]
 
@@ -131,7 +131,7 @@ def outliers(
     result = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **reading)
     dataset = result.dataset
     distances = squared_distances(result.coordinates()) ** 0.5
-    measures = measures_of(dataset, n_workers=reading.get("n_workers"))
+    measures = measure_bodies(dataset, n_workers=reading.get("n_workers"))
     files = dataset.bodies.paths
     # Where each file holds one mask, a folder holds the organs of one subject
     subjects = files if len(set(files)) < len(files) else [file.parent for file in files]
@@ -149,7 +149,7 @@ def outliers(
     print_failures(result.failures, len(dataset))
     if out is not None:
         pictured = [(o, dataset.bodies.names[o.body], dataset.mesh(o.body)) for o in ranked[: min(top, 12)]]
-        write_answer(out, "outliers", rows, outliers_figure(pictured) if pictured else None)
+        write_analysis(out, "outliers", rows, outliers_figure(pictured) if pictured else None)
         print(f"written to {out}")
     return rows
 
@@ -166,7 +166,7 @@ def explain(
         out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and both
             bodies painted with their shares, from the front and from behind, as explain.svg and explain.png.
     """
-    check_share(level=level)
+    check_fraction(level=level)
     source = files_or_folder(meshes)
     if not isinstance(source, Folder):
         if len(source) != 2:
@@ -202,8 +202,8 @@ def explain(
         print(f"{name}: {_extent(values, face_areas(mesh.vertices, mesh.faces))}")
     parts = [{"histogram": name, "share": share} for name, share in explanation.parts.items()]
     if out is not None:
-        write_answer(out, "explain_samples", _sample_rows(dataset, pair, explanation))
-        write_answer(out, "explain", parts, explanation_figure(painted))
+        write_analysis(out, "explain_samples", _sample_rows(dataset, pair, explanation))
+        write_analysis(out, "explain", parts, explanation_figure(painted))
         print(f"written to {out}")
     return {"bodies": names, "distance": explanation.distance, "shares": parts}
 
@@ -219,7 +219,7 @@ def _painted(dataset: SignatureDataset, i: int, explanation: Explanation, side: 
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     samples = {kind: getattr(signature, kind).points for kind in SAMPLE_KINDS}
     shares = (explanation.places or explanation.samples)[side]
-    return dataset.bodies.names[i], mesh, on_surface(shares, samples, centres)
+    return dataset.bodies.names[i], mesh, share_density(shares, samples, centres)
 
 
 def _extent(values: Any, areas: Any) -> str:

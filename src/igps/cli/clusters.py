@@ -16,7 +16,7 @@ from igps.cli.reading import Folder, described, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import LABELS_FILE, Bodies
 from igps.mesh.mesh import millimetres
-from igps.report.answers import clusters_figure, map_figure, write_answer
+from igps.report.answers import clusters_figure, map_figure, write_analysis
 
 
 def clusters(
@@ -71,7 +71,7 @@ def clusters(
             {"name": name, "class": label, "cluster": int(number) + 1, "stability": result.stability[number]}
             for name, label, number in zip(names, labels, result.labels, strict=True)
         ]
-        write_answer(out, "clusters", rows, clusters_figure(result, names))
+        write_analysis(out, "clusters", rows, clusters_figure(result, names))
         print(f"written to {out}")
     return table
 
@@ -124,7 +124,7 @@ def map_bodies(
     ]
     print(f"{len(rows)} bodies; stress {result.stress:.2f} (0: exact distances; above 0.2: strong distortion)")
     if out is not None:
-        write_answer(out, "map", rows, map_figure(result, values, colour))
+        write_analysis(out, "map", rows, map_figure(result, values, colour))
         print(f"written to {out}")
     return rows
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from igps.analysis.comparison import Result, check_names
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import Folder, MirrorOption, signatures, with_side, with_size, write_notes
-from igps.cli.report import check_report
+from igps.cli.reading import Folder, MirrorOption, signatures, with_side, with_size, write_mending_notes
+from igps.cli.report import check_report_folder
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
 from igps.descriptors import NAMES
@@ -47,7 +47,7 @@ def compare(
             meshes, and failures.csv if there are failures.
         report: also write a page of results to the folder of --out, report.html, see igps report
     """
-    check_report(report, out)
+    check_report_folder(report, out)
     names = [with_side(name, mirror, size) for name in descriptors]
     modules = [descriptor_of(name) for name in names]
     if size == "auto" and any(SIZE in module.name for module in modules):
@@ -66,7 +66,7 @@ def compare(
     if n_failed := len(failures) + sum(len(result.failures) for result in results):
         print(f"{n_failed} meshes could not be used or described.")
     if out is not None:
-        write_notes(out / "notes.csv", dataset)
+        write_mending_notes(out / "notes.csv", dataset)
         write_sources(out, dataset)
         curves = {
             result.descriptor.name: precision_recall_curve(result.distances, result.labels)

@@ -15,7 +15,7 @@ from igps.gallery.calibration import Calibration
 from igps.gallery.duplicates import Duplicates, body_distance
 from igps.gallery.duplicates import duplicates as find_duplicates
 from igps.gallery.gallery import Gallery
-from igps.gallery.surfaces import MOST_TOLERATED
+from igps.gallery.surfaces import MAX_TOLERANCE
 from igps.mesh.mesh import millimetres
 from igps.report.tables import write_rows
 
@@ -42,8 +42,8 @@ def duplicates(
             the area, at most 0.02.
         out: CSV file for the groups.
     """
-    if not 0 <= tolerance <= (0 if poses else MOST_TOLERATED):
-        expected = "0 with poses" if poses else f"0 to {MOST_TOLERATED}"
+    if not 0 <= tolerance <= (0 if poses else MAX_TOLERANCE):
+        expected = "0 with poses" if poses else f"0 to {MAX_TOLERANCE}"
         raise ValueError(f"tolerance: expected {expected}, got {tolerance}.")
     source: Any
     unread: list[Failure] = []

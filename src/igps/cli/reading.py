@@ -293,7 +293,7 @@ def mending_summary(dataset: SignatureDataset, n_total: int) -> str:
     return f"{sum(map(bool, steps))} of {n_total} meshes were mended: {listed}"
 
 
-def write_notes(path: Path, dataset: SignatureDataset) -> None:
+def write_mending_notes(path: Path, dataset: SignatureDataset) -> None:
     """Write the notes on how each mesh was mended, as a table."""
     meshes = zip(dataset.bodies.names, dataset.all_notes(), strict=True)
     write_rows(path, ("name", "note"), [(name, note) for name, notes in meshes for note in notes])

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from igps.descriptors import descriptor as descriptor_of
 from igps.report.explanations import keep_explanations, read_explanations
-from igps.report.page import page_of
+from igps.report.page import render_page
 from igps.report.results import read_results, read_sources
 from igps.report.surfaces import keep_surfaces, read_surfaces
 
@@ -45,11 +45,11 @@ def report(
         explanations = keep_explanations(stored, system, dataset, module, surfaces, n_workers=n_workers)
     page = out or results / "report.html"
     page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text(page_of(contents, surfaces, explanations), encoding="utf-8")
+    page.write_text(render_page(contents, surfaces, explanations), encoding="utf-8")
     print(f"page of results: {page}")
 
 
-def check_report(is_wanted: bool, out: Path | None) -> None:
+def check_report_folder(is_wanted: bool, out: Path | None) -> None:
     """Raise a ValueError if a page is requested without a folder for it, before anything is computed."""
     if is_wanted and out is None:
         raise ValueError("report: expected --out with it, the folder for the page. Add --out.")

@@ -22,9 +22,9 @@ from igps.cli.reading import (
     files_or_folder,
     print_failures,
     print_unit_warning,
-    write_notes,
+    write_mending_notes,
 )
-from igps.cli.report import check_report
+from igps.cli.report import check_report_folder
 from igps.cli.report import report as write_report
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
@@ -59,7 +59,7 @@ def retrieve(
         rerank: also re-rank the distances by diffusion and k-reciprocal neighbours, without labels, and print their
             scores in a second table; distances.npz holds them as "reranked".
     """
-    check_report(report, out)
+    check_report_folder(report, out)
     result = described(Folder(root, labelled=True, check=_check_scored), descriptor, **reading)
     labels = result.dataset.bodies.labels or ()
     distances = {"distances": pair_distances(result.descriptor, result.descriptions, progress=True)}
@@ -123,7 +123,7 @@ def extract(
         metadata, measured = feature_table(result.dataset, features)
         table = wide_table(metadata, measured) if wide else {**metadata, **measured}
         write_table(out, table)
-    write_notes(out.with_suffix(".notes.csv"), result.dataset)
+    write_mending_notes(out.with_suffix(".notes.csv"), result.dataset)
     rows = f", rows: {len(next(iter(table.values())))}" if wide else ""
     print(f"{len(features)} descriptions of shape {features.shape[1:]} written to {out}{rows}")
     print_failures(result.failures, len(features))
@@ -238,7 +238,7 @@ def _write_retrieval(out: Path, result: Described, summary: dict[str, Any], dist
 
     write_rows(out / "ranking.csv", ("query", "rank", "model", "distance", "relevant"), ranking())
     write_rows(out / "failures.csv", ("name", "error"), [(failure.id, failure.error) for failure in result.failures])
-    write_notes(out / "notes.csv", result.dataset)
+    write_mending_notes(out / "notes.csv", result.dataset)
     write_sources(out, result.dataset)
     if result.name is None:  # a descriptor whose centres were fitted to the collection has no name
         result.descriptor.save(out / "descriptor.safetensors")

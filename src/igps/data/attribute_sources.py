@@ -24,7 +24,7 @@ from igps._arrays import Booleans, Floats
 from igps._parameters import check_one_of
 from igps.data.attributes import AttributeSource
 from igps.data.cache import content_digest
-from igps.mesh.formats import brains, files_read, images, stamp_of, vertex_values
+from igps.mesh.formats import brains, dependencies_of, images, stat_key, vertex_values
 from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
 from igps.mesh.loading import BodyRef, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
@@ -64,7 +64,7 @@ class ResidueAttribute:
 
 def _molecule(body: BodyRef) -> Molecule:
     """Return the atoms and residues of a body: of a chain, an assembly or a model, or of all models."""
-    part, stamp = body.part or "", stamp_of(body.path)
+    part, stamp = body.part or "", stat_key(body.path)
     words = part.split()  # in a file of several structures, the first is the name of a structure
     kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
     for kind in (*(kinds[word] for word in kinds if word in words), "models"):
@@ -96,8 +96,8 @@ class FileAttribute(ABC):
     def cache_tag(self, body: BodyRef) -> str:
         """Return kind of source, name of the array, and checksum of the file; raise a MeshError if it is missing."""
         file, name = self.file(body)
-        files = files_read(file)
-        return f"{type(self).__name__} 4 {name} {_checksum(*files, stamp=stamp_of(*files))}"
+        files = dependencies_of(file)
+        return f"{type(self).__name__} 4 {name} {_checksum(*files, stamp=stat_key(*files))}"
 
     def __call__(self, body: BodyRef, points: Floats) -> Floats:
         """Return values (P,) or (P, C) at points (P, 3); raise a MeshError if the file cannot be used."""
@@ -166,7 +166,7 @@ class ImageAttribute(FileAttribute):
     """
 
     def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
-        grid, affine = images.read(file, stamp_of(*files_read(file)))
+        grid, affine = images.read(file, stat_key(*dependencies_of(file)))
         indices = (brains.in_scanner(body.path, points) - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
         size = np.array(grid.shape)
         inside = ((indices > -0.5) & (indices < size - 0.5)).all(axis=1)

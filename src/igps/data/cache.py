@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from igps._arrays import Singles
-from igps._files import PARTIAL, whole_file, with_ordered_metadata
+from igps._files import PARTIAL, atomic_write, sort_metadata
 from igps.signature.signature import SAMPLE_KINDS, SampleKind, Samples, Signature, SignatureConfig
 
 logger = logging.getLogger(__name__)
@@ -97,8 +97,8 @@ class FileCache(Generic[T]):
         metadata |= {"format": self._format, "key": key, "checksum": checksum(tensors, metadata)}
         _remove_abandoned(path.parent.glob(f"*{PARTIAL}"))
         try:
-            with whole_file(path) as file:
-                file.write(with_ordered_metadata(save(tensors, metadata=metadata)))
+            with atomic_write(path) as file:
+                file.write(sort_metadata(save(tensors, metadata=metadata)))
         except PermissionError:
             # Some file systems cannot replace a file that another process has open, which holds the same value
             if key not in self:

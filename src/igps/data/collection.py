@@ -12,7 +12,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from igps._files import whole_file
+from igps._files import atomic_write
 from igps.data.cache import check_checksum, checksum, decode, encode
 from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, file_name_of
@@ -92,7 +92,7 @@ def write_collection(path: Path, about: Contents, signature: Callable[[int], Sig
     text += b" " * (-len(text) % 8)
     if len(text) > _MAX_HEADER_BYTES:
         raise ValueError(f"{path}: {n} bodies are too many for one file. Export parts of the dataset.")
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         file.write(len(text).to_bytes(8, "little") + text)
         for (i, _), group in groupby(order, key=lambda key: (key[0], arrays[key[0]][key[1]][0])):
             tensors, _ = encode(signature(i))

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 from igps.data.cache import SignatureCache
 from igps.data.pipeline import CacheHit, SignaturePipeline
-from igps.mesh.formats import files_read, stamp_of
+from igps.mesh.formats import dependencies_of, stat_key
 from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION
 from igps.mesh.mesh import MeshError
@@ -51,7 +51,7 @@ class FileStatCache:
         if not self._path.exists() or not self._is_enabled:
             return hits
         cache = SignatureCache(self._pipeline.cache_dir)
-        current_stamp = lru_cache(maxsize=1)(lambda path: stamp_of(*files_read(path, self._pipeline.reading)))
+        current_stamp = lru_cache(maxsize=1)(lambda path: stat_key(*dependencies_of(path, self._pipeline.reading)))
         with self._tolerate_database_errors(), contextlib.closing(self._database()) as database:
             for body in bodies:
                 row = database.execute(_QUERY, (self._pipeline_id, *_row_key(body))).fetchone()

@@ -7,7 +7,7 @@ from typing import Any
 from igps.data.sources import Bodies
 from igps.mesh.loading import BodyRef, surface_body
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.objects import bodies_of_object
+from igps.mesh.objects import object_bodies
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
@@ -15,7 +15,7 @@ from igps.signature.signature import SignatureConfig
 def bodies_in_memory(
     objects: Mapping[str, Any], labels: Sequence[str] | None, options: LoadOptions, config: SignatureConfig
 ) -> tuple[Bodies, dict[BodyRef, Mesh | MeshError]]:
-    """Return the bodies of objects by name, see `bodies_of_object`, and the mesh or the error of each body."""
+    """Return the bodies of objects by name, see `object_bodies`, and the mesh or the error of each body."""
     if labels is not None and len(labels) != len(objects):
         raise ValueError(f"labels: expected one for each of {len(objects)} bodies, got {len(labels)}.")
     if not objects:
@@ -26,7 +26,7 @@ def bodies_in_memory(
     for i, (name, value) in enumerate(objects.items()):
         n_before = len(meshes)
         try:
-            for raw in bodies_of_object(value, name, options):
+            for raw in object_bodies(value, name, options):
                 ref = BodyRef(Path(name), raw.part)
                 try:
                     meshes[ref] = surface_body(raw.made(), ref, options, least_vertices=min_vertices)

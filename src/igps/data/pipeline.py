@@ -17,7 +17,7 @@ from igps._parallel import Failed, MachineError, attempt
 from igps.data.attribute_sources import with_load_options
 from igps.data.attributes import AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache, content_digest
-from igps.mesh.formats import files_read, stamp_of
+from igps.mesh.formats import dependencies_of, stat_key
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, repair_steps
 from igps.mesh.mesh import Mesh, MeshError
@@ -40,7 +40,7 @@ class PreTransform(Protocol):
 class BodyFile:
     """Time stamp and content of the file of a body."""
 
-    stamp: tuple[int, int, int]  # see `stamp_of`
+    stamp: tuple[int, int, int]  # see `stat_key`
     digest: bytes  # of the content of the file, and of the files that are read with it
 
 
@@ -51,7 +51,7 @@ class CacheHit:
     key: str  # of the Signature, which may have more eigenpairs or attributes than requested
     n_bytes: int  # size of the cached file
     notes: tuple[str, ...]  # on how the mesh was changed
-    stamp: tuple[int, int, int]  # of the body's file when it was read, see `stamp_of`
+    stamp: tuple[int, int, int]  # of the body's file when it was read, see `stat_key`
     attributes: Mapping[str, str] = field(default_factory=dict)  # cache keys of added attributes, by name
 
     @property
@@ -93,8 +93,8 @@ class SignaturePipeline:
             content = mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((mesh.unit, mesh.notes)).encode()
             return BodyFile((0, 0, 0), b"".join(hashlib.sha256(data).digest() for data in content))
         try:
-            files = files_read(body.path, self.reading)
-            return BodyFile(stamp_of(*files), content_digest(*files))
+            files = dependencies_of(body.path, self.reading)
+            return BodyFile(stat_key(*files), content_digest(*files))
         except OSError as error:
             raise MeshError(f"{body.path}: cannot be read ({error.strerror}). Check the path.") from error
 

@@ -17,7 +17,7 @@ from igps._parameters import check_at_least
 from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import undirected_edges
-from igps.signature.ordering import canonically_ordered, spatial_ordering_keys
+from igps.signature.ordering import in_canonical_order, spatial_ordering_keys
 
 _TIE_TOLERANCE = 1e-9  # relative; distances that differ by less are equal except for rounding
 
@@ -43,7 +43,7 @@ def geodesic_samples(mesh: Mesh, n_samples: int, max_vertices: int) -> FarthestP
         ValueError: the mesh has fewer vertices than `n_samples`.
         MeshError: the mesh cannot be simplified.
     """
-    return farthest_points(simplify(canonically_ordered(mesh), max_vertices), n_samples)
+    return farthest_points(simplify(in_canonical_order(mesh), max_vertices), n_samples)
 
 
 def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> FarthestPoints:

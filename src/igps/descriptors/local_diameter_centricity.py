@@ -13,7 +13,7 @@ from igps.descriptors._linear_histogram import linear_histogram
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
-from igps.signature.ordering import canonically_ordered
+from igps.signature.ordering import in_canonical_order
 from igps.signature.sampling import surface_points
 
 # Depth below the surface at which rays start, so that they do not hit their own face, in longest sides of the body.
@@ -55,7 +55,7 @@ class LocalDiameterCentricity(BodyDescriptor):
 
     def describe_body(self, body: Body) -> Singles:
         """(n_diameter_bins, n_centricity_bins) histogram of sum 1; a MeshError if no ray meets the far side."""
-        mesh = canonically_ordered(body.mesh)
+        mesh = in_canonical_order(body.mesh)
         points = surface_points(mesh, self.n_samples, self.seed)
         diameter = local_diameters(mesh, points.face, points.weights, self.n_rays, self.opening_angle)
         central = points.interpolate(centricity(mesh, self.n_sources)[:, None])[:, 0]

@@ -20,7 +20,7 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
 from igps._arrays import Integers, Singles
-from igps._compiled import SUMS, compiled
+from igps._compiled import REASSOCIATE, compiled
 from igps.retrieval.vectors import SearchDistance, VectorMap
 
 Words = NDArray[np.uint64]
@@ -162,7 +162,7 @@ def _popcount(word: np.uint64) -> np.uint64:
     return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
-@compiled(fastmath=SUMS)
+@compiled(fastmath=REASSOCIATE)
 def _estimate(
     signs: Words, square: Singles, scale: Singles, starts: Integers, ends: Integers, planes: Words, step: Singles,
     to_centroid: Singles, distances: Singles,

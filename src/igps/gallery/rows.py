@@ -16,7 +16,7 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.data.file_stat_cache import MIN_AGE
 from igps.data.sources import LABELS_FILE, Bodies, is_number
 from igps.gallery.about import KNOWN, Batch
-from igps.mesh.formats import files_read, stamp_of
+from igps.mesh.formats import dependencies_of, stat_key
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
@@ -101,7 +101,7 @@ def _files(bodies: Bodies) -> list[str]:
 def _stamp(file: Path, reading: LoadOptions) -> dict[str, int]:
     """Return the size and the modification time of the files that are read; time −1 if it is not reliable yet."""
     try:
-        n_bytes, *times = stamp_of(*files_read(file, reading))
+        n_bytes, *times = stat_key(*dependencies_of(file, reading))
     except (OSError, MeshError):  # the description will fail with the reason
         return {"bytes": -1, "modified": -1}
     modified = max(times)

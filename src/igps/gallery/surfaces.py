@@ -38,7 +38,7 @@ _NORMALS: AttributeName = "surface_direction"
 # Lengths are over √area.
 _HOPELESS = 0.03  # distance at which an alignment is given up; a tenth of it is large between copies
 _MAX_STRETCH = 0.1  # difference of log extents above which bodies are not aligned; copies differ by up to 0.045
-MOST_TOLERATED = 0.02
+MAX_TOLERANCE = 0.02
 """Largest `tolerance`, over √area."""
 _ROUNDING = 5e-4  # largest displacement of a vertex by rounding of the coordinates in a file
 # Largest deviation of a sample between triangulations of one surface: ten times that of 40 such copies. A hole that is
@@ -76,8 +76,8 @@ class Surfaces:
     """
 
     def __init__(self, dataset: SignatureDataset, tolerance: float = 0.0) -> None:
-        if not 0 <= tolerance <= MOST_TOLERATED:
-            raise ValueError(f"tolerance: expected 0 to {MOST_TOLERATED} of the root of the area, got {tolerance}.")
+        if not 0 <= tolerance <= MAX_TOLERANCE:
+            raise ValueError(f"tolerance: expected 0 to {MAX_TOLERANCE} of the root of the area, got {tolerance}.")
         self.failures: dict[int, Failure] = {}
         self.nearly: dict[tuple[int, int], float] = {}
         self._tolerance = tolerance

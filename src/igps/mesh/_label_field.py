@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers, Singles
-from igps._compiled import SUMS, compiled
+from igps._compiled import REASSOCIATE, compiled
 
 # Minimal absolute value of the function at voxels wholly inside or outside, in shortest sides (0.5 is the largest that
 # all bodies allow), and weight of the second derivatives; each in smooth places and at edges. The values for smooth
@@ -123,7 +123,7 @@ def filled_volume(field: Floats | Singles, reach: float) -> tuple[float, float]:
     return float(np.clip(share, 0, 1).sum()) + n_full, float((1 / width[is_cut]).sum())
 
 
-@compiled(fastmath=SUMS)
+@compiled(fastmath=REASSOCIATE)
 def _relax(
     field: Floats, laplacian: Floats, nodes: Integers, steps: Integers, weights: Floats, stiffness: Floats,
     target: Floats, inside: Booleans, min_abs: Floats,

@@ -24,7 +24,7 @@ from igps.mesh.surface import connected, signed_volume, stacked
 MAX_VERTICES = 5000
 """Default maximal number of vertices of a label's surface."""
 
-LEAST_VOXELS = 8
+MIN_VOXELS = 8
 """Minimal number of voxels of a label; fewer have no shape."""
 
 _ISLAND = 0.02  # separate pieces of less than this share of the voxels are dropped
@@ -60,7 +60,7 @@ def voxel_surface(
         inside: (X, Y, Z), true at voxels whose centre lies in the body.
         affine: (4, 4) from voxel indices to world coordinates; may shear and mirror. None for voxels of side 1.
         max_vertices: approximate maximal number of vertices.
-        cavities: keep hollows of at least `LEAST_VOXELS` voxels; they get surfaces that are oriented inward.
+        cavities: keep hollows of at least `MIN_VOXELS` voxels; they get surfaces that are oriented inward.
         joins: join separate pieces: up to three missed slices between them are filled, and wider gaps are bridged by
             bars where they are narrowest.
         name: name of the body in error messages.
@@ -75,16 +75,16 @@ def voxel_surface(
     if mask.ndim != 3:
         raise MeshError(f"{name}: expected an array of three axes, got shape {mask.shape}.")
     matrix = np.eye(4) if affine is None else np.asarray(affine, dtype=np.float64)
-    spacing = checked_spacing(matrix, name)
+    spacing = voxel_spacing(matrix, name)
     n_voxels = int(np.count_nonzero(mask))
-    if n_voxels < LEAST_VOXELS:
-        few = f"expected at least {LEAST_VOXELS} voxels, got {n_voxels}, which have no shape"
+    if n_voxels < MIN_VOXELS:
+        few = f"expected at least {MIN_VOXELS} voxels, got {n_voxels}, which have no shape"
         raise MeshError(f"{name}: {few}. Leave out the label, or segment it on a finer grid.")
     (box,) = ndimage.find_objects(mask.view(np.uint8))
     low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
     mask = fill_missed_slices(mask[box], notes) if joins else mask[box]
-    mask, hollows = _clean(mask, notes, LEAST_VOXELS if cavities else None, name)
+    mask, hollows = _clean(mask, notes, MIN_VOXELS if cavities else None, name)
     if cavities and (n_open := _n_nearly_enclosed(mask)) > _MIN_OPEN_CAVITY * np.count_nonzero(mask):
         notes.append(f"a cavity of about {n_open} voxels is open through gaps of up to two voxels in its wall")
     share, factor = _coarsen(mask, spacing, max_vertices)
@@ -119,7 +119,7 @@ def voxel_surface(
     return *stacked(surfaces), tuple(notes)
 
 
-def checked_spacing(affine: Floats, name: str) -> Floats:
+def voxel_spacing(affine: Floats, name: str) -> Floats:
     """Return the sides (3,) of a voxel, or raise a MeshError unless the affine is a finite invertible matrix (4, 4)."""
     if affine.shape != (4, 4) or not np.isfinite(affine).all():
         raise MeshError(f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}.")

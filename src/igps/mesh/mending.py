@@ -17,7 +17,7 @@ from igps._parameters import check_one_of
 from igps.mesh._tidying import drop_hidden_parts, fill_small_holes, tidy, weld
 from igps.mesh._union import drop_inner_walls, unite_parts
 from igps.mesh.denoising import is_noisy, remove_noise
-from igps.mesh.mesh import Mesh, MeshError, check_arrays, check_places, check_size
+from igps.mesh.mesh import Mesh, MeshError, check_arrays, check_coordinates, check_size
 from igps.mesh.simplification import subdivide
 from igps.mesh.watertight import crosses_itself, watertight
 
@@ -72,7 +72,7 @@ def mend(
         vertices = np.asarray(vertices, dtype=np.float64)
         if vertices.size == 0:
             raise MeshError(f"{name}: the file is empty: no vertices and no faces. Export it again.")
-        check_places(vertices, name)
+        check_coordinates(vertices, name)
         check_size(vertices, name)
         mesh = watertight(vertices, normals=normals, name=name)
     else:

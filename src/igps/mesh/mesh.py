@@ -133,9 +133,9 @@ class Mesh:
         """
         if isinstance(body, cls):
             return body
-        from igps.mesh.objects import raw_of
+        from igps.mesh.objects import raw_body
 
-        name, raw = raw_of(body, spacing)
+        name, raw = raw_body(body, spacing)
         return cls(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
 
     def annotated(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Self:
@@ -194,7 +194,7 @@ class Mesh:
 def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
     """Raise a MeshError unless the arrays are finite coordinates (V, 3), and faces (F, 3) with indices in range."""
     v, f = np.asarray(vertices), np.asarray(faces)
-    check_places(v, name)
+    check_coordinates(v, name)
     if f.size == 0:
         raise MeshError(f"{name}: no faces. A surface is needed; a point cloud must be meshed first.")
     if f.ndim != 2 or f.shape[1] != 3 or not np.issubdtype(f.dtype, np.integer):
@@ -207,7 +207,7 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
         )
 
 
-def check_places(vertices: NDArray[Any], name: str) -> None:
+def check_coordinates(vertices: NDArray[Any], name: str) -> None:
     """Raise a MeshError unless the vertices are finite coordinates (V, 3)."""
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MeshError(f"{name}: vertices: expected shape (V, 3), got {vertices.shape}.")

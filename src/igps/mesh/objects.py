@@ -14,20 +14,20 @@ from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
 
-def bodies_of_object(thing: Any, name: str, options: LoadOptions = LoadOptions()) -> list[RawBody]:
-    """Return the bodies of a surface (see `raw_of`), or of labels: an array, a pair (array, spacing), or an image."""
+def object_bodies(thing: Any, name: str, options: LoadOptions = LoadOptions()) -> list[RawBody]:
+    """Return the bodies of a surface (see `raw_body`), or of labels: an array, a pair (array, spacing), or an image."""
     labels, spacing = thing if isinstance(thing, tuple) and len(thing) == 2 else (thing, None)
     if not _is_volume(labels):
-        return [raw_of(thing)[1]]
+        return [raw_body(thing)[1]]
     bodies = label_bodies(volume_in_memory(labels, spacing, name, options), options)
     is_mask = [body.part for body in bodies] == ["1"]
     return [replace(bodies[0], part=None)] if is_mask else bodies
 
 
-def raw_of(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, RawBody]:
+def raw_body(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, RawBody]:
     """Return the name and the unchecked surface of a body; a TypeError unless it has a type listed in `Mesh.of`."""
     if _is_volume(thing):
-        bodies = bodies_of_object((thing, spacing), "volume")
+        bodies = object_bodies((thing, spacing), "volume")
         if len(bodies) > 1:
             several = f"volume: expected one label, got {', '.join(str(body.part) for body in bodies)[:80]}."
             raise MeshError(f"{several} Select one, such as labels == 1, or make a SignatureDataset of all.")

@@ -22,7 +22,7 @@ from igps._parameters import check_at_least
 from igps.mesh._isosurface import level_surface, simplify_surface
 from igps.mesh._level_set import Grid, cell_sizes, distances, join_pieces, level_set, merge_near_vertices
 from igps.mesh._outside import OrientedSurface, find_outside
-from igps.mesh.mesh import Mesh, MeshError, check_places
+from igps.mesh.mesh import Mesh, MeshError, check_coordinates
 from igps.mesh.surface import diagonal, face_areas, largest, longest_side, unit
 
 # Groups of triangles of less than this share of the area are specks, if a grid of this many cells per side separates
@@ -59,7 +59,7 @@ def watertight(
     """
     check_at_least(8, resolution=resolution)
     vertices = np.asarray(vertices, dtype=np.float64)
-    check_places(vertices, name)
+    check_coordinates(vertices, name)
     notes: list[str] = []
     spacing = 0.0
     if faces is None or len(faces) == 0:

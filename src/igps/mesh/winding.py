@@ -16,7 +16,7 @@ def winding_number(vertices: NDArray[np.floating], faces: NDArray[np.integer], p
     """
     import igl
 
-    vertices, faces, points = checked_places(vertices, faces, points)
+    vertices, faces, points = check_mesh_and_points(vertices, faces, points)
     if not has_area(vertices[faces]).any():
         raise ValueError("faces: expected at least one face with an area, got flat faces only; check the mesh")
     if not len(points):
@@ -24,7 +24,7 @@ def winding_number(vertices: NDArray[np.floating], faces: NDArray[np.integer], p
     return np.asarray(igl.winding_number(vertices, faces, points))
 
 
-def checked_places(
+def check_mesh_and_points(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
 ) -> tuple[Floats, Integers, Floats]:
     """Return the vertices and faces of a mesh, and points, as float64 and int64; a ValueError for invalid arrays."""

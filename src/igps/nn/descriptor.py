@@ -27,7 +27,7 @@ from igps.nn.heads.base import Head
 from igps.nn.histograms.base import DescriptionPart
 from igps.nn.specification import Specified, save_module
 from igps.retrieval import chi_square
-from igps.retrieval.vectors import MOST_NUMBERS, SearchDistance
+from igps.retrieval.vectors import MAX_SHORT_WIDTH, SearchDistance
 from igps.signature.signature import SignatureConfig, compute_signature
 
 NAME = re.compile(r"\w{1,100}(\+\w{1,40}(=[\d.e-]{1,10})?){0,9}")
@@ -286,4 +286,4 @@ class EmbeddedDescriptor(Descriptor):
 
     def short(self, embeddings: Tensor) -> Tensor:
         """Return embeddings (N, D) with D ≤ 256 unchanged, others shortened by `Head.short`."""
-        return embeddings if embeddings.shape[1] <= MOST_NUMBERS else self.head.short(embeddings)
+        return embeddings if embeddings.shape[1] <= MAX_SHORT_WIDTH else self.head.short(embeddings)

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from igps._files import whole_file, with_ordered_metadata
+from igps._files import atomic_write, sort_metadata
 
 _FORMAT = "igps-descriptor-1"
 IN_FOLDER = "model.safetensors"  # file name in a folder, beside the card README.md
@@ -143,8 +143,8 @@ def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) ->
     metadata = {"format": _FORMAT, "specification": json.dumps(spec), "card": json.dumps(card)}
     state = {name: value.detach().cpu().clone().contiguous() for name, value in module.state_dict().items()}
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(Path(path)) as file:
-        file.write(with_ordered_metadata(save(state, metadata=metadata)))
+    with atomic_write(Path(path)) as file:
+        file.write(sort_metadata(save(state, metadata=metadata)))
 
 
 def _check_unchanged(module: nn.Module, rebuilt: nn.Module) -> None:

@@ -30,7 +30,7 @@ LEVEL = 0.05
 _SIGNIFICANT, _OTHER = PALETTE[0], "#777777"
 
 
-def write_answer(out: Path, name: str, rows: Sequence[Mapping[str, Any]], figure: Figure | None = None) -> None:
+def write_analysis(out: Path, name: str, rows: Sequence[Mapping[str, Any]], figure: Figure | None = None) -> None:
     """Write rows as NAME.csv and NAME.json, and the figure, if any, as NAME.svg and NAME.png."""
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.json").write_text(json.dumps(finite(list(rows)), indent=2) + "\n")

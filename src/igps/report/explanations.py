@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._parallel import one_thread
-from igps.analysis.explanation import Shares, explain, on_surface
+from igps.analysis.explanation import Shares, explain, share_density
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
@@ -19,7 +19,7 @@ from igps.signature.signature import SAMPLE_KINDS, Signature
 
 
 @dataclass(frozen=True, eq=False)
-class Painted:
+class SurfaceExplanation:
     """Explanation of the distance between a body and its nearest, on the vertices of both surfaces."""
 
     other: str  # name of the nearest body
@@ -35,7 +35,7 @@ def keep_explanations(
     surfaces: Mapping[str, PageSurface],
     *,
     n_workers: int | None = None,
-) -> dict[str, Painted]:
+) -> dict[str, SurfaceExplanation]:
     """Explain the distance of each body to its nearest, and write the explanations to a NumPy archive.
 
     The descriptor, of histograms, is the one of the system's distances. Bodies without a surface are left out.
@@ -62,7 +62,7 @@ def keep_explanations(
     return results
 
 
-def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[str, Painted]:
+def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[str, SurfaceExplanation]:
     """Read explanations from an archive, by name, if their surfaces have not changed; none if there is no file."""
     if not path.is_file():
         return {}
@@ -74,26 +74,26 @@ def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[s
     for name, other, summary, count, values in zip(*columns, split_values, strict=True):
         sizes = [len(surfaces[body].vertices) if body in surfaces else -1 for body in (name, other)]
         if sizes == [count, len(values) - count]:
-            results[name] = Painted(other, summary, (values[:count], values[count:]))
+            results[name] = SurfaceExplanation(other, summary, (values[:count], values[count:]))
     return results
 
 
-def _explain_pair(job: tuple[Descriptor, SignatureDataset, list[PageSurface]]) -> Painted:
+def _explain_pair(job: tuple[Descriptor, SignatureDataset, list[PageSurface]]) -> SurfaceExplanation:
     descriptor, dataset, surfaces = job
     with one_thread():
         explanation = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
     shares = explanation.places or explanation.samples
     first, second = (_vertex_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i]) for i in (0, 1))
-    return Painted(dataset.bodies.names[1], explanation.summary(), (first, second))
+    return SurfaceExplanation(dataset.bodies.names[1], explanation.summary(), (first, second))
 
 
 def _vertex_values(mesh: Mesh, signature: Signature, shares: Shares, surface: PageSurface) -> NDArray[np.uint8]:
-    """Return the values (V,) of `Painted` at the vertices of a page surface, which fills its cube as the mesh does."""
+    """Return the values (V,) of `SurfaceExplanation` at the vertices of a page surface."""
     axes = axes_of(signature.surface.points)
     samples = {kind: getattr(signature, kind).points @ axes for kind in SAMPLE_KINDS}
     vertices = mesh.vertices @ axes
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     points = surface.vertices / STEPS - 0.5
-    values = on_surface(shares, samples, points * (high - low).max() + (low + high) / 2)
+    values = share_density(shares, samples, points * (high - low).max() + (low + high) / 2)
     largest = float(np.quantile(np.abs(values), 0.98)) or 1.0
     return np.rint(128 + 127 * np.clip(values / largest, -1, 1)).astype(np.uint8)

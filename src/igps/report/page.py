@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
-from igps.report.explanations import Painted
+from igps.report.explanations import SurfaceExplanation
 from igps.report.page_data import N_WORST, base64_text, data_of
 from igps.report.results import Results
 from igps.report.surfaces import PageSurface
@@ -31,8 +31,8 @@ SCORE_MEANINGS = dict(  # noqa: C408
 """Explanations of the scores by name."""
 
 
-def page_of(
-    results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, Painted] | None = None
+def render_page(
+    results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, SurfaceExplanation] | None = None
 ) -> str:
     """Return the page of results as HTML text, with surfaces and explanations by the name of the mesh."""
     from jinja2 import Environment, PackageLoader, StrictUndefined

@@ -11,7 +11,7 @@ import numpy as np
 from igps._arrays import Integers
 from igps.analysis.clusters import STABLE, clusters_of
 from igps.analysis.map import body_map
-from igps.report.explanations import Painted
+from igps.report.explanations import SurfaceExplanation
 from igps.report.results import Results, System
 from igps.report.surfaces import PageSurface
 from igps.retrieval import RetrievalScores, precision_recall_curve, retrieval_scores
@@ -26,7 +26,7 @@ _MIN_MAPPED, _MAX_MAPPED = 3, 3000  # shapes of a map; more take too long to lay
 
 
 def data_of(
-    results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, Painted] | None = None
+    results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, SurfaceExplanation] | None = None
 ) -> dict[str, Any]:
     """Return the data of the page without its surfaces; for `shapes` see `_shapes`, for `systems` `_system_data`."""
     classes = sorted(set(results.labels or ()))
@@ -48,7 +48,10 @@ def base64_text(content: bytes) -> str:
 
 
 def _shapes(
-    results: Results, surfaces: Mapping[str, PageSurface], classes: Sequence[str], explanations: Mapping[str, Painted]
+    results: Results,
+    surfaces: Mapping[str, PageSurface],
+    classes: Sequence[str],
+    explanations: Mapping[str, SurfaceExplanation],
 ) -> list[dict[str, Any]]:
     """Return the data of each body.
 

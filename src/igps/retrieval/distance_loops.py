@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Real
-from igps._compiled import SUMS, compiled
+from igps._compiled import REASSOCIATE, compiled
 
 # Rows of the gallery in a tile: with some hundred cells per row, it stays in the second-level cache for all queries.
 TILE = 64
@@ -20,7 +20,7 @@ def fill(queries: NDArray[Real], gallery: NDArray[Real], is_chi_square: bool, di
                 distances[q, g] = chi_square(a, b) if is_chi_square else square(a, b)
 
 
-@compiled(fastmath=SUMS)
+@compiled(fastmath=REASSOCIATE)
 def chi_square(a: NDArray[Real], b: NDArray[Real]) -> Real:
     """Return the sum of (a−b)² / (a+b) over the cells."""
     total, one = a.dtype.type(0), a.dtype.type(1)
@@ -37,7 +37,7 @@ def term(a: Real, b: Real, one: Real) -> Real:
     return difference / (total if total > 0 else one) * difference
 
 
-@compiled(fastmath=SUMS)
+@compiled(fastmath=REASSOCIATE)
 def square(a: NDArray[Real], b: NDArray[Real]) -> Real:
     """Return the sum of (a−b)² over the cells."""
     total = a.dtype.type(0)

@@ -10,7 +10,7 @@ from igps._arrays import Singles
 SearchDistance = Literal["cosine", "chi_square"]
 """Distances of descriptions that Euclidean distances of short vectors approximate."""
 
-MOST_NUMBERS = 256
+MAX_SHORT_WIDTH = 256
 """The largest width of a short vector."""
 
 # With two steps, squared Euclidean distances of features are a fifth to a third below 2 χ², in nearly the same order.
@@ -34,12 +34,12 @@ class VectorMap:
     @classmethod
     def fit(cls, descriptions: Singles, searched_by: SearchDistance, seed: int = 0) -> Self:
         """Fit a map to example descriptions (N, F); a few thousand are enough."""
-        if searched_by == "cosine" and descriptions.shape[1] <= MOST_NUMBERS:
+        if searched_by == "cosine" and descriptions.shape[1] <= MAX_SHORT_WIDTH:
             return cls(searched_by)
         from sklearn.decomposition import PCA
 
         features = _features(descriptions, searched_by)
-        n_components = min(MOST_NUMBERS, *features.shape)
+        n_components = min(MAX_SHORT_WIDTH, *features.shape)
         solver = "randomized" if n_components < min(features.shape) else "full"
         pca = PCA(n_components, svd_solver=solver, random_state=seed).fit(features)
         return cls(searched_by, pca.mean_.astype(np.float32), pca.components_.astype(np.float32))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
-from igps._files import whole_file
+from igps._files import atomic_write
 from igps._parameters import check_at_least
 from igps.shapes.meshing import defect, mesh, roughen
 from igps.shapes.skeleton import pose
@@ -132,7 +132,7 @@ class ArticulatedShapes:
             if not is_whole_off(path):
                 shape = self[index]
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with whole_file(path) as file:
+                with atomic_write(path) as file:
                     file.write(off_text(shape.vertices, shape.faces).encode())
 
 
@@ -142,7 +142,7 @@ def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
     manifest = folder / "shapes.json"
     if not manifest.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(manifest) as file:
+        with atomic_write(manifest) as file:
             file.write(expected.encode())
     elif (recorded := manifest.read_text(encoding="utf-8")) != expected:
         raise ValueError(f"root={str(root)!r} holds shapes of {recorded}, not of {expected}. Choose another folder.")

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from igps._arrays import Floats, Integers
-from igps._threads import ALONE, Team
+from igps._threads import SERIAL, Team
 from igps.mesh.surface import has_area
 from igps.signature._weight_loops import add_near_faces, fill_cluster_terms, fill_hats, find_far_clusters
 from igps.signature.ordering import principal_axes, spatial_order
@@ -144,7 +144,7 @@ class HatClusters:
     n_hats: int  # V
 
     @classmethod
-    def from_hats(cls, hats: Floats, functions: NDArray[np.floating], team: Team = ALONE) -> Self:
+    def from_hats(cls, hats: Floats, functions: NDArray[np.floating], team: Team = SERIAL) -> Self:
         """Cluster hats (V, 24), and sum functions (V, K) over each cluster."""
         n_hats = len(hats)
         sizes = [_LEAF_SIZE]

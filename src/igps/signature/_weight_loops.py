@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
 from igps._arrays import Booleans, Floats, Integers, Singles
-from igps._compiled import CONTRACTED, compiled
+from igps._compiled import FUSE, compiled
 
 SurfaceArrays = tuple[Integers, Floats, Integers, Integers]
 """Faces, table, face_starts and incident_faces of a `HatSurface`."""
@@ -61,7 +61,7 @@ def find_far_clusters(
     return clusters[:n_clusters], hats[:n_near]
 
 
-@compiled(fastmath=CONTRACTED)
+@compiled(fastmath=FUSE)
 def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: Floats, near: Booleans) -> None:
     """Fill the weights (h, n) of the chosen hats (h,), 0 at points within `ratio` radii; mark those in `near`."""
     n = x.shape[1]
@@ -88,7 +88,7 @@ def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: 
             near[k, i] = squared[i] < limit
 
 
-@compiled(fastmath=CONTRACTED)
+@compiled(fastmath=FUSE)
 def fill_clusters(x: Floats, chosen: Integers, centres: Floats, radii: Floats, terms: Floats) -> None:
     """Fill the terms (19 c, n) of the chosen clusters (c,): |e|² times e, its products of two, and of three."""
     for k in range(len(chosen)):
@@ -211,7 +211,7 @@ def add_faces(
                 barycentric[i, corner] = max(areas[corner], 0.0) / total_area
 
 
-@compiled(fastmath=CONTRACTED)
+@compiled(fastmath=FUSE)
 def divide_angles(squares: Floats, cosines: Floats) -> None:
     """Replace squared lengths by angles over lengths, arctan2(length, cosine) / length, accurate to rounding."""
     for m in range(len(squares)):
@@ -229,7 +229,7 @@ def divide_angles(squares: Floats, cosines: Floats) -> None:
         squares[m] = (math.pi - angle if cosine < 0 else angle) / y
 
 
-@compiled(fastmath=CONTRACTED)
+@compiled(fastmath=FUSE)
 def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, terms: Singles) -> None:
     """Fill the contribution (V, 19) of each hat to the sums of its cluster, which consists of `size` consecutive hats.
 

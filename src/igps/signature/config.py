@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self, get_args
 
-from igps._parameters import check_at_least, check_one_of, check_share
+from igps._parameters import check_at_least, check_fraction, check_one_of
 from igps.signature.attributes import AttributeName
 from igps.signature.laplacian import Backend
 
@@ -71,7 +71,7 @@ class SignatureConfig:
             raise ValueError(
                 f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_kept + 1}, got {self.max_vertices}."
             )
-        check_share(accuracy=self.accuracy)
+        check_fraction(accuracy=self.accuracy)
         names, known = tuple(self.attributes), get_args(AttributeName)  # JSON and YAML have lists
         object.__setattr__(self, "attributes", names)
         if not set(names) <= set(known) or len(set(names)) < len(names):

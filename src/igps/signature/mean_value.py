@@ -21,9 +21,9 @@ from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats, Integers
-from igps._parameters import check_share
+from igps._parameters import check_fraction
 from igps._threads import Team
-from igps.mesh.winding import checked_places
+from igps.mesh.winding import check_mesh_and_points
 from igps.signature._far_field import HatClusters, HatSurface
 from igps.signature._weight_loops import fill_clusters
 from igps.signature.ordering import spatial_order
@@ -83,7 +83,7 @@ class Extension:
         self, vertices: NDArray[np.floating], faces: NDArray[np.integer], functions: NDArray[np.floating], *,
         divisors: NDArray[np.floating] | None = None, accuracy: float | None = None, dtype: DTypeLike | None = None,
     ) -> None:  # fmt: skip
-        check_share(accuracy=accuracy)
+        check_fraction(accuracy=accuracy)
         if dtype is None:
             dtype = np.float32 if accuracy is not None and accuracy >= _MIN_FLOAT32_ACCURACY else np.float64
         if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
@@ -208,7 +208,7 @@ def _scaled(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
 ) -> tuple[Floats, Integers, Floats]:
     """Check the arguments; return vertices, faces and points, with lengths scaled to the mesh."""
-    vertices, faces, points = checked_places(vertices, faces, points)
+    vertices, faces, points = check_mesh_and_points(vertices, faces, points)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     centre, scale = (low + high) / 2, np.linalg.norm(high - low) / 2
     if not scale > 0:

@@ -59,7 +59,7 @@ def spatial_ordering_keys(mesh: Mesh) -> Floats:
     return _keys(embedding, vertex_area_shares(mesh.faces, areas))
 
 
-def canonically_ordered(mesh: Mesh) -> Mesh:
+def in_canonical_order(mesh: Mesh) -> Mesh:
     """Return the mesh with vertices, faces and first corners of faces in an order independent of their numbering."""
     order = np.argsort(spatial_ordering_keys(mesh), kind="stable")
     rank = np.empty(len(order), dtype=np.int64)

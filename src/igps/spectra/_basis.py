@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from igps._threads import ALONE, Team
+from igps._threads import SERIAL, Team
 
 # Entries of the largest basis that has a copy in single precision, of 1 GiB.
 MAX_SINGLE_ENTRIES = 2**28
@@ -25,7 +25,7 @@ class Basis:
     the eigenvectors must be written over it.
     """
 
-    def __init__(self, first_row: np.ndarray, capacity: int, team: Team = ALONE) -> None:
+    def __init__(self, first_row: np.ndarray, capacity: int, team: Team = SERIAL) -> None:
         self._team = team
         n_columns = len(first_row)
         self._pieces = split(n_columns, max(1, min(MAX_PIECES, n_columns // MIN_PIECE_COLUMNS)))

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.linalg import qr
 
-from igps._threads import ALONE, Team
+from igps._threads import SERIAL, Team
 from igps.spectra._basis import Basis, split
 from igps.spectra._checks import ROUNDING
 from igps.spectra._multifrontal import Factors
@@ -59,7 +59,7 @@ class Krylov(Basis):
 
     def __init__(
         self, factors: Factors, zero_mode: np.ndarray, block_size: int, capacity: int, generator: np.random.Generator,
-        team: Team = ALONE,
+        team: Team = SERIAL,
     ) -> None:  # fmt: skip
         super().__init__(zero_mode, capacity, team)
         self._factors, self._generator, self._block_size = factors, generator, block_size

@@ -37,7 +37,7 @@ import torch
 from scipy import sparse
 
 from igps._arrays import Floats
-from igps._threads import ALONE, Team
+from igps._threads import SERIAL, Team
 from igps.spectra import _fronts as loops
 from igps.spectra._checks import checked_entries
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
@@ -62,7 +62,7 @@ class Tree:
     subtrees: list[Nodes]  # can be eliminated and solved in parallel
     above: list[Nodes]  # the other nodes, each after its children
 
-    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
+    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = SERIAL) -> Factors:
         """Factorize ``matrix − shift · I``, of which both triangles are read; every team gives the same bits.
 
         A ValueError is raised if the matrix stores other entries than the analysed one, a SingularMatrixError if a
@@ -71,7 +71,7 @@ class Tree:
         blocks = np.empty(self.structure.block_start[-1])
         return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
 
-    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> int:
+    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = SERIAL) -> int:
         """Return the number of negative eigenvalues of ``matrix − shift · I``, with the errors of `factorize`."""
         return self._eliminate(matrix, shift, team, None)
 
@@ -137,7 +137,7 @@ class Factors:
     blocks: np.ndarray  # (S, S + B) block [D E] of each node, end to end
     n_negative: int
 
-    def solve(self, right_hand_sides: torch.Tensor, team: Team = ALONE) -> torch.Tensor:
+    def solve(self, right_hand_sides: torch.Tensor, team: Team = SERIAL) -> torch.Tensor:
         """Return the solutions (V, b) for right-hand sides (V, b), float64, both preferably stored by columns."""
         tree, structure = self.tree, self.tree.structure
         n_vertices, b = right_hand_sides.shape

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from igps._arrays import Floats
-from igps._compiled import SUMS, Lazy, compiled
+from igps._compiled import REASSOCIATE, Lazy, compiled
 
 Four = tuple[float, float, float, float]
 
@@ -178,7 +178,7 @@ def overlaps_by_loops(a: Floats, b: Floats, begin: int, end: int) -> Floats:
     return products
 
 
-@compiled(fastmath=SUMS)
+@compiled(fastmath=REASSOCIATE)
 def four_by_six(
     a: Floats, i: int, b: Floats, j: int, begin: int, end: int
 ) -> tuple[Four, Four, Four, Four, Four, Four]:
@@ -199,7 +199,7 @@ def four_by_six(
     return s0, s1, s2, s3, s4, s5
 
 
-@compiled(fastmath=SUMS)
+@compiled(fastmath=REASSOCIATE)
 def added(sums: Four, x: Four, y: float) -> Four:
     """Return the sums plus x times y."""
     return sums[0] + x[0] * y, sums[1] + x[1] * y, sums[2] + x[2] * y, sums[3] + x[3] * y

@@ -188,7 +188,7 @@ def test_short_vectors_are_the_best_of_so_many_numbers(
     short = head.short(vectors)
     assert short.shape[1] <= vectors.shape[1] <= 256
     torch.testing.assert_close(cosine(short, short), cosine(vectors, vectors), atol=1e-5, rtol=0)
-    monkeypatch.setattr("igps.nn.heads.two_level.MOST_NUMBERS", 7)
+    monkeypatch.setattr("igps.nn.heads.two_level.MAX_SHORT_WIDTH", 7)
     found = head.fit(histograms, classes, bodies=bodies).short(vectors)
     assert found.shape == (len(vectors), 7)
     _, _, axes = np.linalg.svd(vectors.double().numpy(), full_matrices=False)

@@ -12,12 +12,12 @@ from pathlib import Path
 
 from igps.mesh._label_measures import LabelVoxels, VoxelMeasures
 from igps.mesh.formats import archives, brains, clouds, molecules, obj, off, ply, scenes, stl, threemf, volumes, vtk
-from igps.mesh.formats._format import Format, RawBody, faults, stamp_of
+from igps.mesh.formats._format import Format, RawBody, faults, stat_key
 from igps.mesh.options import LoadOptions
 
 __all__ = [
-    "FORMATS", "Format", "LabelVoxels", "RawBody", "VoxelMeasures", "files_read", "format_of", "is_searched",
-    "searched_suffixes", "stamp_of",
+    "FORMATS", "Format", "LabelVoxels", "RawBody", "VoxelMeasures", "dependencies_of", "format_of", "is_searched",
+    "searched_suffixes", "stat_key",
 ]  # fmt: skip
 
 FORMATS: tuple[Format, ...] = (
@@ -36,7 +36,7 @@ def format_of(path: str | Path) -> Format | None:
     return matches[max(matches, key=len)] if matches else None
 
 
-def files_read(path: Path, options: LoadOptions = LoadOptions()) -> list[Path]:
+def dependencies_of(path: Path, options: LoadOptions = LoadOptions()) -> list[Path]:
     """Return a file and existing others on which its bodies depend; a MeshError if it is too damaged to list them."""
     kind = format_of(path)
     if kind is None or kind.beside is None or not path.is_file():

@@ -126,7 +126,7 @@ def distinct(names: Iterable[str]) -> list[str]:
     return list(counts)
 
 
-def stamp_of(*paths: Path) -> tuple[int, int, int]:
+def stat_key(*paths: Path) -> tuple[int, int, int]:
     """Return the total size of files in bytes, and their latest mtime and ctime in nanoseconds."""
     stats = [os.stat(path) for path in paths]
     return sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats), max(s.st_ctime_ns for s in stats)

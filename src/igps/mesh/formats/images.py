@@ -23,7 +23,7 @@ def read(path: Path, changed: tuple[int, int, int]) -> tuple[NDArray[Any], Float
     """Return the values (X, Y, Z) of an image or grid, and the affine (4, 4) from voxels to coordinates.
 
     NIfTI, MGH, NRRD, MetaImage and TIFF are in world coordinates (RAS, millimetres), OpenDX, MRC and CCP4 in ångström.
-    The last file is cached; `changed`, its `stamp_of`, is part of the cache key.
+    The last file is cached; `changed`, its `stat_key`, is part of the cache key.
     """
     if path.name.lower().endswith(_GRIDS):
         return (_read_dx if path.suffix.lower() == ".dx" else _read_map)(path)

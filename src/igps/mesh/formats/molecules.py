@@ -15,7 +15,7 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 from igps._parameters import check_one_of
-from igps.mesh.formats._format import Format, RawBody, deferred, stamp_of
+from igps.mesh.formats._format import Format, RawBody, deferred, stat_key
 from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structures, suffix_of
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
@@ -119,7 +119,7 @@ def read_molecule(
 
 @lru_cache(maxsize=1)
 def molecules_by_part(path: Path, changed: tuple[int, int, int], bodies: MoleculeBodies) -> dict[str, Molecule]:
-    """Return the bodies of a structure file by part; `changed`, its `stamp_of`, is part of the cache key."""
+    """Return the bodies of a structure file by part; `changed`, its `stat_key`, is part of the cache key."""
     molecules = read_molecule(path, bodies)
     return {molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule for molecule in molecules}
 
@@ -283,7 +283,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     from igps.mesh.molecular_surface import molecular_surface
 
     bodies: MoleculeBodies = options.bodies if options.bodies in ("chains", "assembly") else "models"
-    molecules = molecules_by_part(path, stamp_of(path), bodies)
+    molecules = molecules_by_part(path, stat_key(path), bodies)
     names = [name for name in molecules if part in (None, name)]
     return [deferred(partial(molecular_surface, molecules[name]), name, "Å") for name in names]
 

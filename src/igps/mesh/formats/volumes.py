@@ -20,7 +20,7 @@ from igps.mesh._label_measures import LabelVoxels
 from igps.mesh.formats._format import Format, RawBody, deferred, faults
 from igps.mesh.formats._volume_files import READERS, RawVolume, detached, of_nibabel, read_raw, suffix_of
 from igps.mesh.formats.label_names import cleaned, read_label_names, table_beside
-from igps.mesh.label_surface import LEAST_VOXELS, checked_spacing, voxel_surface
+from igps.mesh.label_surface import MIN_VOXELS, voxel_spacing, voxel_surface
 from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
@@ -70,7 +70,7 @@ class LabelVolume:
     notes: tuple[str, ...] = ()  # remarks on how the volume was read
 
     def __post_init__(self) -> None:
-        checked_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
+        voxel_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
         if not self.bodies:
             notes = f" ({'; '.join(self.notes)})" if self.notes else ""
             raise MeshError(f"{self.name}: no voxel has a label, all are 0{notes}. Check the export.")
@@ -275,7 +275,7 @@ def label_bodies(volume: LabelVolume, options: LoadOptions, part: str | None = N
 def _in_pieces(volume: LabelVolume) -> LabelVolume:
     """Give each connected component its own label, in the order of the voxels, without those too small for a body."""
     label, _ = ndimage.label(volume.layers[0], np.ones((3, 3, 3)))
-    is_speck = np.bincount(label.ravel(), minlength=2) < LEAST_VOXELS
+    is_speck = np.bincount(label.ravel(), minlength=2) < MIN_VOXELS
     is_speck[0] = False
     if is_speck[1:].all():  # keep them: their error says that they are too small
         is_speck[:] = False

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from igps._arrays import Booleans, Floats
-from igps._threads import ALONE, Result, Team
+from igps._threads import SERIAL, Result, Team
 from igps.nn._kernels.count_by_torch import count_by_torch
 from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Indices, Numbers
 from igps.nn._kernels.pair_loops import count_block, gradient_block
@@ -89,7 +89,7 @@ def _map_shapes(task: Callable[[int, Team], Result], n_shapes: int) -> list[Resu
     """Run a task for each shape: on parallel threads if there are enough shapes, else one by one with a team."""
     with full_precision(), Team() as team:
         if n_shapes >= team.n_threads:
-            return team.each(lambda number: task(number, ALONE), range(n_shapes))
+            return team.each(lambda number: task(number, SERIAL), range(n_shapes))
         return [task(number, team) for number in range(n_shapes)]
 
 

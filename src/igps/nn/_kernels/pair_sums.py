@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps._compiled import CONTRACTED, compiled
+from igps._compiled import FUSE, compiled
 from igps.nn._kernels.pair_cells import Indices, Numbers
 
 # Scales of shares and of the number of pairs, which are packed in one integer. The shares of 2¹⁸ pairs, the maximum of
@@ -48,7 +48,7 @@ def unpack(packed: Integers, sums: Floats) -> None:
         pairs[:] = 0
 
 
-@compiled(fastmath=CONTRACTED)
+@compiled(fastmath=FUSE)
 def add_one_axis(cell: Indices, home: Indices, share: Numbers, weights: Floats, sums: Floats) -> None:
     """Add pairs (n,) of one row to the sums (cells, 2).
 
@@ -61,7 +61,7 @@ def add_one_axis(cell: Indices, home: Indices, share: Numbers, weights: Floats, 
         sums[i, 1] += upper
 
 
-@compiled(fastmath=CONTRACTED)
+@compiled(fastmath=FUSE)
 def add_two_axes(
     cell: Indices, home: Indices, first: Numbers, second: Numbers, weights: Floats, sums: Floats, corner: Any
 ) -> None:
@@ -75,7 +75,7 @@ def add_two_axes(
         sums[i, corner + 3] += d
 
 
-@compiled(fastmath=CONTRACTED)
+@compiled(fastmath=FUSE)
 def quarters(weight: float, first: float, second: float) -> tuple[float, float, float, float]:
     """Share a weight between the four corners of two axes; no part is negative."""
     upper = weight * first
@@ -84,7 +84,7 @@ def quarters(weight: float, first: float, second: float) -> tuple[float, float, 
     return lower - lower_second, lower_second, upper - upper_second, upper_second
 
 
-@compiled(fastmath=CONTRACTED)
+@compiled(fastmath=FUSE)
 def add_four_axes(cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
     """`add_axes` for four axes, as of a distance and three cosines; a single pass takes half of the time."""
     one, two, three, four = shares[0, first:], shares[1, first:], shares[2, first:], shares[3, first:]
@@ -99,7 +99,7 @@ def add_four_axes(cell: Indices, home: Indices, shares: Numbers, first: int, wei
         add_corners(sums, i, np.int64(12), outer[3], inner)
 
 
-@compiled(fastmath=CONTRACTED)
+@compiled(fastmath=FUSE)
 def add_corners(sums: Floats, cell: Any, corner: Any, weight: float, parts: tuple[float, float, float, float]) -> None:
     """Add the parts of a weight to the four corners of a cell from ``corner`` on."""
     sums[cell, corner] += weight * parts[0]

@@ -83,7 +83,7 @@ def check_cells(cells: Tensor, n_expected: int) -> None:
         raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
 
 
-def checked_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
+def check_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
     """Return `part_cells` as a tensor, by default one part of all cells; raise a ValueError for a wrong sum."""
     sizes = list(part_cells or (cells.shape[1],))
     if min(sizes) < 1 or sum(sizes) != cells.shape[1]:
@@ -91,7 +91,7 @@ def checked_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
     return torch.tensor(sizes, device=cells.device)
 
 
-def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
+def check_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
     """Return the labels (N,) on the device of the descriptions (N, ...); raise a ValueError for another shape."""
     n = len(descriptions)
     if labels.shape != (n,):
@@ -101,7 +101,7 @@ def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
 
 def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
     """Return the classes (N,) of descriptions, numbered from 0; raise a ValueError if no class has two members."""
-    _, members = checked_labels(descriptions, labels).unique(return_inverse=True)
+    _, members = check_labels(descriptions, labels).unique(return_inverse=True)
     if int(members.max()) + 1 == len(members):
         raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
     return members

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from igps.nn.heads.base import Head, checked_labels
+from igps.nn.heads.base import Head, check_labels
 from igps.nn.heads.closed_form import KernelHead
 
 _MAX_FOLDS = 5
@@ -67,7 +67,7 @@ class ClassifierHead(KernelHead):
             ValueError: the shapes of tensors do not match, or there are fewer than two classes.
         """
         scores, strangeness, classes = [], [], []
-        for held_out in folds(checked_labels(descriptions, labels)) if calibrate else ():
+        for held_out in folds(check_labels(descriptions, labels)) if calibrate else ():
             head = copy.deepcopy(self)
             head.fit(descriptions[~held_out], labels[~held_out], part_cells, calibrate=False)
             scores.append(head.scores(descriptions[held_out]))

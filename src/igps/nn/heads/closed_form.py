@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from igps._parameters import check_at_least, check_positive, check_share
+from igps._parameters import check_at_least, check_fraction, check_positive
 from igps.nn.heads.base import (
     Head,
     check_cells,
-    checked_labels,
-    checked_parts,
+    check_labels,
+    check_parts,
     class_means,
     class_members,
     damped,
@@ -70,7 +70,7 @@ class WhitenedHead(Head):
         super().__init__()
         check_at_least(1, n_directions=n_directions)
         check_positive(shrinkage=shrinkage)
-        check_share(prior_share=prior_share)
+        check_fraction(prior_share=prior_share)
         self.n_directions, self.shrinkage, self.prior = n_directions, shrinkage, prior
         self.register_buffer("prior_share", torch.tensor(prior_share))
         self.register_buffer("mean", torch.zeros(0))
@@ -102,7 +102,7 @@ class WhitenedHead(Head):
     def centre(self, descriptions: Tensor, part_cells: Sequence[int] | None = None) -> Self:
         """Fit only the mean to histograms (N, ...), without damping: for shapes without labels, or one per class."""
         roots = square_roots(descriptions)
-        self.part_cells = checked_parts(roots, part_cells)
+        self.part_cells = check_parts(roots, part_cells)
         self._note_buffers()
         n_parts = len(self.part_cells)
         self.mean = roots.mean(dim=0)
@@ -192,7 +192,7 @@ class KernelHead(Head):
     ) -> None:
         super().__init__()
         check_positive(ridge=ridge, temperature=temperature)
-        check_share(prior_share=prior_share)
+        check_fraction(prior_share=prior_share)
         self.whitened = WhitenedHead(n_directions, shrinkage)
         self.prior, self.ridge, self.prior_share = prior, ridge, prior_share
         self.register_buffer("temperature", torch.tensor(temperature))
@@ -205,7 +205,7 @@ class KernelHead(Head):
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
         """Fit whitening and regression to the training shapes, see `Head.fit`."""
-        self.classes, members = checked_labels(descriptions, labels).unique(return_inverse=True)
+        self.classes, members = check_labels(descriptions, labels).unique(return_inverse=True)
         if len(self.classes) < 2:
             raise ValueError(f"labels: expected at least two classes, got {len(self.classes)}.")
         has_class_variation = len(self.classes) < len(members)

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from igps._parameters import check_share
+from igps._parameters import check_fraction
 from igps.nn.heads.base import Head, principal_directions
 from igps.nn.heads.wccn import MEDIAN, WCCNHead
 from igps.retrieval.distances import cosine, euclidean, square_root
-from igps.retrieval.vectors import MOST_NUMBERS
+from igps.retrieval.vectors import MAX_SHORT_WIDTH
 
 # Usual distance of a training shape from the mean: in many dimensions, most pairs of shapes are nearly orthogonal.
 _USUAL_LENGTH = MEDIAN / math.sqrt(2)
@@ -82,7 +82,7 @@ class TwoLevelHead(Head):
         self.individual_head = individual_head
         if not all(bool(x.lengths) for x in (*self._body_heads(), *([individual_head] if individual_head else []))):
             raise ValueError("body_heads, individual_head: expected heads with lengths. Use WCCNHead(lengths=True).")
-        check_share(weight=weight)
+        check_fraction(weight=weight)
         self.register_buffer("scales", torch.tensor(list(scales)))
         self.register_buffer("share", torch.tensor(share))
         self.register_buffer("weight", None if individual_head is None else torch.tensor(weight))
@@ -102,7 +102,7 @@ class TwoLevelHead(Head):
         for head in self._body_heads():
             head.fit(descriptions, labels if bodies is None else bodies, part_cells)
         embeddings = self._two_levels(descriptions)
-        self.principal = principal_directions(embeddings.double(), MOST_NUMBERS)[0].to(embeddings.dtype)
+        self.principal = principal_directions(embeddings.double(), MAX_SHORT_WIDTH)[0].to(embeddings.dtype)
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from igps._parameters import check_at_least, check_positive
 from igps.nn.heads.base import (
     Head,
     check_cells,
-    checked_parts,
+    check_parts,
     class_means,
     class_members,
     damped,
@@ -73,7 +73,7 @@ class WCCNHead(Head):
         """Fit mean and directions to the training shapes, see `Head.fit`."""
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
-        self.part_cells = checked_parts(roots, part_cells)
+        self.part_cells = check_parts(roots, part_cells)
         self._note_buffers()
         n_parts = len(self.part_cells)
         if self._parts is not None and not set(self._parts) <= set(range(n_parts)):
