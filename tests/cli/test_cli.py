@@ -323,7 +323,7 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
         (["query", "nowhere.off", "--gallery", "ROOT", "--descriptor", "d2"], "no such file|cannot be read"),
         (
             ["retrieve", "ROOT", "--paper", "--mend", "never", "--n_workers", "1"],
-            "none of 6 meshes could be used.*too few for 250 eigenpairs",
+            "none of 6 meshes could be used.*expected at least 252 vertices for 250 eigenpairs",
         ),
     ],
 )
