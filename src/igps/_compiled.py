@@ -51,9 +51,7 @@ class Compiled(Lazy, Generic[Arguments, Result]):
         dispatcher: Any = self._entry.dispatcher
         try:
             return dispatcher(*args, **kwargs)
-        except (
-            AttributeError
-        ):  # from a cached file that refers to a class of an earlier version, not from compiled code
+        except AttributeError:  # a file in the cache refers to a class of an earlier version
             dispatcher._cache.flush()
             return dispatcher(*args, **kwargs)
 

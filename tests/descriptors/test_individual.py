@@ -255,7 +255,10 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, caps
     retrieve(root, "shape_dna", **options)
     assert "size is ignored: 1 of 5 bodies have no unit of length" in capsys.readouterr().out
     query(root / "2/e.off", gallery=tmp_path / "index", cache_dir=tmp_path / "cache")
-    assert "size is kept: 1 of 1 bodies have no unit; their numbers count as millimetres" in capsys.readouterr().out
+    assert (
+        "size is kept: 1 of 1 bodies have no unit; their coordinates are taken as millimetres"
+        in capsys.readouterr().out
+    )
     query(root / "2/c.3mf", gallery=tmp_path / "index", cache_dir=tmp_path / "cache")
     assert "no unit" not in capsys.readouterr().out
 

@@ -221,7 +221,8 @@ def print_unit_warning(descriptor: Descriptor, dataset: SignatureDataset) -> Non
     """Print how many bodies have no unit and are read as millimetres, if the descriptor keeps size."""
     n_unknown = sum(unit not in MILLIMETRES for unit in dataset.units()) if SIZE in descriptor.name else 0
     if n_unknown:
-        print(f"size is kept: {n_unknown} of {len(dataset)} bodies have no unit; their numbers count as millimetres")
+        reason = f"{n_unknown} of {len(dataset)} bodies have no unit"
+        print(f"size is kept: {reason}; their coordinates are taken as millimetres")
 
 
 def print_reading_warning(descriptor: Descriptor, dataset: SignatureDataset) -> None:

@@ -431,6 +431,15 @@ def test_values_beyond_the_ranges_stay_in_the_last_cells() -> None:
     assert float(result[-1, -1, -1]) > 0.9
 
 
+@pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
+@pytest.mark.parametrize("name", ["distance_range", "potential_range"])
+def test_a_range_that_is_no_positive_number_is_refused(name: str, value: float) -> None:
+    """An infinite range of potentials put all points into the first class."""
+    embedding, _, _ = some(20)
+    with pytest.raises(ValueError, match=f"{name}: expected a positive number, got {value}"):
+        pair_histogram(embedding, embedding.norm(dim=1), **{name: value})  # type: ignore[arg-type]
+
+
 def two_layouts(options: dict[str, bool], *more: Callable[..., PairAxis]) -> PairHistogram:
     learned = {"learnable": options.get("learnable", False)}
     points = [Potential(**options), Attribute("depth", [-0.1, 0.2, 0.5], **options)]  # type: ignore[arg-type]
