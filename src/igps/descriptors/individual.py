@@ -25,7 +25,7 @@ SIZE, SIDE = "+size", "+side"
 """Suffixes of the names of descriptors that keep size, and that distinguish a body from its mirror image."""
 
 SCALES: Mapping[str, float] = {
-    "interior": 0.017, "gps": 0.017, "multiscale": 0.03, "rich": 0.026, "pretrained": 0.1, "d2": 0.035,
+    "interior": 0.017, "gps": 0.017, "multiscale": 0.03, "rich": 0.026, "pretrained": 0.046, "d2": 0.035,
     "shape_dna": 17, "volume_shape_dna": 23, "local_diameter_centricity": 0.14, "inner_distance": 0.004,
     "canonical_form": 0.066, "geodesic_spectral": 0.0014, "spectral_gw": 0.0014,
 }  # fmt: skip
@@ -33,7 +33,7 @@ SCALES: Mapping[str, float] = {
 
 # Typical distance between individuals of one body, as a share of the scale of the descriptor. `pretrained` has its own
 # value, because its head reduces these distances to almost nothing.
-_INDIVIDUAL_SHARE, _INDIVIDUAL_DISTANCES = 0.25, {"pretrained": 0.0043}
+_INDIVIDUAL_SHARE, _INDIVIDUAL_DISTANCES = 0.25, {"pretrained": 0.0026}
 # A difference in size, in logarithms, adds at most _MAX_GAIN times the distance, and half of that at _HALF_SIZE.
 _MAX_GAIN, _HALF_SIZE = 2.0, 0.3
 # Typical differences in twist and in signed volumes between individuals of one body.

@@ -37,7 +37,7 @@ from igps.signature.signature import SignatureConfig, compute_signature
 # Of `rich`: six histograms in its first part, two oriented ones.
 CELLS = (25920, 750, 750)
 # Of `pretrained_parts`
-PART_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180, 63)
+PART_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180, 64)
 
 
 @pytest.fixture(scope="module")
@@ -111,11 +111,15 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
 
     classes = level("class_head", CLASS_PARTS)
     bodies = [level(f"body_heads.{k}", (part,)) for k, part in enumerate(BODY_PARTS)]
-    individuals = level("individual_head", INDIVIDUAL_PARTS)
+    individuals = [level(f"individual_heads.{k}", (part,)) for k, part in enumerate(INDIVIDUAL_PARTS)]
     share, scales, weight = (stored[f"head.{name}"] for name in ("share", "scales", "weight"))
     root = (0.9 * share / len(bodies)).sqrt()
     found = describe(part, module)
-    levels = [(0.9 * (1 - share)).sqrt() * classes, *(root * one for one in bodies), 0.1**0.5 * individuals]
+    levels = [
+        (0.9 * (1 - share)).sqrt() * classes,
+        *(root * one for one in bodies),
+        *(0.05**0.5 * one for one in individuals),
+    ]
     expected = torch.cat(levels, dim=1)
     torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
     compared = [one[:, :-1] for one in bodies]
@@ -124,7 +128,9 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
     apart = torch.zeros(4, 4, dtype=torch.float64)
     for one, scale in zip(compared, scales, strict=True):
         apart += (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") * shorter / scale) ** 10
-    between = torch.cdist(individuals[:, :-1], individuals[:, :-1], compute_mode="donot_use_mm_for_euclid_dist")
+    between = torch.ones(4, 4, dtype=torch.float64)
+    for one, exponent in zip(individuals, (0.2, 0.8), strict=True):
+        between *= torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist") ** exponent
     of_individuals = weight * (1 - torch.exp(-((between / 0.3) ** 2)))
     distances = (1 - weight) * (1 - classes @ classes.T) * (1 - torch.exp(-apart)) + of_individuals
     torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)

@@ -127,27 +127,45 @@ def test_the_distance_is_that_of_the_classes_where_any_body_head_tells_two_bodie
 
 
 def test_individuals_have_a_small_part_of_the_distance(collection: tuple[Tensor, Tensor, Tensor]) -> None:
-    """Written down from the vectors of the two heads; the other levels, and short vectors, stay what they are."""
+    """Written down from the vectors of the heads; the other levels, and short vectors, stay what they are."""
     histograms, classes, bodies = collection
     plain = TwoLevelHead().fit(histograms, classes, bodies=bodies)
-    individual_head = WCCNHead((1,), n_directions=6, lengths=True)
-    head = TwoLevelHead(individual_head=individual_head, weight=0.2)
+    individual_heads = [WCCNHead((part,), n_directions=6, lengths=True) for part in range(2)]
+    head = TwoLevelHead(individual_heads=individual_heads, exponents=(0.3, 0.7), weight=0.2)
     head.load_state_dict({**head.state_dict(), **plain.state_dict()})
     assert head.fit_individuals(histograms, bodies // 2, (15, 25)) is head
     vectors, of_two = head(histograms), plain(histograms)
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
-    x = individual_head(histograms)
-    products = 0.9 * of_two @ of_two.T + 0.1 * x @ x.T
+    x, y = (one(histograms) for one in individual_heads)
+    products = 0.9 * of_two @ of_two.T + 0.05 * x @ x.T + 0.05 * y @ y.T
     torch.testing.assert_close(vectors @ vectors.T, products, atol=1e-5, rtol=0)
-    apart = torch.cdist(x[:, :-1].double(), x[:, :-1].double(), compute_mode="donot_use_mm_for_euclid_dist")
+    torch.testing.assert_close(head.within_class(vectors)[:, -14:-7], 0.05**0.5 * x, atol=1e-6, rtol=0)
+    first, second = (
+        torch.cdist(one[:, :-1].double(), one[:, :-1].double(), compute_mode="donot_use_mm_for_euclid_dist")
+        for one in (x, y)
+    )
+    apart = first**0.3 * second**0.7
     expected = 0.8 * plain.distances(of_two, of_two).double() + 0.2 * (1 - torch.exp(-((apart / 0.3) ** 2)))
     found = head.distances(vectors, vectors).double()
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
     torch.testing.assert_close(head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0)
     torch.testing.assert_close(head.short(vectors), plain.short(of_two), atol=1e-5, rtol=0)
-    other = TwoLevelHead(individual_head=WCCNHead((1,), lengths=True))
+    other = TwoLevelHead(individual_heads=[WCCNHead((part,), lengths=True) for part in range(2)], exponents=(0.3, 0.7))
     other.load_state_dict(head.state_dict())
     torch.testing.assert_close(other.distances(other(histograms), vectors), found.float(), atol=1e-5, rtol=0)
+
+
+def test_distances_of_equal_vectors_have_a_gradient(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    histograms, classes, bodies = collection
+    individual_heads = [WCCNHead((part,), n_directions=6, lengths=True) for part in range(2)]
+    head = TwoLevelHead(individual_heads=individual_heads, exponents=(0.2, 0.8))
+    head.fit(histograms, classes, (15, 25), bodies=bodies).fit_individuals(histograms, bodies, (15, 25))
+    vectors = head(histograms[:4]).requires_grad_()
+    distances = head.distances(vectors, vectors)
+    assert float(distances.detach().diagonal().max()) < 1e-6
+    distances.sum().backward()
+    assert vectors.grad is not None
+    assert torch.isfinite(vectors.grad).all()
 
 
 def test_individuals_that_bodies_do_not_tell_apart_are_ordered() -> None:
@@ -165,7 +183,7 @@ def test_individuals_that_bodies_do_not_tell_apart_are_ordered() -> None:
     bodies, classes = individuals // 3, individuals // 6
     seen = classes < 6
     two = TwoLevelHead().fit(histograms[seen], classes[seen], bodies=bodies[seen])
-    three = TwoLevelHead(individual_head=WCCNHead(n_directions=20, lengths=True))
+    three = TwoLevelHead(individual_heads=[WCCNHead(n_directions=20, lengths=True)], exponents=(1.0,), weight=0.1)
     three.load_state_dict({**three.state_dict(), **two.state_dict()})
     three.fit_individuals(histograms[seen], individuals[seen])
     found = []
@@ -260,13 +278,16 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
         TwoLevelHead(scales=[0.1, 0.2])
     with pytest.raises(ValueError, match=r"a share between 0 and 1, got \(0.1,\) and 1"):
         TwoLevelHead(share=1)
-    with pytest.raises(ValueError, match="body_heads, individual_head: expected heads with lengths"):
+    with pytest.raises(ValueError, match="body_heads, individual_heads: expected heads with lengths"):
         TwoLevelHead(body_heads=[WCCNHead()])
-    with pytest.raises(ValueError, match="body_heads, individual_head: expected heads with lengths"):
-        TwoLevelHead(individual_head=WCCNHead())
+    with pytest.raises(ValueError, match="body_heads, individual_heads: expected heads with lengths"):
+        TwoLevelHead(individual_heads=[WCCNHead()], exponents=(1.0,))
     with pytest.raises(ValueError, match="weight: expected a number between 0 and 1, got 1"):
         TwoLevelHead(weight=1)
-    with pytest.raises(ValueError, match="individual_head: expected a head to fit, got None"):
+    for exponents in ((), (0.9,), (-1.0,), (0.5, 0.5)):
+        with pytest.raises(ValueError, match="exponents: expected a positive number for each of 1 individual heads"):
+            TwoLevelHead(individual_heads=[WCCNHead(lengths=True)], exponents=exponents)
+    with pytest.raises(ValueError, match="individual_heads: expected heads to fit, got none"):
         TwoLevelHead().fit_individuals(histograms, classes)
     with pytest.raises(RuntimeError, match="TwoLevelHead: expected to be fitted first"):
         TwoLevelHead().short(histograms)

@@ -23,10 +23,10 @@ PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 # Indices into `pretrained_parts`. Body heads use parts that bending leaves as they are; the class head uses the others,
 # and the balls, which serve both.
 BODY_PARTS, CLASS_PARTS = (0, 5, 8), (1, 2, 3, 4, 5, 6, 7)
-# The balls are too coarse to tell individuals apart.
-INDIVIDUAL_PARTS = (0, 8)
+# The balls are too coarse to tell individuals apart. Eigenvalues are more exact than distances between samples.
+INDIVIDUAL_PARTS, _EXPONENTS = (0, 8), (0.2, 0.8)
 # Scales of the body heads, in units in which the median distance between training shapes is 0.5
-_SCALES = (0.125, 0.21, 0.125)
+_SCALES = (0.13, 0.22, 0.13)
 
 
 def pretrained_parts() -> HistogramDescriptor:
@@ -67,22 +67,24 @@ def pretrained_parts() -> HistogramDescriptor:
 
 
 def pretrained_head(*, individuals: bool = True) -> TwoLevelHead:
-    """Return the unfitted head of `pretrained`, with or without an individual head."""
+    """Return the unfitted head of `pretrained`, with or without individual heads."""
     surface, balls, spectrum = BODY_PARTS
     body_heads = [
         WCCNHead([surface], n_directions=90, shrinkage=0.3, lengths=True),
         WCCNHead([balls], n_directions=20, shrinkage=0.3, lengths=True),
         WCCNHead([spectrum], n_directions=60, shrinkage=1.0, lengths=True),
     ]
-    individual_head = WCCNHead(INDIVIDUAL_PARTS, n_directions=60, shrinkage=0.3, lengths=True) if individuals else None
     class_head = WCCNHead(CLASS_PARTS, n_directions=150, shrinkage=0.1)
-    return TwoLevelHead(class_head, body_heads, scales=_SCALES, individual_head=individual_head)
+    if not individuals:
+        return TwoLevelHead(class_head, body_heads, scales=_SCALES)
+    individual_heads = [WCCNHead([part], n_directions=60, shrinkage=0.3, lengths=True) for part in INDIVIDUAL_PARTS]
+    return TwoLevelHead(class_head, body_heads, scales=_SCALES, individual_heads=individual_heads, exponents=_EXPONENTS)
 
 
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
     """Return the histograms of `pretrained_parts` under a head that was fitted to generated shapes, in evaluation mode.
 
-    Descriptions are unit vectors of 1,210 numbers, which the head's `short` reduces to 256. By the distance of the
+    Descriptions are unit vectors of 1,211 numbers, which the head's `short` reduces to 256. By the distance of the
     head, other poses of a body come first, then other bodies of its class. No labels are needed for the shapes that are
     compared. The model card is in the documentation.
 

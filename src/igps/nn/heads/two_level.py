@@ -1,7 +1,7 @@
 """A head with levels: other poses of a body rank first, then look-alikes, then other bodies of its class."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Self
 
 import torch
@@ -17,8 +17,9 @@ from igps.retrieval.vectors import MAX_SHORT_WIDTH
 # Usual distance of a training shape from the mean: in many dimensions, most pairs of shapes are nearly orthogonal.
 _USUAL_LENGTH = MEDIAN / math.sqrt(2)
 _STEEPNESS = 10  # exponent of the factor that rises from 0 to 1 at the scales of the body heads
-_INDIVIDUAL_SHARE = 0.1  # share of the squared length of an embedding that belongs to the individual head
-_INDIVIDUAL_SCALE = 0.3  # distance by the individual head at which most of its weight counts
+_INDIVIDUAL_SHARE = 0.1  # share of the squared length of an embedding that belongs to the individual heads
+_INDIVIDUAL_SCALE = 0.3  # distance by the individual heads at which most of their weight counts
+_MIN_DISTANCE = 1e-6  # shorter distances are rounding errors, and fractional powers have no derivative at 0
 
 
 class TwoLevelHead(Head):
@@ -34,10 +35,11 @@ class TwoLevelHead(Head):
     elsewhere. The scales are therefore multiplied by √(ℓ₀ / ℓ). Here ℓ² is the product of the distances of the two
     shapes from the mean, each in quadratic mean over the body heads, and ℓ₀ is the usual distance.
 
-    Bodies can be nearly alike, such as two people. An individual head, a `WCCNHead` with `lengths`, is fitted by
-    `fit_individuals` to individuals in several poses, so that it ignores the effects of bending and triangulation. With
-    f its distance and w its weight, the distance is (1 − w) times the distance above plus w (1 − exp(−(f / 0.3)²)).
-    The second term orders the shapes that the body heads consider the same body.
+    Bodies can be nearly alike, such as two people. Individual heads, `WCCNHead`s with `lengths`, are fitted by
+    `fit_individuals` to individuals in several poses, so that they ignore the effects of bending and triangulation.
+    With f = Π fₖ^pₖ, where fₖ are their distances and pₖ their exponents, and w their weight, the distance is (1 − w)
+    times the distance above plus w (1 − exp(−(f / 0.3)²)). The second term orders the shapes that the body heads
+    consider the same body.
 
     The cosine distance of whole embeddings is close to the cosine distance of the class embeddings. Search engines that
     only support cosine distances find candidates by whole embeddings or by `short` vectors; the candidates are then
@@ -48,15 +50,17 @@ class TwoLevelHead(Head):
         body_heads: fitted to bodies, with lengths; if None, a single head for the whole description.
         scales: of the body heads, in units of their distances (with median 0.5).
         share: share of the squared length of an embedding that belongs to the body heads.
-        individual_head: fitted to individuals, with lengths; None for two levels.
-        weight: weight w of the individual head.
+        individual_heads: fitted to individuals, with lengths; none for two levels.
+        exponents: pₖ of the individual heads, positive, with sum 1.
+        weight: weight w of the individual heads.
 
     Raises:
-        ValueError: a body head or individual head has no lengths, a scale is missing or not positive, or share or
-            weight is not between 0 and 1.
+        ValueError: a body head or individual head has no lengths, a scale or exponent is missing or not positive, the
+            sum of the exponents is not 1, or share or weight is not between 0 and 1.
     """
 
     scales: Tensor
+    exponents: Tensor
     share: Tensor
     weight: Tensor
     principal: Tensor
@@ -68,8 +72,9 @@ class TwoLevelHead(Head):
         *,
         scales: Sequence[float] = (0.1,),
         share: float = 0.5,
-        individual_head: WCCNHead | None = None,
-        weight: float = 0.1,
+        individual_heads: Sequence[WCCNHead] = (),
+        exponents: Sequence[float] = (),
+        weight: float = 0.05,
     ) -> None:
         super().__init__()
         self.class_head = class_head or WCCNHead()
@@ -79,13 +84,20 @@ class TwoLevelHead(Head):
                 f"scales, share: expected a positive scale for each of {len(self.body_heads)} body heads, and a share "
                 f"between 0 and 1, got {tuple(scales)} and {share}."
             )
-        self.individual_head = individual_head
-        if not all(bool(x.lengths) for x in (*self._body_heads(), *([individual_head] if individual_head else []))):
-            raise ValueError("body_heads, individual_head: expected heads with lengths. Use WCCNHead(lengths=True).")
+        self.individual_heads = nn.ModuleList(individual_heads)
+        if not all(bool(x.lengths) for x in (*self._body_heads(), *self._individual_heads())):
+            raise ValueError("body_heads, individual_heads: expected heads with lengths. Use WCCNHead(lengths=True).")
+        is_positive = len(exponents) == len(individual_heads) and all(exponent > 0 for exponent in exponents)
+        if not is_positive or (exponents and abs(sum(exponents) - 1) > _MIN_DISTANCE):
+            raise ValueError(
+                f"exponents: expected a positive number for each of {len(individual_heads)} individual heads, with sum "
+                f"1, got {tuple(exponents)}."
+            )
         check_fraction(weight=weight)
         self.register_buffer("scales", torch.tensor(list(scales)))
         self.register_buffer("share", torch.tensor(share))
-        self.register_buffer("weight", None if individual_head is None else torch.tensor(weight))
+        self.register_buffer("exponents", torch.tensor(list(exponents)) if individual_heads else None)
+        self.register_buffer("weight", torch.tensor(weight) if individual_heads else None)
         self.register_buffer("principal", torch.zeros(0, 0))
 
     @torch.no_grad()
@@ -106,25 +118,26 @@ class TwoLevelHead(Head):
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """Map histograms (N, ...) to embeddings (N, D) of length 1, with the columns of the individual head last."""
+        """Map histograms (N, ...) to embeddings (N, D) of length 1, with the columns of the individual heads last."""
         levels = self._two_levels(descriptions)
-        if self.individual_head is None:
+        if not self.individual_heads:
             return levels
-        individuals = self.individual_head(descriptions)
-        return torch.cat([math.sqrt(1 - _INDIVIDUAL_SHARE) * levels, math.sqrt(_INDIVIDUAL_SHARE) * individuals], dim=1)
+        individuals = [self._root_individual_share * head(descriptions) for head in self._individual_heads()]
+        return torch.cat([math.sqrt(1 - _INDIVIDUAL_SHARE) * levels, *individuals], dim=1)
 
     @torch.no_grad()
     def fit_individuals(
         self, descriptions: Tensor, individuals: Tensor, part_cells: Sequence[int] | None = None
     ) -> Self:
-        """Fit the individual head to histograms (N, ...) of individuals (N,) in several poses."""
-        if self.individual_head is None:
-            raise ValueError("individual_head: expected a head to fit, got None.")
-        self.individual_head.fit(descriptions, individuals, part_cells)
+        """Fit the individual heads to histograms (N, ...) of individuals (N,) in several poses."""
+        if not self.individual_heads:
+            raise ValueError("individual_heads: expected heads to fit, got none.")
+        for head in self._individual_heads():
+            head.fit(descriptions, individuals, part_cells)
         return self
 
     def within_class(self, embeddings: Tensor) -> Tensor:
-        """Return the columns of embeddings (N, D) by the body heads and the individual head.
+        """Return the columns of embeddings (N, D) by the body heads and the individual heads.
 
         In the columns of the class head, bodies that are nearly alike differ mostly by the scatter of the samples.
         """
@@ -133,7 +146,7 @@ class TwoLevelHead(Head):
     def short(self, embeddings: Tensor) -> Tensor:
         """Project embeddings (N, D) to (N, ≤ 256) of length 1, on the principal directions of the training shapes.
 
-        The cosines are close to those without the individual head, with larger errors for shapes unlike the training
+        The cosines are close to those without the individual heads, with larger errors for shapes unlike the training
         shapes. Raises a ValueError for embeddings of other heads.
         """
         if not len(self.principal):
@@ -149,16 +162,22 @@ class TwoLevelHead(Head):
         (queries, query_individuals), (gallery, gallery_individuals) = self._split(queries), self._split(gallery)
         n = self.class_head.n_numbers
         classes = cosine(queries[:, :n], gallery[:, :n])
-        query_bodies, gallery_bodies = self._bodies(queries), self._bodies(gallery)
+        query_bodies, gallery_bodies = (
+            _compared(x[:, n:], self._body_heads(), self._root_share) for x in (queries, gallery)
+        )
         exponent = torch.zeros_like(classes)
         for query, other, scale in zip(query_bodies, gallery_bodies, self.scales, strict=True):
             exponent = exponent + (euclidean(query, other) / scale).pow(_STEEPNESS)
         lengths = _mean_lengths(query_bodies)[:, None] * _mean_lengths(gallery_bodies)
         distances = classes * -torch.expm1(-exponent * (lengths / _USUAL_LENGTH**2).pow(_STEEPNESS / 4))
-        if self.individual_head is None:
+        if not self.individual_heads:
             return distances
-        individuals = (euclidean(query_individuals, gallery_individuals) / _INDIVIDUAL_SCALE).square()
-        return (1 - self.weight) * distances - self.weight * torch.expm1(-individuals)
+        heads, root = self._individual_heads(), self._root_individual_share
+        compared = (_compared(x, heads, root) for x in (query_individuals, gallery_individuals))
+        individuals = torch.ones_like(distances)
+        for query, other, exponent in zip(*compared, self.exponents, strict=True):
+            individuals = individuals * euclidean(query, other).clamp_min(_MIN_DISTANCE).pow(exponent)
+        return (1 - self.weight) * distances - self.weight * torch.expm1(-(individuals / _INDIVIDUAL_SCALE).square())
 
     def _two_levels(self, descriptions: Tensor) -> Tensor:
         """Return embeddings (N, D) of length 1 from the class head and the body heads, without individuals."""
@@ -166,27 +185,31 @@ class TwoLevelHead(Head):
         return torch.cat([classes, *(self._root_share * head(descriptions) for head in self._body_heads())], dim=1)
 
     def _split(self, embeddings: Tensor) -> tuple[Tensor, Tensor]:
-        """Split embeddings (N, D) into columns of both levels and columns of individuals, without their weights."""
-        if self.individual_head is None:
+        """Split embeddings (N, D) into columns of both levels, without their weight, and columns of individuals."""
+        if not self.individual_heads:
             return embeddings, embeddings[:, :0]
-        n = self.individual_head.n_numbers
-        levels, individuals = embeddings[:, :-n], embeddings[:, -n:-1]
-        return levels / math.sqrt(1 - _INDIVIDUAL_SHARE), individuals / math.sqrt(_INDIVIDUAL_SHARE)
+        n = sum(head.n_numbers for head in self._individual_heads())
+        return embeddings[:, :-n] / math.sqrt(1 - _INDIVIDUAL_SHARE), embeddings[:, -n:]
 
-    def _body_heads(self) -> Iterator[WCCNHead]:
-        return (head for head in self.body_heads if isinstance(head, WCCNHead))
+    def _body_heads(self) -> list[WCCNHead]:
+        return [head for head in self.body_heads if isinstance(head, WCCNHead)]
 
-    def _bodies(self, embeddings: Tensor) -> list[Tensor]:
-        """Return the `n_compared` columns of embeddings (N, D) by each body head, without its weight."""
-        start, bodies = self.class_head.n_numbers, []
-        for head in self._body_heads():
-            bodies.append(embeddings[:, start : start + head.n_compared] / self._root_share)
-            start += head.n_numbers
-        return bodies
+    def _individual_heads(self) -> list[WCCNHead]:
+        return [head for head in self.individual_heads if isinstance(head, WCCNHead)]
 
     @property
     def _root_share(self) -> Tensor:
         return (self.share / len(self.body_heads)).sqrt()
+
+    @property
+    def _root_individual_share(self) -> float:
+        return math.sqrt(_INDIVIDUAL_SHARE / len(self.individual_heads))
+
+
+def _compared(embeddings: Tensor, heads: Sequence[WCCNHead], root_share: Tensor | float) -> list[Tensor]:
+    """Return the `n_compared` columns of embeddings (N, D) by each head, without its weight."""
+    parts = embeddings[:, : sum(head.n_numbers for head in heads)].split([head.n_numbers for head in heads], dim=1)
+    return [part[:, : head.n_compared] / root_share for part, head in zip(parts, heads, strict=True)]
 
 
 def _mean_lengths(bodies: Sequence[Tensor]) -> Tensor:
