@@ -257,7 +257,7 @@ def test_extract_short_vectors(
         np.testing.assert_allclose(np.linalg.norm(short["features"], axis=1), 1, atol=1e-5)
         module = descriptor("pretrained")
         assert isinstance(module, EmbeddedDescriptor)
-        expected = module.short(torch.from_numpy(long["features"])).numpy()
+        expected = module.shorten(torch.from_numpy(long["features"])).numpy()
         np.testing.assert_allclose(short["features"], expected, atol=1e-6)
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, *common, "--short", "--descriptor", INTERIOR, "--out", tmp_path / "none.npz")

@@ -34,7 +34,7 @@ def groups(
     group: str | None = None,
     strata: str | None = None,
     covariate: list[str] | None = None,
-    size: bool = False,
+    test_size: bool = False,
     out: Path | None = None,
     n_permutations: int = 10_000,
     seed: int = 0,
@@ -50,7 +50,7 @@ def groups(
         group: column of labels.csv that holds the groups; the class if not given.
         strata: column of labels.csv, such as scanner; bodies are permuted only among those with the same value.
         covariate: columns that are regressed out first: numeric, such as age, or categorical, such as sex.
-        size: also test the size (the logarithm of the volume), in separate lines
+        test_size: also test the size (the logarithm of the volume), in separate lines
         out: folder for groups.csv, groups.json, and the effects as groups.svg and groups.png.
         n_permutations: number of random permutations.
         seed: seed of the permutations, bootstraps and folds.
@@ -69,8 +69,8 @@ def groups(
     result = described(folder, descriptor, size=size_option, **reading)
     bodies = result.dataset.bodies
     labels, stratum, covariates = columns(bodies)
-    vectors = {"": result.coordinates(of_one_kind=True)}
-    if size:
+    vectors = {"": result.coordinates(within_class=True)}
+    if test_size:
         if warning := keeps_size("keep", result.dataset.units())[1]:
             print(warning)
         vectors[", size"] = np.log([[s.volume * millimetres(s.unit) ** 3] for s in result.dataset.signatures()])

@@ -89,9 +89,9 @@ class Described:
     descriptor: Descriptor
     name: str | None  # name that loads the descriptor; None where its centres were fitted to the collection
 
-    def coordinates(self, *, of_one_kind: bool = False) -> Floats:
+    def coordinates(self, *, within_class: bool = False) -> Floats:
         """Return vectors (N, D) for statistics, see `Descriptor.coordinates`."""
-        return self.descriptor.coordinates(self.descriptions, of_one_kind=of_one_kind).double().numpy()
+        return self.descriptor.coordinates(self.descriptions, within_class=within_class).double().numpy()
 
 
 def signatures(

@@ -40,8 +40,8 @@ class TwoLevelHead(Head):
     The second term orders the shapes that the body heads consider the same body.
 
     The cosine distance of whole embeddings is close to the cosine distance of the class embeddings. Search engines that
-    only support cosine distances find candidates by whole embeddings or by `short` vectors; the candidates are then
-    ranked by `distances`.
+    only support cosine distances find candidates by whole embeddings or by short vectors (`shorten`); candidates are
+    then ranked by `distances`.
 
     Args:
         class_head: fitted to classes.
@@ -130,7 +130,7 @@ class TwoLevelHead(Head):
         """
         return embeddings[:, self.class_head.n_numbers :]
 
-    def short(self, embeddings: Tensor) -> Tensor:
+    def shorten(self, embeddings: Tensor) -> Tensor:
         """Project embeddings (N, D) to (N, ≤ 256) of length 1, on the principal directions of the training shapes.
 
         The cosines are close to those without the individual head, with larger errors for shapes unlike the training
