@@ -409,6 +409,33 @@ def test_help_explains_every_option(
             assert word in text, word
 
 
+def test_help_is_in_the_words_that_are_typed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        igps(monkeypatch, "gallery", "build", "--help")
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.startswith("usage: igps gallery build root --out OUT [options] ")
+    for word in ("None", "`", "see ", "type:", "Literal", "null)", "False)"):
+        assert word not in text, word
+    for words in (
+        "--bodies {whole,labels,objects,pieces,chains,models,assembly}", "null evaluates them exactly",
+        "start vectors (default: 0)", "or 250 without a descriptor",
+    ):  # fmt: skip
+        assert words in text, words
+
+
+def test_a_repeated_list_is_collected_in_place_of_its_default() -> None:
+    parser = cli.command_parser()
+    for command in ("compare", "precompute"):
+        default = parser.parse_args([command, "root"])[command].descriptors
+        assert "pretrained" in default
+        words = ["--descriptors", "pretrained", "--descriptors", "d2", "rich"]
+        for _ in range(2):
+            assert parser.parse_args([command, "root", *words])[command].descriptors == ["pretrained", "d2", "rich"]
+    assert parser.parse_args(["groups", "root", "--with", "a", "--with", "b=2"]).groups["with"] == ["a", "b=2"]
+
+
 def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def wait() -> None:
         """Wait."""
