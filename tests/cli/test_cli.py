@@ -642,9 +642,10 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["clusters", "ROOT", "--n_resamples", "-1"], "n_resamples: expected at least 0, got -1."),
         (["clusters", "TWO"], "root: expected three bodies or more, TWO has 2."),
         (["figure", "map", "TWO"], "root: expected three bodies or more, TWO has 2."),
-        (["figure", "map", "ROOT", "--seed", "-1"], "seed: expected at least 0, got -1."),
+        (["figure", "map", "ROOT", "--seed", "-1"], "seed: expected 0 to 4294967295, got -1."),
+        (["groups", "ROOT", "--seed", "4294967296"], "seed: expected 0 to 4294967295, got 4294967296."),
         (["figure", "map", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
-        (["retrieve", "ROOT", "--with", "ct=-1"], "descriptor: expected +NAME or +NAME=WEIGHT after the name"),
+        (["retrieve", "ROOT", "--with", "ct=-1"], "with: expected NAME or NAME=WEIGHT with a weight above 0, such as"),
         (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
         (
             ["duplicates", "ROOT", "--poses", "--tolerance", "0.01"],

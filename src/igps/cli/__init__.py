@@ -32,6 +32,7 @@ from igps.cli.reading import FLAGS, LISTS, MEANINGS, Verdict
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
 from igps.data.pipeline import version
+from igps.descriptors.registry import attributes_suffix
 from igps.report.page_data import finite
 
 Command = Callable[..., Any]
@@ -117,7 +118,7 @@ def main(
         as_json = options.pop(JSON, False)
         if parsed.subcommand == "figure" and options.get("out", ...) is None:
             options["out"] = Path("figures")
-        if suffix := "".join(f"+{attribute}" for attribute in options.pop("with", None) or ()):
+        if suffix := attributes_suffix(options.pop("with", None) or ()):
             if "descriptors" in options:
                 options["descriptors"] = [name + suffix for name in options["descriptors"]]
             else:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from igps._parameters import check_at_least, check_fraction
+from igps._parameters import check_at_least, check_fraction, check_seed
 from igps.analysis.explanation import Explanation, explain_groups, share_density, without_head
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, with_q_values
@@ -56,7 +56,7 @@ def groups(
         seed: seed of the permutations, bootstraps and folds.
     """
     check_at_least(1, n_permutations=n_permutations)
-    check_at_least(0, seed=seed)
+    check_seed(seed)
 
     def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
         labels = np.array(bodies.labels if group is None else bodies.column(group))
@@ -106,7 +106,7 @@ def groups(
 def _design(bodies: Bodies, name: str) -> Any:
     """Return a column as numbers (N, k): as they are, or one indicator per category where no value is a number."""
     words = bodies.column(name)
-    if any(re.match(r"[-+.\d]|(nan|inf|infinity)$", word, re.IGNORECASE) for word in words):
+    if any(re.match(r"[-+.\d]|inf(inity)?$", word, re.IGNORECASE) for word in words):
         return np.array(bodies.numbers(name))[:, None]
     return np.array([[word == category for category in sorted(set(words))] for word in words], dtype=float)
 

@@ -99,8 +99,8 @@ def extract(
 
     Args:
         meshes: mesh files, or one folder.
-        out: file ending in .csv, .parquet or .npz; notes on mended meshes are written beside it, to a file of the same
-            name ending in .notes.csv.
+        out: file ending in .csv, .parquet or .npz; notes on repaired meshes are written beside it, to a file of the
+            same name ending in .notes.csv.
         short: write unit vectors of at most 256 numbers, for search engines that compare by the cosine (pretrained).
         wide: write one row per file, or per folder with one mask file per organ, and columns such as PART.volume and
             PART.v0 for each of its bodies.
