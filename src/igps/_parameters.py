@@ -13,6 +13,12 @@ def check_at_least(minimum: int, **values: int | None) -> None:
             raise ValueError(f"{name}: expected at least {minimum}, got {value}.")
 
 
+def check_seed(seed: int) -> None:
+    """Raise a ValueError unless every library that draws random numbers accepts a seed."""
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed: expected 0 to {2**32 - 1}, got {seed}.")
+
+
 def check_positive(**values: float) -> None:
     """Raise a ValueError for the first value that is not a finite number above 0."""
     for name, value in values.items():

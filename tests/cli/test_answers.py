@@ -59,7 +59,7 @@ def table(path: Path) -> list[dict[str, str]]:
 def test_groups_prints_and_writes_the_tests(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--strata", "scanner", "--covariate", "age", "--size", "--n_permutations", "199", "--out", tmp_path]
+    words = ["--strata", "scanner", "--covariate", "age", "--test_size", "--n_permutations", "199", "--out", tmp_path]
     igps(monkeypatch, root, "groups", root, *OWN, *words)
     printed = capsys.readouterr().out
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
@@ -118,7 +118,7 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(
             word = ("ann", "bob", "cid", "dan", "eve")[i]  # before and after, of the same subjects
             path = folder / f"{name.format(group=group, i=i, word=word)}.nii.gz"
             nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)), path)
-    words = ["--size", "--out", tmp_path / "found"]
+    words = ["--test_size", "--out", tmp_path / "found"]
     igps(monkeypatch, tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
     _, size = json.loads((tmp_path / "found" / "groups.json").read_text())
     assert (size["body"], size["sizes"]) == ("all, size", "controls:5 patients:5")
@@ -136,7 +136,7 @@ def test_volumes_are_compared_in_one_unit(
             if i % 2:
                 trimesh.load(path, process=False).apply_scale(1e-3).export(path.with_suffix(".glb"))
                 path.unlink()
-    igps(monkeypatch, root, "groups", root, *OWN, "--size", "--out", tmp_path)
+    igps(monkeypatch, root, "groups", root, *OWN, "--test_size", "--out", tmp_path)
     assert (
         "6 of 10 bodies have no unit of length; their coordinates are taken as millimetres" in capsys.readouterr().out
     )

@@ -257,7 +257,7 @@ def test_extract_short_vectors(
         np.testing.assert_allclose(np.linalg.norm(short["features"], axis=1), 1, atol=1e-5)
         module = descriptor("pretrained")
         assert isinstance(module, EmbeddedDescriptor)
-        expected = module.short(torch.from_numpy(long["features"])).numpy()
+        expected = module.shorten(torch.from_numpy(long["features"])).numpy()
         np.testing.assert_allclose(short["features"], expected, atol=1e-6)
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, *common, "--short", "--descriptor", INTERIOR, "--out", tmp_path / "none.npz")
@@ -407,6 +407,33 @@ def test_help_explains_every_option(
     if command not in ("demo", "report"):
         for word in ("--cache_dir", "--strict", "--mend", "--signature.min_samples", "refined until"):
             assert word in text, word
+
+
+def test_help_is_in_the_words_that_are_typed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        igps(monkeypatch, "gallery", "build", "--help")
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.startswith("usage: igps gallery build root --out OUT [options] ")
+    for word in ("None", "`", "see ", "type:", "Literal", "null)", "False)"):
+        assert word not in text, word
+    for words in (
+        "--bodies {whole,labels,objects,pieces,chains,models,assembly}", "null evaluates them exactly",
+        "start vectors (default: 0)", "or 250 without a descriptor",
+    ):  # fmt: skip
+        assert words in text, words
+
+
+def test_a_repeated_list_is_collected_in_place_of_its_default() -> None:
+    parser = cli.command_parser()
+    for command in ("compare", "precompute"):
+        default = parser.parse_args([command, "root"])[command].descriptors
+        assert "pretrained" in default
+        words = ["--descriptors", "pretrained", "--descriptors", "d2", "rich"]
+        for _ in range(2):
+            assert parser.parse_args([command, "root", *words])[command].descriptors == ["pretrained", "d2", "rich"]
+    assert parser.parse_args(["groups", "root", "--with", "a", "--with", "b=2"]).groups["with"] == ["a", "b=2"]
 
 
 def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -615,9 +642,10 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["clusters", "ROOT", "--n_resamples", "-1"], "n_resamples: expected at least 0, got -1."),
         (["clusters", "TWO"], "root: expected three bodies or more, TWO has 2."),
         (["figure", "map", "TWO"], "root: expected three bodies or more, TWO has 2."),
-        (["figure", "map", "ROOT", "--seed", "-1"], "seed: expected at least 0, got -1."),
+        (["figure", "map", "ROOT", "--seed", "-1"], "seed: expected 0 to 4294967295, got -1."),
+        (["groups", "ROOT", "--seed", "4294967296"], "seed: expected 0 to 4294967295, got 4294967296."),
         (["figure", "map", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
-        (["retrieve", "ROOT", "--with", "ct=-1"], "descriptor: expected +NAME or +NAME=WEIGHT after the name"),
+        (["retrieve", "ROOT", "--with", "ct=-1"], "with: expected NAME or NAME=WEIGHT with a weight above 0, such as"),
         (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
         (
             ["duplicates", "ROOT", "--poses", "--tolerance", "0.01"],

@@ -43,7 +43,7 @@ def test_table_and_file_of_a_folder_that_can_be_used(
     assert cells["a/soup.off"][:2] + cells["a/soup.off"][4:] == [str(3 * N_FACES), str(N_VERTICES), "welded"]
     assert cells["b/box.off"][0] == "8"
     assert cells["b/box.off"][4:] == ["subdivided"]
-    assert total.startswith("3 bodies: 2 mended, 0 cannot be used; about ")
+    assert total.startswith("3 bodies: 2 repaired, 0 cannot be used; about ")
     assert written == f"written to {out}"
 
     rows = {row["name"]: row for row in csv.DictReader(out.open(newline=""))}
@@ -75,7 +75,7 @@ def test_status_is_1_if_a_file_cannot_be_used(
         (line,) = [line for line in lines if line.startswith(f"{name} ")]
         assert line.endswith(f"cannot be used: {root / name}: {sentence}")
     assert any(
-        line.startswith(f"{1 + len(sentences)} bodies: 0 mended, {len(sentences)} cannot be used") for line in lines
+        line.startswith(f"{1 + len(sentences)} bodies: 0 repaired, {len(sentences)} cannot be used") for line in lines
     )
     assert "Traceback" not in printed.out + printed.err
     rows = {row["name"]: row for row in csv.DictReader(out.open(newline=""))}
@@ -108,4 +108,4 @@ def test_files_that_bodies_bring_along_are_not_examined(
     write_clean(tmp_path / "a" / "clean.off")
     write_clean(tmp_path / "a" / "clean_fields.off")
     igps(monkeypatch, "doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)
-    assert capsys.readouterr().out.splitlines()[-1].startswith("1 bodies: 0 mended, 0 cannot be used")
+    assert capsys.readouterr().out.splitlines()[-1].startswith("1 bodies: 0 repaired, 0 cannot be used")

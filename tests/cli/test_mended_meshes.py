@@ -42,7 +42,7 @@ def root(tmp_path: Path) -> Path:
 
 
 WELDED = f"welded {3 * N_FACES - N_VERTICES} coincident vertices"
-SUMMARY = "5 of 8 meshes were mended: 2 welded, 2 subdivided, 1 filled"
+SUMMARY = "5 of 8 meshes were repaired: 2 welded, 2 subdivided, 1 filled"
 
 
 def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
@@ -80,7 +80,7 @@ def test_retrieve_says_what_was_mended_from_the_cache_too(
         for i in range(2):
             write_clean(clean / label / f"{i}.off", 1 + 0.1 * i, height)
     igps(monkeypatch, "retrieve", clean, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
-    assert "mended" not in capsys.readouterr().out
+    assert "repaired" not in capsys.readouterr().out
     assert not (out / "notes.csv").exists()
 
 
@@ -105,7 +105,7 @@ def test_never_and_always(
         igps(monkeypatch, "retrieve", root, "--mend", "never", *out, *ONE)
         printed = capsys.readouterr().out
         assert "5 of 8 meshes could not be used." in printed
-        assert "mended" not in printed
+        assert "repaired" not in printed
         refused = {row["name"]: row["error"] for row in csv.DictReader((tmp_path / "out" / "failures.csv").open())}
         assert set(refused) == {"ball/soup.off", "egg/soup.off", "ball/holed.off", "box/1.off", "box/2.off"}
         assert "6 boundary edges" in refused["ball/holed.off"]
@@ -115,7 +115,7 @@ def test_never_and_always(
         logging.disable(logging.NOTSET)
     igps(monkeypatch, "retrieve", root, "--mend", "always", *out, *ONE)
     # What bounds a body without crossing itself is watertight.
-    summary = "5 of 8 meshes were mended: 2 welded, 2 subdivided, 1 made watertight"
+    summary = "5 of 8 meshes were repaired: 2 welded, 2 subdivided, 1 made watertight"
     assert capsys.readouterr().out.splitlines()[0] == summary
     made = {name for name, note in notes(tmp_path / "out" / "notes.csv") if "watertight" in note}
     assert made == {"ball/holed.off"}

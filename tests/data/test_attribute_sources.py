@@ -12,6 +12,7 @@ import pickle
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import MethodType, SimpleNamespace
 
@@ -225,7 +226,7 @@ def test_values_at_vertices_give_the_same_linear_function_inside(
     values = VertexAttribute(name)(body, INSIDE)
     np.testing.assert_allclose(values, linear(INSIDE), atol=1e-3)
     write(body.path.with_name(name.partition("#")[0]), mesh.subdivide(), linear(mesh.subdivide().vertices))
-    with pytest.raises(MeshError, match=r"has 642 values, but the surface has 162 vertices"):
+    with pytest.raises(MeshError, match=r"has 642 values for 162 vertices"):
         VertexAttribute(name)(body, INSIDE)
 
 
@@ -276,6 +277,10 @@ def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(bodies:
         source = VertexAttribute(f"{name}.ply#height", reading=LoadOptions(bodies=bodies))
         found = source(BodyRef(tmp_path / "two.obj", part), INSIDE + np.array([shift, 0, 0]))
         np.testing.assert_allclose(found, linear(INSIDE) + added, atol=1e-3)
+    few = trimesh.creation.icosphere(subdivisions=1)
+    write_ply(tmp_path / "few.ply", few, linear(few.vertices))
+    with pytest.raises(MeshError, match=r"has 42 values for 642 vertices \(1284 in the whole file\)"):
+        replace(source, path="few.ply#height")(BodyRef(tmp_path / "two.obj", parts[0]), INSIDE)
 
 
 def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:

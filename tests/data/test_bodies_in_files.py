@@ -118,6 +118,21 @@ def test_a_table_names_bodies_and_may_tell_more(root: Path) -> None:
         find_bodies(root, OBJECTS)
 
 
+@pytest.mark.parametrize("value", ["", "NA", "n/a", "NaN"])
+def test_a_missing_value_is_none_but_a_class_may_have_its_name(root: Path, value: str) -> None:
+    (root / "labels.csv").write_text(f"file,label,sex\n2.obj,ill,f\n1.obj,well,{value}\n")
+    bodies = find_bodies(root)
+    assert bodies.columns == {"sex": ("f", None)}
+    with pytest.raises(ValueError, match=r"sex: 1 of 2 bodies have no value, such as 1\.obj"):
+        bodies.column("sex")
+    (root / "labels.csv").write_text(f"file,label\n2.obj,ill\n1.obj,{value}\n")
+    if value:
+        assert find_bodies(root).labels == ("ill", value)
+    else:
+        with pytest.raises(ValueError, match="line 3 lacks the name of a file, or a label"):
+            find_bodies(root)
+
+
 def test_further_columns_stay_with_their_bodies(root: Path, tmp_path: Path) -> None:
     table = "file,age,body,label,scanner\n2.obj,30,spleen,ill,A\n1.obj, 41.5 ,,well,\n"
     (root / "labels.csv").write_text(table)

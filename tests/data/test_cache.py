@@ -165,3 +165,13 @@ def test_failed_write_leaves_nothing(tmp_path: Path, signature: Signature, monke
 def test_default_directory_follows_the_convention(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert default_cache_dir() == tmp_path / "igps"
+
+
+def test_a_user_without_a_home_is_told_what_to_give(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_home() -> None:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr("igps.data.cache.Path.home", no_home)
+    with pytest.raises(ValueError, match=r"cache_dir: expected a folder, because this user has no home .* --cache_dir"):
+        default_cache_dir()

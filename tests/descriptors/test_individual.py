@@ -81,11 +81,11 @@ def test_vectors_count_a_small_difference_in_size_as_distances_do(signatures: di
 def test_short_vectors_keep_the_numbers_of_size_and_side(signatures: dict[str, Signature]) -> None:
     descriptor = igps.descriptor("pretrained+side+size")
     vectors = descriptor(collate(list(signatures.values())))
-    short = descriptor.short(vectors)
+    short = descriptor.shorten(vectors)
     assert short.shape[1] == 256 + 55
     torch.testing.assert_close(short[:, -55:], vectors[:, -55:])
-    with pytest.raises(ValueError, match="short: expected a descriptor of vectors"):
-        igps.descriptor("rich+size").short(vectors)
+    with pytest.raises(ValueError, match="shorten: expected a descriptor of vectors"):
+        igps.descriptor("rich+size").shorten(vectors)
 
 
 @pytest.mark.parametrize("name", ["interior", "rich"])

@@ -195,8 +195,8 @@ def test_an_attribute_adds_its_histograms_with_its_weight(bodies: SignatureDatas
     told = sum(chi_square(level.flatten(1), level.flatten(1)) for level in levels) / 3
     expected = descriptor("pretrained").distances(form, form) + 0.5 * 0.046 / 0.017 * told
     np.testing.assert_allclose(whole.distances(described, described), expected, atol=1e-5)
-    rows = whole.coordinates(described, of_one_kind=True)
-    kept = descriptor("pretrained").coordinates(form, of_one_kind=True)
+    rows = whole.coordinates(described, within_class=True)
+    kept = descriptor("pretrained").coordinates(form, within_class=True)
     np.testing.assert_allclose(rows[:, : kept.shape[1]], kept, atol=1e-6)
     np.testing.assert_allclose(rows[:, kept.shape[1] :].square(), 0.5 * 0.046 / 0.017 * inside.flatten(1), atol=1e-5)
     assert igps.descriptor("pretrained+height=0.5+size").name == "pretrained+height=0.5+size"

@@ -280,9 +280,9 @@ def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch: SignatureBat
     roots = below(batch).sqrt() - below(batch).sqrt().mean(dim=0)
     torch.testing.assert_close(embedding, roots / roots.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)
     torch.testing.assert_close(descriptor.distances(embedding, embedding), cosine(embedding, embedding))
-    assert descriptor.short(embedding) is embedding
+    assert descriptor.shorten(embedding) is embedding
     with pytest.raises(ValueError, match=r"expected a head that shortens its embeddings.*WhitenedHead.*300 numbers"):
-        descriptor.short(torch.rand(2, 300))
+        descriptor.shorten(torch.rand(2, 300))
     assert EmbeddedDescriptor(below, descriptor.head, invariant_to=["pose"]).invariant_to == ("pose",)
 
 

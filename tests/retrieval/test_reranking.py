@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from igps.retrieval import euclidean, rerank, rerank_found, retrieval_scores, search
+from igps.retrieval import euclidean, rerank, rerank_candidates, retrieval_scores, search
 
 
 def by_hand(distances: list[list[float]], k: int, n_expanded: int, share: float) -> list[list[float]]:
@@ -172,7 +172,7 @@ def test_classes_that_scatter_are_found_better() -> None:
 def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points: Tensor) -> None:
     queries, gallery = points[:3], points[3:]
     whole = search(queries, gallery, top=len(gallery), distance=euclidean)
-    found = rerank_found(queries, whole, lambda indices: gallery[indices], euclidean, top=5)
+    found = rerank_candidates(queries, whole, lambda indices: gallery[indices], euclidean, top=5)
     for i, query in enumerate(queries):
         together = torch.cat([query[None], gallery])
         expected = rerank(euclidean(together, together))[0, 1:]
@@ -189,7 +189,7 @@ def test_a_query_is_put_in_order_by_its_nearest_alone() -> None:
     precision = []
     for n_near in (20, 60, 100, 240):
         near = search(points[queries], points, top=n_near, distance=euclidean)
-        found = rerank_found(points[queries], near, lambda indices: points[indices], euclidean, top=20)
+        found = rerank_candidates(points[queries], near, lambda indices: points[indices], euclidean, top=20)
         precision.append(float((labels[found.indices] == labels[queries][:, None]).double().mean()))
     assert precision[1] > precision[0] + 0.15
     assert abs(precision[2] - precision[3]) < 0.05

@@ -98,7 +98,7 @@ def pool(
         mesh = subject(proportion, difference, random)
         batch = collate([compute_signature(mesh, config)])
         for name, descriptor in zip(descriptors, chosen, strict=True):
-            coordinates = descriptor.coordinates(descriptor(batch).detach(), of_one_kind=True)
+            coordinates = descriptor.coordinates(descriptor(batch).detach(), within_class=True)
             vectors[name].append(coordinates[0].double().numpy())
         values = shapedna.compute_shapedna(TriaMesh(mesh.vertices, mesh.faces), k=_N_EIGENVALUES)["Eigenvalues"][1:]
         vectors[_LAPY].append(np.log(values / values[0])[1:])

@@ -1,5 +1,6 @@
 """The command line: every subcommand of `igps` is a function, whose signature and docstring define its options."""
 
+import argparse
 import contextlib
 import inspect
 import json
@@ -25,11 +26,13 @@ from igps.cli.doctor import doctor
 from igps.cli.duplicates import distance, duplicates
 from igps.cli.feature_table import SUFFIXES
 from igps.cli.fit import classify, fit
+from igps.cli.help import HelpFormatter, usage_of
 from igps.cli.precompute import cache_export, precompute
 from igps.cli.reading import FLAGS, LISTS, MEANINGS, Verdict
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
 from igps.data.pipeline import version
+from igps.descriptors.registry import attributes_suffix
 from igps.report.page_data import finite
 
 Command = Callable[..., Any]
@@ -115,7 +118,7 @@ def main(
         as_json = options.pop(JSON, False)
         if parsed.subcommand == "figure" and options.get("out", ...) is None:
             options["out"] = Path("figures")
-        if suffix := "".join(f"+{attribute}" for attribute in options.pop("with", None) or ()):
+        if suffix := attributes_suffix(options.pop("with", None) or ()):
             if "descriptors" in options:
                 options["descriptors"] = [name + suffix for name in options["descriptors"]]
             else:
@@ -152,10 +155,11 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
 
 def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:
     """Return the parser of all commands; for the arguments see `main`."""
-    parser = ArgumentParser(prog=program, description="Volumetric shape retrieval by interior Global Point Signatures.")
+    summary = "Volumetric shape retrieval by interior Global Point Signatures."
+    parser = ArgumentParser(prog=program, description=summary, formatter_class=HelpFormatter)
     text = f"%(prog)s {version()}"
     parser.add_argument("--version", action="version", version=text, help="show the version and exit")
-    _add_commands(parser, COMMANDS if commands is None else commands)
+    _add_commands(parser, COMMANDS if commands is None else commands, program)
     return parser
 
 
@@ -166,18 +170,22 @@ def _selected(arguments: Namespace, commands: Commands) -> tuple[Command, dict[s
     return (command, options.as_dict()) if callable(command) else _selected(options, command)
 
 
-def _add_commands(parser: ArgumentParser, commands: Commands) -> None:
+def _add_commands(parser: ArgumentParser, commands: Commands, program: str) -> None:
     subcommands = parser.add_subcommands(required=True)
     for name, command in commands.items():
         if callable(command):
             summary, _, details = (inspect.getdoc(command) or "").partition("\n")
-            subparser = ArgumentParser(description=summary + "\n" + details.partition("Args:")[0])
+            description = summary + "\n" + details.partition("Args:")[0]
+            subparser = ArgumentParser(description=description, formatter_class=HelpFormatter)
             _add_options(subparser, command)
+            subparser.usage = usage_of(subparser, f"{program} {name}")
             subcommands.add_subcommand(name, subparser, help=summary)
         else:
-            group = ArgumentParser(description=f"One of {', '.join(command)}.")
-            subcommands.add_subcommand(name, group, help=", ".join(command))
-            _add_commands(group, command)  # jsonargparse accepts subcommands of a group only after adding the group
+            listed = f"commands: {', '.join(command)}"
+            group = ArgumentParser(description=f"One of several {listed}.", formatter_class=HelpFormatter)
+            subcommands.add_subcommand(name, group, help=listed)
+            # jsonargparse accepts subcommands of a group only after adding the group
+            _add_commands(group, command, f"{program} {name}")
 
 
 def _add_options(parser: ArgumentParser, command: Command) -> None:
@@ -190,11 +198,11 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
     meanings = {**MEANINGS, **documented}
     parameters = inspect.signature(command).parameters
     switches = {name: meanings.get(name) for name in parameters if types[name] is bool}
+    lists: dict[str, str | None] = {}
     if "reading" in parameters:
         switches = {**FLAGS, **switches}
-        for name, help_text in LISTS.items():
-            if name != "with" or {"descriptor", "descriptors"} & set(parameters):
-                parser.add_argument(f"--{name}", nargs="+", action="extend", help=help_text)
+        has_descriptor = {"descriptor", "descriptors"} & set(parameters)
+        lists = {name: meaning for name, meaning in LISTS.items() if name != "with" or has_descriptor}
     if types["return"] is not type(None):
         switches[JSON] = "print the table as JSON, and everything else to standard error"
     custom: set[str | int] = {*switches, *LISTS}  # their syntax differs from jsonargparse's
@@ -202,18 +210,31 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
         is_positional = position == 0 and parameter.default is parameter.empty
         item = _list_item(types[name])
         if is_positional or item is not None:
-            option, settings = (name, {}) if is_positional else (f"--{name}", {"default": parameter.default})
-            if settings.get("default") is parameter.empty:
-                settings = {"required": True}
-            if item is not None and settings.get("default") is None:
-                settings["action"] = "extend"  # a repeated option adds to the list
+            option, settings = (name if is_positional else f"--{name}"), dict[str, Any]()
+            if parameter.default is not parameter.empty:
+                settings["default"] = parameter.default
+            if not is_positional:
+                settings |= {"action": _Collect, "required": not settings}
             parser.add_argument(option, nargs=item and "+", type=item or types[name], help=meanings[name], **settings)
             custom.add(name)
-    parser.add_function_arguments(command, skip=custom)
+    parser.add_function_arguments(command, as_group=False, skip=custom)
     for action in parser._actions:
         action.help = action.help or meanings.get(action.dest)
+    for name, meaning in lists.items():
+        parser.add_argument(f"--{name}", nargs="+", action=_Collect, help=meaning)
     for name, meaning in switches.items():
         parser.add_argument(f"--{name}", action="store_true", help=meaning)
+
+
+class _Collect(argparse.Action):
+    """Collect the values of a repeated option in place of its default."""
+
+    _collected: Any = None  # the last value that this action set, which is never the default
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        given = getattr(namespace, self.dest, None)
+        self._collected = [*given, *values] if given is self._collected and given else values
+        setattr(namespace, self.dest, self._collected)
 
 
 def _list_item(hint: Any) -> Any:

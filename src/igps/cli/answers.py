@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from igps._parameters import check_at_least, check_fraction
+from igps._parameters import check_at_least, check_fraction, check_seed
 from igps.analysis.explanation import Explanation, explain_groups, share_density, without_head
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, with_q_values
@@ -34,7 +34,7 @@ def groups(
     group: str | None = None,
     strata: str | None = None,
     covariate: list[str] | None = None,
-    size: bool = False,
+    test_size: bool = False,
     out: Path | None = None,
     n_permutations: int = 10_000,
     seed: int = 0,
@@ -50,13 +50,13 @@ def groups(
         group: column of labels.csv that holds the groups; the class if not given.
         strata: column of labels.csv, such as scanner; bodies are permuted only among those with the same value.
         covariate: columns that are regressed out first: numeric, such as age, or categorical, such as sex.
-        size: also test the size (the logarithm of the volume), in separate lines
+        test_size: also test the size (the logarithm of the volume), in separate lines
         out: folder for groups.csv, groups.json, and the effects as groups.svg and groups.png.
         n_permutations: number of random permutations.
         seed: seed of the permutations, bootstraps and folds.
     """
     check_at_least(1, n_permutations=n_permutations)
-    check_at_least(0, seed=seed)
+    check_seed(seed)
 
     def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
         labels = np.array(bodies.labels if group is None else bodies.column(group))
@@ -69,8 +69,8 @@ def groups(
     result = described(folder, descriptor, size=size_option, **reading)
     bodies = result.dataset.bodies
     labels, stratum, covariates = columns(bodies)
-    vectors = {"": result.coordinates(of_one_kind=True)}
-    if size:
+    vectors = {"": result.coordinates(within_class=True)}
+    if test_size:
         if warning := keeps_size("keep", result.dataset.units())[1]:
             print(warning)
         vectors[", size"] = np.log([[s.volume * millimetres(s.unit) ** 3] for s in result.dataset.signatures()])
@@ -106,7 +106,7 @@ def groups(
 def _design(bodies: Bodies, name: str) -> Any:
     """Return a column as numbers (N, k): as they are, or one indicator per category where no value is a number."""
     words = bodies.column(name)
-    if any(re.match(r"[-+.\d]|(nan|inf|infinity)$", word, re.IGNORECASE) for word in words):
+    if any(re.match(r"[-+.\d]|inf(inity)?$", word, re.IGNORECASE) for word in words):
         return np.array(bodies.numbers(name))[:, None]
     return np.array([[word == category for category in sorted(set(words))] for word in words], dtype=float)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from igps._arrays import Floats
-from igps._parameters import check_at_least
+from igps._parameters import check_at_least, check_seed
 from igps.analysis.clusters import STABLE, Linkage, clusters_of
 from igps.analysis.comparison import pair_distances
 from igps.analysis.map import Layout, body_map, import_umap
@@ -43,7 +43,8 @@ def clusters(
         seed: seed of the random halves.
         out: folder for clusters.csv and clusters.json, and the tree as clusters.svg and clusters.png.
     """
-    check_at_least(0, n_resamples=n_resamples, seed=seed)
+    check_at_least(0, n_resamples=n_resamples)
+    check_seed(seed)
 
     def check_number(bodies: Bodies) -> None:
         if n_clusters is not None and not 1 <= n_clusters <= len(bodies):
@@ -103,7 +104,7 @@ def map_bodies(
         except ValueError:  # a categorical column
             return list(bodies.column(colour))
 
-    check_at_least(0, seed=seed)
+    check_seed(seed)
     if layout == "umap":
         import_umap()
     dataset, distances, labels = _distances(root, column_values, descriptor, **reading)

@@ -24,10 +24,10 @@ def doctor(
     attribute: list[str] | None = None,
     **options: Any,
 ) -> Verdict:
-    """Check each body of a folder: list its defects, how they are mended, and the expected cost of its signature.
+    """Check each body of a folder: list its defects, how they are repaired, and the expected cost of its signature.
 
     For labels of volumes, also list the number of voxels and of pieces, and the thickness of the thinnest part in
-    voxels, up to ten. Bodies are mended, but no signature is computed. The exit status is 1 if a body cannot be used.
+    voxels, up to ten. Bodies are repaired, but no signature is computed. The exit status is 1 if a body cannot be used.
 
     Args:
         out: CSV file for the findings, with all notes.

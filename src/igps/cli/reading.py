@@ -89,9 +89,9 @@ class Described:
     descriptor: Descriptor
     name: str | None  # name that loads the descriptor; None where its centres were fitted to the collection
 
-    def coordinates(self, *, of_one_kind: bool = False) -> Floats:
+    def coordinates(self, *, within_class: bool = False) -> Floats:
         """Return vectors (N, D) for statistics, see `Descriptor.coordinates`."""
-        return self.descriptor.coordinates(self.descriptions, of_one_kind=of_one_kind).double().numpy()
+        return self.descriptor.coordinates(self.descriptions, within_class=within_class).double().numpy()
 
 
 def signatures(
@@ -284,17 +284,17 @@ def dataset_from_options(
 
 
 def mending_summary(dataset: SignatureDataset, n_total: int) -> str:
-    """Return a line on how many meshes were mended and by which steps; empty if none was."""
+    """Return a line on how many meshes were repaired and by which steps; empty if none was."""
     steps = [repair_steps(notes) for notes in dataset.all_notes()]
     counts = Counter(step for steps_of_mesh in steps for step in steps_of_mesh)
     if not counts:
         return ""
     words = {"watertight": "made watertight"}
     listed = ", ".join(f"{count} {words.get(step, step)}" for step, count in counts.most_common())
-    return f"{sum(map(bool, steps))} of {n_total} meshes were mended: {listed}"
+    return f"{sum(map(bool, steps))} of {n_total} meshes were repaired: {listed}"
 
 
 def write_mending_notes(path: Path, dataset: SignatureDataset) -> None:
-    """Write the notes on how each mesh was mended, as a table."""
+    """Write the notes on how each mesh was repaired, as a table."""
     meshes = zip(dataset.bodies.names, dataset.all_notes(), strict=True)
     write_rows(path, ("name", "note"), [(name, note) for name, notes in meshes for note in notes])

@@ -34,7 +34,7 @@ from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.report.results import write_sources
 from igps.report.tables import scores_table, write_rows
-from igps.retrieval import N_RERANKED, RetrievalScores, rank, rerank_found, retrieval_scores, search
+from igps.retrieval import N_RERANKED, RetrievalScores, rank, rerank_candidates, retrieval_scores, search
 from igps.retrieval import rerank as reranked_distances
 
 
@@ -99,8 +99,8 @@ def extract(
 
     Args:
         meshes: mesh files, or one folder.
-        out: file ending in .csv, .parquet or .npz; notes on mended meshes are written beside it, to a file of the same
-            name ending in .notes.csv.
+        out: file ending in .csv, .parquet or .npz; notes on repaired meshes are written beside it, to a file of the
+            same name ending in .notes.csv.
         short: write unit vectors of at most 256 numbers, for search engines that compare by the cosine (pretrained).
         wide: write one row per file, or per folder with one mask file per organ, and columns such as PART.volume and
             PART.v0 for each of its bodies.
@@ -113,7 +113,7 @@ def extract(
     if short and not isinstance(inner, EmbeddedDescriptor):
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
     result = described(files_or_folder(meshes), descriptor, **reading)
-    features = (result.descriptor.short(result.descriptions) if short else result.descriptions).numpy()
+    features = (result.descriptor.shorten(result.descriptions) if short else result.descriptions).numpy()
     out.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".npz":
         bodies = result.dataset.bodies
@@ -173,7 +173,7 @@ def query(
         n_candidates = min(max(top, N_RERANKED), len(bodies)) if rerank else n_listed
         ranking = search(description, known.descriptions, top=n_candidates, distance=distance)
         if rerank:
-            ranking = rerank_found(description, ranking, lambda i: known.descriptions[i], distance, top=n_listed)
+            ranking = rerank_candidates(description, ranking, lambda i: known.descriptions[i], distance, top=n_listed)
         pairs = zip(ranking.indices[0].tolist(), ranking.distances[0].tolist(), strict=True)
         labels = bodies.labels or [None] * len(bodies)
         nearest = [(bodies.names[i], labels[i], value) for i, value in pairs]

@@ -202,11 +202,11 @@ class VertexAttribute(FileAttribute):
             return ImageAttribute(self.path, self.root).values(body, file, name, points)
         raw = read_surface(body.path, self.reading, part=body.part)
         values = vertex_values.chosen(vertex_values.read(file), name, file)
-        if len(values) != len(raw.vertices) and self.reading.bodies in ("pieces", "objects"):
+        if len(values) != (n_own := len(raw.vertices)) and self.reading.bodies in ("pieces", "objects"):
             raw = read_surface(body.path, replace(self.reading, bodies="whole"))
         if len(values) != len(raw.vertices):
-            counts = f"{len(values)} values, but the surface has {len(raw.vertices)} vertices"
-            raise MeshError(f"{body}: {file} has {counts}. Give one value for each vertex of this surface.")
+            whole = f" ({len(raw.vertices)} in the whole file)" * (len(raw.vertices) != n_own)
+            raise MeshError(f"{body}: {file} has {len(values)} values for {n_own} vertices{whole}. Give one for each.")
         columns = fill_missing(values.reshape(len(values), -1), raw.vertices, str(file))
         mesh = load_mesh(body.path, self.reading, part=body.part)
         if not np.array_equal(mesh.vertices, raw.vertices):

@@ -30,7 +30,13 @@ Result = TypeVar("Result")
 
 def default_cache_dir() -> Path:
     """Return the user's cache directory for Signatures: `$XDG_CACHE_HOME/igps`, or `~/.cache/igps`."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "igps"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "igps"
+    except RuntimeError as error:
+        raise ValueError(
+            "cache_dir: expected a folder, because this user has no home folder. Give cache_dir, on the command line "
+            "--cache_dir, or set XDG_CACHE_HOME."
+        ) from error
 
 
 def content_digest(path: Path, *companions: Path) -> bytes:

@@ -115,15 +115,15 @@ class IndividualDescriptor(Descriptor):
             distances = distances + _MAX_GAIN * (distances + self._unit) * ratio / (1 + ratio)
         return distances
 
-    def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
+    def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, D) descriptions to the coordinates of the descriptor, then the side and size blocks."""
         form, *others = self.split(descriptions)
-        return torch.cat([self.descriptor.coordinates(form, of_one_kind=of_one_kind), *others], dim=1)
+        return torch.cat([self.descriptor.coordinates(form, within_class=within_class), *others], dim=1)
 
-    def short(self, descriptions: Tensor) -> Tensor:
-        """(N, D) descriptions to (N, ≤ 256 + 55): `short` of the descriptor (or its ValueError), then other blocks."""
+    def shorten(self, descriptions: Tensor) -> Tensor:
+        """(N, D) descriptions to (N, ≤ 256 + 55): `shorten` of the descriptor (or its ValueError), then others."""
         form, *others = self.split(descriptions)
-        return torch.cat([self.descriptor.short(form), *others], dim=1)
+        return torch.cat([self.descriptor.shorten(form), *others], dim=1)
 
     def wrap(self, descriptor: Descriptor) -> "IndividualDescriptor":
         """Return an `IndividualDescriptor` of another descriptor with the same options and scales."""

@@ -70,7 +70,7 @@ class SizedHistograms(HistogramDescriptor):
     size, |Δ log area| + |Δ log volume|. The last two numbers of a description are these logarithms.
     """
 
-    searched_by = None
+    search_distance = None
 
     @property
     def n_features(self) -> int:
@@ -92,7 +92,7 @@ class SizedHistograms(HistogramDescriptor):
         size = torch.cdist(queries[:, -2:], gallery[:, -2:], p=1)
         return chi_square(queries[:, :-2], gallery[:, :-2]) * size / (_HALF_SIZE + size)
 
-    def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
+    def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, cells) square roots of the histograms, without the logarithms, which would dominate all distances."""
         return descriptions[:, :-2].sqrt()
 

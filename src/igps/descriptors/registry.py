@@ -4,7 +4,7 @@ import importlib
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -156,6 +156,14 @@ def descriptor(
         with_size, with_side = with_size or base.keeps_size, with_side or base.twists is not None
         base = base.descriptor
     return IndividualDescriptor(base, size=with_size, side=with_side, scale=scale).eval()
+
+
+def attributes_suffix(attributes: Iterable[str]) -> str:
+    """Return the suffix of a name that combines a descriptor with attributes NAME or NAME=WEIGHT."""
+    suffixes = [f"+{attribute}" for attribute in attributes]
+    if wrong := [suffix[1:] for suffix in suffixes if not _ATTRIBUTE_SUFFIX.fullmatch(suffix)]:
+        raise ValueError(f"with: expected NAME or NAME=WEIGHT with a weight above 0, such as ct=0.5, got {wrong[0]!r}.")
+    return "".join(suffixes)
 
 
 def _base_descriptor(which: str | Path | Descriptor) -> Descriptor:

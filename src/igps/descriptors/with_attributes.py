@@ -73,11 +73,11 @@ class WithAttributes(Descriptor):
                 distances = distances + weight / len(_N_MERGED_BINS) * chi_square(*merged)
         return distances
 
-    def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
+    def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, ≤ D + cells) coordinates of the descriptor, then square roots of the weighted histograms."""
         form, *histograms = self._split(descriptions)
         roots = [(weight * cells).sqrt() for weight, cells in zip(self.weights, histograms, strict=True)]
-        return torch.cat([self.descriptor.coordinates(form, of_one_kind=of_one_kind), *roots], dim=1)
+        return torch.cat([self.descriptor.coordinates(form, within_class=within_class), *roots], dim=1)
 
     def _split(self, descriptions: Tensor) -> list[Tensor]:
         """Split descriptions (N, D + cells) into the descriptor's own, in its shape, and each attribute's histogram."""

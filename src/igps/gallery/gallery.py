@@ -24,7 +24,7 @@ from igps.mesh.options import LoadOptions
 from igps.nn.description import check_centres, describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.retrieval.ranking import SearchResult
-from igps.retrieval.reranking import N_RERANKED, rerank_found
+from igps.retrieval.reranking import N_RERANKED, rerank_candidates
 from igps.signature.signature import SignatureConfig
 
 Found = tuple[list[dict[str, Any]], Tensor, Tensor]
@@ -102,7 +102,7 @@ class Gallery:
             top: largest number of bodies.
             cache_dir: cache of Signatures; the user's cache directory if None.
             exact: compare the query with all bodies, which is slow in a large gallery.
-            rerank: order the nearest bodies by the neighbours that they share, see `rerank_found`.
+            rerank: order the nearest bodies by the neighbours that they share, see `rerank_candidates`.
             where: condition on the columns, such as "class = 'femur' AND volume > 2e5"; other bodies are left out.
 
         Raises:
@@ -127,7 +127,9 @@ class Gallery:
             if rerank and rows:
                 ranking, n = SearchResult(torch.arange(len(rows))[None], distances[None]), min(top, len(rows))
                 with torch.inference_mode():
-                    reranked = rerank_found(query[None], ranking, near.__getitem__, self.descriptor.distances, top=n)
+                    reranked = rerank_candidates(
+                        query[None], ranking, near.__getitem__, self.descriptor.distances, top=n
+                    )
                 order, distances = reranked.indices[0].tolist(), reranked.distances[0]
             matches.append([
                 Match(rows[i]["name"], rows[i]["class"], Path(rows[i]["file"]), distance, rows[i])
@@ -170,7 +172,7 @@ class Gallery:
         batches = described_rows(mixed, chosen, kinds, {}, failures, n_workers, strict, progress)
         about = about_of(dataset.config, dataset.reading, descriptor)
         try:
-            tables().write(Path(path), about, chosen.searched_by, batches, kinds)
+            tables().write(Path(path), about, chosen.search_distance, batches, kinds)
         except ValueError as error:
             if len(failures) < len(dataset):
                 raise

@@ -64,7 +64,7 @@ class Descriptor(Specified, ABC):
         invariant_to: which of "motion" (rotation, translation, reflection), "scale" and "pose" (isometric bending)
             leave descriptions unchanged, apart from discretisation.
         requirements: data that a body must have; by default, all eigenpairs.
-        searched_by: the distance by which an index finds candidates, "cosine" for unit vectors or "chi_square" for
+        search_distance: the distance by which an index finds candidates, "cosine" for unit vectors or "chi_square" for
             histograms. The nearest bodies by `distances` must be among the few hundred nearest bodies by this distance.
             If None, an index compares a query with all bodies.
         card: facts about a fitted descriptor, by name.
@@ -77,7 +77,7 @@ class Descriptor(Specified, ABC):
     source: str = ""
     invariant_to: tuple[str, ...] = ()
     requirements: Requirements = Requirements(whole_spectrum=True)
-    searched_by: SearchDistance | None = None
+    search_distance: SearchDistance | None = None
     card: Mapping[str, Any] = MappingProxyType({})
     scale: float | None = None
     description_shape: tuple[int, ...] = (-1,)
@@ -123,18 +123,19 @@ class Descriptor(Specified, ABC):
         """Return distances (Q, G) ≥ 0 between descriptions (Q, ...) and (G, ...); by default, χ² distances."""
         return chi_square(queries, gallery)
 
-    def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
+    def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """Map descriptions (N, ...) to vectors (N, D) for statistics by Euclidean distance.
 
         By default, histograms are mapped to their square roots (Hellinger distance), other descriptions to themselves.
-        If all bodies are `of_one_kind`, such as an organ, entries that distinguish kinds may be left out.
+        If all bodies are of one class, such as an organ (`within_class`), entries that distinguish classes may be left
+        out.
         """
         rows = descriptions.flatten(1)
-        return rows.sqrt() if self.searched_by == "chi_square" else rows
+        return rows.sqrt() if self.search_distance == "chi_square" else rows
 
-    def short(self, descriptions: Tensor) -> Tensor:
+    def shorten(self, descriptions: Tensor) -> Tensor:
         """Map descriptions (N, D) to (N, ≤ 256) for engines with cosine distances; by default, a ValueError."""
-        raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {self.name!r}.")
+        raise ValueError(f"shorten: expected a descriptor of vectors, such as pretrained, got {self.name!r}.")
 
 
 class BodyDescriptor(Descriptor):
@@ -190,7 +191,7 @@ class HistogramDescriptor(Descriptor):
         ValueError: no histogram.
     """
 
-    searched_by: SearchDistance | None = "chi_square"
+    search_distance: SearchDistance | None = "chi_square"
 
     def __init__(
         self,
@@ -248,7 +249,7 @@ class EmbeddedDescriptor(Descriptor):
         invariant_to: see `Descriptor`; if None, as of `descriptor`, although the head may have learned more.
     """
 
-    searched_by: SearchDistance | None = "cosine"
+    search_distance: SearchDistance | None = "cosine"
 
     def __init__(
         self,
@@ -280,10 +281,10 @@ class EmbeddedDescriptor(Descriptor):
         """Return the head's distances (Q, G) between embeddings (Q, D) and (G, D)."""
         return self.head.distances(queries, gallery)
 
-    def coordinates(self, embeddings: Tensor, *, of_one_kind: bool = False) -> Tensor:
-        """Return embeddings (N, D), for bodies of one kind reduced by `Head.within_class`."""
-        return self.head.within_class(embeddings) if of_one_kind else embeddings
+    def coordinates(self, embeddings: Tensor, *, within_class: bool = False) -> Tensor:
+        """Return embeddings (N, D), for bodies of one class reduced by `Head.within_class`."""
+        return self.head.within_class(embeddings) if within_class else embeddings
 
-    def short(self, embeddings: Tensor) -> Tensor:
-        """Return embeddings (N, D) with D ≤ 256 unchanged, others shortened by `Head.short`."""
-        return embeddings if embeddings.shape[1] <= MAX_SHORT_WIDTH else self.head.short(embeddings)
+    def shorten(self, embeddings: Tensor) -> Tensor:
+        """Return embeddings (N, D) with D ≤ 256 unchanged, others shortened by `Head.shorten`."""
+        return embeddings if embeddings.shape[1] <= MAX_SHORT_WIDTH else self.head.shorten(embeddings)

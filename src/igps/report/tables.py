@@ -76,9 +76,11 @@ def findings_table(findings: Sequence[Finding]) -> str:
         cost = f"{finding.seconds or 0:>9.1f}{(finding.memory or 0) / 1e6:>7.0f}"
         lines.append(f"{start}{finding.n_vertices:>10}{finding.n_vertices_after:>9}{cost}  {steps}")
     n_bad = sum(finding.error is not None for finding in findings)
-    n_mended = sum(bool(finding.steps) for finding in findings)
+    n_repaired = sum(bool(finding.steps) for finding in findings)
     minutes = sum(finding.seconds or 0 for finding in findings) / 60
-    lines.append(f"{len(findings)} bodies: {n_mended} mended, {n_bad} cannot be used; about {minutes:.1f} core-minutes")
+    lines.append(
+        f"{len(findings)} bodies: {n_repaired} repaired, {n_bad} cannot be used; about {minutes:.1f} core-minutes"
+    )
     return "\n".join(lines)
 
 

@@ -3,7 +3,7 @@
 from igps.retrieval.distances import Distance, chi_square, cosine, euclidean
 from igps.retrieval.graph_reranking import rerank_graph
 from igps.retrieval.ranking import SearchResult, rank, search
-from igps.retrieval.reranking import N_RERANKED, rerank, rerank_found
+from igps.retrieval.reranking import N_RERANKED, rerank, rerank_candidates
 from igps.retrieval.scores import (
     Labels,
     PrecisionRecallCurve,
@@ -25,7 +25,7 @@ __all__ = [
     "precision_recall_curve",
     "rank",
     "rerank",
-    "rerank_found",
+    "rerank_candidates",
     "rerank_graph",
     "retrieval_scores",
     "search",

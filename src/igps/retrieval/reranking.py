@@ -93,7 +93,7 @@ def rerank(
     return result.fill_diagonal_(0)
 
 
-def rerank_found(
+def rerank_candidates(
     queries: Tensor, found: SearchResult, descriptions: Callable[[Tensor], Tensor], distance: Distance, *, top: int
 ) -> SearchResult:
     """Re-rank the search results of each query by `rerank` of the query and these results alone.

@@ -141,7 +141,7 @@ def test_pretrained_gives_unit_vectors_and_short_ones(dataset: SignatureDataset)
     module = pretrained()
     found = describe(dataset, module)
     assert isinstance(module.head, TwoLevelHead)
-    short = module.head.short(found)
+    short = module.head.shorten(found)
     assert short.shape == (len(dataset), 256)
     for vectors in (found, short):
         torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(dataset)), atol=1e-5, rtol=0)
@@ -229,7 +229,7 @@ def test_coordinates_tell_a_small_difference_from_other_samples() -> None:
     descriptions = torch.cat([described(width, seed) for width in (1.0, 1.03) for seed in range(3)])
     apart = {
         name: torch.cdist(rows, rows)
-        for name, rows in (("whole", descriptions), ("within", descriptor.coordinates(descriptions, of_one_kind=True)))
+        for name, rows in (("whole", descriptions), ("within", descriptor.coordinates(descriptions, within_class=True)))
     }
     same = torch.block_diag(*2 * [torch.ones(3, 3)]).bool()
     assert apart["within"][same].max() < apart["within"][~same].min()

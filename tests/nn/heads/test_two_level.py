@@ -149,7 +149,7 @@ def test_individuals_have_a_small_part_of_the_distance(collection: tuple[Tensor,
     found = head.distances(vectors, vectors).double()
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
     torch.testing.assert_close(head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0)
-    torch.testing.assert_close(head.short(vectors), plain.short(of_two), atol=1e-5, rtol=0)
+    torch.testing.assert_close(head.shorten(vectors), plain.shorten(of_two), atol=1e-5, rtol=0)
     other = TwoLevelHead(individual_heads=[WCCNHead((part,), lengths=True) for part in range(2)], exponents=(0.3, 0.7))
     other.load_state_dict(head.state_dict())
     torch.testing.assert_close(other.distances(other(histograms), vectors), found.float(), atol=1e-5, rtol=0)
@@ -203,11 +203,11 @@ def test_short_vectors_are_the_best_of_so_many_numbers(
     histograms, classes, bodies = collection
     head = TwoLevelHead().fit(histograms, classes, bodies=bodies)
     vectors = head(histograms)
-    short = head.short(vectors)
+    short = head.shorten(vectors)
     assert short.shape[1] <= vectors.shape[1] <= 256
     torch.testing.assert_close(cosine(short, short), cosine(vectors, vectors), atol=1e-5, rtol=0)
     monkeypatch.setattr("igps.nn.heads.two_level.MAX_SHORT_WIDTH", 7)
-    found = head.fit(histograms, classes, bodies=bodies).short(vectors)
+    found = head.fit(histograms, classes, bodies=bodies).shorten(vectors)
     assert found.shape == (len(vectors), 7)
     _, _, axes = np.linalg.svd(vectors.double().numpy(), full_matrices=False)
     expected = vectors.double().numpy() @ axes[:7].T
@@ -241,7 +241,7 @@ def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> N
     vectors = other(histograms)
     assert vectors.shape == (len(histograms), 5 + 6 + 1)
     torch.testing.assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
-    torch.testing.assert_close(other.short(vectors), fitted.short(vectors))
+    torch.testing.assert_close(other.shorten(vectors), fitted.shorten(vectors))
     level = WCCNHead((1,))  # whether lengths count is stored too
     level.load_state_dict(fitted.body_heads[0].state_dict())
     torch.testing.assert_close(level(histograms), fitted.body_heads[0](histograms))
@@ -290,9 +290,9 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
     with pytest.raises(ValueError, match="individual_heads: expected heads to fit, got none"):
         TwoLevelHead().fit_individuals(histograms, classes)
     with pytest.raises(RuntimeError, match="TwoLevelHead: expected to be fitted first"):
-        TwoLevelHead().short(histograms)
+        TwoLevelHead().shorten(histograms)
     fitted = TwoLevelHead().fit(histograms, classes)
     with pytest.raises(ValueError, match="expected 40 cells as in training, got 39"):
         fitted(histograms[:, :39])
     with pytest.raises(ValueError, match=r"embeddings: expected \d+ numbers each, got 40"):
-        fitted.short(histograms)
+        fitted.shorten(histograms)

@@ -84,7 +84,7 @@ def pretrained_head(*, individuals: bool = True) -> TwoLevelHead:
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
     """Return the histograms of `pretrained_parts` under a head that was fitted to generated shapes, in evaluation mode.
 
-    Descriptions are unit vectors of 1,211 numbers, which the head's `short` reduces to 256. By the distance of the
+    Descriptions are unit vectors of 1,211 numbers, which the head's `shorten` reduces to 256. By the distance of the
     head, other poses of a body come first, then other bodies of its class. No labels are needed for the shapes that are
     compared. The model card is in the documentation.
 

@@ -46,10 +46,10 @@ class Head(Specified, ABC):
         """Return the columns (N, ≤ D) of embeddings (N, D) that distinguish bodies of one class; by default, all."""
         return embeddings
 
-    def short(self, embeddings: Tensor) -> Tensor:
+    def shorten(self, embeddings: Tensor) -> Tensor:
         """Map embeddings (N, D) to (N, ≤ 256) of length 1 with nearly the same cosines; by default, a ValueError."""
         got = f"{type(self).__name__} and embeddings of {embeddings.shape[1]} numbers"
-        raise ValueError(f"short: expected a head that shortens its embeddings, such as TwoLevelHead, got {got}.")
+        raise ValueError(f"shorten: expected a head that shortens its embeddings, such as TwoLevelHead, got {got}.")
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
         for name, buffer in self.named_buffers(recurse=False):

@@ -42,8 +42,8 @@ class TwoLevelHead(Head):
     consider the same body.
 
     The cosine distance of whole embeddings is close to the cosine distance of the class embeddings. Search engines that
-    only support cosine distances find candidates by whole embeddings or by `short` vectors; the candidates are then
-    ranked by `distances`.
+    only support cosine distances find candidates by whole embeddings or by short vectors (`shorten`); candidates are
+    then ranked by `distances`.
 
     Args:
         class_head: fitted to classes.
@@ -143,7 +143,7 @@ class TwoLevelHead(Head):
         """
         return embeddings[:, self.class_head.n_numbers :]
 
-    def short(self, embeddings: Tensor) -> Tensor:
+    def shorten(self, embeddings: Tensor) -> Tensor:
         """Project embeddings (N, D) to (N, ≤ 256) of length 1, on the principal directions of the training shapes.
 
         The cosines are close to those without the individual heads, with larger errors for shapes unlike the training
