@@ -23,14 +23,19 @@ def bodies(*copies: int) -> SignatureBatch:
 
 
 @pytest.mark.parametrize(
-    ("copies", "widths"),
+    ("copies", "on_cpu", "widths"),
     [
-        ((1, 50, 2, 40), [(2, 2000), (2, 80)]),
-        ((40, 1, 31, 20), [(2, 1600), (1, 800), (1, 40)]),
-        ((10, 1, 11), [(3, 440)]),  # differ by few samples
+        ((1, 50, 2, 40), False, [(2, 2000), (2, 80)]),
+        ((1, 50, 2, 40), True, [(2, 80), (1, 2000), (1, 1600)]),  # large bodies are not copied
+        ((40, 1, 31, 20), False, [(2, 1600), (1, 800), (1, 40)]),
+        ((10, 1, 11), False, [(3, 440)]),  # differ by few samples
+        ((50, 40, 45), True, [(3, 2000)]),
     ],
 )
-def test_groups_are_padded_to_their_largest_body(copies: tuple[int, ...], widths: list[tuple[int, int]]) -> None:
+def test_groups_are_padded_to_their_largest_body(
+    copies: tuple[int, ...], on_cpu: bool, widths: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda device: on_cpu)
     batch, found = bodies(*copies), []
 
     def sums(group: SignatureBatch) -> Tensor:
@@ -39,6 +44,23 @@ def test_groups_are_padded_to_their_largest_body(copies: tuple[int, ...], widths
 
     torch.testing.assert_close(map_by_size(sums, batch), batch.interior.points.sum(dim=(1, 2)))
     assert found == widths
+
+
+def test_large_bodies_are_not_copied() -> None:
+    batch, found = bodies(1, 50, 2, 45), []
+
+    def addresses(group: SignatureBatch) -> Tensor:
+        found.extend(group.interior.eigenfunctions.data_ptr() for _ in group.ids if len(group) == 1)
+        return group.area
+
+    map_by_size(addresses, batch)
+    assert found == [batch.interior.eigenfunctions[i].data_ptr() for i in (1, 3)]
+
+
+def test_a_batch_may_have_samples_of_one_kind_only() -> None:
+    batch = bodies(1, 50)
+    batch = replace(batch, surface=batch.surface.map(lambda values: values[:, :0]))
+    assert map_by_size(lambda group: group.area, batch).tolist() == batch.area.tolist()
 
 
 def test_padding_beyond_the_largest_body_is_cut() -> None:
@@ -63,3 +85,19 @@ def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several: bo
         torch.testing.assert_close(descriptions[i], description[0], rtol=0, atol=1e-6)
         torch.testing.assert_close(gradients[i, : gradient.shape[1]], gradient[0], rtol=1e-4, atol=1e-7)
         assert not gradients[i, gradient.shape[1] :].any()
+
+
+def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body() -> None:
+    descriptor, batch = HistogramDescriptor(PairHistogram(["interior_distance"])), bodies(1, 20, 2)
+
+    def second_derivatives(batch: SignatureBatch) -> Tensor:
+        functions = batch.interior.eigenfunctions.double().requires_grad_()
+        result = descriptor(replace(batch, interior=replace(batch.interior, eigenfunctions=functions)))
+        gradient = torch.autograd.grad(result.square().sum(), functions, create_graph=True)[0]
+        return torch.autograd.grad(gradient.square().sum(), functions)[0]
+
+    found = second_derivatives(batch)
+    for i in range(3):
+        expected = second_derivatives(alone(batch, i))[0]
+        assert expected.any()
+        torch.testing.assert_close(found[i, : len(expected), : expected.shape[1]], expected, rtol=1e-6, atol=1e-12)

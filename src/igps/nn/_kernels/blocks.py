@@ -43,9 +43,7 @@ def map_by_size(function: Callable[[SignatureBatch], Tensor], batch: SignatureBa
     """
     if torch.compiler.is_compiling():
         return function(batch)
-    masks = [samples.mask for samples in (batch.interior, batch.surface)]
-    ends = [(mask * torch.arange(1, mask.shape[1] + 1, device=mask.device)).amax(dim=1) for mask in masks]
-    sizes: list[list[int]] = torch.stack(ends, dim=1).tolist()
+    sizes: list[list[int]] = torch.stack([_last(kind.mask) for kind in (batch.interior, batch.surface)], dim=1).tolist()
     groups: list[list[int]] = []
     for i in sorted(range(len(sizes)), key=sizes.__getitem__, reverse=True):
         pairs = zip(sizes[groups[-1][0]], sizes[i], strict=True) if groups else ()
@@ -53,15 +51,26 @@ def map_by_size(function: Callable[[SignatureBatch], Tensor], batch: SignatureBa
             groups[-1].append(i)
         else:
             groups.append([i])
+    if len(groups) > 1 and uses_loops(batch.device):
+        # One body is a view of the batch, but several are copied, which costs more than a call for a large body.
+        small = [group for group in groups if max(sizes[group[0]]) <= _FREE_PADDING]
+        groups = [*small, *([i] for group in groups if group not in small for i in group)]
 
-    def result(group: list[int]) -> Tensor:
-        n_interior, n_surface = (max(kind) for kind in zip(*(sizes[i] for i in group), strict=True))
+    def cut_to(members: list[int]) -> SignatureBatch:
+        n_interior, n_surface = (max(kind) for kind in zip(*(sizes[i] for i in members), strict=True))
         interior = batch.interior.map(lambda values: values[:, :n_interior])
         surface = batch.surface.map(lambda values: values[:, :n_surface])
-        cut = replace(batch, interior=interior, surface=surface)
-        return function(cut if len(groups) == 1 else cut[group])
+        return replace(batch, interior=interior, surface=surface)
+
+    def result(group: list[int]) -> Tensor:
+        return function(cut_to(group)[group[0] : group[0] + 1] if len(group) == 1 else cut_to(group)[group])
 
     if len(groups) == 1:
-        return result(groups[0])
+        return function(cut_to(groups[0]))
     order = torch.tensor([i for group in groups for i in group], device=batch.device)
     return torch.cat([result(group) for group in groups])[order.argsort()]
+
+
+def _last(mask: Tensor) -> Tensor:
+    """Return the numbers (N,) of the last true entries of a mask (N, P), counted from 1, or 0 without any."""
+    return (mask * torch.arange(1, mask.shape[1] + 1, device=mask.device)).cummax(dim=1).values[:, -1:].sum(dim=1)
