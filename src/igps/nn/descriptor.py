@@ -232,11 +232,15 @@ class HistogramDescriptor(Descriptor):
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """Return descriptions of sum 1: of a single histogram in its shape (N, ...), of several as (N, cells)."""
-        features = BatchFeatures(batch, self.training)
         if self._sizes is None:
-            return self.parts[0][0](features)
+            return self.parts[0][0](batch)
         shares = [(1 / (len(self.parts) * len(part)), histogram) for part in self.parts for histogram in part]
-        return torch.cat([share * histogram(features).flatten(1) for share, histogram in shares], dim=1)
+
+        def concatenated(group: SignatureBatch) -> Tensor:
+            features = BatchFeatures(group, self.training)
+            return torch.cat([share * histogram(features).flatten(1) for share, histogram in shares], dim=1)
+
+        return blocks.map_by_size(concatenated, batch)
 
 
 class EmbeddedDescriptor(Descriptor):

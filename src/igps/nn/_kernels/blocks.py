@@ -1,14 +1,20 @@
 """The choice between compiled loops and operations of PyTorch, and the number of bodies computed at once."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from igps.data.batch import SignatureBatch
 from igps.retrieval.distances import in_transforms
 
 BLOCK = 2**25
 """Number of entries in a block; enough to keep a GPU busy."""
+
+# Bodies are processed together if their numbers of samples differ by at most this share of the larger number, or by
+# so few that padding takes less time than a call of all functions.
+_MAX_PADDING, _FREE_PADDING = 0.25, 500
 
 
 def uses_loops(device: torch.device) -> bool:
@@ -27,3 +33,44 @@ def map_bodies(function: Callable[..., Tensor], points: Tensor, others: Tensor, 
         return function(*tensors)
     n_bodies = 1 if uses_loops(points.device) else max(1, BLOCK // (points.shape[1] * others.shape[1] or 1))
     return torch.cat([function(*batch) for batch in zip(*(x.split(n_bodies) for x in tensors), strict=True)])
+
+
+def map_by_size(function: Callable[[SignatureBatch], Tensor], batch: SignatureBatch) -> Tensor:
+    """Apply a function to a batch, in groups of bodies of about one size, padded only to the largest of the group.
+
+    Otherwise, one large body would multiply the time and memory of all. Traced code processes all bodies at once, as it
+    cannot depend on their sizes.
+    """
+    if torch.compiler.is_compiling():
+        return function(batch)
+    sizes: list[list[int]] = torch.stack([_last(kind.mask) for kind in (batch.interior, batch.surface)], dim=1).tolist()
+    groups: list[list[int]] = []
+    for i in sorted(range(len(sizes)), key=sizes.__getitem__, reverse=True):
+        pairs = zip(sizes[groups[-1][0]], sizes[i], strict=True) if groups else ()
+        if groups and all(abs(a - b) <= max(_MAX_PADDING * max(a, b), _FREE_PADDING) for a, b in pairs):
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    if len(groups) > 1 and uses_loops(batch.device):
+        # One body is a view of the batch, but several are copied, which costs more than a call for a large body.
+        small = [group for group in groups if max(sizes[group[0]]) <= _FREE_PADDING]
+        groups = [*small, *([i] for group in groups if group not in small for i in group)]
+
+    def cut_to(members: list[int]) -> SignatureBatch:
+        n_interior, n_surface = (max(kind) for kind in zip(*(sizes[i] for i in members), strict=True))
+        interior = batch.interior.map(lambda values: values[:, :n_interior])
+        surface = batch.surface.map(lambda values: values[:, :n_surface])
+        return replace(batch, interior=interior, surface=surface)
+
+    def result(group: list[int]) -> Tensor:
+        return function(cut_to(group)[group[0] : group[0] + 1] if len(group) == 1 else cut_to(group)[group])
+
+    if len(groups) == 1:
+        return function(cut_to(groups[0]))
+    order = torch.tensor([i for group in groups for i in group], device=batch.device)
+    return torch.cat([result(group) for group in groups])[order.argsort()]
+
+
+def _last(mask: Tensor) -> Tensor:
+    """Return the numbers (N,) of the last true entries of a mask (N, P), counted from 1, or 0 without any."""
+    return (mask * torch.arange(1, mask.shape[1] + 1, device=mask.device)).cummax(dim=1).values[:, -1:].sum(dim=1)

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from igps._arrays import Booleans, Floats
+from igps._arrays import Booleans
 from igps._threads import SERIAL, Result, Team
 from igps.nn._kernels.count_by_torch import count_by_torch
-from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Indices, Numbers
+from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Numbers
 from igps.nn._kernels.pair_loops import count_block, gradient_block
 from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
 from igps.nn._precision import full_precision
@@ -44,13 +44,13 @@ class CompiledCount(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, layout: Layout, weights: Tensor, *tensors: Tensor) -> Tensor:
-        ctx.layout, ctx.members = layout, (members := _Members(layout, weights.detach()))
+        ctx.shapes = shapes = _Shapes(layout, weights.detach(), tensors)
         ctx.save_for_backward(weights, *tensors)
 
         def counts(number: int, team: Team) -> Tensor:
-            shape = _Shape(layout, number, members, tensors)
+            shape = _Shape(shapes, number, tensors)
             [total] = _sum_shares(shape, shape.counts, team)
-            return _add_corners_to_bins(total, shape.bins)
+            return _add_corners_to_bins(total, shapes.bins)
 
         return torch.stack(_map_shapes(counts, len(weights)))
 
@@ -59,7 +59,7 @@ class CompiledCount(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         weights, *tensors = ctx.saved_tensors
         if torch.is_grad_enabled():  # for second derivatives, which the loops do not have
-            layout, needed = ctx.layout, ctx.needs_input_grad[1:]
+            layout, needed = ctx.shapes.layout, ctx.needs_input_grad[1:]
             counts = count_by_torch(layout.classes, layout.n_classes, layout.pairs, layout.mask, weights, *tensors)
             leaves = [t for t, is_needed in zip((weights, *tensors), needed, strict=True) if is_needed]
             by_leaves = iter(torch.autograd.grad(counts, leaves, upstream, create_graph=True, allow_unused=True))
@@ -67,14 +67,14 @@ class CompiledCount(torch.autograd.Function):
         totals = [torch.zeros_like(tensor) for tensor in (weights, *tensors)]
 
         def derivatives(number: int, team: Team) -> tuple[Tensor, list[Tensor]]:
-            shape = _Shape(ctx.layout, number, ctx.members, tensors, upstream[number])
+            shape = _Shape(ctx.shapes, number, tensors, upstream[number])
             return shape.order, _sum_shares(shape, shape.gradients, team)
 
         for number, (order, sums) in enumerate(_map_shapes(derivatives, len(weights))):
             by_weights, by_centres, *by_inputs = sums
             axes, inputs = iter(by_centres), iter(by_inputs)
             gradients = [by_weights.T]
-            for pair in ctx.layout.pairs:
+            for pair in ctx.shapes.layout.pairs:
                 gradients += [next(inputs) for _ in pair.inputs]
                 gradients += [next(axes)[: len(centres)] for centres in pair.centres]
             for total, gradient in zip(totals, gradients, strict=True):
@@ -103,52 +103,53 @@ def _sum_shares(shape: _Shape, task: Callable[[Blocks], list[Tensor]], team: Tea
     return total
 
 
-class _Members:
-    """Classes and weights of the points of all shapes, ordered so that points with the same classes are adjacent."""
+class _Shapes:
+    """What all shapes share, and their points, ordered so that points with the same classes are adjacent."""
 
-    def __init__(self, layout: Layout, weights: Tensor) -> None:
+    def __init__(self, layout: Layout, weights: Tensor, tensors: Sequence[Tensor]) -> None:
+        self.layout = layout
         key = torch.zeros_like(layout.classes[..., 0])
         for classes, share in zip(layout.classes.unbind(2), weights.unbind(2), strict=True):
             key = key * layout.n_classes + torch.where(share > 0, classes, 0)
         last = torch.iinfo(key.dtype).max  # sorts padding to the end
         self.order = torch.argsort(key.masked_fill(~layout.mask, last), dim=1, stable=True)
         by_order = self.order.unsqueeze(2).expand_as(layout.classes)
-        self._classes = layout.classes.gather(1, by_order).int().transpose(1, 2).contiguous().numpy()
-        self._weights = weights.gather(1, by_order).double().transpose(1, 2).contiguous().numpy()
-        self._n_points = layout.mask.sum(dim=1).tolist()
-
-    def of(self, number: int) -> tuple[Tensor, tuple[Indices, Floats]]:
-        """Return the order (P,) of a shape's real points, and their classes and weights (M, P) in this order."""
-        n = self._n_points[number]
-        classes, weights = (np.ascontiguousarray(x[number, :, :n]) for x in (self._classes, self._weights))
-        return self.order[number, :n], (classes, weights)
+        self.classes = layout.classes.gather(1, by_order).int().transpose(1, 2).contiguous().numpy()
+        self.weights = weights.gather(1, by_order).double().transpose(1, 2).contiguous().numpy()
+        self.n_points: list[int] = layout.mask.sum(dim=1).tolist()
+        centres = [x.detach() for x in centres_of(with_tensors(layout.pairs, tensors))]
+        self.bins, self.dtype = [len(x) for x in centres], centres[0].dtype
+        self.n_counts = layout.n_classes * (layout.n_classes + 1) // 2, math.prod(self.bins) << len(self.bins)
+        kinds = [kind for pair in layout.pairs for kind in pair.kinds]
+        self.n_values, self.n_oriented = sum(kind != COSINES for kind in kinds), kinds.count(COSINES)
+        self.can_pack = kinds in ([VALUES], [DISTANCES]) and self.dtype == torch.float32
+        padded = pad_sequence(centres, batch_first=True).numpy()
+        empty = np.empty(0)  # in place of the norms and vectors of each shape
+        gaps = _inverse_gaps(padded, self.bins)
+        self.axes = Axes(np.array(kinds), empty, empty, padded, np.array(self.bins), *gaps)
 
 
 class _Shape:
     """The arguments of the loops for one shape, without padding; for a gradient also the derivatives by its counts."""
 
-    def __init__(
-        self, layout: Layout, number: int, members: _Members, tensors: Sequence[Tensor], upstream: Tensor | None = None
-    ) -> None:
-        self.order, self.members = members.of(number)
+    def __init__(self, shapes: _Shapes, number: int, tensors: Sequence[Tensor], upstream: Tensor | None = None) -> None:
+        self.shapes, self.n_points = shapes, (n_points := shapes.n_points[number])
+        self.order = shapes.order[number, :n_points]
+        classes, weights = (np.ascontiguousarray(x[number, :, :n_points]) for x in (shapes.classes, shapes.weights))
+        self.members = classes, weights
+        self.packs = shapes.can_pack and len(classes) == 1 and bool((weights == 1).all())
         own = [t.detach()[number].index_select(0, self.order) if t.ndim > 1 else t.detach() for t in tensors]
-        self.pairs = with_tensors(layout.pairs, own)
-        centres = centres_of(self.pairs)
-        self.bins, self.dtype = [len(x) for x in centres], centres[0].dtype
-        kinds = [kind for pair in self.pairs for kind in pair.kinds]
-        self.n_values, self.n_oriented = sum(kind != COSINES for kind in kinds), kinds.count(COSINES)
+        self.pairs = with_tensors(shapes.layout.pairs, own)
         self.centred = [_centre(pair.inputs[0]) if DISTANCES in pair.kinds else None for pair in self.pairs]
-        n_points, n_columns = len(self.order), min(len(self.order), _MAX_COLUMNS)
-        n_matrices = self.n_values if upstream is None else self.n_values + 4 * self.n_oriented
+        n_columns = min(n_points, _MAX_COLUMNS)
+        n_matrices = shapes.n_values if upstream is None else shapes.n_values + 4 * shapes.n_oriented
         n_rows = min(max(1, _BLOCK_SIZE // (n_columns * max(1, n_matrices))), n_columns)
         self.block = n_rows, n_columns
         blocks = [(row, column) for row in range(0, n_points, n_rows) for column in range(row, n_points, n_columns)]
-        self.n_counts = layout.n_classes * (layout.n_classes + 1) // 2, math.prod(self.bins) << len(self.bins)
-        n_shares = min(_N_SHARES, len(blocks)) if math.prod(self.n_counts) <= _MAX_COUNTS else 1
+        n_shares = min(_N_SHARES, len(blocks)) if math.prod(shapes.n_counts) <= _MAX_COUNTS else 1
         self.shares = [blocks[k::n_shares] for k in range(n_shares)]
-        empty = torch.empty(0, 0, device="cpu")
-        self.upstream = _copy_bins_to_corners(empty if upstream is None else upstream.to(self.dtype)).numpy()
-        norms, row = torch.zeros(self.n_values, n_points, dtype=self.dtype, device="cpu"), 0
+        self.upstream = np.empty(0) if upstream is None else _copy_bins_to_corners(upstream.to(shapes.dtype)).numpy()
+        norms, row = torch.zeros(shapes.n_values, n_points, dtype=shapes.dtype, device="cpu"), 0
         for pair, centred in zip(self.pairs, self.centred, strict=True):
             if centred is not None:
                 norms[row] = centred.square().sum(dim=1)
@@ -157,16 +158,12 @@ class _Shape:
         oriented = norms.new_zeros(0, 2, 0, n_points)
         if vectors:
             oriented = pad_sequence(vectors, batch_first=True).transpose(1, 2).contiguous()
-        padded = pad_sequence(centres, batch_first=True).numpy()
-        gaps = _inverse_gaps(padded, self.bins)
-        self.axes = Axes(np.array(kinds), norms.numpy(), oriented.numpy(), padded, np.array(self.bins), *gaps)
-        classes, weights = self.members
-        self.packs = kinds in ([VALUES], [DISTANCES]) and self.dtype == torch.float32
-        self.packs = self.packs and len(classes) == 1 and bool((weights == 1).all())
+        self.axes = shapes.axes._replace(norms=norms.numpy(), oriented=oriented.numpy())
 
     def counts(self, blocks: Blocks) -> list[Tensor]:
         """Return the float64 counts (C(C+1)/2, cells·2^K) of blocks, for all corners of each cell."""
-        total, buffer = torch.zeros(self.n_counts, dtype=torch.float64, device="cpu"), self._buffer(self.n_values)
+        total = torch.zeros(self.shapes.n_counts, dtype=torch.float64, device="cpu")
+        buffer = self._buffer(self.shapes.n_values)
         for row, column in blocks:
             values = self._view(buffer, row, column)
             self._write_values(values, row, column)
@@ -178,7 +175,7 @@ class _Shape:
         by_weights = torch.zeros(self.members[1].shape, dtype=torch.float64, device="cpu")
         by_centres = torch.zeros(self.axes.centres.shape, dtype=torch.float64, device="cpu")
         by_inputs = [[torch.zeros_like(x) for x in pair.inputs] for pair in self.pairs]
-        value_buffer, cosine_buffer = self._buffer(self.n_values), self._buffer(4 * self.n_oriented)
+        value_buffer, cosine_buffer = self._buffer(self.shapes.n_values), self._buffer(4 * self.shapes.n_oriented)
         for row, column in blocks:
             values, by_cosines = self._view(value_buffer, row, column), self._view(cosine_buffer, row, column)
             self._write_values(values, row, column)
@@ -208,12 +205,12 @@ class _Shape:
         return [by_weights, by_centres, *(gradient for totals in by_inputs for gradient in totals)]
 
     def _buffer(self, n_matrices: int) -> Tensor:
-        return torch.empty(n_matrices * math.prod(self.block), dtype=self.dtype, device="cpu")
+        return torch.empty(n_matrices * math.prod(self.block), dtype=self.shapes.dtype, device="cpu")
 
     def _view(self, buffer: Tensor, row: int, column: int) -> Tensor:
         """Return a view (R, I, J) of a buffer for the block that starts at a row and column."""
         n_matrices = len(buffer) // math.prod(self.block)
-        n = [min(size, len(self.order) - first) for size, first in zip(self.block, (row, column), strict=True)]
+        n = [min(size, self.n_points - first) for size, first in zip(self.block, (row, column), strict=True)]
         return buffer[: n_matrices * math.prod(n)].view(n_matrices, *n)
 
     def _write_values(self, values: Tensor, row: int, column: int) -> None:

@@ -14,9 +14,6 @@ from igps.nn._kernels.pair_values import PairValues, centres_of, with_tensors
 from igps.nn._precision import full_precision
 from igps.retrieval.distances import in_transforms
 
-# Shapes are counted together, padded to the largest, if each has at least this share of the points of the largest.
-_MIN_RELATIVE_SIZE = 0.8
-
 
 def count_by_torch(
     classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor, weights: Tensor, *tensors: Tensor
@@ -25,24 +22,6 @@ def count_by_torch(
     # Padding may hold infinity, and 0 times infinity is NaN.
     clean = [t.masked_fill(~mask.view(*mask.shape, *[1] * (t.ndim - 2)), 0) if t.ndim > 1 else t for t in tensors]
     weights = weights.masked_fill(~mask[:, :, None], 0)
-    if torch.compiler.is_compiling():  # traced code cannot depend on the number of points
-        return _count_together(classes, n_classes, pairs, weights, *clean)
-    ends = (mask * torch.arange(1, mask.shape[1] + 1, device=mask.device)).amax(dim=1)
-    ends, order = ends.sort(descending=True)
-    sizes, counts, first = ends.tolist(), [], 0
-    while first < len(sizes):
-        last = first + sum(size >= _MIN_RELATIVE_SIZE * sizes[first] for size in sizes[first:])
-        shapes = order[first:last]
-        group = (t[shapes, : sizes[first]] if t.ndim > 1 else t for t in (classes, weights, *clean))
-        counts.append(_count_together(next(group), n_classes, pairs, *group))
-        first = last
-    return torch.cat(counts)[order.argsort()]
-
-
-def _count_together(
-    classes: Tensor, n_classes: int, pairs: Sequence[PairValues], weights: Tensor, *tensors: Tensor
-) -> Tensor:
-    """Return counts (N, C(C+1)/2, B, ...) of shapes whose padding has weight 0."""
     n_shapes, n_points, n_members = classes.shape
     bins = [len(centres) for centres in centres_of(pairs)]
     n_cells = n_classes * math.prod(bins)
@@ -56,9 +35,9 @@ def _count_together(
         task = partial(_count_rows, first, first + n_rows, classes, n_classes, pairs)
         # The gradient computes the values of pairs again, as storing them takes much more memory than the points.
         if torch.is_grad_enabled() and not in_transforms():
-            total = total + checkpoint(task, weights, *tensors, use_reentrant=False)
+            total = total + checkpoint(task, weights, *clean, use_reentrant=False)
         else:
-            total = total + task(weights, *tensors)
+            total = total + task(weights, *clean)
     total = total.view(n_shapes, n_classes, n_classes, *bins)
     total = total + total.transpose(1, 2)
     a, b = torch.triu_indices(n_classes, n_classes, device=classes.device)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements, embedding_requirements
+from igps.nn._kernels.blocks import map_by_size
 from igps.nn.axes.pairs import DistanceAxis, PairAxis
 from igps.nn.axes.points import PointAxis
 from igps.nn.batch_features import BatchFeatures, SampleFeatures
@@ -52,7 +53,9 @@ class DescriptionPart(Specified, ABC):
         Raises:
             ValueError: a body has fewer than two samples, an attribute is missing, or values are not finite.
         """
-        return self.of_features(batch if isinstance(batch, BatchFeatures) else BatchFeatures(batch, self.training))
+        if isinstance(batch, BatchFeatures):
+            return self.of_features(batch)
+        return map_by_size(lambda group: self.of_features(BatchFeatures(group, self.training)), batch)
 
 
 class SampleHistogram(DescriptionPart):

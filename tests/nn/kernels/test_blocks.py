@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from batches import alone, two_bodies
+from igps.data.batch import SignatureBatch
+from igps.nn._kernels.blocks import map_by_size
+from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.histograms.pairs import PairHistogram
+
+
+def bodies(*copies: int) -> SignatureBatch:
+    """Bodies of 40 interior samples, each of which occurs several times."""
+    body = alone(two_bodies(), 0)
+    return SignatureBatch.concatenate(
+        [replace(body, interior=body.interior.map(lambda values, n=n: values.repeat(1, n, *[1] * (values.ndim - 2))))
+         for n in copies]
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("copies", "on_cpu", "widths"),
+    [
+        ((1, 50, 2, 40), False, [(2, 2000), (2, 80)]),
+        ((1, 50, 2, 40), True, [(2, 80), (1, 2000), (1, 1600)]),  # large bodies are not copied
+        ((40, 1, 31, 20), False, [(2, 1600), (1, 800), (1, 40)]),
+        ((10, 1, 11), False, [(3, 440)]),  # differ by few samples
+        ((50, 40, 45), True, [(3, 2000)]),
+    ],
+)
+def test_groups_are_padded_to_their_largest_body(
+    copies: tuple[int, ...], on_cpu: bool, widths: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda device: on_cpu)
+    batch, found = bodies(*copies), []
+
+    def sums(group: SignatureBatch) -> Tensor:
+        found.append(tuple(group.interior.mask.shape))
+        return group.interior.points.sum(dim=(1, 2))
+
+    torch.testing.assert_close(map_by_size(sums, batch), batch.interior.points.sum(dim=(1, 2)))
+    assert found == widths
+
+
+def test_large_bodies_are_not_copied() -> None:
+    batch, found = bodies(1, 50, 2, 45), []
+
+    def addresses(group: SignatureBatch) -> Tensor:
+        found.extend(group.interior.eigenfunctions.data_ptr() for _ in group.ids if len(group) == 1)
+        return group.area
+
+    map_by_size(addresses, batch)
+    assert found == [batch.interior.eigenfunctions[i].data_ptr() for i in (1, 3)]
+
+
+def test_a_batch_may_have_samples_of_one_kind_only() -> None:
+    batch = bodies(1, 50)
+    batch = replace(batch, surface=batch.surface.map(lambda values: values[:, :0]))
+    assert map_by_size(lambda group: group.area, batch).tolist() == batch.area.tolist()
+
+
+def test_padding_beyond_the_largest_body_is_cut() -> None:
+    batch = bodies(1, 50, 2)[[0, 2]]
+    assert map_by_size(lambda group: group.interior.points, batch).shape == (2, 80, 3)
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several: bool) -> None:
+    histogram = PairHistogram(["interior_distance"], samples="interior")
+    descriptor = HistogramDescriptor([histogram, PairHistogram(samples="surface")] if several else histogram)
+    batch = bodies(1, 30, 2)
+
+    def described(batch: SignatureBatch) -> tuple[Tensor, Tensor]:
+        functions = batch.interior.eigenfunctions.clone().requires_grad_()
+        result = descriptor(replace(batch, interior=replace(batch.interior, eigenfunctions=functions)))
+        return result.detach(), torch.autograd.grad(result.square().sum(), functions)[0]
+
+    descriptions, gradients = described(batch)
+    for i in range(3):
+        description, gradient = described(alone(batch, i))
+        torch.testing.assert_close(descriptions[i], description[0], rtol=0, atol=1e-6)
+        torch.testing.assert_close(gradients[i, : gradient.shape[1]], gradient[0], rtol=1e-4, atol=1e-7)
+        assert not gradients[i, gradient.shape[1] :].any()
+
+
+def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body() -> None:
+    descriptor, batch = HistogramDescriptor(PairHistogram(["interior_distance"])), bodies(1, 20, 2)
+
+    def second_derivatives(batch: SignatureBatch) -> Tensor:
+        functions = batch.interior.eigenfunctions.double().requires_grad_()
+        result = descriptor(replace(batch, interior=replace(batch.interior, eigenfunctions=functions)))
+        gradient = torch.autograd.grad(result.square().sum(), functions, create_graph=True)[0]
+        return torch.autograd.grad(gradient.square().sum(), functions)[0]
+
+    found = second_derivatives(batch)
+    for i in range(3):
+        expected = second_derivatives(alone(batch, i))[0]
+        assert expected.any()
+        torch.testing.assert_close(found[i, : len(expected), : expected.shape[1]], expected, rtol=1e-6, atol=1e-12)
