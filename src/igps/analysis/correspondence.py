@@ -3,13 +3,12 @@
 import math
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats, Integers
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.mesh.surface import unit
-from igps.nn._kernels.balls import ball_radii
 
 # Times of the heat kernel over the area. The kernel of large times identifies the place on the body, the kernel of
 # small times depends on the surface around it
@@ -21,6 +20,7 @@ _SMOOTHING = 0.06  # standard deviation of the smoothing kernel, over the square
 _PATCH = 0.08  # radius of the patches of surface whose curvature is measured, over the square root of the area
 _N_PLANE, _N_INSIDE = 12, 6  # nearest surface samples that determine a tangent plane, and interior ones its side
 _MAX_BALL = 0.5  # largest radius of a ball, over the square root of the area
+_NEAR, _MIN_SINE = 0.03, 0.2  # a ball may contain samples nearer than this (over √area), or nearer the tangent plane
 
 
 def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
@@ -38,12 +38,12 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     Returns:
         (P,) the exponential of the sum of the measures, positive.
     """
-    large, every = zip(*(_heat_kernels(batch) for batch in (body, other)), strict=True)
-    own, others = (local_shape(batch) for batch in (body, other))
-    corresponding = others[_nearest(*large, _N_CORRESPONDING)[1]]
+    (large, every), (other_large, other_every) = _heat_kernels(body), _heat_kernels(other)
+    own, others = local_shape(body), local_shape(other)
+    corresponding = others[_nearest(large, other_large, _N_CORRESPONDING)[1]]
     variance = corresponding.var(axis=1) + np.square(_MIN_DEVIATION * others.std(axis=0)) + 1e-18
     deviations = np.square(own - corresponding.mean(axis=1)) / variance
-    distances = _nearest(*every, _N_NEAREST)[0].mean(axis=1)
+    distances = _nearest(every, other_every, _N_NEAREST)[0].mean(axis=1)
     points, total = _points(body.surface, body), np.zeros(len(own))
     for values in (*np.log1p(deviations).T, np.log(distances + 1e-6)):
         smoothed = _smoothed(values, points)
@@ -76,20 +76,20 @@ def local_shape(body: SignatureBatch) -> Floats:
     """Return (P, 2): the mean curvature at each surface sample, and the logarithm of the largest ball inside there.
 
     The curvature is that of the quadric through the samples of a patch (least squares), over the radius of the patch.
+    Both depend on the outward normals, which are estimated if the samples have none.
     """
-    points, inside = _points(body.surface, body), _points(body.interior, body)
-    tree = cKDTree(points)
-    _, plane = tree.query(points, list(range(1, min(_N_PLANE, len(points)) + 1)))
-    offsets = points[plane] - points[plane].mean(axis=1, keepdims=True)
-    axes = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets).eigenvectors  # (P, 3, 3), the normal is column 0
-    _, deep = cKDTree(inside).query(points, list(range(1, min(_N_INSIDE, len(inside)) + 1)))
-    is_inward = ((points - inside[deep].mean(axis=1)) * axes[:, :, 0]).sum(axis=1) < 0
-    normals = np.where(is_inward, -1, 1)[:, None] * axes[:, :, 0]
+    points, directions = _points(body.surface, body), body.surface.attributes.get("surface_direction")
+    if directions is None:
+        normals = _estimated_normals(points, _points(body.interior, body))
+    else:
+        normals = unit(directions[0][body.surface.mask[0]].double().numpy())
+    tangent = unit(np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)]))
+    axes, tree = np.stack([tangent, np.cross(normals, tangent)], axis=2), cKDTree(points)
     # A disc of this radius has a share π r² of all samples; the curved surface, and another one near it, have more
     n = max(_N_PLANE, math.ceil(1.5 * math.pi * _PATCH**2 * len(points)))
     distances, patch = tree.query(points, list(range(1, min(n, len(points)) + 1)))
     steps = (points[patch] - points[:, None]) / _PATCH
-    (u, v), height = np.moveaxis(steps @ axes[:, :, 1:], 2, 0), np.einsum("pkc,pc->pk", steps, normals)
+    (u, v), height = np.moveaxis(steps @ axes, 2, 0), np.einsum("pkc,pc->pk", steps, normals)
     weights = np.clip(1 - np.square(distances / _PATCH), 0, 1)
     weights *= np.einsum("pkc,pc->pk", normals[patch], normals) > 0.2  # not the other side of a thin part
     terms = np.stack([np.ones_like(u), u, v, u * u / 2, u * v, v * v / 2], axis=2)
@@ -97,10 +97,34 @@ def local_shape(body: SignatureBatch) -> Floats:
     normal_matrices = weighted.transpose(0, 2, 1) @ terms + 1e-3 * np.eye(6)
     quadrics = np.linalg.solve(normal_matrices, (weighted * height[:, :, None]).sum(axis=1)[:, :, None])[:, :, 0]
     curvature = -(quadrics[:, 3] + quadrics[:, 5]) / 2
-    normals = unit(normals - (axes[:, :, 1:] @ quadrics[:, 1:3, None])[:, :, 0])
-    tensors = (torch.from_numpy(x)[None] for x in (points, normals))
-    radii = ball_radii(*tensors, torch.ones(1, len(points), dtype=torch.bool))[0, :, 0].numpy()
-    return np.stack([curvature, np.log(np.minimum(radii, _MAX_BALL))], axis=1)
+    if directions is None:
+        normals = unit(normals - (axes @ quadrics[:, 1:3, None])[:, :, 0])
+    return np.stack([curvature, np.log(_inner_balls(points, normals))], axis=1)
+
+
+def _estimated_normals(points: Floats, inside: Floats) -> Floats:
+    """Return outward normals (P, 3) of planes through the nearest points, by the nearest samples of the interior."""
+    _, plane = cKDTree(points).query(points, list(range(1, min(_N_PLANE, len(points)) + 1)))
+    offsets = points[plane] - points[plane].mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets).eigenvectors[:, :, 0]
+    _, deep = cKDTree(inside).query(points, list(range(1, min(_N_INSIDE, len(inside)) + 1)))
+    is_inward = ((points - inside[deep].mean(axis=1)) * normals).sum(axis=1) < 0
+    return np.where(is_inward, -1, 1)[:, None] * normals
+
+
+def _inner_balls(points: Floats, normals: Floats) -> Floats:
+    """Return the radius (P,) of the ball that touches each point from inside and contains at most two other points.
+
+    Points near the touching point are left out, as the error of the normal decides whether the ball contains them.
+    """
+    radii = np.empty(len(points))
+    for rows in np.array_split(np.arange(len(points)), math.ceil(len(points) / 256)):
+        squares = cdist(points[rows], points, "sqeuclidean")
+        depths = (normals[rows] * points[rows]).sum(axis=1, keepdims=True) - normals[rows] @ points.T
+        counts = (squares > _NEAR**2) & (depths > _MIN_SINE * np.sqrt(squares))
+        through = np.where(counts, squares / np.where(counts, 2 * depths, 1), _MAX_BALL)
+        radii[rows] = np.partition(through, 2, axis=1)[:, 2]
+    return np.minimum(radii, _MAX_BALL)
 
 
 def _smoothed(values: Floats, points: Floats) -> Floats:
