@@ -193,13 +193,14 @@ def test_a_bump_is_painted_where_it_is(name: str, signatures: list[Signature], b
     assert values[at_bump].mean() > 2 * abs(values[~at_bump].mean())
 
 
-def test_a_small_bump_is_painted_in_another_pose() -> None:
-    """An egg, bent, with a bump that is a fiftieth of the root of its area high."""
+@pytest.mark.parametrize("height", [0.08, -0.08])
+def test_a_small_bump_or_dent_is_painted_in_another_pose(height: float) -> None:
+    """An egg, bent, with a bump that is a fiftieth of the root of its area high, or such a dent."""
     straight = trimesh.creation.icosphere(subdivisions=4)
     straight.vertices *= [0.5, 0.65, 2.0]
     bent, bump = straight.copy(), straight.vertices[np.abs(straight.vertices - [0.45, 0, 0.8]).sum(axis=1).argmin()]
     away = np.linalg.norm(straight.vertices - bump, axis=1)
-    bent.vertices += 0.08 * np.clip(1 - (away / 0.4) ** 2, 0, 1)[:, None] ** 2 * straight.vertex_normals
+    bent.vertices += height * np.clip(1 - (away / 0.4) ** 2, 0, 1)[:, None] ** 2 * straight.vertex_normals
     angle, along = bent.vertices[:, 2] / 4, 4 + bent.vertices[:, 0]
     bent.vertices = np.stack([along * np.cos(angle), bent.vertices[:, 1], along * np.sin(angle)], axis=1)
     config = descriptor("rich").requirements.apply_to(replace(CONFIG, n_surface_samples=800))

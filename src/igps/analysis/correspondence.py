@@ -1,64 +1,136 @@
 """Local differences between corresponding places of two bodies, independent of their poses."""
 
+import math
+
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
-from igps._arrays import Floats
-from igps.data.batch import SignatureBatch
+from igps._arrays import Floats, Integers
+from igps.data.batch import SampleBatch, SignatureBatch
+from igps.mesh.surface import unit
 
 # Times of the heat kernel over the area. The kernel of large times identifies the place on the body, the kernel of
 # small times depends on the surface around it
 _LARGE_TIMES, _SMALL_TIMES = 0.01 * 2.0 ** np.arange(6), 0.0008 * 2.0 ** np.arange(5)
 _N_CORRESPONDING = 10  # samples of the other body that correspond to a sample
 _N_NEAREST = 4  # samples of the other body over which the distance is averaged
-_MIN_DEVIATION = 0.1  # smallest standard deviation at a place, as a fraction of that of the whole body
+_MIN_DEVIATION = 0.3  # smallest standard deviation at a place, as a fraction of that of the whole body
 _SMOOTHING = 0.06  # standard deviation of the smoothing kernel, over the square root of the area
+_PATCH = 0.08  # radius of the patches of surface whose curvature is measured, over the square root of the area
+_N_PLANE, _N_INSIDE = 12, 6  # nearest surface samples that determine a tangent plane, and interior ones its side
+_MAX_BALL = 0.5  # largest radius of a ball, over the square root of the area
+_NEAR, _MIN_SINE = 0.03, 0.2  # a ball may contain samples nearer than this (over √area), or nearer the tangent plane
 
 
 def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     """Return how much each surface sample of a body differs from the corresponding samples of another body.
 
     The ten corresponding samples are the nearest by the heat kernels (Sun, Ovsjanikov and Guibas 2009) at large times,
-    which do not depend on the pose. Two measures are combined: the squared deviation of the kernels at small times from
-    their mean over the corresponding samples, divided by their variance; and the mean distance to the four samples that
-    are nearest by the kernels at all times. The logarithm of each is smoothed on the surface and standardised.
+    which do not depend on the pose. Three measures are combined: the squared deviations of the mean curvature and of
+    the thickness from their means over the corresponding samples, divided by their variances, which are large where
+    poses bend the surface; and the mean distance to the four samples that are nearest by the kernels at all times. The
+    logarithm of each is smoothed on the surface and standardised.
 
     Args:
         body, other: batches of one body each.
 
     Returns:
-        (P,) the exponential of the sum of both measures, positive.
+        (P,) the exponential of the sum of the measures, positive.
     """
-    large, small = zip(*(_heat_kernels(batch) for batch in (body, other)), strict=True)
-    scale = large[1].std(axis=0) + 1e-9
-    _, indices = cKDTree(large[1] / scale).query(large[0] / scale, min(_N_CORRESPONDING, len(large[1])))
-    corresponding = small[1][indices.reshape(len(large[0]), -1)]
-    variance = corresponding.var(axis=1) + np.square(_MIN_DEVIATION * small[1].std(axis=0)) + 1e-18
-    deviations = np.square(small[0] - corresponding.mean(axis=1)) / variance
-    kernels = [np.hstack(both) for both in zip(large, small, strict=True)]
-    scale = kernels[1].std(axis=0) + 1e-9
-    distances, _ = cKDTree(kernels[1] / scale).query(kernels[0] / scale, min(_N_NEAREST, len(kernels[1])))
-    points = body.surface.points[0][body.surface.mask[0]].double().numpy()
-    width, total = _SMOOTHING * float(body.area[0]) ** 0.5, np.zeros(len(points))
-    for values in (np.log1p(deviations.mean(axis=1)), np.log(distances.reshape(len(points), -1).mean(axis=1) + 1e-6)):
-        smoothed = _smoothed(values, points, width)
+    (large, every), (other_large, other_every) = _heat_kernels(body), _heat_kernels(other)
+    own, others = local_shape(body), local_shape(other)
+    corresponding = others[_nearest(large, other_large, _N_CORRESPONDING)[1]]
+    variance = corresponding.var(axis=1) + np.square(_MIN_DEVIATION * others.std(axis=0)) + 1e-18
+    deviations = np.square(own - corresponding.mean(axis=1)) / variance
+    distances = _nearest(every, other_every, _N_NEAREST)[0].mean(axis=1)
+    points, total = _points(body.surface, body), np.zeros(len(own))
+    for values in (*np.log1p(deviations).T, np.log(distances + 1e-6)):
+        smoothed = _smoothed(values, points)
         total += (smoothed - smoothed.mean()) / (smoothed.std() + 1e-12)
     return np.exp(total)
 
 
+def _points(samples: SampleBatch, body: SignatureBatch) -> Floats:
+    """Return the positions of samples (P, 3), over √area."""
+    return samples.points[0][samples.mask[0]].double().numpy() / float(body.area[0]) ** 0.5
+
+
 def _heat_kernels(body: SignatureBatch) -> tuple[Floats, Floats]:
-    """Return log(heat kernel · area) at each surface sample, (P, times), for large and for small times."""
+    """Return log(heat kernel · area) at each surface sample, (P, times), for large and for all times."""
     area, is_sample = float(body.area[0]), body.surface.mask[0]
     squares = body.surface.eigenfunctions[0][is_sample].double().square().numpy() * area
     values = body.eigenvalues[0].double().numpy() * area
     large, small = (np.log1p(squares @ np.exp(-np.outer(values, times))) for times in (_LARGE_TIMES, _SMALL_TIMES))
-    return large, small
+    return large, np.hstack([large, small])
 
 
-def _smoothed(values: Floats, points: Floats, width: float) -> Floats:
-    """Return Gaussian means of the values at the points within two widths of each point."""
+def _nearest(one: Floats, other: Floats, n: int) -> tuple[Floats, Integers]:
+    """Return distances and indices (P, n) of the nearest rows of the other array, each column standardised by it."""
+    scale = other.std(axis=0) + 1e-9
+    distances, indices = cKDTree(other / scale).query(one / scale, list(range(1, min(n, len(other)) + 1)))
+    return distances, indices
+
+
+def local_shape(body: SignatureBatch) -> Floats:
+    """Return (P, 2): the mean curvature at each surface sample, and the logarithm of the largest ball inside there.
+
+    The curvature is that of the quadric through the samples of a patch (least squares), over the radius of the patch.
+    Both depend on the outward normals, which are estimated if the samples have none.
+    """
+    points, directions = _points(body.surface, body), body.surface.attributes.get("surface_direction")
+    if directions is None:
+        normals = _estimated_normals(points, _points(body.interior, body))
+    else:
+        normals = unit(directions[0][body.surface.mask[0]].double().numpy())
+    tangent = unit(np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)]))
+    axes, tree = np.stack([tangent, np.cross(normals, tangent)], axis=2), cKDTree(points)
+    # A disc of this radius has a share π r² of all samples; the curved surface, and another one near it, have more
+    n = max(_N_PLANE, math.ceil(1.5 * math.pi * _PATCH**2 * len(points)))
+    distances, patch = tree.query(points, list(range(1, min(n, len(points)) + 1)))
+    steps = (points[patch] - points[:, None]) / _PATCH
+    (u, v), height = np.moveaxis(steps @ axes, 2, 0), np.einsum("pkc,pc->pk", steps, normals)
+    weights = np.clip(1 - np.square(distances / _PATCH), 0, 1)
+    weights *= np.einsum("pkc,pc->pk", normals[patch], normals) > 0.2  # not the other side of a thin part
+    terms = np.stack([np.ones_like(u), u, v, u * u / 2, u * v, v * v / 2], axis=2)
+    weighted = terms * weights[:, :, None]
+    normal_matrices = weighted.transpose(0, 2, 1) @ terms + 1e-3 * np.eye(6)
+    quadrics = np.linalg.solve(normal_matrices, (weighted * height[:, :, None]).sum(axis=1)[:, :, None])[:, :, 0]
+    curvature = -(quadrics[:, 3] + quadrics[:, 5]) / 2
+    if directions is None:
+        normals = unit(normals - (axes @ quadrics[:, 1:3, None])[:, :, 0])
+    return np.stack([curvature, np.log(_inner_balls(points, normals))], axis=1)
+
+
+def _estimated_normals(points: Floats, inside: Floats) -> Floats:
+    """Return outward normals (P, 3) of planes through the nearest points, by the nearest samples of the interior."""
+    _, plane = cKDTree(points).query(points, list(range(1, min(_N_PLANE, len(points)) + 1)))
+    offsets = points[plane] - points[plane].mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets).eigenvectors[:, :, 0]
+    _, deep = cKDTree(inside).query(points, list(range(1, min(_N_INSIDE, len(inside)) + 1)))
+    is_inward = ((points - inside[deep].mean(axis=1)) * normals).sum(axis=1) < 0
+    return np.where(is_inward, -1, 1)[:, None] * normals
+
+
+def _inner_balls(points: Floats, normals: Floats) -> Floats:
+    """Return the radius (P,) of the ball that touches each point from inside and contains at most two other points.
+
+    Points near the touching point are left out, as the error of the normal decides whether the ball contains them.
+    """
+    radii = np.empty(len(points))
+    for rows in np.array_split(np.arange(len(points)), math.ceil(len(points) / 256)):
+        squares = cdist(points[rows], points, "sqeuclidean")
+        depths = (normals[rows] * points[rows]).sum(axis=1, keepdims=True) - normals[rows] @ points.T
+        counts = (squares > _NEAR**2) & (depths > _MIN_SINE * np.sqrt(squares))
+        through = np.where(counts, squares / np.where(counts, 2 * depths, 1), _MAX_BALL)
+        radii[rows] = np.partition(through, 2, axis=1)[:, 2]
+    return np.minimum(radii, _MAX_BALL)
+
+
+def _smoothed(values: Floats, points: Floats) -> Floats:
+    """Return Gaussian means of the values at the points within two standard deviations of each point."""
     tree = cKDTree(points)
-    pairs = tree.sparse_distance_matrix(tree, 2 * width, output_type="coo_matrix")
-    weights = np.exp(-np.square(pairs.data / width) / 2)
+    pairs = tree.sparse_distance_matrix(tree, 2 * _SMOOTHING, output_type="coo_matrix")
+    weights = np.exp(-np.square(pairs.data / _SMOOTHING) / 2)
     sums = np.bincount(pairs.row, weights * values[pairs.col], len(points))
     return sums / np.bincount(pairs.row, weights, len(points))
