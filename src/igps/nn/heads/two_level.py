@@ -175,8 +175,8 @@ class TwoLevelHead(Head):
         heads, root = self._individual_heads(), self._root_individual_share
         compared = (_compared(x, heads, root) for x in (query_individuals, gallery_individuals))
         individuals = torch.ones_like(distances)
-        for query, other, exponent in zip(*compared, self.exponents, strict=True):
-            individuals = individuals * euclidean(query, other).clamp_min(_MIN_DISTANCE).pow(exponent)
+        for query, other, power in zip(*compared, self.exponents, strict=True):
+            individuals = individuals * euclidean(query, other).clamp_min(_MIN_DISTANCE).pow(power)
         return (1 - self.weight) * distances - self.weight * torch.expm1(-(individuals / _INDIVIDUAL_SCALE).square())
 
     def _two_levels(self, descriptions: Tensor) -> Tensor:
