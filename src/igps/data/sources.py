@@ -253,18 +253,16 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
     if not rows or invalid:
         cause = f"line {invalid[0]} lacks the name of a file, or a label" if invalid else "no rows"
         raise ValueError(f"{file}: {cause}. Each line names a mesh file and its class.")
-    columns = {name: [_known(row[name]) for _, row in rows] for name in further_columns}
+    missing = ("", "na", "n/a", "nan")  # as R and pandas write it
+    columns = {
+        name: [None if row[name].lower() in missing else row[name] for _, row in rows] for name in further_columns
+    }
     files = [(root / row["file"], row["file"], row.get("label"), row.get("body") or None) for _, row in rows]
     bodies = _bodies_in_files(files, options, columns)
     counts = Counter(keys := [(os.path.abspath(body.path), body.part) for body in bodies])  # ./1.off is 1.off
     if duplicates := sorted(name for name, key in zip(bodies.names, keys, strict=True) if counts[key] > 1):
         raise ValueError(f"{file}: {duplicates[0]} is listed twice. List each body once.")
     return bodies
-
-
-def _known(value: str) -> str | None:
-    """Return a value of a further column; None where it is missing, as R and pandas write it too."""
-    return None if value.lower() in ("", "na", "n/a", "nan") else value
 
 
 def _bodies_in_files(
