@@ -166,6 +166,9 @@ def test_distances_of_equal_vectors_have_a_gradient(collection: tuple[Tensor, Te
     distances.sum().backward()
     assert vectors.grad is not None
     assert torch.isfinite(vectors.grad).all()
+    point = torch.zeros(1, vectors.shape[1]).index_fill_(1, torch.tensor([0]), 1.0)
+    _, slope = torch.func.jvp(lambda x: head.distances(x, point), (point,), (torch.ones_like(point),))
+    assert torch.isfinite(slope).all()
 
 
 def test_individuals_that_bodies_do_not_tell_apart_are_ordered() -> None:
