@@ -132,7 +132,8 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
     for one, exponent in zip(individuals, (0.2, 0.8), strict=True):
         between *= torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist") ** exponent
     of_individuals = weight * (1 - torch.exp(-((between / 0.3) ** 2)))
-    distances = (1 - weight) * (1 - classes @ classes.T) * (1 - torch.exp(-apart)) + of_individuals
+    differ = (1 - torch.exp(-apart)) * (1 - torch.exp(-((between / 0.05) ** 10)))
+    distances = (1 - weight) * (1 - classes @ classes.T) * differ + of_individuals
     torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
 
 

@@ -145,7 +145,10 @@ def test_individuals_have_a_small_part_of_the_distance(collection: tuple[Tensor,
         for one in (x, y)
     )
     apart = first**0.3 * second**0.7
-    expected = 0.8 * plain.distances(of_two, of_two).double() + 0.2 * (1 - torch.exp(-((apart / 0.3) ** 2)))
+    same = torch.exp(-((apart / 0.05) ** 10))
+    expected = 0.8 * plain.distances(of_two, of_two).double() * (1 - same)
+    expected += 0.2 * (1 - torch.exp(-((apart / 0.3) ** 2)))
+    assert ((same > 0.1) & (same < 0.9)).any()
     found = head.distances(vectors, vectors).double()
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
     torch.testing.assert_close(head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0)
