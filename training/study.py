@@ -2,6 +2,7 @@
 
 from igps.cli import Commands
 from igps.cli import main as run
+from training.studies.alike import alike
 from training.studies.damage import damage_command
 from training.studies.explaining import explaining
 from training.studies.figure_command import pose, potential, topology
@@ -15,6 +16,7 @@ COMMANDS: Commands = {
     "robustness": robustness_command,
     "damage": damage_command,
     "scales": scales,
+    "alike": alike,
     "surfaces": surfaces,
     "power": power,
     "explaining": explaining,

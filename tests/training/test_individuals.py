@@ -60,3 +60,23 @@ def test_without_individuals_shapes_are_what_they_were() -> None:
     plain = GradedShapes(1, 1, 1, seed=3, n_vertices=(1500, 1800))
     assert plain.names == [f"{plain.class_names[0]}/00/00"]
     assert individual_of(plain.names[0]) == body_of(plain.names[0]) == f"{plain.class_names[0]}/00"
+
+
+def test_sides_differ_by_the_asymmetry_and_rigid_bodies_only_by_a_motion() -> None:
+    """The grid of a pose follows from its number alone, so that vertices correspond in both sets of shapes."""
+    arguments = {"seed": 3, "n_vertices": (1500, 1800), "n_individuals": 2}
+    rigid = GradedShapes(2, 1, 2, rigid=True, **arguments)
+    sides = GradedShapes(2, 1, 2, rigid=True, asymmetry=(0.003, 0.012), **arguments)
+    bends = []
+    for index in range(len(rigid)):
+        before, after = rigid.pose(index), sides.pose(index)
+        assert np.array_equal(before.rest, before.bent)
+        assert np.array_equal(before.faces, after.faces)
+        size = trimesh.Trimesh(before.rest, before.faces, process=False).area ** 0.5
+        step = np.linalg.norm(after.rest - before.rest, axis=1).max() / size
+        assert 0.003 * 0.9 < step < 0.012 * 1.1
+        posed = GradedShapes(2, 1, 2, **arguments).pose(index)
+        bends.append(not np.array_equal(posed.rest, posed.bent))
+    assert any(bends)
+    apart = [sides.pose(index).rest - rigid.pose(index).rest for index in (0, 1)]
+    assert apart[0].shape != apart[1].shape or not np.allclose(*apart)

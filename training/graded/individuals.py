@@ -36,8 +36,8 @@ class Change:
     step: float  # factor of the whole change
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, vertices: Floats, faces: Integers) -> Change:
-        """Draw a change of a surface, whose largest displacement in units of √area is within `SHARES`."""
+    def draw(cls, rng: np.random.Generator, vertices: Floats, faces: Integers, shares: tuple[float, float]) -> Change:
+        """Draw a change of a surface, whose largest displacement in units of √area is within `shares`."""
         size = float(np.sqrt(face_areas(vertices, faces).sum()))
         low, high = np.log(_RADII)
         radii = size * np.exp(rng.uniform(low, high, _N_REGIONS))
@@ -55,7 +55,7 @@ class Change:
         similarity = np.linalg.lstsq(basis.reshape(-1, 7), steps.reshape(-1), rcond=None)[0].astype(np.float64)
         change = replace(change, similarity=similarity)
         largest = float(np.linalg.norm(change(vertices) - vertices, axis=1).max())
-        return replace(change, step=size * float(np.exp(rng.uniform(*np.log(SHARES)))) / largest)
+        return replace(change, step=size * float(np.exp(rng.uniform(*np.log(shares)))) / largest)
 
     def __call__(self, points: Floats) -> Floats:
         steps = self.waves(points) - points
@@ -83,10 +83,10 @@ class ChangedWarp:
         return self.second(self.first(points))
 
 
-def individual(body: Body, rng: np.random.Generator) -> Body:
+def individual(body: Body, rng: np.random.Generator, shares: tuple[float, float] = SHARES) -> Body:
     """Draw an individual of a body: the body with a `Change` of its surface at rest."""
     vertices, faces = body.surface(_TRIAL_VERTICES, np.eye(3))
-    return replace(body, warp=ChangedWarp(body.warp, Change.draw(rng, body.warp(vertices), faces)))
+    return replace(body, warp=ChangedWarp(body.warp, Change.draw(rng, body.warp(vertices), faces, shares)))
 
 
 def _similarity_basis(points: Floats) -> Floats:
