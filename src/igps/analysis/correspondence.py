@@ -14,10 +14,9 @@ from igps.mesh.surface import unit
 # small times depends on the surface around it
 _LARGE_TIMES, _SMALL_TIMES = 0.01 * 2.0 ** np.arange(6), 0.0008 * 2.0 ** np.arange(5)
 _N_CORRESPONDING = 10  # samples of the other body that correspond to a sample
-_N_NEAREST = 4  # samples of the other body over which the distance is averaged
-_MIN_DEVIATION = 0.3  # smallest standard deviation at a place, as a fraction of that of the whole body
+_MIN_DEVIATION = 0.1  # smallest standard deviation at a place, as a fraction of that of the whole body
 _SMOOTHING = 0.06  # standard deviation of the smoothing kernel, over the square root of the area
-_PATCH = 0.08  # radius of the patches of surface whose curvature is measured, over the square root of the area
+_PATCH = 0.04  # radius of the patches of surface whose curvature is measured, over the square root of the area
 _N_PLANE, _N_INSIDE = 12, 6  # nearest surface samples that determine a tangent plane, and interior ones its side
 _MAX_BALL = 0.5  # largest radius of a ball, over the square root of the area
 _NEAR, _MIN_SINE = 0.03, 0.2  # a ball may contain samples nearer than this (over √area), or nearer the tangent plane
@@ -27,26 +26,22 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     """Return how much each surface sample of a body differs from the corresponding samples of another body.
 
     The ten corresponding samples are the nearest by the heat kernels (Sun, Ovsjanikov and Guibas 2009) at large times,
-    which do not depend on the pose. Three measures are combined: the squared deviations of the mean curvature and of
-    the thickness from their means over the corresponding samples, divided by their variances, which are large where
-    poses bend the surface; and the mean distance to the four samples that are nearest by the kernels at all times. The
-    logarithm of each is smoothed on the surface and standardised.
+    which do not depend on the pose. Two kinds of measures are compared: the principal curvatures and the thickness; and
+    the heat kernels at small times. For each kind, the squared Mahalanobis distance from the corresponding samples has
+    their covariance, which is large where poses bend the surface. Its logarithm is smoothed on the surface and
+    standardised.
 
     Args:
         body, other: batches of one body each.
 
     Returns:
-        (P,) the exponential of the sum of the measures, positive.
+        (P,) the exponential of the sum of both, positive.
     """
-    (large, every), (other_large, other_every) = _heat_kernels(body), _heat_kernels(other)
-    own, others = local_shape(body), local_shape(other)
-    corresponding = others[_nearest(large, other_large, _N_CORRESPONDING)[1]]
-    variance = corresponding.var(axis=1) + np.square(_MIN_DEVIATION * others.std(axis=0)) + 1e-18
-    deviations = np.square(own - corresponding.mean(axis=1)) / variance
-    distances = _nearest(every, other_every, _N_NEAREST)[0].mean(axis=1)
-    points, total = _points(body.surface, body), np.zeros(len(own))
-    for values in (*np.log1p(deviations).T, np.log(distances + 1e-6)):
-        smoothed = _smoothed(values, points)
+    (large, small), (other_large, other_small) = _heat_kernels(body), _heat_kernels(other)
+    nearest, points = _nearest(large, other_large), _points(body.surface, body)
+    total = np.zeros(len(points))
+    for own, others in ((local_shape(body), local_shape(other)), (small, other_small)):
+        smoothed = _smoothed(np.log1p(squared_deviations(own, others, nearest)), points)
         total += (smoothed - smoothed.mean()) / (smoothed.std() + 1e-12)
     return np.exp(total)
 
@@ -57,26 +52,43 @@ def _points(samples: SampleBatch, body: SignatureBatch) -> Floats:
 
 
 def _heat_kernels(body: SignatureBatch) -> tuple[Floats, Floats]:
-    """Return log(heat kernel · area) at each surface sample, (P, times), for large and for all times."""
+    """Return log(heat kernel · area) at each surface sample, (P, times), for large and for small times."""
     area, is_sample = float(body.area[0]), body.surface.mask[0]
     squares = body.surface.eigenfunctions[0][is_sample].double().square().numpy() * area
     values = body.eigenvalues[0].double().numpy() * area
     large, small = (np.log1p(squares @ np.exp(-np.outer(values, times))) for times in (_LARGE_TIMES, _SMALL_TIMES))
-    return large, np.hstack([large, small])
+    return large, small
 
 
-def _nearest(one: Floats, other: Floats, n: int) -> tuple[Floats, Integers]:
-    """Return distances and indices (P, n) of the nearest rows of the other array, each column standardised by it."""
-    scale = other.std(axis=0) + 1e-9
-    distances, indices = cKDTree(other / scale).query(one / scale, list(range(1, min(n, len(other)) + 1)))
-    return distances, indices
+def _nearest(one: Floats, other: Floats) -> Integers:
+    """Return indices (P, n) of the nearest rows of the other array, each column standardised by it."""
+    scale, n = other.std(axis=0) + 1e-9, min(_N_CORRESPONDING, len(other))
+    return cKDTree(other / scale).query(one / scale, list(range(1, n + 1)))[1]
+
+
+def squared_deviations(own: Floats, others: Floats, nearest: Integers) -> Floats:
+    """Return the squared Mahalanobis distance of each row from the corresponding rows of another array.
+
+    Args:
+        own, others: (P, D) and (Q, D) measures.
+        nearest: (P, n) indices of the corresponding rows. A fraction of the covariance of all rows is added to theirs.
+
+    Returns:
+        (P,) squared distances from their means.
+    """
+    corresponding = others[nearest]
+    means = corresponding.mean(axis=1)
+    offsets, steps = corresponding - means[:, None], (own - means)[:, :, None]
+    least = np.square(_MIN_DEVIATION) * np.cov(others.T, bias=True) + 1e-12 * np.eye(others.shape[1])
+    covariances = offsets.transpose(0, 2, 1) @ offsets / nearest.shape[1] + least
+    return (steps * np.linalg.solve(covariances, steps)).sum(axis=(1, 2))
 
 
 def local_shape(body: SignatureBatch) -> Floats:
-    """Return (P, 2): the mean curvature at each surface sample, and the logarithm of the largest ball inside there.
+    """Return (P, 3): the principal curvatures at each surface sample, and the log of the largest ball inside there.
 
-    The curvature is that of the quadric through the samples of a patch (least squares), over the radius of the patch.
-    Both depend on the outward normals, which are estimated if the samples have none.
+    The curvatures, ascending and over the radius of a patch, are those of the linear function of the position that fits
+    the normals of the patch (least squares). Normals are outward, and estimated if the samples have none.
     """
     points, directions = _points(body.surface, body), body.surface.attributes.get("surface_direction")
     if directions is None:
@@ -88,18 +100,16 @@ def local_shape(body: SignatureBatch) -> Floats:
     # A disc of this radius has a share π r² of all samples; the curved surface, and another one near it, have more
     n = max(_N_PLANE, math.ceil(1.5 * math.pi * _PATCH**2 * len(points)))
     distances, patch = tree.query(points, list(range(1, min(n, len(points)) + 1)))
-    steps = (points[patch] - points[:, None]) / _PATCH
-    (u, v), height = np.moveaxis(steps @ axes, 2, 0), np.einsum("pkc,pc->pk", steps, normals)
     weights = np.clip(1 - np.square(distances / _PATCH), 0, 1)
     weights *= np.einsum("pkc,pc->pk", normals[patch], normals) > 0.2  # not the other side of a thin part
-    terms = np.stack([np.ones_like(u), u, v, u * u / 2, u * v, v * v / 2], axis=2)
-    weighted = terms * weights[:, :, None]
-    normal_matrices = weighted.transpose(0, 2, 1) @ terms + 1e-3 * np.eye(6)
-    quadrics = np.linalg.solve(normal_matrices, (weighted * height[:, :, None]).sum(axis=1)[:, :, None])[:, :, 0]
-    curvature = -(quadrics[:, 3] + quadrics[:, 5]) / 2
+    steps = (points[patch] - points[:, None]) @ axes / _PATCH
+    terms = np.concatenate([np.ones_like(steps[:, :, :1]), steps], axis=2)
+    weighted = (terms * weights[:, :, None]).transpose(0, 2, 1)
+    fits = np.linalg.solve(weighted @ terms + 1e-3 * np.eye(3), weighted @ (normals[patch] @ axes))
+    curvatures = np.linalg.eigvalsh((fits[:, 1:] + fits[:, 1:].transpose(0, 2, 1)) / 2)
     if directions is None:
-        normals = unit(normals - (axes @ quadrics[:, 1:3, None])[:, :, 0])
-    return np.stack([curvature, np.log(_inner_balls(points, normals))], axis=1)
+        normals = unit(normals + (axes @ fits[:, 0, :, None])[:, :, 0])
+    return np.column_stack([curvatures, np.log(_inner_balls(points, normals))])
 
 
 def _estimated_normals(points: Floats, inside: Floats) -> Floats:
