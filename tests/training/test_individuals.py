@@ -78,5 +78,7 @@ def test_sides_differ_by_the_asymmetry_and_rigid_bodies_only_by_a_motion() -> No
         posed = GradedShapes(2, 1, 2, **arguments).pose(index)
         bends.append(not np.array_equal(posed.rest, posed.bent))
     assert any(bends)
+    with pytest.raises(ValueError, match=r"asymmetry: expected two positive numbers"):
+        GradedShapes(asymmetry=(0.01, -0.01))
     apart = [sides.pose(index).rest - rigid.pose(index).rest for index in (0, 1)]
     assert apart[0].shape != apart[1].shape or not np.allclose(*apart)

@@ -91,6 +91,8 @@ class GradedShapes:
         if not 1500 <= n_vertices[0] <= n_vertices[1]:
             raise ValueError(f"n_vertices: expected two numbers, the first at least 1500 and no more than the second, "
                              f"got {n_vertices}.")  # fmt: skip
+        if asymmetry is not None and not 0 < asymmetry[0] <= asymmetry[1]:
+            raise ValueError(f"asymmetry: expected two positive numbers, the first not larger, got {asymmetry}.")
         self.n_classes, self.n_bodies, self.n_poses = n_classes, n_bodies, n_poses
         self.seed, self.n_vertices, self.look_alikes = seed, n_vertices, look_alikes
         self.n_individuals, self.asymmetry, self.rigid = n_individuals, asymmetry, rigid
@@ -238,6 +240,7 @@ class GradedShapes:
         return self._last_individual[1]
 
     def _side(self, body_class: int, number: int, individual_number: int, pose: int) -> Body:
+        """Return the body or individual that takes a pose, with the asymmetry of this pose."""
         body = self._individual(body_class, number, individual_number)
         if self.asymmetry is not None:
             seed = [self.seed, _SIDE, body_class, number, individual_number, pose]

@@ -7,10 +7,9 @@ import igps
 from igps.nn.description import describe
 from igps.retrieval import retrieval_scores
 from training.graded import GradedShapes, body_of, individual_of
-from training.studies.individuals import generated, number_names
+from training.studies.individuals import N_VERTICES, generated, number_names
 
 _ASYMMETRY = (0.003, 0.012)  # displacements between the two sides of an individual, in units of √area
-_N_VERTICES = (2000, 3600)
 
 
 def alike(
@@ -35,16 +34,16 @@ def alike(
         cache_dir: folder of cached signatures; the user's cache directory if not given.
         n_workers: processes; all cores if not given.
     """
-    for place in ("rigid", "posed"):
+    for folder, rigid in (("rigid", True), ("posed", False)):
         shapes = GradedShapes(
-            n_bodies, 1, 2, seed, n_vertices=_N_VERTICES, n_individuals=n_individuals, asymmetry=_ASYMMETRY,
-            rigid=place == "rigid",
-        )  # fmt: skip
+            n_bodies, 1, 2, seed, n_vertices=N_VERTICES, n_individuals=n_individuals, asymmetry=_ASYMMETRY, rigid=rigid
+        )
         for name in descriptors:
             descriptor = igps.descriptor(name)
-            data = generated(shapes, root / place, descriptor, cache_dir, n_workers)
+            data = generated(shapes, root / folder, descriptor, cache_dir, n_workers)
             bodies, individuals = (number_names([of(x) for x in data.bodies.names]) for of in (body_of, individual_of))
-            distances = descriptor.distances(*2 * (describe(data, descriptor, n_workers=n_workers),))
+            descriptions = describe(data, descriptor, n_workers=n_workers)
+            distances = descriptor.distances(descriptions, descriptions)
             distances[bodies[:, None] != bodies] = float("inf")
             nearest = retrieval_scores(distances, individuals).mean()["nn"]
-            print(f"{place} {name}: {100 * nearest:.1f} % of {len(data)}", flush=True)
+            print(f"{folder} {name}: {100 * nearest:.1f} % of {len(data)}", flush=True)

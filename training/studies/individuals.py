@@ -15,7 +15,8 @@ from igps.nn.heads.two_level import TwoLevelHead
 from training.graded import GradedShapes, body_of, family_of, individual_of
 from training.studies.transfer import level_scores
 
-_N_VERTICES = (2000, 3600)
+N_VERTICES = (2000, 3600)
+"""Smallest and largest number of vertices of the generated individuals."""
 
 
 def fit_individuals(
@@ -39,7 +40,7 @@ def fit_individuals(
         n_parts, seed, plain, cache_dir, n_workers: see `pretrain`.
     """
     n_classes, n_bodies, n_individuals, n_poses = counts
-    shapes = GradedShapes(n_classes, n_bodies, n_poses, seed, n_vertices=_N_VERTICES, n_individuals=n_individuals)
+    shapes = GradedShapes(n_classes, n_bodies, n_poses, seed, n_vertices=N_VERTICES, n_individuals=n_individuals)
     data = generated(shapes, root, descriptor, cache_dir, n_workers)
     histograms = describe(data, descriptor, progress=True, n_workers=n_workers)
     individuals, bodies = (number_names([of(name) for name in data.bodies.names]) for of in (individual_of, body_of))

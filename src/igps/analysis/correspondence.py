@@ -27,9 +27,9 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
 
     The ten corresponding samples are the nearest by the heat kernels (Sun, Ovsjanikov and Guibas 2009) at large times,
     which do not depend on the pose. Two kinds of measures are compared: the principal curvatures and the thickness; and
-    the heat kernels at small times. For each kind, the squared Mahalanobis distance from the corresponding samples has
-    their covariance, which is large where poses bend the surface. Its logarithm is smoothed on the surface and
-    standardised.
+    the heat kernels at small times. For each kind, this is the squared Mahalanobis distance from the mean of the
+    corresponding samples, by their covariance, which is large where poses bend the surface. Its logarithm is smoothed
+    on the surface and standardised.
 
     Args:
         body, other: batches of one body each.
