@@ -125,28 +125,28 @@ class OfTensors(nn.Module):
         super().__init__()
         self.descriptor, self.like = descriptor, like
 
-    def forward(self, eigenvalues: Tensor, area: Tensor, kinds: dict[str, dict[str, Tensor]]) -> Tensor:
+    def forward(self, eigenvalues: Tensor, area: Tensor, volume: Tensor, kinds: dict[str, dict[str, Tensor]]) -> Tensor:
         own = ("points", "eigenfunctions", "mask")
         samples = {
             kind: SampleBatch(*(one[name] for name in own), {name: one[name] for name in one if name not in own})
             for kind, one in kinds.items()
         }
-        return self.descriptor(replace(self.like, eigenvalues=eigenvalues, area=area, **samples))
+        return self.descriptor(replace(self.like, eigenvalues=eigenvalues, area=area, volume=volume, **samples))
 
 
-def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, dict[str, dict[str, Tensor]]]:
+def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, Tensor, dict[str, dict[str, Tensor]]]:
     """What `OfTensors` takes of a batch."""
     kinds = {
         kind: {"points": one.points, "eigenfunctions": one.eigenfunctions, "mask": one.mask, **one.attributes}
         for kind, one in (("interior", batch.interior), ("surface", batch.surface))
     }
-    return batch.eigenvalues, batch.area, kinds
+    return batch.eigenvalues, batch.area, batch.volume, kinds
 
 
 def exported(descriptor: nn.Module, batch: SignatureBatch) -> nn.Module:
     """The program of `OfTensors` that `torch.export` makes for any number of bodies and samples."""
     given, some = tensors(batch), {0: torch.export.Dim.AUTO}
-    of_samples = {kind: {name: {**some, 1: torch.export.Dim.AUTO} for name in one} for kind, one in given[2].items()}
-    shapes = (some, some, of_samples)
+    of_samples = {kind: {name: {**some, 1: torch.export.Dim.AUTO} for name in one} for kind, one in given[3].items()}
+    shapes = (some, some, some, of_samples)
     program = torch.export.export(OfTensors(descriptor, batch), given, dynamic_shapes=shapes, strict=False)
     return program.module()

@@ -316,7 +316,7 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
             ["retrieve", "ROOT", "--descriptor", "best"],
             f"expected one of {', '.join(NAMES)}, molecular, or .*, got 'best'",
         ),
-        (["retrieve", "ROOT"], "n_eigenpairs: this descriptor needs signatures of at least 64, got 20"),
+        (["retrieve", "ROOT"], "n_eigenpairs: this descriptor needs signatures of at least 90, got 20"),
         (["retrieve", "ROOT", "--signature.max_vertices", "0"], "max_vertices: expected more than .*, got 0"),
         (["outliers", "ROOT", "--top", "-1"], "top: expected at least 0, got -1"),
         (["query", "ROOT/egg/1.off", "--gallery", "ROOT", "--top", "0"], "top"),

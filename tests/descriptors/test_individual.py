@@ -64,7 +64,7 @@ def test_distances_with_size_are_those_of_the_formula(name: str, signatures: dic
     for other in ("body", "centimetres", "mirrored"):
         assert sized[other] == pytest.approx(plain[other], rel=1e-2, abs=1e-3 * SCALES[name])
     apart = 2 * np.log(1.1)  # in log √area and in log ∛volume
-    n = {"interior": SCALES["interior"] / 4, "pretrained": 0.0026}[name]
+    n = SCALES[name] / 4
     expected = plain["larger"] + 2 * (plain["larger"] + n) * apart / (0.3 + apart)
     assert sized["larger"] == pytest.approx(expected, rel=1e-3)
 

@@ -24,7 +24,7 @@ from igps.retrieval import chi_square
 from igps.signature.residue_attributes import residue_attribute
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
-CONFIG = SignatureConfig(n_eigenpairs=64, n_surface_samples=100, min_samples=300, resolution=16)
+CONFIG = SignatureConfig(n_eigenpairs=90, n_surface_samples=100, min_samples=300, resolution=16)
 ROTATION = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
 
 

@@ -108,7 +108,7 @@ def test_what_a_descriptor_needs_is_added_or_asked_for() -> None:
         config, attributes=("electrostatic_potential", "depth", "surface_direction")
     )
     assert igps.descriptor("d2").requirements.apply_to(config) == config
-    for name, least in {"pretrained": 64, "rich": 50, "interior": 250, "gps": 250, "multiscale": 250}.items():
+    for name, least in {"pretrained": 90, "rich": 50, "interior": 250, "gps": 250, "multiscale": 250}.items():
         needs = igps.descriptor(name).requirements
         assert needs.n_eigenpairs == least
         needs.apply_to(SignatureConfig(n_eigenpairs=least))

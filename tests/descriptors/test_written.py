@@ -51,7 +51,7 @@ parts:
       - potential: {n_classes: 6, reach: 0.96, soft: true}
   - {histogram: branches, eigenpairs: 16, n_samples: 1000}
   - {histogram: pieces, eigenpairs: 16, n_samples: 1000}
-  - {histogram: spectrum, n_eigenpairs: 64}
+  - {histogram: spectrum, n_eigenpairs: 90}
 """
 
 
@@ -193,12 +193,12 @@ def test_an_attribute_adds_its_histograms_with_its_weight(bodies: SignatureDatas
     by_bins = inside.reshape(3, 36, 32)  # pairs of eight classes
     levels = [by_bins, by_bins.reshape(3, 36, 8, 4).sum(dim=3), by_bins.sum(dim=2)]
     told = sum(chi_square(level.flatten(1), level.flatten(1)) for level in levels) / 3
-    expected = descriptor("pretrained").distances(form, form) + 0.5 * 0.046 / 0.017 * told
+    expected = descriptor("pretrained").distances(form, form) + 0.5 * 0.083 / 0.017 * told
     np.testing.assert_allclose(whole.distances(described, described), expected, atol=1e-5)
     rows = whole.coordinates(described, within_class=True)
     kept = descriptor("pretrained").coordinates(form, within_class=True)
     np.testing.assert_allclose(rows[:, : kept.shape[1]], kept, atol=1e-6)
-    np.testing.assert_allclose(rows[:, kept.shape[1] :].square(), 0.5 * 0.046 / 0.017 * inside.flatten(1), atol=1e-5)
+    np.testing.assert_allclose(rows[:, kept.shape[1] :].square(), 0.5 * 0.083 / 0.017 * inside.flatten(1), atol=1e-5)
     assert igps.descriptor("pretrained+height=0.5+size").name == "pretrained+height=0.5+size"
     with pytest.raises(ValueError, match="with: expected positive weights"):
         igps.descriptor("interior+height=0")

@@ -195,7 +195,7 @@ def test_the_larger_the_cavity_the_farther_from_the_ball() -> None:
     bodies = [Mesh(*ball(1))]
     bodies += [Mesh(*joined(ball(1), ball(radius, inwards=True)), cavities=True) for radius in (0.2, 0.5, 0.8)]
     names = ("depth", "electrostatic_potential", "surface_direction")
-    config = SignatureConfig(n_eigenpairs=64, resolution=16, min_samples=500, attributes=names)
+    config = SignatureConfig(n_eigenpairs=90, resolution=16, min_samples=500, attributes=names)
     batches = [collate([compute_signature(body, config)]) for body in bodies]
     for module in (interior(64), descriptor("rich"), descriptor("pretrained")):
         descriptions = torch.cat([module(batch) for batch in batches])

@@ -80,7 +80,7 @@ def test_rich_and_pretrained_are_measured_too(
 ) -> None:
     ArticulatedShapes(n_classes=2, n_per_class=1, seed=3, n_vertices=1000).write(tmp_path / "meshes")
     meshes = sorted((tmp_path / "meshes").rglob("*.off"))
-    options = ["--signature.n_eigenpairs", "64", "--signature.resolution", "12", "--signature.min_samples", "0"]
+    options = ["--signature.n_eigenpairs", "90", "--signature.resolution", "12", "--signature.min_samples", "0"]
     options += ["--signature.n_surface_samples", "100", "--n_workers", "1"]
     written = run(monkeypatch, tmp_path, *meshes, "--descriptors", "rich", "pretrained", *options)
     rows = [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:3]]

@@ -18,7 +18,7 @@ import pytest
 import torch
 from torch import Tensor
 from training.graded import GradedShape, GradedShapes, body_of
-from training.studies import individuals, pretraining
+from training.studies import pretraining
 
 import igps
 from igps.data.datamodule import SignatureDataModule
@@ -231,7 +231,7 @@ def test_pretraining_saves_a_metric_and_measures_it(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pretraining, "GradedShapes", QuickShapes)
-    monkeypatch.setattr(individuals, "N_VERTICES", (1500, 1500))
+    monkeypatch.setattr(pretraining, "N_VERTICES", (1500, 1500))
     out = run(
         "pretrain", "--root", tmp_path / "generated", "--n_classes", 23, "--n_bodies", 2, "--n_poses", 2,
         "--n_parts", 2, "--n_scored", 4, "--individuals", "[4, 2, 2, 2]",

@@ -7,7 +7,7 @@ import igps
 from igps.nn.description import describe
 from igps.retrieval import retrieval_scores
 from training.graded import GradedShapes, body_of, individual_of
-from training.studies.individuals import N_VERTICES, generated, number_names
+from training.studies.generated import N_VERTICES, generated, number_names
 
 _ASYMMETRY = (0.003, 0.012)  # displacements between the two sides of an individual, in units of √area
 

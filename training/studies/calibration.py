@@ -25,7 +25,7 @@ from igps.mesh.mesh import Mesh
 from igps.nn.description import describe
 from training.graded import GradedShapes, body_of
 from training.studies.disturbances import move, remesh, scale, simplified
-from training.studies.individuals import generated
+from training.studies.generated import generated
 from training.studies.thresholds import quantiles, threshold_at, threshold_between
 
 SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj", "longer": ".off"}

@@ -25,15 +25,13 @@ SIZE, SIDE = "+size", "+side"
 """Suffixes of the names of descriptors that keep size, and that distinguish a body from its mirror image."""
 
 SCALES: Mapping[str, float] = {
-    "interior": 0.017, "gps": 0.017, "multiscale": 0.03, "rich": 0.026, "pretrained": 0.046, "d2": 0.035,
+    "interior": 0.017, "gps": 0.017, "multiscale": 0.03, "rich": 0.026, "pretrained": 0.083, "d2": 0.035,
     "shape_dna": 17, "volume_shape_dna": 23, "local_diameter_centricity": 0.14, "inner_distance": 0.004,
     "canonical_form": 0.066, "geodesic_spectral": 0.0014, "spectral_gw": 0.0014,
 }  # fmt: skip
 """The median distance between generated bodies of one class, by descriptor, as `training.study scales` prints it."""
 
-# Typical distance between individuals of one body, as a share of the scale of the descriptor. `pretrained` has its own
-# value, because its head reduces these distances to almost nothing.
-_INDIVIDUAL_SHARE, _INDIVIDUAL_DISTANCES = 0.25, {"pretrained": 0.0026}
+_INDIVIDUAL_SHARE = 0.25  # typical distance between individuals of one body, over the scale of the descriptor
 # A difference in size, in logarithms, adds at most _MAX_GAIN times the distance, and half of that at _HALF_SIZE.
 _MAX_GAIN, _HALF_SIZE = 2.0, 0.3
 # Typical differences in twist and in signed volumes between individuals of one body.
@@ -50,11 +48,11 @@ class IndividualDescriptor(Descriptor):
     numbers with opposite signs. The size block holds log √area and log ∛volume, in millimetres if the unit is known.
 
     Let d be the distance by the descriptor, t the Euclidean distance of the side blocks, and s the sum of the
-    differences of the two logarithms. Let n be the typical distance between individuals of one body, by default a
-    quarter of the descriptor's scale. The distance of two bodies is e + 2 (e + n) s / (0.3 + s) with e = d + t. So size
-    adds to the distance of bodies of nearly the same form, and multiplies other distances by up to 3. The distance does
-    not depend on the collection. Both blocks are scaled so that they have about the same effect on Euclidean distances
-    of whole descriptions.
+    differences of the two logarithms. Let n be a quarter of the descriptor's scale, a typical distance between
+    individuals of one body. The distance of two bodies is e + 2 (e + n) s / (0.3 + s) with e = d + t. So size adds to
+    the distance of bodies of nearly the same form, and multiplies other distances by up to 3. The distance does not
+    depend on the collection. Both blocks are scaled so that they have about the same effect on Euclidean distances of
+    whole descriptions.
 
     Args:
         descriptor: any descriptor.
@@ -79,7 +77,7 @@ class IndividualDescriptor(Descriptor):
                 "`scale` to the median of its distances between bodies of one class."
             )
         self.descriptor, self.scale, self.keeps_size = descriptor, scale, size
-        self._unit = _INDIVIDUAL_DISTANCES.get(descriptor.name, _INDIVIDUAL_SHARE * scale)
+        self._unit = _INDIVIDUAL_SHARE * scale
         axes, embedding = [InteriorDistance(6, 3.0), PairTwist()], SpectralEmbedding(n_eigenpairs=16)
         self.twists = PairHistogram(axes, embedding) if side else None
         self.name, self.source = descriptor.name + SIDE * side + SIZE * size, descriptor.source
@@ -128,9 +126,7 @@ class IndividualDescriptor(Descriptor):
     def wrap(self, descriptor: Descriptor) -> "IndividualDescriptor":
         """Return an `IndividualDescriptor` of another descriptor with the same options and scales."""
         has_side = self.twists is not None
-        wrapped = IndividualDescriptor(descriptor, size=self.keeps_size, side=has_side, scale=self.scale)
-        wrapped._unit = self._unit
-        return wrapped
+        return IndividualDescriptor(descriptor, size=self.keeps_size, side=has_side, scale=self.scale)
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Split descriptions (N, D) into the descriptor's own, in its shape, the side block and the size block."""

@@ -49,7 +49,7 @@ class SignatureConfig:
 
     DEFAULT_EIGENPAIRS: ClassVar[int] = 250
     # Numbers of eigenpairs that descriptors of the library require, and that caches may therefore hold.
-    SIZES: ClassVar[tuple[int, ...]] = (64, 100, 250)
+    SIZES: ClassVar[tuple[int, ...]] = (64, 90, 100, 250)
 
     n_eigenpairs: int | None = None
     resolution: int = 32

@@ -20,7 +20,6 @@ from igps.data.dataset import SignatureDataset
 from igps.descriptors.pretrained.descriptor import (
     BODY_PARTS,
     CLASS_PARTS,
-    INDIVIDUAL_PARTS,
     PRETRAINED,
     pretrained,
     pretrained_head,
@@ -37,7 +36,7 @@ from igps.signature.signature import SignatureConfig, compute_signature
 # Of `rich`: six histograms in its first part, two oriented ones.
 CELLS = (25920, 750, 750)
 # Of `pretrained_parts`
-PART_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180, 64)
+PART_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180, 91)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +45,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
     root = tmp_path_factory.mktemp("shapes")
     ArticulatedShapes(n_classes=12, n_per_class=3, seed=7, n_vertices=800).write(root)
     needs = rich().requirements | pretrained_parts().requirements
-    config = needs.apply_to(SignatureConfig(n_eigenpairs=64, n_surface_samples=1000))
+    config = needs.apply_to(SignatureConfig(n_eigenpairs=90, n_surface_samples=1000))
     return SignatureDataset(root, config, root / "cache")
 
 
@@ -87,7 +86,7 @@ def test_a_class_is_closer_to_itself(dataset: SignatureDataset, histograms: torc
 
 
 def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> None:
-    """Written down from the stored numbers: roots, directions and lengths part by part, the pole of the bodies."""
+    """Written down from the stored numbers: roots, directions and lengths part by part."""
     part = dataset.subset(range(4))
     module = pretrained()
     roots = describe(part, module.descriptor).double().sqrt()
@@ -111,29 +110,19 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
 
     classes = level("class_head", CLASS_PARTS)
     bodies = [level(f"body_heads.{k}", (part,)) for k, part in enumerate(BODY_PARTS)]
-    individuals = [level(f"individual_heads.{k}", (part,)) for k, part in enumerate(INDIVIDUAL_PARTS)]
-    share, scales, weight = (stored[f"head.{name}"] for name in ("share", "scales", "weight"))
-    root = (0.9 * share / len(bodies)).sqrt()
+    share, scales, exponents = (stored[f"head.{name}"] for name in ("share", "scales", "exponents"))
     found = describe(part, module)
-    levels = [
-        (0.9 * (1 - share)).sqrt() * classes,
-        *(root * one for one in bodies),
-        *(0.05**0.5 * one for one in individuals),
-    ]
-    expected = torch.cat(levels, dim=1)
+    expected = torch.cat([(1 - share).sqrt() * classes, *((share / 2).sqrt() * one for one in bodies)], dim=1)
     torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
-    compared = [one[:, :-1] for one in bodies]
-    from_mean = torch.stack([one.square().sum(dim=1) for one in compared]).mean(dim=0).sqrt()
+    from_mean = torch.stack([one[:, :-1].square().sum(dim=1) for one in bodies]).mean(dim=0).sqrt()
     shorter = (torch.outer(from_mean, from_mean).sqrt() / (0.5 / 2**0.5)).sqrt()
-    apart = torch.zeros(4, 4, dtype=torch.float64)
-    for one, scale in zip(compared, scales, strict=True):
-        apart += (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") * shorter / scale) ** 10
-    between = torch.ones(4, 4, dtype=torch.float64)
-    for one, exponent in zip(individuals, (0.2, 0.8), strict=True):
-        between *= torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist") ** exponent
-    of_individuals = weight * (1 - torch.exp(-((between / 0.3) ** 2)))
-    differ = (1 - torch.exp(-apart)) * (1 - torch.exp(-((between / 0.05) ** 10)))
-    distances = (1 - weight) * (1 - classes @ classes.T) * differ + of_individuals
+    exponent, between = torch.zeros(4, 4, dtype=torch.float64), torch.ones(4, 4, dtype=torch.float64)
+    for one, scale, power in zip(bodies, scales, exponents, strict=True):
+        apart = torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist")
+        exponent += (apart * shorter / scale) ** 20
+        between *= apart**power
+    differ = (1 - torch.exp(-exponent)) * (1 - torch.exp(-((between / 0.1) ** 20)))
+    distances = 0.95 * (1 - classes @ classes.T) * differ + 0.05 * (1 - torch.exp(-((between / 0.1) ** 2)))
     torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
 
 
@@ -157,7 +146,7 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
     """
     GradedShapes(8, 3, 1, seed=3, n_vertices=(1500, 2000), look_alikes=False).write(tmp_path)
     module, plain = pretrained(), rich()
-    config = (module.requirements | plain.requirements).apply_to(SignatureConfig(n_eigenpairs=64))
+    config = (module.requirements | plain.requirements).apply_to(SignatureConfig(n_eigenpairs=90))
     dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")
     assert not dataset.precompute(n_workers=1)
 
@@ -176,7 +165,6 @@ def test_a_head_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_
     descriptor = pretrained_parts().eval()
     described = describe(dataset, descriptor)
     head = pretrained_head().fit(described, dataset.labels, descriptor.part_cells)
-    head.fit_individuals(described, dataset.labels, descriptor.part_cells)
     save_pretrained(EmbeddedDescriptor(descriptor, head), tmp_path / "head.safetensors")
     loaded = pretrained(tmp_path / "head.safetensors")
     assert not loaded.training

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -16,19 +17,29 @@ from igps.nn.descriptor import HistogramDescriptor
 def test_shares_are_those_of_a_loop() -> None:
     batch = two_bodies()
     found = SpectrumShares(6)(batch)
-    assert found.shape == (2, 6)
+    assert found.shape == (2, 7)
     assert found.dtype == torch.float32
     for i in range(2):
-        over_number = [float(batch.eigenvalues[i, k - 1]) / k for k in range(1, 7)]
-        expected = torch.tensor([one / sum(over_number) for one in over_number])
-        torch.testing.assert_close(found[i], expected)
+        radius = (3 * float(batch.volume[i]) / (4 * math.pi)) ** (1 / 3)  # of the ball of this volume
+        shares = [float(batch.eigenvalues[i, k - 1]) * radius**2 / (2 * k) / 6 for k in range(1, 7)]
+        torch.testing.assert_close(found[i], torch.tensor([*shares, 1 - sum(shares)]))
 
 
 def test_a_spectrum_that_follows_weyl_has_equal_shares() -> None:
+    """Half of the bound, times the area of the ball of equal volume over the body's own area."""
     batch = two_bodies()
     line = 4 * torch.pi * torch.arange(1, 13, dtype=torch.float64) / batch.area[:, None]
     found = SpectrumShares(12)(replace(batch, eigenvalues=line))
-    torch.testing.assert_close(found, torch.full((2, 12), 1 / 12))
+    own = 4 * torch.pi * (3 * batch.volume / (4 * torch.pi)) ** (2 / 3) / batch.area
+    torch.testing.assert_close(found[:, :12].double(), (own / 24)[:, None].expand(2, 12), atol=1e-7, rtol=0)
+
+
+def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off() -> None:
+    batch, part = two_bodies(), SpectrumShares(min(N_EIGENPAIRS))
+    found = part(replace(batch, eigenvalues=1e3 * batch.eigenvalues))
+    expected = part(batch)[:, :-1]
+    torch.testing.assert_close(found[:, :-1], expected / expected.sum(dim=1, keepdim=True))
+    torch.testing.assert_close(found[:, -1], torch.zeros(2), atol=1e-6, rtol=0)
 
 
 def test_padding_and_scale_change_nothing() -> None:

@@ -396,11 +396,9 @@ def test_one_shape_of_each_class_is_centred_alone(collection: tuple[Tensor, Tens
 
 def fitted_heads(collection: tuple[Tensor, Tensor]) -> list[Head]:
     """All heads that are fitted in closed form, by themselves and with a prior."""
-    individual_heads = [WCCNHead([part], lengths=True) for part in range(2)]
-    prior = TwoLevelHead(
-        WCCNHead([0]), [WCCNHead([1], lengths=True)], individual_heads=individual_heads, exponents=(0.3, 0.7)
-    )
-    prior.fit(*collection, [20, 40]).fit_individuals(*collection, [20, 40])
+    body_heads = [WCCNHead([part], lengths=True) for part in range(2)]
+    prior = TwoLevelHead(WCCNHead([0]), body_heads, scales=(0.1, 0.2), exponents=(0.3, 0.7))
+    prior.fit(*collection, [20, 40])
     priors = (None, prior)
     made = [head(prior=one) for head in (WhitenedHead, KernelHead, ClassifierHead) for one in priors]
     return [prior, *(head.fit(*collection, [20, 40]) for head in made)]

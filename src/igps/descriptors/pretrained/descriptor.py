@@ -20,17 +20,16 @@ from igps.nn.histograms.points import PointHistogram
 PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 """The parameters of `pretrained`, written by training/pretrain.py."""
 
-# Indices into `pretrained_parts`. Body heads use parts that bending leaves as they are; the class head uses the others,
-# and the balls, which serve both.
-BODY_PARTS, CLASS_PARTS = (0, 5, 8), (1, 2, 3, 4, 5, 6, 7)
-# The balls are too coarse to tell individuals apart. Eigenvalues are more exact than distances between samples.
-INDIVIDUAL_PARTS, _EXPONENTS = (0, 8), (0.2, 0.8)
+# Indices into `pretrained_parts`. Body heads use parts that bending leaves as they are.
+BODY_PARTS, CLASS_PARTS = (0, 8), (1, 2, 3, 4, 5, 6, 7)
 # Scales of the body heads, in units in which the median distance between training shapes is 0.5
-_SCALES = (0.13, 0.22, 0.13)
+_SCALES = (0.13, 0.14)
+# Eigenvalues and the volume are more exact than distances between samples.
+_EXPONENTS = (0.25, 0.75)
 
 
 def pretrained_parts() -> HistogramDescriptor:
-    """Return the histograms of `pretrained`, from at most 64 eigenpairs, as one descriptor with nine parts.
+    """Return the histograms of `pretrained`, from at most 90 eigenpairs, as one descriptor with nine parts.
 
     0. Interior distances between surface samples.
     1. Interior distances between interior samples, with directions to the surface in the embedding of 16 eigenpairs.
@@ -40,7 +39,7 @@ def pretrained_parts() -> HistogramDescriptor:
     5. Radii of the balls that touch the surface from both sides, by the potentials of 4 and 16 eigenpairs.
     6. Lengths of the limbs, by the potential of 16 eigenpairs.
     7. Sizes and lengths of the pieces of the body without its middle, by the same potential.
-    8. Eigenvalues.
+    8. Eigenvalues in units of the volume.
     """
     embeddings = {n: SpectralEmbedding(n_eigenpairs=n) for n in (64, 50, 16, 4)}
     n = N_ORIENTED_SAMPLES
@@ -57,7 +56,7 @@ def pretrained_parts() -> HistogramDescriptor:
             PointHistogram([*balls, *potentials], embeddings[16]),
             BranchHistogram(embeddings[16], n_samples=n),
             PieceHistogram(embedding=embeddings[16], n_samples=n),
-            SpectrumShares(64),
+            SpectrumShares(90),
         ],
         name="pretrained_parts",
         source="Rustamov 2007 and 2010; Wahl, Hillenbrand and Hirzinger 2003; Reuter, Wolter and Peinecke 2006; Ma, "
@@ -66,25 +65,21 @@ def pretrained_parts() -> HistogramDescriptor:
     )
 
 
-def pretrained_head(*, individuals: bool = True) -> TwoLevelHead:
-    """Return the unfitted head of `pretrained`, with or without individual heads."""
-    surface, balls, spectrum = BODY_PARTS
+def pretrained_head() -> TwoLevelHead:
+    """Return the unfitted head of `pretrained`."""
+    surface, spectrum = BODY_PARTS
     body_heads = [
-        WCCNHead([surface], n_directions=90, shrinkage=0.3, lengths=True),
-        WCCNHead([balls], n_directions=20, shrinkage=0.3, lengths=True),
-        WCCNHead([spectrum], n_directions=60, shrinkage=1.0, lengths=True),
+        WCCNHead([surface], n_directions=60, shrinkage=0.3, lengths=True),
+        WCCNHead([spectrum], n_directions=90, shrinkage=1.0, lengths=True),
     ]
     class_head = WCCNHead(CLASS_PARTS, n_directions=150, shrinkage=0.1)
-    if not individuals:
-        return TwoLevelHead(class_head, body_heads, scales=_SCALES)
-    individual_heads = [WCCNHead([part], n_directions=60, shrinkage=0.3, lengths=True) for part in INDIVIDUAL_PARTS]
-    return TwoLevelHead(class_head, body_heads, scales=_SCALES, individual_heads=individual_heads, exponents=_EXPONENTS)
+    return TwoLevelHead(class_head, body_heads, scales=_SCALES, exponents=_EXPONENTS, share=0.2)
 
 
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
     """Return the histograms of `pretrained_parts` under a head that was fitted to generated shapes, in evaluation mode.
 
-    Descriptions are unit vectors of 1,211 numbers, which the head's `shorten` reduces to 256. By the distance of the
+    Descriptions are unit vectors of 1,068 numbers, which the head's `shorten` reduces to 256. By the distance of the
     head, other poses of a body come first, then other bodies of its class. No labels are needed for the shapes that are
     compared. The model card is in the documentation.
 

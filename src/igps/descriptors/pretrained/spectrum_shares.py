@@ -1,4 +1,6 @@
-"""Eigenvalues of a body's surface relative to Weyl's law."""
+"""Eigenvalues of a body's surface relative to Weyl's law, in units of the body's volume."""
+
+import math
 
 import torch
 from torch import Tensor
@@ -10,37 +12,42 @@ from igps.nn.histograms.base import DescriptionPart
 
 
 class SpectrumShares(DescriptionPart):
-    """The ratios λₖ / k of the eigenvalues of a body's surface, as shares of their sum.
+    """The ratios λₖ / k of K eigenvalues of a body's surface, in units of the body's volume V.
 
-    By Weyl's law, λₖ grows like 4πk over the area, so that all shares are nearly equal; their differences characterise
-    the body. Bending leaves eigenvalues as they are, and scaling multiplies all by the same factor. Source: Reuter,
-    Wolter and Peinecke 2006, who compare bodies by such sequences.
+    No surface like a sphere has an eigenvalue above 8πk over its area (Karpukhin, Nadirashvili, Penskoi and Polterovich
+    2021), and none of volume V has an area below (36π)^(1/3) V^(2/3). A cell is therefore λₖ (36π)^(1/3) V^(2/3) / (8πk
+    K), and the remainder up to 1 is the last cell. Surfaces with many handles can exceed the bound; their cells are
+    then divided by their sum.
+
+    By Weyl's law, λₖ grows like 4πk over the area, so that all cells but the last are nearly equal: their mean tells
+    how far the body is from a ball, and their differences characterise its surface. Bending leaves both as they are.
+    Source: Reuter, Wolter and Peinecke 2006, who compare bodies by such sequences.
 
     Example:
-        The eigenvalues of a sphere are l (l + 1), each 2 l + 1 times.
+        The eigenvalues of the unit sphere are l (l + 1), each 2 l + 1 times. The first one attains the bound.
 
         >>> import trimesh
         >>> from igps import SignatureConfig, collate, compute_signature
         >>> ball = trimesh.creation.icosphere(subdivisions=3)
         >>> signature = compute_signature(ball, SignatureConfig(n_eigenpairs=8))
         >>> shares = SpectrumShares(8)(collate([signature]))[0]
-        >>> expected = torch.tensor([2 / 1, 2 / 2, 2 / 3, 6 / 4, 6 / 5, 6 / 6, 6 / 7, 6 / 8])
-        >>> bool((shares / shares[1] - expected).abs().max() < 0.02)
+        >>> expected = torch.tensor([2 / 1, 2 / 2, 2 / 3, 6 / 4, 6 / 5, 6 / 6, 6 / 7, 6 / 8]) / 16
+        >>> bool((shares[:8] - expected).abs().max() < 0.001)
         True
 
     Args:
-        n_eigenpairs: number of eigenvalues.
+        n_eigenpairs: number K of eigenvalues.
     """
 
-    def __init__(self, n_eigenpairs: int = 64) -> None:
+    def __init__(self, n_eigenpairs: int = 90) -> None:
         super().__init__()
         check_at_least(2, n_eigenpairs=n_eigenpairs)
         self.n_eigenpairs = n_eigenpairs
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of eigenvalues."""
-        return (self.n_eigenpairs,)
+        """Number of eigenvalues, and 1 for the remainder."""
+        return (self.n_eigenpairs + 1,)
 
     @property
     def requirements(self) -> Requirements:
@@ -48,14 +55,18 @@ class SpectrumShares(DescriptionPart):
         return Requirements(n_eigenpairs=self.n_eigenpairs)
 
     def of_features(self, features: BatchFeatures) -> Tensor:
-        """(N, K) shares of N shapes."""
+        """(N, K + 1) shares of N shapes."""
         batch = features.batch
         k = torch.arange(1, self.n_eigenpairs + 1, device=batch.eigenvalues.device)
-        ratios = batch.eigenvalues[:, : self.n_eigenpairs] / k
-        shares = (ratios / ratios.sum(dim=1, keepdim=True)).to(batch.surface.eigenfunctions.dtype)
+        smallest_area = (36 * math.pi) ** (1 / 3) * batch.volume.to(batch.eigenvalues)[:, None].pow(2 / 3)
+        ratios = batch.eigenvalues[:, : self.n_eigenpairs] * smallest_area / (8 * math.pi * self.n_eigenpairs * k)
+        shares = (ratios / ratios.sum(dim=1, keepdim=True).clamp_min(1)).to(batch.surface.eigenfunctions.dtype)
+        cells = torch.cat([shares, (1 - shares.sum(dim=1, keepdim=True)).clamp_min(0)], dim=1)
         weights = batch.surface.attributes.get(WEIGHT)
         if weights is None:
-            return shares
-        # An eigenvalue depends on the surface most where its eigenfunction is large (Hadamard 1908).
-        densities = batch.surface.eigenfunctions[:, :, : self.n_eigenpairs].square()
-        return shares * (densities * weights[:, :, None]).sum(dim=1) / densities.sum(dim=1)
+            return cells
+        # An eigenvalue depends on the surface most where its eigenfunction is large (Hadamard 1908), the remainder
+        # everywhere alike.
+        squares = batch.surface.eigenfunctions[:, :, : self.n_eigenpairs].square()
+        densities = torch.cat([squares, batch.surface.mask[:, :, None].to(squares)], dim=2)
+        return cells * (densities * weights[:, :, None]).sum(dim=1) / densities.sum(dim=1)
