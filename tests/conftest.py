@@ -30,13 +30,13 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 @pytest.fixture(params=["loops", "BLAS"])
 def either_processor(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The basis is multiplied as on a processor where loops are faster than BLAS, and as where they are not."""
+    """Multiply by compiled loops and by BLAS, whichever is faster on this processor."""
     monkeypatch.setattr(products, "loops_beat_blas", lambda: request.param == "loops")
 
 
 @pytest.fixture
 def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], list[Figure]]:
-    """A list to which the figures come that a module makes from now on."""
+    """A function from a module to the list of figures that it makes from now on."""
 
     def remembered(module: Any) -> list[Figure]:
         made, make = list[Figure](), module.new_figure
@@ -53,7 +53,7 @@ def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], list[Figure]]
 
 @contextlib.contextmanager
 def torch_threads(n_threads: int) -> Iterator[None]:
-    """PyTorch computes with so many threads within, and with as many as before behind it."""
+    """Set the number of PyTorch threads inside the context, and restore it afterwards."""
     before = torch.get_num_threads()
     torch.set_num_threads(n_threads)
     try:

@@ -1,4 +1,4 @@
-"""Descriptors that see little, so that their distances are known, and fail as they are told."""
+"""Simple descriptors with known distances, some of which fail on purpose."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALL += ["--signature.n_surface_samples", "60", "--n_workers", "1"]
 
 
 class Height(igps.BodyDescriptor):
-    """Sees the height of a mesh, and does to one of its meshes what the test says."""
+    """Describes a mesh by its height, and fails in the given way on the mesh named `bad`."""
 
     source = "nobody"
     invariant_to = ("motion",)

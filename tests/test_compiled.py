@@ -45,7 +45,7 @@ def test_importing_a_compiled_loop_imports_no_compiler():
 
 
 @pytest.mark.parametrize("is_collected", [True, False])
-def test_compiling_leaves_the_search_for_garbage_as_it_was(is_collected: bool) -> None:
+def test_compiling_restores_the_garbage_collector(is_collected: bool) -> None:
     def doubled(x: float) -> float:
         return 2 * x
 

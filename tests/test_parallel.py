@@ -97,7 +97,7 @@ def test_a_job_that_is_killed_once_is_tried_again(results: dict[int, object]) ->
 
 
 def test_workers_leave_an_interruption_to_their_parent(results: dict[int, object]) -> None:
-    """The terminal sends Ctrl-C to all processes; each that told of it would bury the one line."""
+    """A terminal sends Ctrl-C to all processes; only the parent may report it."""
     assert results[10] == 7
 
 

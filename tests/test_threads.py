@@ -151,8 +151,8 @@ def test_threads_that_overlap_leave_each_other_as_they_were() -> None:
     assert (torch.get_num_threads(), blas()) == (before[0], before[2])
 
 
-def test_who_leaves_last_lifts_the_limit_that_another_set() -> None:
-    """Also where the other lives on, to which threadpoolctl would leave it."""
+def test_the_last_context_lifts_a_limit_set_by_another_thread() -> None:
+    """Two overlapping contexts: the settings are restored when the later one ends, whichever thread made the limit."""
     before = settings()
     entered, left = threading.Event(), threading.Event()
 
@@ -399,7 +399,7 @@ def test_a_team_does_every_job_once_and_in_order(max_threads: int) -> None:
             assert sorted(done) == list(range(size))
 
 
-def test_who_asks_a_team_works_beside_it(many_cores: None) -> None:
+def test_the_calling_thread_works_in_its_team(many_cores: None) -> None:
     together = threading.Barrier(3, timeout=20)
     with one_thread(), Team() as team:
         assert team.n_threads == 3
@@ -408,7 +408,7 @@ def test_who_asks_a_team_works_beside_it(many_cores: None) -> None:
     assert threading.current_thread().name in names
 
 
-def test_a_thread_of_a_team_that_is_not_let_run_delays_nobody() -> None:
+def test_a_blocked_thread_of_a_team_does_not_delay_other_callers() -> None:
     released, held = threading.Event(), threading.Barrier(3, timeout=20)
     ended_jobs: list[int] = []
 

@@ -4,8 +4,8 @@
     python -m training.pretrain --config configs/pretrain.yaml --data DATA
 
 The first command makes the file that the package ships. It scores the metric on held-out families of generated classes
-only, beside the plain descriptors. The second command also scores the metric on a labelled collection, alone and with a
-few labels of the collection.
+and individuals, beside the plain descriptors. The second command also scores it on a labelled collection, alone and
+with a few labels of the collection.
 """
 
 from jsonargparse import auto_cli

@@ -8,6 +8,7 @@ from training.studies.explaining import explaining
 from training.studies.figure_command import pose, potential, topology
 from training.studies.label_surfaces import surfaces
 from training.studies.outlying import outlying
+from training.studies.people import people
 from training.studies.power import power
 from training.studies.robustness import robustness_command
 from training.studies.scales import scales
@@ -17,6 +18,7 @@ COMMANDS: Commands = {
     "damage": damage_command,
     "scales": scales,
     "alike": alike,
+    "people": people,
     "surfaces": surfaces,
     "power": power,
     "explaining": explaining,

@@ -144,8 +144,8 @@ def test_the_interval_covers_the_effect() -> None:
     assert 0.88 < np.mean(covered) < 0.99
 
 
-def test_matched_pairs_tell_nothing_where_there_is_nothing() -> None:
-    """Strata of two leave what mirrors itself: one of a pair must not tell the other, nor chance count half."""
+def test_matched_pairs_without_a_difference_show_no_effect() -> None:
+    """Over 40 draws the mean AUC is near 0.5, the mean effect near 0, and intervals cover 0."""
     random = np.random.default_rng(10)
     pairs, found = [str(i) for i in range(12)] * 2, []
     for draw in range(40):
@@ -160,7 +160,7 @@ def test_matched_pairs_tell_nothing_where_there_is_nothing() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_what_no_permutation_changes_has_a_probability_of_one() -> None:
-    """All bodies but one are the same; or both groups hold the same: rounding decides nothing. Or groups are all."""
+    """If all bodies but one, or both groups, are equal, p = 1; for groups without scatter it is the least, 1 / 200."""
     random = np.random.default_rng(11)
     one, twice = np.outer(np.arange(24) == 3, random.normal(size=5)), np.tile(random.normal(size=(12, 3)), (2, 1))
     for vectors in (one, twice):
@@ -173,7 +173,7 @@ def test_what_no_permutation_changes_has_a_probability_of_one() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_small_groups_have_an_interval() -> None:
-    """In two of five runs all six of a group are drawn as one body at least once, which has no scatter."""
+    """A bootstrap sample may consist of one body drawn six times, which has no scatter."""
     random = np.random.default_rng(6)
     vectors = random.normal(size=(12, 3)) + np.repeat([0, 1], 6)[:, None]
     for seed in range(8):

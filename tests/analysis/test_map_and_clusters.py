@@ -117,7 +117,7 @@ def test_clusters_of_one_cloud_are_told_unstable() -> None:
 
 
 def test_a_body_alone_has_no_stability() -> None:
-    """Whatever halves are drawn, it is together with itself: of chance pairs, too, those drawn alone tell nothing."""
+    """A cluster of one body has stability NaN; under 70 % of chance clusters of two bodies count as stable."""
     points = np.concatenate([blobs(20, [[0, 0, 0]], 0.4), [[50.0, 0, 0]]])
     assert np.isnan(clusters_of(cdist(points, points), 2).stability[1])
     pairs = []

@@ -58,7 +58,7 @@ def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n: int, n_odd: 
 
 @pytest.mark.parametrize(("n_subjects", "n_organs"), [(10, 5), (14, 5), (10, 20)])
 def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(n_subjects: int, n_organs: int) -> None:
-    """Twice as long: as many bodies as one subject has are no tail, of however few subjects."""
+    """All lengths of one subject are doubled; the bodies of one subject must not be taken for a tail."""
     random, n = np.random.default_rng(n_subjects), n_subjects * n_organs
     labels = [f"organ {i % n_organs}" for i in range(n)]
     subjects = np.repeat(np.arange(n_subjects), n_organs)
@@ -122,7 +122,7 @@ def test_of_a_pair_the_odd_one_is_found() -> None:
     assert scores[1] > LIMIT
 
 
-def test_what_one_class_has_is_not_usual_of_others() -> None:
+def test_a_coarse_single_body_is_found_beside_a_class_of_finer_ones() -> None:
     """A third of all bodies is finer; a class of one that is coarse is odd all the same."""
     labels = ["fine"] * 8 + [f"single {i}" for i in range(16)]
     spacing = np.log(np.repeat([1.0, 3.0], [8, 16]))

@@ -109,7 +109,7 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
 def test_single_masks_in_a_folder_for_each_group_are_compared(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They are called by their files, so that a name is no body's; the volumes of the two groups do not overlap."""
+    """Masks named by their files count as one body; volumes of the groups do not overlap, so p is nearly minimal."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     place = np.indices((24, 24, 24)) - 12
     for group, side in (("patients", 6), ("controls", 8)):
@@ -264,7 +264,7 @@ def test_explain_writes_shares_that_add_up(
 def test_explain_tells_how_much_of_the_surface_differs(
     largest: int, told: str, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One of 320 faces has all; or none has, as of a body that lacks what the other has. Both were 0 %."""
+    """One of 320 faces has the whole share, whose area trimesh gives; or no face has a positive share."""
     areas = trimesh.load(root / "long3.off", process=False).area_faces
     told = told.format(f"{100 * areas[-1] / areas.sum():.2g}")
     monkeypatch.setattr("igps.cli.answers.share_density", lambda *_: np.append(np.full(319, -1.0), largest))

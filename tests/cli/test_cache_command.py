@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from igps.cli import main
+from commands import run
 from igps.data.dataset import SignatureDataset
 from own_descriptors import SMALL, write_egg
 
 INTERIOR = "own_descriptors:small_interior"
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, words)])
-    main()
 
 
 @pytest.mark.parametrize("labelled", [True, False])
@@ -35,30 +29,30 @@ def test_the_file_stands_for_the_folder(
     command = ["retrieve", "--json"] if labelled else ["query", tmp_path / "egg.off", "--json"]
     where = [] if labelled else ["--gallery"]
     write_egg(tmp_path / "egg.off", 2.0, subdivisions=2)
-    call(monkeypatch, *command, *where, tmp_path / "eggs", "--descriptor", INTERIOR, *cache, *SMALL)
+    run(monkeypatch, *command, *where, tmp_path / "eggs", "--descriptor", INTERIOR, *cache, *SMALL)
     expected = json.loads(capsys.readouterr().out)
-    call(monkeypatch, "cache", "export", tmp_path / "eggs", "--out", out, "--descriptors", INTERIOR, *cache, *SMALL)
+    run(monkeypatch, "cache", "export", tmp_path / "eggs", "--out", out, "--descriptors", INTERIOR, *cache, *SMALL)
     told = capsys.readouterr().out
     assert f"4 signatures written to {out}\n" in told
     assert ("1 of 5 meshes could not be used. The first: " in told) == (not labelled)
     shutil.rmtree(tmp_path / "eggs")
     shutil.rmtree(tmp_path / "cache")
     if labelled:
-        call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache)
+        run(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache)
         assert json.loads(capsys.readouterr().out) == expected
         for option in (["--mend", "never"], ["--attribute", "ct={file}.nii"]):
             with pytest.raises(SystemExit, match="1"):
-                call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, *option)
+                run(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, *option)
             assert "expected no reading options with a file of signatures" in capsys.readouterr().err
-        call(monkeypatch, "extract", out, "--out", tmp_path / "rows.npz", "--descriptor", INTERIOR, *cache)
+        run(monkeypatch, "extract", out, "--out", tmp_path / "rows.npz", "--descriptor", INTERIOR, *cache)
         names = np.load(tmp_path / "rows.npz")["names"].tolist()
         assert names == ["flat/0.off", "flat/1.off", "long/0.off", "long/1.off"]
         with pytest.raises(SystemExit, match="1"):
-            call(monkeypatch, "explain", out, "--level", 0.5, "--descriptor", INTERIOR, *cache)
+            run(monkeypatch, "explain", out, "--level", 0.5, "--descriptor", INTERIOR, *cache)
         assert "expected meshes, got a file of signatures" in capsys.readouterr().err
     else:
         with pytest.raises(SystemExit, match="1"):
-            call(monkeypatch, "retrieve", out, "--descriptor", INTERIOR, *cache)
+            run(monkeypatch, "retrieve", out, "--descriptor", INTERIOR, *cache)
         assert "expected signatures with classes" in capsys.readouterr().err
 
 
@@ -70,17 +64,17 @@ def test_lists_of_files_may_be_one_file_of_signatures_and_what_needs_meshes_says
             write_egg(tmp_path / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2)
     cache, out = ["--cache_dir", tmp_path / "cache"], tmp_path / "signatures.igps"
     rich, model, small = ["--descriptor", "rich"], tmp_path / "mine.safetensors", SMALL[2:]
-    call(monkeypatch, "cache", "export", tmp_path / "eggs", "--out", out, "--descriptors", "rich", *cache, *small)
-    call(monkeypatch, "extract", tmp_path / "eggs", *rich, "--out", tmp_path / "folder.csv", *cache, *small)
-    call(monkeypatch, "fit", out, *rich, "--head", "classifier", "--out", model, *cache)
+    run(monkeypatch, "cache", "export", tmp_path / "eggs", "--out", out, "--descriptors", "rich", *cache, *small)
+    run(monkeypatch, "extract", tmp_path / "eggs", *rich, "--out", tmp_path / "folder.csv", *cache, *small)
+    run(monkeypatch, "fit", out, *rich, "--head", "classifier", "--out", model, *cache)
     capsys.readouterr()
-    call(monkeypatch, "classify", tmp_path / "eggs", "--model", model, *cache, *small, "--json")
+    run(monkeypatch, "classify", tmp_path / "eggs", "--model", model, *cache, *small, "--json")
     expected = json.loads(capsys.readouterr().out)
     shutil.rmtree(tmp_path / "eggs")
-    call(monkeypatch, "extract", out, *rich, "--out", tmp_path / "file.csv", *cache)
+    run(monkeypatch, "extract", out, *rich, "--out", tmp_path / "file.csv", *cache)
     assert (tmp_path / "file.csv").read_text() == (tmp_path / "folder.csv").read_text()
     capsys.readouterr()
-    call(monkeypatch, "classify", out, "--model", model, *cache, "--json")
+    run(monkeypatch, "classify", out, "--model", model, *cache, "--json")
     assert json.loads(capsys.readouterr().out) == expected
     for command, message in (
         (["outliers", out, *rich, *cache], "expected meshes, got a file of signatures"),
@@ -89,7 +83,7 @@ def test_lists_of_files_may_be_one_file_of_signatures_and_what_needs_meshes_says
         (["doctor", out], "expected a folder, got a file"),
     ):
         with pytest.raises(SystemExit, match="1"):
-            call(monkeypatch, *command)
+            run(monkeypatch, *command)
         assert message in capsys.readouterr().err
 
 
@@ -97,7 +91,7 @@ def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_egg(tmp_path / "eggs" / "0.off", 2.0, subdivisions=2)
-    call(monkeypatch, "precompute", tmp_path / "eggs", "--with", "potential", "--cache_dir", tmp_path, "--n_workers", 1)
+    run(monkeypatch, "precompute", tmp_path / "eggs", "--with", "potential", "--cache_dir", tmp_path, "--n_workers", 1)
     dataset = SignatureDataset(tmp_path / "eggs", cache_dir=tmp_path, descriptor="pretrained+potential")
     assert None not in dataset.cached_keys()
 
@@ -112,5 +106,5 @@ def test_a_mesh_in_place_of_a_folder_is_told_as_such(
         ["query", tmp_path / "egg.off", "--gallery", tmp_path / "egg.off"],
     ):
         with pytest.raises(SystemExit, match="1"):
-            call(monkeypatch, *command, "--cache_dir", tmp_path / "cache")
+            run(monkeypatch, *command, "--cache_dir", tmp_path / "cache")
         assert capsys.readouterr().err == f"igps: {tmp_path / 'egg.off'}: expected a folder, got a file.\n"

@@ -17,8 +17,8 @@ import torch
 import trimesh
 from safetensors import safe_open
 
+from commands import run
 from igps import cli
-from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.d2 import D2
@@ -45,16 +45,11 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "meshes"
 
 
-def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
-    main()
-
-
 def test_retrieve_prints_and_writes_what_python_computes(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    igps(
+    run(
         monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--out", out, "--cache_dir", tmp_path / "cache", *SMALL
     )
     printed = capsys.readouterr().out
@@ -99,7 +94,7 @@ def test_results_are_written_though_nobody_reads_what_is_printed(
 
     monkeypatch.setattr("igps.cli.retrieval.print", gone, raising=False)
     with pytest.raises(SystemExit):
-        igps(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", tmp_path / "out", *SMALL)
+        run(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", tmp_path / "out", *SMALL)
     assert (tmp_path / "out" / "scores.json").exists()
 
 
@@ -108,7 +103,7 @@ def test_retrieve_reranks_in_a_table_of_its_own(
 ) -> None:
     options = ("--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL)
     for name, further in (("plain", ()), ("both", ("--rerank",))):
-        igps(monkeypatch, "retrieve", root, "--out", tmp_path / name, *options, *further)
+        run(monkeypatch, "retrieve", root, "--out", tmp_path / name, *options, *further)
     printed = capsys.readouterr().out
     assert printed.count("re-ranked by the whole collection") == 1
     plain, both = (json.loads((tmp_path / name / "scores.json").read_text()) for name in ("plain", "both"))
@@ -134,7 +129,7 @@ def test_gps_is_another_descriptor_on_the_same_cache(
             tmp_path / "cache",
             *SMALL,
         ]
-        igps(monkeypatch, "retrieve", root, *arguments)
+        run(monkeypatch, "retrieve", root, *arguments)
     interior, gps = (json.loads((tmp_path / name / "scores.json").read_text()) for name in ("interior", "gps"))
     assert interior["config"].pop("descriptor") == INTERIOR
     assert gps["config"].pop("descriptor") == "own_descriptors:small_gps"
@@ -148,19 +143,19 @@ def test_gps_is_another_descriptor_on_the_same_cache(
 def test_a_second_run_describes_nothing_and_leaves_the_same_table(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def run(name: str) -> dict[str, bytes]:
+    def retrieved(name: str) -> dict[str, bytes]:
         arguments = ["--descriptor", "d2", "--out", tmp_path / name, "--cache_dir", tmp_path / "cache", *SMALL]
-        igps(monkeypatch, "retrieve", root, *arguments)
+        run(monkeypatch, "retrieve", root, *arguments)
         return {path.name: path.read_bytes() for path in (tmp_path / name).glob("*.[cj]s*")}
 
-    first = run("first")
+    first = retrieved("first")
     assert {"scores.json", "ranking.csv"} <= first.keys()
 
     def described(job: object) -> None:
         raise AssertionError("described again")
 
     monkeypatch.setattr("igps.nn.description.describe_timed", described)
-    assert run("second") == first
+    assert retrieved("second") == first
 
 
 def test_only_the_eigenpairs_that_are_needed_are_computed(
@@ -171,9 +166,9 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(
         path.unlink()
     options = [option for option in SMALL if option not in ("--signature.n_eigenpairs", "20")]
 
-    def run(cache: str, *more: str) -> tuple[int, np.ndarray]:
+    def retrieved(cache: str, *more: str) -> tuple[int, np.ndarray]:
         out = tmp_path / "out"
-        igps(monkeypatch, "retrieve", root, "--out", out, "--cache_dir", tmp_path / cache, *options, *more)
+        run(monkeypatch, "retrieve", root, "--out", out, "--cache_dir", tmp_path / cache, *options, *more)
         with np.load(out / "distances.npz") as archive:
             return json.loads((out / "scores.json").read_text())["config"]["n_eigenpairs"], archive["distances"]
 
@@ -184,17 +179,17 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(
                 found.add(len(opened.get_tensor("eigenvalues")))
         return found
 
-    n_eigenpairs, few = run("cache", "--descriptor", "shape_dna")
+    n_eigenpairs, few = retrieved("cache", "--descriptor", "shape_dna")
     assert n_eigenpairs == 64
     assert computed("cache") == {64}
-    run("cache", "--descriptor", "interior")
+    retrieved("cache", "--descriptor", "interior")
     assert computed("cache") == {64, 250}
-    run("of interior", "--descriptor", "interior")
-    n_eigenpairs, same = run("of interior", "--descriptor", "shape_dna")
+    retrieved("of interior", "--descriptor", "interior")
+    n_eigenpairs, same = retrieved("of interior", "--descriptor", "shape_dna")
     assert n_eigenpairs == 64
     assert computed("of interior") == {250}
     np.testing.assert_allclose(same, few, atol=1e-6)
-    run("explicit", "--descriptor", "shape_dna", "--signature.n_eigenpairs", "70")
+    retrieved("explicit", "--descriptor", "shape_dna", "--signature.n_eigenpairs", "70")
     assert computed("explicit") == {70}
 
 
@@ -213,7 +208,7 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
         tmp_path / "out",
         *SMALL,
     ]
-    igps(monkeypatch, *arguments)
+    run(monkeypatch, *arguments)
     assert "1 of 7 meshes could not be used" in capsys.readouterr().out
     (row,) = csv.DictReader((tmp_path / "out" / "failures.csv").open(newline=""))
     assert row["name"] == "egg/bad.off"
@@ -222,21 +217,21 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
     assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [6, 7, 6, 1]
 
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, *arguments, "--strict")
+        run(monkeypatch, *arguments, "--strict")
     error = capsys.readouterr().err
     assert "bad.off" in error
     assert "Traceback" not in error
 
     (root / "egg" / "bad.off").unlink()
-    igps(monkeypatch, *arguments)
+    run(monkeypatch, *arguments)
     assert not (tmp_path / "out" / "failures.csv").exists()
 
 
 def test_extract_files_and_folder(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = [root / "egg" / "1.off", root / "ball" / "0.off"]
     common = ["--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL]
-    igps(monkeypatch, "extract", *files, "--out", tmp_path / "two.npz", *common)
-    igps(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *common)
+    run(monkeypatch, "extract", *files, "--out", tmp_path / "two.npz", *common)
+    run(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *common)
     with np.load(tmp_path / "two.npz") as two, np.load(tmp_path / "deep" / "all.npz") as everything:
         assert two["names"].tolist() == [str(f) for f in files]
         assert two["features"].shape == (2, 10, 64)
@@ -250,8 +245,8 @@ def test_extract_short_vectors(
 ) -> None:
     """Of `pretrained`, of which a database takes no more than 256 numbers; a histogram has none."""
     common = ["extract", root / "egg", "--cache_dir", tmp_path / "cache", "--n_workers", "1"]
-    igps(monkeypatch, *common, "--out", tmp_path / "long.npz")
-    igps(monkeypatch, *common, "--short", "--out", tmp_path / "short.npz")
+    run(monkeypatch, *common, "--out", tmp_path / "long.npz")
+    run(monkeypatch, *common, "--short", "--out", tmp_path / "short.npz")
     with np.load(tmp_path / "long.npz") as long, np.load(tmp_path / "short.npz") as short:
         assert long["features"].shape[1] > 256 >= short["features"].shape[1]
         np.testing.assert_allclose(np.linalg.norm(short["features"], axis=1), 1, atol=1e-5)
@@ -260,7 +255,7 @@ def test_extract_short_vectors(
         expected = module.shorten(torch.from_numpy(long["features"])).numpy()
         np.testing.assert_allclose(short["features"], expected, atol=1e-6)
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, *common, "--short", "--descriptor", INTERIOR, "--out", tmp_path / "none.npz")
+        run(monkeypatch, *common, "--short", "--descriptor", INTERIOR, "--out", tmp_path / "none.npz")
     assert "short: expected a descriptor of vectors, such as pretrained" in capsys.readouterr().err
     assert not (tmp_path / "none.npz").exists()
 
@@ -270,7 +265,7 @@ def test_query_lists_the_nearest(
 ) -> None:
     wanted = tmp_path / "wanted.off"
     wanted.write_bytes((root / "egg" / "1.off").read_bytes())
-    igps(
+    run(
         monkeypatch,
         "query",
         wanted,
@@ -300,9 +295,9 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, cache = tmp_path / "signatures.igps", ["--cache_dir", tmp_path / "cache"]
-    igps(monkeypatch, "cache", "export", root, "--out", file, "--descriptors", INTERIOR, *cache, *SMALL)
+    run(monkeypatch, "cache", "export", root, "--out", file, "--descriptors", INTERIOR, *cache, *SMALL)
     capsys.readouterr()
-    igps(monkeypatch, "query", root / "egg" / "1.off", "--gallery", file, "--descriptor", INTERIOR, "--json", *cache)
+    run(monkeypatch, "query", root / "egg" / "1.off", "--gallery", file, "--descriptor", INTERIOR, "--json", *cache)
     first = json.loads(capsys.readouterr().out)[0]
     assert (first["name"], first["distance"]) == ("egg/1.off", 0)
 
@@ -335,7 +330,7 @@ def test_errors_are_one_line(
     options = [] if "--paper" in arguments else SMALL
     try:
         with pytest.raises(SystemExit, match="1"):
-            igps(monkeypatch, *[a.replace("ROOT", str(root)) for a in arguments], "--cache_dir", tmp_path, *options)
+            run(monkeypatch, *[a.replace("ROOT", str(root)) for a in arguments], "--cache_dir", tmp_path, *options)
     finally:
         logging.disable(logging.NOTSET)
     error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
@@ -355,13 +350,13 @@ def test_too_few_eigenpairs_are_refused_in_the_same_words_as_in_python(
     for command in (["retrieve", root], ["extract", root, "--out", tmp_path / "x.npz"], ["compare", root]):
         chosen = ["--descriptors" if command[0] == "compare" else "--descriptor", "interior"]
         with pytest.raises(SystemExit, match="1"):
-            igps(monkeypatch, *command, *chosen, "--cache_dir", tmp_path / "cache", *SMALL)
+            run(monkeypatch, *command, *chosen, "--cache_dir", tmp_path / "cache", *SMALL)
         assert f"igps: {raised.value}" in capsys.readouterr().err.splitlines()
 
 
 def test_a_compared_descriptor_retrieves(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, options = tmp_path / "out", ["--cache_dir", tmp_path / "cache", *SMALL]
-    igps(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", out, *options)
+    run(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", out, *options)
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     described = describe(dataset, D2(), n_workers=1)
     expected = torch.cdist(described, described, p=1) / 2
@@ -380,7 +375,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
     arguments = ["retrieve", root, "--descriptor", "own_descriptors:picky", "--out", tmp_path / "out"]
     arguments += ["--cache_dir", tmp_path / "cache", *SMALL]
     try:
-        igps(monkeypatch, *arguments)
+        run(monkeypatch, *arguments)
         assert "2 of 7 meshes could not be used" in capsys.readouterr().out
         rows = list(csv.DictReader((tmp_path / "out" / "failures.csv").open(newline="")))
         assert [row["name"] for row in rows] == ["egg/bad.off", "egg/1.off"]
@@ -389,7 +384,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
         assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [5, 7, 5, 2]
         (root / "egg" / "bad.off").unlink()
         with pytest.raises(SystemExit, match="1"):
-            igps(monkeypatch, *arguments, "--strict")
+            run(monkeypatch, *arguments, "--strict")
         assert "too much" in capsys.readouterr().err
     finally:
         logging.disable(logging.NOTSET)
@@ -400,7 +395,7 @@ def test_help_explains_every_option(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     with pytest.raises(SystemExit, match="0"):
-        igps(monkeypatch, command, "--help")
+        run(monkeypatch, command, "--help")
     text = capsys.readouterr().out
     assert "--n_workers" in text
     assert "--workers" not in text
@@ -413,7 +408,7 @@ def test_help_is_in_the_words_that_are_typed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="0"):
-        igps(monkeypatch, "gallery", "build", "--help")
+        run(monkeypatch, "gallery", "build", "--help")
     text = " ".join(capsys.readouterr().out.split())
     assert text.startswith("usage: igps gallery build root --out OUT [options] ")
     for word in ("None", "`", "see ", "type:", "Literal", "null)", "False)"):
@@ -443,7 +438,7 @@ def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, caps
 
     monkeypatch.setattr(cli, "COMMANDS", {"wait": wait})
     with pytest.raises(SystemExit, match="130"):
-        igps(monkeypatch, "wait")
+        run(monkeypatch, "wait")
     assert capsys.readouterr().err == "igps: interrupted. Run again to continue: finished results are kept.\n"
 
 
@@ -456,7 +451,7 @@ def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
 
     monkeypatch.setattr(cli, "COMMANDS", {"ask": ask})
     with pytest.raises(SystemExit, match="2"):
-        igps(monkeypatch, "ask")
+        run(monkeypatch, "ask")
     assert re.fullmatch(r"igps: out of memory \(.*1.00 PiB.*\). Reduce the input, .*\n", capsys.readouterr().err)
 
 
@@ -464,7 +459,7 @@ def test_the_version_is_that_of_the_distribution(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="0"):
-        igps(monkeypatch, "--version")
+        run(monkeypatch, "--version")
     assert capsys.readouterr().out.startswith(f"igps {importlib.metadata.version('interior-gps')}, signatures ")
 
 
@@ -481,12 +476,12 @@ def test_commands_may_be_grouped(monkeypatch: pytest.MonkeyPatch, capsys: pytest
         print(mesh, classes, exact, size)
 
     monkeypatch.setattr(cli, "COMMANDS", {"figure": {"pose": pose, "demo": cli.demo}, "query": cli.query})
-    igps(monkeypatch, "figure", "pose", "a.off", "--classes", "1", "2", "--exact")
-    igps(monkeypatch, "figure", "pose", "a.off", "--size", "3")
+    run(monkeypatch, "figure", "pose", "a.off", "--classes", "1", "2", "--exact")
+    run(monkeypatch, "figure", "pose", "a.off", "--size", "3")
     assert capsys.readouterr().out.splitlines() == ["a.off [1, 2] True 2.0", "a.off None False 3.0"]
     for arguments, words in ((["figure"], ("pose", "demo")), (["figure", "pose"], ("what to draw", "which to show"))):
         with pytest.raises(SystemExit, match="0"):
-            igps(monkeypatch, *arguments, "--help")
+            run(monkeypatch, *arguments, "--help")
         text = capsys.readouterr().out
         assert all(word in text for word in words)
 
@@ -496,13 +491,13 @@ def test_json_is_what_the_table_tells(
 ) -> None:
     options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", *SMALL]
     out = tmp_path / "out"
-    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--out", out, "--json", *options)
+    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--out", out, "--json", *options)
     printed = capsys.readouterr()
     assert json.loads(printed.out) == json.loads((out / "scores.json").read_text())
     assert "ADR self" in printed.err  # the table, where progress goes
 
     wanted = root / "ball" / "1.off"
-    igps(monkeypatch, "query", wanted, "--gallery", root, "--top", "3", "--descriptor", INTERIOR, "--json", *options)
+    run(monkeypatch, "query", wanted, "--gallery", root, "--top", "3", "--descriptor", INTERIOR, "--json", *options)
     rows = json.loads(capsys.readouterr().out)
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     histograms = describe(dataset, small_interior())
@@ -512,10 +507,10 @@ def test_json_is_what_the_table_tells(
     assert [row["distance"] for row in rows] == pytest.approx(distances[order].tolist(), abs=1e-6)
     assert (rows[0]["rank"], rows[0]["class"]) == (1, "ball")
     words = ["query", wanted, "--gallery", root / "ball", "--top", "1", "--descriptor", INTERIOR, "--json", *options]
-    igps(monkeypatch, *words)
+    run(monkeypatch, *words)
     assert json.loads(capsys.readouterr().out)[0]["class"] is None  # the folder tells none
 
-    igps(monkeypatch, "compare", root, "--descriptors", INTERIOR, "--json", *options)
+    run(monkeypatch, "compare", root, "--descriptors", INTERIOR, "--json", *options)
     (row,) = json.loads(capsys.readouterr().out)
     expected = retrieval_scores(chi_square(histograms, histograms), dataset.bodies.labels or ()).mean()
     assert {name: row[name] for name in expected} == pytest.approx(expected)
@@ -528,7 +523,7 @@ def test_json_has_no_numbers_that_json_does_not_know(
     for path in sorted((root / "egg").iterdir())[1:]:
         path.unlink()
     options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", *SMALL]
-    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--json", *options)
+    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--json", *options)
 
     def refuse(name: str) -> None:
         raise AssertionError(name)
@@ -554,7 +549,7 @@ def test_json_of_two_bodies_and_of_copies(
             path.unlink()
     trimesh.load(egg, process=False).apply_scale(2).export(larger)
     options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", "--json"]
-    igps(monkeypatch, "duplicates", root, *options)
+    run(monkeypatch, "duplicates", root, *options)
     found = json.loads(capsys.readouterr().out)
     assert found["groups"] == [["egg/0.off", "egg/1.off"]]
     assert (found["n_files"], found["n_skipped"]) == (3, 0)
@@ -562,7 +557,7 @@ def test_json_of_two_bodies_and_of_copies(
     assert pair["files"] == ["egg/0.off", "egg/1.off"]
     same = {}
     for other in (larger, ball):
-        igps(monkeypatch, "distance", egg, other, *options)
+        run(monkeypatch, "distance", egg, other, *options)
         printed = capsys.readouterr()
         told = json.loads(printed.out)
         assert told["meaning"] in printed.err  # the sentence, where progress goes
@@ -596,7 +591,7 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
 
     def told(place: Path) -> str:
         with pytest.raises(SystemExit, match="1"):
-            igps(monkeypatch, *given, "--out", place)
+            run(monkeypatch, *given, "--out", place)
         return capsys.readouterr().err.splitlines()[-1]
 
     monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
@@ -670,7 +665,7 @@ def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
     monkeypatch.setitem(sys.modules, "umap", None)
     monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, *(places.get(word, word) for word in words))
+        run(monkeypatch, *(places.get(word, word) for word in words))
     assert capsys.readouterr().err.startswith(f"igps: {told.replace('ROOT', str(root))}")
 
 
@@ -679,7 +674,7 @@ def test_a_list_of_failures_is_no_folder(
 ) -> None:
     monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, "precompute", root, "--failures", tmp_path)
+        run(monkeypatch, "precompute", root, "--failures", tmp_path)
     assert capsys.readouterr().err == f"igps: failures: expected a file, {tmp_path} is a folder. Choose another path.\n"
 
 
@@ -688,7 +683,7 @@ def test_completion_knows_commands_and_options(
     shell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The shell itself reads the script, and completes by it."""
-    igps(monkeypatch, "completion", shell)
+    run(monkeypatch, "completion", shell)
     script = capsys.readouterr().out
     assert all(word in script for word in ("retrieve", "doctor", "--mend", "--cache_dir"))
     program = shutil.which(shell)

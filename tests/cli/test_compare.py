@@ -5,15 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import logging
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from commands import run
 from igps.analysis.comparison import compare
-from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
 from igps.shapes import ArticulatedShapes
@@ -35,18 +34,13 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "meshes"
 
 
-def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
-    main()
-
-
 def test_command_prints_and_writes_what_python_computes(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     words = ["shape_dna", "d2", "own_descriptors:small_interior"]
     cache = ["--cache_dir", root.parent / "cache"]
-    igps(monkeypatch, "compare", root, "--descriptors", *words, "--out", out, *cache, *SMALL)
+    run(monkeypatch, "compare", root, "--descriptors", *words, "--out", out, *cache, *SMALL)
     printed = capsys.readouterr().out.splitlines()
 
     chosen = [descriptor("shape_dna"), descriptor("d2"), small_interior()]
@@ -77,7 +71,7 @@ def test_the_papers_the_learned_and_the_compared_run_side_by_side(
     options = ["--signature.resolution", "12", "--signature.n_surface_samples", "100", "--n_workers", "1"]
     options += ["--signature.min_samples", "100", "--cache_dir", tmp_path / "cache", "--out", tmp_path / "out"]
     names = ["interior", "rich", "pretrained", "d2"]
-    igps(monkeypatch, "compare", tmp_path / "meshes", "--descriptors", *names, *options)
+    run(monkeypatch, "compare", tmp_path / "meshes", "--descriptors", *names, *options)
     printed = capsys.readouterr().out
     rows = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert [row["descriptor"] for row in rows] == names
@@ -104,7 +98,7 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
     arguments = ["compare", root, "--out", tmp_path, "--cache_dir", root.parent / "cache", *SMALL, "--descriptors"]
     chosen = ["own_descriptors:picky", "own_descriptors:broken"]
     try:
-        igps(monkeypatch, *arguments, *chosen)
+        run(monkeypatch, *arguments, *chosen)
         rows = list(csv.reader((tmp_path / "failures.csv").open(newline="")))
         assert rows[0] == ["descriptor", "name", "error"]
         assert [row[:2] for row in rows[1:]] == [["all", "egg/bad.off"], ["picky", "egg/1.off"]]
@@ -117,10 +111,10 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
 
         bad.unlink()
         with pytest.raises(SystemExit, match="1"):
-            igps(monkeypatch, *arguments, *chosen, "--strict")
+            run(monkeypatch, *arguments, *chosen, "--strict")
         assert "igps: picky: " in capsys.readouterr().err
 
-        igps(monkeypatch, *arguments, "own_descriptors:Height")
+        run(monkeypatch, *arguments, "own_descriptors:Height")
         assert not (tmp_path / "failures.csv").exists()
     finally:
         logging.disable(logging.NOTSET)
@@ -131,7 +125,7 @@ def test_unknown_descriptor_is_named_before_anything_is_computed(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, "compare", root, "--descriptors", "d2", "d5", "--cache_dir", tmp_path / "cache")
+        run(monkeypatch, "compare", root, "--descriptors", "d2", "d5", "--cache_dir", tmp_path / "cache")
     error = capsys.readouterr().err
     assert f"expected one of {', '.join(NAMES)}, molecular, or package.module:NAME" in error
     assert "got 'd5'" in error

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
-import sys
 from pathlib import Path
 
 import pytest
 
+from commands import run
 from damaged_files import (
     N_FACES,
     N_VERTICES,
@@ -18,14 +18,8 @@ from damaged_files import (
     write_soup,
     write_unusable,
 )
-from igps.cli import main
 
 FEW = ["--signature.n_eigenpairs", "20", "--n_workers", "1"]
-
-
-def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
-    main()
 
 
 def test_table_and_file_of_a_folder_that_can_be_used(
@@ -35,7 +29,7 @@ def test_table_and_file_of_a_folder_that_can_be_used(
     write_clean(root / "a" / "clean.off")
     write_soup(root / "a" / "soup.off")
     write_box(root / "b" / "box.off")
-    igps(monkeypatch, "doctor", root, "--out", out, *FEW)  # no status: nothing is raised
+    run(monkeypatch, "doctor", root, "--out", out, *FEW)  # no status: nothing is raised
     header, *lines, total, written = capsys.readouterr().out.splitlines()
     assert header.split() == ["vertices", "after", "seconds", "MB", "steps"]
     cells = {line.split()[0]: line.split()[1:] for line in lines}
@@ -67,7 +61,7 @@ def test_status_is_1_if_a_file_cannot_be_used(
     write_clean(root / "clean.off")
     sentences = write_unusable(root)
     with pytest.raises(SystemExit) as stopped:
-        igps(monkeypatch, "doctor", root, "--out", out, *FEW)
+        run(monkeypatch, "doctor", root, "--out", out, *FEW)
     assert stopped.value.code == 1
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
@@ -88,9 +82,9 @@ def test_options_choose_the_mending(
 ) -> None:
     write_holed(tmp_path / "holed.off")
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, "doctor", tmp_path, "--mend", "never", *FEW)
+        run(monkeypatch, "doctor", tmp_path, "--mend", "never", *FEW)
     assert "cannot be used" in capsys.readouterr().out
-    igps(monkeypatch, "doctor", tmp_path, "--mend", "always", *FEW)
+    run(monkeypatch, "doctor", tmp_path, "--mend", "always", *FEW)
     assert capsys.readouterr().out.splitlines()[1].split()[-1] == "watertight"
 
 
@@ -98,7 +92,7 @@ def test_a_folder_without_meshes_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, "doctor", tmp_path, *FEW)
+        run(monkeypatch, "doctor", tmp_path, *FEW)
     assert f"igps: {tmp_path}: no mesh found" in capsys.readouterr().err
 
 
@@ -107,5 +101,5 @@ def test_files_that_bodies_bring_along_are_not_examined(
 ) -> None:
     write_clean(tmp_path / "a" / "clean.off")
     write_clean(tmp_path / "a" / "clean_fields.off")
-    igps(monkeypatch, "doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)
+    run(monkeypatch, "doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)
     assert capsys.readouterr().out.splitlines()[-1].startswith("1 bodies: 0 repaired, 0 cannot be used")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import logging
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from commands import run
 from damaged_files import (
     N_FACES,
     N_VERTICES,
@@ -21,7 +21,7 @@ from damaged_files import (
     write_soup,
     write_unusable,
 )
-from igps.cli import COMMANDS, main
+from igps.cli import COMMANDS
 from own_descriptors import SMALL
 
 ONE = ["--descriptor", "own_descriptors:small_interior", *SMALL]
@@ -45,11 +45,6 @@ WELDED = f"welded {3 * N_FACES - N_VERTICES} coincident vertices"
 SUMMARY = "5 of 8 meshes were repaired: 2 welded, 2 subdivided, 1 filled"
 
 
-def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
-    main()
-
-
 def notes(path: Path) -> list[tuple[str, str]]:
     return [(row["name"], row["note"]) for row in csv.DictReader(path.open(newline=""))]
 
@@ -69,7 +64,7 @@ def test_retrieve_says_what_was_mended_from_the_cache_too(
 ) -> None:
     out = tmp_path / "out"
     for _ in range(2):
-        igps(monkeypatch, "retrieve", root, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
+        run(monkeypatch, "retrieve", root, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
         assert capsys.readouterr().out.splitlines()[0] == SUMMARY
         check_notes(out / "notes.csv")
         (out / "notes.csv").unlink()
@@ -79,7 +74,7 @@ def test_retrieve_says_what_was_mended_from_the_cache_too(
     for label, height in (("ball", 1.0), ("egg", 2.0)):
         for i in range(2):
             write_clean(clean / label / f"{i}.off", 1 + 0.1 * i, height)
-    igps(monkeypatch, "retrieve", clean, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
+    run(monkeypatch, "retrieve", clean, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
     assert "repaired" not in capsys.readouterr().out
     assert not (out / "notes.csv").exists()
 
@@ -88,10 +83,10 @@ def test_extract_and_compare_write_the_same_notes(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cache = ["--cache_dir", tmp_path / "cache"]
-    igps(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *cache, *ONE)
+    run(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *cache, *ONE)
     assert capsys.readouterr().out.splitlines()[0] == SUMMARY
     check_notes(tmp_path / "deep" / "all.notes.csv")
-    igps(monkeypatch, "compare", root, "--descriptors", "d2", "--out", tmp_path / "out", *cache, *SMALL)
+    run(monkeypatch, "compare", root, "--descriptors", "d2", "--out", tmp_path / "out", *cache, *SMALL)
     assert SUMMARY in capsys.readouterr().out.splitlines()
     check_notes(tmp_path / "out" / "notes.csv")
 
@@ -102,7 +97,7 @@ def test_never_and_always(
     logging.disable(logging.WARNING)
     out = ["--out", tmp_path / "out", "--cache_dir", tmp_path / "cache"]
     try:
-        igps(monkeypatch, "retrieve", root, "--mend", "never", *out, *ONE)
+        run(monkeypatch, "retrieve", root, "--mend", "never", *out, *ONE)
         printed = capsys.readouterr().out
         assert "5 of 8 meshes could not be used." in printed
         assert "repaired" not in printed
@@ -113,7 +108,7 @@ def test_never_and_always(
         assert all(error.startswith(str(root)) for error in refused.values())
     finally:
         logging.disable(logging.NOTSET)
-    igps(monkeypatch, "retrieve", root, "--mend", "always", *out, *ONE)
+    run(monkeypatch, "retrieve", root, "--mend", "always", *out, *ONE)
     # What bounds a body without crossing itself is watertight.
     summary = "5 of 8 meshes were repaired: 2 welded, 2 subdivided, 1 made watertight"
     assert capsys.readouterr().out.splitlines()[0] == summary
@@ -125,7 +120,7 @@ def test_an_unknown_way_to_mend_is_refused_by_the_command(
     root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
-        igps(monkeypatch, "retrieve", root, "--mend", "perhaps", *ONE)
+        run(monkeypatch, "retrieve", root, "--mend", "perhaps", *ONE)
     error = capsys.readouterr().err
     assert "mend" in error
     assert all(word in error for word in ("auto", "never", "always"))
@@ -148,7 +143,7 @@ def test_every_command_that_reads_meshes_has_the_choice(
     command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="0"):
-        igps(monkeypatch, *command, "--help")
+        run(monkeypatch, *command, "--help")
     text = capsys.readouterr().out
     assert "--mend {auto,never,always}" in text
     assert '"auto" makes as few repairs as possible' in " ".join(text.split())
@@ -167,7 +162,7 @@ def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
 
     def features(place: Path) -> tuple[list[str], np.ndarray]:
         target = place if command == "retrieve" else place / "all.npz"
-        igps(monkeypatch, command, root, "--out", target, "--cache_dir", place / "cache", *ONE)
+        run(monkeypatch, command, root, "--out", target, "--cache_dir", place / "cache", *ONE)
         with np.load(place / ("distances.npz" if command == "retrieve" else "all.npz")) as archive:
             return archive["names"].tolist(), archive["distances" if command == "retrieve" else "features"]
 

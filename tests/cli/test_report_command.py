@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from commands import run
 from igps.analysis.explanation import explain
-from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.report.explanations import read_explanations
 from igps.report.page import render_page
@@ -33,11 +32,6 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "meshes"
 
 
-def igps(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, words)])
-    main()
-
-
 def data_of(page: Path) -> dict:  # type: ignore[type-arg]
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text("utf-8"))
     assert found is not None
@@ -51,7 +45,7 @@ def options(out: Path, *more: object) -> list[object]:
 @pytest.fixture
 def retrieved(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Results without a page."""
-    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(tmp_path / "out"))
+    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(tmp_path / "out"))
     return tmp_path / "out"
 
 
@@ -59,7 +53,7 @@ def test_retrieve_with_its_page(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(out, "--report"))
+    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(out, "--report"))
     assert capsys.readouterr().out.splitlines()[-1] == f"page of results: {out / 'report.html'}"
     data = data_of(out / "report.html")
     assert [shape["name"] for shape in data["shapes"]] == ["ball/0.off", "ball/1.off", "egg/0.off", "egg/1.off"]
@@ -81,7 +75,7 @@ def test_a_page_afterwards_wherever_the_meshes_are(
     moved = root.rename(tmp_path / "moved")
 
     def n_pictures(*more: object) -> int:
-        igps(monkeypatch, "report", out, "--out", page, "--n_workers", "1", *more)
+        run(monkeypatch, "report", out, "--out", page, "--n_workers", "1", *more)
         return sum("surface" in shape for shape in data_of(page)["shapes"])
 
     assert n_pictures() == 0
@@ -95,7 +89,7 @@ def test_a_page_afterwards_wherever_the_meshes_are(
 
 def test_compare_has_a_page(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     descriptors = ["--descriptors", INTERIOR, "own_descriptors:small_gps"]
-    igps(monkeypatch, "compare", root, *descriptors, *options(tmp_path / "compare", "--report"))
+    run(monkeypatch, "compare", root, *descriptors, *options(tmp_path / "compare", "--report"))
     data = data_of(tmp_path / "compare" / "report.html")
     rows = json.loads((tmp_path / "compare" / "compare.json").read_text())
     assert [system["name"] for system in data["systems"]] == [row["descriptor"] for row in rows]
@@ -109,11 +103,11 @@ def test_what_is_missing_is_told_before_anything_is_computed(
     cache = ["--cache_dir", tmp_path / "cache"]
     for command in ("retrieve", "compare"):
         with pytest.raises(SystemExit, match="1"):
-            igps(monkeypatch, command, root, "--report", *cache)
+            run(monkeypatch, command, root, "--report", *cache)
         assert "expected --out" in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, "report", tmp_path)
+        run(monkeypatch, "report", tmp_path)
     assert "no results found" in capsys.readouterr().err
 
 
@@ -123,7 +117,7 @@ def test_sources_of_another_kind_are_refused(
     for wrong in ('{"format": "other"}', '{"format": "igps-meshes-1"}', "[]", "no JSON"):
         (retrieved / "meshes.json").write_text(wrong)
         with pytest.raises(SystemExit, match="1"):
-            igps(monkeypatch, "report", retrieved)
+            run(monkeypatch, "report", retrieved)
         assert "meshes.json: expected the format igps-meshes-1" in capsys.readouterr().err
 
 
@@ -132,7 +126,7 @@ def test_a_page_with_the_difference_of_each_body_from_its_nearest(
 ) -> None:
     """The values are those of the samples around each vertex, by a loop."""
     out = retrieved
-    igps(monkeypatch, "report", out, "--explain", "--n_workers", "1")
+    run(monkeypatch, "report", out, "--explain", "--n_workers", "1")
     surfaces = read_surfaces(out / "surfaces.npz")
     kept = read_explanations(out / "explanations.npz", surfaces)
     names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(2)]
@@ -155,7 +149,7 @@ def test_a_page_with_the_difference_of_each_body_from_its_nearest(
     assert np.corrcoef(np.sort(painted), np.sort(expected))[0, 1] > 0.99  # the picture has another order
     shapes = data_of(out / "report.html")["shapes"]
     assert [one["explained"]["other"] for one in shapes] == [1, 0, 3, 2]
-    igps(monkeypatch, "report", out, "--n_workers", "1")
+    run(monkeypatch, "report", out, "--n_workers", "1")
     assert data_of(out / "report.html")["shapes"] == shapes
     fewer = {name: one for name, one in surfaces.items() if name != names[0]}
     assert list(read_explanations(out / "explanations.npz", fewer)) == names[2:]
@@ -165,9 +159,9 @@ def test_only_one_descriptor_is_explained(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    igps(monkeypatch, "compare", root, "--descriptors", INTERIOR, "d2", *options(out))
+    run(monkeypatch, "compare", root, "--descriptors", INTERIOR, "d2", *options(out))
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, "report", out, "--explain", "--n_workers", "1")
+        run(monkeypatch, "report", out, "--explain", "--n_workers", "1")
     assert "explain: expected a folder that `igps retrieve` wrote" in capsys.readouterr().err
 
 
@@ -175,7 +169,7 @@ def test_columns_of_the_labels_reach_the_page(root: Path, tmp_path: Path, monkey
     names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(2)]
     rows = [f"{name},{name[:3]},{i}" for i, name in enumerate(names)]
     (root / "labels.csv").write_text("\n".join(["file,label,age", *rows]))
-    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(tmp_path / "out", "--report"))
+    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(tmp_path / "out", "--report"))
     assert data_of(tmp_path / "out" / "report.html")["columns"] == {"age": ["0", "1", "2", "3"]}
 
 
@@ -189,8 +183,8 @@ def test_bodies_named_by_a_table_elsewhere_have_pictures(tmp_path: Path, monkeyp
     (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
     monkeypatch.chdir(tmp_path)
     words = ["--classes", "body", "--names", "names.json", "--size", "ignore"]
-    igps(monkeypatch, "retrieve", "scans", "--descriptor", INTERIOR, *words, *options(tmp_path / "out"))
+    run(monkeypatch, "retrieve", "scans", "--descriptor", INTERIOR, *words, *options(tmp_path / "out"))
     monkeypatch.chdir("/")
-    igps(monkeypatch, "report", tmp_path / "out", "--n_workers", 1)
+    run(monkeypatch, "report", tmp_path / "out", "--n_workers", 1)
     names = {f"{subject}.nii.gz#{body}" for subject in range(2) for body in ("block", "bar")}
     assert set(read_surfaces(tmp_path / "out" / "surfaces.npz")) == names

@@ -128,8 +128,8 @@ def test_axes_of_a_map_in_another_order_are_put_right(body: BodyRef) -> None:
 
 
 @pytest.mark.parametrize("told", ["origin", "start", "both"])
-def test_the_place_of_a_map_may_be_said_twice(told: str, body: BodyRef) -> None:
-    """The origin alone counts then, as in Chimera, EMAN and IMP; the sum of both lies twice as far away."""
+def test_a_map_is_placed_by_its_origin_or_else_by_its_start(told: str, body: BodyRef) -> None:
+    """If both are given, only the origin counts, as in Chimera, EMAN and IMP. The oracle is a linear function."""
     mrcfile = pytest.importorskip("mrcfile")
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
     start = np.array([-10, -12, -8])
@@ -284,7 +284,7 @@ def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(bodies:
 
 
 def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:
-    """Two on it and one outside: in the wall their means over all directions, by inverse distance, far sides less."""
+    """2 on the cavity, 1 outside; in the wall, mean values by an integral over directions, weighted by 1 / distance."""
     ball, pit = trimesh.creation.icosphere(subdivisions=4), trimesh.creation.icosphere(subdivisions=4, radius=0.5)
     pit.invert()
     hollow = trimesh.util.concatenate([ball, pit])
@@ -671,8 +671,8 @@ def helped(body: BodyRef, points: np.ndarray) -> np.ndarray:
     return Shift()(points[:, 0])
 
 
-def test_what_a_function_calls_and_what_that_uses_tell_it_from_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another helper gave the values of before, from the cache; so did a constant in a comprehension."""
+def test_the_cache_tag_depends_on_helpers_and_the_globals_they_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another constant, helper or class gives another tag; the original ones give the first tag again."""
 
     def tag() -> str:
         return FunctionAttribute(helped).cache_tag(None)
@@ -730,7 +730,7 @@ def test_functions_in_one_line_are_told_apart(tmp_path: Path) -> None:
         np.testing.assert_allclose(samples.attributes["along"], samples.points[:, axis], atol=1e-5)
 
 
-def test_what_a_function_is_given_by_default_tells_it_from_others_of_the_same_code(tmp_path: Path) -> None:
+def test_default_arguments_are_part_of_the_cache_key(tmp_path: Path) -> None:
     """Such as functions that are made in a loop."""
     write_body(tmp_path / "a.off", 0.8, 0.9)
     for axis in range(3):

@@ -27,7 +27,7 @@ def dataset(tmp_path: Path) -> SignatureDataset:
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The time at which names and rights changed cannot be set: let a moment be long ago."""
+    """Trust recent files, too, because tests cannot set the time of the last change of a file's metadata (ctime)."""
     monkeypatch.setattr("igps.data.file_stat_cache.MIN_AGE", 0)
 
 
@@ -58,7 +58,7 @@ def test_files_that_did_not_change_are_not_read_again(dataset: SignatureDataset,
     assert dataset.all_notes() == [dataset.notes(i) for i in range(3)]
 
 
-def test_a_file_that_changed_is(dataset: SignatureDataset, read: list[str], tmp_path: Path) -> None:
+def test_a_changed_file_is_read_again(dataset: SignatureDataset, read: list[str], tmp_path: Path) -> None:
     """Even to another of the same size, with the old time given back to it."""
     dataset.precompute(n_workers=1, progress=False)
     first, second = (tmp_path / "meshes" / f"{i}.off" for i in range(2))

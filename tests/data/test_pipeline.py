@@ -99,10 +99,8 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
     assert len(set(keys)) == len(keys)
 
 
-def test_packed_lines_of_atoms_may_be_two_formats_with_radii_of_their_own(
-    pipeline: SignaturePipeline, tmp_path: Path
-) -> None:
-    """Without elements a line of PDB is one of PQR, too: its occupancy a charge, and its B-factor a radius."""
+def test_the_key_tells_pdb_from_pqr_also_when_compressed(pipeline: SignaturePipeline, tmp_path: Path) -> None:
+    """A PDB line without an element is valid PQR, with its occupancy as charge and its B-factor as radius."""
     line = b"ATOM      1  CA  ALA A   1      11.104   6.134  -6.504  1.00  4.00\n"
     names = [f"a.{kind}{packed}" for kind in ("pqr", "pdb", "PQR") for packed in (".gz", "")]
     for name in names:
@@ -144,8 +142,8 @@ def test_a_new_version_of_the_mending_leaves_bodies_that_are_read_as_they_are(
     assert [fill(), fill()] == [1, 0]
 
 
-def test_a_mended_body_of_before_versions_of_the_mending_is_made_again(tmp_path: Path, computed: list[int]) -> None:
-    """Its Signature lies under the key of a body that is read as it is, and its notes tell that it was none."""
+def test_a_mended_body_cached_without_a_mending_version_is_computed_again(tmp_path: Path, computed: list[int]) -> None:
+    """Its entry has the key of a body that needs no mending, but its notes say that it was mended."""
     body = trimesh.creation.icosphere(subdivisions=2)
     path = tmp_path / "open.off"
     trimesh.Trimesh(body.vertices, body.faces[1:], process=False).export(path)

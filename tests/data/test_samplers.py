@@ -19,7 +19,7 @@ def test_every_shape_comes_once_in_batches_of_the_size_asked(drop_last: bool) ->
 
 
 def padding(batches: list[list[int]]) -> float:
-    """Rows that a batch of the longest has more than its shapes, over those of the shapes."""
+    """Padding rows of all batches, over the rows of their shapes."""
     return sum(len(one) * int(SIZES[one].max()) for one in batches) / sum(int(SIZES[one].sum()) for one in batches) - 1
 
 

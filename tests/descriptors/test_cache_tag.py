@@ -75,7 +75,8 @@ def test_the_code_changes_the_words(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(fingerprint, "__file__", str(copied / "descriptors" / "fingerprint.py"))
     fingerprint._code_tag.cache_clear()
     assert words() == before
-    with (copied / "nn" / "histogram.py").open("a") as source:
+    assert (copied / "nn" / "embedding.py").is_file()
+    with (copied / "nn" / "embedding.py").open("a") as source:
         source.write("# one more line\n")
     fingerprint._code_tag.cache_clear()
     assert words() != before

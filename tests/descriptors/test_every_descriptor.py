@@ -149,7 +149,7 @@ def test_half_precision_describes_nearly_the_same(name: str, dtype: torch.dtype)
 def test_tensors_are_made_on_the_device_of_the_bodies(
     name: str, compiled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of the device "meta" are then those that are made without saying where: they have no numbers to go on with."""
+    """With the default device "meta", a tensor that is made without naming a device would have no values."""
     if not compiled:  # as on a GPU
         monkeypatch.setattr(blocks, "uses_loops", lambda _: False)
     found = with_individuals(name)
@@ -180,7 +180,7 @@ class Counting(TorchDispatchMode):
 
 @pytest.mark.parametrize("name", ON_TENSORS)
 def test_a_batch_on_a_device_is_described_at_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With more bodies there are no more operations, and none that waits; each is described as on the CPU."""
+    """The number of operations does not depend on the number of bodies; descriptions equal those of single bodies."""
     found = descriptor(name)
     pair = SignatureBatch.concatenate([fewer_samples(body("rod"), 200), fewer_samples(body("other"), 150)])
     with torch.inference_mode():
@@ -259,7 +259,7 @@ def test_a_bent_body_is_closer_than_another(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "change"), CHANGES)
-def test_descriptions_stay_under_what_the_descriptor_claims(name: str, change: str) -> None:
+def test_descriptions_are_invariant_as_claimed(name: str, change: str) -> None:
     distance = descriptor(name).distances
     changed = float(distance(description(name, "rod"), description(name, change)))
     other = float(distance(description(name, "rod"), description(name, "other")))
@@ -272,7 +272,7 @@ def test_descriptions_stay_under_what_the_descriptor_claims(name: str, change: s
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if "pose" not in descriptor(name).invariant_to])
-def test_who_claims_no_pose_sees_it(name: str) -> None:
+def test_descriptors_not_claimed_pose_invariant_change_with_pose(name: str) -> None:
     distance = descriptor(name).distances
     changed = float(distance(description(name, "rod"), description(name, "pose")))
     scaled = float(distance(description(name, "rod"), description(name, "scale")))

@@ -73,8 +73,8 @@ def test_a_ball_and_a_bumpy_one_are_as_far_apart_as_the_bumps_are_high(amplitude
     assert surface_distance(bumpy(0.0), bumpy(amplitude, seed=5)) == pytest.approx(expected, rel=0.15)
 
 
-def test_what_is_round_in_every_direction_but_for_its_bumps_is_found_in_any_place() -> None:
-    """The principal axes of such a body say nothing of how it is turned."""
+def test_a_rotated_body_with_equal_principal_axes_is_aligned() -> None:
+    """All principal moments are equal, so that the principal axes do not determine the rotation."""
     body = bumpy(0.15)
     again = moved(body, 7, mirror=True, scale=2.0)
     assert surface_distance(body, again) < 0.1 * surface_distance(body, bumpy(0.0, seed=3))
@@ -91,8 +91,8 @@ def rough(amplitude: float, n: int, seed: int) -> tuple[Array, Array]:
     return points, smooth / steepness
 
 
-def test_lost_relief_cancels_where_another_shape_does_not() -> None:
-    """What goes in and out within a patch of ten samples, by a root mean square of amplitude/√2."""
+def test_fine_relief_cancels_but_another_shape_does_not() -> None:
+    """Ripples within a patch of ten samples average out; their root mean square is amplitude/√2."""
     amplitude, area = 0.01, 6.1
     plain, ruffled = (SurfaceSamples.of(*rough(a, 2000, seed), area) for a, seed in ((0.0, 1), (amplitude, 2)))
     high = amplitude / np.sqrt(2) / np.sqrt(area)
@@ -141,8 +141,8 @@ def test_in_place_nothing_is_moved() -> None:
     assert surface_distance(ball, beside) < 1e-4
 
 
-def test_what_lies_beyond_an_edge_is_as_far_as_the_edge() -> None:
-    """Not as far as the plane of either side: there are no gaps in a surface, as there are between samples."""
+def test_distances_beyond_an_edge_are_those_to_the_edge() -> None:
+    """Closed form: 0.05 from points to the nearest edge of a box; the planes of its sides are nearer."""
     box = trimesh.creation.box((1.0, 1.0, 0.1))
     x = np.linspace(-0.4, 0.4, 30)
     points = np.column_stack([x, np.full(30, 0.53), np.full(30, 0.09)])
@@ -168,8 +168,8 @@ def wheel(thinned: float, seed: int) -> SurfaceSamples:
     return SurfaceSamples.of(points[kept], normals[kept], 4.0)
 
 
-def test_axes_that_mislead_are_not_trusted() -> None:
-    """From the axes the bumps fall onto each other, but the high one onto a low one: near, and not the nearest."""
+def test_misleading_principal_axes_do_not_decide_the_alignment() -> None:
+    """The principal axes lead to a local minimum, in which the high bump lies on a low one."""
     one, other = wheel(0.0, 1), wheel(2 * np.pi / 5, 2)
     steps = [samples.extents[1:] / samples.extents[:-1] for samples in (one, other)]
     assert min(map(min, steps)) > 1.1
@@ -177,7 +177,7 @@ def test_axes_that_mislead_are_not_trusted() -> None:
 
 
 def test_thin_sheets_of_other_widths_are_told_apart() -> None:
-    """Every sample of the smaller one lies in the planes of the larger: what lies off to the side must count."""
+    """The planes of both sheets nearly coincide, so that only distances beside the smaller sheet separate them."""
 
     def sheet(length: float, width: float) -> SurfaceSamples:
         n = 40
@@ -189,8 +189,8 @@ def test_thin_sheets_of_other_widths_are_told_apart() -> None:
 
     same = surface_distance(sheet(2.0, 1.0), sheet(4.0, 2.0))
     assert same < 1e-5
-    # Of unit area they reach to 0.5 and 0.61, of which a scale of a tenth leaves 0.53 and 0.58: what lies farther off
-    # than the gap of 0.044 makes √(0.011²/3 · 0.02 / 2) at least, and √(0.068²/3 · 0.11 / 2) without a scale.
+    # At unit area, the sheets end at 0.5 and 0.61, or at 0.53 and 0.58 if scaled by a tenth. Points farther than the
+    # gap of 0.044 then add at least √(0.011²/3 · 0.02 / 2), or √(0.068²/3 · 0.11 / 2) without scaling.
     assert 0.0006 < surface_distance(sheet(2.0, 1.0), sheet(3.0, 1.0)) < 0.009
 
 

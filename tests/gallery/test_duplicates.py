@@ -18,7 +18,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from igps.cli import COMMANDS, main
+from commands import error_of, run
+from igps.cli import COMMANDS
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.descriptors.fingerprint import fingerprint
@@ -93,18 +94,6 @@ def dataset(root: Path, cache: Path) -> SignatureDataset:
 
 def grouped(groups: tuple[tuple[str, ...], ...]) -> set[frozenset[str]]:
     return set(map(frozenset, groups))
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
-    main()
-
-
-def error_of(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    with pytest.raises(SystemExit, match="1"):
-        command(monkeypatch, *arguments)
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
-    return line
 
 
 def test_copies_are_grouped_and_neither_poses_nor_siblings(dataset: SignatureDataset, root: Path) -> None:
@@ -215,7 +204,7 @@ def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path: Path) -> None:
 
 
 def test_each_file_of_a_group_has_one_finer_file_beside_it() -> None:
-    """The nearest that leads a group, before any nearer one that does not; and none joins two groups."""
+    """Worked by hand: a file joins the nearest finer leader, else the nearest finer file; no pair joins two groups."""
     apart = {(0, 1): 0.1, (1, 2): 0.05, (0, 4): 0.2, (3, 4): 0.1, (1, 4): 0.01, (2, 3): 0.3}
 
     class Table:
@@ -252,7 +241,7 @@ def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None
 
 
 def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
-    """Of 128 vertices each, numbered alike: coarseness explains what lies between vertices, not where they are."""
+    """Washers of 128 vertices with holes 0.5 and 1 % larger: coarseness must not excuse displaced vertices."""
     for name, hole in (("one", 0.5), ("half", 0.5025), ("whole", 0.505)):
         trimesh.creation.annulus(hole, 1.0, 0.3, sections=32).export(tmp_path / f"{name}.off")
     mirrored = trimesh.creation.annulus(0.5, 1.0, 0.3, sections=32)
@@ -265,7 +254,7 @@ def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("numbered", ["alike", "otherwise"])
 def test_a_small_hole_that_is_a_little_larger_is_another_surface(tmp_path: Path, numbered: str) -> None:
-    """Larger by 0.5 %: what is farthest is off by what the radius grew by, a small part of the root of the area."""
+    """The hole is larger by 0.5 %; the largest distance is the difference of the radii over √area."""
     one, larger = (trimesh.creation.annulus(hole, 1.0, 0.3, sections=64) for hole in (0.05, 0.05025))
     for name, body in (("one", one), ("copy", one.subdivide()), ("larger", larger)):
         (body.subdivide() if name == "larger" and numbered == "otherwise" else body).export(tmp_path / f"{name}.off")
@@ -339,19 +328,19 @@ def test_the_commands(
     root: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--cache_dir", cache, "--n_workers", 1]
-    command(monkeypatch, "duplicates", root, "--out", tmp_path / "out" / "groups.csv", *options)
+    run(monkeypatch, "duplicates", root, "--out", tmp_path / "out" / "groups.csv", *options)
     lines = capsys.readouterr().out.splitlines()
     assert lines[-3:-1] == ["group 1: bar.obj  bar.off  bar.ply", "group 2: lump.off  lump.stl"]
     assert lines[-1].startswith("5 of 7 files in 2 groups; on generated bodies, this finds ")
     rows = (tmp_path / "out" / "groups.csv").read_text().splitlines()
     assert rows[0] == "group,name,path"
     assert rows[5] == f"2,lump.stl,{root / 'lump.stl'}"
-    command(monkeypatch, "distance", root / "bar.off", root / "bar.ply", *options)
+    run(monkeypatch, "distance", root / "bar.off", root / "bar.ply", *options)
     *_, by_descriptor, by_surfaces, by_lengths = capsys.readouterr().out.splitlines()
     assert float(by_lengths.split()[5]) == pytest.approx(0.2, rel=0.01)
     assert "pairs of different classes" in by_descriptor
     assert ", the same shape (at their level of detail, distances up to " in by_surfaces
-    command(monkeypatch, "distance", root / "bar.off", root / "bent.off", *options)
+    run(monkeypatch, "distance", root / "bar.off", root / "bent.off", *options)
     # Neither has a handle; their vertices are numbered alike
     assert "not the same shape (their handles or vertices differ)" in capsys.readouterr().out
 

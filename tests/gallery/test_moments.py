@@ -72,8 +72,8 @@ def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing() -> None:
 
 @pytest.mark.parametrize("bumps", [0.0, 0.1])
 @pytest.mark.parametrize("stretch", [(1.0, 1.0, 1.0), (1.0, 1.0, 0.4), (3.0, 0.5, 0.5), (3.0, 0.8, 0.5)])
-def test_no_move_is_told_to_be_farther_than_it_is(stretch: tuple[float, float, float], bumps: float) -> None:
-    """Outward moves by polynomials of what is round, long, flat, symmetric and not; some of them are told nearly."""
+def test_the_lower_bound_does_not_exceed_the_displacement(stretch: tuple[float, float, float], bumps: float) -> None:
+    """Normal displacements by polynomials, scaled to a known root mean square; bodies with and without symmetry."""
     body = lump(stretch, bumps)
     normals, weights = np.asarray(body.vertex_normals), np.bincount(body.faces.ravel(), np.repeat(body.area_faces, 3))
     places, told = body.vertices / np.abs(body.vertices).max(axis=0), []
@@ -87,8 +87,8 @@ def test_no_move_is_told_to_be_farther_than_it_is(stretch: tuple[float, float, f
     assert max(told) > 0.6
 
 
-def test_the_least_move_of_a_difference_is_told_as_far_as_it_is() -> None:
-    """Moves along gradients, by finite differences at each vertex, of what a scale leaves as it is."""
+def test_the_lower_bound_is_tight_for_displacements_along_gradients() -> None:
+    """Gradients of scale-invariant combinations of moments, by finite differences at each vertex."""
     body = lump((0.7, 0.5, 1.5), 0.05)
     body.vertices[:, :2] *= np.exp(-0.65 * body.vertices[:, 2:])  # one end is thick, so that the middle moves
     vertices, faces, normals = body.vertices / body.area**0.5, np.asarray(body.faces), body.vertex_normals

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import torch
 import trimesh
 
 import igps
-from igps.cli import main
+from commands import error_of, run
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
 from igps.descriptors.fingerprint import fingerprint
@@ -55,18 +54,6 @@ def root(tmp_path: Path) -> Path:
 @pytest.fixture
 def dataset(root: Path, tmp_path: Path) -> SignatureDataset:
     return SignatureDataset(root, CONFIG, tmp_path / "cache")
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
-    main()
-
-
-def error_of(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    with pytest.raises(SystemExit, match="1"):
-        command(monkeypatch, *arguments)
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
-    return line
 
 
 def test_it_ranks_as_the_descriptor_does(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:
@@ -166,29 +153,29 @@ def test_commands(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     index, cache = tmp_path / "gallery.igps", ["--cache_dir", tmp_path / "cache"]
-    command(monkeypatch, "gallery", "build", root / "egg", "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
+    run(monkeypatch, "gallery", "build", root / "egg", "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
     assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 3 bodies by {INTERIOR}"
-    command(monkeypatch, "gallery", "add", root, "--gallery", index, *cache, "--n_workers", 1)
+    run(monkeypatch, "gallery", "add", root, "--gallery", index, *cache, "--n_workers", 1)
     # Those of the folder of one class have no class: they are known already.
     assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 6 bodies by {INTERIOR}"
-    command(monkeypatch, "gallery", "build", root, "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
-    command(monkeypatch, "gallery", "merge", index, "--out", tmp_path / "copy.igps")
+    run(monkeypatch, "gallery", "build", root, "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
+    run(monkeypatch, "gallery", "merge", index, "--out", tmp_path / "copy.igps")
     assert capsys.readouterr().out.splitlines()[-1] == f"{tmp_path / 'copy.igps'}: 6 bodies by {INTERIOR}"
 
     wanted = root / "egg" / "1.off"
-    command(monkeypatch, "query", wanted, "--gallery", root, "--descriptor", INTERIOR, "--top", 4, *cache, *SMALL)
+    run(monkeypatch, "query", wanted, "--gallery", root, "--descriptor", INTERIOR, "--top", 4, *cache, *SMALL)
     expected = capsys.readouterr().out
     for which in (index, tmp_path / "copy.igps"):
-        command(monkeypatch, "query", wanted, "--gallery", which, "--top", 4, *cache)
+        run(monkeypatch, "query", wanted, "--gallery", which, "--top", 4, *cache)
         assert capsys.readouterr().out == expected
-    command(monkeypatch, "query", wanted, "--gallery", root, "--descriptor", INTERIOR, "--rerank", *cache, *SMALL)
+    run(monkeypatch, "query", wanted, "--gallery", root, "--descriptor", INTERIOR, "--rerank", *cache, *SMALL)
     reranked = capsys.readouterr().out
     assert len(reranked.splitlines()) == 7
     assert reranked.splitlines()[:5] != expected.splitlines()[:5]
-    command(monkeypatch, "query", wanted, "--gallery", index, "--rerank", *cache)
+    run(monkeypatch, "query", wanted, "--gallery", index, "--rerank", *cache)
     assert capsys.readouterr().out == reranked
     (root / "egg" / "0.off").unlink()
-    command(monkeypatch, "query", wanted, "--gallery", index, "--top", 4, *cache)
+    run(monkeypatch, "query", wanted, "--gallery", index, "--top", 4, *cache)
     out = capsys.readouterr().out
     assert out.startswith(expected)
     assert out.splitlines()[-1] == "1 of these 4 files were moved or deleted since they were described."
@@ -218,7 +205,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
     assert "version" in error_of(monkeypatch, capsys, *query)
     monkeypatch.undo()
     with pytest.raises(SystemExit, match="2"):
-        command(monkeypatch, "gallery", "update", index, "--where", "volume > 3")
+        run(monkeypatch, "gallery", "update", index, "--where", "volume > 3")
     assert "required: gallery.update.to" in capsys.readouterr().err
     gone = error_of(monkeypatch, capsys, "gallery", "add", tmp_path / "gone", "--gallery", index)
     assert "gone: no such folder" in gone
@@ -336,7 +323,7 @@ def test_commands_that_change_a_gallery(
     gallery, cache = tmp_path / "gallery.igps", ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
 
     def lines(*arguments: object) -> list[str]:
-        command(monkeypatch, "gallery", *arguments)
+        run(monkeypatch, "gallery", *arguments)
         return capsys.readouterr().out.splitlines()
 
     lines("build", root, "--out", gallery, "--descriptor", INTERIOR, *cache, *SMALL)
@@ -413,7 +400,7 @@ def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gall
     "rest", ["; junk", " junk", ") OR (true", " LIMIT 1", " ORDER BY name", "; DELETE FROM t", " -- note\n junk"]
 )
 def test_a_condition_is_read_to_its_end(dataset: SignatureDataset, tmp_path: Path, rest: str) -> None:
-    """What follows it is no part of it, and may have been meant to narrow it."""
+    """Any text after a valid condition is an error, since it may have been meant to restrict the condition."""
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     where = "name = 'ball/0.off'"
     described = describe(dataset, small_interior())[:1]
@@ -465,7 +452,7 @@ def test_a_gallery_is_no_file(dataset: SignatureDataset, tmp_path: Path) -> None
 
 
 def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path: Path) -> None:
-    """Until it can, when those that it no longer holds go, and the others are described from what it has become."""
+    """When the file can be read again, bodies that it no longer holds are removed, and the others described again."""
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
     labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9], labels[11:22, 11:15, 5:9] = 1, 2, 3
@@ -551,16 +538,16 @@ def test_a_gallery_remembers_the_table_of_names(
     monkeypatch.chdir(tmp_path)
     cache = ["--cache_dir", "cache", "--n_workers", 1]
     build = ["gallery", "build", "scans", "--out", "g.igps", "--descriptor", INTERIOR, "--size", "ignore", *SMALL]
-    command(monkeypatch, *build, "--names", "names.json", *cache)
+    run(monkeypatch, *build, "--names", "names.json", *cache)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     cache = ["--cache_dir", "../cache", "--n_workers", 1]
-    command(monkeypatch, "query", "../scans/scan.nii.gz#bar", "--gallery", "../g.igps", "--top", 1, *cache)
+    run(monkeypatch, "query", "../scans/scan.nii.gz#bar", "--gallery", "../g.igps", "--top", 1, *cache)
     assert "scan.nii.gz#bar" in capsys.readouterr().out
     for given, changes in (([], "0 bodies described, 0 removed"), (["--names", "../other.json"], "1 removed")):
-        command(monkeypatch, "gallery", "sync", "../scans", "--gallery", "../g.igps", *given, *cache)
+        run(monkeypatch, "gallery", "sync", "../scans", "--gallery", "../g.igps", *given, *cache)
         assert changes in capsys.readouterr().out
     assert {row["part"] for row in Gallery("../g.igps").rows("part")} == {"cube", "bar"}
-    command(monkeypatch, *build[:2], "../scans", "--out", "../plain.igps", *build[5:], *cache)
-    command(monkeypatch, "gallery", "merge", "../g.igps", "../plain.igps", "--out", "../all.igps")
+    run(monkeypatch, *build[:2], "../scans", "--out", "../plain.igps", *build[5:], *cache)
+    run(monkeypatch, "gallery", "merge", "../g.igps", "../plain.igps", "--out", "../all.igps")
     assert {row["part"] for row in Gallery("../all.igps").rows("part")} == {"cube", "bar", "1", "2"}

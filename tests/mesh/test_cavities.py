@@ -100,7 +100,7 @@ def test_samples_lie_in_the_wall_and_on_all_surfaces() -> None:
 
 
 def test_eigenfunctions_of_the_outside_go_on_through_the_wall() -> None:
-    """To a ball's first three, linear functions, so that they are the coordinates over their norm everywhere."""
+    """The first three of a ball extend to linear functions in the wall: the sum of squares is 3 |x|² / 4π."""
     config = SignatureConfig(n_eigenpairs=30, accuracy=None)
     hollow = compute_signature(Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True), config)
     full = compute_signature(Mesh(*ball(1)), config)

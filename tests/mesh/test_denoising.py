@@ -61,7 +61,7 @@ def test_area_and_volume_come_back(sphere: Mesh) -> None:
 @pytest.mark.parametrize("ratio", [0.1, 0.2, 0.3])
 @pytest.mark.parametrize("subdivisions", [4, 5])
 def test_passes_follow_the_noise(ratio: float, subdivisions: int) -> None:
-    """What is left adds the same share of the area whatever the noise; the ball of which it is told is the oracle."""
+    """The area, volume and normals of the clean ball come back from noise of several strengths."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
     noise_length = ratio * np.sqrt((ball.edges_unique_length**2).mean())
@@ -133,7 +133,7 @@ def plate_with_holes(seed: int, longest_edge: float | None = None) -> Mesh:
 @pytest.mark.parametrize("longest_edge", [None, 0.06])
 @pytest.mark.parametrize("seed", range(3))
 def test_plates_with_holes_keep_their_volume(seed: int, longest_edge: float | None) -> None:
-    """What is near a vertex lies on one side of it, along its rim; or noise is wider than slivers."""
+    """Against the clean plate. Neighbours on a rim lie on one side of a vertex; noise may exceed slivers."""
     part = plate_with_holes(seed, longest_edge)
     rough = noise(part, 0.002, seed)
     assert is_noisy(rough.vertices, rough.faces)

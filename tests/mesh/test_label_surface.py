@@ -232,7 +232,7 @@ def test_small_pieces_apart_are_dropped_and_large_ones_stay() -> None:
 
 @pytest.mark.parametrize(("more", "lost"), [(0, "100% of the voxels lie in 121"), (20, "94% of the voxels lie in 120")])
 def test_a_label_that_is_mostly_small_pieces_is_refused(more: int, lost: str) -> None:
-    """Lesions: all were dropped, which failed on a division, or all but one, which was the body."""
+    """Many small lesions: dropping all of them, or all but one, would be wrong."""
     mask = np.zeros((54, 54, 36), dtype=np.uint8)
     mask[:5, :4, : 4 + more] = 1
     for corner in np.ndindex(5, 6, 4):
@@ -255,7 +255,7 @@ def rod_across(angle: float, radius: float = 6.0, length: float = 30.0, n: int =
 
 @pytest.mark.parametrize(("angle", "axis", "n_missed"), [(0, 2, 3), (25, 2, 1), (40, 2, 2), (60, 0, 2)])
 def test_slices_that_were_missed_are_filled(angle: float, axis: int, n_missed: int) -> None:
-    """The volume and the area are those of the whole capsule; a bar would lack a tenth of one and add to the other."""
+    """Closed forms of the whole capsule; joining the parts by a bar would lose a tenth of the volume and add area."""
     mask = rod_across(angle)
     np.moveaxis(mask, axis, 0)[24 : 24 + n_missed] = False
     vertices, faces, notes = voxel_surface(mask, joins=True)

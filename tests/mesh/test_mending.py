@@ -174,7 +174,7 @@ def test_always_leaves_the_boundary_of_one_body_as_it_is(blob: Mesh) -> None:
     np.testing.assert_array_equal(mesh.faces, blob.faces)
 
 
-def test_what_lies_side_by_side_stays_apart_always() -> None:
+def test_close_turns_of_a_coil_stay_apart() -> None:
     """Two turns of a coil, half a cell from each other: a grid joins them."""
     near = coil(turns=2.2, pitch=0.41)
     assert watertight(near.vertices, near.faces).area < 0.97 * near.area

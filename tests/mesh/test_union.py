@@ -67,8 +67,8 @@ def test_two_halves_with_a_wall_each_that_overlap_are_the_body_that_they_were_cu
     np.testing.assert_allclose((body.volume, body.area), (shape.volume, shape.area), rtol=1e-9)
 
 
-def test_a_patch_that_closes_the_surface_stays():
-    """Half of the wall is missing: it hangs on the surface, and is dropped by what drops fins; a floor is not."""
+def test_a_box_without_inner_walls_is_unchanged():
+    """The faces of a closed box are returned as they are, without a note."""
     vertices, faces = box([0, 0, 0], [1, 1, 1])
     notes = []
     assert drop_inner_walls(vertices, faces, notes)[1] is faces

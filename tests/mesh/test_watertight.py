@@ -339,8 +339,8 @@ def test_a_long_rod_is_as_thick_as_it_was() -> None:
     assert body.area == pytest.approx(rod.area, rel=0.03)
 
 
-def test_what_stays_coarse_is_told() -> None:
-    """Rods to all sides: there is no room for a finer grid."""
+def test_a_note_tells_that_the_grid_is_too_coarse() -> None:
+    """Thin rods in all directions, for which the grid cannot be refined enough."""
     rods = [trimesh.creation.cylinder(0.004, 1, sections=12) for _ in range(12)]
     generator = np.random.default_rng(0)
     for rod in rods:

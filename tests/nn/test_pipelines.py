@@ -91,7 +91,7 @@ def test_what_is_compiled_does_not_grow_with_the_samples(
 
 
 @pytest.mark.parametrize("name", ["hard", "learned", "in space"])
-def test_what_is_compiled_for_some_numbers_of_bodies_serves_all(name: str) -> None:
+def test_a_compiled_program_serves_any_number_of_bodies(name: str) -> None:
     """With fullgraph=True PyTorch compiles eight times and then raises."""
     descriptor, batch, programs = HistogramDescriptor(MODULES[name]()).eval(), two_bodies(), []
 
@@ -156,7 +156,7 @@ def test_transforms_of_functions_follow_a_histogram(module: DescriptionPart) -> 
 
 
 def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(module: DescriptionPart) -> None:
-    """Of padding there is none: neither of samples nor of eigenvalues, which are infinite there."""
+    """Finite differences at the largest entry; the gradient at padding is 0, also at its infinite eigenvalues."""
     batch, module = two_bodies().to(torch.float64), module.double()
     interior, surface = (one.points.clone().requires_grad_() for one in (batch.interior, batch.surface))
     eigenvalues = batch.eigenvalues.clone().requires_grad_()
@@ -173,7 +173,7 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
 
     leaves = (interior, surface, eigenvalues)
     found = torch.autograd.grad(loss(), leaves, allow_unused=True)
-    assert any(gradient is not None for gradient in found)
+    compared = 0
     for leaf, gradient in zip(leaves, found, strict=True):
         if gradient is None or not gradient.any():
             continue
@@ -187,6 +187,8 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
                 moved.append(float(loss()))
             leaf.view(-1)[entry] += 1e-6
         assert float(gradient.view(-1)[entry]) == pytest.approx((moved[0] - moved[1]) / 2e-6, rel=1e-3)
+        compared += 1
+    assert compared > 0
 
 
 def test_padding_leaves_second_derivatives_as_they_are(module: DescriptionPart) -> None:

@@ -99,7 +99,7 @@ def test_no_bin_changes(setting: Callable[[], None]) -> None:
 
 
 def test_threads_share_the_settings(setting: Callable[[], None]) -> None:
-    """One that leaves while others are inside must not take the precision from them; the last one restores it."""
+    """A thread that leaves early must not change the precision of the others; the last one restores the settings."""
     expected = kernels()
     setting()
     before = state()

@@ -238,7 +238,7 @@ def test_numbers_of_a_description_are_known() -> None:
     assert igps.descriptor("interior").n_features == 640
     pretrained = igps.descriptor("pretrained")
     assert isinstance(pretrained, EmbeddedDescriptor)
-    assert pretrained.n_features == 1211
+    assert pretrained.n_features == 1068
     assert pretrained.descriptor.n_features == sum(pretrained.descriptor.part_cells)  # type: ignore[operator]
     assert own_descriptors.Same().n_features == 1
     assert igps.descriptor("d2").n_features == 64

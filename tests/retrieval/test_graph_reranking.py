@@ -31,7 +31,7 @@ def mean_of(distances: Tensor) -> float:
     [{}, {"diffusion": 0}, {"n_neighbours": 6, "n_expanded": 3, "share": 0.5, "diffusion": 0.8}, {"share": 0.1},
      {"n_neighbours": 4, "n_expanded": 7}],
 )  # fmt: skip
-def test_with_lists_of_all_walks_by_steps_are_those_of_the_inverse(
+def test_complete_lists_give_the_distances_of_the_dense_solution(
     numbers: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     points = torch.randn(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

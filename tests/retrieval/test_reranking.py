@@ -94,8 +94,8 @@ def test_walks_come_before_the_sets(k: int, share: float, fading: float, points:
     torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
 
 
-def test_the_nearest_come_forward_between_the_steps_too(points: Tensor) -> None:
-    """Else the second step would see neighbourhoods that diffusion has torn apart."""
+def test_nearest_pairs_are_moved_forward_after_diffusion(points: Tensor) -> None:
+    """Against loops over walks, nearest pairs and reciprocal sets; the second step must see the moved pairs."""
     k, share, fading, n = 6, 0.3, 0.8, 12
     distances = euclidean(points[:n], points[:n]).tolist()
     nearest = [min((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j]) for i in range(n)]

@@ -260,7 +260,7 @@ def test_cluster_error_falls_with_the_third_power() -> None:
 def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Constants that promise too much stand for a mesh on which the measured ones do."""
+    """Error constants that are too small stand for such a mesh; the sampled error must trigger a second evaluation."""
     mesh = bumpy_sphere(5)
     points, functions = interior_points(mesh, 250), smooth_functions(mesh[0])
     exact = extend(*mesh, functions, points)

@@ -62,7 +62,7 @@ def test_places_go_with_the_points_and_leave_signs_and_bases_alone() -> None:
 
 
 def test_points_of_one_potential_have_different_places() -> None:
-    """The mirror images in a symmetric body, told apart the same way whichever of them comes first."""
+    """Mirror images in a symmetric body get distinct keys, which do not depend on their order."""
     functions, eigenvalues = spectrum_of(300)
     mirror = np.where(np.arange(30) % 3 == 0, -1.0, 1.0)
     both = np.concatenate([functions, functions * mirror])
@@ -72,7 +72,7 @@ def test_points_of_one_potential_have_different_places() -> None:
     np.testing.assert_allclose(np.sort(exchanged), np.sort(found), rtol=1e-9)
 
 
-def test_marks_are_counts_of_what_is_around() -> None:
+def test_spacings_and_area_shares_by_hand() -> None:
     line = np.zeros((9, 3))
     line[:, 0] = np.arange(9)
     expected = np.abs(line[:, 0] - line[:, :1]).mean(axis=1)  # all are nearest
@@ -83,7 +83,7 @@ def test_marks_are_counts_of_what_is_around() -> None:
     )
 
 
-def test_each_share_gets_one() -> None:
+def test_systematic_samples_follow_the_sizes() -> None:
     sizes = np.random.default_rng(0).random(50) ** 3
     sizes[[0, 20, 49]] = 0
     ends = np.cumsum(sizes)

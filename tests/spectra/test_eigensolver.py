@@ -150,8 +150,8 @@ def filled(vectors: np.ndarray, steps: list[Callable[[], None]]) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("either_processor")
-def test_krylov_basis_keeps_its_promises(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Orthonormal rows, a projection that is the operator's, residuals that are the vectors'; also when widened."""
+def test_krylov_basis_projection_and_residuals(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Orthonormal rows, the projection of the operator, and residuals recomputed by NumPy; also after widening."""
     monkeypatch.setattr(krylov, "PIECE_COLUMNS", 100)  # the eigenvectors take many steps
     stiffness, mass, positions = torus_problem
     matrix = sparse.csr_array(stiffness * mass.sum() / np.sqrt(mass)[:, None] / np.sqrt(mass))
@@ -183,7 +183,7 @@ def test_krylov_basis_keeps_its_promises(torus_problem: Problem, monkeypatch: py
 def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
     distance: float, torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    """There the operator magnifies most what rounding leaves of older vectors, from block to block."""
+    """Near an eigenvalue the operator magnifies rounding errors from block to block; dense solver as oracle."""
     stiffness, mass, positions = torus_problem
     area = mass.sum()
     matrix = sparse.csr_array(stiffness * area / np.sqrt(mass)[:, None] / np.sqrt(mass))

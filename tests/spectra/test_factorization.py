@@ -74,7 +74,7 @@ def eliminations(factors: Factors) -> list[np.ndarray]:
 
 
 def elimination_growth(factors: Factors) -> float:
-    """The largest norm of what one elimination adds to the rest in terms of what it takes away, at least 1."""
+    """The largest norm of the multipliers E of one elimination, at least 1."""
     return max([1.0, *(float(np.linalg.norm(elimination)) for elimination in eliminations(factors))])
 
 

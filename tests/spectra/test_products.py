@@ -79,8 +79,8 @@ def test_subtract_takes_the_product_from_a_piece(
 
 
 @pytest.mark.usefixtures("either_processor")
-def test_what_is_taken_out_in_single_precision_leaves_the_rows_in_double() -> None:
-    """Of rows of length 1, a part of 1e-9 is taken out to 1e-15: the factors are rounded, the rows are not."""
+def test_subtraction_by_single_precision_factors_keeps_double_rows() -> None:
+    """A component of 1e-9 is removed from unit rows down to 1e-15, although the factors are rounded to single."""
     basis = np.linalg.qr(rows(20, seed=3).T)[0].T.copy()
     old, new = basis[:16], basis[16:] + 1e-9 * basis[:4]
     everywhere, of_new, of_old = slice(0, N_COLUMNS), torch.from_numpy(new), torch.from_numpy(old)
@@ -100,7 +100,7 @@ def test_what_is_taken_out_in_single_precision_leaves_the_rows_in_double() -> No
         ("neoverse-n1", False, False, True),
     ],
 )
-def test_only_on_intels_processors_with_avx_512_mkl_goes_before_the_loops(
+def test_mkl_is_preferred_only_on_intel_processors_with_avx_512(
     processor: str, has_avx512: bool, has_mkl: bool, expected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(binding, "get_host_cpu_name", lambda: processor)

@@ -17,7 +17,7 @@ def test_an_embedding_does_not_depend_on_the_order_of_samples() -> None:
     assert_close(found.norm(dim=1), torch.ones(3))
 
 
-def test_features_do_not_depend_on_scale_nor_on_signs_of_eigenfunctions(blob: igps.Mesh) -> None:
+def test_features_do_not_depend_on_scale(blob: igps.Mesh) -> None:
     config = igps.SignatureConfig(
         n_eigenpairs=80, resolution=10, min_samples=0, n_surface_samples=60, attributes=("surface_direction",)
     )

@@ -234,7 +234,7 @@ def test_pretraining_saves_a_metric_and_measures_it(
     monkeypatch.setattr(pretraining, "N_VERTICES", (1500, 1500))
     out = run(
         "pretrain", "--root", tmp_path / "generated", "--n_classes", 23, "--n_bodies", 2, "--n_poses", 2,
-        "--n_parts", 2, "--n_scored", 4, "--individuals", "[4, 2, 2, 2]",
+        "--n_parts", 2, "--n_scored", 4, "--individuals", "[17, 1, 2, 2]",
         "--cache_dir", root / "cache", "--data", root / "meshes",
         "--plain", '["shape_dna"]',
         "--out", tmp_path / "metric.safetensors",
@@ -246,6 +246,7 @@ def test_pretraining_saves_a_metric_and_measures_it(
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-4, rtol=0)
     assert "2 parts of the families" in out
     assert re.search(r"shape_dna +body NN \d+\.\d FT \d+\.\d ± \d+\.\d", out)
-    assert out.count("without look-alikes") == 2
+    assert re.search(r"shape_dna +individual NN \d+\.\d FT \d+\.\d ± \d+\.\d", out)
+    assert out.count("without look-alikes") == 3  # classes, individuals, and the collection
     assert "1 labels a class" in out
     assert "5 labels a class" not in out  # a single shape of each class would be left to score

@@ -1,7 +1,7 @@
-"""Collections of generated shapes: their datasets, their families, and their numbers."""
+"""Datasets of generated shapes, and their families."""
 
 import random
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import torch
@@ -27,28 +27,26 @@ def generated(
 
 
 def usable_shapes(
-    root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, indices: list[int] | None = None
+    root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, names: list[str] | None = None
 ) -> igps.SignatureDataset:
-    """Return the dataset of the meshes (of `indices`, if given) whose signatures can be computed; print failures."""
+    """Return the dataset of the meshes (of `names`, if given) whose signatures can be computed; print failures."""
     data = igps.SignatureDataset(root, descriptor=descriptor, cache_dir=cache_dir)
-    if indices is not None:
-        data = data.subset(indices)
+    if names is not None:
+        data = data[names]
     failures = data.precompute(n_workers=n_workers)
     for failure in failures:
         print(failure)
     return data.usable(failures)
 
 
-def deal_families(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
-    """Deal whole families into parts at random; return the indices of the classes of each part."""
+def deal_families(families: Iterable[str], n_parts: int, seed: int) -> dict[str, int]:
+    """Deal families into parts at random; return the part of each family."""
     names = sorted(set(families))
     random.Random(seed).shuffle(names)
-    return [
-        torch.tensor([i for i, family in enumerate(families) if family in names[k::n_parts]]) for k in range(n_parts)
-    ]
+    return {name: place % n_parts for place, name in enumerate(names)}
 
 
 def number_names(names: Sequence[str]) -> Tensor:
-    """Number distinct names in sorted order; return the number of each name."""
+    """Number distinct names in sorted order; return the number (N,) of each name."""
     number = {name: i for i, name in enumerate(sorted(set(names)))}
     return torch.tensor([number[name] for name in names])

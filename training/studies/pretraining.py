@@ -1,7 +1,7 @@
 """Fit the metric of the descriptor `pretrained` to generated shapes, and score it on held-out shapes."""
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 import igps
 from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_head, pretrained_parts
 from igps.nn.description import describe
-from igps.nn.descriptor import EmbeddedDescriptor
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
 from training.graded import GradedShapes, body_of, family_of, individual_of, looks_alike
 from training.studies.generated import N_VERTICES, deal_families, generated, number_names, usable_shapes
@@ -19,6 +19,40 @@ from training.studies.transfer import few_labels, level_scores, report
 
 # With two classes, each part has a single direction, and its vectors are signs, which may cancel.
 _MIN_CLASSES = 3
+
+
+class _Collection:
+    """Generated shapes with their histograms.
+
+    Args:
+        shapes: the shapes.
+        root: folder of their meshes.
+        part_of: the part of each family.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
+        n_workers: processes; all cores if not given.
+    """
+
+    def __init__(
+        self,
+        shapes: GradedShapes,
+        root: Path,
+        part_of: Mapping[str, int],
+        cache_dir: Path | None,
+        n_workers: int | None,
+    ) -> None:
+        descriptor = pretrained_parts().eval()
+        data = generated(shapes, root, descriptor, cache_dir, n_workers)
+        self.root, self.names, self.labels = root, data.bodies.names, data.labels
+        self.histograms = describe(data, descriptor, progress=True, n_workers=n_workers)
+        of_levels = (individual_of, body_of) if shapes.n_individuals else (body_of,)
+        self.levels = *(number_names([of(name) for name in self.names]) for of in of_levels), self.labels
+        self.parts = torch.tensor([part_of[family_of(name)] for name in data.classes])[self.labels]
+        self.are_look_alikes = torch.tensor([looks_alike(name) for name in data.classes])[self.labels]
+
+    def draw_classes(self, part: int, n: int, seed: int) -> Tensor:
+        """Return a mask of the shapes of at most n classes of a part, drawn by the seed."""
+        classes = self.labels[self.parts == part].unique().tolist()
+        return torch.isin(self.labels, torch.tensor(random.Random(seed).sample(classes, min(n, len(classes)))))
 
 
 def pretrain(
@@ -38,7 +72,8 @@ def pretrain(
 ) -> None:
     """Generate shapes, score the metric on held-out families, fit it to all, and save it.
 
-    The class head is fitted to one collection, the body heads to another one, of individuals that are nearly alike.
+    The class head is fitted to one collection, the body heads to another one, of individuals that are nearly alike. Of
+    the held-out families, some classes of the first collection and all individuals of the second one are scored.
 
     Args:
         root: folder of the generated meshes; those of individuals are written to `ROOT-individuals`.
@@ -50,88 +85,87 @@ def pretrain(
             poses of an individual.
         out: file of the parameters.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
-        plain: descriptors to score on the same classes for comparison.
+        plain: descriptors to score on the same shapes for comparison.
         data: labelled collection on which to score the metric, too.
         n_workers: processes; all cores if not given.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     descriptor = pretrained_parts().eval()
-    shapes = generated(GradedShapes(n_classes, n_bodies, n_poses, seed), root, descriptor, cache_dir, n_workers)
-    histograms, labels = describe(shapes, descriptor, progress=True, n_workers=n_workers), shapes.labels
-    bodies = _numbers(shapes, body_of)
-    second_root = root.with_name(f"{root.name}-individuals")
-    second = GradedShapes(*individuals[:2], individuals[3], seed, n_vertices=N_VERTICES, n_individuals=individuals[2])
-    alike = generated(second, second_root, descriptor, cache_dir, n_workers)
-    histograms_alike = describe(alike, descriptor, progress=True, n_workers=n_workers)
-    individuals_alike, bodies_alike = _numbers(alike, individual_of), _numbers(alike, body_of)
-    parts = deal_families([family_of(name) for name in shapes.classes], n_parts, seed)
-    families = [{family_of(shapes.classes[i]) for i in part.tolist()} for part in parts]
-    parts_alike = [
-        torch.tensor([family_of(alike.classes[i]) in held_out for i in alike.labels.tolist()]) for held_out in families
-    ]
+    shapes = (
+        GradedShapes(n_classes, n_bodies, n_poses, seed),
+        GradedShapes(*individuals[:2], individuals[3], seed, n_vertices=N_VERTICES, n_individuals=individuals[2]),
+    )
+    part_of = deal_families([family_of(name) for one in shapes for name in one.class_names], n_parts, seed)
+    first, second = (
+        _Collection(one, folder, part_of, cache_dir, n_workers)
+        for one, folder in zip(shapes, (root, root.with_name(f"{root.name}-individuals")), strict=True)
+    )
 
-    def fit(classes: Tensor, n: int, held_out: Tensor) -> TwoLevelHead:
-        """Fit the metric to n of some classes, drawn by the seed, and to all individuals that are not held out."""
-        chosen = torch.isin(labels, torch.tensor(_draw_classes(classes.tolist(), n, seed)))
+    def chosen(held_out: int | None, look_alikes: bool) -> tuple[Tensor, Tensor]:
+        """Return masks of the shapes of both collections, without a part, and perhaps without look-alikes."""
+        masks = [(x.parts != held_out) & (look_alikes | ~x.are_look_alikes) for x in (first, second)]
+        return masks[0], masks[1]
+
+    def suffice(of_first: Tensor, of_second: Tensor) -> bool:
+        return len(first.labels[of_first].unique()) >= _MIN_CLASSES and bool(of_second.any())
+
+    def fit(of_first: Tensor, of_second: Tensor) -> TwoLevelHead:
         return pretrained_head().fit(
-            histograms[chosen],
-            labels[chosen],
+            first.histograms[of_first],
+            first.labels[of_first],
             descriptor.part_cells,
-            bodies=individuals_alike[~held_out],
-            body_descriptions=histograms_alike[~held_out],
+            bodies=second.levels[0][of_second],
+            body_descriptions=second.histograms[of_second],
         )
 
-    scored = [torch.isin(labels, torch.tensor(_draw_classes(part.tolist(), n_scored, seed))) for part in parts]
-    others = [torch.cat([*parts[:i], *parts[i + 1 :]]) for i in range(n_parts)]
-    is_look_alike = torch.tensor([looks_alike(name) for name in shapes.classes])  # of a class of SHREC'07
-    unlike_others = [classes[~is_look_alike[classes]] for classes in others]
-    resembling = torch.tensor([looks_alike(name) for name in alike.classes])[alike.labels]
-    variants = [("pretrained", others, others, parts_alike)]
-    if min(map(len, unlike_others)) >= _MIN_CLASSES:
-        variants += [
-            ("without look-alikes", unlike_others, unlike_others, [part | resembling for part in parts_alike]),
-            ("as many, with them", others, unlike_others, parts_alike),
-        ]
+    scored = [
+        (first, [first.draw_classes(part, n_scored, seed) for part in range(n_parts)]),
+        (second, [second.parts == part for part in range(n_parts)]),
+    ]
+
+    def score(name: str, distances: Callable[[_Collection, Tensor, int], Tensor]) -> None:
+        """Print the scores of distances between the shapes of a collection that a mask chooses from a part."""
+        for collection, masks in scored:
+            level_scores(
+                name,
+                [
+                    (distances(collection, mask, part), *(level[mask] for level in collection.levels))
+                    for part, mask in enumerate(masks)
+                ],
+            )
+
+    def score_heads(name: str, heads: Sequence[TwoLevelHead]) -> None:
+        score(name, lambda collection, mask, part: _distances(heads[part], collection.histograms[mask]))
+
+    def score_plain(other: Descriptor) -> None:
+        def distances(collection: _Collection, mask: Tensor, part: int) -> Tensor:
+            names = [collection.names[i] for i in mask.nonzero().flatten().tolist()]
+            data = usable_shapes(collection.root, other, cache_dir, n_workers, names)
+            described = describe(data, other, n_workers=n_workers)
+            return other.distances(described, described)
+
+        score(other.name, distances)
+
     print(f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:")
-
-    def score(name: str, distances: Sequence[Tensor]) -> None:
-        level_scores(name, [(d, bodies[chosen], labels[chosen]) for d, chosen in zip(distances, scored, strict=True)])
-
-    def score_alike(name: str, distances: Sequence[Tensor]) -> None:
-        levels = (individuals_alike, bodies_alike, alike.labels)
-        parted = zip(distances, parts_alike, strict=True)
-        level_scores(name, [(d, *(level[part] for level in levels)) for d, part in parted])
-
-    for name, pools, equally_many, held_out in variants:
-        counts = [len(classes) for classes in equally_many]
-        heads = [fit(*arguments) for arguments in zip(pools, counts, held_out, strict=True)]
-        score(name, [_distances(head, histograms[part]) for head, part in zip(heads, scored, strict=True)])
-        score_alike(name, [_distances(x, histograms_alike[part]) for x, part in zip(heads, parts_alike, strict=True)])
+    for name, look_alikes in (("pretrained", True), ("without look-alikes", False)):
+        masks = [chosen(part, look_alikes) for part in range(n_parts)]
+        if all(suffice(*each) for each in masks):
+            score_heads(name, [fit(*each) for each in masks])
     for name in plain:
-        other = igps.descriptor(name)
-        for folder, chosen, print_scores in ((root, scored, score), (second_root, parts_alike, score_alike)):
-            datasets = [
-                usable_shapes(folder, other, cache_dir, n_workers, torch.nonzero(part).flatten().tolist())
-                for part in chosen
-            ]
-            described = [describe(dataset, other, n_workers=n_workers) for dataset in datasets]
-            print_scores(name, [other.distances(x, x) for x in described])
+        score_plain(igps.descriptor(name))
 
-    all_classes, nothing = torch.arange(len(shapes.classes)), torch.zeros(len(alike), dtype=torch.bool)
-    head = fit(all_classes, len(all_classes), nothing)
+    head = fit(*chosen(None, True))
     save_pretrained(EmbeddedDescriptor(descriptor, head), out)
-    print(f"fitted to all {len(all_classes)} classes and written: {out}")
+    print(f"fitted to all {n_classes} classes and written: {out}")
     if data is None:
         return
 
     real = usable_shapes(data, descriptor, cache_dir, n_workers)
     real_histograms, labels_of_real = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
     report(str(data), real_histograms, labels_of_real, head)
-    unlike = all_classes[~is_look_alike]
-    choices = ("without look-alikes", unlike, resembling), ("of all kinds", all_classes, nothing)
-    for name, classes, left_out in choices if len(unlike) >= _MIN_CLASSES else ():
-        title = f"{data}, fitted to {len(unlike)} classes {name}"
-        report(title, real_histograms, labels_of_real, fit(classes, len(unlike), left_out))
+    unlike = chosen(None, False)
+    if suffice(*unlike):
+        report(f"{data}, without look-alikes", real_histograms, labels_of_real, fit(*unlike))
     # At least two shapes of each class remain to be scored against each other
     for n in (n for n in (1, 3, 5) if n + 2 <= int(labels_of_real.bincount().min())):
         few_labels(n, real_histograms, labels_of_real, head, descriptor.part_cells)
@@ -144,15 +178,6 @@ def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
         for name, tensor in module.state_dict().items()
     }
     save_file(state, path)
-
-
-def _numbers(shapes: igps.SignatureDataset, of: Callable[[str], str]) -> Tensor:
-    """Number the bodies or individuals of generated shapes by their names."""
-    return number_names([of(name) for name in shapes.bodies.names])
-
-
-def _draw_classes(classes: Sequence[int], n: int, seed: int) -> list[int]:
-    return random.Random(seed).sample(sorted(classes), min(n, len(classes)))
 
 
 def _distances(head: TwoLevelHead, histograms: Tensor) -> Tensor:

@@ -31,7 +31,9 @@ SCALES: Mapping[str, float] = {
 }  # fmt: skip
 """The median distance between generated bodies of one class, by descriptor, as `training.study scales` prints it."""
 
-_INDIVIDUAL_SHARE = 0.25  # typical distance between individuals of one body, over the scale of the descriptor
+# Typical distance between individuals of one body, over the scale of the descriptor; `training.study scales` measures
+# such distances
+_INDIVIDUAL_SHARE = 0.25
 # A difference in size, in logarithms, adds at most _MAX_GAIN times the distance, and half of that at _HALF_SIZE.
 _MAX_GAIN, _HALF_SIZE = 2.0, 0.3
 # Typical differences in twist and in signed volumes between individuals of one body.

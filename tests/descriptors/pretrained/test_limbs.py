@@ -52,7 +52,7 @@ def pieces_of(kept: set[int], graph: list[set[int]]) -> list[set[int]]:
 
 
 def test_branches_are_as_long_as_pieces_stay_apart() -> None:
-    """As the level falls from point to point: of the pieces that become one, that with the highest peak lives on."""
+    """By brute force: components of every superlevel set; when components merge, that of the highest peak survives."""
     batch = two_bodies()
     found = BranchHistogram(EMBEDDING, n_branches=4)(batch)
     for i in range(2):
@@ -112,8 +112,8 @@ def test_as_many_shares_are_large_as_there_are_arms(n_arms: int) -> None:
     assert float(found[n_arms:].sum()) < 0.1
 
 
-def test_pieces_are_the_arms_and_as_large_as_they_are() -> None:
-    """Of three arms and 200 other points, arms are 60 of 380 each: 2^−2.66, between the last two centres."""
+def test_pieces_of_a_star_are_its_arms() -> None:
+    """Each of three arms has 60 of 380 points: the binary log is −2.66, between the last two centres."""
     found = PieceHistogram((180 / 380,), SpectralEmbedding(), n_bins=(6, 5))(star(3, 1.0, seed=3))[0, 0]
     of_sizes = np.array(hat(float(np.log2(60 / 380)), np.linspace(-6, -0.5, 6).tolist()))
     np.testing.assert_allclose(found.sum(dim=1), of_sizes, atol=0.02)

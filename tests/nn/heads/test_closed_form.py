@@ -84,7 +84,7 @@ def test_kernels_of_parts_are_averaged(collection: tuple[Tensor, Tensor]) -> Non
     torch.testing.assert_close(copy(histograms), head(histograms))
 
 
-def test_as_made_it_is_the_root_at_unit_length(collection: tuple[Tensor, Tensor]) -> None:
+def test_an_unfitted_head_gives_normalised_square_roots(collection: tuple[Tensor, Tensor]) -> None:
     """Whatever the number of cells."""
     torch.testing.assert_close(WhitenedHead()(collection[0]), collection[0].sqrt())
     few = collection[0][:, :7]
@@ -218,7 +218,7 @@ def prior(collection: tuple[Tensor, Tensor]) -> WhitenedHead:
 
 
 class SquaredPrior(WhitenedHead):
-    """A head with a distance of its own: of unit vectors the square of the cosine's, of others not."""
+    """A head whose distance is the squared cosine distance for unit vectors, but not for other vectors."""
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         return euclidean(queries, gallery) ** 4 / 4
@@ -245,6 +245,31 @@ def test_a_prior_stays_as_it_is(
     copy = kind(prior=WhitenedHead())
     copy.load_state_dict(head.state_dict())
     torch.testing.assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
+
+
+class SteppedPrior(WhitenedHead):
+    """A head whose distances are 0.01 or 1; the kernel of such distances is not positive definite."""
+
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        return (euclidean(queries, gallery) > 1.1).to(queries.dtype).clamp_min(0.01)
+
+
+def test_an_indefinite_kernel_is_projected_on_its_positive_eigenvectors(
+    collection: tuple[Tensor, Tensor], prior: WhitenedHead
+) -> None:
+    """Against scikit-learn on the projected kernel. Here the ridge cancels the smallest eigenvalue."""
+    histograms, labels = collection
+    stepped = SteppedPrior()
+    stepped.load_state_dict(prior.state_dict())
+    head = KernelHead(stepped, prior_share=0.9).fit(histograms, labels)
+    kernel = head._kernel(head.anchors).double().numpy()
+    values, vectors = np.linalg.eigh(kernel)
+    assert values[0] < -0.1
+    head = KernelHead(stepped, prior_share=0.9, ridge=-float(values[0])).fit(histograms, labels)
+    positive = vectors[:, values > 0]
+    projection = positive @ positive.T
+    oracle = KernelRidge(alpha=-values[0], kernel="precomputed").fit(projection @ kernel, np.eye(8)[labels])
+    np.testing.assert_allclose(head.scores(histograms), oracle.predict(kernel @ projection), atol=1e-4)
 
 
 def test_weights_and_temperature_are_loaded(collection: tuple[Tensor, Tensor], prior: WhitenedHead) -> None:
@@ -275,10 +300,10 @@ def test_whitened_distance_is_the_weighted_mean_with_the_priors(
         WhitenedHead(prior=prior).distances(beside, beside)
 
 
-def test_beside_a_prior_parts_count_by_fishers_discriminant(
+def test_parts_beside_a_prior_are_weighted_by_fishers_discriminant(
     collection: tuple[Tensor, Tensor], squared: SquaredPrior
 ) -> None:
-    """Of classes that were fitted to; the last part tells shapes of one class apart, but not the classes."""
+    """Means and variances over all pairs, by `statistics`; the last part separates shapes, but not classes."""
     histograms, labels = collection
     backwards = histograms.roll(1, dims=0).view(8, 6, N_CELLS).transpose(0, 1).reshape(48, N_CELLS)
     descriptions, cells = torch.cat([histograms, backwards], dim=1), (5, 55, 60)
@@ -322,10 +347,10 @@ class Stretched(Head):
         return self.head.distances(queries, gallery)
 
 
-def test_where_no_pair_tells_anything_all_parts_count_alike(
+def test_without_separation_all_parts_have_equal_weights(
     collection: tuple[Tensor, Tensor], prior: WhitenedHead
 ) -> None:
-    """One class alone, or classes that are the same shapes again."""
+    """A single class, or two classes of identical shapes."""
     histograms, _ = collection
     again = torch.cat([histograms[:6], histograms[:6]])
     for shapes, labels in ((histograms[:6], torch.zeros(6)), (again, torch.arange(2).repeat_interleave(6))):
@@ -370,7 +395,7 @@ def test_one_shape_of_each_class_leaves_the_prior_alone(collection: tuple[Tensor
 def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(
     collection: tuple[Tensor, Tensor], n_of_each: int, temperature: float
 ) -> None:
-    """With three shapes of each class twice as warm as with six or more."""
+    """Against NumPy and SciPy's softmax; with three shapes of each class the temperature is doubled."""
     histograms, labels = collection
     used = slice(None, None, 2 if n_of_each == 3 else 1)
     labels = labels % 2 if n_of_each == 24 else labels

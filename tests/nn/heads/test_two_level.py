@@ -1,4 +1,4 @@
-"""The head of two levels against SciPy's generalised eigenproblem, its kernel's formula, and what it promises."""
+"""The head of two levels against matrix functions of SciPy and NumPy, and against its formula."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def projected(histograms: Tensor, bodies: Tensor, shrinkage: float) -> np.ndarra
     relative = within * rank / within.trace()
     whitening = np.real(sqrtm(shrinkage * np.linalg.inv(shrinkage * np.eye(N_CELLS) + relative)))
     centred = roots - roots.mean(axis=0)
-    # of 40 cells the roots span all: nothing but the mean is taken off
+    # The training roots span all 40 dimensions, so the head only subtracts their mean
     _, _, axes = np.linalg.svd((means - roots.mean(axis=0)) @ whitening, full_matrices=False)
     return centred @ whitening @ axes[:10].T
 
@@ -56,7 +56,7 @@ def projected(histograms: Tensor, bodies: Tensor, shrinkage: float) -> np.ndarra
 def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
     collection: tuple[Tensor, Tensor, Tensor],
 ) -> None:
-    """Written down with SciPy's matrix functions; the signs and the basis of the vectors are free, cosines are not."""
+    """Against SciPy's `sqrtm` and NumPy's SVD; cosines are compared, since vectors are unique only up to a rotation."""
     histograms, _, bodies = collection
     expected = projected(histograms, bodies, 0.2)
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
@@ -72,7 +72,7 @@ def test_parts_have_equal_shares_and_others_do_not_count(collection: tuple[Tenso
     head = WCCNHead((0, 2)).fit(histograms, classes, cells)
     expected = (cosine(alone[0], alone[0]) + cosine(alone[2], alone[2])) / 2
     found = head(histograms)
-    assert found.shape == (len(histograms), 12 + 10)  # as many numbers as cells, where directions would be more
+    assert found.shape == (len(histograms), 12 + 10)  # a part has at most as many directions as cells
     torch.testing.assert_close(cosine(found, found), expected, atol=2e-4, rtol=0)
     changed = histograms.clone()
     changed[:, 12:30] = torch.rand(len(changed), 18, generator=torch.Generator().manual_seed(1))
@@ -80,7 +80,7 @@ def test_parts_have_equal_shares_and_others_do_not_count(collection: tuple[Tenso
 
 
 def test_with_lengths_distances_are_those_of_mahalanobis(collection: tuple[Tensor, Tensor, Tensor]) -> None:
-    """Written down with SciPy's matrix functions, up to one factor; and a number that makes the length 1."""
+    """Against SciPy's `sqrtm`, up to one common factor; the last number makes the length of the vector 1."""
     histograms, _, bodies = collection
     expected = torch.from_numpy(projected(histograms, bodies, 0.2))
     head = WCCNHead(n_directions=10, shrinkage=0.2, lengths=True).fit(histograms.double(), bodies)
@@ -92,15 +92,15 @@ def test_with_lengths_distances_are_those_of_mahalanobis(collection: tuple[Tenso
     assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
 
 
-def test_what_is_far_beyond_all_training_shapes_is_a_unit_vector_too(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_shapes_far_from_the_training_shapes_have_unit_vectors(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, _, bodies = collection
     head = WCCNHead(n_directions=10, lengths=True).fit(histograms, bodies)
-    alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(1.0)  # all in one cell, where training shapes have all 40
+    alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(1.0)  # one cell each; training shapes fill all 40 cells
     torch.testing.assert_close(head(alone).norm(dim=1), torch.ones(N_CELLS), atol=1e-5, rtol=0)
 
 
 def test_the_distance_is_what_the_formula_says(collection: tuple[Tensor, Tensor, Tensor]) -> None:
-    """Written down from the vectors of the heads, of which the last number, with lengths, is no part of a distance."""
+    """Against the formula in float64; the last number of a vector with `lengths` does not enter its distance."""
     histograms, classes, bodies = collection
     class_head = WCCNHead(n_directions=20)
     body_heads = WCCNHead((0,), n_directions=6, lengths=True), WCCNHead((1,), n_directions=5, lengths=True)
@@ -132,9 +132,7 @@ def test_the_distance_is_what_the_formula_says(collection: tuple[Tensor, Tensor,
 
 def test_body_heads_can_have_shapes_of_their_own(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, classes, bodies = collection
-    head = TwoLevelHead().fit(
-        histograms[:200], classes[:200], bodies=bodies[200:], body_descriptions=histograms[200:]
-    )  # fmt: skip
+    head = TwoLevelHead().fit(histograms[:200], classes[:200], bodies=bodies[200:], body_descriptions=histograms[200:])
     of_class, of_body = WCCNHead(), WCCNHead(n_directions=64, shrinkage=0.3, lengths=True)
     of_class.fit(histograms[:200], classes[:200])
     of_body.fit(histograms[200:], bodies[200:])
@@ -162,8 +160,19 @@ def test_distances_of_equal_vectors_have_a_gradient(collection: tuple[Tensor, Te
     assert torch.isfinite(slope).all()
 
 
-def test_individuals_that_bodies_do_not_tell_apart_are_ordered() -> None:
-    """Poses move the first cells, individuals the last, less than bodies differ; of classes that are not fitted to."""
+def test_small_scales_do_not_overflow(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    histograms, classes, bodies = collection
+    head = TwoLevelHead(scales=(1e-3,)).fit(histograms, classes, bodies=bodies)
+    vectors = head(histograms).requires_grad_()
+    distances = head.distances(vectors, vectors)
+    assert torch.isfinite(distances).all()
+    distances.sum().backward()
+    assert vectors.grad is not None
+    assert torch.isfinite(vectors.grad).all()
+
+
+def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to_bodies() -> None:
+    """On other classes. Poses change the first cells, individuals the last ones, by less than bodies differ."""
     generator = torch.Generator().manual_seed(1)
     shape = (12, 2, 3, 4)  # classes, bodies, individuals, poses
     kinds = torch.randn(12, 1, 1, 1, N_CELLS, generator=generator)
@@ -183,16 +192,15 @@ def test_individuals_that_bodies_do_not_tell_apart_are_ordered() -> None:
         vectors = head(histograms[~seen])
         distances = head.distances(vectors, vectors)
         found.append([retrieval_scores(distances, one[~seen]).mean()["ft"] for one in (individuals, bodies, classes)])
-    print(found)
     assert found[1][0] > found[0][0] + 0.1
     assert found[1][1] > found[0][1] - 0.02
     assert found[1][2] > found[0][2] - 0.02
 
 
-def test_short_vectors_are_the_best_of_so_many_numbers(
+def test_short_vectors_span_the_leading_singular_directions(
     collection: tuple[Tensor, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those of NumPy's singular value decomposition; and where there is room for all, cosines stay what they are."""
+    """Against NumPy's SVD for 7 numbers; if all numbers fit, the cosines do not change."""
     histograms, classes, bodies = collection
     head = TwoLevelHead().fit(histograms, classes, bodies=bodies)
     vectors = head(histograms)
@@ -208,8 +216,8 @@ def test_short_vectors_are_the_best_of_so_many_numbers(
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-4)
 
 
-def test_both_levels_are_ordered(collection: tuple[Tensor, Tensor, Tensor]) -> None:
-    """On classes that it was not fitted to: each better than by the head of the other level alone."""
+def test_both_levels_score_better_than_with_the_other_head_alone(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    """FT on held-out classes, by bodies and by classes, exceeds that of the other level's head by 0.05."""
     histograms, classes, bodies = collection
     seen = classes < N_CLASSES // 2
     head = TwoLevelHead().fit(histograms[seen], classes[seen], bodies=bodies[seen])
@@ -235,7 +243,7 @@ def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> N
     assert vectors.shape == (len(histograms), 5 + 6 + 1)
     torch.testing.assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
     torch.testing.assert_close(other.shorten(vectors), fitted.shorten(vectors))
-    level = WCCNHead((1,))  # whether lengths count is stored too
+    level = WCCNHead((1,))  # the state includes `lengths`
     level.load_state_dict(fitted.body_heads[0].state_dict())
     torch.testing.assert_close(level(histograms), fitted.body_heads[0](histograms))
 
@@ -275,6 +283,8 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
     for exponents in ((), (0.9,), (-1.0,), (0.5, 0.5)):
         with pytest.raises(ValueError, match="exponents: expected a positive number for each of 1 body heads"):
             TwoLevelHead(exponents=exponents)
+    with pytest.raises(ValueError, match="bodies: expected one for each of 10 descriptions, got 320"):
+        TwoLevelHead().fit(histograms, classes, body_descriptions=histograms[:10])
     with pytest.raises(RuntimeError, match="TwoLevelHead: expected to be fitted first"):
         TwoLevelHead().shorten(histograms)
     fitted = TwoLevelHead().fit(histograms, classes)

@@ -350,7 +350,7 @@ def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
         (lambda: [InteriorDistance(4), EmbeddedPairCosines(3)], 9.0),
     ],
 )
-def test_padding_has_no_part_in_result_or_gradient(
+def test_padding_changes_neither_result_nor_gradient_of_the_samples(
     make: Callable[[], list[PointAxis | PairAxis]], padding: float
 ) -> None:
     embedding, points, directions = some(40)
@@ -371,7 +371,7 @@ def test_padding_has_no_part_in_result_or_gradient(
 
 
 def test_gradient_through_classes_and_layout() -> None:
-    """By the parameters of a learned layout and the embedding, the potential being the embedding's norm."""
+    """By learned centres and by the embedding, whose norm is the potential; against finite differences."""
     embedding = some(9, seed=2)[0].requires_grad_()
     layer = PairHistogram([Potential(3, learnable=True), InteriorDistance(4, 2.0, learnable=True)]).double()
     names = ["axes.1.centres.log_gap", "axes.0.centres.log_gap"]

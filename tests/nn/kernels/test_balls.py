@@ -23,7 +23,7 @@ def on(mesh: trimesh.Trimesh, n: int) -> tuple[Tensor, Tensor]:
 
 
 def by_definition(points: Tensor, directions: Tensor, side: int) -> list[float]:
-    """The third smallest ball that touches x and passes through another point, but for those next to its plane."""
+    """Third smallest radius of balls tangent at x through another point that is not close to the tangent plane."""
     radii = []
     for i, (x, n) in enumerate(zip(points.tolist(), directions.tolist(), strict=True)):
         found = []
@@ -95,8 +95,8 @@ def test_two_plates_have_half_their_thickness_inside_and_half_their_gap_outside(
     assert float(radii[into_the_gap, 1].median()) == pytest.approx(0.1, rel=0.1)
 
 
-def test_a_sample_with_a_wrong_direction_makes_no_ball_small(ball_radii: Radii) -> None:
-    """A ball of radius 1 of which two points lie deep inside, as noise would have it."""
+def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii: Radii) -> None:
+    """Closed form: 398 points of a unit sphere keep radius 1, although two noisy points lie at half the radius."""
     points = normalize(torch.randn(400, 3, generator=torch.Generator().manual_seed(2)), dim=1)
     directions = points.clone()
     points[:2] *= 0.5
@@ -123,7 +123,7 @@ def test_what_is_not_finite_is_refused(ball_radii: Radii) -> None:
         ball_radii(points, torch.eye(3))
 
 
-def test_padding_takes_part_in_no_ball(ball_radii: Radii) -> None:
+def test_padding_does_not_change_radii(ball_radii: Radii) -> None:
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(2, 30, 3, generator=generator)
     directions = normalize(torch.randn(2, 30, 3, generator=generator), dim=2)

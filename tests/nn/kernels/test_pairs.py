@@ -159,7 +159,7 @@ def test_distance_on_a_centre_is_exact(device: str) -> None:
 
 
 def test_narrow_ramps_tend_to_a_plain_histogram(device: str) -> None:
-    """Centres in close pairs around the edges: the bins between hold what falls between the edges."""
+    """Against NumPy's histogram: two centres next to each edge make the ramps narrow."""
     coordinates = some(60)["coordinates"].to(device)
     edges = torch.tensor([0.5, 1.0, 1.7, 2.0], dtype=torch.float64)
     layout = torch.stack([edges - 1e-9, edges + 1e-9], dim=1).flatten().to(device)
@@ -180,7 +180,7 @@ def test_single_precision_is_summed_in_double(device: str) -> None:
 
 @pytest.mark.parametrize("layout", [EQUAL, MANY])
 def test_whole_pairs_of_single_precision_are_as_those_of_double(layout: list[float]) -> None:
-    """Points in one class each are counted in integers, several classes, and many alike side by side."""
+    """Against double precision: one-hot points are counted in integers; sorted points make neighbours similar."""
     generator = torch.Generator().manual_seed(6)
     points = torch.randn(2300, 3, generator=generator).sort(dim=0).values * 0.4
     memberships = one_hot(torch.randint(3, (2300,), generator=generator), 3).double()
@@ -193,7 +193,7 @@ def test_whole_pairs_of_single_precision_are_as_those_of_double(layout: list[flo
 
 @pytest.mark.parametrize(("spread", "bin_of_all"), [(0.0, 0), (1e4, 4)])
 def test_a_block_of_pairs_that_all_fall_into_one_bin(spread: float, bin_of_all: int) -> None:
-    """As many as are ever counted at once in one integer, with the largest share and with none."""
+    """The largest number of pairs that one integer counts, with the largest share of a pair and with share 0."""
     points = torch.arange(1.0, 2401.0)[:, None] * spread
     expected = one_hot(torch.tensor([bin_of_all]), 5).float()
     assert torch.equal(
@@ -264,7 +264,7 @@ def test_turning_moving_and_reordering_change_nothing(device: str, layout: list[
 
 @pytest.mark.parametrize("joint", [False, True])
 def test_no_cell_is_negative(device: str, joint: bool) -> None:
-    """Isolated pairs just below a centre: what rounding leaves in the cell before it would have no other to hide in."""
+    """Isolated pairs just below a centre: no other pair hides a rounding error in the cell before it."""
     generator = torch.Generator().manual_seed(0)
     layout = ((torch.arange(12) + 0.5) / 3).to(device)
     below = torch.nextafter(layout[1:].cpu(), torch.zeros(())).repeat(20)

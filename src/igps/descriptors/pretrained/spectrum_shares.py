@@ -28,11 +28,11 @@ class SpectrumShares(DescriptionPart):
 
         >>> import trimesh
         >>> from igps import SignatureConfig, collate, compute_signature
-        >>> ball = trimesh.creation.icosphere(subdivisions=3)
+        >>> ball = trimesh.creation.icosphere(subdivisions=4)
         >>> signature = compute_signature(ball, SignatureConfig(n_eigenpairs=8))
         >>> shares = SpectrumShares(8)(collate([signature]))[0]
         >>> expected = torch.tensor([2 / 1, 2 / 2, 2 / 3, 6 / 4, 6 / 5, 6 / 6, 6 / 7, 6 / 8]) / 16
-        >>> bool((shares[:8] - expected).abs().max() < 0.001)
+        >>> bool((shares[:8] - expected).abs().max() < 0.0005)
         True
 
     Args:

@@ -151,7 +151,9 @@ class KernelHead(Head):
     The kernel is exp(−d/m), where d is the cosine distance of the whitened histograms and m its median between training
     shapes. With several parts, the kernel is the mean of the kernels of the parts. The targets of the regression are
     the indicators of the classes. A prior (see `WhitenedHead`) adds the kernel of its distance, with weight
-    `prior_share`. This is the library's best head for classes in the training set; for others use the `WhitenedHead`.
+    `prior_share`. As that kernel need not be positive definite, eigenvectors with negative eigenvalues are left out
+    (Chen, Garcia, Gupta, Rahimi and Cazzanti 2009, "spectrum clip"). This is the library's best head for classes in the
+    training set; for others use the `WhitenedHead`.
 
     An embedding consists of two halves of equal weight: the scores minus their mean, which show how similar a shape is
     to each class, and the square roots of the softmax of the scores, which show its class. With only the second half,
@@ -221,11 +223,11 @@ class KernelHead(Head):
         i, j = torch.triu_indices(len(self.anchors), len(self.anchors), 1, device=self.anchors.device)
         distances = self._distances(self.anchors)[:, i, j]
         self.medians = distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny)
-        kernel = self._kernel(self.anchors).double()
-        kernel.diagonal().add_(self.ridge)
+        values, vectors = torch.linalg.eigh(self._kernel(self.anchors).double())
+        factors = torch.where(values > 0, 1 / (values + self.ridge), 0)
         targets = functional.one_hot(members, len(self.classes)).double()
         # Contiguous as after loading from a file, so that products with them are rounded in the same way.
-        self.coefficients = torch.linalg.solve(kernel, targets).to(self.anchors.dtype).contiguous()
+        self.coefficients = (vectors * factors @ (vectors.T @ targets)).to(self.anchors.dtype).contiguous()
         return self
 
     def scores(self, descriptions: Tensor) -> Tensor:

@@ -18,7 +18,8 @@ _USUAL_LENGTH = MEDIAN / math.sqrt(2)
 _STEEPNESS = 20  # exponent of the factors that rise from 0 to 1
 _SAME_BODY = 0.1  # nearly all pairs of poses of an unseen generated body are nearer
 _WEIGHT = 0.05  # of the term that orders bodies that are nearly alike
-_MIN_DISTANCE = 1e-6  # shorter distances are rounding errors, and fractional powers have no derivative at 0
+_MIN_DISTANCE = 1e-7  # shorter distances are rounding errors, and fractional powers have no derivative at 0
+_MAX_RATIO = 16  # of a distance to its scale: greater ones could overflow, and the factor is 1 long before
 
 
 class TwoLevelHead(Head):
@@ -82,7 +83,7 @@ class TwoLevelHead(Head):
             raise ValueError(
                 f"scales: expected a positive scale for each of {n_heads} body heads, got {tuple(scales)}."
             )
-        if len(exponents) != n_heads or min(exponents) <= 0 or abs(sum(exponents) - 1) > _MIN_DISTANCE:
+        if len(exponents) != n_heads or min(exponents) <= 0 or not math.isclose(sum(exponents), 1):
             raise ValueError(
                 f"exponents: expected a positive number for each of {n_heads} body heads, with sum 1, got "
                 f"{tuple(exponents)}."
@@ -110,14 +111,20 @@ class TwoLevelHead(Head):
             part_cells: see `Head.fit`.
             bodies: (M,) integers, by default the labels.
             body_descriptions: (M, ...) histograms of these bodies, by default `descriptions`.
+
+        Raises:
+            ValueError: not every description of a body has its body; see also `Head.fit`.
         """
+        body_descriptions = descriptions if body_descriptions is None else body_descriptions
+        bodies = labels if bodies is None else bodies
+        if len(bodies) != len(body_descriptions):
+            raise ValueError(
+                f"bodies: expected one for each of {len(body_descriptions)} descriptions, got {len(bodies)}. With "
+                "body_descriptions, pass their bodies."
+            )
         self.class_head.fit(descriptions, labels, part_cells)
         for head in self._body_heads():
-            head.fit(
-                descriptions if body_descriptions is None else body_descriptions,
-                labels if bodies is None else bodies,
-                part_cells,
-            )
+            head.fit(body_descriptions, bodies, part_cells)
         embeddings = self(descriptions)
         self.principal = principal_directions(embeddings.double(), MAX_SHORT_WIDTH)[0].to(embeddings.dtype)
         return self
@@ -155,7 +162,7 @@ class TwoLevelHead(Head):
         compared = zip(query_bodies, gallery_bodies, self.scales, self.exponents, strict=True)
         for query, other, scale, power in compared:
             distances = euclidean(query, other).clamp_min(_MIN_DISTANCE)
-            exponent = exponent + (distances / scale).pow(_STEEPNESS)
+            exponent = exponent + (distances / scale).clamp_max(_MAX_RATIO).pow(_STEEPNESS)
             bodies = bodies * distances.pow(power)
         lengths = _mean_lengths(query_bodies)[:, None] * _mean_lengths(gallery_bodies)
         exponent = exponent * (lengths / _USUAL_LENGTH**2).pow(_STEEPNESS / 4)
