@@ -22,6 +22,7 @@ from igps.signature.signature import SAMPLE_KINDS, SampleKind
 
 # Nodes of the quadrature along the line between two descriptions, tried in order until its relative error is small
 _N_NODES, _TOLERANCE = (16, 64, 256, 1024), 1e-8
+_MIN_DISTANCE = 1e-12  # smaller distances are 0 up to rounding
 _N_NEIGHBOURS = 12  # samples whose mean is the value of a point of the surface
 
 Shares = Mapping[SampleKind, Floats]
@@ -40,7 +41,7 @@ class Explanation:
 
     def summary(self) -> str:
         """Return the three largest shares of histograms as text."""
-        if self.distance < 1e-12:  # zero up to rounding
+        if not self.distance:
             return "no difference"
         largest = sorted(self.parts.items(), key=lambda item: -abs(item[1]))[:3]
         return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)
@@ -119,6 +120,7 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
         return descriptor.distances(*rows).diagonal()
 
     distance = float(distances(roots[:, None]).detach())
+    distance = distance if distance > _MIN_DISTANCE else 0.0
     gradient = torch.zeros_like(midpoint)
     for n_nodes in _N_NODES if distance else ():
         gradient.zero_()
