@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import jobs
-from conftest import torch_threads
-from igps._parallel import one_thread
 from igps.data.batch import Body, SignatureBatch
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
@@ -132,13 +130,6 @@ def test_training_subsets_are_for_training_alone(dataset: SignatureDataset) -> N
     torch.testing.assert_close(
         describe(dataset, drawn), describe(dataset, HistogramDescriptor(PairHistogram(["interior_distance"])))
     )
-
-
-def test_one_thread_is_put_back() -> None:
-    with torch_threads(2):
-        with one_thread():
-            assert torch.get_num_threads() == 1
-        assert torch.get_num_threads() == 2
 
 
 @pytest.mark.parametrize("function", [describe, describe_usable])

@@ -8,7 +8,8 @@ import torch
 from tqdm import tqdm
 
 from igps._arrays import Singles
-from igps._parallel import Failed, one_thread, run
+from igps._parallel import Failed, run
+from igps._threads import one_thread
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh

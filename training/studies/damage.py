@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from igps._parallel import one_thread
+from igps._threads import one_thread
 from igps.cli.reading import signatures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies

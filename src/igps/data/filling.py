@@ -13,7 +13,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from igps._parallel import Failed, Limits, MachineError, n_cores, run
+from igps._parallel import Failed, Limits, MachineError, run
+from igps._threads import n_cores
 from igps.data.cache import SignatureCache
 from igps.data.file_stat_cache import FileStatCache
 from igps.data.pipeline import CacheHit, SignaturePipeline, fill_elsewhere, version

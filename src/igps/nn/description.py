@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from igps._arrays import Singles
-from igps._parallel import Failed, n_cores, on_threads, one_thread, run
+from igps._parallel import Failed, on_threads, run
+from igps._threads import n_cores, one_thread
 from igps.data.cache import DescriptionCache
 from igps.data.dataset import Failure, SignatureDataset
 from igps.mesh.mesh import MeshError

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from igps._parallel import one_thread
+from igps._threads import one_thread
 from igps.analysis.explanation import Shares, explain, share_density
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
