@@ -1,9 +1,13 @@
 """Deformation transfer: individuals of a scanned body in its poses."""
 
+import re
+from pathlib import Path
+
 import numpy as np
+import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from training.studies.people import transfer
+from training.studies.people import people, transfer
 
 
 def test_an_unchanged_surface_takes_the_poses():
@@ -29,6 +33,24 @@ def test_the_changed_surface_bends_with_the_pose():
     errors = np.linalg.norm(_centred(moved) - _centred(_bend(changed)), axis=1)
     assert errors.max() < 0.02
     assert np.linalg.norm(_centred(moved) - _centred(_bend(rest)), axis=1).max() > 0.04
+
+
+def test_individuals_in_rigid_poses_are_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Rigid poses do not change the spectrum, so that each individual is nearest to itself."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    for pose in range(3):
+        path = tmp_path / "bodies" / "ball" / f"{pose}.off"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        turned = ball.vertices * [1.0, 1.2, 1.5] @ Rotation.from_euler("x", pose).as_matrix()
+        trimesh.Trimesh(turned, ball.faces, process=False).export(path)
+    cache = tmp_path / "cache"
+    people(tmp_path / "bodies", tmp_path / "made", ["shape_dna"], n_individuals=4, cache_dir=cache, n_workers=1)
+    assert "ball shape_dna: NN 100.0 FT 100.0" in capsys.readouterr().out
+    assert len(list((tmp_path / "made").rglob("*.off"))) == 4 * 3
+    ball.invert()
+    ball.export(path)
+    with pytest.raises(ValueError, match=re.escape(f"data: expected the faces of 0.off in {path}")):
+        people(tmp_path / "bodies", tmp_path / "made")
 
 
 def _rod() -> tuple[np.ndarray, np.ndarray]:

@@ -40,10 +40,17 @@ def people(
         seed: seed of the changes.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
         n_workers: processes; all cores if not given.
+
+    Raises:
+        ValueError: a mesh has other faces than the first mesh of its folder.
     """
     for number, folder in enumerate(sorted(path for path in data.iterdir() if path.is_dir())):
-        poses = [trimesh.load_mesh(path, process=False) for path in sorted(folder.iterdir())]
+        files = sorted(folder.iterdir())
+        poses = [trimesh.load_mesh(path, process=False) for path in files]
         faces, random = np.asarray(poses[0].faces), np.random.default_rng([seed, number])
+        for path, scan in zip(files, poses, strict=True):
+            if not np.array_equal(scan.faces, faces):
+                raise ValueError(f"data: expected the faces of {files[0].name} in {path}, got others.")
         vertices = [np.asarray(pose.vertices, dtype=np.float64) for pose in poses]
         for individual in range(n_individuals):
             change = Change.draw(random, vertices[0], faces, _SHARES)

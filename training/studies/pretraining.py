@@ -19,6 +19,7 @@ from training.studies.transfer import few_labels, level_scores, report
 
 # With two classes, each part has a single direction, and its vectors are signs, which may cancel.
 _MIN_CLASSES = 3
+_NO_PART = -1
 
 
 class _Collection:
@@ -101,7 +102,7 @@ def pretrain(
         for one, folder in zip(shapes, (root, root.with_name(f"{root.name}-individuals")), strict=True)
     )
 
-    def chosen(held_out: int | None, look_alikes: bool) -> tuple[Tensor, Tensor]:
+    def chosen(held_out: int, look_alikes: bool) -> tuple[Tensor, Tensor]:
         """Return masks of the shapes of both collections, without a part, and perhaps without look-alikes."""
         masks = [(x.parts != held_out) & (look_alikes | ~x.are_look_alikes) for x in (first, second)]
         return masks[0], masks[1]
@@ -154,7 +155,7 @@ def pretrain(
     for name in plain:
         score_plain(igps.descriptor(name))
 
-    head = fit(*chosen(None, True))
+    head = fit(*chosen(_NO_PART, True))
     save_pretrained(EmbeddedDescriptor(descriptor, head), out)
     print(f"fitted to all {n_classes} classes and written: {out}")
     if data is None:
@@ -163,7 +164,7 @@ def pretrain(
     real = usable_shapes(data, descriptor, cache_dir, n_workers)
     real_histograms, labels_of_real = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
     report(str(data), real_histograms, labels_of_real, head)
-    unlike = chosen(None, False)
+    unlike = chosen(_NO_PART, False)
     if suffice(*unlike):
         report(f"{data}, without look-alikes", real_histograms, labels_of_real, fit(*unlike))
     # At least two shapes of each class remain to be scored against each other
