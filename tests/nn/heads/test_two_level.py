@@ -8,6 +8,7 @@ import torch
 from scipy.linalg import sqrtm
 from torch import Tensor
 
+from igps.nn.heads import two_level
 from igps.nn.heads.base import Head
 from igps.nn.heads.two_level import TwoLevelHead
 from igps.nn.heads.wccn import WCCNHead
@@ -99,8 +100,12 @@ def test_shapes_far_from_the_training_shapes_have_unit_vectors(collection: tuple
     torch.testing.assert_close(head(alone).norm(dim=1), torch.ones(N_CELLS), atol=1e-5, rtol=0)
 
 
-def test_the_distance_is_what_the_formula_says(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+@pytest.mark.parametrize("same_class", [0.55, 0.1])
+def test_the_distance_is_what_the_formula_says(
+    same_class: float, collection: tuple[Tensor, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Against the formula in float64; the last number of a vector with `lengths` does not enter its distance."""
+    monkeypatch.setattr(two_level, "_SAME_CLASS", same_class)
     histograms, classes, bodies = collection
     class_head = WCCNHead(n_directions=20)
     body_heads = WCCNHead((0,), n_directions=6, lengths=True), WCCNHead((1,), n_directions=5, lengths=True)
@@ -117,9 +122,12 @@ def test_the_distance_is_what_the_formula_says(collection: tuple[Tensor, Tensor,
     apart = first**0.3 * second**0.7
     usual, from_mean = 0.5 / 2**0.5, ((y[:, :-1].norm(dim=1) ** 2 + z[:, :-1].norm(dim=1) ** 2) / 2).sqrt()
     shorter = (torch.outer(from_mean, from_mean).sqrt() / usual).sqrt()
-    all_near = torch.exp(-((first * shorter / 0.2) ** 20) - (second * shorter / 0.3) ** 20)
+    by_class = 1 - x @ x.T
+    all_near = torch.exp(
+        -((by_class / same_class) ** 20) - (first * shorter / 0.2) ** 20 - (second * shorter / 0.3) ** 20
+    )
     near = torch.exp(-((apart / 0.1) ** 20))
-    expected = 0.95 * (1 - x @ x.T) * (1 - all_near) * (1 - near) + 0.05 * (1 - torch.exp(-((apart / 0.1) ** 2)))
+    expected = 0.95 * by_class * (1 - all_near) * (1 - near) + 0.05 * (1 - torch.exp(-((apart / 0.1) ** 2)))
     found = head.distances(vectors, vectors).double()
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
     torch.testing.assert_close(head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0)
@@ -127,6 +135,7 @@ def test_the_distance_is_what_the_formula_says(collection: tuple[Tensor, Tensor,
     assert ((near > 0.2) & (near < 0.9)).any()
     assert ((first < 0.15) & (all_near < 0.1)).any()
     assert ((second < 0.25) & (all_near < 0.1)).any()
+    assert same_class > 0.1 or ((first < 0.15) & (second < 0.25) & (all_near < 0.1)).any()
     assert ((shorter < 0.95) | (shorter > 1.05)).double().mean() > 0.5
 
 

@@ -16,6 +16,7 @@ from igps.retrieval.vectors import MAX_SHORT_WIDTH
 # Usual distance of a training shape from the mean: in many dimensions, most pairs of shapes are nearly orthogonal.
 _USUAL_LENGTH = MEDIAN / math.sqrt(2)
 _STEEPNESS = 20  # exponent of the factors that rise from 0 to 1
+_SAME_CLASS = 0.55  # nearly all poses of a scanned body have smaller distances by the class head
 _SAME_BODY = 0.1  # nearly all pairs of poses of an unseen generated body are nearer
 _WEIGHT = 0.05  # of the term that orders bodies that are nearly alike
 _MIN_DISTANCE = 1e-7  # shorter distances are rounding errors, and fractional powers have no derivative at 0
@@ -30,12 +31,13 @@ class TwoLevelHead(Head):
     triangulation. Let c be the cosine distance of the class embeddings, dₖ the distances by the body heads, and f = Π
     dₖ^pₖ. The distance is 0.95 times
 
-        c (1 − exp(−Σ (dₖ / sₖ)²⁰)) (1 − exp(−(f / 0.1)²⁰)),
+        c (1 − exp(−(c / 0.55)²⁰ − Σ (dₖ / sₖ)²⁰)) (1 − exp(−(f / 0.1)²⁰)),
 
-    plus 0.05 (1 − exp(−(f / 0.1)²)). The first factor is nearly 0 if all dₖ are below their scales sₖ, as between poses
-    of a body, and nearly 1 if any is above its scale. The second factor is nearly 0 if f is as small as between poses
-    of a body, even if one of the dₖ is not. The factors saturate, as the amount by which two bodies differ does not
-    predict their classes. The second term orders bodies that are nearly alike, such as two people.
+    plus 0.05 (1 − exp(−(f / 0.1)²)). The first factor is nearly 0 if c and all dₖ are below their scales, 0.55 and sₖ,
+    as between poses of a body, and nearly 1 if any is above its scale. The second factor is nearly 0 if f is as small
+    as between poses of a body, even if c or one of the dₖ is not. The factors saturate, as the amount by which two
+    bodies differ does not predict their classes. The second term orders bodies that are nearly alike, such as two
+    people.
 
     Far from the mean of the training shapes, distances between different bodies are as small as distances between poses
     elsewhere. The scales sₖ are therefore multiplied by √(ℓ₀ / ℓ). Here ℓ² is the product of the distances of the two
@@ -166,6 +168,7 @@ class TwoLevelHead(Head):
             bodies = bodies * distances.pow(power)
         lengths = _mean_lengths(query_bodies)[:, None] * _mean_lengths(gallery_bodies)
         exponent = exponent * (lengths / _USUAL_LENGTH**2).pow(_STEEPNESS / 4)
+        exponent = exponent + (classes / _SAME_CLASS).pow(_STEEPNESS)
         differ = torch.expm1(-exponent) * torch.expm1(-(bodies / _SAME_BODY).pow(_STEEPNESS))
         return (1 - _WEIGHT) * classes * differ - _WEIGHT * torch.expm1(-(bodies / _SAME_BODY).square())
 
