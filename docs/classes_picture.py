@@ -20,6 +20,8 @@ shapes = GradedShapes(*(fitted_to[name] for name in ("n_classes", "n_bodies", "n
 out = Path(sys.argv[1])
 contact_sheet(shapes, out)
 picture = Image.open(out).convert("RGB")
-picture = picture.resize((WIDTH, round(WIDTH * picture.height / picture.width)), Image.Resampling.LANCZOS)
+picture = picture.resize(
+    (WIDTH, round(WIDTH * picture.height / picture.width)), Image.Resampling.LANCZOS
+)
 picture.quantize(64, dither=Image.Dither.NONE).save(out, optimize=True)
 print(f"{out}: {out.stat().st_size // 1000} kB")

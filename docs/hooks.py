@@ -16,7 +16,11 @@ PLACEHOLDER = "<!-- commands -->"
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Replace the placeholder of a page by the help of every command."""
-    return markdown.replace(PLACEHOLDER, "\n".join(_sections(COMMANDS))) if PLACEHOLDER in markdown else markdown
+    return (
+        markdown.replace(PLACEHOLDER, "\n".join(_sections(COMMANDS)))
+        if PLACEHOLDER in markdown
+        else markdown
+    )
 
 
 def _sections(commands: Commands, *group: str) -> list[str]:

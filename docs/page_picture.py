@@ -15,7 +15,11 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 page_path, name, out = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3])
-flags = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", *(["--no-sandbox"] if os.geteuid() == 0 else [])]
+flags = [
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    *(["--no-sandbox"] if os.geteuid() == 0 else []),
+]
 with sync_playwright() as driver:
     browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
     page = browser.new_page(viewport={"width": 1180, "height": 860}, color_scheme="light")
@@ -24,7 +28,9 @@ with sync_playwright() as driver:
     cards = page.locator("#ranking-list canvas")
     while page.locator("#ranking-list canvas.drawn").count() < min(20, cards.count()):
         page.wait_for_timeout(100)
-    page.locator("#shape").evaluate("dialog => { dialog.style.border = 'none'; dialog.style.borderRadius = '0'; }")
+    page.locator("#shape").evaluate(
+        "dialog => { dialog.style.border = 'none'; dialog.style.borderRadius = '0'; }"
+    )
     shot = page.locator("#shape").screenshot()
     browser.close()
 picture = Image.open(io.BytesIO(shot)).convert("RGB")

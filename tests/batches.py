@@ -40,7 +40,8 @@ def _samples(generator: torch.Generator) -> SampleBatch:
     points = torch.rand(2, longest, 3, generator=generator) * mask[:, :, None]
     attributes = {
         "depth": torch.rand(2, longest, generator=generator) * mask,
-        "surface_direction": normalize(torch.randn(2, longest, 3, generator=generator), dim=2) * mask[:, :, None],
+        "surface_direction": normalize(torch.randn(2, longest, 3, generator=generator), dim=2)
+        * mask[:, :, None],
     }
     return SampleBatch(points, functions, mask, attributes)
 
@@ -49,7 +50,10 @@ def alone(batch: SignatureBatch, i: int) -> SignatureBatch:
     """One shape without its padding."""
 
     def unpadded(samples: SampleBatch) -> SampleBatch:
-        n_points, n_eigenpairs = int(samples.mask[i].sum()), int(torch.isfinite(batch.eigenvalues[i]).sum())
+        n_points, n_eigenpairs = (
+            int(samples.mask[i].sum()),
+            int(torch.isfinite(batch.eigenvalues[i]).sum()),
+        )
         return SampleBatch(
             samples.points[i : i + 1, :n_points],
             samples.eigenfunctions[i : i + 1, :n_points, :n_eigenpairs],
@@ -73,7 +77,9 @@ def scaled(batch: SignatureBatch, scale: float) -> SignatureBatch:
     """The same shapes, larger."""
 
     def grown(samples: SampleBatch) -> SampleBatch:
-        return replace(samples, points=samples.points * scale, eigenfunctions=samples.eigenfunctions / scale)
+        return replace(
+            samples, points=samples.points * scale, eigenfunctions=samples.eigenfunctions / scale
+        )
 
     return replace(
         batch,
@@ -85,11 +91,15 @@ def scaled(batch: SignatureBatch, scale: float) -> SignatureBatch:
     )
 
 
-def embedded(batch: SignatureBatch, i: int, kind: str = "interior", n_eigenpairs: int | None = None) -> Tensor:
+def embedded(
+    batch: SignatureBatch, i: int, kind: str = "interior", n_eigenpairs: int | None = None
+) -> Tensor:
     """(P, K) commute time embedding of one shape's samples, φₖ/√λₖ, float64, by its definition."""
     samples: SampleBatch = getattr(batch, kind)
     eigenvalues = batch.eigenvalues[i, torch.isfinite(batch.eigenvalues[i])][:n_eigenpairs]
-    return samples.eigenfunctions[i, samples.mask[i], : len(eigenvalues)].double() / eigenvalues.sqrt()
+    return (
+        samples.eigenfunctions[i, samples.mask[i], : len(eigenvalues)].double() / eigenvalues.sqrt()
+    )
 
 
 def batch_of(
@@ -103,9 +113,17 @@ def batch_of(
     All that is given is as it is, gradients and padding included; the surface samples are the interior ones.
     """
     n_shapes, n_points, dimension = embedding.shape
-    mask = torch.ones(n_shapes, n_points, dtype=torch.bool, device=embedding.device) if mask is None else mask
-    samples = SampleBatch(torch.zeros_like(embedding[..., :3]) if points is None else points, embedding, mask,
-                          attributes or {})  # fmt: skip
+    mask = (
+        torch.ones(n_shapes, n_points, dtype=torch.bool, device=embedding.device)
+        if mask is None
+        else mask
+    )
+    samples = SampleBatch(
+        torch.zeros_like(embedding[..., :3]) if points is None else points,
+        embedding,
+        mask,
+        attributes or {},
+    )
     ones = torch.ones(n_shapes, dtype=torch.float64, device=embedding.device)
     return SignatureBatch(
         eigenvalues=ones[:, None].expand(-1, dimension),
@@ -125,19 +143,30 @@ class OfTensors(nn.Module):
         super().__init__()
         self.descriptor, self.like = descriptor, like
 
-    def forward(self, eigenvalues: Tensor, area: Tensor, volume: Tensor, kinds: dict[str, dict[str, Tensor]]) -> Tensor:
+    def forward(
+        self, eigenvalues: Tensor, area: Tensor, volume: Tensor, kinds: dict[str, dict[str, Tensor]]
+    ) -> Tensor:
         own = ("points", "eigenfunctions", "mask")
         samples = {
-            kind: SampleBatch(*(one[name] for name in own), {name: one[name] for name in one if name not in own})
+            kind: SampleBatch(
+                *(one[name] for name in own), {name: one[name] for name in one if name not in own}
+            )
             for kind, one in kinds.items()
         }
-        return self.descriptor(replace(self.like, eigenvalues=eigenvalues, area=area, volume=volume, **samples))
+        return self.descriptor(
+            replace(self.like, eigenvalues=eigenvalues, area=area, volume=volume, **samples)
+        )
 
 
 def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, Tensor, dict[str, dict[str, Tensor]]]:
     """What `OfTensors` takes of a batch."""
     kinds = {
-        kind: {"points": one.points, "eigenfunctions": one.eigenfunctions, "mask": one.mask, **one.attributes}
+        kind: {
+            "points": one.points,
+            "eigenfunctions": one.eigenfunctions,
+            "mask": one.mask,
+            **one.attributes,
+        }
         for kind, one in (("interior", batch.interior), ("surface", batch.surface))
     }
     return batch.eigenvalues, batch.area, batch.volume, kinds
@@ -146,7 +175,12 @@ def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, Tensor, dict[str, di
 def exported(descriptor: nn.Module, batch: SignatureBatch) -> nn.Module:
     """The program of `OfTensors` that `torch.export` makes for any number of bodies and samples."""
     given, some = tensors(batch), {0: torch.export.Dim.AUTO}
-    of_samples = {kind: {name: {**some, 1: torch.export.Dim.AUTO} for name in one} for kind, one in given[3].items()}
+    of_samples = {
+        kind: {name: {**some, 1: torch.export.Dim.AUTO} for name in one}
+        for kind, one in given[3].items()
+    }
     shapes = (some, some, some, of_samples)
-    program = torch.export.export(OfTensors(descriptor, batch), given, dynamic_shapes=shapes, strict=False)
+    program = torch.export.export(
+        OfTensors(descriptor, batch), given, dynamic_shapes=shapes, strict=False
+    )
     return program.module()

@@ -16,7 +16,9 @@ def bumpy_sphere(subdivisions: int, amplitude: float = 0.3) -> Mesh:
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     x, y, z = sphere.vertices.T
     radius = 1 + amplitude * np.sin(3 * x + 0.5) * np.cos(2 * y) + 0.2 * amplitude * z
-    return np.asarray(sphere.vertices * radius[:, None] * [1.0, 0.8, 1.3]), np.asarray(sphere.faces, np.int64)
+    return np.asarray(sphere.vertices * radius[:, None] * [1.0, 0.8, 1.3]), np.asarray(
+        sphere.faces, np.int64
+    )
 
 
 def cube() -> Mesh:
@@ -38,15 +40,21 @@ def interior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
 
 def exterior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
     vertices, faces = mesh
-    points = np.random.default_rng(seed).uniform(2 * vertices.min(0), 2 * vertices.max(0), (8 * n, 3))
+    points = np.random.default_rng(seed).uniform(
+        2 * vertices.min(0), 2 * vertices.max(0), (8 * n, 3)
+    )
     return points[igl.winding_number(vertices, faces, points) < 0.5][:n]
 
 
 def smooth_functions(vertices: np.ndarray) -> np.ndarray:
     x, y, z = vertices.T
-    return np.stack([np.sin(2 * x), np.cos(3 * y + x), x * y * z, np.exp(z), np.sin(5 * z) * x, x], axis=1)
+    return np.stack(
+        [np.sin(2 * x), np.cos(3 * y + x), x * y * z, np.exp(z), np.sin(5 * z) * x, x], axis=1
+    )
 
 
-def mean_value_coordinates(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+def mean_value_coordinates(
+    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
+) -> np.ndarray:
     """(P, V) at points (P, 3): what extends the vertices' own functions, each 1 at one vertex."""
     return extend(vertices, faces, np.eye(len(vertices)), points)

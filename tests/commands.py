@@ -15,7 +15,9 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
     main()
 
 
-def error_of(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+def error_of(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
+) -> str:
     """Return the line of the error with which `igps` ends for these arguments."""
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, *arguments)

@@ -70,17 +70,24 @@ def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
-def horseshoe(half_gap: float = 0.05, tube: float = 0.3, n_sections: int = 48, n_around: int = 14) -> Mesh:
+def horseshoe(
+    half_gap: float = 0.05, tube: float = 0.3, n_sections: int = 48, n_around: int = 14
+) -> Mesh:
     """A ring that is open by twice `half_gap` radians, with flat ends, without any symmetry."""
     jitter = np.random.default_rng(0).uniform(0.9, 1.1, (n_sections, n_around))
     u = np.linspace(half_gap, 2 * np.pi - half_gap, n_sections)[:, None]
     v = np.arange(n_around)[None, :] * (2 * np.pi / n_around)
     radius = 1 + tube * jitter * np.cos(v)
-    ring = np.stack([radius * np.cos(u), radius * np.sin(u), tube * jitter * np.sin(v)], axis=2).reshape(-1, 3)
+    ring = np.stack(
+        [radius * np.cos(u), radius * np.sin(u), tube * jitter * np.sin(v)], axis=2
+    ).reshape(-1, 3)
     ends = np.stack([np.cos(u[[0, -1], 0]), np.sin(u[[0, -1], 0]), np.zeros(2)], axis=1)
     i, j = np.mgrid[: n_sections - 1, :n_around]
     a, b = i * n_around + j, i * n_around + (j + 1) % n_around
-    sides = [np.stack([a, a + n_around, b], axis=-1), np.stack([b, a + n_around, b + n_around], axis=-1)]
+    sides = [
+        np.stack([a, a + n_around, b], axis=-1),
+        np.stack([b, a + n_around, b + n_around], axis=-1),
+    ]
     here = np.arange(n_around)
     there, last, n = (here + 1) % n_around, (n_sections - 1) * n_around, n_sections * n_around
     caps = [np.stack([here, there, np.full(n_around, n)], axis=1)]
@@ -89,13 +96,17 @@ def horseshoe(half_gap: float = 0.05, tube: float = 0.3, n_sections: int = 48, n
     return Mesh(np.concatenate([ring, ends]), faces, name="horseshoe")
 
 
-def with_slivers(vertices: np.ndarray, faces: np.ndarray, n_slivers: int) -> tuple[np.ndarray, np.ndarray]:
+def with_slivers(
+    vertices: np.ndarray, faces: np.ndarray, n_slivers: int
+) -> tuple[np.ndarray, np.ndarray]:
     """The same surface, with so many random faces cut in three by a vertex hardly off the middle of a side."""
     split = np.random.default_rng(3).choice(len(faces), n_slivers, replace=False)
     inside = np.einsum("i,fij->fj", [0.4995, 0.4995, 0.001], vertices[faces[split]])
     new, (a, b, c) = len(vertices) + np.arange(n_slivers), faces[split].T
     thirds = [np.stack(corners, axis=1) for corners in ((a, b, new), (b, c, new), (c, a, new))]
-    return np.concatenate([vertices, inside]), np.concatenate([np.delete(faces, split, axis=0), *thirds])
+    return np.concatenate([vertices, inside]), np.concatenate(
+        [np.delete(faces, split, axis=0), *thirds]
+    )
 
 
 def surface_genus(mesh: Mesh) -> int:
@@ -135,5 +146,7 @@ def blob() -> Mesh:
 def homer() -> Mesh:
     path = SHARED / "data" / "homer.obj"
     if not path.is_file():
-        pytest.skip("the Homer model is not distributed with the project (expected in ../shared/data)")
+        pytest.skip(
+            "the Homer model is not distributed with the project (expected in ../shared/data)"
+        )
     return load_mesh(path)

@@ -27,8 +27,12 @@ def write_clean(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
 def write_soup(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
     """Every triangle with its own corners, as STL files have them."""
     body = ball(width, height)
-    return _written(path, trimesh.Trimesh(body.vertices[body.faces.ravel()], np.arange(3 * N_FACES).reshape(-1, 3),
-                                          process=False))  # fmt: skip
+    return _written(
+        path,
+        trimesh.Trimesh(
+            body.vertices[body.faces.ravel()], np.arange(3 * N_FACES).reshape(-1, 3), process=False
+        ),
+    )
 
 
 def write_holed(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
@@ -81,7 +85,9 @@ def write_unusable(folder: Path) -> dict[str, str]:
 def without_collada(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     """What trimesh knows of COLLADA files where pycollada is not installed, wherever these tests run."""
     error = ModuleNotFoundError("No module named 'collada'")
-    monkeypatch.setitem(trimesh.exchange.load.mesh_loaders, "dae", trimesh.exceptions.ExceptionWrapper(error))
+    monkeypatch.setitem(
+        trimesh.exchange.load.mesh_loaders, "dae", trimesh.exceptions.ExceptionWrapper(error)
+    )
 
 
 def free_edges(path: Path) -> int:

@@ -34,7 +34,9 @@ def equal_bins(n: int, reach: float) -> list[float]:
 
 def hard_classes(values: Tensor | np.ndarray, edges: Sequence[float]) -> np.ndarray:
     """(P, C) one-hot rows: how many of the edges between classes a value has reached."""
-    return np.array([np.eye(len(edges) + 1)[sum(float(value) >= edge for edge in edges)] for value in values])
+    return np.array(
+        [np.eye(len(edges) + 1)[sum(float(value) >= edge for edge in edges)] for value in values]
+    )
 
 
 def soft_classes(values: Tensor | np.ndarray, centres: Sequence[float]) -> np.ndarray:
@@ -85,7 +87,10 @@ def pair_histogram_by_loops(memberships: np.ndarray | Tensor, axes: Sequence[Axi
     n_pairs = 0
     for i in range(len(m)):
         for j in range(i):
-            share = reduce(np.multiply.outer, [np.array(hat(values[i, j], centres)) for values, centres in axes])
+            share = reduce(
+                np.multiply.outer,
+                [np.array(hat(values[i, j], centres)) for values, centres in axes],
+            )
             for row, (a, b) in enumerate(rows):
                 weight = m[i, a] * m[j, b] + (m[i, b] * m[j, a] if a != b else 0)
                 if weight:

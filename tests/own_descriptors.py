@@ -18,7 +18,14 @@ from igps.data.requirements import Requirements
 from igps.descriptors.gps import gps
 from igps.descriptors.interior import interior
 
-SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
+SMALL = [
+    "--signature.n_eigenpairs",
+    "20",
+    "--signature.resolution",
+    "10",
+    "--signature.min_samples",
+    "0",
+]
 SMALL += ["--signature.n_surface_samples", "60", "--n_workers", "1"]
 
 
@@ -29,7 +36,9 @@ class Height(igps.BodyDescriptor):
     invariant_to = ("motion",)
     requirements = Requirements(mesh=True)
 
-    def __init__(self, name: str = "height", bad: str = "no such mesh", fault: str = "raise") -> None:
+    def __init__(
+        self, name: str = "height", bad: str = "no such mesh", fault: str = "raise"
+    ) -> None:
         super().__init__()
         self.name = name
         self.bad = bad

@@ -31,7 +31,9 @@ def main() -> None:
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        subprocess.run([sys.executable, "-m", "build", "--outdir", folder / "dist", PROJECT], check=True)
+        subprocess.run(
+            [sys.executable, "-m", "build", "--outdir", folder / "dist", PROJECT], check=True
+        )
         (wheel,), (source,) = (folder / "dist").glob("*.whl"), (folder / "dist").glob("*.tar.gz")
         # Lightning needs a setuptools that still has pkg_resources in its lowest versions
         pins = {"lowest": [*lowest(project["dependencies"]), "setuptools<81"], "newest": []}
@@ -40,8 +42,19 @@ def main() -> None:
             venv.create(place, with_pip=True)
             python = str(place / "bin" / "python")
             (folder / "constraints.txt").write_text("\n".join(constraints))
-            command = [python, "-m", "pip", "install", "--quiet", "--constraint", folder / "constraints.txt", archive]
-            subprocess.run([*command, *(["setuptools<81"] if which == "lowest" else [])], check=True)
+            command = [
+                python,
+                "-m",
+                "pip",
+                "install",
+                "--quiet",
+                "--constraint",
+                folder / "constraints.txt",
+                archive,
+            ]
+            subprocess.run(
+                [*command, *(["setuptools<81"] if which == "lowest" else [])], check=True
+            )
             smoke = [python, PROJECT / "tests" / "smoke.py", project["version"], place]
             subprocess.run(smoke, check=True, cwd=folder)
             print(f"{which} versions, {archive.name}: works")

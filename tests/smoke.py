@@ -62,7 +62,9 @@ with tempfile.TemporaryDirectory() as name:
         distances, labels = archive["distances"], archive["labels"]
     assert igps.retrieval_scores(torch.from_numpy(distances), labels.tolist()).mean()["nn"] == 1
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    for number, example in enumerate(re.findall(r"^```python\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)):
+    for number, example in enumerate(
+        re.findall(r"^```python\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)
+    ):
         (folder / f"readme{number}").mkdir()
         (folder / f"example{number}.py").write_text(example)
         command = [sys.executable, str(folder / f"example{number}.py")]

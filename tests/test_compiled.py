@@ -52,7 +52,9 @@ def test_compiling_restores_the_garbage_collector(is_collected: bool) -> None:
     before = gc.isenabled()
     try:
         (gc.enable if is_collected else gc.disable)()
-        compiled()(doubled).dispatcher.compile("float64(float64)")  # such a form is never read from disk
+        compiled()(doubled).dispatcher.compile(
+            "float64(float64)"
+        )  # such a form is never read from disk
         assert gc.isenabled() is is_collected
     finally:
         (gc.enable if before else gc.disable)()
@@ -67,5 +69,12 @@ def test_loops_of_an_earlier_version_are_compiled_anew(tmp_path: Path) -> None:
             f"@compiled()\ndef times(pair):\n    return {factor} * pair.x\n"
         )
         code = f"import loops, sys; sys.exit(loops.times(loops.{name}(5.0)) != {5 * factor})"
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(tmp_path)}
-        assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment).returncode == 0
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(sys.path),
+            "NUMBA_CACHE_DIR": str(tmp_path),
+        }
+        assert (
+            subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment).returncode
+            == 0
+        )

@@ -58,13 +58,28 @@ def test_the_installed_wheel_works(archives: tuple[Path, Path], tmp_path: Path) 
     if not python.exists():
         pytest.skip("knows only the layout of environments on Unix")
     (there,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+    ]
     subprocess.run([*command, "--target", str(there), str(archives[0])], check=True)
     borrowed = [path for path in sys.path if path.endswith("site-packages")]
     # Only their modules: pth files, such as that of an editable install of this very tree, are not read
-    environment = {"PYTHONPATH": ":".join([str(there), *borrowed]), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin"}
+    environment = {
+        "PYTHONPATH": ":".join([str(there), *borrowed]),
+        "OMP_NUM_THREADS": "1",
+        "PATH": "/usr/bin:/bin",
+    }
     command = [str(python), str(SMOKE), VERSION, str(there)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "works"
 

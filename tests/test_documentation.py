@@ -44,7 +44,9 @@ class Block:
 
 
 def blocks(page: str) -> list[Block]:
-    found = re.findall(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```', TEXT[page], flags=re.DOTALL | re.MULTILINE)
+    found = re.findall(
+        r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```', TEXT[page], flags=re.DOTALL | re.MULTILINE
+    )
     return [Block(language, title or None, text) for language, title, text in found]
 
 
@@ -56,7 +58,9 @@ def run(folder: Path, *arguments: str) -> str:
     paths = [str(PROJECT / "src"), str(folder), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *arguments]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=False, env=environment
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -91,7 +95,9 @@ def first_tier(distances: np.ndarray, labels: list[str]) -> tuple[float, float]:
 
 def histograms_by_loops(dataset: SignatureDataset) -> list[np.ndarray]:
     signatures = [dataset[i].signature for i in range(len(dataset))]
-    return [paper_histogram(one.interior.eigenfunctions, one.eigenvalues).ravel() for one in signatures]
+    return [
+        paper_histogram(one.interior.eigenfunctions, one.eigenvalues).ravel() for one in signatures
+    ]
 
 
 def test_readme_is_short_and_has_its_examples() -> None:
@@ -109,7 +115,9 @@ def test_the_ten_lines_print_scores_and_the_nearest(tmp_path: Path) -> None:
     assert list(found) == SCORES
     dataset = SignatureDataset(tmp_path / "shapes", cache_dir=tmp_path / "cache")
     cells = histograms_by_loops(dataset)
-    distances = np.array([[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells])
+    distances = np.array(
+        [[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells]
+    )
     labels = list(dataset.bodies.labels or ())
     assert (found["nn"], found["ft"]) == pytest.approx(first_tier(distances, labels))
     expected = [dataset.bodies.names[i] for i in np.argsort(distances[0], kind="stable")[:3]]
@@ -134,11 +142,24 @@ def test_the_classifier_of_the_readme_tells_classes_apart(tmp_path: Path) -> Non
 
 
 def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path: Path) -> None:
-    mine = next(block for block in python("docs/how-to/own-descriptors.md") if block.title == "mine.py")
+    mine = next(
+        block for block in python("docs/how-to/own-descriptors.md") if block.title == "mine.py"
+    )
     (tmp_path / "mine.py").write_text(mine.text)
     ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=600).write(tmp_path / "shapes")
-    options = ["--signature.n_eigenpairs", "5", "--n_workers", "1", "--cache_dir", "cache", "--out", "out"]
-    run(tmp_path, "-m", "igps.cli", "retrieve", "shapes", "--descriptor", "mine:Roundness", *options)
+    options = [
+        "--signature.n_eigenpairs",
+        "5",
+        "--n_workers",
+        "1",
+        "--cache_dir",
+        "cache",
+        "--out",
+        "out",
+    ]
+    run(
+        tmp_path, "-m", "igps.cli", "retrieve", "shapes", "--descriptor", "mine:Roundness", *options
+    )
     with np.load(tmp_path / "out" / "distances.npz") as archive:
         distances, names, labels = archive["distances"], archive["names"], archive["labels"]
     bodies = [trimesh.load(tmp_path / "shapes" / name) for name in names]
@@ -154,11 +175,15 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page: str, tmp_p
     code, expected = program(page, tmp_path)
     assert code
     if "MDAnalysis" in code:
-        pytest.importorskip("MDAnalysis", reason="frames of simulations are read by MDAnalysis, of the extra [test]")
+        pytest.importorskip(
+            "MDAnalysis", reason="frames of simulations are read by MDAnalysis, of the extra [test]"
+        )
     (tmp_path / "page.py").write_text(code)
     printed = run(tmp_path, "page.py")
     shown = iter(printed.splitlines())
-    missing = [line for line in expected.splitlines() if line not in shown]  # in this order, others between
+    missing = [
+        line for line in expected.splitlines() if line not in shown
+    ]  # in this order, others between
     assert not missing, f"{page} shows {missing}, printed was\n{printed}"
     check = CHECKS.get(page)
     if check:
@@ -168,9 +193,13 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page: str, tmp_p
 def check_retrieval(printed: str, folder: Path) -> None:
     dataset = SignatureDataset(folder / "shapes", cache_dir=folder / "cache")
     cells, labels = histograms_by_loops(dataset), list(dataset.bodies.labels or ())
-    distances = np.array([[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells])
+    distances = np.array(
+        [[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells]
+    )
     bipeds = [i for i, label in enumerate(labels) if label == "biped"]
-    rankings = [[labels[j] for j in np.argsort(distances[i], kind="stable") if j != i] for i in bipeds]
+    rankings = [
+        [labels[j] for j in np.argsort(distances[i], kind="stable") if j != i] for i in bipeds
+    ]
     tier = np.mean([ranking[:3].count("biped") / 3 for ranking in rankings])
     first = np.mean([ranking[0] == "biped" for ranking in rankings])
     assert ast.literal_eval(printed) == {"nn": round(100 * first), "ft": round(100 * tier)}
@@ -188,11 +217,15 @@ def check_classification(printed: str, folder: Path) -> None:
     for train, test in StratifiedKFold(3, shuffle=True, random_state=0).split(cells, labels):
         machine = SVC().fit(np.sqrt(cells[train]), labels[train])
         expected.append(np.mean(machine.predict(np.sqrt(cells[test])) == labels[test]))
-    np.testing.assert_allclose(np.fromstring(told["folds"].strip("[]"), sep=" "), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        np.fromstring(told["folds"].strip("[]"), sep=" "), expected, atol=1e-6
+    )
     assert min(expected) > 1 / 3  # by guessing
     chosen, score = told["chosen"].split()
     assert chosen in ("interior", "d2")
-    assert float(score) >= round(float(np.mean(expected)), 2)  # the first of the grid is this very pipeline
+    assert float(score) >= round(
+        float(np.mean(expected)), 2
+    )  # the first of the grid is this very pipeline
     assert told["predicted"] == labels[0]
     kernel = chi2_kernel(cells)
     expected_score = SVC(kernel="precomputed").fit(kernel, labels).score(kernel, labels)
@@ -225,7 +258,9 @@ CHECKS = {
 
 def shell_lines(page: str) -> list[str]:
     """The commands of its shell blocks, and those within sentences."""
-    text = "\n".join(block.text for block in blocks(page) if block.language == "sh").replace("\\\n", " ")
+    text = "\n".join(block.text for block in blocks(page) if block.language == "sh").replace(
+        "\\\n", " "
+    )
     lines = [line.split(" #")[0] for line in text.splitlines()]
     words = [part.strip() for line in lines for part in re.split(r";|&&|\|", line)]
     prose = re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE)
@@ -249,7 +284,9 @@ def known_command(words: list[str]) -> list[str]:
 def told(page: str) -> list[tuple[str, list[str]]]:
     """What the shell is told on a page: each line, without settings for one command, and its words."""
     lines = [re.sub(r"^([A-Z_]+=\S* )+", "", line) for line in shell_lines(page)]
-    return [(line, [word for word in shlex.split(line) if not word.startswith(">")]) for line in lines]
+    return [
+        (line, [word for word in shlex.split(line) if not word.startswith(">")]) for line in lines
+    ]
 
 
 def commands_told() -> dict[str, list[tuple[str, list[str]]]]:
@@ -281,7 +318,9 @@ def test_what_igps_is_told_exists(
 @pytest.mark.parametrize("page", [page for page in TEXT if shell_lines(page)])
 def test_what_the_shell_is_told_exists(page: str) -> None:
     targets = re.findall(r"^([a-z0-9-]+):", (PROJECT / "Makefile").read_text(), flags=re.MULTILINE)
-    extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     for line, words in told(page):
         if words[0] == "make":
             wanted = [word for word in words[1:] if "=" not in word]
@@ -291,30 +330,53 @@ def test_what_the_shell_is_told_exists(page: str) -> None:
             script = next(word for word in words[1:] if not word.startswith("-"))
             assert "-m" in words or (PROJECT / script).is_file(), line
             source = "" if "-m" in words else (PROJECT / script).read_text()
-            for option in re.findall(r"--([a-z_]+)", line) if source and "LightningCLI" not in source else ():
-                assert option == "config" or re.search(rf"\b{option}\b|--{option}\b", source), f"{line}: no {option}"
+            for option in (
+                re.findall(r"--([a-z_]+)", line) if source and "LightningCLI" not in source else ()
+            ):
+                assert option == "config" or re.search(rf"\b{option}\b|--{option}\b", source), (
+                    f"{line}: no {option}"
+                )
         elif words[0] == "pip":
             assert words[1] == "install", line
-            named = {name for several in re.findall(r"\[([^\]]+)\]", line) for name in several.split(",")}
+            named = {
+                name for several in re.findall(r"\[([^\]]+)\]", line) for name in several.split(",")
+            }
             assert named <= set(extras), line
         elif words[0] == "igps":
             assert words[1:] == ["--help"] or known_command(words[1:])
         else:
-            assert words[0] in {"git", "cd", "dask", "sbatch", "squeue", "eval", "source", "ssh", "rsync", "sudo"}, line
+            assert words[0] in {
+                "git",
+                "cd",
+                "dask",
+                "sbatch",
+                "squeue",
+                "eval",
+                "source",
+                "ssh",
+                "rsync",
+                "sudo",
+            }, line
 
 
 def test_descriptors_and_commands_are_named() -> None:
     for name in NAMES:
         assert f"`{name}`" in TEXT["docs/index.md"], name
-    extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     for name in set(extras) - {"test", "lint", "campaign", "docs"}:
         assert f"`{name}`" in TEXT["docs/index.md"] or f"[{name}]" in "".join(TEXT.values()), name
 
 
 def anchors(text: str) -> set[str]:
     """Ids of the headings, as GitHub and MkDocs make them of plain words."""
-    headings = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), flags=re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+    headings = re.findall(
+        r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), flags=re.MULTILINE
+    )
+    return {
+        re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings
+    }
 
 
 @pytest.mark.parametrize("name", re.findall(r"^::: (\S+)", TEXT["docs/api.md"], re.MULTILINE))
@@ -354,9 +416,9 @@ def test_tables_are_whole_and_prose_is_wrapped(page: str) -> None:
         cells = len(re.findall(r"(?<!\\)\|", re.sub(r"`[^`]*`", "", line)))
         head = cells if place == 0 else head
         assert cells == head, f"{page}: {line}"
-        assert (re.fullmatch(r"[|:\- ]+", line) is not None) is (place == 1) or line.strip("| ") == "", (
-            f"{page}: {line}"
-        )
+        assert (re.fullmatch(r"[|:\- ]+", line) is not None) is (place == 1) or line.strip(
+            "| "
+        ) == "", f"{page}: {line}"
         place += 1
 
 
@@ -378,8 +440,13 @@ def table_rows(page: str, heading: str) -> dict[str, dict[str, str]]:
 
 def test_the_figures_of_the_readme_are_those_that_were_measured() -> None:
     readme = table_rows("README.md", "## Which descriptor")
-    measured = json.loads((PROJECT / "docs" / "benchmarks" / "results" / "shrec07.json").read_text("utf-8"))
-    rows = {row[0].strip("`"): dict(zip(measured["columns"], row, strict=True)) for row in measured["rows"]}
+    measured = json.loads(
+        (PROJECT / "docs" / "benchmarks" / "results" / "shrec07.json").read_text("utf-8")
+    )
+    rows = {
+        row[0].strip("`"): dict(zip(measured["columns"], row, strict=True))
+        for row in measured["rows"]
+    }
     assert set(readme) == {"interior", "gps", "multiscale", "rich", "pretrained"}
     for name, row in readme.items():
         for score in ("NN", "FT", "ST", "DCG"):

@@ -60,7 +60,9 @@ def test_front_door_has_these_names_and_no_others() -> None:
     assert len(set(NAMES)) == len(NAMES) <= 25
     rooms = {path.stem for path in PACKAGE.iterdir()}
     public = {name for name in vars(igps) if not name.startswith("_")} - rooms - {"annotations"}
-    assert public <= {*NAMES, "importlib", "TYPE_CHECKING", "Any"}, "a name that __all__ does not tell of"
+    assert public <= {*NAMES, "importlib", "TYPE_CHECKING", "Any"}, (
+        "a name that __all__ does not tell of"
+    )
 
 
 def test_every_name_opens() -> None:
@@ -70,7 +72,16 @@ def test_every_name_opens() -> None:
 
 def test_import_loads_nothing_heavy() -> None:
     heavy = (
-        *("pytorch_lightning", "torch._dynamo", "torchmetrics", "matplotlib", "sklearn", "skimage", "igl", "pandas"),
+        *(
+            "pytorch_lightning",
+            "torch._dynamo",
+            "torchmetrics",
+            "matplotlib",
+            "sklearn",
+            "skimage",
+            "igl",
+            "pandas",
+        ),
         *("numba", "jinja2", "nibabel"),
     )
     words = f"import sys; import igps; print([name for name in {heavy!r} if name in sys.modules])"
@@ -83,7 +94,9 @@ def test_import_loads_nothing_heavy() -> None:
 def test_lazy_names_do_load_what_they_need() -> None:
     words = "import sys, igps; igps.RetrievalLearner; print('pytorch_lightning' in sys.modules)"
     environment = {"PYTHONPATH": str(PACKAGE.parent), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment
+    )
     assert done.stdout.strip() == "True"
 
 
@@ -92,7 +105,11 @@ def imported(path: Path) -> set[str]:
     found: set[str] = set()
 
     def look(node: ast.AST) -> None:
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+        if (
+            isinstance(node, ast.If)
+            and isinstance(node.test, ast.Name)
+            and node.test.id == "TYPE_CHECKING"
+        ):
             for child in node.orelse:
                 look(child)
             return
@@ -112,7 +129,10 @@ def normal(name: str) -> str:
 
 
 def declared(requirements: list[str]) -> set[str]:
-    return {normal(re.split(r"[\s\[<>=!~;]", requirement, maxsplit=1)[0]) for requirement in requirements}
+    return {
+        normal(re.split(r"[\s\[<>=!~;]", requirement, maxsplit=1)[0])
+        for requirement in requirements
+    }
 
 
 def test_every_import_is_declared() -> None:
@@ -133,7 +153,12 @@ def test_every_import_is_declared() -> None:
                     f"{path} imports {module}, which pyproject.toml does not declare"
                 )
     # And nothing is declared that is not used.
-    every = set().union(*(imported(path) for path in [*PACKAGE.rglob("*.py"), *(PROJECT / "training").rglob("*.py")]))
+    every = set().union(
+        *(
+            imported(path)
+            for path in [*PACKAGE.rglob("*.py"), *(PROJECT / "training").rglob("*.py")]
+        )
+    )
     used = {normal(DISTRIBUTIONS.get(module, module)) for module in every}
     # trimesh imports these, where a file asks for them: text that is not UTF-8, or a format
     assert core - {"charset-normalizer"} <= used
@@ -148,8 +173,12 @@ def test_modules_that_import_at_once_need_no_extra() -> None:
         for node in ast.parse(path.read_text()).body:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            for module in {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"igps", ""}:
-                assert normal(DISTRIBUTIONS.get(module, module)) in core, f"{path} needs {module} at once"
+            for module in (
+                {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"igps", ""}
+            ):
+                assert normal(DISTRIBUTIONS.get(module, module)) in core, (
+                    f"{path} needs {module} at once"
+                )
 
 
 def test_distributions_are_called_so() -> None:

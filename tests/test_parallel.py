@@ -23,7 +23,9 @@ GIB = 2**30
 LINUX = sys.platform == "linux"
 # Bytes of a body that a worker keeps for the next
 PAGES = 40 * 2**20
-needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to see whether a process lives")
+needs_proc = pytest.mark.skipif(
+    not Path("/proc").is_dir(), reason="needs /proc to see whether a process lives"
+)
 
 
 def all_of(*arguments, **options) -> dict:  # type: ignore[no-untyped-def]
@@ -78,7 +80,9 @@ def limited() -> dict:  # type: ignore[type-arg]
     found += [partial(jobs.allocate, size) for size in (1000, 2 * GIB, 2000)]
     found += [partial(jobs.pages_cleared, PAGES)] * 3
     found += [partial(jobs.sleep, seconds) for seconds in (0.1, 1000.0, 0.2)]
-    return all_of(jobs.call, found, n_workers=1, limits=Limits(seconds=5, memory=GIB if LINUX else None))
+    return all_of(
+        jobs.call, found, n_workers=1, limits=Limits(seconds=5, memory=GIB if LINUX else None)
+    )
 
 
 def test_every_job_has_its_result_in_this_process_and_in_others(results: dict[int, object]) -> None:
@@ -117,7 +121,9 @@ def test_workers_leave_it_to_their_parent_while_they_start(tmp_path: Path) -> No
         "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in jobs in the background
         "    os.kill(os.getpid(), signal.SIGINT)\n"
     )
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, check=False
+    )
     assert done.stdout == "7\n"
     assert done.stderr.count("Traceback") == 1  # the script's own
     assert "KeyboardInterrupt" in done.stderr
@@ -139,7 +145,9 @@ def test_fewer_than_one_worker_is_refused(n_workers: int) -> None:
         all_of(jobs.square, [1, 2], n_workers=n_workers)
 
 
-def test_one_worker_is_this_process_unless_there_are_limits(limited: dict[int, tuple[int, str]]) -> None:
+def test_one_worker_is_this_process_unless_there_are_limits(
+    limited: dict[int, tuple[int, str]],
+) -> None:
     assert all_of(jobs.process, [0, 0], n_workers=1)[1][0] == os.getpid()
     assert limited[0][0] == limited[1][0] != os.getpid()
 
@@ -150,8 +158,13 @@ def test_a_job_that_needs_too_much_memory_is_named(limited: dict[int, object]) -
     assert [limited[number] for number in (2, 3, 4)] == expected
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are")
-@pytest.mark.skipif("[always]" in jobs.huge_pages(), reason="the system hands out huge pages, of which there are few")
+@pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are"
+)
+@pytest.mark.skipif(
+    "[always]" in jobs.huge_pages(),
+    reason="the system hands out huge pages, of which there are few",
+)
 @pytest.mark.skipif(not LINUX, reason="Linux alone enforces a memory limit")
 def test_a_limit_below_what_python_itself_takes_is_to_be_raised() -> None:
     with pytest.raises(MachineError, match="raise the memory_limit"):
@@ -176,11 +189,16 @@ def test_a_job_that_takes_too_long_is_ended(limited: dict[int, object]) -> None:
         (partial(jobs.fail_with, errno.ENOSPC), "ENOSPC.*Free disk space.*run again"),
         (partial(jobs.fail_with, errno.EMFILE), "EMFILE.*Raise the limit of open files.*run again"),
         (partial(jobs.fail_with, 0), "out of memory. Use fewer workers"),
-        (partial(jobs.need_library, "no_such_library"), "No module named 'no_such_library'.*Install it and run again"),
+        (
+            partial(jobs.need_library, "no_such_library"),
+            "No module named 'no_such_library'.*Install it and run again",
+        ),
     ],
     ids=["disk", "files", "memory", "library"],
 )
-def test_the_machine_is_not_the_jobs_fault(where: str, job: Callable[[], None], message: str) -> None:
+def test_the_machine_is_not_the_jobs_fault(
+    where: str, job: Callable[[], None], message: str
+) -> None:
     """It is told once, and not of every job."""
     with ThreadPoolExecutor(1) as pool, pytest.raises(MachineError, match=message):
         list(
@@ -200,7 +218,11 @@ def test_other_errors_of_the_system_are_those_of_a_job() -> None:
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: ThreadPoolExecutor(2), lambda: ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))]
+    "make",
+    [
+        lambda: ThreadPoolExecutor(2),
+        lambda: ProcessPoolExecutor(1, multiprocessing.get_context("spawn")),
+    ],
 )
 def test_another_executor_does_the_work(make: Callable[[], Executor]) -> None:
     with make() as pool:
@@ -217,7 +239,10 @@ def test_an_executor_that_breaks_is_the_machine() -> None:
 
 
 def test_an_executor_has_limits_of_its_own() -> None:
-    with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match="limits: expected None with an executor"):
+    with (
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(ValueError, match="limits: expected None with an executor"),
+    ):
         list(run(jobs.square, [1], executor=pool, limits=Limits(seconds=1)))
 
 
@@ -229,7 +254,9 @@ def test_a_caller_that_takes_its_time_costs_no_job_its_result() -> None:
     assert found == [(0, 0.1), (1, 0.6)]
 
 
-@pytest.mark.parametrize(("name", "options"), [("time_limit", {"seconds": 0}), ("memory_limit", {"memory": -5})])
+@pytest.mark.parametrize(
+    ("name", "options"), [("time_limit", {"seconds": 0}), ("memory_limit", {"memory": -5})]
+)
 def test_impossible_limits_are_refused(name: str, options: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=f"{name}: expected None or a positive number"):
         Limits(**options)
@@ -237,8 +264,12 @@ def test_impossible_limits_are_refused(name: str, options: dict[str, int]) -> No
 
 def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
-    script.write_text("from igps._parallel import Limits, run\nlist(run(abs, [1], limits=Limits(seconds=9)))\n")
-    told = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False)
+    script.write_text(
+        "from igps._parallel import Limits, run\nlist(run(abs, [1], limits=Limits(seconds=9)))\n"
+    )
+    told = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False
+    )
     assert told.returncode != 0
     assert "MachineError: no worker process could be started" in told.stderr
     assert "under `if __name__ == '__main__':`" in told.stderr
@@ -266,7 +297,9 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
         "        print(worker, flush=True)\n"
         "        os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
+    with subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, text=True
+    ) as parent:
         assert parent.stdout is not None
         worker = int(parent.stdout.readline())
     if not ended(worker):

@@ -51,16 +51,24 @@ def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture
 def features(tmp_path: Path) -> VolumetricFeatures:
-    return VolumetricFeatures(interior(n_eigenpairs=20), config=CONFIG, cache_dir=tmp_path, n_workers=1)
+    return VolumetricFeatures(
+        interior(n_eigenpairs=20), config=CONFIG, cache_dir=tmp_path, n_workers=1
+    )
 
 
 def test_features_are_the_roots_of_the_histograms(
     paths: list[Path], features: VolumetricFeatures, tmp_path: Path
 ) -> None:
-    histograms = describe(SignatureDataset(paths, CONFIG, tmp_path), interior(n_eigenpairs=20)).flatten(1).numpy()
+    histograms = (
+        describe(SignatureDataset(paths, CONFIG, tmp_path), interior(n_eigenpairs=20))
+        .flatten(1)
+        .numpy()
+    )
     np.testing.assert_allclose(features.fit_transform(paths), np.sqrt(histograms), atol=1e-6)
     plain = clone(features).set_params(square_root=False)
-    np.testing.assert_allclose(plain.transform([str(path) for path in paths]), histograms, atol=1e-6)
+    np.testing.assert_allclose(
+        plain.transform([str(path) for path in paths]), histograms, atol=1e-6
+    )
 
 
 def test_meshes_give_what_their_files_give(paths: list[Path], features: VolumetricFeatures) -> None:
@@ -85,7 +93,9 @@ def test_other_input_is_refused(features: VolumetricFeatures) -> None:
         features.transform([1, 2])
     with pytest.raises(TypeError, match=r"expected a list of paths .*, got 'a\.off' alone"):
         features.transform("a.off")
-    with pytest.raises(ValueError, match=r"expected one column of paths or meshes, got an array of shape \(1, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"expected one column of paths or meshes, got an array of shape \(1, 2\)"
+    ):
         features.transform(np.array([["a.off", "b.off"]]))  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="got nothing"):
         features.fit([])
@@ -108,20 +118,26 @@ def test_a_file_of_several_bodies_is_no_row(tmp_path: Path) -> None:
     labels[1:6, 1:11, 1:11], labels[7:11, 1:11, 1:11] = 1, 2
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "a.nii.gz")
     features = VolumetricFeatures("interior", cache_dir=tmp_path, n_workers=1)
-    with pytest.raises(ValueError, match=r"got several, such as .*a\.nii\.gz#1\. Name each as FILE#PART"):
+    with pytest.raises(
+        ValueError, match=r"got several, such as .*a\.nii\.gz#1\. Name each as FILE#PART"
+    ):
         features.transform([tmp_path / "a.nii.gz"])
 
 
 def test_a_name_is_a_descriptor_with_its_needs(paths: list[Path], tmp_path: Path) -> None:
     few = VolumetricFeatures("interior", config=CONFIG, cache_dir=tmp_path, n_workers=1)
     for given in (paths[:1], [load_mesh(paths[0])]):
-        with pytest.raises(ValueError, match="this descriptor needs signatures of at least 250, got 20"):
+        with pytest.raises(
+            ValueError, match="this descriptor needs signatures of at least 250, got 20"
+        ):
             few.fit(given).transform(given)
     with pytest.raises(ValueError, match=r"mine\.nothing:Here"):
         VolumetricFeatures("mine.nothing:Here").fit(paths)
 
 
-def test_descriptions_that_are_no_histograms_are_given_as_they_are(paths: list[Path], tmp_path: Path) -> None:
+def test_descriptions_that_are_no_histograms_are_given_as_they_are(
+    paths: list[Path], tmp_path: Path
+) -> None:
     features = VolumetricFeatures(D2(), config=CONFIG, cache_dir=tmp_path, n_workers=1)
     expected = describe(SignatureDataset(paths[:2], CONFIG, tmp_path), D2(), n_workers=1)
     np.testing.assert_allclose(features.transform(paths[:2]), expected, atol=1e-6)
@@ -153,7 +169,9 @@ def test_reading_is_passed_on(paths: list[Path], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("descriptor", [DISTANCES, interior(n_eigenpairs=3)])
-def test_columns_have_names_and_tables_have_them(paths: list[Path], tmp_path: Path, descriptor: Descriptor) -> None:
+def test_columns_have_names_and_tables_have_them(
+    paths: list[Path], tmp_path: Path, descriptor: Descriptor
+) -> None:
     features = VolumetricFeatures(descriptor, config=CONFIG, cache_dir=tmp_path, n_workers=1)
     with pytest.raises(NotFittedError):
         features.get_feature_names_out()
@@ -229,18 +247,36 @@ def mesh_of_row(row: bytes) -> Mesh:
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.SkipTestWarning")
 def test_conventions_of_scikit_learn() -> None:
     """All its checks of a transformer, on meshes that are made of the rows of its tables."""
-    known = {"check_parameters_default_constructible": "its defaults are objects; see the test below for the real ones"}
+    known = {
+        "check_parameters_default_constructible": "its defaults are objects; see the test below for the real ones"
+    }
     results = check_estimator(OnRows(), on_fail=None, on_skip=None, expected_failed_checks=known)
     status = {result["check_name"]: result["status"] for result in results}
-    assert {name: one for name, one in status.items() if one not in ("passed", "skipped") and name not in known} == {}
+    assert {
+        name: one
+        for name, one in status.items()
+        if one not in ("passed", "skipped") and name not in known
+    } == {}
     passed = {name for name, one in status.items() if one == "passed"}
     assert {
-        "check_estimator_cloneable", "check_no_attributes_set_in_init", "check_estimators_overwrite_params",
-        "check_dont_overwrite_parameters", "check_estimators_fit_returns_self", "check_estimators_pickle",
-        "check_transformer_general", "check_methods_sample_order_invariance", "check_methods_subset_invariance",
-        "check_get_params_invariance", "check_set_params", "check_dict_unchanged", "check_fit_idempotent",
-        "check_fit_score_takes_y", "check_mixin_order", "check_valid_tag_types", "check_fit_check_is_fitted",
-    } <= passed  # fmt: skip
+        "check_estimator_cloneable",
+        "check_no_attributes_set_in_init",
+        "check_estimators_overwrite_params",
+        "check_dont_overwrite_parameters",
+        "check_estimators_fit_returns_self",
+        "check_estimators_pickle",
+        "check_transformer_general",
+        "check_methods_sample_order_invariance",
+        "check_methods_subset_invariance",
+        "check_get_params_invariance",
+        "check_set_params",
+        "check_dict_unchanged",
+        "check_fit_idempotent",
+        "check_fit_score_takes_y",
+        "check_mixin_order",
+        "check_valid_tag_types",
+        "check_fit_check_is_fitted",
+    } <= passed
     assert len(passed) > 25
     # What is left out asks for other libraries of arrays; nothing that is about transformers.
     skipped = {name for name, one in status.items() if one == "skipped"}

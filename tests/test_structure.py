@@ -27,7 +27,16 @@ FLOORS = (
     ("cli", "sklearn"),
 )
 # Rooms that are one file.
-FILES = ("_arrays", "_compiled", "_files", "_parallel", "_parameters", "_threads", "_workers", "sklearn")
+FILES = (
+    "_arrays",
+    "_compiled",
+    "_files",
+    "_parallel",
+    "_parameters",
+    "_threads",
+    "_workers",
+    "sklearn",
+)
 
 
 def imported_rooms(path: Path) -> set[str]:
@@ -43,7 +52,9 @@ def imported_rooms(path: Path) -> set[str]:
     return rooms
 
 
-@pytest.mark.parametrize(("floor", "room"), [(floor, room) for floor, rooms in enumerate(FLOORS) for room in rooms])
+@pytest.mark.parametrize(
+    ("floor", "room"), [(floor, room) for floor, rooms in enumerate(FLOORS) for room in rooms]
+)
 def test_imports_run_one_way(floor: int, room: str) -> None:
     below = {name for rooms in FLOORS[:floor] for name in rooms}
     files = [PACKAGE / f"{room}.py"] if room in FILES else sorted((PACKAGE / room).rglob("*.py"))

@@ -28,7 +28,9 @@ from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
-needs_affinity = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs an affinity to set")
+needs_affinity = pytest.mark.skipif(
+    not hasattr(os, "sched_setaffinity"), reason="needs an affinity to set"
+)
 
 
 def blas() -> list[int]:
@@ -64,7 +66,9 @@ def test_cores_are_at_most_those_of_the_machine_and_of_the_affinity() -> None:
     assert 1 <= n_cores() <= seen
 
 
-@pytest.mark.parametrize(("quota", "cores"), [("50000 100000", 1), ("150000 100000", 2), ("max 100000", 64)])
+@pytest.mark.parametrize(
+    ("quota", "cores"), [("50000 100000", 1), ("150000 100000", 2), ("max 100000", 64)]
+)
 def test_cores_are_those_that_the_container_grants(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, quota: str, cores: int
 ) -> None:
@@ -73,7 +77,11 @@ def test_cores_are_those_that_the_container_grants(
     original = open
 
     def redirected(file: Any, *arguments: Any, **options: Any) -> Any:
-        return original(tmp_path / "cpu.max" if file == "/sys/fs/cgroup/cpu.max" else file, *arguments, **options)
+        return original(
+            tmp_path / "cpu.max" if file == "/sys/fs/cgroup/cpu.max" else file,
+            *arguments,
+            **options,
+        )
 
     monkeypatch.setattr("builtins.open", redirected)
     monkeypatch.setattr(os.path, "exists", lambda path: path == "/sys/fs/cgroup/cpu.max")
@@ -93,7 +101,9 @@ def test_on_one_core_a_body_is_computed_on_one_thread() -> None:
         "signature = igps.compute_signature(igps.Mesh(ball.vertices, ball.faces), config)\n"
         "print(n_cores(), n_threads(), round(float(signature.eigenvalues[0]), 1))"
     )
-    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    environment = {
+        name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")
+    }
     output = subprocess.run(
         [sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environment
     ).stdout
@@ -171,7 +181,9 @@ def test_the_last_context_lifts_a_limit_set_by_another_thread() -> None:
     assert settings() == before
 
 
-def test_no_thread_is_needed_where_the_system_starts_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_thread_is_needed_where_the_system_starts_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """As in a container with a limit."""
     before, refused = settings(), []
 
@@ -312,7 +324,9 @@ def test_calls_on_a_body_leave_the_settings(blob: Mesh) -> None:
         others = list(pool.map(lambda _: igps.compute_signature(blob, CONFIG), range(3)))
         assert set(pool.map(lambda _: torch.get_num_threads(), range(9))) == {3}
     for other in others:
-        np.testing.assert_array_equal(other.interior.eigenfunctions, signature.interior.eigenfunctions)
+        np.testing.assert_array_equal(
+            other.interior.eigenfunctions, signature.interior.eigenfunctions
+        )
     assert settings() == before
 
 
@@ -358,8 +372,15 @@ def test_a_training_step_is_computed_on_one_thread(blob: Mesh) -> None:
     items = [LabelledSignature(signature, i // 2, str(i)) for i in range(4)]
     described = Watched()
     learner = igps.RetrievalLearner(described, BlendedDistance(ProjectionHead(width=4, n_hidden=8)))
-    options = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    trainer = Trainer(max_epochs=1, accumulate_grad_batches=2, enable_model_summary=False, **options)  # type: ignore[arg-type]
+    options = {
+        "accelerator": "cpu",
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+    }
+    trainer = Trainer(
+        max_epochs=1, accumulate_grad_batches=2, enable_model_summary=False, **options
+    )  # type: ignore[arg-type]
     with pytest.warns(UserWarning, match="val_dataloader"):
         trainer.fit(learner, DataLoader(items, batch_size=2, collate_fn=igps.collate))  # type: ignore[arg-type]
     assert described.seen.count(("gradient", 1)) == 2
@@ -367,7 +388,9 @@ def test_a_training_step_is_computed_on_one_thread(blob: Mesh) -> None:
     assert settings() == before
 
 
-def test_a_command_leaves_the_settings(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_leaves_the_settings(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = settings()
     seen: list[int] = []
 
@@ -390,7 +413,10 @@ def test_a_team_does_every_job_once_and_in_order(max_threads: int) -> None:
 
     def square(number: int) -> tuple[int, int]:
         done.append(number)
-        return number**2, n_threads() if threading.current_thread() is not threading.main_thread() else 1
+        return (
+            number**2,
+            n_threads() if threading.current_thread() is not threading.main_thread() else 1,
+        )
 
     with Team(max_threads) as team:
         for size in (0, 1, 3, 40, 2):

@@ -15,7 +15,11 @@ from igps.data.datamodule import SignatureDataModule
 from igps.nn.learner import RetrievalLearner
 
 DEFAULTS = Path(__file__).parents[1] / "configs" / "default.yaml"
-_SHORT_NAMES = {"root": ("data", "root"), "out": ("trainer", "default_root_dir"), "epochs": ("trainer", "max_epochs")}
+_SHORT_NAMES = {
+    "root": ("data", "root"),
+    "out": ("trainer", "default_root_dir"),
+    "epochs": ("trainer", "max_epochs"),
+}
 
 
 class Run(LightningCLI):
@@ -27,9 +31,15 @@ class Run(LightningCLI):
     """
 
     def __init__(self) -> None:
-        last = ModelCheckpoint(filename="last", save_on_train_epoch_end=True, enable_version_counter=False)
+        last = ModelCheckpoint(
+            filename="last", save_on_train_epoch_end=True, enable_version_counter=False
+        )
         best = ModelCheckpoint(
-            filename="best", monitor="val_ft", mode="max", save_on_train_epoch_end=False, enable_version_counter=False
+            filename="best",
+            monitor="val_ft",
+            mode="max",
+            save_on_train_epoch_end=False,
+            enable_version_counter=False,
         )
         files = {"default_config_files": [str(DEFAULTS)]}
         super().__init__(
@@ -43,15 +53,30 @@ class Run(LightningCLI):
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Add short names of frequent options, resumption and early stopping."""
-        parser.add_argument("--root", type=str | None, help="short for data.root: the folder of labelled meshes")
-        parser.add_argument("--out", type=str | None, help="short for trainer.default_root_dir: the folder of the run")
+        parser.add_argument(
+            "--root", type=str | None, help="short for data.root: the folder of labelled meshes"
+        )
+        parser.add_argument(
+            "--out",
+            type=str | None,
+            help="short for trainer.default_root_dir: the folder of the run",
+        )
         parser.add_argument("--epochs", type=int | None, help="short for trainer.max_epochs")
-        parser.add_argument("--resume", type=str | None, help="checkpoint to resume from, or 'last'")
+        parser.add_argument(
+            "--resume", type=str | None, help="checkpoint to resume from, or 'last'"
+        )
         parser.add_lightning_class_args(EarlyStopping, "early_stopping")
         parser.set_defaults(
-            {f"early_stopping.{key}": value for key, value in
-             {"monitor": "val_ft", "mode": "max", "patience": 5, "strict": False}.items()}
-        )  # fmt: skip
+            {
+                f"early_stopping.{key}": value
+                for key, value in {
+                    "monitor": "val_ft",
+                    "mode": "max",
+                    "patience": 5,
+                    "strict": False,
+                }.items()
+            }
+        )
 
     def before_instantiate_classes(self) -> None:
         """Copy the values of short names to the options they stand for."""
@@ -63,8 +88,13 @@ class Run(LightningCLI):
         if self.subcommand == "fit" and config.resume is not None:
             config.ckpt_path = str(last) if config.resume == "last" else config.resume
         elif self.subcommand == "fit" and config.ckpt_path is None and last.exists():
-            raise FileExistsError(f"out: {last} exists, of an earlier run. Give --resume last, or another folder.")
-        if config.ckpt_path not in (None, "best", "last", "hpc") and not Path(config.ckpt_path).exists():
+            raise FileExistsError(
+                f"out: {last} exists, of an earlier run. Give --resume last, or another folder."
+            )
+        if (
+            config.ckpt_path not in (None, "best", "last", "hpc")
+            and not Path(config.ckpt_path).exists()
+        ):
             raise FileNotFoundError(
                 f"resume, ckpt_path: expected a checkpoint, got {config.ckpt_path}, which does not exist."
             )
@@ -101,7 +131,9 @@ class SeededEpochs(Callback):
             self.state["seed"] = torch.initial_seed() % 2**31
         self._seed()
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
+    ) -> None:
         """Seed the steps of an epoch."""
         if batch_idx == 0:
             self._seed()
@@ -148,7 +180,9 @@ class TrainingCurve(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Add the row of the epoch, and write the files."""
-        self.rows.append({"epoch": trainer.current_epoch, "train_loss": mean(self._losses), **self._scores})
+        self.rows.append(
+            {"epoch": trainer.current_epoch, "train_loss": mean(self._losses), **self._scores}
+        )
         if trainer.is_global_zero:
             self.write(Path(trainer.default_root_dir))
 
@@ -162,7 +196,12 @@ class TrainingCurve(Callback):
             table.writerows(self.rows)
         figure = Figure(figsize=(6, 3.5), layout="constrained")
         loss = figure.subplots()
-        loss.plot([row["epoch"] for row in self.rows], [row["train_loss"] for row in self.rows], "C0", label="loss")
+        loss.plot(
+            [row["epoch"] for row in self.rows],
+            [row["train_loss"] for row in self.rows],
+            "C0",
+            label="loss",
+        )
         loss.set(xlabel="epoch", ylabel="loss of the training part")
         scored = [row for row in self.rows if "val_ft" in row]
         if scored:

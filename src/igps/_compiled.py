@@ -16,8 +16,14 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 # Values of `fastmath`
-REASSOCIATE = {"contract", "reassoc", "nsz"}  # allows sums in any order, and thus vector instructions
-FUSE = {"contract"}  # allows fused multiply-add: a product and its sum are rounded once instead of twice
+REASSOCIATE = {
+    "contract",
+    "reassoc",
+    "nsz",
+}  # allows sums in any order, and thus vector instructions
+FUSE = {
+    "contract"
+}  # allows fused multiply-add: a product and its sum are rounded once instead of twice
 
 
 class Lazy:
@@ -30,7 +36,11 @@ class Lazy:
     def dispatcher(self) -> Callable[..., Any]:
         """The Numba dispatcher; the same object for all threads."""
         dispatcher = self.__dict__.get("_dispatcher")
-        return self.__dict__.setdefault("_dispatcher", self._make()) if dispatcher is None else dispatcher
+        return (
+            self.__dict__.setdefault("_dispatcher", self._make())
+            if dispatcher is None
+            else dispatcher
+        )
 
 
 class Compiled(Lazy, Generic[Arguments, Result]):
@@ -56,7 +66,9 @@ class Compiled(Lazy, Generic[Arguments, Result]):
             return dispatcher(*args, **kwargs)
 
 
-def compiled(**options: Any) -> Callable[[Callable[Arguments, Result]], Compiled[Arguments, Result]]:
+def compiled(
+    **options: Any,
+) -> Callable[[Callable[Arguments, Result]], Compiled[Arguments, Result]]:
     """Return a decorator that makes a function `Compiled`, with options for `numba.njit`."""
     return lambda function: Compiled(function, **options)
 
@@ -65,11 +77,15 @@ def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
     """Return the Numba dispatcher of a function, in whose globals dispatchers replace the `Lazy` objects."""
     assert isinstance(function, FunctionType)
     used = {name: function.__globals__.get(name) for name in function.__code__.co_names}
-    dispatchers = {name: value.dispatcher for name, value in used.items() if isinstance(value, Lazy)}
+    dispatchers = {
+        name: value.dispatcher for name, value in used.items() if isinstance(value, Lazy)
+    }
     if dispatchers:
         names = {**function.__globals__, **dispatchers}
         function = FunctionType(function.__code__, names, function.__name__, function.__defaults__)
-    return _numba().njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options)(function)
+    return _numba().njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options)(
+        function
+    )
 
 
 @cache
@@ -79,7 +95,9 @@ def _numba() -> ModuleType:
     from numba.core import event
     from numba.core.compiler_lock import global_compiler_lock as lock
 
-    was_enabled: list[bool] = []  # a stack, as compiling a function compiles the functions that it calls
+    was_enabled: list[
+        bool
+    ] = []  # a stack, as compiling a function compiles the functions that it calls
 
     class GarbageCollectionOff(event.Listener):
         """Turns off garbage collection, which would take a tenth of the time of compiling with its many objects."""
@@ -94,5 +112,7 @@ def _numba() -> ModuleType:
 
     event.register("numba:compile", GarbageCollectionOff())
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release)
+        os.register_at_fork(
+            before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release
+        )
     return numba

@@ -27,7 +27,9 @@ from igps._threads import Job, Result, n_cores, one_thread, stay_on_one_thread
 from igps._threads import n_threads as available_threads
 from igps._workers import MachineError, Worker, workers_environment
 
-_MAX_ATTEMPTS = 2  # of a job whose process died: an administrator or another program may be the cause
+_MAX_ATTEMPTS = (
+    2  # of a job whose process died: an administrator or another program may be the cause
+)
 _KILLED = "its process was killed twice. It may need more memory: use fewer workers, or set a memory limit to find out."
 _KILLED_ON_CLUSTER = "several workers that had it were killed. It may need more memory: start workers with more memory."
 _MAX_SUBMITTED = 10_000  # jobs in an executor: enough for the workers of a large cluster, few enough for the memory
@@ -38,7 +40,9 @@ _MACHINE_ERRORS = {
     "Raise the limit of open files": ("EMFILE", "ENFILE"),
     "Free memory": ("ENOMEM",),
 }
-_REMEDIES = {getattr(errno, name, 0): remedy for remedy, names in _MACHINE_ERRORS.items() for name in names}
+_REMEDIES = {
+    getattr(errno, name, 0): remedy for remedy, names in _MACHINE_ERRORS.items() for name in names
+}
 
 
 @dataclass(frozen=True)
@@ -129,17 +133,25 @@ def attempt(function: Callable[[], Result], limits: Limits = Limits()) -> Result
         raise
     except MemoryError as error:
         if limits.memory is not None:
-            return Failed(f"it needs more than the memory_limit of {limits.memory / 2**20:.0f} MiB.")
-        raise MachineError("out of memory. Use fewer workers or a memory limit: finished results are kept.") from error
+            return Failed(
+                f"it needs more than the memory_limit of {limits.memory / 2**20:.0f} MiB."
+            )
+        raise MachineError(
+            "out of memory. Use fewer workers or a memory limit: finished results are kept."
+        ) from error
     except ImportError as error:
-        raise MachineError(f"{str(error).rstrip('.')}. Install it and run again: finished results are kept.") from error
+        raise MachineError(
+            f"{str(error).rstrip('.')}. Install it and run again: finished results are kept."
+        ) from error
     except OSError as error:
         if is_machine_error(error):
             raise MachineError(machine_error_text(error)) from error
         return Failed(_sentence(error))
     except Exception as error:
         # Dask raises KilledWorker after several workers died with the same job.
-        return Failed(_KILLED_ON_CLUSTER if type(error).__name__ == "KilledWorker" else _sentence(error))
+        return Failed(
+            _KILLED_ON_CLUSTER if type(error).__name__ == "KilledWorker" else _sentence(error)
+        )
 
 
 def _sentence(error: Exception) -> str:
@@ -166,11 +178,15 @@ def _run_on_executor(
             yield indices.pop(future), attempt(future.result)
             submit(1)
     except CancelledError as error:
-        raise MachineError("the executor cancelled a job. Run again: finished results are kept.") from error
+        raise MachineError(
+            "the executor cancelled a job. Run again: finished results are kept."
+        ) from error
     except MachineError:
         raise
     except RuntimeError as error:  # the executor broke, or was shut down
-        raise MachineError(f"the executor broke ({error}). Run again: finished results are kept.") from error
+        raise MachineError(
+            f"the executor broke ({error}). Run again: finished results are kept."
+        ) from error
     finally:
         for future in indices:
             future.cancel()

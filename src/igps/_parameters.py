@@ -37,4 +37,6 @@ def check_one_of(allowed: Collection[str | None], **values: str | None) -> None:
     """Raise a ValueError for the first value that is not allowed."""
     for name, value in values.items():
         if value not in allowed:
-            raise ValueError(f"{name}: expected one of {', '.join(map(str, allowed))}, got {value!r}.")
+            raise ValueError(
+                f"{name}: expected one of {', '.join(map(str, allowed))}, got {value!r}."
+            )

@@ -36,7 +36,9 @@ def n_threads() -> int:
     if _state.max_threads is not None:
         return _state.max_threads
     n_torch = _get_torch_threads()
-    return min(n_cores(), n_torch) if n_torch > 1 else n_torch  # `n_cores` is slow, as it reads files
+    return (
+        min(n_cores(), n_torch) if n_torch > 1 else n_torch
+    )  # `n_cores` is slow, as it reads files
 
 
 @contextlib.contextmanager
@@ -55,7 +57,9 @@ def one_thread() -> Iterator[None]:
                 _set_torch_threads(1)
             yield
     finally:
-        if before > 1:  # do not check what torch reports: it may be MKL's number, while new Python threads get one
+        if (
+            before > 1
+        ):  # do not check what torch reports: it may be MKL's number, while new Python threads get one
             _set_torch_threads(before)
         _state.max_threads = outside
 
@@ -198,7 +202,9 @@ def _set_torch_threads(n: int) -> None:
 
 def _in_new_thread(function: Callable[[], Result]) -> Result:
     results: SimpleQueue[Result] = SimpleQueue()
-    start_new_thread(lambda: results.put(function()), ())  # `Thread.start` would wait until the thread runs
+    start_new_thread(
+        lambda: results.put(function()), ()
+    )  # `Thread.start` would wait until the thread runs
     return results.get()
 
 
@@ -222,7 +228,9 @@ def _blas_to_one_thread() -> Callable[[], None]:
 
 def _release_control() -> None:
     """Let other threads lift the limit. Since threadpoolctl 3.8, only the thread that set it may, while it is alive."""
-    clear = getattr(getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", None)
+    clear = getattr(
+        getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", None
+    )
     if clear is not None:
         clear()
 

@@ -48,7 +48,9 @@ class Worker:
         while self._pool is None:
             n_starts += 1
             with workers_environment():
-                pool = ProcessPoolExecutor(1, context, initializer=_initialise, initargs=(self._max_bytes,))
+                pool = ProcessPoolExecutor(
+                    1, context, initializer=_initialise, initargs=(self._max_bytes,)
+                )
                 try:
                     with _interrupts_blocked():
                         first = pool.submit(os.getpid)

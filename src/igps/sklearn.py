@@ -98,18 +98,30 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         if isinstance(shapes[0], Mesh):
             config = chosen.requirements.apply_to(self.config or SignatureConfig())
             with torch.inference_mode():
-                parts = [chosen(collate([compute_signature(mesh, config)], [mesh])) for mesh in shapes]
+                parts = [
+                    chosen(collate([compute_signature(mesh, config)], [mesh])) for mesh in shapes
+                ]
             features = torch.cat(parts)
         else:
-            dataset = SignatureDataset(shapes, self.config, self.cache_dir, descriptor=chosen, reading=self.reading)
+            dataset = SignatureDataset(
+                shapes, self.config, self.cache_dir, descriptor=chosen, reading=self.reading
+            )
             if len(dataset) != len(shapes):
-                part = next(name for name in dataset.bodies.names if name not in set(map(str, shapes)))
-                raise ValueError(f"X: expected files of one body, got several, such as {part}. Name each as FILE#PART.")
+                part = next(
+                    name for name in dataset.bodies.names if name not in set(map(str, shapes))
+                )
+                raise ValueError(
+                    f"X: expected files of one body, got several, such as {part}. Name each as FILE#PART."
+                )
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
-            features = describe(dataset, chosen, cache_tag=cache_tag(chosen), n_workers=self.n_workers)
+            features = describe(
+                dataset, chosen, cache_tag=cache_tag(chosen), n_workers=self.n_workers
+            )
         cells = features.flatten(1)
         if self.square_root and isinstance(chosen, HistogramDescriptor):
-            cells[:, : sum(chosen.part_cells)].sqrt_()  # not the size of molecules, which follows the cells
+            cells[
+                :, : sum(chosen.part_cells)
+            ].sqrt_()  # not the size of molecules, which follows the cells
         return cells.numpy()
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -127,14 +139,23 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
 
 def _checked(shapes: Sequence[str | Path | Mesh]) -> list[Any]:
     if isinstance(shapes, str | Path):
-        raise TypeError(f"X: expected a list of paths of mesh files, or of meshes, got {str(shapes)!r} alone.")
+        raise TypeError(
+            f"X: expected a list of paths of mesh files, or of meshes, got {str(shapes)!r} alone."
+        )
     items = list(shapes)
-    if isinstance(shapes, np.ndarray) or hasattr(shapes, "to_numpy"):  # a list of a table would be its column names
+    if isinstance(shapes, np.ndarray) or hasattr(
+        shapes, "to_numpy"
+    ):  # a list of a table would be its column names
         table = np.asarray(shapes, dtype=object)
         if table.shape[1:] not in ((), (1,)):
-            raise ValueError(f"X: expected one column of paths or meshes, got an array of shape {table.shape}.")
+            raise ValueError(
+                f"X: expected one column of paths or meshes, got an array of shape {table.shape}."
+            )
         items = list(table.ravel())
-    types = {Mesh if isinstance(item, Mesh) else Path if isinstance(item, str | Path) else type(item) for item in items}
+    types = {
+        Mesh if isinstance(item, Mesh) else Path if isinstance(item, str | Path) else type(item)
+        for item in items
+    }
     if types not in ({Mesh}, {Path}):
         names = sorted(kind.__name__ for kind in types) or ["nothing"]
         raise TypeError(f"X: expected paths of mesh files, or meshes, got {', '.join(names)}.")

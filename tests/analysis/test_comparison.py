@@ -50,7 +50,9 @@ def test_result_is_what_heights_give(dataset: SignatureDataset) -> None:
     result = run(dataset, Height("tall"))["tall"]
     heights = torch.tensor([1.0, 1.1, 2.3, 2.2, 2.4, 2.6]) * 2
     assert result.distances is not None
-    torch.testing.assert_close(result.distances, (heights[:, None] - heights).abs(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        result.distances, (heights[:, None] - heights).abs(), atol=1e-5, rtol=0
+    )
     assert result.names == dataset.bodies.names
     assert result.labels == ("ball", "ball", "ball", "egg", "egg", "egg")
     row = result.row()
@@ -63,7 +65,9 @@ def test_result_is_what_heights_give(dataset: SignatureDataset) -> None:
     assert result.error is None
 
 
-@pytest.mark.parametrize(("fault", "reason"), [("raise", "a height of 4.8 is too much"), ("nan", "not finite")])
+@pytest.mark.parametrize(
+    ("fault", "reason"), [("raise", "a height of 4.8 is too much"), ("nan", "not finite")]
+)
 def test_a_mesh_that_one_descriptor_cannot_describe_is_its_failure_alone(
     dataset: SignatureDataset, fault: str, reason: str
 ) -> None:
@@ -113,7 +117,9 @@ def test_seconds_are_the_processor_time_of_a_description(dataset: SignatureDatas
     assert 0.05 <= seconds < 0.3
 
 
-def test_distances_by_blocks_are_the_same(dataset: SignatureDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_distances_by_blocks_are_the_same(
+    dataset: SignatureDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = run(dataset, Height("tall"))["tall"].distances
     sizes: list[tuple[int, int]] = []
     plain = Height.distances
@@ -131,7 +137,9 @@ def test_distances_by_blocks_are_the_same(dataset: SignatureDataset, monkeypatch
     torch.testing.assert_close(parts, whole, rtol=0, atol=0)
 
 
-def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_each(dataset: SignatureDataset) -> None:
+def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_each(
+    dataset: SignatureDataset,
+) -> None:
     chosen = [Height("fine"), Height("deadly", "0.off", "kill")]
     results = run(dataset, *chosen, n_workers=2)
     assert [failure.id for failure in results["deadly"].failures] == ["ball/0.off", "egg/0.off"]
@@ -143,14 +151,20 @@ def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_ea
     torch.testing.assert_close(results["fine"].distances, expected, rtol=0, atol=0)
 
 
-def test_signatures_without_what_a_descriptor_needs_are_refused_before_work(dataset: SignatureDataset) -> None:
-    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 20"):
+def test_signatures_without_what_a_descriptor_needs_are_refused_before_work(
+    dataset: SignatureDataset,
+) -> None:
+    with pytest.raises(
+        ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 20"
+    ):
         next(compare(dataset, [Height(), descriptor("interior")], progress=False))
 
 
 def test_two_of_one_name_are_refused(dataset: SignatureDataset) -> None:
     """They would be one row of a table, and one file."""
-    with pytest.raises(ValueError, match=r"descriptors: expected different names, got d2 more than once"):
+    with pytest.raises(
+        ValueError, match=r"descriptors: expected different names, got d2 more than once"
+    ):
         next(compare(dataset, [D2(), Height(), D2(n_bins=8)], progress=False))
 
 

@@ -14,7 +14,10 @@ from igps.signature.attributes import AttributeName
 from igps.signature.signature import Signature, SignatureConfig, compute_signature
 
 RADIUS, HALF_LENGTH = 1.0, 1.6
-NORMALS: dict[str, tuple[AttributeName, ...]] = {"estimated normals": (), "given normals": ("surface_direction",)}
+NORMALS: dict[str, tuple[AttributeName, ...]] = {
+    "estimated normals": (),
+    "given normals": ("surface_direction",),
+}
 
 
 @pytest.fixture(params=NORMALS.values(), ids=NORMALS)
@@ -26,7 +29,9 @@ def spheroid(attributes: tuple[AttributeName, ...], subdivisions: int, n_samples
     """Return the signature of a spheroid along the z axis."""
     body = trimesh.creation.icosphere(subdivisions=subdivisions)
     body.vertices *= [RADIUS, RADIUS, HALF_LENGTH]
-    config = SignatureConfig(n_eigenpairs=10, resolution=16, n_surface_samples=n_samples, attributes=attributes)
+    config = SignatureConfig(
+        n_eigenpairs=10, resolution=16, n_surface_samples=n_samples, attributes=attributes
+    )
     return compute_signature(as_mesh(body), config)
 
 
@@ -44,13 +49,17 @@ def test_curvatures_and_thickness_of_a_spheroid(attributes: tuple[AttributeName,
     assert np.abs(errors.mean(axis=0)).max() < 0.02
     if attributes:
         assert measured[:, :2].mean(axis=1) == pytest.approx(exact.mean(axis=1), rel=0.1)
-    assert np.exp(measured[:, 2]) * unit * of_circles == pytest.approx(1, rel=0.25)  # normals of flat faces
+    assert np.exp(measured[:, 2]) * unit * of_circles == pytest.approx(
+        1, rel=0.25
+    )  # normals of flat faces
 
 
 def test_a_rough_surface_is_no_thinner(attributes: tuple[AttributeName, ...]) -> None:
     """Neighbours a little below the tangent plane make no ball small."""
     body = spheroid(attributes, subdivisions=4, n_samples=2000)
-    step = 0.001 * np.sqrt(body.area) * np.random.default_rng(0).normal(size=body.surface.points.shape)
+    step = (
+        0.001 * np.sqrt(body.area) * np.random.default_rng(0).normal(size=body.surface.points.shape)
+    )
     rough = replace(body, surface=replace(body.surface, points=body.surface.points + step))
     thickness = [local_shape(collate([each]))[:, 2] for each in (body, rough)]
     assert thickness[1] == pytest.approx(thickness[0], abs=0.6)
@@ -59,10 +68,15 @@ def test_a_rough_surface_is_no_thinner(attributes: tuple[AttributeName, ...]) ->
 def test_deviations_are_mahalanobis_distances_from_the_corresponding_samples() -> None:
     """To the covariance at a place, a hundredth of that of the whole body is added."""
     random = np.random.default_rng(0)
-    own, others = random.normal(size=(20, 3)), random.normal(size=(50, 3)) @ random.normal(size=(3, 3))
+    own, others = (
+        random.normal(size=(20, 3)),
+        random.normal(size=(50, 3)) @ random.normal(size=(3, 3)),
+    )
     nearest = random.integers(50, size=(20, 10))
     expected = []
     for row, indices in zip(own, nearest, strict=True):
         covariance = np.cov(others[indices].T, ddof=0) + 0.01 * np.cov(others.T, ddof=0)
-        expected.append(mahalanobis(row, others[indices].mean(axis=0), np.linalg.inv(covariance)) ** 2)
+        expected.append(
+            mahalanobis(row, others[indices].mean(axis=0), np.linalg.inv(covariance)) ** 2
+        )
     assert squared_deviations(own, others, nearest) == pytest.approx(np.array(expected), rel=1e-6)

@@ -52,7 +52,10 @@ def test_each_fault_and_what_will_be_done(tmp_path: Path) -> None:
 
     assert found["soup.off"].steps == ("welded",)
     assert found["soup.off"].notes == (f"welded {3 * N_FACES - N_VERTICES} coincident vertices",)
-    assert (found["soup.off"].n_vertices, found["soup.off"].n_vertices_after) == (3 * N_FACES, N_VERTICES)
+    assert (found["soup.off"].n_vertices, found["soup.off"].n_vertices_after) == (
+        3 * N_FACES,
+        N_VERTICES,
+    )
     assert f"{free_edges(soup)} boundary edges" in str(found["soup.off"].fault)
 
     assert found["holed.off"].steps == ("filled",)
@@ -71,7 +74,9 @@ def test_each_fault_and_what_will_be_done(tmp_path: Path) -> None:
     assert found["crossing.off"].steps[0] == "united"
 
 
-def test_what_cannot_be_used_costs_the_others_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_used_costs_the_others_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     without_collada(monkeypatch)
     write_clean(tmp_path / "clean.off")
     sentences = write_unusable(tmp_path)
@@ -81,11 +86,19 @@ def test_what_cannot_be_used_costs_the_others_nothing(tmp_path: Path, monkeypatc
         **{name: f"{tmp_path / name}: {sentence}" for name, sentence in sentences.items()},
     }
     assert any(one.error is not None for one in found.values())
-    assert all(found[name].seconds is None and found[name].n_vertices_after is None for name in sentences)
+    assert all(
+        found[name].seconds is None and found[name].n_vertices_after is None for name in sentences
+    )
     # Some can be read at least.
-    assert {name: found[name].n_vertices for name in ("triangle.off", "line.obj", "five.xyz", "empty.off")} == {
-        "triangle.off": 3, "line.obj": 4, "five.xyz": 5, "empty.off": None,
-    }  # fmt: skip
+    assert {
+        name: found[name].n_vertices
+        for name in ("triangle.off", "line.obj", "five.xyz", "empty.off")
+    } == {
+        "triangle.off": 3,
+        "line.obj": 4,
+        "five.xyz": 5,
+        "empty.off": None,
+    }
 
 
 def test_the_reading_decides(tmp_path: Path) -> None:
@@ -118,7 +131,9 @@ def test_the_cost_is_that_of_the_mesh_that_is_simplified(tmp_path: Path) -> None
     write_clean(tmp_path / "clean.off")
     files = find_bodies(tmp_path)
     (full,) = examine(files, config=CONFIG, n_workers=1, progress=False)
-    fewer = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60, max_vertices=60)
+    fewer = SignatureConfig(
+        n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60, max_vertices=60
+    )
     (simplified,) = examine(files, config=fewer, n_workers=1, progress=False)
     assert full.memory == expected_cost(N_VERTICES, 20)[1]
     assert simplified.memory == expected_cost(60, 20)[1]
@@ -135,7 +150,11 @@ def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path: Path) 
     found = findings(tmp_path)
     assert list(found) == ["x.nii.gz#cube", "x.nii.gz#plate", "x.nii.gz#line"]
     measures = [one.voxels for one in found.values()]
-    assert measures == [VoxelMeasures(12**3 + 1, 2, 10), VoxelMeasures(288, 1, 2), VoxelMeasures(7, 1, 1)]
+    assert measures == [
+        VoxelMeasures(12**3 + 1, 2, 10),
+        VoxelMeasures(288, 1, 2),
+        VoxelMeasures(7, 1, 1),
+    ]
     cube, plate, line = found.values()
     assert cube.notes == ("dropped 1 small piece apart of 1 voxels, 0.1% of the label",)
     assert (cube.error, plate.error, plate.fault, plate.steps) == (None, None, None, ())
@@ -178,7 +197,9 @@ def test_squared_distances_are_those_of_a_transform_up_to_the_most(most: int) ->
 
 def test_a_body_that_is_not_in_its_file_is_told(tmp_path: Path) -> None:
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
-    nibabel.save(nibabel.Nifti1Image(np.ones((9, 9, 9), dtype=np.uint8), np.eye(4)), tmp_path / "x.nii")
+    nibabel.save(
+        nibabel.Nifti1Image(np.ones((9, 9, 9), dtype=np.uint8), np.eye(4)), tmp_path / "x.nii"
+    )
     (tmp_path / "labels.csv").write_text("file,body,label\nx.nii,x,a\nx.nii,liver,b\n")
     found = findings(tmp_path)
     assert found["x.nii#x"].error is None

@@ -54,7 +54,9 @@ def described_by(name: str) -> Descriptor:
         return descriptor(name)
     histograms = HistogramDescriptor([PairHistogram(), PairHistogram(["interior_distance"])])
     cells = torch.rand(12, 704).pow(4)
-    return EmbeddedDescriptor(histograms, WhitenedHead().fit(cells, torch.arange(12) // 3, histograms.part_cells))
+    return EmbeddedDescriptor(
+        histograms, WhitenedHead().fit(cells, torch.arange(12) // 3, histograms.part_cells)
+    )
 
 
 @pytest.mark.parametrize(
@@ -81,7 +83,9 @@ def test_all_shares_add_up_to_the_distance(name: str, batches: list[SignatureBat
     of_samples = sum(values.sum() for of_body in found.samples for values in of_body.values())
     assert of_samples == pytest.approx(found.distance, rel=1e-6)
     assert sum(found.parts.values()) == pytest.approx(found.distance, rel=1e-6)
-    by_place = np.concatenate([values for of_body in found.places or () for values in of_body.values()])
+    by_place = np.concatenate(
+        [values for of_body in found.places or () for values in of_body.values()]
+    )
     assert by_place.sum() == pytest.approx(found.distance, rel=1e-6)
     assert by_place.min() >= 0
     assert "%" in found.summary()
@@ -95,8 +99,16 @@ def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures: list[Signat
         area=4 * one.area,
         volume=8 * one.volume,
         eigenvalues=one.eigenvalues / 4,
-        interior=replace(one.interior, points=2 * one.interior.points, eigenfunctions=one.interior.eigenfunctions / 2),
-        surface=replace(one.surface, points=2 * one.surface.points, eigenfunctions=one.surface.eigenfunctions / 2),
+        interior=replace(
+            one.interior,
+            points=2 * one.interior.points,
+            eigenfunctions=one.interior.eigenfunctions / 2,
+        ),
+        surface=replace(
+            one.surface,
+            points=2 * one.surface.points,
+            eigenfunctions=one.surface.eigenfunctions / 2,
+        ),
     )
     found = explain(descriptor("interior+size"), *(collate([each]) for each in (one, larger)))
     apart = 2 * np.log(2)
@@ -106,7 +118,9 @@ def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures: list[Signat
         np.testing.assert_allclose(shares, found.distance / 4 / len(shares), rtol=1e-3)
 
 
-def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(batches: list[SignatureBatch]) -> None:
+def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(
+    batches: list[SignatureBatch],
+) -> None:
     """Interior distances alone: each pair falls into two bins, and gives each of its ends half of what it counts."""
     chosen = HistogramDescriptor(PairHistogram(["interior_distance"]))
     found = explain(chosen, *batches)
@@ -119,15 +133,22 @@ def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(batches: list[S
         counts = np.interp(place, np.arange(64), sign * units)
         np.fill_diagonal(counts, 0)
         n = len(points)
-        np.testing.assert_allclose(shares["interior"], counts.sum(axis=1) / (n * (n - 1)), atol=2e-8)
+        np.testing.assert_allclose(
+            shares["interior"], counts.sum(axis=1) / (n * (n - 1)), atol=2e-8
+        )
         assert not shares["surface"].any()
 
 
 def test_shares_of_a_squared_euclidean_distance_are_products(batches: list[SignatureBatch]) -> None:
     class Squared(HistogramDescriptor):
         def distances(self, queries: torch.Tensor, gallery: torch.Tensor) -> torch.Tensor:
-            matrix = torch.linspace(-1, 2, queries.flatten(1).shape[1] * 3, dtype=queries.dtype).view(-1, 3)
-            return torch.cdist(queries.flatten(1).sqrt() @ matrix, gallery.flatten(1).sqrt() @ matrix) ** 2
+            matrix = torch.linspace(
+                -1, 2, queries.flatten(1).shape[1] * 3, dtype=queries.dtype
+            ).view(-1, 3)
+            return (
+                torch.cdist(queries.flatten(1).sqrt() @ matrix, gallery.flatten(1).sqrt() @ matrix)
+                ** 2
+            )
 
     one, other = torch.tensor([[0.1, 0.4, 0.5, 0.0], [0.3, 0.0, 0.2, 0.5]], dtype=torch.float64)
     units, distance = unit_shares(Squared(PairHistogram()), one, other)
@@ -139,7 +160,9 @@ def test_shares_of_a_squared_euclidean_distance_are_products(batches: list[Signa
 
 
 @pytest.mark.parametrize("name", ["pretrained", "whitened"])
-def test_shares_behind_a_head_are_those_of_small_steps(name: str, batches: list[SignatureBatch]) -> None:
+def test_shares_behind_a_head_are_those_of_small_steps(
+    name: str, batches: list[SignatureBatch]
+) -> None:
     """Along the line on which the roots come apart, the distance grows step by step: in one cell alone, by differences.
 
     The cells with the largest shares, and others; and the one that differs most, whose share may be 0.
@@ -167,11 +190,15 @@ def test_shares_behind_a_head_are_those_of_small_steps(name: str, batches: list[
         assert float(shares[cell]) == pytest.approx(share, rel=0.02, abs=1e-8)
 
 
-def test_the_share_of_a_sample_is_the_derivative_by_its_weight(batches: list[SignatureBatch]) -> None:
+def test_the_share_of_a_sample_is_the_derivative_by_its_weight(
+    batches: list[SignatureBatch],
+) -> None:
     """Of one histogram: the derivative by the weight of a sample, over the two samples of a pair, by differences."""
     chosen = descriptor("interior")
     found = explain(chosen, *batches)
-    units, _ = unit_shares(chosen, *(chosen(batch).detach().flatten().double() for batch in batches))
+    units, _ = unit_shares(
+        chosen, *(chosen(batch).detach().flatten().double() for batch in batches)
+    )
     samples = batches[0].interior
     for i in (0, 17, len(samples.points[0]) - 1):
         changed = []
@@ -180,11 +207,15 @@ def test_the_share_of_a_sample_is_the_derivative_by_its_weight(batches: list[Sig
             weights[0, i] = weight
             heavier = replace(samples, attributes={**samples.attributes, "weight": weights})
             changed.append(chosen(replace(batches[0], interior=heavier)).double().flatten() @ units)
-        assert found.samples[0]["interior"][i] == pytest.approx(float(changed[1] - changed[0]) / 2, rel=0.02)
+        assert found.samples[0]["interior"][i] == pytest.approx(
+            float(changed[1] - changed[0]) / 2, rel=0.02
+        )
 
 
 @pytest.mark.parametrize("name", ["interior", "rich"])
-def test_a_bump_is_painted_where_it_is(name: str, signatures: list[Signature], batches: list[SignatureBatch]) -> None:
+def test_a_bump_is_painted_where_it_is(
+    name: str, signatures: list[Signature], batches: list[SignatureBatch]
+) -> None:
     found = explain(descriptor(name), *batches)
     places = {kind: getattr(signatures[1], kind).points for kind in ("interior", "surface")}
     points = places["surface"]
@@ -198,11 +229,18 @@ def test_a_small_bump_or_dent_is_painted_in_another_pose(height: float) -> None:
     """An egg, bent, with a bump that is a fiftieth of the root of its area high, or such a dent."""
     straight = trimesh.creation.icosphere(subdivisions=4)
     straight.vertices *= [0.5, 0.65, 2.0]
-    bent, bump = straight.copy(), straight.vertices[np.abs(straight.vertices - [0.45, 0, 0.8]).sum(axis=1).argmin()]
+    bent, bump = (
+        straight.copy(),
+        straight.vertices[np.abs(straight.vertices - [0.45, 0, 0.8]).sum(axis=1).argmin()],
+    )
     away = np.linalg.norm(straight.vertices - bump, axis=1)
-    bent.vertices += height * np.clip(1 - (away / 0.4) ** 2, 0, 1)[:, None] ** 2 * straight.vertex_normals
+    bent.vertices += (
+        height * np.clip(1 - (away / 0.4) ** 2, 0, 1)[:, None] ** 2 * straight.vertex_normals
+    )
     angle, along = bent.vertices[:, 2] / 4, 4 + bent.vertices[:, 0]
-    bent.vertices = np.stack([along * np.cos(angle), bent.vertices[:, 1], along * np.sin(angle)], axis=1)
+    bent.vertices = np.stack(
+        [along * np.cos(angle), bent.vertices[:, 1], along * np.sin(angle)], axis=1
+    )
     config = descriptor("rich").requirements.apply_to(replace(CONFIG, n_surface_samples=800))
     pair = [compute_signature(as_mesh(one), config) for one in (straight, bent)]
     found = explain(descriptor("interior"), *(collate([one]) for one in pair))
@@ -229,7 +267,11 @@ def test_what_knows_no_samples_is_refused(batches: list[SignatureBatch]) -> None
 def test_without_a_difference_one_test_in_twenty_finds_a_cell() -> None:
     random = torch.Generator().manual_seed(0)
     any_held = [
-        bool(significant_cells(*torch.rand(2, 12, 30, generator=random), n_permutations=99, seed=i).any())
+        bool(
+            significant_cells(
+                *torch.rand(2, 12, 30, generator=random), n_permutations=99, seed=i
+            ).any()
+        )
         for i in range(400)
     ]
     assert 0.02 <= np.mean(any_held) <= 0.08
@@ -258,7 +300,9 @@ def test_groups_that_differ_in_size_alone_differ_in_size(batches: list[Signature
         contents = without_head(chosen)(batches[0]).repeat(16, 1)
     contents[:, -2:] += torch.randn(16, 2, generator=torch.Generator().manual_seed(0)) / 100
     contents[8:, -2:] += 3
-    found, kept = explain_groups(chosen, contents[:8], contents[8:], [batches[0]] * 2, n_permutations=199)
+    found, kept = explain_groups(
+        chosen, contents[:8], contents[8:], [batches[0]] * 2, n_permutations=199
+    )
     assert kept.nonzero().flatten().tolist() == [len(kept) - 2, len(kept) - 1]
     assert found.parts["size"] == pytest.approx(found.distance)
     assert found.distance == pytest.approx(

@@ -27,7 +27,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> igps.SignatureDataset:
     for label, height in HEIGHTS.items():
         for i in range(4):
             write_egg(root / "eggs" / label / f"{i}.off", height * (1 + 0.04 * i), subdivisions=2)
-    config = igps.SignatureConfig(n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=30)
+    config = igps.SignatureConfig(
+        n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=30
+    )
     found = igps.SignatureDataset(root / "eggs", config, root / "cache")
     assert found.precompute(n_workers=1, progress=False) == []
     return found
@@ -37,7 +39,9 @@ def histograms(dataset: igps.SignatureDataset) -> Tensor:
     return igps.describe(dataset, small_interior()).flatten(1)
 
 
-def test_a_classifier_is_fitted_saved_and_asked(dataset: igps.SignatureDataset, tmp_path: Path) -> None:
+def test_a_classifier_is_fitted_saved_and_asked(
+    dataset: igps.SignatureDataset, tmp_path: Path
+) -> None:
     train = dataset.subset([i for i in range(16) if i % 4])
     test = dataset.subset(range(0, 16, 4))
     model = igps.fit(train, small_interior(), head="classifier")
@@ -80,7 +84,10 @@ def test_held_out_scores_are_of_what_was_held_out(dataset: igps.SignatureDataset
     scores = model.card["held_out_scores"]
     assert scores["accuracy"] == pytest.approx(sum(hits) / 16)
     in_bin = np.ceil(np.array(sure) * 10)
-    gaps = [abs(sum(np.array(sure)[in_bin == one]) - sum(np.array(hits)[in_bin == one])) for one in range(11)]
+    gaps = [
+        abs(sum(np.array(sure)[in_bin == one]) - sum(np.array(hits)[in_bin == one]))
+        for one in range(11)
+    ]
     assert scores["calibration_error"] == pytest.approx(sum(gaps) / 16, abs=1e-5)
     assert scores["unknown_auc"] == pytest.approx(np.mean(areas))
 
@@ -97,11 +104,16 @@ def test_the_prior_stands_beside_the_new_head_or_not(dataset: igps.SignatureData
         assert (model.head.prior is prior) == wanted == model.card["prior"]
 
 
-def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(dataset: igps.SignatureDataset) -> None:
+def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(
+    dataset: igps.SignatureDataset,
+) -> None:
     model = igps.fit(dataset, small_interior(), goal="new")
     assert set(model.card["held_out_scores"]) == {"nn", "ft", "dcg"}
     assert model.card["head"] in ("whitened", "as_is")
-    said = {name: igps.fit(dataset, small_interior(), goal="new", head=name).card for name in ("whitened", "as_is")}  # type: ignore[arg-type]
+    said = {
+        name: igps.fit(dataset, small_interior(), goal="new", head=name).card
+        for name in ("whitened", "as_is")
+    }  # type: ignore[arg-type]
     best = max(card["held_out_scores"]["ft"] for card in said.values())
     assert said[model.card["head"]]["held_out_scores"]["ft"] == pytest.approx(best, abs=0.1)
     with pytest.raises(ValueError, match="model: expected a classifier, got interior"):
@@ -109,7 +121,9 @@ def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(dataset
 
 
 @pytest.mark.parametrize("head", ["as_is", "whitened"])
-def test_the_descriptor_that_is_given_stays_as_it_was(dataset: igps.SignatureDataset, head: HeadName) -> None:
+def test_the_descriptor_that_is_given_stays_as_it_was(
+    dataset: igps.SignatureDataset, head: HeadName
+) -> None:
     given = small_interior()
     model = igps.fit(dataset, given, goal="new", head=head)
     assert (model.scale, model.card["head"]) == (model.card["scale"], head)
@@ -117,20 +131,26 @@ def test_the_descriptor_that_is_given_stays_as_it_was(dataset: igps.SignatureDat
 
 
 def test_too_little_to_fit_to_is_said(dataset: igps.SignatureDataset) -> None:
-    with pytest.raises(ValueError, match=r"classes: expected at least 2, .* of two bodies, got \{'flat': 4\}"):
+    with pytest.raises(
+        ValueError, match=r"classes: expected at least 2, .* of two bodies, got \{'flat': 4\}"
+    ):
         igps.fit(dataset.subset(range(4)), small_interior())
     with pytest.raises(ValueError, match="classes: expected at least 4"):
         igps.fit(dataset.subset(range(8)), small_interior(), goal="new")
     with pytest.raises(ValueError, match="goal: expected one of known, new, got 'both'"):
         igps.fit(dataset, small_interior(), goal="both")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="head: expected one of auto, classifier, whitened, as_is, got 'best'"):
+    with pytest.raises(
+        ValueError, match="head: expected one of auto, classifier, whitened, as_is, got 'best'"
+    ):
         igps.fit(dataset, small_interior(), head="best")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="descriptions: expected histograms"):
         igps.fit(dataset, Below(), head="whitened")
 
 
 @pytest.mark.parametrize("sizes", [(5, 5, 5), (5, 5, 5, 1), (5, 1, 1), (3, 1), (2, 2)])
-def test_no_sizes_of_classes_are_too_uneven(dataset: igps.SignatureDataset, sizes: tuple[int, ...]) -> None:
+def test_no_sizes_of_classes_are_too_uneven(
+    dataset: igps.SignatureDataset, sizes: tuple[int, ...]
+) -> None:
     """Folds may lack two training bodies of any class, or hold out no class that the classifier knows."""
     labels = [name for name, n in zip(HEIGHTS, sizes, strict=False) for _ in range(n)]
     bodies = replace(dataset.bodies.subset(range(len(labels))), labels=tuple(labels))

@@ -13,7 +13,9 @@ from igps.analysis.groups import GroupTest, group_test, squared_distances, with_
 PAIR = ["a"] * 12 + ["b"] * 12
 
 
-def quick(vectors: NDArray[np.float64], groups: list[str] = PAIR, seed: int = 0, **given: object) -> GroupTest:
+def quick(
+    vectors: NDArray[np.float64], groups: list[str] = PAIR, seed: int = 0, **given: object
+) -> GroupTest:
     options = {"n_permutations": 199, "n_bootstraps": 0, "n_repeats": 0, **given}
     return group_test(vectors, groups, seed=seed, **options)  # type: ignore[arg-type]
 
@@ -29,15 +31,23 @@ def whitened_kernel(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     low, high = 1e-9 * np.trace(scatter), 1e9 * np.trace(scatter)
     for _ in range(200):
         inverse = np.linalg.inv(scatter + (middle := (low * high) ** 0.5) * np.eye(n_numbers))
-        low, high = (middle, high) if np.trace(scatter @ inverse) > min(n / 10, 0.9 * n_numbers) else (low, middle)
+        low, high = (
+            (middle, high)
+            if np.trace(scatter @ inverse) > min(n / 10, 0.9 * n_numbers)
+            else (low, middle)
+        )
     apart = vectors[:, None] - vectors
     squares = np.einsum("ijk,kl,ijl->ij", apart, inverse, apart)
-    kernel: NDArray[np.float64] = np.exp(-squares / (2 * np.median(squares[np.triu_indices(len(vectors), 1)])))
+    kernel: NDArray[np.float64] = np.exp(
+        -squares / (2 * np.median(squares[np.triu_indices(len(vectors), 1)]))
+    )
     return kernel
 
 
 @pytest.mark.parametrize(("is_confounded", "n_numbers"), [(False, 6), (True, 6), (True, 40)])
-def test_without_a_difference_one_test_in_twenty_rejects(is_confounded: bool, n_numbers: int) -> None:
+def test_without_a_difference_one_test_in_twenty_rejects(
+    is_confounded: bool, n_numbers: int
+) -> None:
     """Of 1,000 draws; also where a covariate that differs between the groups, and the strata, cause a difference."""
     random = np.random.default_rng(1)
     found = []
@@ -86,9 +96,15 @@ def test_power_grows_with_the_difference() -> None:
     powers = []
     for shift in (0.0, 0.7, 1.4, 2.8):
         tests = [
-            quick(random.normal(size=(24, 4)) + np.outer(np.repeat([0, 1], 12), [shift, 0, 0, 0])) for _ in range(60)
+            quick(random.normal(size=(24, 4)) + np.outer(np.repeat([0, 1], 12), [shift, 0, 0, 0]))
+            for _ in range(60)
         ]
-        powers.append([np.mean([getattr(one, name) <= 0.05 for one in tests]) for name in ("permanova_p", "kernel_p")])
+        powers.append(
+            [
+                np.mean([getattr(one, name) <= 0.05 for one in tests])
+                for name in ("permanova_p", "kernel_p")
+            ]
+        )
     assert (np.diff(powers, axis=0) > 0).all(), powers
     assert min(powers[-1]) > 0.95
 
@@ -96,8 +112,14 @@ def test_power_grows_with_the_difference() -> None:
 def test_the_kernel_test_finds_a_small_direction_that_distances_drown() -> None:
     random = np.random.default_rng(9)
     scales, shift = np.array([10.0, 5, 2, 1, 1]), np.outer(np.repeat([0, 1], 20), [0, 0, 0, 2.0, 0])
-    tests = [quick(random.normal(size=(40, 5)) * scales + shift, ["a"] * 20 + ["b"] * 20, i) for i in range(60)]
-    shares = [np.mean([getattr(one, name) <= 0.05 for one in tests]) for name in ("permanova_p", "kernel_p")]
+    tests = [
+        quick(random.normal(size=(40, 5)) * scales + shift, ["a"] * 20 + ["b"] * 20, i)
+        for i in range(60)
+    ]
+    shares = [
+        np.mean([getattr(one, name) <= 0.05 for one in tests])
+        for name in ("permanova_p", "kernel_p")
+    ]
     assert shares[0] < 0.2 < 0.9 < shares[1], shares
 
 
@@ -120,7 +142,9 @@ def test_statistics_are_those_of_the_textbook() -> None:
     vectors = random.normal(size=(24, 3)) + np.repeat([0, 1], 12)[:, None]
     test = quick(vectors)
     one, other = vectors[:12], vectors[12:]
-    between = 12 * sum(((part.mean(axis=0) - vectors.mean(axis=0)) ** 2).sum() for part in (one, other))
+    between = 12 * sum(
+        ((part.mean(axis=0) - vectors.mean(axis=0)) ** 2).sum() for part in (one, other)
+    )
     within = sum(((part - part.mean(axis=0)) ** 2).sum() for part in (one, other))
     assert test.permanova_f == pytest.approx(between / (within / 22))
     squares = squared_distances(vectors)
@@ -151,7 +175,9 @@ def test_matched_pairs_without_a_difference_show_no_effect() -> None:
     for draw in range(40):
         vectors = random.normal(size=(24, 20)) + np.tile(3 * random.normal(size=(12, 20)), (2, 1))
         test = quick(vectors, seed=draw, strata=pairs, n_bootstraps=200, n_repeats=1)
-        found.append((test.auc, test.effect, (test.effect_low or 1) <= 0 <= (test.effect_high or -1)))
+        found.append(
+            (test.auc, test.effect, (test.effect_low or 1) <= 0 <= (test.effect_high or -1))
+        )
     auc, effect, covered = np.array(found, dtype=float).mean(axis=0)
     assert abs(auc - 0.5) < 0.1
     assert abs(effect) < 0.01
@@ -162,7 +188,10 @@ def test_matched_pairs_without_a_difference_show_no_effect() -> None:
 def test_what_no_permutation_changes_has_a_probability_of_one() -> None:
     """If all bodies but one, or both groups, are equal, p = 1; for groups without scatter it is the least, 1 / 200."""
     random = np.random.default_rng(11)
-    one, twice = np.outer(np.arange(24) == 3, random.normal(size=5)), np.tile(random.normal(size=(12, 3)), (2, 1))
+    one, twice = (
+        np.outer(np.arange(24) == 3, random.normal(size=5)),
+        np.tile(random.normal(size=(12, 3)), (2, 1)),
+    )
     for vectors in (one, twice):
         test = quick(vectors)
         assert (test.permanova_p, test.kernel_p) == (1, 1)
@@ -194,7 +223,9 @@ def test_a_probability_is_that_of_all_arrangements() -> None:
         side = np.isin(np.arange(10), one)
         of_means.append(abs(values[side].mean() - values[~side].mean()))
         of_kernel.append(
-            kernel[side][:, side].mean() + kernel[~side][:, ~side].mean() - 2 * kernel[side][:, ~side].mean()
+            kernel[side][:, side].mean()
+            + kernel[~side][:, ~side].mean()
+            - 2 * kernel[side][:, ~side].mean()
         )
     exact = [np.mean([one >= each[0] - 1e-12 for one in each]) for each in (of_means, of_kernel)]
     test = quick(values[:, None], ["a"] * 5 + ["b"] * 5, n_permutations=20_000)
@@ -207,7 +238,10 @@ def test_a_probability_is_that_of_all_arrangements() -> None:
         ({"groups": ["a"] * 21 + ["b"] * 3}, "b has 3"),
         ({"groups": ["a"] * 24}, "expected two groups, got a alone"),
         ({"strata": PAIR}, "within strata the groups can be arranged in only 1 ways"),
-        ({"covariates": np.repeat([[0.0], [1.0]], 12, axis=0)}, "covariates or strata determine the groups"),
+        (
+            {"covariates": np.repeat([[0.0], [1.0]], 12, axis=0)},
+            "covariates or strata determine the groups",
+        ),
         ({"vectors": np.ones((24, 3))}, "do not differ"),
         ({"covariates": np.random.default_rng(0).normal(size=(24, 21))}, "too few"),
     ],
@@ -222,7 +256,9 @@ def test_what_makes_no_sense_is_refused(given: dict[str, object], why: str) -> N
 
 
 def test_discovery_rates_are_over_what_was_tested() -> None:
-    tests = [GroupTest(str(i), {}, permanova_p=p, kernel_p=p) for i, p in enumerate((0.01, 0.04, 0.03))]
+    tests = [
+        GroupTest(str(i), {}, permanova_p=p, kernel_p=p) for i, p in enumerate((0.01, 0.04, 0.03))
+    ]
     refused = GroupTest("no", {}, refused="too few")
     found = with_q_values([tests[0], refused, *tests[1:]])
     assert found[1] is refused

@@ -14,7 +14,9 @@ from igps.analysis.map import body_map
 
 def blobs(n_each: int, centres: list[list[float]], scatter: float, seed: int = 0) -> np.ndarray:
     random = np.random.default_rng(seed)
-    return np.concatenate([random.normal(centre, scatter, (n_each, len(centre))) for centre in centres])
+    return np.concatenate(
+        [random.normal(centre, scatter, (n_each, len(centre))) for centre in centres]
+    )
 
 
 @pytest.mark.parametrize("n", [5, 60])
@@ -26,7 +28,9 @@ def test_points_of_a_plane_keep_all_their_distances(n: int) -> None:
     assert found.stress < 1e-6
     assert found.points[:, 0].var() > found.points[:, 1].var()
     order = np.random.default_rng(1).permutation(n)
-    np.testing.assert_allclose(body_map(distances[np.ix_(order, order)]).points, found.points[order], atol=1e-5)
+    np.testing.assert_allclose(
+        body_map(distances[np.ix_(order, order)]).points, found.points[order], atol=1e-5
+    )
 
 
 def test_the_improved_map_has_less_stress_than_the_classical_one() -> None:
@@ -68,7 +72,11 @@ def test_without_umap_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize(
     ("distances", "match"),
-    [(np.ones((2, 2)), "three bodies"), (np.ones((4, 3)), "got .4, 3"), (np.full((4, 4), np.nan), "finite")],
+    [
+        (np.ones((2, 2)), "three bodies"),
+        (np.ones((4, 3)), "got .4, 3"),
+        (np.full((4, 4), np.nan), "finite"),
+    ],
 )
 def test_what_are_no_distances_is_refused(distances: np.ndarray, match: str) -> None:
     with pytest.raises(ValueError, match=match):
@@ -90,7 +98,9 @@ def test_words_and_numbers_that_are_none_are_refused() -> None:
 
 @pytest.mark.parametrize("linkage", ["average", "complete", "single"])
 def test_clusters_that_were_put_in_are_found_and_stable(linkage: str) -> None:
-    points = np.concatenate([blobs(20, [[0, 0, 0]], 0.4), blobs(12, [[9, 0, 0], [0, 9, 0]], 0.4, seed=1)])
+    points = np.concatenate(
+        [blobs(20, [[0, 0, 0]], 0.4), blobs(12, [[9, 0, 0], [0, 9, 0]], 0.4, seed=1)]
+    )
     found = clusters_of(cdist(points, points), linkage=linkage)  # type: ignore[arg-type]
     assert found.labels[:20].tolist() == [0] * 20
     assert sorted(found.labels[20:].tolist()) == [1] * 12 + [2] * 12
@@ -124,7 +134,9 @@ def test_a_body_alone_has_no_stability() -> None:
     for seed in range(3):
         points = np.random.default_rng(seed).normal(size=(80, 5))
         found = clusters_of(cdist(points, points), 22, linkage="complete")
-        pairs += [found.stability[k] >= STABLE for k in np.flatnonzero(np.bincount(found.labels) == 2)]
+        pairs += [
+            found.stability[k] >= STABLE for k in np.flatnonzero(np.bincount(found.labels) == 2)
+        ]
     assert len(pairs) > 10
     assert np.mean(pairs) < 0.7
 

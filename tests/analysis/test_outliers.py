@@ -35,7 +35,9 @@ def test_what_is_usual_is_no_outlier() -> None:
 
 def test_a_body_alone_in_its_class_is_told_not_to_be_judged() -> None:
     found = outliers(squared_distances(usual()) ** 0.5, ["alone", *LABELS[1:]])
-    assert [one.label for one in found if one.reason == "shape not assessed: the only body of its class"] == ["alone"]
+    assert [
+        one.label for one in found if one.reason == "shape not assessed: the only body of its class"
+    ] == ["alone"]
 
 
 def test_a_body_of_another_shape_comes_first() -> None:
@@ -57,12 +59,16 @@ def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n: int, n_odd: 
 
 
 @pytest.mark.parametrize(("n_subjects", "n_organs"), [(10, 5), (14, 5), (10, 20)])
-def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(n_subjects: int, n_organs: int) -> None:
+def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(
+    n_subjects: int, n_organs: int
+) -> None:
     """All lengths of one subject are doubled; the bodies of one subject must not be taken for a tail."""
     random, n = np.random.default_rng(n_subjects), n_subjects * n_organs
     labels = [f"organ {i % n_organs}" for i in range(n)]
     subjects = np.repeat(np.arange(n_subjects), n_organs)
-    points = random.normal(size=(n, 6)) + np.tile(10 * random.normal(size=(n_organs, 6)), (n_subjects, 1))
+    points = random.normal(size=(n, 6)) + np.tile(
+        10 * random.normal(size=(n_organs, 6)), (n_subjects, 1)
+    )
     spacing = 0.1 * np.repeat(random.normal(size=n_subjects), n_organs)
     volume = 0.2 * random.normal(size=n)
     volume[subjects == 3] += np.log(8)
@@ -97,7 +103,11 @@ def test_a_wrong_label_is_told() -> None:
     ],
 )
 def test_each_measure_is_a_reason(name: str, value: float, told: str) -> None:
-    values = 0.01 * np.random.default_rng(1).normal(size=24) if name in ("volume", "spacing") else np.zeros(24)
+    values = (
+        0.01 * np.random.default_rng(1).normal(size=24)
+        if name in ("volume", "spacing")
+        else np.zeros(24)
+    )
     values[5] = value
     first = found_of(usual(), measures={name: values})[0]
     assert first.body == 5
@@ -141,7 +151,9 @@ def test_what_is_repaired_in_labels_is_measured_in_their_voxels() -> None:
     notes = [["smoothed 3 times"]] * 24
     notes[7] = ["dropped 1 small piece apart of 9 voxels, 0.1% of the label"]
     stray = np.where(np.arange(24) == 7, 0.001**0.5, 0.0)
-    scores = {one.body: one.scores for one in found_of(usual(), measures={"stray": stray}, notes=notes)}
+    scores = {
+        one.body: one.scores for one in found_of(usual(), measures={"stray": stray}, notes=notes)
+    }
     assert scores[7]["repairs"] == 0 < scores[7]["stray"]
 
 
@@ -185,8 +197,12 @@ def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path: Path) -> Non
     for name, side in (("fine", 1.0), ("coarse", 2.0)):
         places = (np.indices(3 * [int(40 / side)]) + 0.5) * side - 20
         mask = ((places**2).sum(axis=0) < 14**2).astype(np.uint8)
-        nibabel.save(nibabel.Nifti1Image(mask, np.diag([side, side, side, 1])), tmp_path / f"{name}.nii.gz")
-    dataset = SignatureDataset([tmp_path / "fine.nii.gz", tmp_path / "coarse.nii.gz"], cache_dir=tmp_path)
+        nibabel.save(
+            nibabel.Nifti1Image(mask, np.diag([side, side, side, 1])), tmp_path / f"{name}.nii.gz"
+        )
+    dataset = SignatureDataset(
+        [tmp_path / "fine.nii.gz", tmp_path / "coarse.nii.gz"], cache_dir=tmp_path
+    )
     spacing = measure_bodies(dataset, n_workers=1)["spacing"]
     assert np.exp(spacing) == pytest.approx([1, 2], rel=0.01)
 
@@ -200,14 +216,26 @@ def test_labels_are_measured_in_their_grid(tmp_path: Path) -> None:
         return (x - at) ** 2 + (y - 20) ** 2 + (z - height) ** 2 <= radius**2
 
     island = ball(40) | ball(56, 2)
-    masks = {"a": ball(20), "b": ball(36), "cut": ball(20) & (z < 24), "border": ball(20, 10, 35), "island": island}
+    masks = {
+        "a": ball(20),
+        "b": ball(36),
+        "cut": ball(20) & (z < 24),
+        "border": ball(20, 10, 35),
+        "island": island,
+    }
     for name, mask in masks.items():
-        nibabel.save(nibabel.Nifti1Image(mask.astype(np.uint8), np.eye(4)), tmp_path / f"{name}.nii.gz")
+        nibabel.save(
+            nibabel.Nifti1Image(mask.astype(np.uint8), np.eye(4)), tmp_path / f"{name}.nii.gz"
+        )
     files = [tmp_path / f"{name}.nii.gz" for name in masks]
     dataset = SignatureDataset(files, cache_dir=tmp_path, labels=["a", "b", "a", "c", "d"])
     found = measure_bodies(dataset, n_workers=1)
-    assert found["overlap"][0, 1] == pytest.approx((masks["a"] & masks["b"]).sum() / masks["a"].sum())
-    assert found["overlap"][0, 3] == pytest.approx((masks["a"] & masks["border"]).sum() / masks["a"].sum())
+    assert found["overlap"][0, 1] == pytest.approx(
+        (masks["a"] & masks["b"]).sum() / masks["a"].sum()
+    )
+    assert found["overlap"][0, 3] == pytest.approx(
+        (masks["a"] & masks["border"]).sum() / masks["a"].sum()
+    )
     assert found["overlap"][0, 2] == 0  # of one class, which may be another subject
     assert found["stray"] ** 2 == pytest.approx([0, 0, 0, 0, ball(56, 2).sum() / island.sum()])
     assert found["cut"][2] > 3 * max(found["cut"][[0, 1, 3]])
@@ -220,13 +248,19 @@ def test_labels_of_other_subjects_in_the_same_standard_space_do_not_overlap(tmp_
     for name, at in (("s1", 12), ("s2", 20)):
         labels = np.where((x - at) ** 2 + (y - 12) ** 2 + (z - 12) ** 2 <= 64, 1, 0)
         labels[at + 9 :, 4:20, 4:20] = 2
-        nibabel.save(nibabel.Nifti1Image(labels.astype(np.uint8), np.eye(4)), tmp_path / f"{name}.nii.gz")
+        nibabel.save(
+            nibabel.Nifti1Image(labels.astype(np.uint8), np.eye(4)), tmp_path / f"{name}.nii.gz"
+        )
     bodies = find_bodies(tmp_path, classes="body")
     assert bodies.labels == ("1", "2", "1", "2")
-    assert not measure_bodies(SignatureDataset(bodies, cache_dir=tmp_path), n_workers=1)["overlap"].any()
+    assert not measure_bodies(SignatureDataset(bodies, cache_dir=tmp_path), n_workers=1)[
+        "overlap"
+    ].any()
 
 
-def test_a_volume_is_read_once_for_all_its_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_volume_is_read_once_for_all_its_labels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     labels = np.zeros((40, 20, 20), dtype=np.uint8)
     for label, at in ((1, 2), (2, 14), (3, 26)):
@@ -238,4 +272,6 @@ def test_a_volume_is_read_once_for_all_its_labels(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(volumes, "read_raw", lambda path: reads.append(path) or read(path))
     found = measure_bodies(dataset, n_workers=1)
     assert len(reads) == 1
-    assert np.exp(found["volume"]) == pytest.approx([1440, 1440, 1440, np.nan], rel=0.01, nan_ok=True)
+    assert np.exp(found["volume"]) == pytest.approx(
+        [1440, 1440, 1440, np.nan], rel=0.01, nan_ok=True
+    )

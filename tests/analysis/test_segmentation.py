@@ -70,12 +70,16 @@ def test_a_gap_does_not_depend_on_the_grid_and_not_on_the_unit() -> None:
     usual = gap_root(mask, ONES)
     assert gap_root(mask, 3 * ONES) == pytest.approx(usual)
     assert gap_root(np.repeat(mask, 2, axis=2), ONES * [1, 1, 0.5]) == pytest.approx(usual, rel=0.1)
-    assert gap_root(drilled(60, 15, 64), ONES) == pytest.approx(usual, rel=0.1)  # put on a coarser grid
+    assert gap_root(drilled(60, 15, 64), ONES) == pytest.approx(
+        usual, rel=0.1
+    )  # put on a coarser grid
 
 
 def test_a_cut_shows_unless_the_border_of_the_volume_made_it() -> None:
     half = ball(20, 20)[:, :, :26]
     inside, at_border = np.zeros((3, 2), dtype=bool), np.zeros((3, 2), dtype=bool)
     at_border[2, 1] = True
-    assert cut_end(half, inside) == pytest.approx((1 - 0.4**0.5) * (np.pi * (20**2 - 5**2)) ** 0.5, rel=0.05)
+    assert cut_end(half, inside) == pytest.approx(
+        (1 - 0.4**0.5) * (np.pi * (20**2 - 5**2)) ** 0.5, rel=0.05
+    )
     assert cut_end(half, at_border) < 2

@@ -69,12 +69,16 @@ spreads: list[float] = []
 """Range of the repetitions over their median, for all timings in this process."""
 
 
-def timed(ours: Callable[[], object], baseline: Callable[[], object], repeat: int = 3) -> tuple[float, float]:
+def timed(
+    ours: Callable[[], object], baseline: Callable[[], object], repeat: int = 3
+) -> tuple[float, float]:
     """Median seconds of both functions, over alternating repetitions."""
     return timed_by(lambda: _seconds(ours), lambda: _seconds(baseline), repeat)
 
 
-def timed_by(ours: Callable[[], float], baseline: Callable[[], float], repeat: int = 3) -> tuple[float, float]:
+def timed_by(
+    ours: Callable[[], float], baseline: Callable[[], float], repeat: int = 3
+) -> tuple[float, float]:
     """Like `timed`, for functions that return their own seconds."""
     seconds: tuple[list[float], list[float]] = ([], [])
     for _ in range(repeat):
@@ -111,14 +115,20 @@ class Machine:
     @staticmethod
     def _ticks() -> tuple[float, float]:
         try:
-            ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
+            ticks = [
+                int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
+            ]
         except OSError:
             return 0.0, 0.0
         return float(sum(ticks[:8])), float(ticks[7])  # user time includes the time of guests
 
 
 def against(
-    name: str, ours: Callable[[], object], baseline: Callable[[], object], repeat: int = 3, note: str = ""
+    name: str,
+    ours: Callable[[], object],
+    baseline: Callable[[], object],
+    repeat: int = 3,
+    note: str = "",
 ) -> Figure:
     seconds, reference = timed(ours, baseline, repeat)
     return Figure(seconds, "s", reference, name, reference / seconds, note)
@@ -149,11 +159,17 @@ def vertex_count(path: Path) -> int:
         return int(file.readline().split()[0])
 
 
-def by_eigsh(stiffness: sparse.csr_matrix, mass: np.ndarray, k: int = K) -> tuple[np.ndarray, np.ndarray]:
-    return sparse.linalg.eigsh(stiffness.tocsc(), k + 1, sparse.diags(mass, format="csc"), sigma=-0.01 / mass.sum())
+def by_eigsh(
+    stiffness: sparse.csr_matrix, mass: np.ndarray, k: int = K
+) -> tuple[np.ndarray, np.ndarray]:
+    return sparse.linalg.eigsh(
+        stiffness.tocsc(), k + 1, sparse.diags(mass, format="csc"), sigma=-0.01 / mass.sum()
+    )
 
 
-def eigen(data: Path | None, n_vertices: int, subdivisions: int = 0, repeat: int = 3, k: int = K) -> Figure:
+def eigen(
+    data: Path | None, n_vertices: int, subdivisions: int = 0, repeat: int = 3, k: int = K
+) -> Figure:
     mesh = model(data, n_vertices, subdivisions)
     stiffness, mass = laplacian(mesh)
     spectrum = eigenpairs(stiffness, mass, k, positions=mesh.vertices)
@@ -180,7 +196,12 @@ def eigen_against_lapy(data: Path | None) -> Figure:
         stiffness, mass = laplacian(mesh)
         eigenpairs(stiffness, mass, K, positions=mesh.vertices)
 
-    return against("LaPy", ours, lambda: Solver(TriaMesh(vertices, faces)).eigs(K + 1), note="matrices and eigenpairs")
+    return against(
+        "LaPy",
+        ours,
+        lambda: Solver(TriaMesh(vertices, faces)).eigs(K + 1),
+        note="matrices and eigenpairs",
+    )
 
 
 def eigen_against_robust(data: Path | None) -> Figure:
@@ -197,7 +218,9 @@ def eigen_against_robust(data: Path | None) -> Figure:
         stiffness, mass = robust_laplacian.mesh_laplacian(vertices, faces)
         by_eigsh(stiffness.tocsr(), mass.diagonal())
 
-    return against("robust-laplacian + eigsh", ours, theirs, note="intrinsic-Delaunay matrices and eigenpairs")
+    return against(
+        "robust-laplacian + eigsh", ours, theirs, note="intrinsic-Delaunay matrices and eigenpairs"
+    )
 
 
 def coordinates_25k(data: Path | None) -> Figure:
@@ -209,7 +232,9 @@ def coordinates_25k(data: Path | None) -> Figure:
     def evaluate(accuracy: float | None) -> np.ndarray:
         return extend(mesh.vertices, mesh.faces, spectrum.eigenfunctions, points, accuracy=accuracy)
 
-    embedding = [torch.from_numpy(evaluate(a) / np.sqrt(spectrum.eigenvalues)) for a in (None, 1e-3)]
+    embedding = [
+        torch.from_numpy(evaluate(a) / np.sqrt(spectrum.eigenvalues)) for a in (None, 1e-3)
+    ]
     exact, hybrid = (torch.pdist(e) for e in embedding)
     error = torch.quantile(((hybrid - exact).abs() / exact)[:: len(exact) // 1_000_000 + 1], 0.99)
     note = f"{len(points)} samples, 99 % of interior distances within {error:.1e}"
@@ -224,9 +249,13 @@ def voxels_128(data: Path | None) -> Figure:
     count = int(np.prod([len(axis) for axis in axes]))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)[:: count // 2000]
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    seconds, sample = timed(lambda: inside_grid(mesh, axes), lambda: igl.winding_number(vertices, faces, points))
+    seconds, sample = timed(
+        lambda: inside_grid(mesh, axes), lambda: igl.winding_number(vertices, faces, points)
+    )
     reference = sample * count / len(points)
-    note = f"{len(mesh.faces)} faces, {count} cells; the baseline scaled up from {len(points)} cells"
+    note = (
+        f"{len(mesh.faces)} faces, {count} cells; the baseline scaled up from {len(points)} cells"
+    )
     return Figure(seconds, "s", reference, "libigl winding number", reference / seconds, note)
 
 
@@ -255,7 +284,14 @@ def histogram_pairs(data: Path | None) -> Figure:
     seconds, reference = timed(lambda: pair_histogram(embedding, potential), plain, 5)
     pairs = len(embedding) * (len(embedding) - 1) / 2e6
     note = "baseline: distances alone and one hard histogram, no classes"
-    return Figure(pairs / seconds, "M pairs/s", pairs / reference, "torch pdist + histc", reference / seconds, note)
+    return Figure(
+        pairs / seconds,
+        "M pairs/s",
+        pairs / reference,
+        "torch pdist + histc",
+        reference / seconds,
+        note,
+    )
 
 
 def histogram_backward(data: Path | None) -> Figure:
@@ -326,14 +362,23 @@ def oriented_pairs(data: Path | None) -> Figure:
         line = x[j] - x[i]
         distance = np.linalg.norm(line, axis=1)
         a, b = ((sign * n[end] * line).sum(axis=1) / distance for sign, end in ((1, i), (-1, j)))
-        features = np.stack([distance, np.maximum(a, b), np.minimum(a, b), (n[i] * n[j]).sum(axis=1)], axis=1)
+        features = np.stack(
+            [distance, np.maximum(a, b), np.minimum(a, b), (n[i] * n[j]).sum(axis=1)], axis=1
+        )
         np.histogramdd(features, (6, 5, 5, 5), [(0, 1), (-1, 1), (-1, 1), (-1, 1)])
 
     ours()  # compiled at the first call
     seconds, reference = timed(ours, by_numpy, 5)
     pairs = len(i) / 1e6
     note = "four linear kernels; baseline: nearest bins"
-    return Figure(pairs / seconds, "M pairs/s", pairs / reference, "numpy histogramdd", reference / seconds, note)
+    return Figure(
+        pairs / seconds,
+        "M pairs/s",
+        pairs / reference,
+        "numpy histogramdd",
+        reference / seconds,
+        note,
+    )
 
 
 def describe_before(data: Path | None) -> dict[str, Figure]:
@@ -349,7 +394,9 @@ def describe_before(data: Path | None) -> dict[str, Figure]:
             for name in ("rich", "pretrained", "multiscale", "interior", "gps"):
                 ours, before = seconds_of(name)
                 note = f"{len(signature.interior)} and {len(signature.surface)} samples"
-                figures[f"describe_{name}"] = Figure(ours, "s", before, f"commit {BEFORE}", before / ours, note)
+                figures[f"describe_{name}"] = Figure(
+                    ours, "s", before, f"commit {BEFORE}", before / ours, note
+                )
     return figures
 
 
@@ -377,11 +424,17 @@ def epoch(data: Path | None) -> dict[str, Figure]:
             without_workers, before = seconds_of("0")
             with_workers, before_with_workers = seconds_of("2")
     note = "400 items of 20 generated bodies, batches of 16; ours from one file, without meshes"
-    figures["epoch"] = Figure(without_workers, "s", before, "version 0.2.0", before / without_workers, note)
+    figures["epoch"] = Figure(
+        without_workers, "s", before, "version 0.2.0", before / without_workers, note
+    )
     ratio = before_with_workers / with_workers
-    figures["epoch_workers"] = Figure(with_workers, "s", before_with_workers, "version 0.2.0", ratio, "two workers")
+    figures["epoch_workers"] = Figure(
+        with_workers, "s", before_with_workers, "version 0.2.0", ratio, "two workers"
+    )
     ratio = without_workers / with_workers
-    figures["epoch_helped"] = Figure(with_workers, "s", without_workers, "no worker", ratio, "two workers")
+    figures["epoch_helped"] = Figure(
+        with_workers, "s", without_workers, "no worker", ratio, "two workers"
+    )
     return figures
 
 
@@ -392,25 +445,40 @@ def learned_step(data: Path | None) -> Figure:
         igps.ArticulatedShapes(n_classes=4, n_per_class=5, n_vertices=1500).write(root)
         with two_versions("steps.py", root, VERSION_0_2_0) as seconds_of:
             ours, before = seconds_of("step")
-    return Figure(ours, "s", before, "version 0.2.0", before / ours, "40 shapes, 400 samples of each")
+    return Figure(
+        ours, "s", before, "version 0.2.0", before / ours, "40 shapes, 400 samples of each"
+    )
 
 
 def together(data: Path | None) -> dict[str, Figure]:
     """Processor time for the description of 32 bodies as one batch, on one thread, against batches of one body."""
     torch.set_num_threads(1)
-    requirements = igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
+    requirements = (
+        igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
+    )
     with tempfile.TemporaryDirectory() as folder:
-        igps.ArticulatedShapes(n_classes=8, n_per_class=4, n_vertices=1500).write(f"{folder}/meshes")
-        dataset = igps.SignatureDataset(f"{folder}/meshes", cache_dir=f"{folder}/cache", descriptor=requirements)
+        igps.ArticulatedShapes(n_classes=8, n_per_class=4, n_vertices=1500).write(
+            f"{folder}/meshes"
+        )
+        dataset = igps.SignatureDataset(
+            f"{folder}/meshes", cache_dir=f"{folder}/cache", descriptor=requirements
+        )
         signatures = dataset.to_memory()
     figures = {}
     for n_samples, amount in ((400, "400"), (None, "all")):
-        bodies = signatures.to_memory(FewerSamples(n_interior=n_samples, n_surface=n_samples, seed=0))
-        batch, single_bodies = bodies.batch(range(len(bodies))), [bodies.batch([i]) for i in range(len(bodies))]
+        bodies = signatures.to_memory(
+            FewerSamples(n_interior=n_samples, n_surface=n_samples, seed=0)
+        )
+        batch, single_bodies = (
+            bodies.batch(range(len(bodies))),
+            [bodies.batch([i]) for i in range(len(bodies))],
+        )
         for name in ("interior", "pretrained"):
             descriptor = igps.descriptor(name)
 
-            def seconds(batches: Sequence[igps.SignatureBatch], descriptor: igps.Descriptor = descriptor) -> float:
+            def seconds(
+                batches: Sequence[igps.SignatureBatch], descriptor: igps.Descriptor = descriptor
+            ) -> float:
                 start = time.process_time()
                 with torch.no_grad():
                     for batch in batches:
@@ -419,27 +487,36 @@ def together(data: Path | None) -> dict[str, Figure]:
 
             ours, before = timed_by(lambda: seconds([batch]), lambda: seconds(single_bodies), 5)  # noqa: B023
             note = f"32 generated bodies, {amount} samples"
-            figures[f"together_{name}_{amount}"] = Figure(ours, "s", before, "one by one", before / ours, note)
+            figures[f"together_{name}_{amount}"] = Figure(
+                ours, "s", before, "one by one", before / ours, note
+            )
     return figures
 
 
 @contextlib.contextmanager
-def two_versions(script: str, path: Path, commit: str) -> Iterator[Callable[[str], tuple[float, float]]]:
+def two_versions(
+    script: str, path: Path, commit: str
+) -> Iterator[Callable[[str], tuple[float, float]]]:
     """Run a script of this folder with the current igps and with that of a commit, each on one thread.
 
     Gives a function from a line of input to the seconds that both scripts print, medians of seven repetitions.
     """
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
-        archive = subprocess.run(["git", "archive", commit, "src"], check=True, capture_output=True, cwd=PROJECT).stdout
+        archive = subprocess.run(
+            ["git", "archive", commit, "src"], check=True, capture_output=True, cwd=PROJECT
+        ).stdout
         subprocess.run(["tar", "x", "-C", folder], check=True, input=archive)
         processes = []
         for source in (PROJECT / "src", Path(folder) / "src"):
             environment = {**os.environ, **one_thread, "PYTHONPATH": str(source)}
             process = subprocess.Popen(
-                [sys.executable, str(Path(__file__).with_name(script)), str(path)], text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment,
-            )  # fmt: skip
+                [sys.executable, str(Path(__file__).with_name(script)), str(path)],
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env=environment,
+            )
             stack.enter_context(process)
             processes.append(process)
 
@@ -463,7 +540,14 @@ def descriptor_15k(data: Path | None) -> Figure:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     pair_histogram(embedding, potential)
     growth = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20 - before
-    return Figure(growth, "GiB", 1.0, "target", 1.0 / max(growth, 1e-3), "memory beyond the embedding's own 14 MiB")
+    return Figure(
+        growth,
+        "GiB",
+        1.0,
+        "target",
+        1.0 / max(growth, 1e-3),
+        "memory beyond the embedding's own 14 MiB",
+    )
 
 
 def mesh_to_histogram(mesh: Mesh) -> float:
@@ -497,23 +581,43 @@ def shrec07(data: Path | None) -> dict[str, Figure]:
     with tempfile.TemporaryDirectory() as folder:
         before = Path(folder) / "before"
         before.mkdir()
-        archive = subprocess.run(["git", "archive", BEFORE, "src"], check=True, capture_output=True, cwd=PROJECT).stdout
+        archive = subprocess.run(
+            ["git", "archive", BEFORE, "src"], check=True, capture_output=True, cwd=PROJECT
+        ).stdout
         subprocess.run(["tar", "x", "-C", before], check=True, input=archive)
         environment_before = {**os.environ, "PYTHONPATH": str(before / "src")}
 
-        def retrieve(descriptor: str, option: str, cache: str, environment: dict[str, str] | None = None) -> float:
-            command = [sys.executable, "-m", "igps.cli", "retrieve", str(data), "--descriptor", descriptor]
+        def retrieve(
+            descriptor: str, option: str, cache: str, environment: dict[str, str] | None = None
+        ) -> float:
+            command = [
+                sys.executable,
+                "-m",
+                "igps.cli",
+                "retrieve",
+                str(data),
+                "--descriptor",
+                descriptor,
+            ]
             command += [option, str(Path(folder) / cache)]
-            return _seconds(lambda: subprocess.run(command, check=True, capture_output=True, env=environment))
+            return _seconds(
+                lambda: subprocess.run(command, check=True, capture_output=True, env=environment)
+            )
 
         for name in ("interior", "pretrained"):
             seconds = retrieve(name, "--cache_dir", name)
             reference = retrieve(name, "--cache", f"{name} before", environment_before)
-            figures[f"shrec07_{name}"] = Figure(seconds, "s", reference, f"commit {BEFORE}", reference / seconds)
-        figures["shrec07_warm"] = within(10, retrieve("interior", "--cache_dir", "interior"), "interior")
+            figures[f"shrec07_{name}"] = Figure(
+                seconds, "s", reference, f"commit {BEFORE}", reference / seconds
+            )
+        figures["shrec07_warm"] = within(
+            10, retrieve("interior", "--cache_dir", "interior"), "interior"
+        )
         shutil.rmtree(Path(folder) / "interior" / "descriptions")
         seconds = retrieve("interior", "--cache_dir", "interior")
-        figures["shrec07_described"] = within(20, seconds, "interior, with signatures but no descriptions in the cache")
+        figures["shrec07_described"] = within(
+            20, seconds, "interior, with signatures but no descriptions in the cache"
+        )
     return figures
 
 
@@ -524,14 +628,22 @@ def company(data: Path | None) -> dict[str, Figure]:
     input while the other one computes.
     """
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    default = {name: value for name, value in os.environ.items() if name not in (*one_thread, "OMP_WAIT_POLICY")}
+    default = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in (*one_thread, "OMP_WAIT_POLICY")
+    }
     figures = {}
     with contextlib.ExitStack() as stack:
-        ours, single = (stack.enter_context(worker(data, env)) for env in (default, {**default, **one_thread}))
+        ours, single = (
+            stack.enter_context(worker(data, env)) for env in (default, {**default, **one_thread})
+        )
         for _ in range(2):
             stack.enter_context(busy())
         for task in COMPANY:
-            seconds, reference = timed_by(lambda task=task: ours(task), lambda task=task: single(task), 5)  # type: ignore[misc]
+            seconds, reference = timed_by(
+                lambda task=task: ours(task), lambda task=task: single(task), 5
+            )  # type: ignore[misc]
             slowdown = seconds / reference
             note = f"{seconds:.2f} s beside two busy processes, {reference:.2f} s with one thread"
             figures[f"company_{task}"] = Figure(slowdown, "×", 1.5, "target", 1.5 / slowdown, note)
@@ -553,7 +665,9 @@ def busy() -> Iterator[None]:
 def worker(data: Path | None, environment: dict[str, str]) -> Iterator[Callable[[str], float]]:
     """Start a process that runs tasks of `COMPANY`. Gives a function from the name of a task to its seconds."""
     command = [sys.executable, __file__, "--worker"] + (["--data", str(data)] if data else [])
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    )
     assert process.stdin is not None
     assert process.stdout is not None
     write, read = process.stdin, process.stdout
@@ -602,7 +716,9 @@ def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
     axes = [Potential(4, learnable=True), InteriorDistance(64, learnable=True)]
     embedding = igps.SpectralEmbedding(n_eigenpairs=64, n_knots=12)
     descriptor = igps.HistogramDescriptor(igps.PairHistogram(axes, embedding))
-    learner = igps.RetrievalLearner(descriptor, BlendedDistance(ProjectionHead(width=16, n_hidden=32)))
+    learner = igps.RetrievalLearner(
+        descriptor, BlendedDistance(ProjectionHead(width=16, n_hidden=32))
+    )
     batch = replace(batch, labels=torch.tensor([0, 0, 1, 1]))
     loader: DataLoader[igps.SignatureBatch] = DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
     learner.on_train_start = lambda: None  # type: ignore[method-assign]  # a step does not include the fit of the head
@@ -610,9 +726,14 @@ def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
 
     def step() -> None:
         trainer = Trainer(
-            max_steps=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
-            enable_model_summary=False, limit_val_batches=0,
-        )  # fmt: skip
+            max_steps=1,
+            accelerator="cpu",
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            limit_val_batches=0,
+        )
         trainer.fit(learner, loader)
 
     return step
@@ -713,7 +834,9 @@ def main() -> None:
         run_one(options.here, options.data)
         return
     table: dict[str, dict[str, float | str]] = {}
-    print(f"{os.cpu_count()} cores, of which {n_cores()} may be used; load average {Machine().load():.1f}")
+    print(
+        f"{os.cpu_count()} cores, of which {n_cores()} may be used; load average {Machine().load():.1f}"
+    )
     print(
         f"{'figure':<18}{'value':>10} {'unit':<10}{'baseline':>10}  {'ratio':>7}  {'peak':>9}  {'load':>5}  "
         f"{'steal':>5}  {'spread':>6}  baseline; note"

@@ -44,7 +44,12 @@ def measure(path: Path, n_eigenpairs: int) -> dict[str, float]:
     compute_signature(mesh, SignatureConfig(n_eigenpairs=n_eigenpairs))
     seconds = time.process_time() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    return {"vertices": len(mesh.vertices), "eigenpairs": n_eigenpairs, "seconds": seconds, "bytes": peak}
+    return {
+        "vertices": len(mesh.vertices),
+        "eigenpairs": n_eigenpairs,
+        "seconds": seconds,
+        "bytes": peak,
+    }
 
 
 def terms(vertices: NDArray[np.float64], eigenpairs: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -75,26 +80,40 @@ def accuracy(expected: NDArray[np.float64], measured: NDArray[np.float64]) -> st
 
 
 def report(rows: list[dict[str, float]]) -> None:
-    vertices, eigenpairs, bodies = (np.array([row[key] for row in rows]) for key in ("vertices", "eigenpairs", "body"))
+    vertices, eigenpairs, bodies = (
+        np.array([row[key] for row in rows]) for key in ("vertices", "eigenpairs", "body")
+    )
     columns = terms(vertices, eigenpairs)
     for key, name in (("seconds", "_SECONDS"), ("bytes", "_BYTES")):
         values = np.array([row[key] for row in rows])
         constants = fitted(columns, values)
-        print(f"{name}, {name}_PER_VERTEX, {name}_PER_ENTRY = {', '.join(f'{x:.3g}' for x in constants)}")
+        print(
+            f"{name}, {name}_PER_VERTEX, {name}_PER_ENTRY = {', '.join(f'{x:.3g}' for x in constants)}"
+        )
         print(f"  bodies of the fit: {accuracy(columns @ constants, values)}")
         expected = np.empty(len(values))
         for body in np.unique(bodies):
             own = bodies == body
             expected[own] = columns[own] @ fitted(columns[~own], values[~own])
         print(f"  bodies left out: {accuracy(expected, values)}")
-        current = np.array([expected_cost(int(v), int(k)) for v, k in zip(vertices, eigenpairs, strict=True)])
-        print(f"  current constants: {accuracy(current[:, int(key == 'bytes')], values)}", flush=True)
+        current = np.array(
+            [expected_cost(int(v), int(k)) for v, k in zip(vertices, eigenpairs, strict=True)]
+        )
+        print(
+            f"  current constants: {accuracy(current[:, int(key == 'bytes')], values)}", flush=True
+        )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, default=Path("build/cost.csv"), help="file of the measurements")
-    parser.add_argument("--largest", type=int, default=max(SIZES), help="number of vertices of the largest bodies")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--table", type=Path, default=Path("build/cost.csv"), help="file of the measurements"
+    )
+    parser.add_argument(
+        "--largest", type=int, default=max(SIZES), help="number of vertices of the largest bodies"
+    )
     parser.add_argument("--here", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.here:
@@ -103,13 +122,22 @@ def main() -> None:
     rows: list[dict[str, float]] = []
     if options.table.is_file():
         with options.table.open(newline="") as file:
-            rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+            rows = [
+                {key: float(value) for key, value in row.items()} for row in csv.DictReader(file)
+            ]
     done = {(row["size"], row["body"], row["eigenpairs"]) for row in rows}
     options.table.parent.mkdir(parents=True, exist_ok=True)
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    bodies = [(size, body) for size in SIZES if size <= options.largest for body in CLASSES[: N_CLASSES.get(size)]]
+    bodies = [
+        (size, body)
+        for size in SIZES
+        if size <= options.largest
+        for body in CLASSES[: N_CLASSES.get(size)]
+    ]
     for size, body in bodies:
-        missing = [n_eigenpairs for n_eigenpairs in EIGENPAIRS if (size, body, n_eigenpairs) not in done]
+        missing = [
+            n_eigenpairs for n_eigenpairs in EIGENPAIRS if (size, body, n_eigenpairs) not in done
+        ]
         if not missing:
             continue
         with tempfile.TemporaryDirectory() as folder:
@@ -118,8 +146,12 @@ def main() -> None:
             path.write_text(off_text(shape.vertices, shape.faces))
             for n_eigenpairs in missing:
                 command = [sys.executable, __file__, "--here", str(path), str(n_eigenpairs)]
-                output = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | threads)
-                rows.append({"size": size, "body": body, **json.loads(output.stdout.splitlines()[-1])})
+                output = subprocess.run(
+                    command, check=True, capture_output=True, text=True, env=os.environ | threads
+                )
+                rows.append(
+                    {"size": size, "body": body, **json.loads(output.stdout.splitlines()[-1])}
+                )
         with options.table.open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]))
             writer.writeheader()

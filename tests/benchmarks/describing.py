@@ -27,11 +27,19 @@ KINDS = ("interior", "surface")
 
 def save(signature: Signature, path: Path) -> None:
     """Write the fields of a signature that both versions have."""
-    arrays: dict[str, Any] = {"eigenvalues": signature.eigenvalues, "scalars": [signature.area, signature.volume]}
+    arrays: dict[str, Any] = {
+        "eigenvalues": signature.eigenvalues,
+        "scalars": [signature.area, signature.volume],
+    }
     for kind in KINDS:
         samples: Samples = getattr(signature, kind)
-        arrays |= {f"{kind} points": samples.points, f"{kind} eigenfunctions": samples.eigenfunctions}
-        arrays |= {f"{kind} attribute {name}": values for name, values in samples.attributes.items()}
+        arrays |= {
+            f"{kind} points": samples.points,
+            f"{kind} eigenfunctions": samples.eigenfunctions,
+        }
+        arrays |= {
+            f"{kind} attribute {name}": values for name, values in samples.attributes.items()
+        }
     np.savez(path, **arrays)
 
 
@@ -42,7 +50,9 @@ def load(path: Path) -> Signature:
             prefix = f"{kind} attribute "
             names = [name.removeprefix(prefix) for name in arrays.files if name.startswith(prefix)]
             attributes = {name: arrays[prefix + name] for name in names}
-            samples.append(Samples(arrays[f"{kind} points"], arrays[f"{kind} eigenfunctions"], attributes))
+            samples.append(
+                Samples(arrays[f"{kind} points"], arrays[f"{kind} eigenfunctions"], attributes)
+            )
         area, volume = arrays["scalars"].tolist()
         return Signature(arrays["eigenvalues"], *samples, area, volume, SignatureConfig())
 
@@ -51,7 +61,10 @@ def main() -> None:
     signature = load(Path(sys.argv[1]))
     torch.set_num_threads(1)
     if importlib.util.find_spec("igps.descriptors") is not None:
-        make, collate = importlib.import_module("igps").descriptor, importlib.import_module("igps").collate
+        make, collate = (
+            importlib.import_module("igps").descriptor,
+            importlib.import_module("igps").collate,
+        )
     else:
         presets = importlib.import_module("igps.nn.presets")
         collate = importlib.import_module("igps.data.dataset").collate

@@ -46,7 +46,12 @@ def main() -> None:
             items = dataset.to_memory() if where and hasattr(dataset, "to_memory") else dataset
             n = int(n_workers)
             loaders[line] = DataLoader(
-                items, 16, sampler=indices, num_workers=n, persistent_workers=n > 0, collate_fn=collate
+                items,
+                16,
+                sampler=indices,
+                num_workers=n,
+                persistent_workers=n > 0,
+                collate_fn=collate,
             )
             epoch(loaders[line])
         print(epoch(loaders[line]), flush=True)

@@ -26,11 +26,17 @@ from igps.retrieval import cosine
 
 WIDTH, FAMILY, BATCH, TOP = 256, 250, 10_000, 10
 AMPLITUDES = (1 + np.arange(WIDTH, dtype=np.float32)) ** -0.5
-CONDITIONS = {"all": "", "1 % at random": "volume < 0.01", "1 % by class": "class IN ('3', '4', '5', '6', '7')"}
+CONDITIONS = {
+    "all": "",
+    "1 % at random": "volume < 0.01",
+    "1 % by class": "class IN ('3', '4', '5', '6', '7')",
+}
 
 
 def members(centres: np.ndarray, noise: float, generator: np.random.Generator) -> np.ndarray:
-    vectors = (centres + noise * generator.standard_normal(centres.shape, dtype=np.float32)) * AMPLITUDES
+    vectors = (
+        centres + noise * generator.standard_normal(centres.shape, dtype=np.float32)
+    ) * AMPLITUDES
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
@@ -47,11 +53,20 @@ def batch(start: int, n_rows: int, noise: float) -> tuple[torch.Tensor, list[dic
     vectors = members(centres[family], noise, generator)
     area, volume = generator.random((2, BATCH))
     rows = [
-        {"id": f"/meshes/{n:07}.off", "name": f"{n:07}", "class": str(family[i] % 500), "file": f"/meshes/{n:07}.off",
-         "checksum": f"{n:064x}", "bytes": n, "modified": n, "area": area[i], "volume": volume[i],
-         "thumbnail": generator.bytes(900)}
+        {
+            "id": f"/meshes/{n:07}.off",
+            "name": f"{n:07}",
+            "class": str(family[i] % 500),
+            "file": f"/meshes/{n:07}.off",
+            "checksum": f"{n:064x}",
+            "bytes": n,
+            "modified": n,
+            "area": area[i],
+            "volume": volume[i],
+            "thumbnail": generator.bytes(900),
+        }
         for i, n in enumerate(range(start, start + BATCH))
-    ]  # fmt: skip
+    ]
     return torch.from_numpy(vectors), rows
 
 
@@ -70,10 +85,15 @@ def exact_nearest(vectors: np.ndarray, n_rows: int, noise: float) -> dict[str, n
         batch_vectors, rows = batch(start, n_rows, noise)
         batch_distances = 1 - vectors @ batch_vectors.numpy().T
         label = np.array([int(row["class"]) for row in rows])
-        masks = {"all": np.ones(BATCH, bool), "1 % at random": np.array([row["volume"] < 0.01 for row in rows]),
-                 "1 % by class": (label >= 3) & (label <= 7)}  # fmt: skip
+        masks = {
+            "all": np.ones(BATCH, bool),
+            "1 % at random": np.array([row["volume"] < 0.01 for row in rows]),
+            "1 % by class": (label >= 3) & (label <= 7),
+        }
         for name, mask in masks.items():
-            batch_indices = np.broadcast_to(start + np.flatnonzero(mask), (len(vectors), int(mask.sum())))
+            batch_indices = np.broadcast_to(
+                start + np.flatnonzero(mask), (len(vectors), int(mask.sum()))
+            )
             candidates = np.hstack([distances[name], batch_distances[:, mask]])
             candidate_indices = np.hstack([indices[name], batch_indices])
             best = np.argsort(candidates, axis=1)[:, :TOP]
@@ -92,17 +112,27 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.folder.exists():
         start = time.monotonic()
-        batches = (batch(start, arguments.n, arguments.noise) for start in range(0, arguments.n, BATCH))
+        batches = (
+            batch(start, arguments.n, arguments.noise) for start in range(0, arguments.n, BATCH)
+        )
         _table.write(arguments.folder, {"descriptor": "made"}, "cosine", batches, {})
         size = sum(path.stat().st_size for path in arguments.folder.rglob("*") if path.is_file())
-        print(f"built in {time.monotonic() - start:.0f} s, {size / 2**30:.2f} GiB, {memory()}", flush=True)
-    table, vectors = BodyTable(arguments.folder), queries(arguments.n_queries, arguments.n, arguments.noise)
+        print(
+            f"built in {time.monotonic() - start:.0f} s, {size / 2**30:.2f} GiB, {memory()}",
+            flush=True,
+        )
+    table, vectors = (
+        BodyTable(arguments.folder),
+        queries(arguments.n_queries, arguments.n, arguments.noise),
+    )
     answers: dict[str, list[list[int]]] = {}
     seconds: dict[str, list[float]] = {}
     for name, where in CONDITIONS.items():
         for query in torch.from_numpy(vectors):
             start = time.perf_counter()
-            rows, _, _ = nearest_rows(table, query[None], cosine, top=TOP, candidates=CANDIDATES, where=where or None)
+            rows, _, _ = nearest_rows(
+                table, query[None], cosine, top=TOP, candidates=CANDIDATES, where=where or None
+            )
             seconds.setdefault(name, []).append(time.perf_counter() - start)
             answers.setdefault(name, []).append([int(row["name"]) for row in rows])
     search_memory = memory()
@@ -110,7 +140,9 @@ def main() -> None:
         pairs = zip(answers[name], expected.tolist(), strict=True)
         recall = np.mean([len(set(answer) & set(exact)) / TOP for answer, exact in pairs])
         median, slow = (1e3 * np.quantile(seconds[name], share) for share in (0.5, 0.99))
-        print(f"{name}: {median:.1f} ms (median), {slow:.1f} ms (99 %), recall {recall:.4f} at {TOP}; {search_memory}")
+        print(
+            f"{name}: {median:.1f} ms (median), {slow:.1f} ms (99 %), recall {recall:.4f} at {TOP}; {search_memory}"
+        )
 
 
 def memory() -> str:

@@ -25,7 +25,9 @@ def main() -> None:
     known = set()
     for line in sys.stdin:
         parameters = json.loads(line)
-        config = igps.SignatureConfig(**{**parameters, "attributes": tuple(parameters["attributes"])})
+        config = igps.SignatureConfig(
+            **{**parameters, "attributes": tuple(parameters["attributes"])}
+        )
         if line not in known:
             known.add(line)
             igps.compute_signature(mesh, config)  # the first call loads and compiles functions

@@ -33,10 +33,14 @@ def main() -> None:
     rich = importlib.import_module("igps.descriptors.rich").rich
     descriptor: Any = rich(learnable=True, n_training_samples=N_SAMPLES).train()
     config = igps.SignatureConfig(
-        n_eigenpairs=50, attributes=("depth", "electrostatic_potential", "surface_direction"), n_surface_samples=2000
+        n_eigenpairs=50,
+        attributes=("depth", "electrostatic_potential", "surface_direction"),
+        n_surface_samples=2000,
     )
     dataset: Any = igps.SignatureDataset(root, config, root.parent / f"cache-{version}")
-    batch = importlib.import_module("igps").collate([dataset[i % len(dataset)] for i in range(N_SHAPES)])
+    batch = importlib.import_module("igps").collate(
+        [dataset[i % len(dataset)] for i in range(N_SHAPES)]
+    )
     classes = torch.arange(N_SHAPES) % N_CLASSES
     optimizer = torch.optim.Adam(descriptor.parameters())
     step(descriptor, optimizer, batch, classes)  # the first call loads and compiles functions
@@ -49,7 +53,9 @@ def main() -> None:
 def step(descriptor: Any, optimizer: torch.optim.Optimizer, batch: Any, classes: Tensor) -> None:
     roots = descriptor(batch).flatten(1).clamp(min=1e-9).sqrt()
     is_self = torch.eye(len(classes), dtype=torch.bool)
-    similarity = (-20 * torch.cdist(roots, roots)).masked_fill(is_self, -torch.inf).log_softmax(dim=1)
+    similarity = (
+        (-20 * torch.cdist(roots, roots)).masked_fill(is_self, -torch.inf).log_softmax(dim=1)
+    )
     loss = -similarity[(classes[:, None] == classes) & ~is_self].mean()
     optimizer.zero_grad()
     loss.backward()

@@ -57,7 +57,9 @@ class BodyFile:
 def body_file(seed: int, number: int) -> BodyFile:
     """Make the file of a seed and a number. Kinds alternate, and faults are random."""
     generator = np.random.default_rng([seed, number])
-    make = (_volume, _molecule, _image, _volume, _molecule, _scene, _pqr, _beside, _dicom, _beside)[number % 10]
+    make = (_volume, _molecule, _image, _volume, _molecule, _scene, _pqr, _beside, _dicom, _beside)[
+        number % 10
+    ]
     return make(generator)
 
 
@@ -95,7 +97,9 @@ def labels() -> Array:
         (4, (17, 7, 7), (5, 5, 4)),
         (9, (12, 19, 6), (8, 5, 5)),
     ):
-        volume[(volume == 0) & (((x - cx) / a) ** 2 + ((y - cy) / b) ** 2 + ((z - cz) / c) ** 2 < 1)] = label
+        volume[
+            (volume == 0) & (((x - cx) / a) ** 2 + ((y - cy) / b) ** 2 + ((z - cz) / c) ** 2 < 1)
+        ] = label
     return volume
 
 
@@ -117,12 +121,20 @@ def _volume(generator: Generator) -> BodyFile:
     elif fault == "probabilities":
         values, expected = (labels() == 4) * 0.75, {"x": expected["4"]}
     elif fault in ("names", "names repeat", "names of others"):
-        given = {"names": LABELS, "names repeat": dict.fromkeys(LABELS, "liver"), "names of others": {77: "heart"}}[
-            fault
-        ]
-        beside["x.csv"] = "\n".join(["label,name", *(f"{label},{name}" for label, name in given.items())]).encode()
-        is_repeated = fault == "names repeat"  # repeated names are followed by the number of the label
-        expected = {f"liver ({k})" if is_repeated else given.get(int(k), k): v for k, v in expected.items()}
+        given = {
+            "names": LABELS,
+            "names repeat": dict.fromkeys(LABELS, "liver"),
+            "names of others": {77: "heart"},
+        }[fault]
+        beside["x.csv"] = "\n".join(
+            ["label,name", *(f"{label},{name}" for label, name in given.items())]
+        ).encode()
+        is_repeated = (
+            fault == "names repeat"
+        )  # repeated names are followed by the number of the label
+        expected = {
+            f"liver ({k})" if is_repeated else given.get(int(k), k): v for k, v in expected.items()
+        }
     elif fault in ("no names", "no such names"):
         options["names"] = "names.csv" if fault == "no names" else "none.csv"
         beside = {"names.csv": b"nothing is named here\n"} if fault == "no names" else {}
@@ -135,9 +147,15 @@ def _volume(generator: Generator) -> BodyFile:
         values = values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
     if suffix == "tif" and values.ndim == 4:
         suffix = "nrrd"
-    content = _oversized(generator, suffix) if fault == "promises" else written_volume(suffix, values, affine)
+    content = (
+        _oversized(generator, suffix)
+        if fault == "promises"
+        else written_volume(suffix, values, affine)
+    )
     expected = REFUSED if fault == "promises" else expected
-    return BodyFile("volume", {f"x.{suffix}": content, **beside}, expected, f"{suffix}: {fault}", options)
+    return BodyFile(
+        "volume", {f"x.{suffix}": content, **beside}, expected, f"{suffix}: {fault}", options
+    )
 
 
 def written_volume(suffix: str, values: Array, affine: Array) -> bytes:
@@ -245,7 +263,7 @@ _ON_VOLUMES: dict[str, Callable[..., tuple[Array, Array, bool]] | None] = {
     "axis without length": _refusing(lambda g, v, a: (v, a * [1, 1, 0, 1])),
     "one slice": _refusing(lambda g, v, a: (v[:, :, :1], a)),
     "no label": _refusing(lambda g, v, a: (0 * v, a)),
-}  # fmt: skip
+}
 
 
 @cache
@@ -258,13 +276,20 @@ def segmentation() -> bytes:
 
 
 def _dicom(generator: Generator) -> BodyFile:
-    content, fault = segmentation(), _drawn(generator, ("nothing", "an image", "no modality", "damage", "damage"))
+    content, fault = (
+        segmentation(),
+        _drawn(generator, ("nothing", "an image", "no modality", "damage", "damage")),
+    )
     cell = abs(np.linalg.det(test_volumes.AFFINE[:3, :3]))
-    expected: Any = {name: cell * float((labels() == label).sum()) for label, name in LABELS.items()}
+    expected: Any = {
+        name: cell * float((labels() == label).sum()) for label, name in LABELS.items()
+    }
     if fault == "damage":
         return _damaged(generator, BodyFile("volume", {"x.dcm": content}, None), False)
     if fault != "nothing":
-        content = content.replace(b"CS\4\0SEG ", b"CS\4\0CT  " if fault == "an image" else b"CS\4\0    ")
+        content = content.replace(
+            b"CS\4\0SEG ", b"CS\4\0CT  " if fault == "an image" else b"CS\4\0    "
+        )
         expected = REFUSED
     return BodyFile("volume", {"x.dcm": content}, expected, f"dcm: {fault}")
 
@@ -296,9 +321,18 @@ def helices() -> tuple[str, ...]:
 
 
 def atom_line(
-    serial: int, name: str, residue: str, chain: str, number: int, at: Iterable[float], *, element: str | None = None,
-    altloc: str = " ", occupancy: float = 1.0, record: str = "ATOM",
-) -> str:  # fmt: skip
+    serial: int,
+    name: str,
+    residue: str,
+    chain: str,
+    number: int,
+    at: Iterable[float],
+    *,
+    element: str | None = None,
+    altloc: str = " ",
+    occupancy: float = 1.0,
+    record: str = "ATOM",
+) -> str:
     """A line of an atom in a PDB file."""
     position = "".join(f"{x:8.3f}"[:8] for x in at)
     return (
@@ -318,12 +352,16 @@ def _molecule(generator: Generator) -> BodyFile:
     if fault in ("nowhere", "all nowhere"):  # only PDB files may have asterisks in place of numbers
         suffix = "pdb"
     text = "\n".join(lines) + "\n"
-    content = gemmi.read_pdb_string(text).make_mmcif_document().as_string() if suffix == "cif" else text
+    content = (
+        gemmi.read_pdb_string(text).make_mmcif_document().as_string() if suffix == "cif" else text
+    )
     packed = suffix.endswith(".gz")
     whole = BodyFile(
-        "molecule", {f"x.{suffix}": gzip.compress(content.encode(), mtime=0) if packed else content.encode()},
-        expected, f"{suffix}: {fault}",
-    )  # fmt: skip
+        "molecule",
+        {f"x.{suffix}": gzip.compress(content.encode(), mtime=0) if packed else content.encode()},
+        expected,
+        f"{suffix}: {fault}",
+    )
     return _damaged(generator, whole, packed) if fault == "damage" else whole
 
 
@@ -336,8 +374,12 @@ def _each_atom(lines: list[str], change: Callable[[str, int], str | None]) -> li
     return [line for line in changed if line is not None]
 
 
-def _of_chain_a(change: Callable[[str], str], last: int = 10**6) -> Callable[[Generator, list[str]], list[str]]:
-    return lambda g, lines: _each_atom(lines, lambda line, i: change(line) if line[21] == "A" and i <= last else line)
+def _of_chain_a(
+    change: Callable[[str], str], last: int = 10**6
+) -> Callable[[Generator, list[str]], list[str]]:
+    return lambda g, lines: _each_atom(
+        lines, lambda line, i: change(line) if line[21] == "A" and i <= last else line
+    )
 
 
 def _numbered(line: str, number: int) -> str:
@@ -353,7 +395,9 @@ def _alternatives(generator: Generator, lines: list[str]) -> Change:
     for line in lines:
         if line.startswith("ATOM") and generator.random() < 0.2:
             found.append(f"{line[:16]}A{line[17:54]}  0.60{line[60:]}")
-            found.append(_placed(f"{line[:16]}B{line[17:54]}  0.40{line[60:]}", generator.normal(size=3) * 5))
+            found.append(
+                _placed(f"{line[:16]}B{line[17:54]}  0.40{line[60:]}", generator.normal(size=3) * 5)
+            )
         else:
             found.append(line)
     return found, {}
@@ -362,55 +406,96 @@ def _alternatives(generator: Generator, lines: list[str]) -> Change:
 _ON_MOLECULES: dict[str, Callable[[Generator, list[str]], Change]] = {
     "nothing": lambda g, lines: (lines, {}),
     "alternatives": _alternatives,
-    "negative numbers": lambda g, lines: (_each_atom(lines, lambda line, i: _numbered(line, int(line[22:26]) - 6)), {}),
-    "repeated numbers": lambda g, lines: (
-        _each_atom(lines, lambda line, i: _numbered(line, (int(line[22:26]) + 1) // 2)), {}
+    "negative numbers": lambda g, lines: (
+        _each_atom(lines, lambda line, i: _numbered(line, int(line[22:26]) - 6)),
+        {},
     ),
-    "repeated serials": lambda g, lines: (_each_atom(lines, lambda line, i: f"{line[:6]}    1{line[11:]}"), {}),
-    "serials of letters": lambda g, lines: (_each_atom(lines, lambda line, i: f"{line[:6]}***** {line[12:]}"), {}),
+    "repeated numbers": lambda g, lines: (
+        _each_atom(lines, lambda line, i: _numbered(line, (int(line[22:26]) + 1) // 2)),
+        {},
+    ),
+    "repeated serials": lambda g, lines: (
+        _each_atom(lines, lambda line, i: f"{line[:6]}    1{line[11:]}"),
+        {},
+    ),
+    "serials of letters": lambda g, lines: (
+        _each_atom(lines, lambda line, i: f"{line[:6]}***** {line[12:]}"),
+        {},
+    ),
     "unknown residues": lambda g, lines: (
-        _each_atom(lines, lambda line, i: line if line[17:20] == "GLY" else f"{line[:17]}XQZ{line[20:]}"), {}
+        _each_atom(
+            lines, lambda line, i: line if line[17:20] == "GLY" else f"{line[:17]}XQZ{line[20:]}"
+        ),
+        {},
     ),
     "no elements": lambda g, lines: (_each_atom(lines, lambda line, i: line[:76]), {}),
     "hydrogens": lambda g, lines: (
-        [*lines[:3], atom_line(900, "H", "ALA", "A", 1, (0, 0, 30)), *lines[3:]], {}
+        [*lines[:3], atom_line(900, "H", "ALA", "A", 1, (0, 0, 30)), *lines[3:]],
+        {},
     ),
     "water": lambda g, lines: (
-        [*lines, *(atom_line(900 + i, "O", "HOH", "C", i, (i, 40, 0), record="HETATM") for i in range(9))], {}
+        [
+            *lines,
+            *(
+                atom_line(900 + i, "O", "HOH", "C", i, (i, 40, 0), record="HETATM")
+                for i in range(9)
+            ),
+        ],
+        {},
     ),
     "other ends of lines": lambda g, lines: ([line + "\r" for line in lines], {}),
-    "remarks": lambda g, lines: (["HEADER    NONE", "REMARK   2 é", *lines, "CONECT    1    2"], {}),
-    "unknown elements": lambda g, lines: (_of_chain_a(lambda line: f"{line[:76]} Q", 5)(g, lines), {"chain A": None}),
+    "remarks": lambda g, lines: (
+        ["HEADER    NONE", "REMARK   2 é", *lines, "CONECT    1    2"],
+        {},
+    ),
+    "unknown elements": lambda g, lines: (
+        _of_chain_a(lambda line: f"{line[:76]} Q", 5)(g, lines),
+        {"chain A": None},
+    ),
     "nowhere": lambda g, lines: (
-        _of_chain_a(lambda line: f"{line[:30]}********{line[38:]}", 5)(g, lines), {"chain A": None}
+        _of_chain_a(lambda line: f"{line[:30]}********{line[38:]}", 5)(g, lines),
+        {"chain A": None},
     ),
     "far away": lambda g, lines: (
-        _of_chain_a(lambda line: _placed(line, (9999, 9999, 9999)), 0)(g, lines), {"chain A": REFUSED}
+        _of_chain_a(lambda line: _placed(line, (9999, 9999, 9999)), 0)(g, lines),
+        {"chain A": REFUSED},
     ),
     "all in one place": lambda g, lines: (
-        _of_chain_a(lambda line: _placed(line, (1, 2, 3)))(g, lines), {"chain A": None}
+        _of_chain_a(lambda line: _placed(line, (1, 2, 3)))(g, lines),
+        {"chain A": None},
     ),
     "no atoms": lambda g, lines: (["HEADER    NONE", "END"], REFUSED),
     "water alone": lambda g, lines: (
-        [atom_line(i, "O", "HOH", "A", i, (3 * i, 0, 0), record="HETATM") for i in range(9)], REFUSED
+        [atom_line(i, "O", "HOH", "A", i, (3 * i, 0, 0), record="HETATM") for i in range(9)],
+        REFUSED,
     ),
-    "all nowhere": lambda g, lines: (_each_atom(lines, lambda line, i: f"{line[:30]}{'*' * 24}{line[54:]}"), REFUSED),
+    "all nowhere": lambda g, lines: (
+        _each_atom(lines, lambda line, i: f"{line[:30]}{'*' * 24}{line[54:]}"),
+        REFUSED,
+    ),
     "one line": lambda g, lines: (lines[:1], None),
-}  # fmt: skip
+}
 
 
 def _pqr(generator: Generator) -> BodyFile:
     """A PQR file: words separated by spaces, with charges and radii in the last columns."""
     lines = [
         f"ATOM {line[6:11]} {line[12:16]} {line[17:20]} {line[21]} {line[22:26]} {line[30:54]} {charge:.4f} 1.80"
-        for line, charge in zip((x for x in helices() if x.startswith("ATOM")), cycle([0.1, -0.1]), strict=False)
+        for line, charge in zip(
+            (x for x in helices() if x.startswith("ATOM")), cycle([0.1, -0.1]), strict=False
+        )
     ]
-    fault = _drawn(generator, ("nothing", "remarks", "no chains", "radius", "charge", "damage", "damage"))
+    fault = _drawn(
+        generator, ("nothing", "remarks", "no chains", "radius", "charge", "damage", "damage")
+    )
     expected: Any = {"chain A": None, "chain B": None}
     if fault == "remarks":
         lines = ["REMARK   1 PQR file generated by PDB2PQR", "", *lines, "TER", "END"]
     elif fault == "no chains":
-        lines, expected = [" ".join((words := line.split())[:4] + words[5:]) for line in lines], None
+        lines, expected = (
+            [" ".join((words := line.split())[:4] + words[5:]) for line in lines],
+            None,
+        )
     elif fault in ("radius", "charge"):
         words, at = lines[7].split(), -1 if fault == "radius" else -2
         words[at] = str(generator.choice(["nan", "inf", "1e9", "-1", "word"]))
@@ -419,7 +504,10 @@ def _pqr(generator: Generator) -> BodyFile:
     content = "\n".join([*lines, ""]).encode()
     packed = name.endswith(".gz")
     whole = BodyFile(
-        "molecule", {name: gzip.compress(content, mtime=0) if packed else content}, expected, f"{name}: {fault}"
+        "molecule",
+        {name: gzip.compress(content, mtime=0) if packed else content},
+        expected,
+        f"{name}: {fault}",
     )
     return _damaged(generator, whole, packed) if fault == "damage" else whole
 
@@ -431,7 +519,11 @@ def _scene(generator: Generator) -> BodyFile:
     boxes = {"shaft": (1.0, 2.0, 3.0), "wheel": (2.0, 2.0, 1.0), "plate": (4.0, 3.0, 0.5)}
     step = generator.random() < 0.4
     fault = str(
-        generator.choice(["nothing", "damage", "damage"] if step else ["nothing", "not finite", "repeat", "damage"])
+        generator.choice(
+            ["nothing", "damage", "damage"]
+            if step
+            else ["nothing", "not finite", "repeat", "damage"]
+        )
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / ("x.step" if step else "x.glb")
@@ -443,9 +535,13 @@ def _scene(generator: Generator) -> BodyFile:
                 mesh = trimesh.creation.box(sides)
                 if fault == "not finite" and name == "wheel":
                     mesh.vertices[3, 2] = np.nan
-                scene.add_geometry(mesh, node_name=name, geom_name=name, transform=np.diag([(-1) ** i, 1, 1, 1]))
+                scene.add_geometry(
+                    mesh, node_name=name, geom_name=name, transform=np.diag([(-1) ** i, 1, 1, 1])
+                )
             if fault == "repeat":
-                scene.add_geometry(scene.geometry["shaft"], node_name="shaft again", geom_name="shaft")
+                scene.add_geometry(
+                    scene.geometry["shaft"], node_name="shaft again", geom_name="shaft"
+                )
             scene.export(path)
         content = path.read_bytes()
     expected: Any = {name: float(np.prod(sides)) for name, sides in boxes.items()}
@@ -453,7 +549,9 @@ def _scene(generator: Generator) -> BodyFile:
         expected["wheel"] = REFUSED
     if fault == "repeat":
         expected["shaft again"] = expected["shaft"]
-    whole = BodyFile("scene", {path.name: content}, expected, f"{path.suffix}: {fault}", {"bodies": "objects"})
+    whole = BodyFile(
+        "scene", {path.name: content}, expected, f"{path.suffix}: {fault}", {"bodies": "objects"}
+    )
     return _damaged(generator, whole, False) if fault == "damage" else whole
 
 
@@ -467,7 +565,9 @@ def field_at(points: Array) -> Array:
 
 def _image(generator: Generator) -> BodyFile:
     suffix = str(generator.choice(["nii.gz", "nrrd", "mha", "nii"]))
-    fault = _drawn(generator, ("nothing", "some holes", "border", "half", "of another", "not finite", "damage"))
+    fault = _drawn(
+        generator, ("nothing", "some holes", "border", "half", "of another", "not finite", "damage")
+    )
     affine = np.diag([-0.5, 0.6, 0.4, 1.0])
     shape = np.array([24, 20, 30])
     affine[:3, 3] = -affine[:3, :3] @ ((shape - 1) / 2)
@@ -476,7 +576,9 @@ def _image(generator: Generator) -> BodyFile:
     index = np.stack(np.indices(tuple(shape)), axis=-1)
     values = field_at(index @ affine[:3, :3].T + affine[:3, 3]).astype(np.float32)
     if fault == "some holes":
-        values[tuple((shape * [0.5, 0.6, 0.5]).astype(int))] = generator.choice([np.nan, np.inf, 7e18])
+        values[tuple((shape * [0.5, 0.6, 0.5]).astype(int))] = generator.choice(
+            [np.nan, np.inf, 7e18]
+        )
     elif fault == "border":
         values[[0, -1]] = values[:, [0, -1]] = values[:, :, [0, -1]] = 7e18
     elif fault == "not finite":
@@ -496,7 +598,9 @@ def _beside(generator: Generator) -> BodyFile:
     suffix = str(generator.choice(["dx", "mrc", "map", "ply", "vtk", "shape.gii", "curv"]))
     is_grid = suffix in ("dx", "mrc", "map")
     faults = ["nothing", "damage", "damage", "some holes", "not finite"]
-    fault = _drawn(generator, [*faults, "half", "of another", "border"] if is_grid else [*faults, "of another"])
+    fault = _drawn(
+        generator, [*faults, "half", "of another", "border"] if is_grid else [*faults, "of another"]
+    )
     ball = trimesh.creation.icosphere(subdivisions=2, radius=3.0)
     content = (_grid if is_grid else _at_vertices)(generator, suffix, fault, ball)
     # One vertex gets the value of a neighbour, with an error of 2. The mean weight of a vertex inside is 1/162, and at
@@ -522,8 +626,12 @@ def _holed(generator: Generator, values: Array, fault: str) -> Array:
 
 def _grid(generator: Generator, suffix: str, fault: str, ball: trimesh.Trimesh) -> bytes:
     side, shape = np.array([0.5, 0.6, 0.4]), np.array([17, 15, 21])
-    origin = -side * (shape - 1) / 2 + np.array([{"half": 5, "of another": 1000}.get(fault, 0), 0, 0])
-    values = field_at(np.stack(np.indices(tuple(shape)), axis=-1) * side + origin).astype(np.float32)
+    origin = -side * (shape - 1) / 2 + np.array(
+        [{"half": 5, "of another": 1000}.get(fault, 0), 0, 0]
+    )
+    values = field_at(np.stack(np.indices(tuple(shape)), axis=-1) * side + origin).astype(
+        np.float32
+    )
     if fault == "border":
         values[[0, -1]] = values[:, [0, -1]] = values[:, :, [0, -1]] = 7e18
     values = _holed(generator, values, fault)
@@ -535,7 +643,10 @@ def _grid(generator: Generator, suffix: str, fault: str, ball: trimesh.Trimesh) 
             *(f"delta {_words(row)}" for row in np.diag(side)),
             f"object 2 class gridconnections counts {_integers(shape)}",
             f"object 3 class array type double rank 0 items {values.size} data follows",
-            *(" ".join(f"{x:.6e}" for x in row) for row in np.array_split(values.ravel(), values.size // 3)),
+            *(
+                " ".join(f"{x:.6e}" for x in row)
+                for row in np.array_split(values.ravel(), values.size // 3)
+            ),
             'attribute "dep" string "positions"',
         ]
         return "\n".join([*rows, ""]).encode()
@@ -565,10 +676,18 @@ def _at_vertices(generator: Generator, suffix: str, fault: str, ball: trimesh.Tr
         )
     places = ball.vertices[: len(values)]
     if suffix == "vtk":
-        rows = ["# vtk DataFile Version 3.0", "x", "ASCII", "DATASET POLYDATA", f"POINTS {len(places)} float"]
+        rows = [
+            "# vtk DataFile Version 3.0",
+            "x",
+            "ASCII",
+            "DATASET POLYDATA",
+            f"POINTS {len(places)} float",
+        ]
         rows += [_words(place) for place in places]
         rows += [f"POINT_DATA {len(values)}", "SCALARS value float 1", "LOOKUP_TABLE default"]
         return "\n".join([*rows, *map(repr, values.tolist()), ""]).encode()
     names = "\n".join(f"property float {name}" for name in ("x", "y", "z", "value"))
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(values)}\n{names}\nend_header\n"
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(values)}\n{names}\nend_header\n"
+    )
     return head.encode() + np.column_stack([places, values]).astype("<f4").tobytes()

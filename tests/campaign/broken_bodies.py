@@ -65,7 +65,8 @@ def judge(given: BodyFile, folder: Path) -> Verdict:
         except Exception as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
             return Verdict(
-                "wrong", f"a traceback of {type(error).__name__} from {where.filename}:{where.lineno}: {error}"
+                "wrong",
+                f"a traceback of {type(error).__name__} from {where.filename}:{where.lineno}: {error}",
             )
         if listed != list(bodies):
             return Verdict("wrong", f"listed are {listed}, read were {list(bodies)}")
@@ -84,7 +85,9 @@ def _refused(error: Exception, name: Path | str, folder: Path) -> Verdict:
     return Verdict("refused", text.replace(str(folder), "FOLDER"))
 
 
-def _judge_bodies(given: BodyFile, path: Path, bodies: dict[str, tuple[BodyRef, Mesh | MeshError]]) -> Verdict:
+def _judge_bodies(
+    given: BodyFile, path: Path, bodies: dict[str, tuple[BodyRef, Mesh | MeshError]]
+) -> Verdict:
     expected = given.expected
     if expected is not None and set(expected) != set(bodies):
         return Verdict("wrong", f"{sorted(bodies)} were read, {sorted(expected)} expected")
@@ -104,7 +107,9 @@ def _judge_bodies(given: BodyFile, path: Path, bodies: dict[str, tuple[BodyRef, 
             return Verdict("wrong", f"{part}: read, and a refusal was expected")
         surface = trimesh.Trimesh(body.vertices, body.faces, process=False)
         if not surface.is_watertight or not surface.volume > 0:
-            return Verdict("wrong", f"{part}: closed {surface.is_watertight}, volume {surface.volume}")
+            return Verdict(
+                "wrong", f"{part}: closed {surface.is_watertight}, volume {surface.volume}"
+            )
         if wanted == AS_IT_IS:
             wanted = _clean()[part]
         low, high = bounds.get(part, (0.0, np.inf))
@@ -112,7 +117,9 @@ def _judge_bodies(given: BodyFile, path: Path, bodies: dict[str, tuple[BodyRef, 
             error = EXACT if given.kind != "volume" else VOLUME
             low, high = wanted * (1 - error), wanted * (1 + error)
         if not low <= surface.volume <= high:
-            return Verdict("wrong", f"{part}: volume {surface.volume}, between {low} and {high} expected")
+            return Verdict(
+                "wrong", f"{part}: volume {surface.volume}, between {low} and {high} expected"
+            )
     kind, n_confirmed = "refused" if refusals else "confirmed", len(bodies) - len(refusals)
     return Verdict(kind, "; ".join(refusals), ("bodies",) * n_confirmed)
 
@@ -132,7 +139,9 @@ def _bounds(path: Path) -> dict[str, tuple[float, float]]:
     elif path.suffix in (".nrrd", ".mha"):
         image = SimpleITK.ReadImage(str(path))
         values = SimpleITK.GetArrayFromImage(image)
-        cell = abs(np.prod(image.GetSpacing()) * np.linalg.det(np.reshape(image.GetDirection(), (3, 3))))
+        cell = abs(
+            np.prod(image.GetSpacing()) * np.linalg.det(np.reshape(image.GetDirection(), (3, 3)))
+        )
     else:
         return {}
     bounds = {}
@@ -152,7 +161,9 @@ def _clean() -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "x.pdb"
         path.write_text("\n".join(helices()) + "\n")
-        return {str(ref.part): body.volume for ref, body in each_body(path) if isinstance(body, Mesh)}
+        return {
+            str(ref.part): body.volume for ref, body in each_body(path) if isinstance(body, Mesh)
+        }
 
 
 def _judge_image(given: BodyFile, path: Path) -> Verdict:
@@ -175,8 +186,12 @@ def _judge_image(given: BodyFile, path: Path) -> Verdict:
     if given.expected is not None:
         error = np.abs(values - field_at(points))
         tolerance = max(1e-2, given.expected["linear"])
-        if np.quantile(error, 0.9) > tolerance or error.max() > 3:  # values next to a hole are those of neighbours
-            return Verdict("wrong", f"values are off by {np.quantile(error, 0.9)}, at most {error.max()}")
+        if (
+            np.quantile(error, 0.9) > tolerance or error.max() > 3
+        ):  # values next to a hole are those of neighbours
+            return Verdict(
+                "wrong", f"values are off by {np.quantile(error, 0.9)}, at most {error.max()}"
+            )
     return Verdict("confirmed", "", ("values",))
 
 
@@ -197,7 +212,9 @@ def main() -> None:
     """Repeat one case and print its verdict."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--case", type=int, required=True, help="number of the file")
-    parser.add_argument("--out", type=Path, default=Path("build/campaign"), help="folder for the file")
+    parser.add_argument(
+        "--out", type=Path, default=Path("build/campaign"), help="folder for the file"
+    )
     arguments = parser.parse_args()
     given = body_file(SEED, arguments.case)
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -73,7 +73,9 @@ def judge(broken: Broken, folder: Path, number: int) -> Verdict:
     path.write_bytes(broken.content)
     options, may_change = _options(number)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # such as those of overflow in readers; the numbers are checked below
+        warnings.simplefilter(
+            "ignore"
+        )  # such as those of overflow in readers; the numbers are checked below
         try:
             with _grid(number):
                 mesh = load_mesh(path, options)
@@ -99,7 +101,11 @@ def judge(broken: Broken, folder: Path, number: int) -> Verdict:
                 doubts, checks = confirm(mesh, signature, written, CONFIG, path.suffix)
         except MeshError as error:
             return Verdict("wrong", f"the moved mesh is refused: {error}")
-    return Verdict("wrong", "; ".join(doubts), tuple(checks)) if doubts else Verdict("confirmed", "", tuple(checks))
+    return (
+        Verdict("wrong", "; ".join(doubts), tuple(checks))
+        if doubts
+        else Verdict("confirmed", "", tuple(checks))
+    )
 
 
 def _options(number: int) -> tuple[LoadOptions, bool]:
@@ -107,7 +113,9 @@ def _options(number: int) -> tuple[LoadOptions, bool]:
     component: Component | None = "largest" if number % 7 == 1 else None
     allow_open = number % 3 == 1
     mend = ("never", "auto", "never", "auto", "never", "auto", "never", "always")[number % 8]
-    return LoadOptions(mend=mend, component=component, allow_open=allow_open), mend != "never" or bool(component)  # type: ignore[arg-type]
+    return LoadOptions(
+        mend=mend, component=component, allow_open=allow_open
+    ), mend != "never" or bool(component)  # type: ignore[arg-type]
 
 
 def _grid(number: int) -> AbstractContextManager[object]:
@@ -145,7 +153,9 @@ def count_verdicts(
     reasons: Counter[str] = Counter()
     checks: Counter[str] = Counter()
     missed = []
-    for index, verdict in run(examine, jobs, n_workers=n_workers, limits=Limits(MAX_SECONDS, MAX_BYTES)):
+    for index, verdict in run(
+        examine, jobs, n_workers=n_workers, limits=Limits(MAX_SECONDS, MAX_BYTES)
+    ):
         number = jobs[index][1]
         if isinstance(verdict, Failed):
             verdict = Verdict("wrong", verdict.reason)
@@ -163,7 +173,11 @@ def count_verdicts(
             target,
             f"{kinds['refused']} refused, {kinds['confirmed']} confirmed, {kinds['wrong']} wrong",
             missed=sorted(missed),
-            details={"kinds": dict(kinds), "confirmations": dict(checks), "refusals": dict(reasons.most_common(40))},
+            details={
+                "kinds": dict(kinds),
+                "confirmations": dict(checks),
+                "refusals": dict(reasons.most_common(40)),
+            },
             seconds=time.monotonic() - start,
         )
     ]
@@ -173,7 +187,9 @@ def main() -> None:
     """Repeat one case and print its verdict."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--case", type=int, required=True, help="number of the file")
-    parser.add_argument("--out", type=Path, default=Path("build/campaign"), help="folder for the file")
+    parser.add_argument(
+        "--out", type=Path, default=Path("build/campaign"), help="folder for the file"
+    )
     arguments = parser.parse_args()
     broken = broken_mesh(SEED, arguments.case)
     arguments.out.mkdir(parents=True, exist_ok=True)

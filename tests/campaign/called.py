@@ -44,7 +44,10 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     finally:
         sys.setprofile(None)
         threading.setprofile(None)  # type: ignore[arg-type]
-        _tests[item.nodeid] = {"seconds": sum(os.times()[:4]) - sum(start[:4]), "functions": _names(_own)}
+        _tests[item.nodeid] = {
+            "seconds": sum(os.times()[:4]) - sum(start[:4]),
+            "functions": _names(_own),
+        }
 
 
 @pytest.hookimpl(wrapper=True)

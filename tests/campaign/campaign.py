@@ -48,7 +48,10 @@ def _run(part: str, amount: int) -> list[Row]:
     start, before = time.monotonic(), os.times()
     rows = run(amount) if amount else run()
     processors = sum(os.times()[:4]) - sum(before[:4])
-    print(f"{part}: {time.monotonic() - start:.0f} s of wall time, {processors:.0f} s of processors", flush=True)
+    print(
+        f"{part}: {time.monotonic() - start:.0f} s of wall time, {processors:.0f} s of processors",
+        flush=True,
+    )
     return rows
 
 
@@ -68,13 +71,19 @@ def main() -> None:
     """Run the campaign, or parts of it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--small", action="store_true", help="run the campaign of two minutes")
-    parser.add_argument("--parts", nargs="+", choices=_AMOUNTS, default=list(_AMOUNTS), help="parts to run")
-    parser.add_argument("--out", type=Path, default=Path("build/campaign.json"), help="JSON file of the table")
+    parser.add_argument(
+        "--parts", nargs="+", choices=_AMOUNTS, default=list(_AMOUNTS), help="parts to run"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("build/campaign.json"), help="JSON file of the table"
+    )
     arguments = parser.parse_args()
     amounts = {part: amount[arguments.small] for part, amount in _AMOUNTS.items()}
     results: dict[str, list[Row]] = {}
     for stage in _STAGES:
-        lines = [[(part, amounts[part]) for part in line if part in arguments.parts] for line in stage]
+        lines = [
+            [(part, amounts[part]) for part in line if part in arguments.parts] for line in stage
+        ]
         lines = [[(part, amount) for part, amount in line if amount is not None] for line in lines]
         lines = [line for line in lines if line]
         if not lines:

@@ -11,4 +11,6 @@ N_EIGENPAIRS = 6
 def cheap() -> HistogramDescriptor:
     """The histogram of `interior` with few eigenpairs and few bins."""
     embedding = SpectralEmbedding(n_eigenpairs=N_EIGENPAIRS)
-    return HistogramDescriptor(PairHistogram([Potential(2), InteriorDistance(16)], embedding), name="cheap")
+    return HistogramDescriptor(
+        PairHistogram([Potential(2), InteriorDistance(16)], embedding), name="cheap"
+    )

@@ -68,7 +68,9 @@ def _tables() -> Any:
 
 def _vectors_and_rows(rows: Rows) -> tuple[torch.Tensor, list[dict[str, Any]]]:
     vectors = torch.from_numpy(np.stack([vector(seed) for _, seed in rows.values()]))
-    return vectors, [{"id": id_, "name": id_, "volume": volume} for id_, (volume, _) in rows.items()]
+    return vectors, [
+        {"id": id_, "name": id_, "volume": volume} for id_, (volume, _) in rows.items()
+    ]
 
 
 def _create(path: Path) -> None:
@@ -98,10 +100,15 @@ def _write(path: Path, writer: int, number: int, journal: Path) -> None:
 def _read(path: Path, out: Path) -> None:
     """Write all rows of the table to a file, and whether some of them are found as nearest to themselves."""
     table = _tables().BodyTable(path)
-    rows = {row["id"]: (row["volume"], vectors) for batch in table.batches()
-            for vectors, row in zip(*table.decoded(batch), strict=True)}  # fmt: skip
+    rows = {
+        row["id"]: (row["volume"], vectors)
+        for batch in table.batches()
+        for vectors, row in zip(*table.decoded(batch), strict=True)
+    }
     ids = sorted(rows)[:: max(len(rows) // 10, 1)]
-    are_nearest = all(nearest_rows(table, rows[id_][1][None], cosine, top=1)[0][0]["id"] == id_ for id_ in ids)
+    are_nearest = all(
+        nearest_rows(table, rows[id_][1][None], cosine, top=1)[0][0]["id"] == id_ for id_ in ids
+    )
     arrays = {id_: (volume, values.numpy()) for id_, (volume, values) in rows.items()}
     out.write_bytes(pickle.dumps((arrays, are_nearest)))
 
@@ -175,9 +182,13 @@ def campaign(n_kills: int) -> list[Row]:
                 if _equal(own, after) and not _equal(own, rows[i]):
                     rows[i], numbers[i] = after, numbers[i] + 1
                 elif not _equal(own, rows[i]):
-                    missed.append(f"round {n_rounds}: writer {i} had finished {numbers[i]} changes, the rows differ")
+                    missed.append(
+                        f"round {n_rounds}: writer {i} had finished {numbers[i]} changes, the rows differ"
+                    )
             unchanged = {f"unchanged/{i}": (1.0, 10**9 + i) for i in range(N_UNCHANGED)}
-            if not _equal({id_: row for id_, row in actual.items() if id_.startswith("u")}, unchanged):
+            if not _equal(
+                {id_: row for id_, row in actual.items() if id_.startswith("u")}, unchanged
+            ):
                 missed.append(f"round {n_rounds}: rows that nobody touched differ")
     return [
         Row(

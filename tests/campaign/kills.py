@@ -60,7 +60,11 @@ class _Run:
     """A run with a separate cache and output folder."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        self.shapes, self.cache, self.out = folder / "shapes", folder / "caches" / name, folder / "out" / name
+        self.shapes, self.cache, self.out = (
+            folder / "shapes",
+            folder / "caches" / name,
+            folder / "out" / name,
+        )
 
     def command(self, n_workers: int, out: Path | None = None) -> Command:
         return Command(self.shapes, self.cache, out or self.out, n_workers)
@@ -99,7 +103,9 @@ def _workers(folder: Path, expected: object, n_kills: int, seconds: float) -> Ro
         run = _Run(folder, f"worker-{number}")
         command = run.command(2)
         run_start = time.monotonic()
-        kill_times = np.sort(generator.uniform(0, seconds, min(N_WORKER_KILLS, n_kills - n_killed))).tolist()
+        kill_times = np.sort(
+            generator.uniform(0, seconds, min(N_WORKER_KILLS, n_kills - n_killed))
+        ).tolist()
         while command.status() is None and time.monotonic() < run_start + seconds + _RUN_TIMEOUT:
             workers = [pid for pid in command.children() if is_python_worker(pid)]
             if kill_times and time.monotonic() >= run_start + kill_times[0] and workers:
@@ -178,7 +184,9 @@ def _eight(folder: Path, expected: object, n_kills: int) -> Row:
         generator = np.random.default_rng([SEED, 2, number])
         run = _Run(folder, f"eight-{number}")
         run_start = time.monotonic()
-        commands = [run.command(1, run.out.with_name(f"{run.out.name}-{i}")) for i in range(N_PROCESSES)]
+        commands = [
+            run.command(1, run.out.with_name(f"{run.out.name}-{i}")) for i in range(N_PROCESSES)
+        ]
         kill_times = np.sort(generator.uniform(0, seconds, N_KILLED))
         for i, kill_time in enumerate(kill_times):
             time.sleep(max(0.0, run_start + kill_time - time.monotonic()))
@@ -190,7 +198,9 @@ def _eight(folder: Path, expected: object, n_kills: int) -> Row:
             out = run.out.with_name(f"{run.out.name}-{i}")
             if command.wait() != 0 or table(out) != expected:
                 log = out.with_suffix(".log").read_text()[-300:]
-                missed.append(f"eight {number}: process {i} ends with status {command.wait()} or another table: {log}")
+                missed.append(
+                    f"eight {number}: process {i} ends with status {command.wait()} or another table: {log}"
+                )
         seconds = 0.8 * (time.monotonic() - run_start)
         missed += _check_rerun(run, expected, f"eight {number}")
         number += 1
@@ -212,7 +222,9 @@ def _leftovers(folder: Path, expected: object) -> Row:
     # A kill during a write is rare. So such files are also planted, in the folder of each version of the library.
     for cache in caches[:2]:
         written = next(cache.rglob("*.safetensors"))
-        written.with_name(f"{written.stem}.{2**22}-planted.partial").write_bytes(written.read_bytes()[:1000])
+        written.with_name(f"{written.stem}.{2**22}-planted.partial").write_bytes(
+            written.read_bytes()[:1000]
+        )
     leftovers = [path for cache in caches for path in partials(cache)]
     for path in leftovers:
         os.utime(path, (time.time() - 2 * _DAY,) * 2)
@@ -221,7 +233,9 @@ def _leftovers(folder: Path, expected: object) -> Row:
         missed += _check_rerun(_Run(folder, cache.name), expected, f"leftover in {cache.name}")
     remaining = [path for path in leftovers if path.exists()]
     if remaining:
-        missed.append(f"{len(remaining)} files that a killed process left stay for ever, such as {remaining[0].name}")
+        missed.append(
+            f"{len(remaining)} files that a killed process left stay for ever, such as {remaining[0].name}"
+        )
     return Row(
         "kills",
         "files half written, two days and one run later",

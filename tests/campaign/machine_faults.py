@@ -15,7 +15,11 @@ from typing import Any
 from outcome import Row
 from retrieving import Command, retrieve, table, write_shapes
 
-_WITHOUT_OVERRIDE = ("setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-dac_override")
+_WITHOUT_OVERRIDE = (
+    "setpriv",
+    "--bounding-set=-dac_override,-dac_read_search",
+    "--inh-caps=-dac_override",
+)
 Expected = Any
 Attempt = Callable[[Path, Expected], tuple[list[str], str]]
 
@@ -47,7 +51,9 @@ def campaign() -> list[Row]:
             place.mkdir()
             (place / "shapes").symlink_to(shapes, target_is_directory=True)
             missed, how = attempt(place, expected)
-            rows.append(Row("machine", what, 1, target, how, missed, seconds=time.monotonic() - start))
+            rows.append(
+                Row("machine", what, 1, target, how, missed, seconds=time.monotonic() - start)
+            )
     return rows
 
 
@@ -113,7 +119,9 @@ def _no_rename(place: Path, expected: Expected) -> tuple[list[str], str]:
     cache = place / "cache"
     outs = [place / f"out-{i}" for i in range(4)]
     with ThreadPoolExecutor(len(outs)) as pool:
-        runs = list(pool.map(lambda out: retrieve(place / "shapes", cache, out, fault="rename"), outs))
+        runs = list(
+            pool.map(lambda out: retrieve(place / "shapes", cache, out, fault="rename"), outs)
+        )
     missed = [
         f"process {i} ends with status {run.returncode}: {run.stderr[-300:]}"
         for i, run in enumerate(runs)
@@ -171,9 +179,15 @@ def _resumes(place: Path, cache: Path, expected: Expected, kept: dict[Path, int]
     if run.returncode:
         return [f"the run afterwards ends with status {run.returncode}: {run.stderr[-300:]}"]
     missed = [] if table(place / "out") == expected else ["the run afterwards leaves another table"]
-    recomputed = [path for path, stamp in kept.items() if not path.exists() or path.stat().st_mtime_ns != stamp]
+    recomputed = [
+        path
+        for path, stamp in kept.items()
+        if not path.exists() or path.stat().st_mtime_ns != stamp
+    ]
     if recomputed:
-        missed.append(f"{len(recomputed)} of {len(kept)} signatures that were kept are computed again")
+        missed.append(
+            f"{len(recomputed)} of {len(kept)} signatures that were kept are computed again"
+        )
     return missed
 
 

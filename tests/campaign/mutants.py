@@ -48,7 +48,14 @@ _EXTRA_SECONDS, _FACTOR = 60, 3
 _HOUR = 3600
 # Modules that take seconds to import, and start no threads, which a fork would lose
 _PRELOADED = (
-    *("torch", "torch._dynamo", "torch.nn.functional", "torchmetrics", "pytorch_lightning", "jsonargparse"),
+    *(
+        "torch",
+        "torch._dynamo",
+        "torch.nn.functional",
+        "torchmetrics",
+        "pytorch_lightning",
+        "jsonargparse",
+    ),
     *(
         "scipy.sparse.linalg",
         "scipy.spatial",
@@ -57,7 +64,16 @@ _PRELOADED = (
         "scipy.optimize",
         "sklearn.decomposition",
     ),
-    *("trimesh", "networkx", "igl", "skimage.measure", "sklearn.decomposition", "numba", "hypothesis", "pytest"),
+    *(
+        "trimesh",
+        "networkx",
+        "igl",
+        "skimage.measure",
+        "sklearn.decomposition",
+        "numba",
+        "hypothesis",
+        "pytest",
+    ),
 )
 # Equivalent mutants, which were read one by one: the module, and the line with the fault.
 EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
@@ -77,21 +93,33 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "n_directions: int = 59,",
         ),
         # The order of the points affects only the time.
-        ("src/igps/nn/_kernels/count_by_loops.py", "key = key * layout.n_classes - torch.where(share > 0, classes, 0)"),
+        (
+            "src/igps/nn/_kernels/count_by_loops.py",
+            "key = key * layout.n_classes - torch.where(share > 0, classes, 0)",
+        ),
         # No resolution is above the finest: larger arguments are refused before, and increments are clipped.
         ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == max_resolution:"),
         # No code compares two instances.
         ("src/igps/signature/sampling.py", "@dataclass(frozen=True, eq=True)"),
         # NumPy accepts any negative number for an unknown length.
-        ("src/igps/mesh/simplification.py", "order = (np.arange(3) + np.reshape(turn, (- 2, 1))) % 3"),
+        (
+            "src/igps/mesh/simplification.py",
+            "order = (np.arange(3) + np.reshape(turn, (- 2, 1))) % 3",
+        ),
         # The rotation of one ring of a patch relative to the next.
-        ("src/igps/mesh/_tidying.py", "disc.append(_circle((np.arange(size) + ring / 3) / size, radius))"),
+        (
+            "src/igps/mesh/_tidying.py",
+            "disc.append(_circle((np.arange(size) + ring / 3) / size, radius))",
+        ),
         # Values below zero are rounding errors.
         (
             "src/igps/retrieval/graph_reranking.py",
             "return (1 - factor[:, None] * sums[:, 1:] * factor[neighbours]).clip( -1)",
         ),
-        ("src/igps/retrieval/graph_reranking.py", "return np.subtract(1, common, out=common).clip( -1, out=common)"),
+        (
+            "src/igps/retrieval/graph_reranking.py",
+            "return np.subtract(1, common, out=common).clip( -1, out=common)",
+        ),
     }
 )
 
@@ -127,8 +155,14 @@ class Calls:
         """Groups of tests to run in order: those that call the function, then those of the module's test file."""
         function = _function(mutant)
         callers = {name for name, (_, functions) in self.tests.items() if function in functions}
-        own = {name for name in self.tests if Path(name.partition("::")[0]).stem == f"test_{mutant.path.stem}"}
-        if function in self.shared or not callers:  # such as code that runs on import, or is compiled
+        own = {
+            name
+            for name in self.tests
+            if Path(name.partition("::")[0]).stem == f"test_{mutant.path.stem}"
+        }
+        if (
+            function in self.shared or not callers
+        ):  # such as code that runs on import, or is compiled
             callers, own = own, set(self.tests)
         first = sorted(callers, key=lambda name: self.tests[name][0])
         others = sorted(own - callers, key=lambda name: self.tests[name][0])
@@ -144,7 +178,9 @@ def _function(mutant: Mutant) -> str:
     line, *_ = difference(mutant)
     first = 0
     for node in ast.walk(ast.parse((ROOT / mutant.path).read_text())):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and line <= (node.end_lineno or 0):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and line <= (
+            node.end_lineno or 0
+        ):
             start = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
             # Decorators and defaults are evaluated when the module is imported.
             if start <= line and line >= node.body[0].lineno:
@@ -188,7 +224,9 @@ def mutated(mutant: Mutant) -> str:
     from cosmic_ray.mutating import mutate_code
     from cosmic_ray.plugins import get_operator
 
-    code = mutate_code((ROOT / mutant.path).read_text(), get_operator(mutant.operator)(), mutant.occurrence)
+    code = mutate_code(
+        (ROOT / mutant.path).read_text(), get_operator(mutant.operator)(), mutant.occurrence
+    )
     return str(code)
 
 
@@ -208,15 +246,22 @@ def _executable(source: str) -> str:
             node.returns = None
         elif isinstance(node, ast.arg):
             node.annotation = None
-        elif isinstance(node, ast.arguments):  # positional-only and keyword-only markers do not change a computation
+        elif isinstance(
+            node, ast.arguments
+        ):  # positional-only and keyword-only markers do not change a computation
             node.args = [*node.posonlyargs, *node.args, *node.kwonlyargs]
-            node.defaults = [*node.defaults, *(default for default in node.kw_defaults if default is not None)]
+            node.defaults = [
+                *node.defaults,
+                *(default for default in node.kw_defaults if default is not None),
+            ]
             node.posonlyargs, node.kwonlyargs, node.kw_defaults = [], [], []
         elif isinstance(node, ast.AnnAssign):
             node.annotation = ast.Constant(None)
         elif isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             node.exc.args = []
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).startswith(("logger.", "warnings.warn")):
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).startswith(
+            ("logger.", "warnings.warn")
+        ):
             node.args = []
         elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "TYPE_CHECKING":
             node.value = ast.Constant(None)
@@ -227,9 +272,15 @@ def _executable(source: str) -> str:
 def difference(mutant: Mutant) -> tuple[int, str, str]:
     """Line number, the original line, and the line with the fault."""
     before, after = (ROOT / mutant.path).read_text().splitlines(), mutated(mutant).splitlines()
-    for kind, first, last, start, end in difflib.SequenceMatcher(a=before, b=after, autojunk=False).get_opcodes():
+    for kind, first, last, start, end in difflib.SequenceMatcher(
+        a=before, b=after, autojunk=False
+    ).get_opcodes():
         if kind != "equal":
-            return first + 1, " ".join(before[first:last]).strip(), " ".join(after[start:end]).strip()
+            return (
+                first + 1,
+                " ".join(before[first:last]).strip(),
+                " ".join(after[start:end]).strip(),
+            )
     return 0, "", ""
 
 
@@ -257,14 +308,22 @@ def called(room: str) -> tuple[Calls, list[str]]:
     status = _run([f"tests/{room}"], _HOUR, ("-p", "called"), report)
     if status not in (0, 1):
         log = report.with_suffix(".log").read_text()[-1000:]
-        raise RuntimeError(f"tests/{room}: pytest ends with {status} on the unchanged code; its log ends with {log}")
+        raise RuntimeError(
+            f"tests/{room}: pytest ends with {status} on the unchanged code; its log ends with {log}"
+        )
     results = json.loads(report.read_text())
-    tests = {name: (test["seconds"], frozenset(test["functions"])) for name, test in results["tests"].items()}
+    tests = {
+        name: (test["seconds"], frozenset(test["functions"]))
+        for name, test in results["tests"].items()
+    }
     return Calls(tests, frozenset(results["shared"])), results["failed"]
 
 
 def _run(
-    tests: Sequence[str], seconds: float, plugins: Sequence[str] = ("-x",), report: Path | None = None
+    tests: Sequence[str],
+    seconds: float,
+    plugins: Sequence[str] = ("-x",),
+    report: Path | None = None,
 ) -> int | None:
     """Run tests in the given order on this process's copy of the tree, and return pytest's exit status.
 
@@ -295,11 +354,16 @@ def _become_pytest(arguments: Sequence[str], limit: int, report: Path | None) ->
         resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
         copy = _copy_of_process()
         os.chdir(copy)
-        log = os.open(report.with_suffix(".log") if report else os.devnull, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        log = os.open(
+            report.with_suffix(".log") if report else os.devnull,
+            os.O_WRONLY | os.O_CREAT | os.O_TRUNC,
+        )
         for stream in (1, 2):
             os.dup2(log, stream)
         # The copy comes first on the path, so that the tests and their processes import it.
-        sys.path[:] = dict.fromkeys([str(copy), str(copy / "src"), str(HERE), *filter(None, sys.path)])
+        sys.path[:] = dict.fromkeys(
+            [str(copy), str(copy / "src"), str(HERE), *filter(None, sys.path)]
+        )
         os.environ["PYTHONPATH"] = os.pathsep.join(sys.path[1:])
         os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
         os.environ["IGPS_CAMPAIGN_CALLED"] = str(report)
@@ -335,7 +399,9 @@ def _copy_of_process() -> Path:
 def _preload() -> None:
     """Import slow modules for all forks of this process."""
     if imported := [name for name in sys.modules if name.partition(".")[0] == "igps"]:
-        raise RuntimeError(f"{imported[0]} is imported already: tests in forked processes would see no fault")
+        raise RuntimeError(
+            f"{imported[0]} is imported already: tests in forked processes would see no fault"
+        )
     os.environ["OMP_NUM_THREADS"] = "1"
     for name in _PRELOADED:
         with contextlib.suppress(ImportError):
@@ -374,11 +440,16 @@ def _attempt(mutant: Mutant, plan: Sequence[tuple[list[str], float]]) -> bool:
     noticed = is_noticed(mutant, plan)
     line, before, after = difference(mutant)
     verdict = "noticed " if noticed else "SURVIVES"
-    print(f"{verdict} {time.monotonic() - start:4.0f} s {mutant.path}:{line}  {before}  ->  {after}", flush=True)
+    print(
+        f"{verdict} {time.monotonic() - start:4.0f} s {mutant.path}:{line}  {before}  ->  {after}",
+        flush=True,
+    )
     return noticed
 
 
-def _submit(room: str, number: int, calls: Calls, pool: Executor) -> dict[Mutant, Future[bool] | None]:
+def _submit(
+    room: str, number: int, calls: Calls, pool: Executor
+) -> dict[Mutant, Future[bool] | None]:
     """Submit the faults of a room. The results of equivalent mutants, which are not tried, are None."""
     futures: dict[Mutant, Future[bool] | None] = {}
     for mutant in sample(number, [room]) if calls.tests else []:
@@ -388,7 +459,9 @@ def _submit(room: str, number: int, calls: Calls, pool: Executor) -> dict[Mutant
     return futures
 
 
-def _row(room: str, calls: Calls, failed: list[str], tried: dict[Mutant, Future[bool] | None]) -> Row:
+def _row(
+    room: str, calls: Calls, failed: list[str], tried: dict[Mutant, Future[bool] | None]
+) -> Row:
     start = time.monotonic()
     missed = [f"{name} fails on the unchanged code" for name in failed]
     if not calls.tests:

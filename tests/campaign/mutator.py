@@ -20,12 +20,50 @@ Surface = tuple[NDArray[np.float64], NDArray[np.int64]]
 FORMATS = ("off", "obj", "ply", "stl", "glb", "3mf")
 _TEXT_PLY, _TEXT_STL = "ply_ascii", "stl_ascii"
 _WORDS = (
-    "nan", "inf", "-inf", "1e309", "-1e309", "1e300", "1e-300", "1e-320", "0", "-0", "-1", "1", "3", "4", "1e999",
-    "2147483647", "2147483648", "-2147483648", "9223372036854775808", "99999999999999999999999", "0.5", "0x10", "1,5",
-    "", "abc", "é", "#", "//", "1/1/1", "-1/-1", "\x00", "\n", "OFF", "v", "f", "end_header", "1_0", "١",
-)  # fmt: skip
+    "nan",
+    "inf",
+    "-inf",
+    "1e309",
+    "-1e309",
+    "1e300",
+    "1e-300",
+    "1e-320",
+    "0",
+    "-0",
+    "-1",
+    "1",
+    "3",
+    "4",
+    "1e999",
+    "2147483647",
+    "2147483648",
+    "-2147483648",
+    "9223372036854775808",
+    "99999999999999999999999",
+    "0.5",
+    "0x10",
+    "1,5",
+    "",
+    "abc",
+    "é",
+    "#",
+    "//",
+    "1/1/1",
+    "-1/-1",
+    "\x00",
+    "\n",
+    "OFF",
+    "v",
+    "f",
+    "end_header",
+    "1_0",
+    "١",
+)
 _WORDS_OF_FOUR = (
-    *(struct.pack("<f", x) for x in (np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, 3e38, -3e38, 1e-38, 1e-45)),
+    *(
+        struct.pack("<f", x)
+        for x in (np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, 3e38, -3e38, 1e-38, 1e-45)
+    ),
     *(struct.pack("<i", x) for x in (-1, 0, 1, 2, 3, 255, 65535, 2**31 - 1, -(2**31))),
 )
 
@@ -67,7 +105,12 @@ def valid_surfaces() -> tuple[Surface, ...]:
         x, y, z = np.asarray(mesh.vertices).T
         # A smooth and injective map, so that nothing is symmetric and eigenvalues are distinct
         bent = np.stack(
-            [1.3 * x + 0.11 * y * z, y + 0.13 * x * x + 0.05 * z, 0.8 * z + 0.09 * np.sin(2 * x + number)], 1
+            [
+                1.3 * x + 0.11 * y * z,
+                y + 0.13 * x * x + 0.05 * z,
+                0.8 * z + 0.09 * np.sin(2 * x + number),
+            ],
+            1,
         )
         surfaces.append((bent, np.asarray(mesh.faces, dtype=np.int64)))
     return tuple(surfaces)
@@ -91,7 +134,9 @@ def broken_mesh(seed: int, number: int) -> Broken:
         for fault in (fault for fault in faults if fault in _ON_ARRAYS):
             vertices, faces = _ON_ARRAYS[fault](generator, vertices, faces)
             story.append(fault)
-        kind = f"{suffix}_ascii" if suffix in ("ply", "stl") and generator.random() < 0.5 else suffix
+        kind = (
+            f"{suffix}_ascii" if suffix in ("ply", "stl") and generator.random() < 0.5 else suffix
+        )
         content = written(vertices, faces, kind)
     file_faults = [fault for fault in faults if fault in _ON_FILES]
     for fault in file_faults:
@@ -102,7 +147,9 @@ def broken_mesh(seed: int, number: int) -> Broken:
             content = break_file(generator, content, suffix)
         story.append(fault)
     arrays = None if file_faults else (vertices, faces)
-    return Broken(f"{number:06d}.{suffix}", content, arrays, f"{kind}: {', '.join(story) or 'nothing'}")
+    return Broken(
+        f"{number:06d}.{suffix}", content, arrays, f"{kind}: {', '.join(story) or 'nothing'}"
+    )
 
 
 def broken_bytes(generator: Generator, content: bytes) -> tuple[str, bytes]:
@@ -115,7 +162,11 @@ def written(vertices: NDArray[np.float64], faces: NDArray[np.int64], kind: str) 
     """Write arrays in a format, even invalid ones, which no exporter would write."""
     points = [" ".join(repr(float(x)) for x in row) for row in vertices]
     if kind == "off":
-        rows = [f"OFF\n{len(vertices)} {len(faces)} 0", *points, *(f"3 {a} {b} {c}" for a, b, c in faces)]
+        rows = [
+            f"OFF\n{len(vertices)} {len(faces)} 0",
+            *points,
+            *(f"3 {a} {b} {c}" for a, b, c in faces),
+        ]
         return ("\n".join(rows) + "\n").encode()
     if kind == "obj":
         rows = [*(f"v {point}" for point in points), *(f"f {a} {b} {c}" for a, b, c in faces + 1)]
@@ -127,14 +178,19 @@ def written(vertices: NDArray[np.float64], faces: NDArray[np.int64], kind: str) 
     return _glb(vertices, faces) if kind == "glb" else _3mf(points, faces)
 
 
-def _ply(vertices: NDArray[np.float64], faces: NDArray[np.int64], points: list[str], text: bool) -> bytes:
+def _ply(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], points: list[str], text: bool
+) -> bytes:
     header = (
         f"ply\nformat {'ascii' if text else 'binary_little_endian'} 1.0\nelement vertex {len(vertices)}\n"
         "property double x\nproperty double y\nproperty double z\n"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     ).encode()
     if text:
-        return header + ("\n".join([*points, *(f"3 {a} {b} {c}" for a, b, c in faces)]) + "\n").encode()
+        return (
+            header
+            + ("\n".join([*points, *(f"3 {a} {b} {c}" for a, b, c in faces)]) + "\n").encode()
+        )
     corners = np.empty(len(faces), dtype=[("n", "u1"), ("corners", "<i4", 3)])
     corners["n"], corners["corners"] = 3, faces
     return header + np.asarray(vertices, "<f8").tobytes() + corners.tobytes()
@@ -149,7 +205,9 @@ def _stl(vertices: NDArray[np.float64], faces: NDArray[np.int64], text: bool) ->
             rows += ["vertex " + " ".join(repr(float(x)) for x in corner) for corner in triangle]
             rows += ["endloop", "endfacet"]
         return ("\n".join([*rows, "endsolid campaign"]) + "\n").encode()
-    records = np.zeros(len(faces), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
+    records = np.zeros(
+        len(faces), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")]
+    )
     records["corners"] = corners
     return b"campaign".ljust(80) + struct.pack("<I", len(faces)) + records.tobytes()
 
@@ -170,7 +228,12 @@ def _glb(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bytes:
     ).encode()
     text += b" " * (-len(text) % 4)
     body = positions.tobytes() + indices.tobytes()
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(body), b"BIN\0")
+        + body
+    )
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
@@ -200,7 +263,15 @@ def _in_archive(fault: Callable[..., bytes], generator: Generator, content: byte
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             model = archive.read("3D/3dmodel.model")
-    except (zipfile.BadZipFile, KeyError, OSError, ValueError, EOFError, RuntimeError, zipfile.zlib.error):
+    except (
+        zipfile.BadZipFile,
+        KeyError,
+        OSError,
+        ValueError,
+        EOFError,
+        RuntimeError,
+        zipfile.zlib.error,
+    ):
         return fault(generator, content, "zip")  # the archive is broken already
     return _archive(fault(generator, model, "3mf"))
 
@@ -238,7 +309,9 @@ def _tokens(generator: Generator, content: bytes, suffix: str) -> bytes:
         tokens = list(re.finditer(rb"[-+.0-9eE]+|[a-zA-Z_]+", content))
         if not tokens:
             return content
-        chosen = generator.choice(len(tokens), size=min(int(generator.integers(1, 4)), len(tokens)), replace=False)
+        chosen = generator.choice(
+            len(tokens), size=min(int(generator.integers(1, 4)), len(tokens)), replace=False
+        )
         for i in sorted(chosen, reverse=True):
             word = str(generator.choice(_WORDS)).encode()
             content = content[: tokens[i].start()] + word + content[tokens[i].end() :]
@@ -257,7 +330,9 @@ def _counts(generator: Generator, content: bytes, suffix: str) -> bytes:
     wrong = int(replacement) if generator.random() < 0.5 else None
     if suffix == "stl" and not content.startswith(b"solid") and len(content) >= 84:
         (count,) = struct.unpack("<I", content[80:84])
-        count = wrong % 2**32 if wrong is not None else max(count + int(generator.integers(-3, 4)), 0)
+        count = (
+            wrong % 2**32 if wrong is not None else max(count + int(generator.integers(-3, 4)), 0)
+        )
         return content[:80] + struct.pack("<I", count) + content[84:]
     patterns = {
         "off": rb"(?<=OFF\n)(\d+)|(?<= )(\d+)(?= 0\n)",
@@ -268,7 +343,9 @@ def _counts(generator: Generator, content: bytes, suffix: str) -> bytes:
         matches = list(re.finditer(patterns[suffix], content[:4000]))
         if matches:
             match = matches[generator.integers(len(matches))]
-            value = wrong if wrong is not None else int(match.group()) + int(generator.integers(-3, 4))
+            value = (
+                wrong if wrong is not None else int(match.group()) + int(generator.integers(-3, 4))
+            )
             word = str(value).encode()
             # GLB files declare the lengths of their chunks. Padding keeps these lengths correct.
             if suffix == "glb":
@@ -286,7 +363,11 @@ def _counts(generator: Generator, content: bytes, suffix: str) -> bytes:
 
 
 def _is_text(content: bytes) -> bool:
-    return b"\0" not in content[:2000] and b"binary" not in content[:100] and not content.startswith(b"PK")
+    return (
+        b"\0" not in content[:2000]
+        and b"binary" not in content[:100]
+        and not content.startswith(b"PK")
+    )
 
 
 # Faults of the surface.
@@ -299,12 +380,18 @@ def _flip(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np
 
 
 def _hole(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-    return vertices, np.delete(faces, generator.integers(len(faces), size=generator.choice([1, 2, 20])), axis=0)
+    return vertices, np.delete(
+        faces, generator.integers(len(faces), size=generator.choice([1, 2, 20])), axis=0
+    )
 
 
-def _double(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _double(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     copies = faces[generator.integers(len(faces), size=generator.choice([1, 5]))]
-    return vertices, np.concatenate([faces, copies[:, ::-1] if generator.random() < 0.5 else copies])
+    return vertices, np.concatenate(
+        [faces, copies[:, ::-1] if generator.random() < 0.5 else copies]
+    )
 
 
 def _glue(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
@@ -315,55 +402,79 @@ def _glue(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np
 
 
 def _fin(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-    return vertices, np.concatenate([faces, generator.integers(len(vertices), size=(generator.choice([1, 3]), 3))])
+    return vertices, np.concatenate(
+        [faces, generator.integers(len(vertices), size=(generator.choice([1, 3]), 3))]
+    )
 
 
-def _index(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _index(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     wrong = int(generator.choice([-1, len(vertices), 10**6, 2**31 - 1, -(2**31), int(faces.max())]))
     faces[generator.integers(len(faces)), generator.integers(3)] = wrong
     return vertices, faces
 
 
-def _strays(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _strays(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     return np.concatenate([vertices, generator.normal(size=(generator.choice([1, 5]), 3))]), faces
 
 
-def _twins(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _twins(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     """Add a second body, outside, touching or inside."""
     offset = generator.choice([0.0, 0.1, 5.0])
     factor = generator.choice([1.0, 0.5, 1e-3])
-    return np.concatenate([vertices, factor * vertices + offset]), np.concatenate([faces, faces + len(vertices)])
+    return np.concatenate([vertices, factor * vertices + offset]), np.concatenate(
+        [faces, faces + len(vertices)]
+    )
 
 
 def _seam(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
     """Give some or all faces separate vertices."""
     chosen = generator.random(len(faces)) < generator.choice([0.02, 0.5, 1.0])
-    chosen &= ((faces >= 0) & (faces < len(vertices))).all(axis=1)  # an earlier fault may have made invalid indices
+    chosen &= ((faces >= 0) & (faces < len(vertices))).all(
+        axis=1
+    )  # an earlier fault may have made invalid indices
     corners = faces[chosen].ravel()
     split = faces.copy()
     split[chosen] = len(vertices) + np.arange(len(corners)).reshape(-1, 3)
     return np.concatenate([vertices, vertices[corners]]), split
 
 
-def _order(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _order(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     order = generator.permutation(len(vertices))
     position = np.argsort(order)
     is_valid = (faces >= 0) & (faces < len(vertices))
     return vertices[order], np.where(is_valid, position[np.where(is_valid, faces, 0)], faces)
 
 
-def _not_finite(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-    vertices[generator.integers(len(vertices)), generator.integers(3)] = generator.choice([np.nan, np.inf, -np.inf])
+def _not_finite(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
+    vertices[generator.integers(len(vertices)), generator.integers(3)] = generator.choice(
+        [np.nan, np.inf, -np.inf]
+    )
     return vertices, faces
 
 
-def _spike(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _spike(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     exponent = generator.choice([generator.uniform(0, 3), generator.uniform(-300, 300)])
-    vertices[generator.integers(len(vertices)), generator.integers(3)] = generator.choice([-1, 1]) * 10**exponent
+    vertices[generator.integers(len(vertices)), generator.integers(3)] = (
+        generator.choice([-1, 1]) * 10**exponent
+    )
     return vertices, faces
 
 
-def _noise(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _noise(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     return vertices + generator.normal(size=vertices.shape) * 10 ** generator.uniform(-8, 0), faces
 
 
@@ -372,7 +483,9 @@ def _flat(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np
     return vertices, faces
 
 
-def _slivers(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _slivers(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     """Move some vertices to a neighbour, or almost to it."""
     for face in faces[generator.integers(len(faces), size=generator.choice([1, 10]))]:
         corners = face[(face >= 0) & (face < len(vertices))]
@@ -382,15 +495,21 @@ def _slivers(generator: Generator, vertices: NDArray[np.float64], faces: NDArray
     return vertices, faces
 
 
-def _scale(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _scale(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     return vertices * 10 ** generator.uniform(-300, 300), faces
 
 
-def _modest_scale(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _modest_scale(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     return vertices * 10 ** generator.uniform(-12, 12), faces
 
 
-def _far_away(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _far_away(
+    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Surface:
     return vertices + generator.normal(size=3) * 10 ** generator.uniform(0, 20), faces
 
 

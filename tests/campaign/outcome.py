@@ -61,7 +61,11 @@ def table(rows: Sequence[Row]) -> str:
     widths = [max(len(line[i]) for line in (header, *lines)) for i in range(len(header))]
 
     def formatted(line: Sequence[str]) -> str:
-        return "| " + " | ".join(word.ljust(width) for word, width in zip(line, widths, strict=True)) + " |"
+        return (
+            "| "
+            + " | ".join(word.ljust(width) for word, width in zip(line, widths, strict=True))
+            + " |"
+        )
 
     text = [formatted(header), formatted(["-" * width for width in widths]), *map(formatted, lines)]
     for row in rows:

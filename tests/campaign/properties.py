@@ -66,7 +66,10 @@ class Bound:
 # Known movements above the bound, and their reasons
 KNOWN: dict[tuple[str, str], str] = {
     # The worst body moves by 14 % from one subdivision to two, and by 2 % from two to three.
-    ("subdivision", "gps"): "one subdivision has too few vertices for the last of its 250 eigenpairs",
+    (
+        "subdivision",
+        "gps",
+    ): "one subdivision has too few vertices for the last of its 250 eigenpairs",
 }
 
 
@@ -97,7 +100,12 @@ def bodies() -> tuple[Mesh, ...]:
         surface.merge_vertices()
         x, y, z = np.asarray(surface.vertices).T
         bent = np.stack(
-            [1.2 * x + 0.15 * y * z, y + 0.2 * x * x + 0.07 * z, 0.9 * z + 0.15 * np.sin(2 * x + number)], 1
+            [
+                1.2 * x + 0.15 * y * z,
+                y + 0.2 * x * x + 0.07 * z,
+                0.9 * z + 0.15 * np.sin(2 * x + number),
+            ],
+            1,
         )
         meshes.append(Mesh(bent, np.asarray(surface.faces), name=f"body {number}"))
     return tuple(meshes)
@@ -128,18 +136,27 @@ class Describer:
             requirements = requirements | module.requirements
         self.config = requirements.apply_to(CONFIG)
         self.signatures = [compute_signature(mesh, self.config) for mesh in bodies()]
-        self.unchanged = [self.describe(s, m) for s, m in zip(self.signatures, bodies(), strict=True)]
+        self.unchanged = [
+            self.describe(s, m) for s, m in zip(self.signatures, bodies(), strict=True)
+        ]
         self.median = {}
         for name, module in self.descriptors.items():
             descriptions = torch.cat([description[name] for description in self.unchanged])
             distances = _distance(module)(descriptions, descriptions)
-            self.median[name] = float(distances[~torch.eye(len(descriptions), dtype=torch.bool)].median())
+            self.median[name] = float(
+                distances[~torch.eye(len(descriptions), dtype=torch.bool)].median()
+            )
 
-    def describe(self, signature: Signature, mesh: Mesh, names: Sequence[str] | None = None) -> dict[str, torch.Tensor]:
+    def describe(
+        self, signature: Signature, mesh: Mesh, names: Sequence[str] | None = None
+    ) -> dict[str, torch.Tensor]:
         """Description (1, ...) by each descriptor, or by some of them."""
         batch = collate([signature], [mesh])
         with torch.inference_mode():
-            return {name: self.descriptors[name](batch) for name in (self.descriptors if names is None else names)}
+            return {
+                name: self.descriptors[name](batch)
+                for name in (self.descriptors if names is None else names)
+            }
 
     @cache  # noqa: B019 (there is one describer in a campaign)
     def describe_subdivided(self, number: int, n_times: int) -> dict[str, torch.Tensor]:
@@ -149,13 +166,23 @@ class Describer:
 
     def simplifying(self, mesh: Mesh) -> list[str]:
         """Names of the descriptors that simplify a mesh first."""
-        limits = {name: getattr(module, "max_vertices", None) for name, module in self.descriptors.items()}
-        return [name for name, limit in limits.items() if limit is not None and limit < len(mesh.vertices)]
+        limits = {
+            name: getattr(module, "max_vertices", None) for name, module in self.descriptors.items()
+        }
+        return [
+            name
+            for name, limit in limits.items()
+            if limit is not None and limit < len(mesh.vertices)
+        ]
 
-    def movements(self, before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> dict[str, float]:
+    def movements(
+        self, before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]
+    ) -> dict[str, float]:
         """Movement by each descriptor, in percent of the median distance."""
         return {
-            name: 100 * float(_distance(self.descriptors[name])(before[name], value)) / self.median[name]
+            name: 100
+            * float(_distance(self.descriptors[name])(before[name], value))
+            / self.median[name]
             for name, value in after.items()
         }
 
@@ -169,14 +196,18 @@ _seeds = st.integers(0, 2**32 - 1)
 
 
 def _moved_mesh(describer: Describer, number: int, mesh: Mesh) -> Pair:
-    return describer.unchanged[number], describer.describe(compute_signature(mesh, describer.config), mesh)
+    return describer.unchanged[number], describer.describe(
+        compute_signature(mesh, describer.config), mesh
+    )
 
 
 def _motion(describer: Describer, data: st.DataObject) -> Pair:
     """A rotation and a shift, with or without a reflection."""
     number = data.draw(_numbers)
     generator = np.random.default_rng(data.draw(_seeds))
-    turn = Rotation.from_quat(generator.normal(size=4)).as_matrix() * data.draw(st.sampled_from([1.0, -1.0]))
+    turn = Rotation.from_quat(generator.normal(size=4)).as_matrix() * data.draw(
+        st.sampled_from([1.0, -1.0])
+    )
     mesh = bodies()[number]
     faces = mesh.faces if np.linalg.det(turn) > 0 else mesh.faces[:, ::-1]
     moved = replace(mesh, vertices=mesh.vertices @ turn.T + generator.normal(size=3), faces=faces)
@@ -196,7 +227,11 @@ def _turned_grid(describer: Describer, data: st.DataObject) -> Pair:
 def _scale(describer: Describer, data: st.DataObject) -> Pair:
     number = data.draw(_numbers)
     mesh = bodies()[number]
-    return _moved_mesh(describer, number, replace(mesh, vertices=mesh.vertices * 10 ** data.draw(st.floats(-12, 12))))
+    return _moved_mesh(
+        describer,
+        number,
+        replace(mesh, vertices=mesh.vertices * 10 ** data.draw(st.floats(-12, 12))),
+    )
 
 
 def _vertices(describer: Describer, data: st.DataObject) -> Pair:
@@ -208,7 +243,9 @@ def _many_vertices(describer: Describer, data: st.DataObject) -> Pair:
     """A renumbering of large meshes, for descriptors that simplify them before they choose samples."""
     number = data.draw(_numbers)
     mesh = _renumbered(_subdivided(number, 1), data.draw(_seeds))
-    after = describer.describe(compute_signature(mesh, describer.config), mesh, describer.simplifying(mesh))
+    after = describer.describe(
+        compute_signature(mesh, describer.config), mesh, describer.simplifying(mesh)
+    )
     return describer.describe_subdivided(number, 1), after
 
 
@@ -255,18 +292,30 @@ def _multiplet(describer: Describer, data: st.DataObject) -> Pair:
     values = signature.eigenvalues.copy()
     values[first : first + size] = values[first : first + size].mean()
     basis = np.eye(n_eigenpairs)
-    basis[first : first + size, first : first + size] = np.linalg.qr(generator.normal(size=(size, size)))[0]
-    degenerate = describer.describe(_in_basis(signature, np.eye(n_eigenpairs), values), bodies()[number])
+    basis[first : first + size, first : first + size] = np.linalg.qr(
+        generator.normal(size=(size, size))
+    )[0]
+    degenerate = describer.describe(
+        _in_basis(signature, np.eye(n_eigenpairs), values), bodies()[number]
+    )
     turned = describer.describe(_in_basis(signature, basis, values), bodies()[number])
     return degenerate, turned
 
 
-def _in_basis(signature: Signature, basis: NDArray[np.float64], values: NDArray[np.float64]) -> Signature:
+def _in_basis(
+    signature: Signature, basis: NDArray[np.float64], values: NDArray[np.float64]
+) -> Signature:
     def turned(samples: Samples) -> Samples:
-        return replace(samples, eigenfunctions=(samples.eigenfunctions.astype(np.float64) @ basis).astype(np.float32))
+        return replace(
+            samples,
+            eigenfunctions=(samples.eigenfunctions.astype(np.float64) @ basis).astype(np.float32),
+        )
 
     return replace(
-        signature, eigenvalues=values, interior=turned(signature.interior), surface=turned(signature.surface)
+        signature,
+        eigenvalues=values,
+        interior=turned(signature.interior),
+        surface=turned(signature.surface),
     )
 
 
@@ -286,7 +335,9 @@ def _padding(describer: Describer, data: st.DataObject) -> Pair:
 
     larger = replace(
         repeated,
-        eigenvalues=np.append(repeated.eigenvalues, repeated.eigenvalues[-1] * (1 + np.arange(1, 6) / 100)),
+        eigenvalues=np.append(
+            repeated.eigenvalues, repeated.eigenvalues[-1] * (1 + np.arange(1, 6) / 100)
+        ),
         interior=longer(repeated.interior),
         surface=longer(repeated.surface),
     )
@@ -351,7 +402,10 @@ def _row(describer: Describer, prop: str, changes: tuple[Change, ...], n_example
             for name, movement in movements.items():
                 largest[name] = max(largest[name], movement if np.isfinite(movement) else np.inf)
             # Hypothesis searches for the largest movement relative to its bound.
-            shares = [min(movement, 1e6) / bound(prop, name).percent for name, movement in movements.items()]
+            shares = [
+                min(movement, 1e6) / bound(prop, name).percent
+                for name, movement in movements.items()
+            ]
             target(max(shares, default=0.0), label=change.__name__)
 
     run = given(st.data())(example)
@@ -383,7 +437,8 @@ def _row(describer: Describer, prop: str, changes: tuple[Change, ...], n_example
         missed,
         notes,
         details={
-            name: {"percent": movement, "allowed": bound(prop, name).percent} for name, movement in largest.items()
+            name: {"percent": movement, "allowed": bound(prop, name).percent}
+            for name, movement in largest.items()
         },
         seconds=time.monotonic() - start,
     )

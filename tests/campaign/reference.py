@@ -61,16 +61,22 @@ def confirm(
         check("arrays", *_same_arrays(mesh, written, single=suffix == ".glb"))
     check("topology", *_is_surface(vertices, faces, mesh.allow_open))
     area, volume = _area_and_volume(vertices, faces)
-    for name, value, unit, power in (("area", signature.area, area, 2), ("volume", signature.volume, volume, 3)):
+    for name, value, unit, power in (
+        ("area", signature.area, area, 2),
+        ("volume", signature.volume, volume, 3),
+    ):
         expected = _scaled(unit, scale, power)
         rounding = 1e-12 * area / unit if unit > 0 else np.inf
-        check(name, _close(value, expected, _ROUNDING + rounding), f"{value!r}, expected {expected!r}")
+        check(
+            name, _close(value, expected, _ROUNDING + rounding), f"{value!r}, expected {expected!r}"
+        )
     values = signature.eigenvalues
     in_unit = np.array([_scaled(value, scale, 2) for value in values])
     check(
         "finite",
         all(
-            np.isfinite(x).all() for x in (values, signature.interior.eigenfunctions, signature.surface.eigenfunctions)
+            np.isfinite(x).all()
+            for x in (values, signature.interior.eigenfunctions, signature.surface.eigenfunctions)
         ),
         "eigenvalues or eigenfunctions are not",
     )
@@ -83,12 +89,19 @@ def confirm(
         check("eigenvalues", error < 1e-5, f"relative error {error:.2g}")
     closed = trimesh.Trimesh(vertices, faces, process=False).is_watertight
     if closed:
-        check("interior samples", *_samples_confirmed(mesh, signature, vertices, faces, config.resolution))
+        check(
+            "interior samples",
+            *_samples_confirmed(mesh, signature, vertices, faces, config.resolution),
+        )
     if functions is not None and expected[-1] / expected[-2] > 1 + 1e-3:
         # The accuracy holds inside closed surfaces. Next to openings, only the closed form reaches it.
         exact = signature if closed else compute_signature(mesh, replace(config, accuracy=None))
-        checked = np.linspace(0, len(exact.interior) - 1, min(_N_CHECKED, len(exact.interior))).astype(int)
-        potential = np.square(exact.interior.eigenfunctions[checked].astype(np.float64)) @ (1 / values)
+        checked = np.linspace(
+            0, len(exact.interior) - 1, min(_N_CHECKED, len(exact.interior))
+        ).astype(int)
+        potential = np.square(exact.interior.eigenfunctions[checked].astype(np.float64)) @ (
+            1 / values
+        )
         points = (exact.interior.points[checked] - _centre(mesh)) / scale
         extended = mean_values(vertices, faces, points, functions[:, :-1])
         reference = np.square(extended) @ (1 / expected[:-1])
@@ -97,15 +110,27 @@ def confirm(
     batch = collate([signature])
     histograms = _describe(signature)
     for name, value in histograms.items():
-        check(f"{name} sum", bool(np.isfinite(value).all() and abs(value.sum() - 1) < 1e-5), f"{value.sum()}")
+        check(
+            f"{name} sum",
+            bool(np.isfinite(value).all() and abs(value.sum() - 1) < 1e-5),
+            f"{value.sum()}",
+        )
     batch_area = float(batch.area[0])
-    reference, doubtful = distances_histogram(batch.surface.points[0].double().numpy() / np.sqrt(batch_area))
+    reference, doubtful = distances_histogram(
+        batch.surface.points[0].double().numpy() / np.sqrt(batch_area)
+    )
     error = np.abs(histograms["d2"] - reference).sum() / 2
     check("d2", error < 1e-5 + doubtful, f"{error:.2g} of the pairs are in other bins")
     if len(signature.interior) > 1:
-        reference, doubtful = interior_histogram(signature.interior.eigenfunctions / np.sqrt(values))
+        reference, doubtful = interior_histogram(
+            signature.interior.eigenfunctions / np.sqrt(values)
+        )
         error = np.abs(histograms["interior"] - reference).sum() / 2
-        check("interior histogram", error < 1e-4 + doubtful, f"{error:.2g} of the pairs are in other cells")
+        check(
+            "interior histogram",
+            error < 1e-4 + doubtful,
+            f"{error:.2g} of the pairs are in other cells",
+        )
     _check_motion(mesh, signature, histograms, config, check)
     return doubts, checks
 
@@ -133,7 +158,9 @@ def _describe(signature: Signature) -> dict[str, Floats]:
     histograms = {"d2": D2()(batch)[0].double().numpy()}
     if len(signature.interior) > 1:
         embedding = SpectralEmbedding(n_eigenpairs=len(signature.eigenvalues))
-        histogram = PairHistogram([Potential(N_CLASSES), InteriorDistance(N_BINS, REACH)], embedding)
+        histogram = PairHistogram(
+            [Potential(N_CLASSES), InteriorDistance(N_BINS, REACH)], embedding
+        )
         with torch.inference_mode():
             histograms["interior"] = histogram(batch)[0].double().numpy()
     return histograms
@@ -158,7 +185,9 @@ def _scaled(value: float, scale: float, power: int) -> float:
 
 
 def _close(value: float, expected: float, tolerance: float) -> bool:
-    return bool(np.isfinite(value) and value > 0 and abs(value - expected) <= tolerance * abs(expected))
+    return bool(
+        np.isfinite(value) and value > 0 and abs(value - expected) <= tolerance * abs(expected)
+    )
 
 
 def _same_arrays(mesh: Mesh, written: Surface, single: bool) -> tuple[bool, str]:
@@ -166,7 +195,10 @@ def _same_arrays(mesh: Mesh, written: Surface, single: bool) -> tuple[bool, str]
     if single:
         vertices = vertices.astype(np.float32).astype(np.float64)
     if mesh.vertices.shape != vertices.shape or mesh.faces.shape != faces.shape:
-        return False, f"{len(mesh.vertices)} vertices and {len(mesh.faces)} faces of {len(vertices)} and {len(faces)}"
+        return (
+            False,
+            f"{len(mesh.vertices)} vertices and {len(mesh.faces)} faces of {len(vertices)} and {len(faces)}",
+        )
     same_faces = np.array_equal(mesh.faces, faces) or np.array_equal(mesh.faces, faces[:, ::-1])
     return bool(np.array_equal(mesh.vertices, vertices) and same_faces), "other than those written"
 
@@ -175,7 +207,9 @@ def _is_surface(vertices: Floats, faces: NDArray[np.int64], allow_open: bool) ->
     """Whether a surface is closed (unless it may be open), connected and oriented, without edges of three faces."""
     surface = trimesh.Trimesh(vertices, faces, process=False)
     edges, count = np.unique(np.sort(surface.edges, axis=1), axis=0, return_counts=True)
-    n_components = trimesh.graph.connected_component_labels(edges, node_count=len(vertices)).max() + 1
+    n_components = (
+        trimesh.graph.connected_component_labels(edges, node_count=len(vertices)).max() + 1
+    )
     is_surface = (
         (surface.is_watertight or allow_open)
         and surface.is_winding_consistent
@@ -183,7 +217,9 @@ def _is_surface(vertices: Floats, faces: NDArray[np.int64], allow_open: bool) ->
         and n_components == 1
         and len(np.unique(faces)) == len(vertices)
     )
-    return bool(is_surface), f"trimesh finds {n_components} components and an edge of {count.max()} faces"
+    return bool(
+        is_surface
+    ), f"trimesh finds {n_components} components and an edge of {count.max()} faces"
 
 
 def _area_and_volume(vertices: Floats, faces: NDArray[np.int64]) -> tuple[float, float]:
@@ -197,7 +233,9 @@ def _thinness(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
     return np.asarray(igl.doublearea(vertices, faces) / np.square(lengths).max(axis=1))
 
 
-def eigenpairs(vertices: Floats, faces: NDArray[np.int64], n_eigenpairs: int) -> tuple[Floats, Floats]:
+def eigenpairs(
+    vertices: Floats, faces: NDArray[np.int64], n_eigenpairs: int
+) -> tuple[Floats, Floats]:
     """Eigenpairs (K,) and (V, K) of libigl's cotangent stiffness and mixed Voronoi mass, without the zero mode.
 
     They are computed by a dense solver, or for larger surfaces by ARPACK with a shift below the spectrum.
@@ -210,13 +248,17 @@ def eigenpairs(vertices: Floats, faces: NDArray[np.int64], n_eigenpairs: int) ->
         values, vectors = scipy.linalg.eigh(symmetric.toarray(), subset_by_index=[1, n_eigenpairs])
     else:
         start = np.sqrt(mass) * (1 + vertices[:, 0] ** 2 + vertices[:, 1])
-        values, vectors = scipy.sparse.linalg.eigsh(symmetric, n_eigenpairs + 1, sigma=-0.1 / mass.sum(), v0=start)
+        values, vectors = scipy.sparse.linalg.eigsh(
+            symmetric, n_eigenpairs + 1, sigma=-0.1 / mass.sum(), v0=start
+        )
         order = np.argsort(values)[1:]
         values, vectors = values[order], vectors[:, order]
     return values, root @ vectors
 
 
-def mean_values(vertices: Floats, faces: NDArray[np.int64], points: Floats, functions: Floats) -> Floats:
+def mean_values(
+    vertices: Floats, faces: NDArray[np.int64], points: Floats, functions: Floats
+) -> Floats:
     """(P, K) mean value interpolation of functions (V, K), point by point (Ju, Schaefer and Warren 2005)."""
     values = np.empty((len(points), functions.shape[1]))
     for i, point in enumerate(points):
@@ -229,7 +271,9 @@ def mean_values(vertices: Floats, faces: NDArray[np.int64], points: Floats, func
         sines = np.sin(angles)
         sine_after, sine_before = np.roll(sines, -1, axis=1), np.roll(sines, -2, axis=1)
         cosines = 2 * np.sin(half) * np.sin(half - angles) / (sine_after * sine_before) - 1
-        signed_sines = np.sign(np.linalg.det(u))[:, None] * np.sqrt(np.clip(1 - cosines**2, 0, None))
+        signed_sines = np.sign(np.linalg.det(u))[:, None] * np.sqrt(
+            np.clip(1 - cosines**2, 0, None)
+        )
         numerators = (
             angles
             - np.roll(cosines, -1, axis=1) * np.roll(angles, -2, axis=1)
@@ -250,23 +294,36 @@ def _samples_confirmed(
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     cell = (high - low).max() / resolution
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1).astype(int)
-    axes = [(low[i] + high[i]) / 2 + (np.arange(n) - (n - 1) / 2) * cell for i, n in enumerate(counts)]
+    axes = [
+        (low[i] + high[i]) / 2 + (np.arange(n) - (n - 1) / 2) * cell for i, n in enumerate(counts)
+    ]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     winding = igl.winding_number(vertices, faces, grid)
     squared, *_ = igl.point_mesh_squared_distance(grid, vertices, faces)
     is_off_surface = np.sqrt(squared) > 1e-6 * cell
-    certain, possible = grid[(winding > 0.5) & is_off_surface], grid[(winding > 0.5) | ~is_off_surface]
+    certain, possible = (
+        grid[(winding > 0.5) & is_off_surface],
+        grid[(winding > 0.5) | ~is_off_surface],
+    )
     scale = np.abs(mesh.vertices - _centre(mesh)).max()
     points = (signature.interior.points - _centre(mesh)) / scale
 
     def cells(centres: Floats) -> set[tuple[int, ...]]:
-        return {tuple(index) for index in np.rint((centres - [axis[0] for axis in axes]) / cell).astype(int)}
+        return {
+            tuple(index)
+            for index in np.rint((centres - [axis[0] for axis in axes]) / cell).astype(int)
+        }
 
     missing, outside = cells(certain) - cells(points), cells(points) - cells(possible)
-    return not missing and not outside, f"{len(missing)} missing, {len(outside)} not inside, of {len(points)}"
+    return (
+        not missing and not outside,
+        f"{len(missing)} missing, {len(outside)} not inside, of {len(points)}",
+    )
 
 
-def distances_histogram(points: Floats, n_bins: int = 64, reach: float = 2.0) -> tuple[Floats, float]:
+def distances_histogram(
+    points: Floats, n_bins: int = 64, reach: float = 2.0
+) -> tuple[Floats, float]:
     """D2 by a loop, and the share of distances so close to an edge of a bin that their bin depends on rounding."""
     counts = np.zeros(n_bins)
     doubtful = 0

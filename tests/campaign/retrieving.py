@@ -36,16 +36,29 @@ def write_shapes(folder: Path) -> None:
             x, y, z = np.asarray(mesh.vertices).T
             a, b, c = generator.uniform(0.05, 0.3, 3)
             vertices = np.stack([x * (1 + a), y + b * x * x, z + c * np.sin(2 * x)], axis=1)
-            (folder / label / f"{number}.off").write_text(off_text(vertices, np.asarray(mesh.faces)))
+            (folder / label / f"{number}.off").write_text(
+                off_text(vertices, np.asarray(mesh.faces))
+            )
 
 
 def arguments(shapes: Path, cache: Path, out: Path, n_workers: int) -> list[str]:
     """Arguments of the command, without its name."""
     signature = {"n_eigenpairs": 6, "resolution": 10, "min_samples": 0, "n_surface_samples": 20}
     return [
-        *("retrieve", str(shapes), "--descriptor", "cheap_descriptor:cheap", "--n_workers", str(n_workers)),
+        *(
+            "retrieve",
+            str(shapes),
+            "--descriptor",
+            "cheap_descriptor:cheap",
+            "--n_workers",
+            str(n_workers),
+        ),
         *("--cache_dir", str(cache), "--out", str(out)),
-        *(word for name, value in signature.items() for word in (f"--signature.{name}", str(value))),
+        *(
+            word
+            for name, value in signature.items()
+            for word in (f"--signature.{name}", str(value))
+        ),
     ]
 
 
@@ -57,11 +70,18 @@ def environment(fault: str = "") -> dict[str, str]:
 
 
 def retrieve(
-    shapes: Path, cache: Path, out: Path, n_workers: int = 1, fault: str = "", under: Sequence[str] = ()
+    shapes: Path,
+    cache: Path,
+    out: Path,
+    n_workers: int = 1,
+    fault: str = "",
+    under: Sequence[str] = (),
 ) -> subprocess.CompletedProcess[str]:
     """Run the command to its end, with a fault of the machine, or under another command."""
     command = [*under, sys.executable, "-m", "igps.cli", *arguments(shapes, cache, out, n_workers)]
-    return subprocess.run(command, env=environment(fault), capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(
+        command, env=environment(fault), capture_output=True, text=True, timeout=300, check=False
+    )
 
 
 class Command:
@@ -153,10 +173,17 @@ def table(out: Path) -> Mapping[str, Any] | None:
         with (out / "ranking.csv").open(newline="") as file:
             ranking = list(csv.reader(file))
         with np.load(out / "distances.npz") as archive:
-            arrays = {name: (archive[name].dtype.str, archive[name].tobytes()) for name in archive.files}
+            arrays = {
+                name: (archive[name].dtype.str, archive[name].tobytes()) for name in archive.files
+            }
     except (OSError, ValueError, KeyError, EOFError):
         return None
-    return {"scores": scores, "ranking": ranking, "arrays": arrays, "failures": (out / "failures.csv").exists()}
+    return {
+        "scores": scores,
+        "ranking": ranking,
+        "arrays": arrays,
+        "failures": (out / "failures.csv").exists(),
+    }
 
 
 def partials(cache: Path) -> list[Path]:

@@ -35,15 +35,21 @@ def measure(folder: Path, names: list[str], cache_dir: Path | None, n_workers: i
     for module in descriptors.values():
         requirements = requirements | module.requirements
     config = requirements.apply_to(SignatureConfig.paper())
-    dataset = SignatureDataset(find_bodies(folder, labelled=True), config, cache_dir, reading=LoadOptions())
+    dataset = SignatureDataset(
+        find_bodies(folder, labelled=True), config, cache_dir, reading=LoadOptions()
+    )
     dataset.precompute(n_workers=n_workers, strict=True)
     table = {}
     for name, module in descriptors.items():
         failures: list[Failure] = []
-        descriptions = describe(dataset, module, failures=failures, n_workers=n_workers, progress=True)
+        descriptions = describe(
+            dataset, module, failures=failures, n_workers=n_workers, progress=True
+        )
         distances = pair_distances(module, descriptions)
         means = retrieval_scores(distances, dataset.usable(failures).bodies.labels or ()).mean()
-        table[name] = {score: round(100 * _POINT * float(means[score])) / _POINT for score in SCORES}
+        table[name] = {
+            score: round(100 * _POINT * float(means[score])) / _POINT for score in SCORES
+        }
         table[name]["n_described"] = len(descriptions)
     return table
 
@@ -57,7 +63,9 @@ def differences(measured: Table, expected: Table) -> list[str]:
             continue
         for score, value in scores.items():
             if value != expected[name].get(score):
-                sentences.append(f"{name}: {score} is {value}, expected {expected[name].get(score)}")
+                sentences.append(
+                    f"{name}: {score} is {value}, expected {expected[name].get(score)}"
+                )
     return sentences
 
 
@@ -65,12 +73,20 @@ def main() -> None:
     """Compare the scores with the expected ones, or store them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="folder of the SHREC'07 meshes, with labels.csv")
-    parser.add_argument("--descriptors", nargs="+", choices=NAMES, help="default: those with expected scores")
-    parser.add_argument("--cache_dir", type=Path, help="cache of signatures; default: the user's cache")
+    parser.add_argument(
+        "--descriptors", nargs="+", choices=NAMES, help="default: those with expected scores"
+    )
+    parser.add_argument(
+        "--cache_dir", type=Path, help="cache of signatures; default: the user's cache"
+    )
     parser.add_argument("--n_workers", type=int, help="number of processes; default: all cores")
-    parser.add_argument("--write", action="store_true", help="store the scores as the expected ones")
+    parser.add_argument(
+        "--write", action="store_true", help="store the scores as the expected ones"
+    )
     arguments = parser.parse_args()
-    expected: dict[str, Mapping[str, float]] = json.loads(EXPECTED.read_text()) if EXPECTED.exists() else {}
+    expected: dict[str, Mapping[str, float]] = (
+        json.loads(EXPECTED.read_text()) if EXPECTED.exists() else {}
+    )
     names = arguments.descriptors or list(expected) or list(NAMES)
     measured = measure(arguments.folder, names, arguments.cache_dir, arguments.n_workers)
     for name, scores in measured.items():

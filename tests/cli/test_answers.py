@@ -60,7 +60,17 @@ def table(path: Path) -> list[dict[str, str]]:
 def test_groups_prints_and_writes_the_tests(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--strata", "scanner", "--covariate", "age", "--test_size", "--n_permutations", "199", "--out", tmp_path]
+    words = [
+        "--strata",
+        "scanner",
+        "--covariate",
+        "age",
+        "--test_size",
+        "--n_permutations",
+        "199",
+        "--out",
+        tmp_path,
+    ]
     igps(monkeypatch, root, "groups", root, *OWN, *words)
     printed = capsys.readouterr().out
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
@@ -92,7 +102,9 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
     for i in range(8):
         labels = np.zeros((24, 60, 24), dtype=np.uint8)
         for label, at, length in ((17, 0, 6 + 0.2 * i), (53, 26, 10 + 0.2 * i)):
-            inside = (place[0] / 6) ** 2 + ((place[1] - at) / length) ** 2 + (place[2] / 6) ** 2 <= 1
+            inside = (place[0] / 6) ** 2 + ((place[1] - at) / length) ** 2 + (
+                place[2] / 6
+            ) ** 2 <= 1
             labels[inside] = label
             rows.append(f"s{i}.nii.gz,{label},{'left' if label == 17 else 'right'},{i}")
         (root := tmp_path / "brains").mkdir(exist_ok=True)
@@ -102,7 +114,9 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
     igps(monkeypatch, root, "groups", root, *OWN, *words)
     (found,) = json.loads((tmp_path / "found" / "groups.json").read_text())
     assert (found["body"], found["sizes"]) == ("all", "left:8 right:8")
-    assert found["permanova_p"] <= 3 / 128  # the swap of all pairs does as well, and one or two may be drawn more often
+    assert (
+        found["permanova_p"] <= 3 / 128
+    )  # the swap of all pairs does as well, and one or two may be drawn more often
 
 
 @pytest.mark.parametrize("name", ["{group}{i}", "{i}", "case_{i}", "{word}"])
@@ -115,7 +129,9 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(
     for group, side in (("patients", 6), ("controls", 8)):
         (folder := tmp_path / "masks" / group).mkdir(parents=True)
         for i in range(5):
-            inside = (place[0] / (side + 0.2 * i)) ** 2 + (place[1] / 7) ** 2 + (place[2] / 7) ** 2 <= 1
+            inside = (place[0] / (side + 0.2 * i)) ** 2 + (place[1] / 7) ** 2 + (
+                place[2] / 7
+            ) ** 2 <= 1
             word = ("ann", "bob", "cid", "dan", "eve")[i]  # before and after, of the same subjects
             path = folder / f"{name.format(group=group, i=i, word=word)}.nii.gz"
             nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)), path)
@@ -123,14 +139,19 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(
     igps(monkeypatch, tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
     _, size = json.loads((tmp_path / "found" / "groups.json").read_text())
     assert (size["body"], size["sizes"]) == ("all, size", "controls:5 patients:5")
-    assert size["permanova_p"] <= 6 / 252  # of the 252 ways to draw five of ten, this one and its mirror
+    assert (
+        size["permanova_p"] <= 6 / 252
+    )  # of the 252 ways to draw five of ten, this one and its mirror
 
 
 def test_volumes_are_compared_in_one_unit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Half of the eggs of each group are in metres."""
-    root, heights = tmp_path / "eggs", {"low": (1.0, 1.02, 1.04, 1.06, 1.08), "high": (2.0, 2.02, 2.04, 2.06, 2.08)}
+    root, heights = (
+        tmp_path / "eggs",
+        {"low": (1.0, 1.02, 1.04, 1.06, 1.08), "high": (2.0, 2.02, 2.04, 2.06, 2.08)},
+    )
     for label, of_each in heights.items():
         for i, height in enumerate(of_each):
             write_egg(path := root / label / f"{i}.off", height, subdivisions=2)
@@ -139,7 +160,8 @@ def test_volumes_are_compared_in_one_unit(
                 path.unlink()
     igps(monkeypatch, root, "groups", root, *OWN, "--test_size", "--out", tmp_path)
     assert (
-        "6 of 10 bodies have no unit of length; their coordinates are taken as millimetres" in capsys.readouterr().out
+        "6 of 10 bodies have no unit of length; their coordinates are taken as millimetres"
+        in capsys.readouterr().out
     )
     assert float(table(tmp_path / "groups.csv")[1]["effect"]) > 0.9
     igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", "volume", "--out", tmp_path)
@@ -164,11 +186,17 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(
     descriptions = describe(SignatureDataset(root, CONFIG, root.parent / "cache"), small_interior())
     vectors = descriptions.flatten(1).double().sqrt().numpy()
     is_f = np.arange(13)[:, None] % 3 == 0
-    expected = group_test(vectors, [row["label"] for row in rows], covariates=is_f.astype(float), n_permutations=199)
+    expected = group_test(
+        vectors, [row["label"] for row in rows], covariates=is_f.astype(float), n_permutations=199
+    )
     assert found["permanova_f"] == pytest.approx(expected.permanova_f)
     assert found["permanova_p"] == expected.permanova_p
-    igps(monkeypatch, root, *words, "--covariate", "site", "--json")  # a word that begins as NaN does
-    assert json.loads(capsys.readouterr().out)[0]["permanova_f"] == pytest.approx(expected.permanova_f)
+    igps(
+        monkeypatch, root, *words, "--covariate", "site", "--json"
+    )  # a word that begins as NaN does
+    assert json.loads(capsys.readouterr().out)[0]["permanova_f"] == pytest.approx(
+        expected.permanova_f
+    )
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, root, *words, "--covariate", "dose")
     assert "dose: expected numbers, got '5o'" in capsys.readouterr().err
@@ -178,7 +206,10 @@ def test_covariates_that_are_named_one_by_one_all_count(
     root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = []
-    for words in (["--covariate", "age", "scanner"], ["--covariate", "age", "--covariate", "scanner"]):
+    for words in (
+        ["--covariate", "age", "scanner"],
+        ["--covariate", "age", "--covariate", "scanner"],
+    ):
         igps(monkeypatch, root, "groups", root, *OWN, *words, "--n_permutations", "99", "--json")
         found.append(json.loads(capsys.readouterr().out))
     assert found[0] == found[1]
@@ -189,10 +220,16 @@ def test_groups_refuses_three_of_a_group(
 ) -> None:
     rows = table(root / "labels.csv")
     (tmp_path / "labels.csv").write_text(
-        "file,ill\n" + "".join(f"{root / row['file']},{'yes' if i < 3 else 'no'}\n" for i, row in enumerate(rows))
+        "file,ill\n"
+        + "".join(
+            f"{root / row['file']},{'yes' if i < 3 else 'no'}\n" for i, row in enumerate(rows)
+        )
     )
     igps(monkeypatch, root, "groups", tmp_path, "--group", "ill", *OWN, "--out", tmp_path / "out")
-    assert "not tested (10 no, 3 yes): yes has 3 bodies, a test needs at least 5" in capsys.readouterr().out
+    assert (
+        "not tested (10 no, 3 yes): yes has 3 bodies, a test needs at least 5"
+        in capsys.readouterr().out
+    )
     assert not (tmp_path / "out" / "groups.png").exists()
 
 
@@ -209,7 +246,9 @@ def test_outliers_lists_the_short_egg_among_the_long_first(
     svg = (tmp_path / "outliers.svg").read_text()
     assert f"<!-- {float(rows[0]['score']):.1f}  long6.off -->" in svg
     assert str(root) not in svg
-    assert [float(row["score"]) for row in rows] == sorted((float(row["score"]) for row in rows), reverse=True)
+    assert [float(row["score"]) for row in rows] == sorted(
+        (float(row["score"]) for row in rows), reverse=True
+    )
     assert imread(tmp_path / "outliers.png").std() > 0.02
     igps(monkeypatch, root, "outliers", root, *OWN, "--top", "0", "--out", tmp_path / "none")
     assert table(tmp_path / "none" / "outliers.csv") == rows
@@ -227,13 +266,27 @@ def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(
         labels = np.zeros((40, 14, 14), dtype=np.uint8)
         for label, (x, *half) in enumerate([(0, 4, 4, 4), (12, 6, 3, 3), (26, 6, 5, 3)], start=1):
             a, b, c = half * random.normal(1, 0.05, 3)
-            labels[((place[0] - x) / a) ** 2 + (place[1] / b) ** 2 + (place[2] / c) ** 2 < 1] = label
+            labels[((place[0] - x) / a) ** 2 + (place[1] / b) ** 2 + (place[2] / c) ** 2 < 1] = (
+                label
+            )
         affine = np.diag([2.0, 2, 2, 1] if subject == 4 else [1.0, 1, 1, 1])
         organs = {f"s{subject}/organ{label}": labels == label for label in (1, 2, 3)}
         for name, voxels in organs.items() if masks else [(f"s{subject}", labels)]:
-            (path := tmp_path / "scans" / f"{name}.nii.gz").parent.mkdir(parents=True, exist_ok=True)
+            (path := tmp_path / "scans" / f"{name}.nii.gz").parent.mkdir(
+                parents=True, exist_ok=True
+            )
             nibabel.save(nibabel.Nifti1Image(voxels.astype(np.uint8), affine), path)
-    igps(monkeypatch, tmp_path / "x", "outliers", tmp_path / "scans", *OWN, "--classes", "body", "--out", tmp_path)
+    igps(
+        monkeypatch,
+        tmp_path / "x",
+        "outliers",
+        tmp_path / "scans",
+        *OWN,
+        "--classes",
+        "body",
+        "--out",
+        tmp_path,
+    )
     first = table(tmp_path / "outliers.csv")[:3]
     assert [row["name"][:2] for row in first] == ["s4"] * 3
     assert all(float(row["score"]) > LIMIT for row in first)
@@ -241,7 +294,11 @@ def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(
 
 @pytest.mark.parametrize("is_group", [False, True])
 def test_explain_writes_shares_that_add_up(
-    is_group: bool, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    is_group: bool,
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     what = ["explain", root] if is_group else ["explain", root / "short0.off", root / "long3.off"]
     igps(monkeypatch, root, *what, *OWN, "--out", tmp_path)
@@ -259,15 +316,24 @@ def test_explain_writes_shares_that_add_up(
 
 @pytest.mark.parametrize(
     ("largest", "told"),
-    [(1, "half of its share lies on {}% of its surface"), (0, "none of the difference lies on its surface")],
+    [
+        (1, "half of its share lies on {}% of its surface"),
+        (0, "none of the difference lies on its surface"),
+    ],
 )
 def test_explain_tells_how_much_of_the_surface_differs(
-    largest: int, told: str, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    largest: int,
+    told: str,
+    root: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """One of 320 faces has the whole share, whose area trimesh gives; or no face has a positive share."""
     areas = trimesh.load(root / "long3.off", process=False).area_faces
     told = told.format(f"{100 * areas[-1] / areas.sum():.2g}")
-    monkeypatch.setattr("igps.cli.answers.share_density", lambda *_: np.append(np.full(319, -1.0), largest))
+    monkeypatch.setattr(
+        "igps.cli.answers.share_density", lambda *_: np.append(np.full(319, -1.0), largest)
+    )
     igps(monkeypatch, root, "explain", root / "short0.off", root / "long3.off", *OWN)
     assert capsys.readouterr().out.splitlines()[-1] == f"{root}/long3.off: {told}"
 
@@ -286,7 +352,18 @@ def test_explain_heeds_size_and_side(
             egg.export(folder / label / f"{i}.off")
     what = [folder] if is_group else [folder / "small" / "0.off", folder / "large" / "0.off"]
     own = ["--descriptor", "own_descriptors:small_gps"]
-    igps(monkeypatch, root, "explain", *what, *own, "--size", "keep", "--mirror", "distinct", "--json")
+    igps(
+        monkeypatch,
+        root,
+        "explain",
+        *what,
+        *own,
+        "--size",
+        "keep",
+        "--mirror",
+        "distinct",
+        "--json",
+    )
     found = json.loads(capsys.readouterr().out)
     shares = {row["histogram"]: row["share"] for row in found["shares"]}
     assert list(shares)[-2:] == ["side", "size"]
@@ -308,13 +385,19 @@ def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are(
         ball = trimesh.creation.revolve(profile[::-1], sections=72)
         heights = ball.triangles_center[:, 2]
         sentence = _extent(np.where(heights > 0.5, 1 + 1e-6 * heights, 0), ball.area_faces)
-        percent = float(sentence.removeprefix("half of its share lies on ").removesuffix("% of its surface"))
+        percent = float(
+            sentence.removeprefix("half of its share lies on ").removesuffix("% of its surface")
+        )
         assert percent == pytest.approx(12.5, abs=0.6)  # of two digits
 
 
 @pytest.mark.parametrize("words", [["clusters"], ["figure", "clusters"]])
 def test_clusters_are_the_two_kinds_of_eggs(
-    words: list[str], root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     out = [] if words[0] == "figure" else ["--out", "figures"]
@@ -339,13 +422,19 @@ def test_a_stability_that_was_not_measured_is_unknown(
 
 @pytest.mark.parametrize("colour", ["class", "cluster", "volume", "age", "scanner"])
 def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
-    colour: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    colour: str,
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", colour, "--out", tmp_path)
     rows = table(tmp_path / "map.csv")
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
     found = body_map(chi_square(*2 * [describe(dataset, small_interior())]).numpy())
-    assert np.array([[row["x"], row["y"]] for row in rows], dtype=float) == pytest.approx(found.points, abs=1e-5)
+    assert np.array([[row["x"], row["y"]] for row in rows], dtype=float) == pytest.approx(
+        found.points, abs=1e-5
+    )
     assert f"stress {found.stress:.2f}" in capsys.readouterr().out
     first = {
         "class": "short",
@@ -364,7 +453,9 @@ def test_a_column_called_as_the_coordinates_leaves_them_alone(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = table(root / "labels.csv")
-    (tmp_path / "labels.csv").write_text("file,x\n" + "".join(f"{root / row['file']},7\n" for row in rows))
+    (tmp_path / "labels.csv").write_text(
+        "file,x\n" + "".join(f"{root / row['file']},7\n" for row in rows)
+    )
     igps(monkeypatch, root, "figure", "map", tmp_path, *OWN, "--colour", "x", "--out", tmp_path)
     found = table(tmp_path / "map.csv")
     assert {row["x of labels.csv"] for row in found} == {"7.0"}
@@ -397,7 +488,9 @@ def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None
 def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path: Path) -> None:
     distances = np.array([[0.0, 1, 3], [1, 0, 2], [3, 2, 0]])
     for folder in ("one", "other"):
-        figure = clusters_figure(clusters_of(distances, 2), ["a", "b", "sub-01/" + "x" * 200 + ".off"])
+        figure = clusters_figure(
+            clusters_of(distances, 2), ["a", "b", "sub-01/" + "x" * 200 + ".off"]
+        )
         write_analysis(tmp_path / folder, "clusters", [{"body": "a"}], figure)
         assert figure.axes[0].get_window_extent().width > 0.4 * figure.bbox.width
     one, other = ((tmp_path / folder / "clusters.svg").read_bytes() for folder in ("one", "other"))
@@ -412,15 +505,22 @@ def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path: P
             ["figure", "map", "--colour", "weight"],
             "weight: no such column of labels.csv; further columns: scanner, age",
         ),
-        (["groups", "--group", "weight"], "weight: no such column of labels.csv; further columns: scanner, age"),
+        (
+            ["groups", "--group", "weight"],
+            "weight: no such column of labels.csv; further columns: scanner, age",
+        ),
         (["groups", "--strata", "weight"], "weight: no such column of labels.csv"),
         (["groups", "--covariate", "age", "weight"], "weight: no such column of labels.csv"),
     ],
 )
 def test_what_labels_do_not_tell_is_refused_before_anything_is_computed(
-    command: list[str], message: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    command: list[str],
+    message: str,
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     cache = ["--cache_dir", tmp_path / "cache"]
     where = next(i for i, word in enumerate(command) if word.startswith("--"))
     words = ["igps", *command[:where], root, *command[where:], *OWN, *cache, *SMALL]
@@ -437,7 +537,9 @@ def test_three_classes_are_refused_before_anything_is_computed(
     for label in "abc":
         write_egg(tmp_path / "eggs" / label / "0.off", 1.0, subdivisions=2)
     monkeypatch.setattr(
-        sys, "argv", ["igps", "explain", str(tmp_path / "eggs"), "--cache_dir", str(tmp_path / "cache")]
+        sys,
+        "argv",
+        ["igps", "explain", str(tmp_path / "eggs"), "--cache_dir", str(tmp_path / "cache")],
     )
     with pytest.raises(SystemExit, match="1"):
         main()

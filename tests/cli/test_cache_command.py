@@ -18,7 +18,10 @@ INTERIOR = "own_descriptors:small_interior"
 
 @pytest.mark.parametrize("labelled", [True, False])
 def test_the_file_stands_for_the_folder(
-    labelled: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    labelled: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     for label, height in (("flat", 0.5), ("long", 2.0)):
         for i in range(2):
@@ -31,7 +34,18 @@ def test_the_file_stands_for_the_folder(
     write_egg(tmp_path / "egg.off", 2.0, subdivisions=2)
     run(monkeypatch, *command, *where, tmp_path / "eggs", "--descriptor", INTERIOR, *cache, *SMALL)
     expected = json.loads(capsys.readouterr().out)
-    run(monkeypatch, "cache", "export", tmp_path / "eggs", "--out", out, "--descriptors", INTERIOR, *cache, *SMALL)
+    run(
+        monkeypatch,
+        "cache",
+        "export",
+        tmp_path / "eggs",
+        "--out",
+        out,
+        "--descriptors",
+        INTERIOR,
+        *cache,
+        *SMALL,
+    )
     told = capsys.readouterr().out
     assert f"4 signatures written to {out}\n" in told
     assert ("1 of 5 meshes could not be used. The first: " in told) == (not labelled)
@@ -43,8 +57,19 @@ def test_the_file_stands_for_the_folder(
         for option in (["--mend", "never"], ["--attribute", "ct={file}.nii"]):
             with pytest.raises(SystemExit, match="1"):
                 run(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, *option)
-            assert "expected no reading options with a file of signatures" in capsys.readouterr().err
-        run(monkeypatch, "extract", out, "--out", tmp_path / "rows.npz", "--descriptor", INTERIOR, *cache)
+            assert (
+                "expected no reading options with a file of signatures" in capsys.readouterr().err
+            )
+        run(
+            monkeypatch,
+            "extract",
+            out,
+            "--out",
+            tmp_path / "rows.npz",
+            "--descriptor",
+            INTERIOR,
+            *cache,
+        )
         names = np.load(tmp_path / "rows.npz")["names"].tolist()
         assert names == ["flat/0.off", "flat/1.off", "long/0.off", "long/1.off"]
         with pytest.raises(SystemExit, match="1"):
@@ -61,11 +86,33 @@ def test_lists_of_files_may_be_one_file_of_signatures_and_what_needs_meshes_says
 ) -> None:
     for label, height in (("flat", 0.5), ("long", 2.0)):
         for i in range(2):
-            write_egg(tmp_path / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2)
+            write_egg(
+                tmp_path / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2
+            )
     cache, out = ["--cache_dir", tmp_path / "cache"], tmp_path / "signatures.igps"
     rich, model, small = ["--descriptor", "rich"], tmp_path / "mine.safetensors", SMALL[2:]
-    run(monkeypatch, "cache", "export", tmp_path / "eggs", "--out", out, "--descriptors", "rich", *cache, *small)
-    run(monkeypatch, "extract", tmp_path / "eggs", *rich, "--out", tmp_path / "folder.csv", *cache, *small)
+    run(
+        monkeypatch,
+        "cache",
+        "export",
+        tmp_path / "eggs",
+        "--out",
+        out,
+        "--descriptors",
+        "rich",
+        *cache,
+        *small,
+    )
+    run(
+        monkeypatch,
+        "extract",
+        tmp_path / "eggs",
+        *rich,
+        "--out",
+        tmp_path / "folder.csv",
+        *cache,
+        *small,
+    )
     run(monkeypatch, "fit", out, *rich, "--head", "classifier", "--out", model, *cache)
     capsys.readouterr()
     run(monkeypatch, "classify", tmp_path / "eggs", "--model", model, *cache, *small, "--json")
@@ -91,8 +138,20 @@ def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_egg(tmp_path / "eggs" / "0.off", 2.0, subdivisions=2)
-    run(monkeypatch, "precompute", tmp_path / "eggs", "--with", "potential", "--cache_dir", tmp_path, "--n_workers", 1)
-    dataset = SignatureDataset(tmp_path / "eggs", cache_dir=tmp_path, descriptor="pretrained+potential")
+    run(
+        monkeypatch,
+        "precompute",
+        tmp_path / "eggs",
+        "--with",
+        "potential",
+        "--cache_dir",
+        tmp_path,
+        "--n_workers",
+        1,
+    )
+    dataset = SignatureDataset(
+        tmp_path / "eggs", cache_dir=tmp_path, descriptor="pretrained+potential"
+    )
     assert None not in dataset.cached_keys()
 
 
@@ -107,4 +166,7 @@ def test_a_mesh_in_place_of_a_folder_is_told_as_such(
     ):
         with pytest.raises(SystemExit, match="1"):
             run(monkeypatch, *command, "--cache_dir", tmp_path / "cache")
-        assert capsys.readouterr().err == f"igps: {tmp_path / 'egg.off'}: expected a folder, got a file.\n"
+        assert (
+            capsys.readouterr().err
+            == f"igps: {tmp_path / 'egg.off'}: expected a folder, got a file.\n"
+        )

@@ -50,7 +50,16 @@ def test_retrieve_prints_and_writes_what_python_computes(
 ) -> None:
     out = tmp_path / "out"
     run(
-        monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--out", out, "--cache_dir", tmp_path / "cache", *SMALL
+        monkeypatch,
+        "retrieve",
+        root,
+        "--descriptor",
+        INTERIOR,
+        "--out",
+        out,
+        "--cache_dir",
+        tmp_path / "cache",
+        *SMALL,
     )
     printed = capsys.readouterr().out
 
@@ -60,12 +69,29 @@ def test_retrieve_prints_and_writes_what_python_computes(
     expected = retrieval_scores(distances, dataset.bodies.labels or ())
 
     scores = json.loads((out / "scores.json").read_text())
-    assert {"nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map", "n_queries", "per_class", "config"} | {
+    assert {
+        "nn",
+        "ft",
+        "st",
+        "e",
+        "dcg",
+        "adr",
+        "adr_self",
+        "map",
+        "n_queries",
+        "per_class",
+        "config",
+    } | {
         "n_given",
         "n_used",
         "n_refused",
     } == set(scores)
-    assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [6, 6, 6, 0]
+    assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [
+        6,
+        6,
+        6,
+        0,
+    ]
     assert {name: scores[name] for name in expected.mean()} == pytest.approx(expected.mean())
     assert scores["per_class"]["egg"]["ft"] == pytest.approx(expected.per_class()["egg"]["ft"])
     assert scores["config"]["resolution"] == 10
@@ -106,7 +132,9 @@ def test_retrieve_reranks_in_a_table_of_its_own(
         run(monkeypatch, "retrieve", root, "--out", tmp_path / name, *options, *further)
     printed = capsys.readouterr().out
     assert printed.count("re-ranked by the whole collection") == 1
-    plain, both = (json.loads((tmp_path / name / "scores.json").read_text()) for name in ("plain", "both"))
+    plain, both = (
+        json.loads((tmp_path / name / "scores.json").read_text()) for name in ("plain", "both")
+    )
     with np.load(tmp_path / "both" / "distances.npz") as archive:
         expected = rerank(torch.from_numpy(archive["distances"]))
         np.testing.assert_allclose(archive["reranked"], expected, atol=1e-7)
@@ -130,13 +158,21 @@ def test_gps_is_another_descriptor_on_the_same_cache(
             *SMALL,
         ]
         run(monkeypatch, "retrieve", root, *arguments)
-    interior, gps = (json.loads((tmp_path / name / "scores.json").read_text()) for name in ("interior", "gps"))
+    interior, gps = (
+        json.loads((tmp_path / name / "scores.json").read_text()) for name in ("interior", "gps")
+    )
     assert interior["config"].pop("descriptor") == INTERIOR
     assert gps["config"].pop("descriptor") == "own_descriptors:small_gps"
     assert interior["config"] == gps["config"]
-    archives = [np.load(tmp_path / name / "distances.npz")["distances"] for name in ("interior", "gps")]
+    archives = [
+        np.load(tmp_path / name / "distances.npz")["distances"] for name in ("interior", "gps")
+    ]
     assert np.abs(archives[0] - archives[1]).max() > 1e-3
-    kept = [path for path in (tmp_path / "cache").rglob("*.safetensors") if "descriptions" not in path.parts]
+    kept = [
+        path
+        for path in (tmp_path / "cache").rglob("*.safetensors")
+        if "descriptions" not in path.parts
+    ]
     assert len(kept) == 6
 
 
@@ -144,7 +180,15 @@ def test_a_second_run_describes_nothing_and_leaves_the_same_table(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def retrieved(name: str) -> dict[str, bytes]:
-        arguments = ["--descriptor", "d2", "--out", tmp_path / name, "--cache_dir", tmp_path / "cache", *SMALL]
+        arguments = [
+            "--descriptor",
+            "d2",
+            "--out",
+            tmp_path / name,
+            "--cache_dir",
+            tmp_path / "cache",
+            *SMALL,
+        ]
         run(monkeypatch, "retrieve", root, *arguments)
         return {path.name: path.read_bytes() for path in (tmp_path / name).glob("*.[cj]s*")}
 
@@ -162,15 +206,30 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Unless a number is given, and unless a cache has more."""
-    for path in (*root.glob("egg/*"), root / "ball" / "2.off"):  # 250 eigenpairs of each take a while
+    for path in (
+        *root.glob("egg/*"),
+        root / "ball" / "2.off",
+    ):  # 250 eigenpairs of each take a while
         path.unlink()
     options = [option for option in SMALL if option not in ("--signature.n_eigenpairs", "20")]
 
     def retrieved(cache: str, *more: str) -> tuple[int, np.ndarray]:
         out = tmp_path / "out"
-        run(monkeypatch, "retrieve", root, "--out", out, "--cache_dir", tmp_path / cache, *options, *more)
+        run(
+            monkeypatch,
+            "retrieve",
+            root,
+            "--out",
+            out,
+            "--cache_dir",
+            tmp_path / cache,
+            *options,
+            *more,
+        )
         with np.load(out / "distances.npz") as archive:
-            return json.loads((out / "scores.json").read_text())["config"]["n_eigenpairs"], archive["distances"]
+            return json.loads((out / "scores.json").read_text())["config"]["n_eigenpairs"], archive[
+                "distances"
+            ]
 
     def computed(cache: str) -> set[int]:
         found = set()
@@ -214,7 +273,12 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
     assert row["name"] == "egg/bad.off"
     assert "a single triangle" in row["error"]
     scores = json.loads((tmp_path / "out" / "scores.json").read_text())
-    assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [6, 7, 6, 1]
+    assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [
+        6,
+        7,
+        6,
+        1,
+    ]
 
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, *arguments, "--strict")
@@ -227,7 +291,9 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
     assert not (tmp_path / "out" / "failures.csv").exists()
 
 
-def test_extract_files_and_folder(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_extract_files_and_folder(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     files = [root / "egg" / "1.off", root / "ball" / "0.off"]
     common = ["--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL]
     run(monkeypatch, "extract", *files, "--out", tmp_path / "two.npz", *common)
@@ -255,7 +321,15 @@ def test_extract_short_vectors(
         expected = module.shorten(torch.from_numpy(long["features"])).numpy()
         np.testing.assert_allclose(short["features"], expected, atol=1e-6)
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, *common, "--short", "--descriptor", INTERIOR, "--out", tmp_path / "none.npz")
+        run(
+            monkeypatch,
+            *common,
+            "--short",
+            "--descriptor",
+            INTERIOR,
+            "--out",
+            tmp_path / "none.npz",
+        )
     assert "short: expected a descriptor of vectors, such as pretrained" in capsys.readouterr().err
     assert not (tmp_path / "none.npz").exists()
 
@@ -288,16 +362,39 @@ def test_query_lists_the_nearest(
     names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(3)]
     nearest = torch.argsort(distances, stable=True)[:4].tolist()
     assert [line.split()[2] for line in lines] == [names[i] for i in nearest]
-    assert [float(line.split()[1]) for line in lines] == pytest.approx(distances[nearest].tolist(), rel=5e-3)
+    assert [float(line.split()[1]) for line in lines] == pytest.approx(
+        distances[nearest].tolist(), rel=5e-3
+    )
 
 
 def test_what_asks_a_file_of_signatures_is_described_as_they_are(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, cache = tmp_path / "signatures.igps", ["--cache_dir", tmp_path / "cache"]
-    run(monkeypatch, "cache", "export", root, "--out", file, "--descriptors", INTERIOR, *cache, *SMALL)
+    run(
+        monkeypatch,
+        "cache",
+        "export",
+        root,
+        "--out",
+        file,
+        "--descriptors",
+        INTERIOR,
+        *cache,
+        *SMALL,
+    )
     capsys.readouterr()
-    run(monkeypatch, "query", root / "egg" / "1.off", "--gallery", file, "--descriptor", INTERIOR, "--json", *cache)
+    run(
+        monkeypatch,
+        "query",
+        root / "egg" / "1.off",
+        "--gallery",
+        file,
+        "--descriptor",
+        INTERIOR,
+        "--json",
+        *cache,
+    )
     first = json.loads(capsys.readouterr().out)[0]
     assert (first["name"], first["distance"]) == ("egg/1.off", 0)
 
@@ -311,11 +408,20 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
             ["retrieve", "ROOT", "--descriptor", "best"],
             f"expected one of {', '.join(NAMES)}, molecular, or .*, got 'best'",
         ),
-        (["retrieve", "ROOT"], "n_eigenpairs: this descriptor needs signatures of at least 90, got 20"),
-        (["retrieve", "ROOT", "--signature.max_vertices", "0"], "max_vertices: expected more than .*, got 0"),
+        (
+            ["retrieve", "ROOT"],
+            "n_eigenpairs: this descriptor needs signatures of at least 90, got 20",
+        ),
+        (
+            ["retrieve", "ROOT", "--signature.max_vertices", "0"],
+            "max_vertices: expected more than .*, got 0",
+        ),
         (["outliers", "ROOT", "--top", "-1"], "top: expected at least 0, got -1"),
         (["query", "ROOT/egg/1.off", "--gallery", "ROOT", "--top", "0"], "top"),
-        (["query", "nowhere.off", "--gallery", "ROOT", "--descriptor", "d2"], "no such file|cannot be read"),
+        (
+            ["query", "nowhere.off", "--gallery", "ROOT", "--descriptor", "d2"],
+            "no such file|cannot be read",
+        ),
         (
             ["retrieve", "ROOT", "--paper", "--mend", "never", "--n_workers", "1"],
             "none of 6 meshes could be used.*expected at least 252 vertices for 250 eigenpairs",
@@ -323,14 +429,24 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
     ],
 )
 def test_errors_are_one_line(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    arguments: list[str], message: str,
-) -> None:  # fmt: skip
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
     logging.disable(logging.WARNING)
     options = [] if "--paper" in arguments else SMALL
     try:
         with pytest.raises(SystemExit, match="1"):
-            run(monkeypatch, *[a.replace("ROOT", str(root)) for a in arguments], "--cache_dir", tmp_path, *options)
+            run(
+                monkeypatch,
+                *[a.replace("ROOT", str(root)) for a in arguments],
+                "--cache_dir",
+                tmp_path,
+                *options,
+            )
     finally:
         logging.disable(logging.NOTSET)
     error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
@@ -347,14 +463,20 @@ def test_too_few_eigenpairs_are_refused_in_the_same_words_as_in_python(
     with pytest.raises(ValueError, match="got 20") as of_batch:
         descriptor("interior")(dataset.batch([0]))
     assert str(of_batch.value) == str(raised.value)
-    for command in (["retrieve", root], ["extract", root, "--out", tmp_path / "x.npz"], ["compare", root]):
+    for command in (
+        ["retrieve", root],
+        ["extract", root, "--out", tmp_path / "x.npz"],
+        ["compare", root],
+    ):
         chosen = ["--descriptors" if command[0] == "compare" else "--descriptor", "interior"]
         with pytest.raises(SystemExit, match="1"):
             run(monkeypatch, *command, *chosen, "--cache_dir", tmp_path / "cache", *SMALL)
         assert f"igps: {raised.value}" in capsys.readouterr().err.splitlines()
 
 
-def test_a_compared_descriptor_retrieves(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_compared_descriptor_retrieves(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, options = tmp_path / "out", ["--cache_dir", tmp_path / "cache", *SMALL]
     run(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", out, *options)
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
@@ -372,7 +494,14 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
 ) -> None:
     logging.disable(logging.WARNING)
     (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    arguments = ["retrieve", root, "--descriptor", "own_descriptors:picky", "--out", tmp_path / "out"]
+    arguments = [
+        "retrieve",
+        root,
+        "--descriptor",
+        "own_descriptors:picky",
+        "--out",
+        tmp_path / "out",
+    ]
     arguments += ["--cache_dir", tmp_path / "cache", *SMALL]
     try:
         run(monkeypatch, *arguments)
@@ -381,7 +510,12 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
         assert [row["name"] for row in rows] == ["egg/bad.off", "egg/1.off"]
         assert "too much" in rows[1]["error"]
         scores = json.loads((tmp_path / "out" / "scores.json").read_text())
-        assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [5, 7, 5, 2]
+        assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [
+            5,
+            7,
+            5,
+            2,
+        ]
         (root / "egg" / "bad.off").unlink()
         with pytest.raises(SystemExit, match="1"):
             run(monkeypatch, *arguments, "--strict")
@@ -390,7 +524,9 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
         logging.disable(logging.NOTSET)
 
 
-@pytest.mark.parametrize("command", ["retrieve", "extract", "query", "precompute", "demo", "compare", "report"])
+@pytest.mark.parametrize(
+    "command", ["retrieve", "extract", "query", "precompute", "demo", "compare", "report"]
+)
 def test_help_explains_every_option(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
@@ -400,7 +536,13 @@ def test_help_explains_every_option(
     assert "--n_workers" in text
     assert "--workers" not in text
     if command not in ("demo", "report"):
-        for word in ("--cache_dir", "--strict", "--mend", "--signature.min_samples", "refined until"):
+        for word in (
+            "--cache_dir",
+            "--strict",
+            "--mend",
+            "--signature.min_samples",
+            "refined until",
+        ):
             assert word in text, word
 
 
@@ -414,9 +556,11 @@ def test_help_is_in_the_words_that_are_typed(
     for word in ("None", "`", "see ", "type:", "Literal", "null)", "False)"):
         assert word not in text, word
     for words in (
-        "--bodies {whole,labels,objects,pieces,chains,models,assembly}", "null evaluates them exactly",
-        "start vectors (default: 0)", "or 250 without a descriptor",
-    ):  # fmt: skip
+        "--bodies {whole,labels,objects,pieces,chains,models,assembly}",
+        "null evaluates them exactly",
+        "start vectors (default: 0)",
+        "or 250 without a descriptor",
+    ):
         assert words in text, words
 
 
@@ -427,11 +571,20 @@ def test_a_repeated_list_is_collected_in_place_of_its_default() -> None:
         assert "pretrained" in default
         words = ["--descriptors", "pretrained", "--descriptors", "d2", "rich"]
         for _ in range(2):
-            assert parser.parse_args([command, "root", *words])[command].descriptors == ["pretrained", "d2", "rich"]
-    assert parser.parse_args(["groups", "root", "--with", "a", "--with", "b=2"]).groups["with"] == ["a", "b=2"]
+            assert parser.parse_args([command, "root", *words])[command].descriptors == [
+                "pretrained",
+                "d2",
+                "rich",
+            ]
+    assert parser.parse_args(["groups", "root", "--with", "a", "--with", "b=2"]).groups["with"] == [
+        "a",
+        "b=2",
+    ]
 
 
-def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_interruption_is_told_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def wait() -> None:
         """Wait."""
         raise KeyboardInterrupt
@@ -439,7 +592,10 @@ def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setattr(cli, "COMMANDS", {"wait": wait})
     with pytest.raises(SystemExit, match="130"):
         run(monkeypatch, "wait")
-    assert capsys.readouterr().err == "igps: interrupted. Run again to continue: finished results are kept.\n"
+    assert (
+        capsys.readouterr().err
+        == "igps: interrupted. Run again to continue: finished results are kept.\n"
+    )
 
 
 def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
@@ -452,7 +608,9 @@ def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
     monkeypatch.setattr(cli, "COMMANDS", {"ask": ask})
     with pytest.raises(SystemExit, match="2"):
         run(monkeypatch, "ask")
-    assert re.fullmatch(r"igps: out of memory \(.*1.00 PiB.*\). Reduce the input, .*\n", capsys.readouterr().err)
+    assert re.fullmatch(
+        r"igps: out of memory \(.*1.00 PiB.*\). Reduce the input, .*\n", capsys.readouterr().err
+    )
 
 
 def test_the_version_is_that_of_the_distribution(
@@ -460,11 +618,17 @@ def test_the_version_is_that_of_the_distribution(
 ) -> None:
     with pytest.raises(SystemExit, match="0"):
         run(monkeypatch, "--version")
-    assert capsys.readouterr().out.startswith(f"igps {importlib.metadata.version('interior-gps')}, signatures ")
+    assert capsys.readouterr().out.startswith(
+        f"igps {importlib.metadata.version('interior-gps')}, signatures "
+    )
 
 
-def test_commands_may_be_grouped(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def pose(mesh: Path, classes: list[int] | None = None, exact: bool = False, size: float = 2.0) -> None:
+def test_commands_may_be_grouped(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def pose(
+        mesh: Path, classes: list[int] | None = None, exact: bool = False, size: float = 2.0
+    ) -> None:
         """Draw a pose.
 
         Args:
@@ -475,11 +639,16 @@ def test_commands_may_be_grouped(monkeypatch: pytest.MonkeyPatch, capsys: pytest
         """
         print(mesh, classes, exact, size)
 
-    monkeypatch.setattr(cli, "COMMANDS", {"figure": {"pose": pose, "demo": cli.demo}, "query": cli.query})
+    monkeypatch.setattr(
+        cli, "COMMANDS", {"figure": {"pose": pose, "demo": cli.demo}, "query": cli.query}
+    )
     run(monkeypatch, "figure", "pose", "a.off", "--classes", "1", "2", "--exact")
     run(monkeypatch, "figure", "pose", "a.off", "--size", "3")
     assert capsys.readouterr().out.splitlines() == ["a.off [1, 2] True 2.0", "a.off None False 3.0"]
-    for arguments, words in ((["figure"], ("pose", "demo")), (["figure", "pose"], ("what to draw", "which to show"))):
+    for arguments, words in (
+        (["figure"], ("pose", "demo")),
+        (["figure", "pose"], ("what to draw", "which to show")),
+    ):
         with pytest.raises(SystemExit, match="0"):
             run(monkeypatch, *arguments, "--help")
         text = capsys.readouterr().out
@@ -497,7 +666,19 @@ def test_json_is_what_the_table_tells(
     assert "ADR self" in printed.err  # the table, where progress goes
 
     wanted = root / "ball" / "1.off"
-    run(monkeypatch, "query", wanted, "--gallery", root, "--top", "3", "--descriptor", INTERIOR, "--json", *options)
+    run(
+        monkeypatch,
+        "query",
+        wanted,
+        "--gallery",
+        root,
+        "--top",
+        "3",
+        "--descriptor",
+        INTERIOR,
+        "--json",
+        *options,
+    )
     rows = json.loads(capsys.readouterr().out)
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     histograms = describe(dataset, small_interior())
@@ -506,13 +687,26 @@ def test_json_is_what_the_table_tells(
     assert [row["name"] for row in rows] == [dataset.bodies.names[i] for i in order]
     assert [row["distance"] for row in rows] == pytest.approx(distances[order].tolist(), abs=1e-6)
     assert (rows[0]["rank"], rows[0]["class"]) == (1, "ball")
-    words = ["query", wanted, "--gallery", root / "ball", "--top", "1", "--descriptor", INTERIOR, "--json", *options]
+    words = [
+        "query",
+        wanted,
+        "--gallery",
+        root / "ball",
+        "--top",
+        "1",
+        "--descriptor",
+        INTERIOR,
+        "--json",
+        *options,
+    ]
     run(monkeypatch, *words)
     assert json.loads(capsys.readouterr().out)[0]["class"] is None  # the folder tells none
 
     run(monkeypatch, "compare", root, "--descriptors", INTERIOR, "--json", *options)
     (row,) = json.loads(capsys.readouterr().out)
-    expected = retrieval_scores(chi_square(histograms, histograms), dataset.bodies.labels or ()).mean()
+    expected = retrieval_scores(
+        chi_square(histograms, histograms), dataset.bodies.labels or ()
+    ).mean()
     assert {name: row[name] for name in expected} == pytest.approx(expected)
 
 
@@ -566,7 +760,9 @@ def test_json_of_two_bodies_and_of_copies(
     assert same == {larger: True, ball: False}
 
 
-def _writing(commands: cli.Commands, words: tuple[str, ...] = ()) -> dict[tuple[str, ...], cli.Command]:
+def _writing(
+    commands: cli.Commands, words: tuple[str, ...] = ()
+) -> dict[tuple[str, ...], cli.Command]:
     """The commands that have `out`, by the words that name them."""
     found: dict[tuple[str, ...], cli.Command] = {}
     for name, one in commands.items():
@@ -586,7 +782,11 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     endings = cli.ENDINGS.get(_writing(cli.COMMANDS)[words])
-    given = [*words, *([] if words == ("demo",) else [root]), *(["--model", "none"] if words == ("classify",) else [])]
+    given = [
+        *words,
+        *([] if words == ("demo",) else [root]),
+        *(["--model", "none"] if words == ("classify",) else []),
+    ]
     name = f"there{(endings or ['.csv'])[0]}"
 
     def told(place: Path) -> str:
@@ -594,7 +794,9 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
             run(monkeypatch, *given, "--out", place)
         return capsys.readouterr().err.splitlines()[-1]
 
-    monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    monkeypatch.setattr(
+        SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
+    )
     (tmp_path / "file").touch()
     assert told(tmp_path / "file" / name) == (
         f"igps: out: expected a folder, {tmp_path / 'file'} is a file. Choose another path."
@@ -602,51 +804,93 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
     (tmp_path / name).touch() if endings is None else (tmp_path / name).mkdir()
     kind, other = ("folder", "file") if endings is None else ("file", "folder")
     assert (
-        told(tmp_path / name) == f"igps: out: expected a {kind}, {tmp_path / name} is a {other}. Choose another path."
+        told(tmp_path / name)
+        == f"igps: out: expected a {kind}, {tmp_path / name} is a {other}. Choose another path."
     )
     if endings:
         assert told(tmp_path / "there.zip").startswith("igps: out: expected a file ending in ")
     monkeypatch.setattr("os.access", lambda *_: False)
-    assert told(tmp_path / "new" / name).startswith(f"igps: out: no permission to write to {tmp_path}.")
+    assert told(tmp_path / "new" / name).startswith(
+        f"igps: out: no permission to write to {tmp_path}."
+    )
 
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["retrieve", "ROOT", "--descriptor", "d2", "--with", "ct"], "attributes: expected 'ct' of each body"),
+        (
+            ["retrieve", "ROOT", "--descriptor", "d2", "--with", "ct"],
+            "attributes: expected 'ct' of each body",
+        ),
         (["explain", "ROOT", "--level", "2"], "level: expected a number between 0 and 1, got 2.0"),
         (["groups", "ROOT", "--n_permutations", "0"], "n_permutations: expected at least 1, got 0"),
         (
             ["retrieve", "ROOT", "--classes", "file"],
             "root: expected a class of two bodies or more, got 6 classes of one.",
         ),
-        (["fit", "ROOT", "--out", "ROOT"], "out: expected a new or empty folder, or a model's, ROOT holds "),
+        (
+            ["fit", "ROOT", "--out", "ROOT"],
+            "out: expected a new or empty folder, or a model's, ROOT holds ",
+        ),
         (["report", "TWO", "--meshes", "none"], "meshes: none: no such folder."),
         (["demo", "--n_workers", "0"], "n_workers: expected at least 1, got 0."),
-        (["retrieve", "ROOT", "--descriptor", ":"], "descriptor: expected package.module:NAME to be importable"),
-        (["retrieve", "ROOT", "--descriptor", "own_descriptors:write_egg"], "descriptor: expected own_descriptors:"),
-        (["retrieve", "ROOT", "--memory_limit", "-1"], "memory_limit: expected a positive number, got -1.0."),
-        (["retrieve", "ROOT", "--memory_limit", "1e400"], "memory_limit: expected a positive number, got inf."),
-        (["explain", "BALL"], "meshes: expected two files, or a folder of two classes, got 1 files."),
-        (["explain", "BALL", "BALL", "BALL"], "meshes: expected two files, or a folder of two classes, got 3 files."),
+        (
+            ["retrieve", "ROOT", "--descriptor", ":"],
+            "descriptor: expected package.module:NAME to be importable",
+        ),
+        (
+            ["retrieve", "ROOT", "--descriptor", "own_descriptors:write_egg"],
+            "descriptor: expected own_descriptors:",
+        ),
+        (
+            ["retrieve", "ROOT", "--memory_limit", "-1"],
+            "memory_limit: expected a positive number, got -1.0.",
+        ),
+        (
+            ["retrieve", "ROOT", "--memory_limit", "1e400"],
+            "memory_limit: expected a positive number, got inf.",
+        ),
+        (
+            ["explain", "BALL"],
+            "meshes: expected two files, or a folder of two classes, got 1 files.",
+        ),
+        (
+            ["explain", "BALL", "BALL", "BALL"],
+            "meshes: expected two files, or a folder of two classes, got 3 files.",
+        ),
         (["explain", "ROOT", "ROOT"], "ROOT: expected a file, got a folder."),
         (["distance", "BALL", "none.off"], "none.off: no such file."),
         (["query", "none.off", "--gallery", "ROOT"], "none.off: no such file."),
-        (["clusters", "ROOT", "--n_clusters", "7"], "n_clusters: expected 1 to 6, the bodies of the folder, got 7."),
-        (["clusters", "ROOT", "--n_clusters", "0"], "n_clusters: expected 1 to 6, the bodies of the folder, got 0."),
+        (
+            ["clusters", "ROOT", "--n_clusters", "7"],
+            "n_clusters: expected 1 to 6, the bodies of the folder, got 7.",
+        ),
+        (
+            ["clusters", "ROOT", "--n_clusters", "0"],
+            "n_clusters: expected 1 to 6, the bodies of the folder, got 0.",
+        ),
         (["clusters", "ROOT", "--n_resamples", "-1"], "n_resamples: expected at least 0, got -1."),
         (["clusters", "TWO"], "root: expected three bodies or more, TWO has 2."),
         (["figure", "map", "TWO"], "root: expected three bodies or more, TWO has 2."),
         (["figure", "map", "ROOT", "--seed", "-1"], "seed: expected 0 to 4294967295, got -1."),
-        (["groups", "ROOT", "--seed", "4294967296"], "seed: expected 0 to 4294967295, got 4294967296."),
+        (
+            ["groups", "ROOT", "--seed", "4294967296"],
+            "seed: expected 0 to 4294967295, got 4294967296.",
+        ),
         (["figure", "map", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
-        (["retrieve", "ROOT", "--with", "ct=-1"], "with: expected NAME or NAME=WEIGHT with a weight above 0, such as"),
+        (
+            ["retrieve", "ROOT", "--with", "ct=-1"],
+            "with: expected NAME or NAME=WEIGHT with a weight above 0, such as",
+        ),
         (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
         (
             ["duplicates", "ROOT", "--poses", "--tolerance", "0.01"],
             "tolerance: expected 0 with poses, got 0.01.",
         ),
-        (["classify", "ROOT", "--model", "plain.safetensors"], "model: expected a classifier, got d2."),
+        (
+            ["classify", "ROOT", "--model", "plain.safetensors"],
+            "model: expected a classifier, got d2.",
+        ),
     ],
 )
 def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
@@ -663,7 +907,9 @@ def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
     (tmp_path / "TWO" / "2.off").unlink()
     places = {"ROOT": str(root), "BALL": str(root / "ball" / "0.off")}
     monkeypatch.setitem(sys.modules, "umap", None)
-    monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    monkeypatch.setattr(
+        SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
+    )
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, *(places.get(word, word) for word in words))
     assert capsys.readouterr().err.startswith(f"igps: {told.replace('ROOT', str(root))}")
@@ -672,10 +918,15 @@ def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
 def test_a_list_of_failures_is_no_folder(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    monkeypatch.setattr(
+        SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
+    )
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, "precompute", root, "--failures", tmp_path)
-    assert capsys.readouterr().err == f"igps: failures: expected a file, {tmp_path} is a folder. Choose another path.\n"
+    assert (
+        capsys.readouterr().err
+        == f"igps: failures: expected a file, {tmp_path} is a folder. Choose another path.\n"
+    )
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])

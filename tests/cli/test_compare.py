@@ -48,7 +48,9 @@ def test_command_prints_and_writes_what_python_computes(
     rows = json.loads((out / "compare.json").read_text())
     assert [list(row) for row in rows] == [KEYS] * 3
     assert [row["descriptor"] for row in rows] == ["shape_dna", "d2", "interior"]
-    for row, result in zip(rows, compare(dataset, chosen, n_workers=1, progress=False), strict=True):
+    for row, result in zip(
+        rows, compare(dataset, chosen, n_workers=1, progress=False), strict=True
+    ):
         name, expected = result.descriptor.name, result.row()
         assert row.pop("seconds_per_mesh") >= 0
         expected.pop("seconds_per_mesh")
@@ -68,8 +70,22 @@ def test_the_papers_the_learned_and_the_compared_run_side_by_side(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ArticulatedShapes(n_classes=2, n_per_class=2, seed=5, n_vertices=500).write(tmp_path / "meshes")
-    options = ["--signature.resolution", "12", "--signature.n_surface_samples", "100", "--n_workers", "1"]
-    options += ["--signature.min_samples", "100", "--cache_dir", tmp_path / "cache", "--out", tmp_path / "out"]
+    options = [
+        "--signature.resolution",
+        "12",
+        "--signature.n_surface_samples",
+        "100",
+        "--n_workers",
+        "1",
+    ]
+    options += [
+        "--signature.min_samples",
+        "100",
+        "--cache_dir",
+        tmp_path / "cache",
+        "--out",
+        tmp_path / "out",
+    ]
     names = ["interior", "rich", "pretrained", "d2"]
     run(monkeypatch, "compare", tmp_path / "meshes", "--descriptors", *names, *options)
     printed = capsys.readouterr().out
@@ -95,7 +111,16 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
     logging.disable(logging.WARNING)
     bad = root / "egg" / "bad.off"
     bad.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    arguments = ["compare", root, "--out", tmp_path, "--cache_dir", root.parent / "cache", *SMALL, "--descriptors"]
+    arguments = [
+        "compare",
+        root,
+        "--out",
+        tmp_path,
+        "--cache_dir",
+        root.parent / "cache",
+        *SMALL,
+        "--descriptors",
+    ]
     chosen = ["own_descriptors:picky", "own_descriptors:broken"]
     try:
         run(monkeypatch, *arguments, *chosen)
@@ -125,7 +150,16 @@ def test_unknown_descriptor_is_named_before_anything_is_computed(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, "compare", root, "--descriptors", "d2", "d5", "--cache_dir", tmp_path / "cache")
+        run(
+            monkeypatch,
+            "compare",
+            root,
+            "--descriptors",
+            "d2",
+            "d5",
+            "--cache_dir",
+            tmp_path / "cache",
+        )
     error = capsys.readouterr().err
     assert f"expected one of {', '.join(NAMES)}, molecular, or package.module:NAME" in error
     assert "got 'd5'" in error

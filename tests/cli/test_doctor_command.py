@@ -33,8 +33,16 @@ def test_table_and_file_of_a_folder_that_can_be_used(
     header, *lines, total, written = capsys.readouterr().out.splitlines()
     assert header.split() == ["vertices", "after", "seconds", "MB", "steps"]
     cells = {line.split()[0]: line.split()[1:] for line in lines}
-    assert cells["a/clean.off"][:2] + cells["a/clean.off"][4:] == [str(N_VERTICES), str(N_VERTICES), "none"]
-    assert cells["a/soup.off"][:2] + cells["a/soup.off"][4:] == [str(3 * N_FACES), str(N_VERTICES), "welded"]
+    assert cells["a/clean.off"][:2] + cells["a/clean.off"][4:] == [
+        str(N_VERTICES),
+        str(N_VERTICES),
+        "none",
+    ]
+    assert cells["a/soup.off"][:2] + cells["a/soup.off"][4:] == [
+        str(3 * N_FACES),
+        str(N_VERTICES),
+        "welded",
+    ]
     assert cells["b/box.off"][0] == "8"
     assert cells["b/box.off"][4:] == ["subdivided"]
     assert total.startswith("3 bodies: 2 repaired, 0 cannot be used; about ")
@@ -43,11 +51,17 @@ def test_table_and_file_of_a_folder_that_can_be_used(
     rows = {row["name"]: row for row in csv.DictReader(out.open(newline=""))}
     assert list(rows) == ["a/clean.off", "a/soup.off", "b/box.off"]
     for name, row in rows.items():
-        assert [row["vertices"], row["vertices_after"], row["seconds"], row["megabytes"]] == cells[name][:4]
+        assert [row["vertices"], row["vertices_after"], row["seconds"], row["megabytes"]] == cells[
+            name
+        ][:4]
         assert (row["usable"], row["error"]) == ("yes", "")
         assert float(row["seconds"]) > 0
         assert float(row["megabytes"]) > 0
-    assert (rows["a/clean.off"]["fault"], rows["a/clean.off"]["mended_by"], rows["a/clean.off"]["notes"]) == ("",) * 3
+    assert (
+        rows["a/clean.off"]["fault"],
+        rows["a/clean.off"]["mended_by"],
+        rows["a/clean.off"]["notes"],
+    ) == ("",) * 3
     assert "boundary edges" in rows["a/soup.off"]["fault"]
     assert rows["a/soup.off"]["mended_by"] == "welded"
     assert rows["a/soup.off"]["notes"] == f"welded {3 * N_FACES - N_VERTICES} coincident vertices"
@@ -69,12 +83,18 @@ def test_status_is_1_if_a_file_cannot_be_used(
         (line,) = [line for line in lines if line.startswith(f"{name} ")]
         assert line.endswith(f"cannot be used: {root / name}: {sentence}")
     assert any(
-        line.startswith(f"{1 + len(sentences)} bodies: 0 repaired, {len(sentences)} cannot be used") for line in lines
+        line.startswith(f"{1 + len(sentences)} bodies: 0 repaired, {len(sentences)} cannot be used")
+        for line in lines
     )
     assert "Traceback" not in printed.out + printed.err
     rows = {row["name"]: row for row in csv.DictReader(out.open(newline=""))}
-    assert {name: row["usable"] for name, row in rows.items()} == {"clean.off": "yes", **dict.fromkeys(sentences, "no")}
-    assert all(rows[name]["error"] == f"{root / name}: {sentence}" for name, sentence in sentences.items())
+    assert {name: row["usable"] for name, row in rows.items()} == {
+        "clean.off": "yes",
+        **dict.fromkeys(sentences, "no"),
+    }
+    assert all(
+        rows[name]["error"] == f"{root / name}: {sentence}" for name, sentence in sentences.items()
+    )
 
 
 def test_options_choose_the_mending(
@@ -102,4 +122,8 @@ def test_files_that_bodies_bring_along_are_not_examined(
     write_clean(tmp_path / "a" / "clean.off")
     write_clean(tmp_path / "a" / "clean_fields.off")
     run(monkeypatch, "doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)
-    assert capsys.readouterr().out.splitlines()[-1].startswith("1 bodies: 0 repaired, 0 cannot be used")
+    assert (
+        capsys.readouterr()
+        .out.splitlines()[-1]
+        .startswith("1 bodies: 0 repaired, 0 cannot be used")
+    )

@@ -23,7 +23,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     index = np.indices((24, 20, 20))
     for i in (1, 2):
         labels = np.zeros((24, 20, 20), dtype=np.uint8)
-        labels[((index - np.array([6, 9, 9]).reshape(3, 1, 1, 1)) ** 2).sum(axis=0) < 20 + 6 * i] = 1
+        labels[
+            ((index - np.array([6, 9, 9]).reshape(3, 1, 1, 1)) ** 2).sum(axis=0) < 20 + 6 * i
+        ] = 1
         labels[14:20, 5:12, 5 : 14 + i] = 2
         labels[22, 2:9, 2] = 3 * (i == 2)
         nibabel.save(nibabel.Nifti1Image(labels, np.diag([2.0, 2, 2, 1])), folder / f"{i}.nii.gz")
@@ -34,7 +36,17 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def extract(monkeypatch: pytest.MonkeyPatch, root: Path, out: Path, *options: str) -> None:
     cache = ["--cache_dir", str(root.parent / "cache"), "--n_workers", "1"]
-    words = ["extract", str(root), "--out", str(out), "--descriptor", INTERIOR, *SMALL, *cache, *options]
+    words = [
+        "extract",
+        str(root),
+        "--out",
+        str(out),
+        "--descriptor",
+        INTERIOR,
+        *SMALL,
+        *cache,
+        *options,
+    ]
     monkeypatch.setattr(sys, "argv", ["igps", *words])
     main()
 
@@ -45,13 +57,20 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(
     extract(monkeypatch, root, tmp_path / "features.csv")
     assert "4 descriptions of shape (642,)" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "features.csv", dtype={"age": str}, keep_default_na=False)
-    assert table["name"].tolist() == ["1.nii.gz#liver", "1.nii.gz#spleen", "2.nii.gz#liver", "2.nii.gz#spleen"]
+    assert table["name"].tolist() == [
+        "1.nii.gz#liver",
+        "1.nii.gz#spleen",
+        "2.nii.gz#liver",
+        "2.nii.gz#spleen",
+    ]
     assert table["file"].tolist() == ["1.nii.gz"] * 2 + ["2.nii.gz"] * 2
     assert table["part"].tolist() == ["liver", "spleen"] * 2
     assert table["class"].tolist() == ["well", "well", "ill", "ill"]
     assert table["age"].tolist() == ["40", "40", "", ""]
     assert table["unit"].tolist() == ["mm"] * 4
-    n_voxels = [nibabel.load(root / f"{i}.nii.gz").get_fdata() == label for i in (1, 2) for label in (1, 2)]
+    n_voxels = [
+        nibabel.load(root / f"{i}.nii.gz").get_fdata() == label for i in (1, 2) for label in (1, 2)
+    ]
     np.testing.assert_allclose(table["volume"], [8 * mask.sum() for mask in n_voxels], rtol=1e-3)
     assert (table["area"] > (36 * np.pi) ** (1 / 3) * table["volume"] ** (2 / 3)).all()
     extract(monkeypatch, root, tmp_path / "features.npz")
@@ -72,7 +91,14 @@ def test_a_wide_table_has_a_row_for_each_file(
     extract(monkeypatch, root, tmp_path / f"long.{suffix}")
     extract(monkeypatch, root, tmp_path / f"wide.{suffix}", "--wide")
     long, wide = read(tmp_path / f"long.{suffix}"), read(tmp_path / f"wide.{suffix}")
-    assert wide.columns.tolist()[:6] == ["file", "class", "age", "unit", "liver.volume", "liver.area"]
+    assert wide.columns.tolist()[:6] == [
+        "file",
+        "class",
+        "age",
+        "unit",
+        "liver.volume",
+        "liver.area",
+    ]
     assert len(wide.columns) == 4 + 2 * (2 + 642)
     assert wide["class"].tolist() == ["well", "ill"]
     assert wide["age"].sum() == 40  # a number in Parquet, too
@@ -86,14 +112,22 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As TotalSegmentator writes them: two subjects with a cube and a bar, the third without the bar."""
-    for i, sides in enumerate([{"cube": (8, 8, 8), "bar": (5, 5, 15)}, {"cube": (9, 9, 9), "bar": (5, 5, 17)},
-                               {"cube": (10, 10, 10)}]):  # fmt: skip
+    for i, sides in enumerate(
+        [
+            {"cube": (8, 8, 8), "bar": (5, 5, 15)},
+            {"cube": (9, 9, 9), "bar": (5, 5, 17)},
+            {"cube": (10, 10, 10)},
+        ]
+    ):
         (folder := tmp_path / f"masks/s{i}/segmentations").mkdir(parents=True)
         for name, (a, b, c) in sides.items():
             mask = np.zeros((20, 20, 20), dtype=np.uint8)
             mask[2 : 2 + a, 2 : 2 + b, 2 : 2 + c] = 1
             nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), folder / f"{name}.nii.gz")
-    rows = [f"{path.relative_to(tmp_path / 'masks')}" for path in sorted((tmp_path / "masks").rglob("*.nii.gz"))]
+    rows = [
+        f"{path.relative_to(tmp_path / 'masks')}"
+        for path in sorted((tmp_path / "masks").rglob("*.nii.gz"))
+    ]
     lines = [f"{row},{row[:2]},{'b' if row.startswith('s2') else 'a'}" for row in rows]
     (tmp_path / "masks" / "labels.csv").write_text("\n".join(["file,label,folder", *lines]))
     extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
@@ -101,16 +135,24 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
     assert wide["folder"].tolist() == [f"s{i}/segmentations" for i in range(3)]
     np.testing.assert_allclose(wide["cube.volume"], [512, 729, 1000], rtol=1e-3)
     np.testing.assert_allclose(wide["bar.volume"], [375, 425, np.nan], rtol=1e-3)
-    assert wide["folder of labels.csv"].tolist() == ["a", "a", "b"]  # a column of the user's takes no rows together
+    assert wide["folder of labels.csv"].tolist() == [
+        "a",
+        "a",
+        "b",
+    ]  # a column of the user's takes no rows together
     assert "file" not in wide
     assert wide["class"].tolist() == ["s0", "s1", "s2"]
     assert "wide.csv, rows: 3" in capsys.readouterr().out
-    extract(monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide")  # of a single subject
+    extract(
+        monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide"
+    )  # of a single subject
     one = pd.read_csv(tmp_path / "one.csv")
     np.testing.assert_allclose(one[["bar.volume", "cube.volume"]], [[375, 512]], rtol=1e-3)
 
 
-def test_masks_that_are_numbered_have_a_row_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_masks_that_are_numbered_have_a_row_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two subjects of each class: a number is no organ's name."""
     sides = {("ill", 0): 5, ("ill", 1): 6, ("well", 0): 7, ("well", 1): 8}
     for (label, number), side in sides.items():
@@ -143,10 +185,14 @@ def test_columns_that_are_called_as_ours_are_kept_beside_them(
     assert table["unit"].tolist() == ["mm"] * len(table)
 
 
-def test_a_body_that_a_file_lacks_has_no_values(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_body_that_a_file_lacks_has_no_values(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("1.nii.gz", "2.nii.gz", "1.csv", "2.csv"):
         (tmp_path / name).write_bytes((root / name).read_bytes())
-    (tmp_path / "labels.csv").write_text("file,body,label\n1.nii.gz,liver,a\n2.nii.gz,liver,b\n2.nii.gz,spleen,c\n")
+    (tmp_path / "labels.csv").write_text(
+        "file,body,label\n1.nii.gz,liver,a\n2.nii.gz,liver,b\n2.nii.gz,spleen,c\n"
+    )
     extract(monkeypatch, tmp_path, tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     assert wide["liver.class"].tolist() == ["a", "b"]
@@ -155,12 +201,19 @@ def test_a_body_that_a_file_lacks_has_no_values(root: Path, tmp_path: Path, monk
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [(["out.txt"], "ending in .csv, .parquet, .npz"), (["out.npz", "--wide"], "wide table ending in .csv or .parquet")],
+    [
+        (["out.txt"], "ending in .csv, .parquet, .npz"),
+        (["out.npz", "--wide"], "wide table ending in .csv or .parquet"),
+    ],
 )
 def test_a_file_of_another_kind_is_refused_before_anything_is_computed(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    options: list[str], words: str,
-) -> None:  # fmt: skip
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    words: str,
+) -> None:
     with pytest.raises(SystemExit, match="1"):
         extract(monkeypatch, root, tmp_path / options[0], *options[1:])
     assert words in capsys.readouterr().err.replace("one of ", "")

@@ -19,7 +19,14 @@ from igps.cli import main
 from igps.nn.description import describe
 from own_descriptors import write_egg
 
-SMALL = ["--signature.resolution", "9", "--signature.min_samples", "0", "--signature.n_surface_samples", "40"]
+SMALL = [
+    "--signature.resolution",
+    "9",
+    "--signature.min_samples",
+    "0",
+    "--signature.n_surface_samples",
+    "40",
+]
 HEIGHTS = {"flat": 0.5, "long": 2.0}
 
 
@@ -34,7 +41,15 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def call(monkeypatch: pytest.MonkeyPatch, root: Path, *words: object) -> None:
-    command = ["igps", *map(str, words), "--cache_dir", str(root / "cache"), "--n_workers", "1", *SMALL]
+    command = [
+        "igps",
+        *map(str, words),
+        "--cache_dir",
+        str(root / "cache"),
+        "--n_workers",
+        "1",
+        *SMALL,
+    ]
     monkeypatch.setattr(sys, "argv", command)
     main()
 
@@ -70,36 +85,88 @@ def test_fit_writes_model_and_card(
 def test_fit_writes_a_folder_to_share(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["fit", root / "eggs", "--descriptor", "rich", "--head", "classifier", "--out", tmp_path / "mine"]
+    words = [
+        "fit",
+        root / "eggs",
+        "--descriptor",
+        "rich",
+        "--head",
+        "classifier",
+        "--out",
+        tmp_path / "mine",
+    ]
     call(monkeypatch, root, *words, "--json")
     told = json.loads(capsys.readouterr().out)
-    assert {path.name for path in (tmp_path / "mine").iterdir()} == {"model.safetensors", "README.md"}
+    assert {path.name for path in (tmp_path / "mine").iterdir()} == {
+        "model.safetensors",
+        "README.md",
+    }
     assert json.dumps(told["held_out_scores"]) in (tmp_path / "mine" / "README.md").read_text()
     call(monkeypatch, root, "classify", root / "eggs", "--model", tmp_path / "mine", "--json")
-    assert [row["class"] for row in json.loads(capsys.readouterr().out)] == ["flat"] * 3 + ["long"] * 3
+    assert [row["class"] for row in json.loads(capsys.readouterr().out)] == ["flat"] * 3 + [
+        "long"
+    ] * 3
 
 
 @pytest.mark.parametrize("cavities", ["fill", "keep"])
 def test_bodies_that_are_read_otherwise_than_those_of_the_fit_are_told(
-    root: Path, model: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], cavities: str
+    root: Path,
+    model: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    cavities: str,
 ) -> None:
     call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--cavities", cavities)
-    assert ("read with --cavities fill, not keep" in capsys.readouterr().out) == (cavities == "keep")
+    assert ("read with --cavities fill, not keep" in capsys.readouterr().out) == (
+        cavities == "keep"
+    )
 
 
 def test_every_command_takes_the_file(
-    root: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path,
+    model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     found = library.load(model)
     expected = describe(dataset(root, model), found)
-    call(monkeypatch, root, "extract", root / "eggs", "--descriptor", model, "--out", tmp_path / "features.npz")
+    call(
+        monkeypatch,
+        root,
+        "extract",
+        root / "eggs",
+        "--descriptor",
+        model,
+        "--out",
+        tmp_path / "features.npz",
+    )
     with np.load(tmp_path / "features.npz") as archive:
         np.testing.assert_allclose(archive["features"], expected, atol=1e-6)
-    call(monkeypatch, root, "retrieve", root / "eggs", "--descriptor", model, "--out", tmp_path / "retrieved")
-    with np.load(tmp_path / "retrieved" / "distances.npz") as archive:
-        np.testing.assert_allclose(archive["distances"], found.distances(expected, expected), atol=1e-6)
     call(
-        monkeypatch, root, "compare", root / "eggs", "--descriptors", model, "interior", "--out", tmp_path / "compared"
+        monkeypatch,
+        root,
+        "retrieve",
+        root / "eggs",
+        "--descriptor",
+        model,
+        "--out",
+        tmp_path / "retrieved",
+    )
+    with np.load(tmp_path / "retrieved" / "distances.npz") as archive:
+        np.testing.assert_allclose(
+            archive["distances"], found.distances(expected, expected), atol=1e-6
+        )
+    call(
+        monkeypatch,
+        root,
+        "compare",
+        root / "eggs",
+        "--descriptors",
+        model,
+        "interior",
+        "--out",
+        tmp_path / "compared",
     )
     rows = json.loads((tmp_path / "compared" / "compare.json").read_text())
     assert [row["descriptor"] for row in rows] == ["rich_classifier", "interior"]
@@ -110,20 +177,43 @@ def test_every_command_takes_the_file(
     call(monkeypatch, root, *query, "--gallery", root / "eggs", "--descriptor", model)
     nearest = json.loads(capsys.readouterr().out)
     assert [row["class"] for row in nearest] == ["long"] * 3
-    call(monkeypatch, root, "gallery", "build", root / "eggs", "--descriptor", model, "--out", tmp_path / "eggs.igps")
+    call(
+        monkeypatch,
+        root,
+        "gallery",
+        "build",
+        root / "eggs",
+        "--descriptor",
+        model,
+        "--out",
+        tmp_path / "eggs.igps",
+    )
     monkeypatch.chdir(tmp_path)
     moved = tmp_path / "moved.safetensors"
     moved.write_bytes(model.read_bytes())
     for options in ([], ["--descriptor", "moved.safetensors"]):
         capsys.readouterr()
-        words = [*map(str, query), "--gallery", "eggs.igps", *options, "--cache_dir", str(root / "cache")]
+        words = [
+            *map(str, query),
+            "--gallery",
+            "eggs.igps",
+            *options,
+            "--cache_dir",
+            str(root / "cache"),
+        ]
         monkeypatch.setattr(sys, "argv", ["igps", *words])
         main()
-        assert [row["name"] for row in json.loads(capsys.readouterr().out)] == [row["name"] for row in nearest]
+        assert [row["name"] for row in json.loads(capsys.readouterr().out)] == [
+            row["name"] for row in nearest
+        ]
 
 
 def test_classify_tells_what_python_computes(
-    root: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path,
+    model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "classes.csv"
     call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--out", out, "--json")
@@ -131,38 +221,73 @@ def test_classify_tells_what_python_computes(
     expected = classify(dataset(root, model), str(model))
     assert [one["name"] for one in told] == list(expected.names)
     assert [one["most_like"] for one in told] == ["flat"] * 3 + ["long"] * 3
-    assert [one["probability"] for one in told] == pytest.approx(expected.probabilities.max(dim=1).values.tolist())
+    assert [one["probability"] for one in told] == pytest.approx(
+        expected.probabilities.max(dim=1).values.tolist()
+    )
     with out.open(newline="") as file:
         header, *rows = csv.reader(file)
     assert header == ["name", "class", "most_like", "flat", "long"]
-    assert [row[:3] for row in rows] == [[one["name"], one["class"] or "", one["most_like"]] for one in told]
+    assert [row[:3] for row in rows] == [
+        [one["name"], one["class"] or "", one["most_like"]] for one in told
+    ]
     torch.testing.assert_close(
-        torch.tensor([[float(one) for one in row[3:]] for row in rows]), expected.probabilities, rtol=0, atol=1e-6
+        torch.tensor([[float(one) for one in row[3:]] for row in rows]),
+        expected.probabilities,
+        rtol=0,
+        atol=1e-6,
     )
 
 
 def test_what_is_unlike_everything_is_said(
-    root: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path,
+    model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     import trimesh
 
     box = trimesh.creation.box((1, 1, 12)).subdivide().subdivide().subdivide().subdivide()
     box.export(tmp_path / "rod.off")
-    call(monkeypatch, root, "classify", tmp_path / "rod.off", root / "eggs" / "flat" / "1.off", "--model", model)
+    call(
+        monkeypatch,
+        root,
+        "classify",
+        tmp_path / "rod.off",
+        root / "eggs" / "flat" / "1.off",
+        "--model",
+        model,
+    )
     lines = capsys.readouterr().out.splitlines()
     assert "unlike every known class" in next(line for line in lines if "rod.off" in line)
     assert next(line for line in lines if "1.off" in line).endswith("flat")
 
 
 def test_wrong_files_cost_one_sentence(
-    root: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path,
+    model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "bad.safetensors").write_bytes(model.read_bytes()[:-10])
     for words, message in (
-        (["fit", root / "eggs", "--out", tmp_path / "mine.pt"], "out: expected a file ending in .safetensors"),
-        (["classify", root / "eggs", "--model", tmp_path / "bad.safetensors"], "expected a descriptor in the format"),
-        (["retrieve", root / "eggs", "--descriptor", tmp_path / "bad.safetensors"], "expected a descriptor in the"),
-        (["retrieve", root / "eggs", "--descriptor", tmp_path / "no.safetensors"], "no such file. Check the path."),
+        (
+            ["fit", root / "eggs", "--out", tmp_path / "mine.pt"],
+            "out: expected a file ending in .safetensors",
+        ),
+        (
+            ["classify", root / "eggs", "--model", tmp_path / "bad.safetensors"],
+            "expected a descriptor in the format",
+        ),
+        (
+            ["retrieve", root / "eggs", "--descriptor", tmp_path / "bad.safetensors"],
+            "expected a descriptor in the",
+        ),
+        (
+            ["retrieve", root / "eggs", "--descriptor", tmp_path / "no.safetensors"],
+            "no such file. Check the path.",
+        ),
     ):
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, root, *words)
@@ -185,13 +310,30 @@ def test_what_no_file_can_hold_is_refused_before_anything_is_computed(
 
 @pytest.mark.parametrize("goal", ["known", "new"])
 def test_too_few_classes_are_told_before_anything_is_computed(
-    goal: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    goal: str,
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(library.SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    monkeypatch.setattr(
+        library.SignatureDataset,
+        "precompute",
+        lambda *_, **__: pytest.fail("signatures are computed"),
+    )
     folder = tmp_path / "few"
     for label in ("one", "two")[: 1 + (goal == "new")]:
-        shutil.copytree(next(path for path in (root / "eggs").iterdir() if path.is_dir()), folder / label)
-    monkeypatch.setattr(sys, "argv", ["igps", "fit", f"{folder}", "--goal", goal, "--out", f"{tmp_path}/m.safetensors"])
+        shutil.copytree(
+            next(path for path in (root / "eggs").iterdir() if path.is_dir()), folder / label
+        )
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        ["igps", "fit", f"{folder}", "--goal", goal, "--out", f"{tmp_path}/m.safetensors"],
+    )
     with pytest.raises(SystemExit, match="1"):
         main()
-    assert f"classes: expected at least {4 if goal == 'new' else 2}, one of them" in capsys.readouterr().err
+    assert (
+        f"classes: expected at least {4 if goal == 'new' else 2}, one of them"
+        in capsys.readouterr().err
+    )

@@ -53,7 +53,13 @@ def check_notes(path: Path) -> None:
     """Each mended file, by what was done to it by hand, and no other."""
     found = dict(notes(path))
     assert len(found) == len(notes(path))
-    assert set(found) == {"ball/soup.off", "egg/soup.off", "ball/holed.off", "box/1.off", "box/2.off"}
+    assert set(found) == {
+        "ball/soup.off",
+        "egg/soup.off",
+        "ball/holed.off",
+        "box/1.off",
+        "box/2.off",
+    }
     assert found["ball/soup.off"] == found["egg/soup.off"] == WELDED
     assert found["ball/holed.off"] == "filled 1 small holes"
     assert all(found[f"box/{i}.off"].startswith("subdivided from 8 to ") for i in (1, 2))
@@ -86,7 +92,17 @@ def test_extract_and_compare_write_the_same_notes(
     run(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *cache, *ONE)
     assert capsys.readouterr().out.splitlines()[0] == SUMMARY
     check_notes(tmp_path / "deep" / "all.notes.csv")
-    run(monkeypatch, "compare", root, "--descriptors", "d2", "--out", tmp_path / "out", *cache, *SMALL)
+    run(
+        monkeypatch,
+        "compare",
+        root,
+        "--descriptors",
+        "d2",
+        "--out",
+        tmp_path / "out",
+        *cache,
+        *SMALL,
+    )
     assert SUMMARY in capsys.readouterr().out.splitlines()
     check_notes(tmp_path / "out" / "notes.csv")
 
@@ -101,8 +117,17 @@ def test_never_and_always(
         printed = capsys.readouterr().out
         assert "5 of 8 meshes could not be used." in printed
         assert "repaired" not in printed
-        refused = {row["name"]: row["error"] for row in csv.DictReader((tmp_path / "out" / "failures.csv").open())}
-        assert set(refused) == {"ball/soup.off", "egg/soup.off", "ball/holed.off", "box/1.off", "box/2.off"}
+        refused = {
+            row["name"]: row["error"]
+            for row in csv.DictReader((tmp_path / "out" / "failures.csv").open())
+        }
+        assert set(refused) == {
+            "ball/soup.off",
+            "egg/soup.off",
+            "ball/holed.off",
+            "box/1.off",
+            "box/2.off",
+        }
         assert "6 boundary edges" in refused["ball/holed.off"]
         assert "expected at least 22 vertices for 20 eigenpairs" in refused["box/1.off"]
         assert all(error.startswith(str(root)) for error in refused.values())
@@ -138,7 +163,9 @@ NO_MESHES = "merge", "remove", "update", "info", "versions", "restore"
 READS_NONE = {("demo",), ("report",), ("completion",), *(("gallery", one) for one in NO_MESHES)}
 
 
-@pytest.mark.parametrize("command", [c for c in leaves(COMMANDS) if c not in READS_NONE], ids=" ".join)
+@pytest.mark.parametrize(
+    "command", [c for c in leaves(COMMANDS) if c not in READS_NONE], ids=" ".join
+)
 def test_every_command_that_reads_meshes_has_the_choice(
     command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -151,9 +178,12 @@ def test_every_command_that_reads_meshes_has_the_choice(
 
 @pytest.mark.parametrize("command", ["retrieve", "extract"])
 def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    command: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
+) -> None:
     without_collada(monkeypatch)
     root, out = tmp_path / "meshes", tmp_path / "out"
     for label, height in (("ball", 1.0), ("egg", 2.0)):
@@ -164,7 +194,9 @@ def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
         target = place if command == "retrieve" else place / "all.npz"
         run(monkeypatch, command, root, "--out", target, "--cache_dir", place / "cache", *ONE)
         with np.load(place / ("distances.npz" if command == "retrieve" else "all.npz")) as archive:
-            return archive["names"].tolist(), archive["distances" if command == "retrieve" else "features"]
+            return archive["names"].tolist(), archive[
+                "distances" if command == "retrieve" else "features"
+            ]
 
     names, values = features(tmp_path / "clean")
     sentences = write_unusable(root / "egg")
@@ -174,10 +206,18 @@ def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
     assert names_beside == names == ["ball/0.off", "ball/1.off", "egg/0.off", "egg/1.off"]
     np.testing.assert_array_equal(values_beside, values)
     said = {record.getMessage() for record in caplog.records if "skipped" in record.getMessage()}
-    assert said == {f"skipped: {root / 'egg' / name}: {sentence}" for name, sentence in sentences.items()}
+    assert said == {
+        f"skipped: {root / 'egg' / name}: {sentence}" for name, sentence in sentences.items()
+    }
     printed = capsys.readouterr()
     assert "Traceback" not in printed.out + printed.err
     if command == "retrieve":
-        rows = {row["name"]: row["error"] for row in csv.DictReader((out / "failures.csv").open(newline=""))}
-        assert rows == {f"egg/{name}": f"{root / 'egg' / name}: {sentence}" for name, sentence in sentences.items()}
+        rows = {
+            row["name"]: row["error"]
+            for row in csv.DictReader((out / "failures.csv").open(newline=""))
+        }
+        assert rows == {
+            f"egg/{name}": f"{root / 'egg' / name}: {sentence}"
+            for name, sentence in sentences.items()
+        }
     assert f"{len(sentences)} of {4 + len(sentences)} meshes could not be used." in printed.out

@@ -38,26 +38,54 @@ def bars(text: str) -> dict[str, tuple[int, int]]:
 @pytest.mark.parametrize(
     ("command", "expected"),
     [
-        ("retrieve ROOT --descriptor INTERIOR --out OUT --rerank --report SMALL",
-         {"signatures": 4, "descriptions": 4, "distances by interior": 4, "re-ranked": 4, "rankings": 4,
-          "pictures": 4}),
-        ("compare ROOT --descriptors INTERIOR SMALL",
-         {"signatures": 4, "descriptions": 4, "distances by interior": 4}),
-        ("extract ROOT --out OUT.npz --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
-        ("query MESH --gallery ROOT --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
+        (
+            "retrieve ROOT --descriptor INTERIOR --out OUT --rerank --report SMALL",
+            {
+                "signatures": 4,
+                "descriptions": 4,
+                "distances by interior": 4,
+                "re-ranked": 4,
+                "rankings": 4,
+                "pictures": 4,
+            },
+        ),
+        (
+            "compare ROOT --descriptors INTERIOR SMALL",
+            {"signatures": 4, "descriptions": 4, "distances by interior": 4},
+        ),
+        (
+            "extract ROOT --out OUT.npz --descriptor INTERIOR SMALL",
+            {"signatures": 4, "descriptions": 4},
+        ),
+        (
+            "query MESH --gallery ROOT --descriptor INTERIOR SMALL",
+            {"signatures": 4, "descriptions": 4},
+        ),
         ("precompute ROOT --descriptors INTERIOR SMALL", {"signatures": 4}),
-        ("gallery build ROOT --out OUT.igps --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
+        (
+            "gallery build ROOT --out OUT.igps --descriptor INTERIOR SMALL",
+            {"signatures": 4, "descriptions": 4},
+        ),
         ("figure pose ROOT --out OUT.png SMALL", {"signatures": 4, "descriptions": 4}),
-        ("figure topology MESH --weld 0 3 --out OUT.png --n_eigenpairs 20 --resolution 10", {"steps": 6}),
+        (
+            "figure topology MESH --weld 0 3 --out OUT.png --n_eigenpairs 20 --resolution 10",
+            {"steps": 6},
+        ),
         ("figure potential MESH --out OUT.png --n_eigenpairs 20 --resolution 10", {"steps": 7}),
-        ("robustness MESH OTHER --descriptors INTERIOR SMALL", {"signatures": 2, "altered meshes": None}),
-        ("damage ROOT --descriptors INTERIOR --damages noise SMALL", {"signatures": 4, "altered meshes": 8}),
+        (
+            "robustness MESH OTHER --descriptors INTERIOR SMALL",
+            {"signatures": 2, "altered meshes": None},
+        ),
+        (
+            "damage ROOT --descriptors INTERIOR --damages noise SMALL",
+            {"signatures": 4, "altered meshes": 8},
+        ),
         ("doctor ROOT --n_workers 1", {"bodies": 4}),
         ("distance MESH OTHER --n_workers 1", {"signatures": 2, "descriptions": 2}),
         ("duplicates ROOT --n_workers 1", {"signatures": 4, "surfaces": 4, "compared": 4}),
     ],
     ids=lambda value: value.split(" ROOT")[0].split(" MESH")[0] if isinstance(value, str) else "",
-)  # fmt: skip
+)
 def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
     command: str,
     expected: dict[str, int | None],
@@ -68,10 +96,16 @@ def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
 ) -> None:
     """The bars have the names, and the ends that the number of files sets, and they reach them."""
     words = {
-        "ROOT": str(root), "MESH": str(root / "egg" / "0.off"), "OTHER": str(root / "ball" / "1.off"),
-        "INTERIOR": INTERIOR, "SMALL": " ".join(SMALL), "OUT": str(tmp_path / "out"),
-    }  # fmt: skip
-    line = re.sub(r"\b(ROOT|MESH|OTHER|INTERIOR|SMALL|OUT)\b", lambda match: words[match[0]], command)
+        "ROOT": str(root),
+        "MESH": str(root / "egg" / "0.off"),
+        "OTHER": str(root / "ball" / "1.off"),
+        "INTERIOR": INTERIOR,
+        "SMALL": " ".join(SMALL),
+        "OUT": str(tmp_path / "out"),
+    }
+    line = re.sub(
+        r"\b(ROOT|MESH|OTHER|INTERIOR|SMALL|OUT)\b", lambda match: words[match[0]], command
+    )
     reads_signatures = not command.startswith(("figure topology", "figure potential", "doctor"))
     cache = ["--cache_dir", str(tmp_path / "cache")] if reads_signatures else []
     monkeypatch.setattr(sys, "argv", ["igps", *line.split(), *cache])
@@ -97,12 +131,16 @@ def test_merging_galleries_shows_a_bar(
         main()
     capsys.readouterr()
     both = [str(tmp_path / f"{name}.igps") for name in ("ball", "egg")]
-    monkeypatch.setattr(sys, "argv", ["igps", "gallery", "merge", *both, "--out", str(tmp_path / "all.igps")])
+    monkeypatch.setattr(
+        sys, "argv", ["igps", "gallery", "merge", *both, "--out", str(tmp_path / "all.igps")]
+    )
     main()
     assert bars(capsys.readouterr().err)["entries"] == (4, 4)
 
 
-def test_the_library_is_silent_unless_asked(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_library_is_silent_unless_asked(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from training.studies.paper import weld_change
 
     from igps.mesh.loading import load_mesh

@@ -33,7 +33,9 @@ def root(tmp_path: Path) -> Path:
 
 
 def data_of(page: Path) -> dict:  # type: ignore[type-arg]
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text("utf-8"))
+    found = re.search(
+        r'<script type="application/json" id="data">(.*?)</script>', page.read_text("utf-8")
+    )
     assert found is not None
     return json.loads(found[1])
 
@@ -56,11 +58,21 @@ def test_retrieve_with_its_page(
     run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(out, "--report"))
     assert capsys.readouterr().out.splitlines()[-1] == f"page of results: {out / 'report.html'}"
     data = data_of(out / "report.html")
-    assert [shape["name"] for shape in data["shapes"]] == ["ball/0.off", "ball/1.off", "egg/0.off", "egg/1.off"]
+    assert [shape["name"] for shape in data["shapes"]] == [
+        "ball/0.off",
+        "ball/1.off",
+        "egg/0.off",
+        "egg/1.off",
+    ]
     assert all(shape["mesh"][0] == 162 for shape in data["shapes"])  # an icosphere, divided twice
     assert data["systems"][0]["scores"] == pytest.approx(
-        {name: value for name, value in json.loads((out / "scores.json").read_text()).items() if name in
-         data["systems"][0]["scores"]}, abs=1e-5)  # fmt: skip
+        {
+            name: value
+            for name, value in json.loads((out / "scores.json").read_text()).items()
+            if name in data["systems"][0]["scores"]
+        },
+        abs=1e-5,
+    )
     kept = read_surfaces(out / "surfaces.npz")
     assert (out / "report.html").read_text("utf-8") == render_page(read_results(out), kept)
     assert not re.search(re.escape(str(tmp_path)), (out / "report.html").read_text("utf-8"))
@@ -93,7 +105,9 @@ def test_compare_has_a_page(root: Path, tmp_path: Path, monkeypatch: pytest.Monk
     data = data_of(tmp_path / "compare" / "report.html")
     rows = json.loads((tmp_path / "compare" / "compare.json").read_text())
     assert [system["name"] for system in data["systems"]] == [row["descriptor"] for row in rows]
-    assert [system["scores"]["ft"] for system in data["systems"]] == pytest.approx([row["ft"] for row in rows])
+    assert [system["scores"]["ft"] for system in data["systems"]] == pytest.approx(
+        [row["ft"] for row in rows]
+    )
     assert sum("surface" in shape for shape in data["shapes"]) == 4
 
 
@@ -146,7 +160,9 @@ def test_a_page_with_the_difference_of_each_body_from_its_nearest(
     expected = np.clip(np.array(values) / np.quantile(np.abs(values), 0.98), -1, 1)
     painted = kept[names[2]].values[1] / 127.0 - 128 / 127
     assert len(painted) == len(expected)
-    assert np.corrcoef(np.sort(painted), np.sort(expected))[0, 1] > 0.99  # the picture has another order
+    assert (
+        np.corrcoef(np.sort(painted), np.sort(expected))[0, 1] > 0.99
+    )  # the picture has another order
     shapes = data_of(out / "report.html")["shapes"]
     assert [one["explained"]["other"] for one in shapes] == [1, 0, 3, 2]
     run(monkeypatch, "report", out, "--n_workers", "1")
@@ -165,25 +181,47 @@ def test_only_one_descriptor_is_explained(
     assert "explain: expected a folder that `igps retrieve` wrote" in capsys.readouterr().err
 
 
-def test_columns_of_the_labels_reach_the_page(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_columns_of_the_labels_reach_the_page(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(2)]
     rows = [f"{name},{name[:3]},{i}" for i, name in enumerate(names)]
     (root / "labels.csv").write_text("\n".join(["file,label,age", *rows]))
-    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(tmp_path / "out", "--report"))
+    run(
+        monkeypatch,
+        "retrieve",
+        root,
+        "--descriptor",
+        INTERIOR,
+        *options(tmp_path / "out", "--report"),
+    )
     assert data_of(tmp_path / "out" / "report.html")["columns"] == {"age": ["0", "1", "2", "3"]}
 
 
-def test_bodies_named_by_a_table_elsewhere_have_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_named_by_a_table_elsewhere_have_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
     labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9] = 1, 2
     for subject in range(2):
         (tmp_path / "scans").mkdir(exist_ok=True)
-        nibabel.save(nibabel.Nifti1Image(labels[subject:], np.eye(4)), tmp_path / "scans" / f"{subject}.nii.gz")
+        nibabel.save(
+            nibabel.Nifti1Image(labels[subject:], np.eye(4)),
+            tmp_path / "scans" / f"{subject}.nii.gz",
+        )
     (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
     monkeypatch.chdir(tmp_path)
     words = ["--classes", "body", "--names", "names.json", "--size", "ignore"]
-    run(monkeypatch, "retrieve", "scans", "--descriptor", INTERIOR, *words, *options(tmp_path / "out"))
+    run(
+        monkeypatch,
+        "retrieve",
+        "scans",
+        "--descriptor",
+        INTERIOR,
+        *words,
+        *options(tmp_path / "out"),
+    )
     monkeypatch.chdir("/")
     run(monkeypatch, "report", tmp_path / "out", "--n_workers", 1)
     names = {f"{subject}.nii.gz#{body}" for subject in range(2) for body in ("block", "bar")}

@@ -84,7 +84,8 @@ def body(tmp_path: Path) -> BodyRef:
 
 
 @pytest.mark.parametrize(
-    ("suffix", "write"), [(".nii.gz", write_nifti), (".nii", write_nifti), (".nrrd", write_itk), (".mha", write_itk)]
+    ("suffix", "write"),
+    [(".nii.gz", write_nifti), (".nii", write_nifti), (".nrrd", write_itk), (".mha", write_itk)],
 )
 def test_an_image_gives_a_linear_function_wherever_it_lies(
     body: BodyRef, suffix: str, write: Callable[[Path, np.ndarray], None]
@@ -98,7 +99,9 @@ def test_an_image_may_have_the_whole_name_of_the_body(tmp_path: Path) -> None:
     (tmp_path / "ct").mkdir()
     write_nifti(tmp_path / "ct" / "egg.nii.gz", image())
     source = attribute_source("ct/{file}", tmp_path)
-    np.testing.assert_allclose(source(BodyRef(tmp_path / "egg.nii.gz", "1"), INSIDE), linear(INSIDE), atol=1e-5)
+    np.testing.assert_allclose(
+        source(BodyRef(tmp_path / "egg.nii.gz", "1"), INSIDE), linear(INSIDE), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("suffix", [".dx", ".mrc"])
@@ -109,7 +112,9 @@ def test_a_grid_gives_a_linear_function(body: BodyRef, suffix: str) -> None:
     grids.Grid(linear(index * delta + origin), origin=origin, delta=delta).export(
         str(body.path.with_name(f"a{suffix}"))
     )
-    np.testing.assert_allclose(attribute_source(f"a{suffix}")(body, INSIDE), linear(INSIDE), atol=1e-4)
+    np.testing.assert_allclose(
+        attribute_source(f"a{suffix}")(body, INSIDE), linear(INSIDE), atol=1e-4
+    )
 
 
 def test_axes_of_a_map_in_another_order_are_put_right(body: BodyRef) -> None:
@@ -145,14 +150,21 @@ def test_a_map_is_placed_by_its_origin_or_else_by_its_start(told: str, body: Bod
 
 @pytest.mark.parametrize(
     ("values", "size", "message"),
-    [(np.ones((9, 9, 9), np.float32), 0, "voxels of .*0"), (np.ones((9, 9, 9), np.complex64), 0.5, "complex numbers")],
+    [
+        (np.ones((9, 9, 9), np.float32), 0, "voxels of .*0"),
+        (np.ones((9, 9, 9), np.complex64), 0.5, "complex numbers"),
+    ],
 )
-def test_a_map_of_no_use_is_refused(values: np.ndarray, size: float, message: str, body: BodyRef) -> None:
+def test_a_map_of_no_use_is_refused(
+    values: np.ndarray, size: float, message: str, body: BodyRef
+) -> None:
     mrcfile = pytest.importorskip("mrcfile")
     with mrcfile.new(body.path.with_name("a.mrc")) as file:
         file.set_data(values)
         file.voxel_size = size
-    with pytest.raises(MeshError, match=rf"a\.mrc: expected real numbers in voxels of known size, got {message}"):
+    with pytest.raises(
+        MeshError, match=rf"a\.mrc: expected real numbers in voxels of known size, got {message}"
+    ):
         attribute_source("a.mrc")(body, INSIDE)
 
 
@@ -162,12 +174,16 @@ def test_a_map_that_was_cut_short_is_to_be_exported_again(body: BodyRef) -> None
     with mrcfile.new(path) as file:
         file.set_data(np.ones((9, 9, 9), np.float32))
     path.write_bytes(path.read_bytes()[:-4])
-    with pytest.raises(MeshError, match=r"a\.mrc: expected 3940 bytes, got 3936\. Export it again\.$"):
+    with pytest.raises(
+        MeshError, match=r"a\.mrc: expected 3940 bytes, got 3936\. Export it again\.$"
+    ):
         attribute_source("a.mrc")(body, INSIDE)
 
 
 def write_ply(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
-    rows = "\n".join(" ".join(map(repr, map(float, row))) for row in np.column_stack([mesh.vertices, values]))
+    rows = "\n".join(
+        " ".join(map(repr, map(float, row))) for row in np.column_stack([mesh.vertices, values])
+    )
     faces = "\n".join("3 " + " ".join(map(str, face)) for face in mesh.faces)
     names = "\n".join(f"property double {name}" for name in ("x", "y", "z", "height"))
     path.write_text(
@@ -185,7 +201,9 @@ def write_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
 def write_vtk_of_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     """With the notes that VTK writes behind arrays of a field."""
     n, faces = len(values), len(mesh.faces)
-    points, heights, triangles = (" ".join(map(str, a.ravel())) for a in (mesh.vertices, values, mesh.faces))
+    points, heights, triangles = (
+        " ".join(map(str, a.ravel())) for a in (mesh.vertices, values, mesh.faces)
+    )
     head = f"# vtk DataFile Version 5.1\nvtk output\nASCII\nDATASET POLYDATA\nPOINTS {n} double\n{points}\n"
     offsets = " ".join(map(str, range(0, 3 * faces + 1, 3)))
     cells = f"POLYGONS {faces + 1} {3 * faces}\nOFFSETS vtktypeint64\n{offsets}\nCONNECTIVITY vtkIdType\n{triangles}\n"
@@ -225,14 +243,20 @@ def test_values_at_vertices_give_the_same_linear_function_inside(
     write(body.path.with_name(name.partition("#")[0]), mesh, linear(mesh.vertices))
     values = VertexAttribute(name)(body, INSIDE)
     np.testing.assert_allclose(values, linear(INSIDE), atol=1e-3)
-    write(body.path.with_name(name.partition("#")[0]), mesh.subdivide(), linear(mesh.subdivide().vertices))
+    write(
+        body.path.with_name(name.partition("#")[0]),
+        mesh.subdivide(),
+        linear(mesh.subdivide().vertices),
+    )
     with pytest.raises(MeshError, match=r"has 642 values for 162 vertices"):
         VertexAttribute(name)(body, INSIDE)
 
 
 @pytest.mark.filterwarnings("ignore:Unknown extension code")
 @pytest.mark.parametrize("head", [[2, 0, 20], [20], [2, 1, 20], None])
-def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path: Path, head: list[int] | None) -> None:
+def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(
+    tmp_path: Path, head: list[int] | None
+) -> None:
     """Its origin is in the middle of the image, and its axes are not the world's, unless the file says otherwise."""
     nibabel = pytest.importorskip("nibabel")
     made = nibabel.MGHImage(image().astype(np.float32), AFFINE)
@@ -240,13 +264,26 @@ def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path: Pa
     ball = trimesh.creation.icosphere(subdivisions=1)
     mdc = made.header["Mdc"]  # rows are the directions of the axes of voxels
     keys = dict(zip(("xras", "yras", "zras", "cras"), [*mdc, made.header["Pxyz_c"]], strict=True))
-    told = {"head": head, "valid": "1  # volume info valid", "filename": "t1.mgz", "volume": SHAPE, **keys}
+    told = {
+        "head": head,
+        "valid": "1  # volume info valid",
+        "filename": "t1.mgz",
+        "volume": SHAPE,
+        **keys,
+    }
     told["voxelsize"] = made.header["delta"]
     nibabel.freesurfer.write_geometry(
         tmp_path / "lh.pial", ball.vertices, ball.faces, volume_info=told if head else None
     )
-    to_scanner = made.affine @ np.linalg.inv(made.header.get_vox2ras_tkr()) if head in ([2, 0, 20], [20]) else np.eye(4)
-    points = INSIDE @ np.linalg.inv(to_scanner[:3, :3]).T - np.linalg.inv(to_scanner)[:3, :3] @ to_scanner[:3, 3]
+    to_scanner = (
+        made.affine @ np.linalg.inv(made.header.get_vox2ras_tkr())
+        if head in ([2, 0, 20], [20])
+        else np.eye(4)
+    )
+    points = (
+        INSIDE @ np.linalg.inv(to_scanner[:3, :3]).T
+        - np.linalg.inv(to_scanner)[:3, :3] @ to_scanner[:3, 3]
+    )
     found = attribute_source("t1.mgz")(BodyRef(tmp_path / "lh.pial"), points)
     np.testing.assert_allclose(found, linear(INSIDE), atol=1e-4)
 
@@ -261,7 +298,9 @@ def test_values_at_vertices_survive_mending(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bodies", ["pieces", "objects"])
-def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(bodies: BodyKind, tmp_path: Path) -> None:
+def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(
+    bodies: BodyKind, tmp_path: Path
+) -> None:
     """Two balls in one file, whose values jump between them; then values of the second ball alone."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     away = trimesh.Trimesh(ball.vertices + np.array([5, 0, 0]), ball.faces, process=False)
@@ -270,25 +309,39 @@ def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(bodies:
     write_ply(tmp_path / "both.ply", both, values)
     write_ply(tmp_path / "b.ply", away, linear(ball.vertices) + 7)
     rows = ["".join(f"v {x} {y} {z}\n" for x, y, z in both.vertices.tolist())]
-    rows += ["".join(f"f {a} {b} {c}\n" for a, b, c in (both.faces[k : k + 1280] + 1).tolist()) for k in (0, 1280)]
+    rows += [
+        "".join(f"f {a} {b} {c}\n" for a, b, c in (both.faces[k : k + 1280] + 1).tolist())
+        for k in (0, 1280)
+    ]
     (tmp_path / "two.obj").write_text(f"{rows[0]}o a\n{rows[1]}o b\n{rows[2]}")
     parts = ("piece 1", "piece 2") if bodies == "pieces" else ("a", "b")
-    for name, part, shift, added in (("both", parts[0], 0, 0), ("both", parts[1], 5, 100), ("b", parts[1], 5, 7)):
+    for name, part, shift, added in (
+        ("both", parts[0], 0, 0),
+        ("both", parts[1], 5, 100),
+        ("b", parts[1], 5, 7),
+    ):
         source = VertexAttribute(f"{name}.ply#height", reading=LoadOptions(bodies=bodies))
         found = source(BodyRef(tmp_path / "two.obj", part), INSIDE + np.array([shift, 0, 0]))
         np.testing.assert_allclose(found, linear(INSIDE) + added, atol=1e-3)
     few = trimesh.creation.icosphere(subdivisions=1)
     write_ply(tmp_path / "few.ply", few, linear(few.vertices))
-    with pytest.raises(MeshError, match=r"has 42 values for 642 vertices \(1284 in the whole file\)"):
+    with pytest.raises(
+        MeshError, match=r"has 42 values for 642 vertices \(1284 in the whole file\)"
+    ):
         replace(source, path="few.ply#height")(BodyRef(tmp_path / "two.obj", parts[0]), INSIDE)
 
 
 def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:
     """2 on the cavity, 1 outside; in the wall, mean values by an integral over directions, weighted by 1 / distance."""
-    ball, pit = trimesh.creation.icosphere(subdivisions=4), trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    ball, pit = (
+        trimesh.creation.icosphere(subdivisions=4),
+        trimesh.creation.icosphere(subdivisions=4, radius=0.5),
+    )
     pit.invert()
     hollow = trimesh.util.concatenate([ball, pit])
-    hollow.vertex_attributes["heat"] = np.where(np.linalg.norm(hollow.vertices, axis=1) < 0.9, 2.0, 1.0)
+    hollow.vertex_attributes["heat"] = np.where(
+        np.linalg.norm(hollow.vertices, axis=1) < 0.9, 2.0, 1.0
+    )
     hollow.export(tmp_path / "ball.ply")
     (tmp_path / "bodies").mkdir()
     hollow.export(tmp_path / "bodies" / "ball.off")
@@ -299,14 +352,19 @@ def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:
         outside = 1 / (-radius * cosines + np.sqrt(across + 1))
         meets = (cosines < 0) & (across > -0.25)
         root = np.sqrt(np.where(meets, across + 0.25, 0))
-        near, far = (meets / np.where(meets, -radius * cosines + side * root, 1) for side in (-1, 1))
+        near, far = (
+            meets / np.where(meets, -radius * cosines + side * root, 1) for side in (-1, 1)
+        )
         return float((outside + 2 * (near - far)).sum() / (outside + near - far).sum())
 
     for cavities in ("keep", "fill"):
         dataset = SignatureDataset(
-            tmp_path / "bodies", SignatureConfig(n_eigenpairs=10), tmp_path / "cache",
-            reading=LoadOptions(cavities=cavities), attributes={"heat": VertexAttribute("{stem}.ply", tmp_path)},
-        )  # fmt: skip
+            tmp_path / "bodies",
+            SignatureConfig(n_eigenpairs=10),
+            tmp_path / "cache",
+            reading=LoadOptions(cavities=cavities),
+            attributes={"heat": VertexAttribute("{stem}.ply", tmp_path)},
+        )
         inside, surface = dataset[0].signature.interior, dataset[0].signature.surface
         radii = np.linalg.norm(inside.points, axis=1)
         expected = [in_wall(radius) if cavities == "keep" else 1.0 for radius in radii]
@@ -323,7 +381,9 @@ def test_tetrahedra_give_a_linear_function_inside_and_nothing_far_outside(body: 
     points = np.random.default_rng(2).uniform(-1, 1, (300, 3))
     points = np.concatenate([points, np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T])
     cells = [("tetra", Delaunay(points).simplices)]
-    meshio.Mesh(points, cells, point_data={"stress": linear(points)}).write(body.path.with_name("a.vtu"))
+    meshio.Mesh(points, cells, point_data={"stress": linear(points)}).write(
+        body.path.with_name("a.vtu")
+    )
     source = attribute_source("a.vtu")
     assert isinstance(source, TetAttribute)
     np.testing.assert_allclose(source(body, INSIDE), linear(INSIDE), atol=1e-5)
@@ -331,7 +391,9 @@ def test_tetrahedra_give_a_linear_function_inside_and_nothing_far_outside(body: 
         source(body, INSIDE + 5)
 
 
-def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_is_missing_is_taken_from_beside_and_told_or_refused(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     points = np.arange(40.0)[:, None] * [1, 0, 0]
     values = np.arange(40.0)
     for fill in (np.nan, np.inf, 7e18):
@@ -345,7 +407,8 @@ def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog: pytest
         assert "here: 2 of 40 values were taken from the nearest point" in caplog.text
         given[:5] = fill
         with pytest.raises(
-            MeshError, match=r"here: has no value at 7 of 40 points .* from \(0, 0, 0\) to \(39, 0, 0\)"
+            MeshError,
+            match=r"here: has no value at 7 of 40 points .* from \(0, 0, 0\) to \(39, 0, 0\)",
         ):
             fill_missing(given, points, "here")
 
@@ -368,13 +431,18 @@ def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body: BodyRef)
 
 def test_an_image_of_another_subject_and_a_grid_beside_the_body_are_refused(body: BodyRef) -> None:
     write_nifti(body.path.with_name("egg.nii"), image())
-    with pytest.raises(MeshError, match=r"egg\.nii: has no value at 200 of 200 points of the body, which extends from"):
+    with pytest.raises(
+        MeshError,
+        match=r"egg\.nii: has no value at 200 of 200 points of the body, which extends from",
+    ):
         ImageAttribute("{stem}.nii")(body, INSIDE + 100)
     with pytest.raises(MeshError, match=r"has no value at \d+ of 200 points"):
         ImageAttribute("{stem}.nii")(body, INSIDE + TURN @ [3.4, 0, 0])
 
 
-@pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd", ".dx", ".mrc", ".ply", ".vtk", ".vtu", ".gii", ".thickness"])
+@pytest.mark.parametrize(
+    "suffix", [".nii.gz", ".nrrd", ".dx", ".mrc", ".ply", ".vtk", ".vtu", ".gii", ".thickness"]
+)
 def test_files_cut_short_are_one_sentence(body: BodyRef, suffix: str) -> None:
     path = body.path.with_name(f"a{suffix}")
     mesh = trimesh.load(body.path, process=False)
@@ -386,7 +454,9 @@ def test_files_cut_short_are_one_sentence(body: BodyRef, suffix: str) -> None:
         grids = pytest.importorskip("gridData")
         grids.Grid(image(), origin=[-5, -5, -5], delta=[0.5] * 3).export(str(path))
     else:
-        write = {".ply": write_ply, ".gii": write_gifti, ".thickness": write_freesurfer}.get(suffix, write_vtk)
+        write = {".ply": write_ply, ".gii": write_gifti, ".thickness": write_freesurfer}.get(
+            suffix, write_vtk
+        )
         write(path, mesh, linear(mesh.vertices))
     content = path.read_bytes()
     for share in (0, 0.02, 0.4, 0.6):  # of a PLY file all values are in the first 0.69
@@ -405,9 +475,17 @@ def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path: Path) -> Non
     root = tmp_path / "root"
 
     def file(pattern: str, root: Path | None = root) -> str:
-        return FileAttribute.file(ImageAttribute(pattern, root), body)[0].relative_to(tmp_path).as_posix()
+        return (
+            FileAttribute.file(ImageAttribute(pattern, root), body)[0]
+            .relative_to(tmp_path)
+            .as_posix()
+        )
 
-    assert file("images/{stem}.nii") == file(f"{root}/images/{{stem}}.nii", None) == "root/images/one.nii"
+    assert (
+        file("images/{stem}.nii")
+        == file(f"{root}/images/{{stem}}.nii", None)
+        == "root/images/one.nii"
+    )
     assert file("ct/{file}.nii") == "root/ct/ball/one.scan.off.nii"
     assert file("x.nii", None) == "root/ball/x.nii"
     for pattern in ("../x.nii", "images/{part}.nii", "ct/{part}.nii"):
@@ -428,16 +506,24 @@ def test_a_body_that_is_a_link_has_the_attribute_of_its_own_name(tmp_path: Path)
     (tmp_path / "link").symlink_to(tmp_path / "root")
     (tmp_path / "root" / "cow").symlink_to(tmp_path / "root" / "dog")
     (tmp_path / "root" / "ct" / "cow").symlink_to(tmp_path / "root" / "ct" / "dog")
-    for root, path in (("root", "root/cat"), ("link", "root/dog"), ("root", "link/dog"), ("root", "root/cow")):
+    for root, path in (
+        ("root", "root/cat"),
+        ("link", "root/dog"),
+        ("root", "link/dog"),
+        ("root", "root/cow"),
+    ):
         source = ImageAttribute("ct/{file}.nii", tmp_path / root)
         found = source.file(BodyRef(tmp_path / path / "1.off"))[0]
         assert found.relative_to(tmp_path / root).as_posix() == f"ct/{path[-3:]}/1.off.nii"
 
 
 @pytest.mark.parametrize(
-    ("suffix", "content"), [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12)), ("nrrd", b"x")]
+    ("suffix", "content"),
+    [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12)), ("nrrd", b"x")],
 )
-def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(body: BodyRef, suffix: str, content: bytes) -> None:
+def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(
+    body: BodyRef, suffix: str, content: bytes
+) -> None:
     body.path.with_suffix(f".{suffix}").write_bytes(content)
     with pytest.raises(MeshError) as error:
         attribute_source(f"{{stem}}.{suffix}")(body, INSIDE)
@@ -463,11 +549,15 @@ def test_images_among_bodies_are_no_bodies(tmp_path: Path, is_absolute: bool) ->
     assert files == [tmp_path / "ct" / name / "x.off.nii.gz" for name in ("ball", "cube")]
     # What is itself a body's file stays one.
     own = {"thickness": attribute_source("{file}#thickness", tmp_path / "ball")}
-    assert SignatureDataset(tmp_path / "ball", cache_dir=tmp_path / ".cache", attributes=own).bodies.names == ("x.off",)
+    assert SignatureDataset(
+        tmp_path / "ball", cache_dir=tmp_path / ".cache", attributes=own
+    ).bodies.names == ("x.off",)
 
 
 def test_words_of_the_command_line_become_sources() -> None:
-    found = attribute_sources(["ct=a/{stem}.nii.gz", "q=charge", "t={file}#t", "e=a.vtu"], Path("root"))
+    found = attribute_sources(
+        ["ct=a/{stem}.nii.gz", "q=charge", "t={file}#t", "e=a.vtu"], Path("root")
+    )
     assert found == {
         "ct": ImageAttribute("a/{stem}.nii.gz", Path("root")),
         "q": ResidueAttribute("charge"),
@@ -476,9 +566,13 @@ def test_words_of_the_command_line_become_sources() -> None:
     }
     assert pickle.loads(pickle.dumps(found)) == found
     for wrong in ("ct", "=a.nii", "a b=c.nii", "ct="):
-        with pytest.raises(ValueError, match="attribute: expected a new name and a path, as in ct="):
+        with pytest.raises(
+            ValueError, match="attribute: expected a new name and a path, as in ct="
+        ):
             attribute_sources([wrong], None)
-    with pytest.raises(ValueError, match=r"attribute: expected a new name and a path, as in .*, got 'ct=b\.nii'"):
+    with pytest.raises(
+        ValueError, match=r"attribute: expected a new name and a path, as in .*, got 'ct=b\.nii'"
+    ):
         attribute_sources(["ct=a.nii", "ct=b.nii"], None)
 
 
@@ -494,10 +588,15 @@ def test_an_image_is_added_to_a_cached_collection_without_eigenpairs_and_again_w
         return SignatureDataset(files, CONFIG, tmp_path / "cache", **options)  # type: ignore[arg-type]
 
     dataset().precompute(n_workers=1, progress=False)
-    monkeypatch.setattr(pipeline_module, "compute_signature", lambda *_: pytest.fail("eigenpairs are computed"))
+    monkeypatch.setattr(
+        pipeline_module, "compute_signature", lambda *_: pytest.fail("eigenpairs are computed")
+    )
     source = {"ct": ImageAttribute("{stem}.nii.gz")}
     assert dataset(attributes=source).precompute(n_workers=1, progress=False) == []
-    for samples in (dataset(attributes=source)[0].signature.interior, dataset(attributes=source)[1].signature.surface):
+    for samples in (
+        dataset(attributes=source)[0].signature.interior,
+        dataset(attributes=source)[1].signature.surface,
+    ):
         np.testing.assert_allclose(samples.attributes["ct"], linear(samples.points), atol=1e-5)
     first = dataset(attributes=source).cached_keys()
     write_nifti(tmp_path / "bodies" / "one.nii.gz", image() + 1)
@@ -519,24 +618,46 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path: Path) -> 
     for chain, names in (("A", ["LYS"] * 6), ("B", ["ASP"] * 6)):
         for i, name in enumerate(names):
             for j, (atom, x, y) in enumerate(rows):
-                text += line.format(j, f" {atom}", name, chain, i, x + 3.8 * i, y, 30.0 * (chain == "B"), 10.0, atom[0])
-    for path, content in ((tmp_path / "a.pdb", text.encode()), (tmp_path / "b.pdb.gz", gzip.compress(text.encode()))):
+                text += line.format(
+                    j,
+                    f" {atom}",
+                    name,
+                    chain,
+                    i,
+                    x + 3.8 * i,
+                    y,
+                    30.0 * (chain == "B"),
+                    10.0,
+                    atom[0],
+                )
+    for path, content in (
+        (tmp_path / "a.pdb", text.encode()),
+        (tmp_path / "b.pdb.gz", gzip.compress(text.encode())),
+    ):
         path.write_bytes(content)
         points = np.array([[5.0, 0, 0], [8.0, 0, 0]])
         charge = ResidueAttribute("charge")
         np.testing.assert_allclose(charge(BodyRef(path, "chain A"), points), 1.0, atol=1e-6)
         np.testing.assert_allclose(charge(BodyRef(path, "chain B"), points), -1.0, atol=1e-6)
         np.testing.assert_allclose(charge(BodyRef(path, "model"), points), 1.0, atol=1e-6)
-        np.testing.assert_allclose(charge(BodyRef(path), points + np.array([0, 0, 30])), -1.0, atol=1e-6)
+        np.testing.assert_allclose(
+            charge(BodyRef(path), points + np.array([0, 0, 30])), -1.0, atol=1e-6
+        )
     write_body(tmp_path / "egg.off", 1, 1)
-    with pytest.raises(MeshError, match=r"egg\.off: expected a PDB, mmCIF or PQR file for 'charge'"):
+    with pytest.raises(
+        MeshError, match=r"egg\.off: expected a PDB, mmCIF or PQR file for 'charge'"
+    ):
         charge(BodyRef(tmp_path / "egg.off"), points)
     with pytest.raises(ValueError, match=r"attribute: expected one of charge, .*, got 'mood'"):
         ResidueAttribute("mood")
 
 
-@pytest.mark.parametrize("name", ["ct.mha", "header.mhd"])  # the latter has its voxels in another file
-def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name", ["ct.mha", "header.mhd"]
+)  # the latter has its voxels in another file
+def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(
+    name: str, tmp_path: Path
+) -> None:
     itk = pytest.importorskip("SimpleITK")
     for value in (1.0, 2.0):
         itk.WriteImage(itk.GetImageFromArray(np.full((9, 9, 9), value)), str(tmp_path / name))
@@ -545,22 +666,31 @@ def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(nam
         np.testing.assert_allclose(found, value)
 
 
-def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(tmp_path: Path) -> None:
+def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(
+    tmp_path: Path,
+) -> None:
     pytest.importorskip("gemmi")
     body = BodyRef(tmp_path / "one.pdb", "chain A")
     for name, charge in (("ASP", -1.0), ("LYS", 1.0)):
-        body.path.write_text(f"ATOM      1  CA  {name} A   1       2.000   3.000   4.000  1.00 20.00           C\n")
+        body.path.write_text(
+            f"ATOM      1  CA  {name} A   1       2.000   3.000   4.000  1.00 20.00           C\n"
+        )
         os.utime(body.path, (1e9, 1e9))
         np.testing.assert_allclose(ResidueAttribute("charge")(body, np.zeros((1, 3))), charge)
 
 
-def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_words(tmp_path: Path) -> None:
+def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_words(
+    tmp_path: Path,
+) -> None:
     pytest.importorskip("gemmi")
     atom = "ATOM      1  P    DA A   1       2.000   3.000   4.000  1.00 20.00           P\n"
     (tmp_path / "dna.pdb").write_text(atom)
     body = BodyRef(tmp_path / "dna.pdb", "chain A")
     assert ResidueAttribute("residue_shares")(body, INSIDE).shape == (200, 25)
-    with pytest.raises(MeshError, match=r"dna\.pdb#chain A: 'hydropathy' is defined for none of its residues\. Choose"):
+    with pytest.raises(
+        MeshError,
+        match=r"dna\.pdb#chain A: 'hydropathy' is defined for none of its residues\. Choose",
+    ):
         ResidueAttribute("hydropathy")(body, INSIDE)
 
 
@@ -570,7 +700,9 @@ def test_names_of_blocks_do_not_tell_what_a_body_is(tmp_path: Path) -> None:
     places = ("Cartn_x", "Cartn_y", "Cartn_z", "pdbx_PDB_model_num")
     loop = "loop_\n" + "".join(f"_atom_site.{one}\n" for one in [*columns.split(), *places])
     rows = "1 C CA . LYS A 1 0 0 0 1\n2 C CA . ASP A 1 0 0 0 2\n"
-    (tmp_path / "two.cif").write_text("".join(f"data_{name}\n{loop}{rows}" for name in ("chain", "assembly")))
+    (tmp_path / "two.cif").write_text(
+        "".join(f"data_{name}\n{loop}{rows}" for name in ("chain", "assembly"))
+    )
     for name in ("chain", "assembly"):
         for number, charge in ((1, 1.0), (2, -1.0)):
             body = BodyRef(tmp_path / "two.cif", f"{name} model {number}")
@@ -601,10 +733,16 @@ def test_a_function_of_body_and_points_is_a_source_that_is_kept(
     dataset = SignatureDataset(tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes=given)
     for item, n_letters in zip(dataset, (1, 3), strict=True):
         points = item.signature.interior.points
-        np.testing.assert_allclose(item.signature.interior.attributes["told"], n_letters + points[:, 2], atol=1e-5)
-        np.testing.assert_allclose(item.signature.interior.attributes["x"], 2 * points[:, 0], atol=1e-5)
+        np.testing.assert_allclose(
+            item.signature.interior.attributes["told"], n_letters + points[:, 2], atol=1e-5
+        )
+        np.testing.assert_allclose(
+            item.signature.interior.attributes["x"], 2 * points[:, 0], atol=1e-5
+        )
     tag = FunctionAttribute(stem_and_height).cache_tag(None)
-    kept = SignatureDataset(tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes={"told": stem_and_height})
+    kept = SignatureDataset(
+        tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes={"told": stem_and_height}
+    )
     monkeypatch.setattr(FunctionAttribute, "__call__", lambda *given: pytest.fail("it is kept"))
     assert len(list(kept)) == 2
     monkeypatch.setattr(inspect, "getsource", lambda function: "return points[:, 1]")
@@ -614,10 +752,14 @@ def test_a_function_of_body_and_points_is_a_source_that_is_kept(
 def test_a_function_of_the_name_of_a_body_tells_copies_of_a_file_apart(tmp_path: Path) -> None:
     for name in ("a", "bbb"):
         write_body(tmp_path / "shapes" / f"{name}.off", 0.8, 0.9)
-    dataset = SignatureDataset(tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes={"told": stem_and_height})
+    dataset = SignatureDataset(
+        tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes={"told": stem_and_height}
+    )
     for item, n_letters in zip(dataset, (1, 3), strict=True):
         samples = item.signature.interior
-        np.testing.assert_allclose(samples.attributes["told"], n_letters + samples.points[:, 2], atol=1e-5)
+        np.testing.assert_allclose(
+            samples.attributes["told"], n_letters + samples.points[:, 2], atol=1e-5
+        )
 
 
 def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: Path) -> None:
@@ -642,7 +784,9 @@ def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: P
             SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"told": function})
 
 
-def test_constants_that_a_function_uses_tell_it_from_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_constants_that_a_function_uses_tell_it_from_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def tag() -> str:
         return FunctionAttribute(scaled).cache_tag(None)
 
@@ -652,7 +796,9 @@ def test_constants_that_a_function_uses_tell_it_from_itself(monkeypatch: pytest.
     monkeypatch.setitem(globals(), "FACTOR", 2.0)
     assert tag() == first
     monkeypatch.setitem(globals(), "FACTOR", np.ones(3))
-    with pytest.raises(ValueError, match=r"attributes: scaled uses variables that a cache key cannot hold"):
+    with pytest.raises(
+        ValueError, match=r"attributes: scaled uses variables that a cache key cannot hold"
+    ):
         tag()
 
 
@@ -671,7 +817,9 @@ def helped(body: BodyRef, points: np.ndarray) -> np.ndarray:
     return Shift()(points[:, 0])
 
 
-def test_the_cache_tag_depends_on_helpers_and_the_globals_they_use(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_tag_depends_on_helpers_and_the_globals_they_use(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Another constant, helper or class gives another tag; the original ones give the first tag again."""
 
     def tag() -> str:
@@ -690,11 +838,15 @@ def test_the_cache_tag_depends_on_helpers_and_the_globals_they_use(monkeypatch: 
     assert len({first, *found}) == 4
     assert tag() == first
     monkeypatch.setitem(globals(), "doubled", SimpleNamespace(factor=2.0))
-    with pytest.raises(ValueError, match=r"attributes: Shift uses variables that a cache key cannot hold"):
+    with pytest.raises(
+        ValueError, match=r"attributes: Shift uses variables that a cache key cannot hold"
+    ):
         tag()
 
 
-def test_helpers_of_another_module_tell_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_helpers_of_another_module_tell_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As functions by name, and as attributes of a module."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "user.py").write_text(
@@ -704,7 +856,9 @@ def test_helpers_of_another_module_tell_too(tmp_path: Path, monkeypatch: pytest.
     )
     tags: list[tuple[str, str]] = []
     for one, two, by in ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2)):
-        text = f"BY = {by}\n\ndef one(x):\n    return {one} * x\n\ndef two(x):\n    return {two} * x\n"
+        text = (
+            f"BY = {by}\n\ndef one(x):\n    return {one} * x\n\ndef two(x):\n    return {two} * x\n"
+        )
         (tmp_path / "helpers.py").write_text(text)
         for name in ("helpers", "user"):
             sys.modules.pop(name, None)
@@ -712,7 +866,9 @@ def test_helpers_of_another_module_tell_too(tmp_path: Path, monkeypatch: pytest.
         importlib.invalidate_caches()
         shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)
         user = importlib.import_module("user")
-        tags.append(tuple(FunctionAttribute(f).cache_tag(None) for f in (user.by_name, user.by_module)))
+        tags.append(
+            tuple(FunctionAttribute(f).cache_tag(None) for f in (user.by_name, user.by_module))
+        )
     by_name, by_module = zip(*tags, strict=True)
     assert len(set(by_name)) == 2
     assert len(set(by_module)) == 3
@@ -721,11 +877,13 @@ def test_helpers_of_another_module_tell_too(tmp_path: Path, monkeypatch: pytest.
 def test_functions_in_one_line_are_told_apart(tmp_path: Path) -> None:
     """They have one name and one source; and that of a lambda may end before its body."""
     write_body(tmp_path / "a.off", 0.8, 0.9)
-    # fmt: off
+
     pair = (lambda body, points: points[:, 0], lambda body, points: points[:, 1])
-    # fmt: on
+
     for axis, function in enumerate(pair):
-        (item,) = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"along": function})
+        (item,) = SignatureDataset(
+            tmp_path, CONFIG, tmp_path / "cache", attributes={"along": function}
+        )
         samples = item.signature.interior
         np.testing.assert_allclose(samples.attributes["along"], samples.points[:, axis], atol=1e-5)
 
@@ -746,5 +904,7 @@ def test_a_body_of_all_models_has_the_residues_of_all(tmp_path: Path) -> None:
     lines = [("MODEL        1", "LYS", 0.0), ("MODEL        2", "ASP", 60.0)]
     text = "\n".join(f"{model}\n{atom.format(name, x)}\nENDMDL" for model, name, x in lines)
     (tmp_path / "two.pdb").write_text(text + "\nEND\n")
-    charges = ResidueAttribute("charge")(BodyRef(tmp_path / "two.pdb"), np.array([[0.0, 0, 0], [60, 0, 0], [1, 0, 0]]))
+    charges = ResidueAttribute("charge")(
+        BodyRef(tmp_path / "two.pdb"), np.array([[0.0, 0, 0], [60, 0, 0], [1, 0, 0]])
+    )
     np.testing.assert_allclose(charges, [1, -1, 1], atol=1e-6)

@@ -93,7 +93,11 @@ def test_collate_pads_without_changing_any_description(signatures: list[Signatur
 
 
 def test_labels_and_names(signatures: list[Signature]) -> None:
-    items = [LabelledSignature(signatures[0], 4, "a"), LabelledSignature(signatures[2], 0, "b"), signatures[1]]
+    items = [
+        LabelledSignature(signatures[0], 4, "a"),
+        LabelledSignature(signatures[2], 0, "b"),
+        signatures[1],
+    ]
     batch = collate(items)
     assert batch.labels.tolist() == [4, 0, -1]
     assert batch.ids == ("a", "b", "body 1")
@@ -102,7 +106,10 @@ def test_labels_and_names(signatures: list[Signature]) -> None:
 
 def test_meshes_go_with_their_bodies(signatures: list[Signature]) -> None:
     box = trimesh.creation.box()
-    meshes = [Mesh(np.asarray(box.vertices) * s, np.asarray(box.faces), name=str(s)) for s in (1.0, 2.0, 3.0)]
+    meshes = [
+        Mesh(np.asarray(box.vertices) * s, np.asarray(box.faces), name=str(s))
+        for s in (1.0, 2.0, 3.0)
+    ]
     batch = collate(signatures, meshes)
     assert batch.meshes == tuple(meshes)
     assert [body.mesh for body in batch.bodies()] == meshes
@@ -121,7 +128,9 @@ def test_points_are_centred_before_they_lose_digits() -> None:
     far = replace(near, points=near.points + 1e6)
     whole = Signature(np.array([1.0, 2.0]), near, near, 1.0, 1.0, SignatureConfig(n_eigenpairs=2))
     batch = collate([whole, replace(whole, interior=far, surface=far)])
-    torch.testing.assert_close(batch.interior.points[0], batch.interior.points[1], atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        batch.interior.points[0], batch.interior.points[1], atol=1e-6, rtol=0
+    )
     np.testing.assert_allclose(batch.interior.points.mean(dim=1), 0, atol=1e-6)
 
 
@@ -129,12 +138,19 @@ def test_nothing_and_unlike_attributes_are_refused(signatures: list[Signature]) 
     with pytest.raises(ValueError, match="at least one"):
         collate([])
     bare = replace(signatures[0].interior, attributes={})
-    with pytest.raises(ValueError, match=r"same sample attributes, got \['depth', 'surface_direction'\] and \[\]"):
+    with pytest.raises(
+        ValueError, match=r"same sample attributes, got \['depth', 'surface_direction'\] and \[\]"
+    ):
         collate([signatures[1], replace(signatures[0], interior=bare)])
 
 
 def of_samples(batch: SampleBatch, i: int) -> set[tuple[float, ...]]:
-    return {tuple(row) for row in torch.cat([batch.points[i], batch.eigenfunctions[i]], dim=1)[batch.mask[i]].tolist()}
+    return {
+        tuple(row)
+        for row in torch.cat([batch.points[i], batch.eigenfunctions[i]], dim=1)[
+            batch.mask[i]
+        ].tolist()
+    }
 
 
 @pytest.mark.parametrize("seed", [None, 0])
@@ -146,7 +162,10 @@ def test_subset_takes_real_samples_each_once(signatures: list[Signature], seed: 
         assert len(of_samples(some, i)) == n
         assert of_samples(some, i) <= of_samples(batch, i)
         for name, values in some.attributes.items():
-            order = [batch.points[i].tolist().index(point) for point in some.points[i, some.mask[i]].tolist()]
+            order = [
+                batch.points[i].tolist().index(point)
+                for point in some.points[i, some.mask[i]].tolist()
+            ]
             assert torch.equal(values[i, some.mask[i]], batch.attributes[name][i, order])
     assert (some.eigenfunctions[~some.mask] == 0).all()
 
@@ -199,7 +218,9 @@ def equal(one: SignatureBatch, other: SignatureBatch) -> bool:
 def test_some_shapes_of_a_batch_are_the_batch_of_them(
     signatures: list[Signature], index: slice | list[int] | torch.Tensor, chosen: list[int]
 ) -> None:
-    items = [LabelledSignature(signature, 4 - i, f"number {i}") for i, signature in enumerate(signatures)]
+    items = [
+        LabelledSignature(signature, 4 - i, f"number {i}") for i, signature in enumerate(signatures)
+    ]
     some = collate(items)[index]
     assert len(some) == len(chosen)
     assert not chosen or equal(some, collate([items[i] for i in chosen]))
@@ -262,7 +283,9 @@ class Several(Dataset[Signature]):
         return self.signatures[index]
 
 
-def test_workers_give_the_batches_of_this_process_in_one_piece_of_memory(signatures: list[Signature]) -> None:
+def test_workers_give_the_batches_of_this_process_in_one_piece_of_memory(
+    signatures: list[Signature],
+) -> None:
     """Of like shapes, which are written as they are, and of others, which are padded in every dimension."""
     (batch,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate)
     expected = collate(signatures)
@@ -275,13 +298,18 @@ def test_workers_give_the_batches_of_this_process_in_one_piece_of_memory(signatu
     (batch,) = DataLoader(Several(alike), batch_size=2, num_workers=1, collate_fn=collate)
     assert equal(batch, collate(alike))
     assert torch.equal(batch.interior.eigenfunctions, collate(alike).interior.eigenfunctions)
-    whole = {one.untyped_storage().data_ptr() for one in (batch.interior.points, batch.surface.eigenfunctions)}
+    whole = {
+        one.untyped_storage().data_ptr()
+        for one in (batch.interior.points, batch.surface.eigenfunctions)
+    }
     assert len(whole) == 1
     batch.interior.points.zero_()  # writable, as any batch is
 
 
 @pytest.mark.parametrize("n_workers", [0, 1])
-def test_a_loader_makes_batches_by_itself_also_of_parts_of_items(signatures: list[Signature], n_workers: int) -> None:
+def test_a_loader_makes_batches_by_itself_also_of_parts_of_items(
+    signatures: list[Signature], n_workers: int
+) -> None:
     """Where no collate_fn is given, which PyTorch answered by a list of the types that it knows."""
     labelled = [LabelledSignature(one, i, str(i)) for i, one in enumerate(signatures)]
     items = [{"body": labelled[i], "also": (signatures[i], float(i))} for i in range(3)]
@@ -297,24 +325,38 @@ def test_a_precision_that_would_write_into_batches_is_refused_with_the_remedy(
     signatures: list[Signature], precision: Any
 ) -> None:
     """Areas and eigenvalues in 16 bits overflow; Lightning spoke of a frozen dataclass, and named none."""
-    trainer = Trainer(precision=precision, accelerator="cpu", logger=False, enable_checkpointing=False)
-    with pytest.raises(AttributeError, match=r'a batch is fixed.*batch\.to\(torch\.float64\).*"bf16-mixed"'):
+    trainer = Trainer(
+        precision=precision, accelerator="cpu", logger=False, enable_checkpointing=False
+    )
+    with pytest.raises(
+        AttributeError, match=r'a batch is fixed.*batch\.to\(torch\.float64\).*"bf16-mixed"'
+    ):
         trainer.precision_plugin.convert_input(collate(signatures))
-    plain = Trainer(precision="bf16-mixed", accelerator="cpu", logger=False, enable_checkpointing=False)
+    plain = Trainer(
+        precision="bf16-mixed", accelerator="cpu", logger=False, enable_checkpointing=False
+    )
     assert equal(plain.precision_plugin.convert_input(collate(signatures)), collate(signatures))
 
 
-def test_a_batch_is_saved_and_loaded_without_trust(signatures: list[Signature], tmp_path: Path) -> None:
+def test_a_batch_is_saved_and_loaded_without_trust(
+    signatures: list[Signature], tmp_path: Path
+) -> None:
     torch.save(collate(signatures), tmp_path / "batch.pt")
     assert equal(torch.load(tmp_path / "batch.pt", weights_only=True), collate(signatures))
 
 
-def test_a_worker_takes_memory_again_only_when_its_batch_is_gone(signatures: list[Signature]) -> None:
+def test_a_worker_takes_memory_again_only_when_its_batch_is_gone(
+    signatures: list[Signature],
+) -> None:
     """Batches of other sizes, kept, dropped, or in part kept, hold what this process makes of the same bodies."""
     order = [[0, 1], [2], [1, 2, 0], [0], [2, 1], [0, 0, 0]] * 6
     expected = [collate([signatures[i] for i in some]) for some in order]
     loader = DataLoader(
-        Several(signatures), batch_sampler=order, num_workers=2, collate_fn=collate, persistent_workers=True
+        Several(signatures),
+        batch_sampler=order,
+        num_workers=2,
+        collate_fn=collate,
+        persistent_workers=True,
     )
     kept: list[tuple[SignatureBatch, SignatureBatch]] = []
     parts: list[tuple[Tensor, Tensor]] = []
@@ -332,7 +374,9 @@ def test_a_worker_takes_memory_again_only_when_its_batch_is_gone(signatures: lis
 def thinned(items: list[Signature]) -> SignatureBatch:
     """Views of a batch, and a tensor that lies elsewhere."""
     batch = collate(items)
-    return replace(batch, area=2 * batch.area, interior=batch.interior.map(lambda values: values[:, ::2]))
+    return replace(
+        batch, area=2 * batch.area, interior=batch.interior.map(lambda values: values[:, ::2])
+    )
 
 
 def numbered(items: list[Signature]) -> SignatureBatch:
@@ -359,16 +403,24 @@ def with_blocks(items: list[Signature]) -> tuple[SignatureBatch, int]:
     return batch, len(_shared_memory._blocks)
 
 
-@pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="only Linux has memory that is a file without a name")
+@pytest.mark.skipif(
+    not hasattr(os, "memfd_create"), reason="only Linux has memory that is a file without a name"
+)
 def test_a_worker_does_not_gather_memory(signatures: list[Signature]) -> None:
     loader = DataLoader(
-        Several(signatures * 10), batch_size=2, num_workers=1, collate_fn=with_blocks, prefetch_factor=2
+        Several(signatures * 10),
+        batch_size=2,
+        num_workers=1,
+        collate_fn=with_blocks,
+        prefetch_factor=2,
     )
     # Two are on their way, one is in use here, one is received, and one is let go.
     assert max(n_blocks for _, n_blocks in loader) <= 5
 
 
-def test_numbers_of_samples_take_another_type_and_all_others_stay(signatures: list[Signature]) -> None:
+def test_numbers_of_samples_take_another_type_and_all_others_stay(
+    signatures: list[Signature],
+) -> None:
     batch = collate(signatures)
     other = batch.to(torch.float16)
     for one, before in ((other.interior, batch.interior), (other.surface, batch.surface)):
@@ -383,12 +435,19 @@ def test_numbers_of_samples_take_another_type_and_all_others_stay(signatures: li
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_batches_go_to_a_device_and_bodies_come_back(signatures: list[Signature]) -> None:
-    (pinned,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate, pin_memory=True)
+    (pinned,) = DataLoader(
+        Several(signatures), batch_size=3, num_workers=1, collate_fn=collate, pin_memory=True
+    )
     assert pinned.interior.points.is_pinned()
     batch: SignatureBatch = pinned.to("cuda", non_blocking=True)
-    assert equal(batch[torch.tensor([2, 0], device="cuda")].to("cpu"), collate([signatures[2], signatures[0]]))
+    assert equal(
+        batch[torch.tensor([2, 0], device="cuda")].to("cpu"),
+        collate([signatures[2], signatures[0]]),
+    )
     assert equal(SignatureBatch.concatenate([batch[:1], batch[1:]]).to("cpu"), collate(signatures))
     assert batch.interior.attributes["depth"].is_cuda
     assert batch.labels.is_cuda
     for body, signature in zip(batch.bodies(), signatures, strict=True):
-        np.testing.assert_array_equal(body.interior.eigenfunctions, signature.interior.eigenfunctions)
+        np.testing.assert_array_equal(
+            body.interior.eigenfunctions, signature.interior.eigenfunctions
+        )

@@ -81,20 +81,40 @@ def test_bodies_are_found_by_file_and_part(root: Path) -> None:
 
 
 def test_the_class_is_the_folder_the_part_or_the_file(root: Path) -> None:
-    assert find_bodies(root, OBJECTS, classes="body").labels == ("liver", "spleen", "liver", "spleen")
+    assert find_bodies(root, OBJECTS, classes="body").labels == (
+        "liver",
+        "spleen",
+        "liver",
+        "spleen",
+    )
     assert find_bodies(root, OBJECTS, classes="file").labels == ("1.obj", "1.obj", "2.obj", "2.obj")
     assert find_bodies(root.parent, OBJECTS).labels == ("subjects",) * 4
-    assert SignatureDataset(root, CONFIG, reading=OBJECTS, classes="body").labels.tolist() == [0, 1, 0, 1]
-    with pytest.raises(ValueError, match=r"classes: expected files of several bodies with 'body', but 1\.obj is one"):
+    assert SignatureDataset(root, CONFIG, reading=OBJECTS, classes="body").labels.tolist() == [
+        0,
+        1,
+        0,
+        1,
+    ]
+    with pytest.raises(
+        ValueError,
+        match=r"classes: expected files of several bodies with 'body', but 1\.obj is one",
+    ):
         find_bodies(root, classes="body")
-    with pytest.raises(ValueError, match="classes: expected 'folder', 'body' or 'file', got 'organ'"):
+    with pytest.raises(
+        ValueError, match="classes: expected 'folder', 'body' or 'file', got 'organ'"
+    ):
         find_bodies(root, classes="organ")  # type: ignore[arg-type]
 
 
 def test_an_empty_mask_among_organs_costs_no_other_its_class(tmp_path: Path) -> None:
     """As TotalSegmentator writes them: a file for each organ, of which some are out of view."""
     nibabel = pytest.importorskip("nibabel")
-    for subject, organ, value in (("s1", "liver", 1), ("s1", "spleen", 0), ("s2", "liver", 1), ("s2", "spleen", 1)):
+    for subject, organ, value in (
+        ("s1", "liver", 1),
+        ("s1", "spleen", 0),
+        ("s2", "liver", 1),
+        ("s2", "spleen", 1),
+    ):
         mask = np.zeros((14, 14, 14), dtype=np.uint8)
         mask[2:12, 3:10, 4:11] = value
         (tmp_path / subject).mkdir(exist_ok=True)
@@ -141,9 +161,13 @@ def test_further_columns_stay_with_their_bodies(root: Path, tmp_path: Path) -> N
     assert bodies.with_classes("body").columns == bodies.columns
     assert bodies.numbers("age") == [30, 41.5, 41.5]
     assert bodies.subset([0]).column("scanner") == ("A",)
-    with pytest.raises(ValueError, match=r"scanner: 2 of 3 bodies have no value, such as 1\.obj#liver"):
+    with pytest.raises(
+        ValueError, match=r"scanner: 2 of 3 bodies have no value, such as 1\.obj#liver"
+    ):
         bodies.column("scanner")
-    with pytest.raises(ValueError, match=r"weight: no such column of labels\.csv; further columns: age, scanner"):
+    with pytest.raises(
+        ValueError, match=r"weight: no such column of labels\.csv; further columns: age, scanner"
+    ):
         bodies.column("weight")
     with pytest.raises(ValueError, match=r"scanner: expected numbers, got 'A' of 2\.obj#spleen"):
         bodies.subset([0]).numbers("scanner")
@@ -168,12 +192,21 @@ def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
     (root / "labels.csv").write_text("file,age\n1.obj,30\n2.obj\n")
     bodies = find_bodies(root, OBJECTS)
     assert (bodies.labels, bodies.columns) == (None, {"age": ("30", "30", None, None)})
-    with pytest.raises(ValueError, match=r"no classes found\..* Or rename one of the columns age to label"):
+    with pytest.raises(
+        ValueError, match=r"no classes found\..* Or rename one of the columns age to label"
+    ):
         find_bodies(root, OBJECTS, labelled=True)
-    assert find_bodies(root, OBJECTS, classes="body", labelled=True).labels == ("liver", "spleen", "liver", "spleen")
+    assert find_bodies(root, OBJECTS, classes="body", labelled=True).labels == (
+        "liver",
+        "spleen",
+        "liver",
+        "spleen",
+    )
 
 
-def test_many_bodies_of_a_file_are_reported_some_at_a_time(tmp_path: Path, reads: list[str]) -> None:
+def test_many_bodies_of_a_file_are_reported_some_at_a_time(
+    tmp_path: Path, reads: list[str]
+) -> None:
     """Of 65 labels of a volume the first 64 are reported before the last is computed, for which it is read again."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     labels = np.zeros((65 * 7, 8, 8), dtype=np.uint8)
@@ -182,7 +215,9 @@ def test_many_bodies_of_a_file_are_reported_some_at_a_time(tmp_path: Path, reads
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "cells.nii.gz")
     few = SignatureConfig(n_eigenpairs=5, resolution=4, min_samples=0, n_surface_samples=10)
     pipeline = SignatureDataset(tmp_path, few, tmp_path / "cache").pipeline
-    outcomes = compute(pipeline, find_bodies(tmp_path), range(65), n_workers=1, executor=None, limits=Limits())
+    outcomes = compute(
+        pipeline, find_bodies(tmp_path), range(65), n_workers=1, executor=None, limits=Limits()
+    )
     assert [next(outcomes)[0] for _ in range(64)] == list(range(64))
     assert len(reads) == 1
     assert [number for number, _ in outcomes] == [64]
@@ -195,7 +230,9 @@ def test_counts_that_do_not_fit_are_refused() -> None:
 
 
 @pytest.mark.parametrize("how", ["at once", "on first touch"])
-def test_each_has_the_signature_of_its_own_surface(root: Path, tmp_path: Path, reads: list[str], how: str) -> None:
+def test_each_has_the_signature_of_its_own_surface(
+    root: Path, tmp_path: Path, reads: list[str], how: str
+) -> None:
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", reading=OBJECTS)
     if how == "at once":
         assert dataset.precompute(n_workers=1, progress=False) == []
@@ -206,7 +243,9 @@ def test_each_has_the_signature_of_its_own_surface(root: Path, tmp_path: Path, r
         body = egg(part, subject)
         expected = compute_signature(Mesh(body.vertices, body.faces), CONFIG)
         assert dataset[name].id == dataset[name].signature.name == name
-        np.testing.assert_allclose(dataset[i].signature.eigenvalues, expected.eigenvalues, rtol=1e-9)
+        np.testing.assert_allclose(
+            dataset[i].signature.eigenvalues, expected.eigenvalues, rtol=1e-9
+        )
         assert dataset.mesh(i).volume == pytest.approx(body.volume)
     assert len({dataset.key(i) for i in range(4)}) == 4
     if how == "at once":
@@ -226,7 +265,12 @@ def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path: Path) -> None:
     for _ in range(2):
         dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
         failures = dataset.precompute(n_workers=1, progress=False)
-        assert {failure.id for failure in failures} == {"dot.mhd", "deep.gltf", "list.gltf", "out.gltf"}
+        assert {failure.id for failure in failures} == {
+            "dot.mhd",
+            "deep.gltf",
+            "list.gltf",
+            "out.gltf",
+        }
         assert all("not readable as" in failure.error for failure in failures)
         assert dataset.usable(failures)[0].signature.volume == pytest.approx(ball.volume)
 
@@ -239,7 +283,9 @@ def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.M
     labels[2:8, 4:16, 4:16], labels[10:18, 4:16, 4:16] = 1, 2
 
     def volumes(folder: str, names: str | None = None) -> dict[str, int]:
-        dataset = SignatureDataset(tmp_path / folder, CONFIG, tmp_path / "cache", reading=LoadOptions(names=names))
+        dataset = SignatureDataset(
+            tmp_path / folder, CONFIG, tmp_path / "cache", reading=LoadOptions(names=names)
+        )
         dataset.precompute(n_workers=1, progress=False)
         return {name: round(dataset[name].signature.volume) for name in dataset.bodies.names}
 
@@ -263,18 +309,24 @@ def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.M
     for table, order in (("one.csv", (1, 2)), ("two.csv", (2, 1))):
         (tmp_path / table).write_text("label,name\n{},liver\n{},spleen\n".format(*order))
         os.utime(tmp_path / table, (1e9, 1e9))
-    (tmp_path / "nifti" / "x.nii.gz").touch()  # so that the tables tell nothing by their times and sizes
+    (
+        tmp_path / "nifti" / "x.nii.gz"
+    ).touch()  # so that the tables tell nothing by their times and sizes
     assert volumes("nifti", str(tmp_path / "one.csv"))["x.nii.gz#liver"] == 864
     assert volumes("nifti", str(tmp_path / "two.csv"))["x.nii.gz#liver"] == 1152
 
     (tmp_path / "gltf").mkdir()
-    scene = trimesh.Scene(trimesh.creation.icosphere(subdivisions=2, radius=9)).export(file_type="gltf")
+    scene = trimesh.Scene(trimesh.creation.icosphere(subdivisions=2, radius=9)).export(
+        file_type="gltf"
+    )
     for name, content in scene.items():
         (tmp_path / "gltf" / name.replace("buffer", "a buffer")).write_bytes(
             content.replace(b"gltf_buffer", b"gltf_a%20buffer")
         )
     volume = volumes("gltf")["model.gltf"]
-    places = next(path for path in (tmp_path / "gltf").glob("*.bin") if path.stat().st_size == 162 * 12)
+    places = next(
+        path for path in (tmp_path / "gltf").glob("*.bin") if path.stat().st_size == 162 * 12
+    )
     places.write_bytes((2 * np.frombuffer(places.read_bytes(), dtype=np.float32)).tobytes())
     assert volumes("gltf")["model.gltf"] == pytest.approx(8 * volume, rel=1e-3)
 
@@ -292,7 +344,9 @@ def test_a_bad_body_costs_no_other_of_its_file(root: Path, tmp_path: Path, how: 
     assert [failure.id for failure in failures] == ["1.obj#liver", "2.obj#heart", "3.obj#x"]
     assert [failure.path.name for failure in failures] == ["1.obj", "2.obj", "3.obj"]
     for failure, words in zip(
-        failures, ("#liver: open surface with 3 boundary edges", "has no body 'heart'", "3.obj"), strict=True
+        failures,
+        ("#liver: open surface with 3 boundary edges", "has no body 'heart'", "3.obj"),
+        strict=True,
     ):
         assert failure.error.startswith(str(failure.path))
         assert words in failure.error
@@ -311,7 +365,9 @@ class Fragile(ThreadPoolExecutor):
         return lost
 
 
-def test_where_a_job_of_several_bodies_is_lost_each_is_tried_alone(root: Path, tmp_path: Path) -> None:
+def test_where_a_job_of_several_bodies_is_lost_each_is_tried_alone(
+    root: Path, tmp_path: Path
+) -> None:
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", reading=OBJECTS)
     with Fragile(1) as executor:
         assert dataset.precompute(executor, n_workers=1, progress=False) == []

@@ -26,9 +26,16 @@ def signature() -> Signature:
         return Samples(generator.random((n, 3)), values, {"depth": values[:, 0].copy()})
 
     return Signature(
-        np.array([1.0, 2.0, 3.5]), samples(7), samples(4), 3.25, 0.1, SignatureConfig(n_eigenpairs=3), "a",
-        ("turned",), 2e-9,
-    )  # fmt: skip
+        np.array([1.0, 2.0, 3.5]),
+        samples(7),
+        samples(4),
+        3.25,
+        0.1,
+        SignatureConfig(n_eigenpairs=3),
+        "a",
+        ("turned",),
+        2e-9,
+    )
 
 
 def test_round_trip_is_exact(tmp_path: Path, signature: Signature) -> None:
@@ -71,7 +78,9 @@ def belongs_to_another_key(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(KEY.encode(), KEY[::-1].encode()))
 
 
-@pytest.mark.parametrize("damage", [truncate, overwrite, empty, replace_by_foreign, belongs_to_another_key])
+@pytest.mark.parametrize(
+    "damage", [truncate, overwrite, empty, replace_by_foreign, belongs_to_another_key]
+)
 def test_damaged_or_foreign_file_is_noticed(
     tmp_path: Path, signature: Signature, damage, caplog: pytest.LogCaptureFixture
 ) -> None:  # type: ignore[no-untyped-def]
@@ -86,7 +95,9 @@ def test_damaged_or_foreign_file_is_noticed(
     assert cache.get(KEY) is not None
 
 
-@pytest.mark.parametrize("what", ["surface.eigenfunctions", "interior.points", "eigenvalues", "area"])
+@pytest.mark.parametrize(
+    "what", ["surface.eigenfunctions", "interior.points", "eigenvalues", "area"]
+)
 def test_damaged_payload_is_noticed(
     tmp_path: Path, signature: Signature, what: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -119,7 +130,9 @@ def test_file_without_a_checksum_is_not_trusted(tmp_path: Path, signature: Signa
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions are those of POSIX")
 @pytest.mark.parametrize(("umask", "expected"), [(0o002, 0o664), (0o027, 0o640)])
-def test_umask_says_who_may_read(tmp_path: Path, signature: Signature, umask: int, expected: int) -> None:
+def test_umask_says_who_may_read(
+    tmp_path: Path, signature: Signature, umask: int, expected: int
+) -> None:
     before = os.umask(umask)
     try:
         SignatureCache(tmp_path / "cache").put(KEY, signature)
@@ -141,17 +154,23 @@ def test_what_a_killed_run_left_is_removed_later(tmp_path: Path, signature: Sign
     os.utime(old, (time.time() - 2 * 24 * 3600,) * 2)
     cache.put(KEY, signature)
     cache.remove_abandoned()
-    assert sorted(folder.iterdir()) == sorted([cache.path(KEY), fresh])  # another process may still write the fresh one
+    assert sorted(folder.iterdir()) == sorted(
+        [cache.path(KEY), fresh]
+    )  # another process may still write the fresh one
 
 
-def test_older_algorithm_is_not_trusted(tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_older_algorithm_is_not_trusted(
+    tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cache = SignatureCache(tmp_path)
     cache.put(KEY, signature)
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
     assert cache.get(KEY) is None
 
 
-def test_failed_write_leaves_nothing(tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_write_leaves_nothing(
+    tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(*_: object, **__: object) -> None:
         raise OSError("disk full")
 
@@ -162,7 +181,9 @@ def test_failed_write_leaves_nothing(tmp_path: Path, signature: Signature, monke
     assert not list(tmp_path.rglob("*.*"))
 
 
-def test_default_directory_follows_the_convention(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_default_directory_follows_the_convention(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert default_cache_dir() == tmp_path / "igps"
 
@@ -173,5 +194,8 @@ def test_a_user_without_a_home_is_told_what_to_give(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr("igps.data.cache.Path.home", no_home)
-    with pytest.raises(ValueError, match=r"cache_dir: expected a folder, because this user has no home .* --cache_dir"):
+    with pytest.raises(
+        ValueError,
+        match=r"cache_dir: expected a folder, because this user has no home .* --cache_dir",
+    ):
         default_cache_dir()

@@ -27,7 +27,14 @@ from igps.signature.signature import SignatureConfig
 distributed = pytest.importorskip("distributed")
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
-SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
+SMALL = [
+    "--signature.n_eigenpairs",
+    "20",
+    "--signature.resolution",
+    "10",
+    "--signature.min_samples",
+    "0",
+]
 SMALL += ["--signature.n_surface_samples", "50"]
 SOURCE = str(Path(fill_elsewhere.__code__.co_filename).parents[2])
 
@@ -62,7 +69,11 @@ class Cluster:
     def _start(self, *words: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "dask", *words]
         return subprocess.Popen(
-            command, env=self._environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=self._folder
+            command,
+            env=self._environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd=self._folder,
         )
 
     def end(self) -> None:
@@ -93,18 +104,28 @@ def stored(cache: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in cache.rglob("*.safetensors")}
 
 
-def test_a_cluster_leaves_the_bytes_of_this_machine(cluster: Cluster, root: Path, tmp_path: Path) -> None:
+def test_a_cluster_leaves_the_bytes_of_this_machine(
+    cluster: Cluster, root: Path, tmp_path: Path
+) -> None:
     (root / "bad.off").write_text("nothing")
     with dask_executor(cluster.address) as executor:
-        (failure,) = SignatureDataset(root, CONFIG, tmp_path / "there").precompute(executor, progress=False)
-        assert SignatureDataset(root, CONFIG, tmp_path / "there").precompute(executor, progress=False) == [failure]
+        (failure,) = SignatureDataset(root, CONFIG, tmp_path / "there").precompute(
+            executor, progress=False
+        )
+        assert SignatureDataset(root, CONFIG, tmp_path / "there").precompute(
+            executor, progress=False
+        ) == [failure]
     assert failure.id == "bad.off"
-    assert SignatureDataset(root, CONFIG, tmp_path / "here").precompute(n_workers=1, progress=False) == [failure]
+    assert SignatureDataset(root, CONFIG, tmp_path / "here").precompute(
+        n_workers=1, progress=False
+    ) == [failure]
     assert stored(tmp_path / "there") == stored(tmp_path / "here")
     assert len(stored(tmp_path / "here")) == 12
 
 
-def test_a_worker_that_is_killed_costs_nothing(cluster: Cluster, root: Path, tmp_path: Path) -> None:
+def test_a_worker_that_is_killed_costs_nothing(
+    cluster: Cluster, root: Path, tmp_path: Path
+) -> None:
     """In the middle of its work: the others do that."""
     dataset = SignatureDataset(root, CONFIG, tmp_path / "there")
     with dask_executor(cluster.address) as executor, ThreadPoolExecutor(1) as beside:
@@ -121,12 +142,18 @@ def test_a_worker_that_is_killed_costs_nothing(cluster: Cluster, root: Path, tmp
 
 
 def test_the_command_and_what_it_says_of_no_scheduler(
-    cluster: Cluster, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cluster: Cluster,
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     words = ["igps", "precompute", str(root), "--cache_dir", str(tmp_path / "cache"), *SMALL]
     words += ["--descriptors", "own_descriptors:small_interior"]
     monkeypatch.setattr(
-        sys, "argv", [*words, "--cluster", cluster.address, "--descriptors", "own_descriptors:small_interior"]
+        sys,
+        "argv",
+        [*words, "--cluster", cluster.address, "--descriptors", "own_descriptors:small_interior"],
     )
     main()
     assert capsys.readouterr().out == "12 of 12 signatures are in the cache; 0 failed\n"
@@ -148,21 +175,37 @@ def test_shards_have_all_files_once(
     for wrong in ("0/4", "5/4", "3", "a/b", "-1/4", "1/4/2"):
         with pytest.raises(ValueError, match="shard: expected a part such as 3/64"):
             of_shard(100, wrong)
-    words = ["igps", "precompute", str(root), "--cache_dir", str(tmp_path / "cache"), "--n_workers", "1", *SMALL]
+    words = [
+        "igps",
+        "precompute",
+        str(root),
+        "--cache_dir",
+        str(tmp_path / "cache"),
+        "--n_workers",
+        "1",
+        *SMALL,
+    ]
     words += ["--descriptors", "own_descriptors:small_interior"]
     for k, n_there in ((2, 6), (1, 12)):
         monkeypatch.setattr(
-            sys, "argv", [*words, "--shard", f"{k}/2", "--descriptors", "own_descriptors:small_interior"]
+            sys,
+            "argv",
+            [*words, "--shard", f"{k}/2", "--descriptors", "own_descriptors:small_interior"],
         )
         main()
-        assert capsys.readouterr().out == f"6 of 6 signatures in shard {k}/2 are in the cache; 0 failed\n"
+        assert (
+            capsys.readouterr().out
+            == f"6 of 6 signatures in shard {k}/2 are in the cache; 0 failed\n"
+        )
         assert len(stored(tmp_path / "cache")) == n_there
 
 
 class Broken(ThreadPoolExecutor):
     """What an executor does whose scheduler is lost."""
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
+    def submit(
+        self, function: Callable[..., Any], /, *arguments: Any, **options: Any
+    ) -> Future[Any]:
         future: Future[Any] = Future()
         future.cancel()
         future.set_running_or_notify_cancel()
@@ -172,7 +215,9 @@ class Broken(ThreadPoolExecutor):
 class Elsewhere(ThreadPoolExecutor):
     """Does nothing that is seen here."""
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
+    def submit(
+        self, function: Callable[..., Any], /, *arguments: Any, **options: Any
+    ) -> Future[Any]:
         return super().submit(lambda bodies: [Nowhere() for _ in bodies], *arguments)
 
 
@@ -194,6 +239,8 @@ def test_a_cluster_that_fails_is_told(
 
 def test_a_worker_of_another_version_is_refused(root: Path, tmp_path: Path) -> None:
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
-    with pytest.raises(MachineError, match=r"has igps .*, signatures \d+, but 9\.9, signatures 9 is required"):
+    with pytest.raises(
+        MachineError, match=r"has igps .*, signatures \d+, but 9\.9, signatures 9 is required"
+    ):
         fill_elsewhere(dataset.pipeline.fill, "9.9, signatures 9", [BodyRef(root / "00.off")])
     assert stored(tmp_path / "cache") == {}

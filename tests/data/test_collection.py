@@ -23,7 +23,9 @@ from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 # An odd number of eigenpairs and samples: arrays of doubles must not begin amid a word.
-CONFIG = SignatureConfig(n_eigenpairs=13, resolution=9, min_samples=0, n_surface_samples=21, attributes=("depth",))
+CONFIG = SignatureConfig(
+    n_eigenpairs=13, resolution=9, min_samples=0, n_surface_samples=21, attributes=("depth",)
+)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +35,9 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[SignatureDataset,
     for label, ratio in (("ball", 1.0), ("egg", 1.7)):
         for i in (1, 2):
             write_body(folder / "meshes" / label / f"{i}.off", 1.0 + 0.05 * i, ratio)
-    dataset = SignatureDataset(folder / "meshes", CONFIG, folder / "cache", reading=LoadOptions("never"))
+    dataset = SignatureDataset(
+        folder / "meshes", CONFIG, folder / "cache", reading=LoadOptions("never")
+    )
     dataset.precompute(n_workers=1, progress=False)
     dataset.to_file(folder / "signatures.igps")
     kept = dataset.to_memory()
@@ -53,8 +57,14 @@ def test_it_comes_back_to_the_bit_without_meshes(written: tuple[SignatureDataset
     assert after.precompute() == []
     for one, other in zip(after, before, strict=True):
         assert (one.id, one.label) == (other.id, other.label)
-        assert (one.signature.config, one.signature.notes) == (other.signature.config, other.signature.notes)
-        assert (one.signature.area, one.signature.volume) == (other.signature.area, other.signature.volume)
+        assert (one.signature.config, one.signature.notes) == (
+            other.signature.config,
+            other.signature.notes,
+        )
+        assert (one.signature.area, one.signature.volume) == (
+            other.signature.area,
+            other.signature.volume,
+        )
         assert one.signature.name == one.id
         np.testing.assert_array_equal(one.signature.eigenvalues, other.signature.eigenvalues)
         for a, b in (
@@ -66,14 +76,18 @@ def test_it_comes_back_to_the_bit_without_meshes(written: tuple[SignatureDataset
             assert a.attributes.keys() == b.attributes.keys()
             for name, values in b.attributes.items():
                 np.testing.assert_array_equal(a.attributes[name], values)
-    with pytest.raises(MeshError, match=r"ball/1\.off: .*signatures\.igps holds signatures and no meshes"):
+    with pytest.raises(
+        MeshError, match=r"ball/1\.off: .*signatures\.igps holds signatures and no meshes"
+    ):
         after.mesh(0)
 
 
 def test_it_is_read_by_any_reader_of_tensors(written: tuple[SignatureDataset, Path]) -> None:
     before, path = written
     found = load_file(path)
-    np.testing.assert_array_equal(found["2.interior.eigenfunctions"], before[2].signature.interior.eigenfunctions)
+    np.testing.assert_array_equal(
+        found["2.interior.eigenfunctions"], before[2].signature.interior.eigenfunctions
+    )
     assert str(path.parent).encode() not in path.read_bytes()[:100_000]  # no path of the machine
 
 
@@ -89,19 +103,23 @@ def test_parts_of_it_are_written_again_and_go_to_other_processes(
         assert one.bodies.names == ("egg/2.off", "ball/1.off")
         assert one.labels.tolist() == [1, 0]
         expected = collate([before[3], before[0]])
-        assert torch.equal(one.batch([0, 1]).interior.eigenfunctions, expected.interior.eigenfunctions)
+        assert torch.equal(
+            one.batch([0, 1]).interior.eigenfunctions, expected.interior.eigenfunctions
+        )
 
 
 def test_what_a_descriptor_requires_is_asked_of_it(written: tuple[SignatureDataset, Path]) -> None:
     SignatureDataset.from_file(written[1], descriptor=Requirements(13, ("depth",)))
     with pytest.raises(
-        ValueError, match=r"\.igps: n_eigenpairs: .* at least 14, got 13\. .*export the collection again"
+        ValueError,
+        match=r"\.igps: n_eigenpairs: .* at least 14, got 13\. .*export the collection again",
     ):
         SignatureDataset.from_file(written[1], descriptor=Requirements(14))
 
 
 @pytest.mark.parametrize(
-    "where", ["0.interior.points", "3.surface.eigenfunctions", "2.interior.attributes.depth", "area"]
+    "where",
+    ["0.interior.points", "3.surface.eigenfunctions", "2.interior.attributes.depth", "area"],
 )
 def test_a_damaged_signature_is_named_and_costs_no_other(
     written: tuple[SignatureDataset, Path], tmp_path: Path, where: str
@@ -119,14 +137,18 @@ def test_a_damaged_signature_is_named_and_costs_no_other(
     damaged = SignatureDataset.from_file(tmp_path / "damaged.igps")
     for i, name in enumerate(before.bodies.names):
         if i == number:
-            with pytest.raises(ValueError, match=rf"damaged\.igps: {name} is not usable \(its content is damaged"):
+            with pytest.raises(
+                ValueError, match=rf"damaged\.igps: {name} is not usable \(its content is damaged"
+            ):
                 damaged[i]
         else:
             assert damaged[i].id == name
 
 
 @pytest.mark.parametrize("word", [b"egg/2.off", b"ball"])
-def test_a_damaged_name_is_noticed(written: tuple[SignatureDataset, Path], tmp_path: Path, word: bytes) -> None:
+def test_a_damaged_name_is_noticed(
+    written: tuple[SignatureDataset, Path], tmp_path: Path, word: bytes
+) -> None:
     content = bytearray(written[1].read_bytes())
     content[content.index(word) + 1] ^= 1
     (tmp_path / "damaged.igps").write_bytes(content)
@@ -173,10 +195,14 @@ def test_a_file_that_tells_nonsense_is_refused(
         SignatureDataset.from_file(path)
 
 
-def test_what_is_no_collection_is_refused(written: tuple[SignatureDataset, Path], tmp_path: Path) -> None:
+def test_what_is_no_collection_is_refused(
+    written: tuple[SignatureDataset, Path], tmp_path: Path
+) -> None:
     content = written[1].read_bytes()
     huge = (2**40).to_bytes(8, "little") + content[8:]
-    for i, wrong in enumerate((b"", b"no tensors at all", content[:-20], content[:100], huge, pickle.dumps([1]))):
+    for i, wrong in enumerate(
+        (b"", b"no tensors at all", content[:-20], content[:100], huge, pickle.dumps([1]))
+    ):
         path = tmp_path / f"{i}.igps"
         path.write_bytes(wrong)
         with pytest.raises(ValueError, match=rf"{i}\.igps: expected a collection"):

@@ -22,15 +22,24 @@ CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface
 def root(tmp_path: Path) -> Path:
     for label in range(3):
         for i in range(4):
-            write_body(tmp_path / "meshes" / f"class{label}" / f"{i}.off", 1.0 + 0.1 * i, 1.0 + label)
+            write_body(
+                tmp_path / "meshes" / f"class{label}" / f"{i}.off", 1.0 + 0.1 * i, 1.0 + label
+            )
     return tmp_path / "meshes"
 
 
 def test_loaders_give_the_parts_and_balanced_batches(root: Path, tmp_path: Path) -> None:
     module = SignatureDataModule(
-        root, "seen", n_train=3, n_validation=1, classes_per_batch=3, shapes_per_class=2, config=CONFIG,
-        cache_dir=tmp_path / "cache", n_workers=1,
-    )  # fmt: skip
+        root,
+        "seen",
+        n_train=3,
+        n_validation=1,
+        classes_per_batch=3,
+        shapes_per_class=2,
+        config=CONFIG,
+        cache_dir=tmp_path / "cache",
+        n_workers=1,
+    )
     module.prepare_data()
     names = module.dataset.bodies.names
     (batch,) = module.train_dataloader()
@@ -45,13 +54,24 @@ def test_loaders_give_the_parts_and_balanced_batches(root: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize("n_samples", [20, None])
-def test_training_shapes_are_kept_in_memory_thinned(root: Path, tmp_path: Path, n_samples: int | None) -> None:
+def test_training_shapes_are_kept_in_memory_thinned(
+    root: Path, tmp_path: Path, n_samples: int | None
+) -> None:
     module = SignatureDataModule(
-        root, n_train=3, n_validation=1, classes_per_batch=3, shapes_per_class=2, config=CONFIG,
-        cache_dir=tmp_path / "cache", n_workers=1, n_samples_in_memory=n_samples,
-    )  # fmt: skip
+        root,
+        n_train=3,
+        n_validation=1,
+        classes_per_batch=3,
+        shapes_per_class=2,
+        config=CONFIG,
+        cache_dir=tmp_path / "cache",
+        n_workers=1,
+        n_samples_in_memory=n_samples,
+    )
     module.prepare_data()
-    whole = {item.id: item.signature.interior for item in (module.dataset[i] for i in module.split.train)}
+    whole = {
+        item.id: item.signature.interior for item in (module.dataset[i] for i in module.split.train)
+    }
     (batch,) = module.train_dataloader()
     shutil.rmtree(tmp_path / "cache")
     for i, name in enumerate(batch.ids):
@@ -65,10 +85,18 @@ def test_training_shapes_are_kept_in_memory_thinned(root: Path, tmp_path: Path, 
         assert len(list(module.train_dataloader())) == 1
 
 
-def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(root: Path, tmp_path: Path) -> None:
+def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(
+    root: Path, tmp_path: Path
+) -> None:
     def module(**options: int) -> SignatureDataModule:
         return SignatureDataModule(
-            root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path / "cache", n_workers=1, **options
+            root,
+            n_train=2,
+            n_validation=0,
+            config=CONFIG,
+            cache_dir=tmp_path / "cache",
+            n_workers=1,
+            **options,
         )
 
     one, other = module(), module(n_loading_workers=2, evaluation_batch_size=4)
@@ -89,7 +117,9 @@ def test_a_single_sample_in_memory_is_refused(root: Path) -> None:
 
 def test_a_bad_mesh_stops_training(root: Path, tmp_path: Path) -> None:
     (root / "class1" / "9.off").write_text("nothing")
-    module = SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1)
+    module = SignatureDataModule(
+        root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1
+    )
     with pytest.raises(MeshError, match=r"9\.off"):
         module.prepare_data()
 
@@ -114,7 +144,13 @@ def test_meshes_are_read_as_asked(root: Path, tmp_path: Path) -> None:
 
     def module(**options: LoadOptions) -> SignatureDataModule:
         return SignatureDataModule(
-            root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path / "cache", n_workers=1, **options
+            root,
+            n_train=2,
+            n_validation=0,
+            config=CONFIG,
+            cache_dir=tmp_path / "cache",
+            n_workers=1,
+            **options,
         )
 
     with pytest.raises(MeshError, match=r"2\.off.*boundary edges"):
@@ -123,7 +159,9 @@ def test_meshes_are_read_as_asked(root: Path, tmp_path: Path) -> None:
 
 
 def test_nothing_to_validate_on_is_no_loader(root: Path, tmp_path: Path) -> None:
-    module = SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1)
+    module = SignatureDataModule(
+        root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1
+    )
     assert module.val_dataloader() == []
 
 

@@ -66,29 +66,39 @@ def test_items_are_labelled_and_named(dataset: SignatureDataset) -> None:
 
 
 def test_functions_of_position_become_attributes(root: Path, tmp_path: Path) -> None:
-    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"height": lambda points: points[:, 2]})
+    dataset = SignatureDataset(
+        root, CONFIG, tmp_path / "cache", attributes={"height": lambda points: points[:, 2]}
+    )
     for part in (dataset, dataset.subset([0, 3])):
         for samples in (part[1].signature.interior, part[1].signature.surface):
-            np.testing.assert_allclose(samples.attributes["height"], samples.points[:, 2], rtol=1e-6)
+            np.testing.assert_allclose(
+                samples.attributes["height"], samples.points[:, 2], rtol=1e-6
+            )
     assert SignatureDataset(root, CONFIG, tmp_path / "cache")[0].signature.interior.attributes == {}
     wrong = {"height": lambda points: points[:-1]}
     broken = SignatureDataset(root, CONFIG, tmp_path / "cache", attributes=wrong)
-    with pytest.raises(ValueError, match=r"ball/1.off: attributes: height: expected a finite number"):
+    with pytest.raises(
+        ValueError, match=r"ball/1.off: attributes: height: expected a finite number"
+    ):
         broken[0]
 
 
 def test_the_name_of_an_attribute_is_no_source(root: Path, tmp_path: Path) -> None:
     with pytest.raises(
-        ValueError, match=r"attributes: expected functions or sources by names other than .*, got h='depth'"
+        ValueError,
+        match=r"attributes: expected functions or sources by names other than .*, got h='depth'",
     ):
         SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"h": "depth"})  # type: ignore[dict-item]
 
 
 def test_an_attribute_does_not_stand_in_for_one_of_the_library(root: Path, tmp_path: Path) -> None:
     with pytest.raises(
-        ValueError, match=r"names other than .*depth.*, got depth=.*of the library are set by SignatureConfig"
+        ValueError,
+        match=r"names other than .*depth.*, got depth=.*of the library are set by SignatureConfig",
     ):
-        SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"depth": lambda points: points[:, 2]})
+        SignatureDataset(
+            root, CONFIG, tmp_path / "cache", attributes={"depth": lambda points: points[:, 2]}
+        )
 
 
 def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) -> None:
@@ -99,23 +109,46 @@ def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) 
 
 @pytest.mark.parametrize(
     "change",
-    [{"n_eigenpairs": 21}, {"resolution": 11}, {"min_samples": 300}, {"n_surface_samples": 51}, {"backend": "robust"},
-     {"max_vertices": 100}, {"accuracy": None}, {"attributes": ("depth",)}, {"seed": 1}, {"least_vertices": 200}],
-)  # fmt: skip
-def test_key_covers_every_parameter(root: Path, tmp_path: Path, counted: list[str], change: dict[str, object]) -> None:
+    [
+        {"n_eigenpairs": 21},
+        {"resolution": 11},
+        {"min_samples": 300},
+        {"n_surface_samples": 51},
+        {"backend": "robust"},
+        {"max_vertices": 100},
+        {"accuracy": None},
+        {"attributes": ("depth",)},
+        {"seed": 1},
+        {"least_vertices": 200},
+    ],
+)
+def test_key_covers_every_parameter(
+    root: Path, tmp_path: Path, counted: list[str], change: dict[str, object]
+) -> None:
     SignatureDataset(root, CONFIG, tmp_path / "cache")[0]
     SignatureDataset(root, replace(CONFIG, **change), tmp_path / "cache")[0]  # type: ignore[arg-type]
     assert len(counted) == 2
 
 
 def test_parametrisation_above_is_complete() -> None:
-    changed = {"n_eigenpairs", "resolution", "min_samples", "n_surface_samples", "backend", "max_vertices", "accuracy",
-               "attributes", "seed"}  # fmt: skip
+    changed = {
+        "n_eigenpairs",
+        "resolution",
+        "min_samples",
+        "n_surface_samples",
+        "backend",
+        "max_vertices",
+        "accuracy",
+        "attributes",
+        "seed",
+    }
     assert set(CONFIG.as_dict()) == changed | {"algorithm_version"}
     assert {field.name for field in fields(CONFIG)} == changed | {"least_vertices"}
 
 
-@pytest.mark.parametrize("option", [{"mend": "always"}, {"component": "largest"}, {"allow_open": True}])
+@pytest.mark.parametrize(
+    "option", [{"mend": "always"}, {"component": "largest"}, {"allow_open": True}]
+)
 def test_key_covers_how_the_file_is_read(
     root: Path, tmp_path: Path, counted: list[str], option: dict[str, object]
 ) -> None:
@@ -142,10 +175,13 @@ def test_key_covers_content_and_version_but_not_the_path(
 
 
 @pytest.mark.parametrize("cache", ["file", "file/cache"])
-def test_a_cache_that_cannot_be_made_is_no_fault_of_the_bodies(root: Path, tmp_path: Path, cache: str) -> None:
+def test_a_cache_that_cannot_be_made_is_no_fault_of_the_bodies(
+    root: Path, tmp_path: Path, cache: str
+) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(
-        MachineError, match=rf"cache_dir: {tmp_path / cache} cannot be created .*Choose a writable folder"
+        MachineError,
+        match=rf"cache_dir: {tmp_path / cache} cannot be created .*Choose a writable folder",
     ):
         SignatureDataset(root, CONFIG, tmp_path / cache).precompute(n_workers=1)
 
@@ -164,7 +200,9 @@ def test_truncated_file_is_reported_and_computed_again(
 
 
 @pytest.mark.parametrize("how", ["processes", "inline", "threads"])
-def test_precompute_fills_the_cache_and_lists_bad_meshes(root: Path, tmp_path: Path, how: str) -> None:
+def test_precompute_fills_the_cache_and_lists_bad_meshes(
+    root: Path, tmp_path: Path, how: str
+) -> None:
     (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     if how == "threads":
@@ -197,7 +235,9 @@ def test_strict_stops_at_a_bad_mesh(root: Path, tmp_path: Path) -> None:
 
 
 def test_a_missing_file_is_a_failure_like_any_other(root: Path, tmp_path: Path) -> None:
-    dataset = SignatureDataset([root / "ball" / "1.off", root / "gone.off"], CONFIG, tmp_path / "cache")
+    dataset = SignatureDataset(
+        [root / "ball" / "1.off", root / "gone.off"], CONFIG, tmp_path / "cache"
+    )
     (failure,) = dataset.precompute(n_workers=1, progress=False)
     assert "gone.off" in failure.error
     with pytest.raises(MeshError, match=r"gone\.off"):
@@ -209,13 +249,18 @@ def test_two_processes_on_one_cache(root: Path, tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
         results = list(pool.map(lambda d: d.precompute(n_workers=2, progress=False), datasets))
     assert results == [[], []]
-    assert len(list((tmp_path / "cache").rglob("*"))) - len(list((tmp_path / "cache").iterdir())) == 4
+    assert (
+        len(list((tmp_path / "cache").rglob("*"))) - len(list((tmp_path / "cache").iterdir())) == 4
+    )
     assert all(isinstance(datasets[0][i], LabelledSignature) for i in range(4))
 
 
 def test_works_in_a_data_loader(dataset: SignatureDataset) -> None:
     batches = list(DataLoader(dataset, batch_size=3, collate_fn=collate))
-    assert [batch.ids for batch in batches] == [("ball/1.off", "ball/2.off", "egg/1.off"), ("egg/2.off",)]
+    assert [batch.ids for batch in batches] == [
+        ("ball/1.off", "ball/2.off", "egg/1.off"),
+        ("egg/2.off",),
+    ]
     for batch, first in zip(batches, (0, 3), strict=True):
         direct = collate([dataset[first + i] for i in range(len(batch))])
         assert torch.equal(batch.interior.eigenfunctions, direct.interior.eigenfunctions)
@@ -266,14 +311,20 @@ def test_parts_of_a_subclass_are_of_it_and_keep_what_it_has(root: Path, tmp_path
         ([], []),
     ],
 )
-def test_some_items_are_a_dataset(dataset: SignatureDataset, index: slice | list[int], chosen: list[int]) -> None:
+def test_some_items_are_a_dataset(
+    dataset: SignatureDataset, index: slice | list[int], chosen: list[int]
+) -> None:
     part = dataset[index]
     assert part.bodies.names == tuple(dataset.bodies.names[i] for i in chosen)
     assert part.labels.tolist() == dataset.labels[chosen].tolist()
 
 
 def test_an_item_is_asked_for_by_number_or_name(dataset: SignatureDataset) -> None:
-    assert [dataset[i].id for i in (-1, np.int64(2), "ball/2.off")] == ["egg/2.off", "egg/1.off", "ball/2.off"]
+    assert [dataset[i].id for i in (-1, np.int64(2), "ball/2.off")] == [
+        "egg/2.off",
+        "egg/1.off",
+        "ball/2.off",
+    ]
     assert [item.id for item in dataset] == list(dataset.bodies.names)
     for number in (torch.tensor(2), np.array(2)):
         assert dataset[number].id == "egg/1.off"  # type: ignore[call-overload]
@@ -292,14 +343,21 @@ def test_the_descriptor_says_what_signatures_it_is_for(root: Path, tmp_path: Pat
     for descriptor in ("rich", rich, rich.requirements):
         assert SignatureDataset(root, descriptor=descriptor).config == expected
     small = SignatureConfig(n_eigenpairs=20)
-    assert SignatureDataset(root, replace(CONFIG, n_eigenpairs=None), descriptor="shape_dna").config.resolution == 10
+    assert (
+        SignatureDataset(
+            root, replace(CONFIG, n_eigenpairs=None), descriptor="shape_dna"
+        ).config.resolution
+        == 10
+    )
     with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs"):
         SignatureDataset(root, small, descriptor="rich")
     with pytest.raises(ValueError, match="descriptor: expected one of"):
         SignatureDataset(root, descriptor="no such")
 
 
-def test_after_precompute_the_meshes_are_not_needed(dataset: SignatureDataset, root: Path, counted: list[str]) -> None:
+def test_after_precompute_the_meshes_are_not_needed(
+    dataset: SignatureDataset, root: Path, counted: list[str]
+) -> None:
     before = [dataset[i].signature for i in range(4)]
     assert dataset.precompute(n_workers=1, progress=False) == []
     keys, notes = dataset.cached_keys(), dataset.all_notes()
@@ -307,7 +365,9 @@ def test_after_precompute_the_meshes_are_not_needed(dataset: SignatureDataset, r
     shutil.rmtree(root)
     for part in (dataset, pickle.loads(pickle.dumps(dataset)), dataset.subset(range(4))):
         for item, expected in zip(part, before, strict=True):
-            np.testing.assert_array_equal(item.signature.interior.eigenfunctions, expected.interior.eigenfunctions)
+            np.testing.assert_array_equal(
+                item.signature.interior.eigenfunctions, expected.interior.eigenfunctions
+            )
         assert (part.cached_keys(), part.all_notes()) == (keys, notes)
     assert counted == []
     with pytest.raises(MeshError, match=r"1\.off"):
@@ -323,7 +383,9 @@ def test_after_precompute_a_lost_signature_is_computed_again(
     assert len(counted) == 5
 
 
-def test_in_memory_nothing_is_read_any_more(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:
+def test_in_memory_nothing_is_read_any_more(
+    dataset: SignatureDataset, root: Path, tmp_path: Path
+) -> None:
     before = collate([dataset[i] for i in range(4)])
     kept = dataset.to_memory()
     shutil.rmtree(root)
@@ -339,10 +401,15 @@ def test_sizes_are_those_of_the_interior_samples(dataset: SignatureDataset) -> N
     assert dataset.sizes.tolist() == [len(item.signature.interior) for item in dataset]
 
 
-def test_a_transform_is_applied_at_each_reading_and_not_kept(dataset: SignatureDataset, counted: list[str]) -> None:
+def test_a_transform_is_applied_at_each_reading_and_not_kept(
+    dataset: SignatureDataset, counted: list[str]
+) -> None:
     plain = dataset[0].signature
     changed = SignatureDataset(
-        dataset.bodies, CONFIG, dataset.pipeline.cache_dir, transform=FewerSamples(n_interior=5, n_surface=5)
+        dataset.bodies,
+        CONFIG,
+        dataset.pipeline.cache_dir,
+        transform=FewerSamples(n_interior=5, n_surface=5),
     )
     torch.manual_seed(0)
     first, second = changed[0].signature, changed[0].signature
@@ -361,10 +428,14 @@ def test_a_pre_transform_is_kept_under_a_key_of_its_own(
     counted.clear()
     applied: list[str] = []
     change = Scale._changed
-    monkeypatch.setattr(Scale, "_changed", lambda self, s, g: applied.append(s.name) or change(self, s, g))
+    monkeypatch.setattr(
+        Scale, "_changed", lambda self, s, g: applied.append(s.name) or change(self, s, g)
+    )
 
     def changed(seed: int) -> SignatureDataset:
-        return SignatureDataset(root, CONFIG, dataset.pipeline.cache_dir, pre_transform=Scale(seed=seed))
+        return SignatureDataset(
+            root, CONFIG, dataset.pipeline.cache_dir, pre_transform=Scale(seed=seed)
+        )
 
     first = changed(0)
     volume = first[0].signature.volume
@@ -377,7 +448,9 @@ def test_a_pre_transform_is_kept_under_a_key_of_its_own(
     assert first.precompute(n_workers=1, progress=False) == []
     assert len(applied) == 5
     keys = first.cached_keys()
-    assert len({*keys, *dataset.cached_keys(), *changed(1).cached_keys()}) == 10  # of the last one is, and None
+    assert (
+        len({*keys, *dataset.cached_keys(), *changed(1).cached_keys()}) == 10
+    )  # of the last one is, and None
     assert changed(0).cached_keys() == keys
     assert [first.key(i) for i in range(len(first))] == keys
     for wrong, message in (
@@ -441,14 +514,19 @@ def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(
     )
 
 
-def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(tmp_path: Path) -> None:
+def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(
+    tmp_path: Path,
+) -> None:
     for name in ("a", "b"):
         write_body(tmp_path / f"{name}.off", 1.1, 1.3)
     files = [tmp_path / "a.off", tmp_path / "b.off"]
     found = []
     for number, order in enumerate((files, files[::-1])):
         dataset = SignatureDataset(
-            order, CONFIG, tmp_path / f"cache {number}", pre_transform=FewerSamples(n_interior=6, seed=0)
+            order,
+            CONFIG,
+            tmp_path / f"cache {number}",
+            pre_transform=FewerSamples(n_interior=6, seed=0),
         )
         found += [dataset[0].signature, dataset[1].signature]
     assert [Path(one.name).name for one in found] == ["a.off", "b.off", "b.off", "a.off"]
@@ -456,22 +534,31 @@ def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(tm
         np.testing.assert_array_equal(one.interior.points, found[0].interior.points)
 
 
-def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root: Path, tmp_path: Path) -> None:
+def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(
+    root: Path, tmp_path: Path
+) -> None:
     def changed(slope: float) -> SignatureDataset:
         return SignatureDataset(
-            root, CONFIG, tmp_path / "cache", attributes={"ct": Image(slope)},
+            root,
+            CONFIG,
+            tmp_path / "cache",
+            attributes={"ct": Image(slope)},
             pre_transform=FewerSamples(n_interior=6, seed=0),
-        )  # fmt: skip
+        )
 
     for slope in (2.0, 3.0, 2.0):
         dataset = changed(slope)
         dataset.precompute(n_workers=1, progress=False)
         samples = dataset[1].signature.interior
         assert len(samples) == 6
-        np.testing.assert_allclose(samples.attributes["ct"], slope * samples.points[:, 2], rtol=1e-6)
+        np.testing.assert_allclose(
+            samples.attributes["ct"], slope * samples.points[:, 2], rtol=1e-6
+        )
     assert changed(2.0).cached_keys() != changed(3.0).cached_keys()
     with pytest.raises(ValueError, match="pre_transform: expected attributes with a cache_tag"):
-        SignatureDataset(root, attributes={"x": lambda points: points[:, 0]}, pre_transform=Scale(seed=0))
+        SignatureDataset(
+            root, attributes={"x": lambda points: points[:, 0]}, pre_transform=Scale(seed=0)
+        )
 
 
 @pytest.mark.parametrize(("start", "how"), [("fork", "cache"), ("fork", "file"), ("spawn", "file")])
@@ -485,9 +572,13 @@ def test_workers_give_what_this_process_gives(
         dataset = SignatureDataset.from_file(tmp_path / "all.igps")
     shutil.rmtree(root)
     loader = DataLoader(
-        dataset, batch_size=2, num_workers=2, persistent_workers=True, collate_fn=collate,
+        dataset,
+        batch_size=2,
+        num_workers=2,
+        persistent_workers=True,
+        collate_fn=collate,
         multiprocessing_context=start,
-    )  # fmt: skip
+    )
     for _ in range(2):
         found = SignatureBatch.concatenate(list(loader))
         assert found.ids == expected.ids
@@ -496,7 +587,9 @@ def test_workers_give_what_this_process_gives(
 
 
 def test_slow_meshes_are_listed(dataset: SignatureDataset, tmp_path: Path) -> None:
-    (failure,) = dataset.subset([2]).precompute(n_workers=1, progress=False, limits=Limits(seconds=1e-6))
+    (failure,) = dataset.subset([2]).precompute(
+        n_workers=1, progress=False, limits=Limits(seconds=1e-6)
+    )
     assert failure.id == "egg/1.off"
     assert failure.error.startswith(f"{failure.path}: it took longer than the time_limit")
     assert not list((tmp_path / "cache").rglob("*.safetensors"))
@@ -505,4 +598,8 @@ def test_slow_meshes_are_listed(dataset: SignatureDataset, tmp_path: Path) -> No
 def test_a_failure_names_its_file_once(dataset: SignatureDataset) -> None:
     path = dataset.bodies.paths[2]
     expected = Failure("egg/1.off", path, f"{path}: bad")
-    assert Failure.of(dataset.bodies, 2, "bad") == Failure.of(dataset.bodies, 2, f"{path}: bad") == expected
+    assert (
+        Failure.of(dataset.bodies, 2, "bad")
+        == Failure.of(dataset.bodies, 2, f"{path}: bad")
+        == expected
+    )

@@ -48,7 +48,9 @@ def make_old(path: Path) -> None:
     os.utime(path, (LONG_AGO, LONG_AGO))
 
 
-def test_files_that_did_not_change_are_not_read_again(dataset: SignatureDataset, read: list[str]) -> None:
+def test_files_that_did_not_change_are_not_read_again(
+    dataset: SignatureDataset, read: list[str]
+) -> None:
     dataset.precompute(n_workers=1, progress=False)
     assert set(read) == {"0.off", "1.off", "2.off"}
     read.clear()
@@ -58,7 +60,9 @@ def test_files_that_did_not_change_are_not_read_again(dataset: SignatureDataset,
     assert dataset.all_notes() == [dataset.notes(i) for i in range(3)]
 
 
-def test_a_changed_file_is_read_again(dataset: SignatureDataset, read: list[str], tmp_path: Path) -> None:
+def test_a_changed_file_is_read_again(
+    dataset: SignatureDataset, read: list[str], tmp_path: Path
+) -> None:
     """Even to another of the same size, with the old time given back to it."""
     dataset.precompute(n_workers=1, progress=False)
     first, second = (tmp_path / "meshes" / f"{i}.off" for i in range(2))
@@ -68,7 +72,9 @@ def test_a_changed_file_is_read_again(dataset: SignatureDataset, read: list[str]
     read.clear()
     dataset.precompute(n_workers=1, progress=False)
     assert set(read) == {"0.off"}
-    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 4 - (first.read_bytes() == second.read_bytes())
+    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 4 - (
+        first.read_bytes() == second.read_bytes()
+    )
 
 
 def test_a_file_that_changed_a_moment_ago_is_not_remembered(
@@ -82,25 +88,35 @@ def test_a_file_that_changed_a_moment_ago_is_not_remembered(
 
 
 @pytest.mark.parametrize("left", [None, 100])
-def test_a_lost_signature_is_computed_again(dataset: SignatureDataset, tmp_path: Path, left: int | None) -> None:
+def test_a_lost_signature_is_computed_again(
+    dataset: SignatureDataset, tmp_path: Path, left: int | None
+) -> None:
     dataset.precompute(n_workers=1, progress=False)
     before = {path: path.read_bytes() for path in (tmp_path / "cache").rglob("*.safetensors")}
     path = sorted(before)[0]
     path.unlink() if left is None else path.write_bytes(before[path][:left])
     dataset.precompute(n_workers=1, progress=False)
-    assert {path: path.read_bytes() for path in (tmp_path / "cache").rglob("*.safetensors")} == before
+    assert {
+        path: path.read_bytes() for path in (tmp_path / "cache").rglob("*.safetensors")
+    } == before
 
 
 def test_other_parameters_are_other_files(dataset: SignatureDataset, tmp_path: Path) -> None:
     dataset.precompute(n_workers=1, progress=False)
-    other = SignatureDataset(tmp_path / "meshes", SignatureConfig(n_eigenpairs=21, resolution=10), tmp_path / "cache")
+    other = SignatureDataset(
+        tmp_path / "meshes", SignatureConfig(n_eigenpairs=21, resolution=10), tmp_path / "cache"
+    )
     other.precompute(n_workers=1, progress=False)
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 6
 
 
 @pytest.mark.parametrize("fault", ["garbage", "another table", "a folder"])
 def test_without_the_memory_all_goes_on(
-    dataset: SignatureDataset, tmp_path: Path, read: list[str], caplog: pytest.LogCaptureFixture, fault: str
+    dataset: SignatureDataset,
+    tmp_path: Path,
+    read: list[str],
+    caplog: pytest.LogCaptureFixture,
+    fault: str,
 ) -> None:
     dataset.precompute(n_workers=1, progress=False)
     memory = tmp_path / "cache" / "known_files.sqlite"

@@ -30,8 +30,14 @@ def test_they_have_the_signatures_of_their_files(tmp_path: Path) -> None:
     image = nibabel.Nifti1Image(two_balls_and_a_speck(), AFFINE)
     nibabel.save(image, tmp_path / "a.nii")
     BALL.export(tmp_path / "b.stl")
-    of_files = SignatureDataset([tmp_path / "a.nii", tmp_path / "b.stl"], CONFIG, tmp_path / "files")
-    given: dict[str, Any] = {"a": image, "b": trimesh.load(tmp_path / "b.stl"), "c": np.full((4, 4, 4), np.nan)}
+    of_files = SignatureDataset(
+        [tmp_path / "a.nii", tmp_path / "b.stl"], CONFIG, tmp_path / "files"
+    )
+    given: dict[str, Any] = {
+        "a": image,
+        "b": trimesh.load(tmp_path / "b.stl"),
+        "c": np.full((4, 4, 4), np.nan),
+    }
     in_memory = SignatureDataset(given, CONFIG, tmp_path / "memory", labels=["x", "y", "z"])
     assert in_memory.bodies.names == ("a#2", "a#5", "a#9", "b", "c")
     assert in_memory.bodies.labels == ("x", "x", "x", "y", "z")

@@ -55,7 +55,9 @@ def test_a_signature_is_computed_once_and_is_that_of_the_mesh(
 
     monkeypatch.setattr(pipeline_module, "compute_signature", no_more)
     for found in (first, pipeline.signature(BodyRef(path))):
-        np.testing.assert_array_equal(found.interior.eigenfunctions, expected.interior.eigenfunctions)
+        np.testing.assert_array_equal(
+            found.interior.eigenfunctions, expected.interior.eigenfunctions
+        )
         np.testing.assert_array_equal(found.eigenvalues, expected.eigenvalues)
 
 
@@ -99,18 +101,24 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
     assert len(set(keys)) == len(keys)
 
 
-def test_the_key_tells_pdb_from_pqr_also_when_compressed(pipeline: SignaturePipeline, tmp_path: Path) -> None:
+def test_the_key_tells_pdb_from_pqr_also_when_compressed(
+    pipeline: SignaturePipeline, tmp_path: Path
+) -> None:
     """A PDB line without an element is valid PQR, with its occupancy as charge and its B-factor as radius."""
     line = b"ATOM      1  CA  ALA A   1      11.104   6.134  -6.504  1.00  4.00\n"
     names = [f"a.{kind}{packed}" for kind in ("pqr", "pdb", "PQR") for packed in (".gz", "")]
     for name in names:
-        (tmp_path / name).write_bytes(gzip.compress(line, mtime=0) if name.endswith(".gz") else line)
+        (tmp_path / name).write_bytes(
+            gzip.compress(line, mtime=0) if name.endswith(".gz") else line
+        )
     keys = [pipeline.key(BodyRef(tmp_path / name)) for name in names]
     assert keys[4:] == keys[:2]
     assert len(set(keys)) == 4
 
 
-def test_keys_are_those_of_the_caches_that_exist(pipeline: SignaturePipeline, tmp_path: Path) -> None:
+def test_keys_are_those_of_the_caches_that_exist(
+    pipeline: SignaturePipeline, tmp_path: Path
+) -> None:
     """Frozen: another key leaves all caches useless. It changes with ALGORITHM_VERSION alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
     assert SignatureConfig.ALGORITHM_VERSION == 5
@@ -142,7 +150,9 @@ def test_a_new_version_of_the_mending_leaves_bodies_that_are_read_as_they_are(
     assert [fill(), fill()] == [1, 0]
 
 
-def test_a_mended_body_cached_without_a_mending_version_is_computed_again(tmp_path: Path, computed: list[int]) -> None:
+def test_a_mended_body_cached_without_a_mending_version_is_computed_again(
+    tmp_path: Path, computed: list[int]
+) -> None:
     """Its entry has the key of a body that needs no mending, but its notes say that it was mended."""
     body = trimesh.creation.icosphere(subdivisions=2)
     path = tmp_path / "open.off"
@@ -181,10 +191,16 @@ def test_a_larger_signature_serves(tmp_path: Path, computed: list[int], subdivis
     A body without symmetry: in one that has some, rounding decides which of like points comes first.
     """
     body = trimesh.creation.icosphere(subdivisions=subdivisions)
-    body.vertices *= (1 + 0.2 * np.sin(2 * body.vertices @ [1.0, 0.7, 0.4]))[:, None] * [1.0, 1.3, 1.9]
+    body.vertices *= (1 + 0.2 * np.sin(2 * body.vertices @ [1.0, 0.7, 0.4]))[:, None] * [
+        1.0,
+        1.3,
+        1.9,
+    ]
     path = tmp_path / "egg.off"
     body.export(path)
-    full = SignaturePipeline(replace(USUAL, attributes=get_args(AttributeName)), LoadOptions(), tmp_path / "cache")
+    full = SignaturePipeline(
+        replace(USUAL, attributes=get_args(AttributeName)), LoadOptions(), tmp_path / "cache"
+    )
     full.signature(BodyRef(path))
     needed = replace(full, config=replace(NEEDED, attributes=("surface_direction",)))
     assert is_cached(needed, BodyRef(path))
@@ -197,7 +213,9 @@ def test_a_larger_signature_serves(tmp_path: Path, computed: list[int], subdivis
     np.testing.assert_allclose(found.eigenvalues, expected.eigenvalues, rtol=1e-9)
     for one, other in ((found.interior, expected.interior), (found.surface, expected.surface)):
         np.testing.assert_allclose(one.points, other.points, atol=1e-12)
-        np.testing.assert_allclose(np.abs(one.eigenfunctions), np.abs(other.eigenfunctions), atol=1e-3)
+        np.testing.assert_allclose(
+            np.abs(one.eigenfunctions), np.abs(other.eigenfunctions), atol=1e-3
+        )
         assert set(one.attributes) == set(other.attributes) == {"surface_direction"}
     # And never the other way round.
     replace(needed, cache_dir=tmp_path / "other").signature(BodyRef(path))
@@ -218,7 +236,9 @@ def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(
     assert computed == [250, 64, 20, 64]
 
 
-def test_a_damaged_larger_signature_is_passed_over(path: Path, tmp_path: Path, computed: list[int]) -> None:
+def test_a_damaged_larger_signature_is_passed_over(
+    path: Path, tmp_path: Path, computed: list[int]
+) -> None:
     pipeline = SignaturePipeline(USUAL, LoadOptions(), tmp_path / "cache")
     pipeline.signature(BodyRef(path))
     (file,) = (tmp_path / "cache").rglob("*.safetensors")

@@ -22,7 +22,9 @@ def test_together_is_what_both_need() -> None:
         Requirements(5, ("depth", "surface_direction")),
         Requirements(9, ("electrostatic_potential", "depth"), mesh=True),
     )
-    assert one | other == Requirements(9, ("depth", "surface_direction", "electrostatic_potential"), mesh=True)
+    assert one | other == Requirements(
+        9, ("depth", "surface_direction", "electrostatic_potential"), mesh=True
+    )
     assert one | Requirements() == Requirements() | one == one
 
 
@@ -34,18 +36,28 @@ def test_completed_configuration_satisfies_what_is_needed() -> None:
     completed = requirements.apply_to(config)
     requirements.check_config(completed)
     assert completed == replace(config, attributes=("depth", "surface_direction"))
-    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 30, got 29"):
+    with pytest.raises(
+        ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 30, got 29"
+    ):
         requirements.apply_to(SignatureConfig(n_eigenpairs=29))
 
 
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (SignatureConfig(n_eigenpairs=11, attributes=("depth",)), "n_eigenpairs: .* at least 12, got 11.* Raise"),
-        (SignatureConfig(n_eigenpairs=12), r"attributes: .* signatures with depth, got \[\]. Compute them with"),
+        (
+            SignatureConfig(n_eigenpairs=11, attributes=("depth",)),
+            "n_eigenpairs: .* at least 12, got 11.* Raise",
+        ),
+        (
+            SignatureConfig(n_eigenpairs=12),
+            r"attributes: .* signatures with depth, got \[\]. Compute them with",
+        ),
     ],
 )
-def test_a_configuration_that_lacks_something_is_refused(config: SignatureConfig, message: str) -> None:
+def test_a_configuration_that_lacks_something_is_refused(
+    config: SignatureConfig, message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         Requirements(12, ("depth",)).check_config(config)
 
@@ -54,7 +66,9 @@ def test_a_batch_that_lacks_something_is_refused() -> None:
     """The second shape has seven eigenpairs; what is padded is none."""
     batch = two_bodies()
     Requirements(7, ("depth", "surface_direction")).check(batch)
-    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 8, got 7"):
+    with pytest.raises(
+        ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 8, got 7"
+    ):
         Requirements(8).check(batch)
     with pytest.raises(
         ValueError,
@@ -62,7 +76,9 @@ def test_a_batch_that_lacks_something_is_refused() -> None:
         r"got \['depth', 'surface_direction'\]",
     ):
         Requirements(attributes=("depth", "electrostatic_potential")).check(batch)
-    with pytest.raises(ValueError, match=r"meshes: this descriptor needs the surfaces too. Make the batch by"):
+    with pytest.raises(
+        ValueError, match=r"meshes: this descriptor needs the surfaces too. Make the batch by"
+    ):
         Requirements(mesh=True).check(batch)
     Requirements().check(batch_of(torch.rand(1, 5, 3)))
 
@@ -86,7 +102,9 @@ def test_needs_of_an_embedding_are_its_eigenpairs() -> None:
         (Requirements(300, whole_spectrum=True), 300),
     ],
 )
-def test_as_many_eigenpairs_as_needed_where_no_number_is_given(needs: Requirements, n_eigenpairs: int) -> None:
+def test_as_many_eigenpairs_as_needed_where_no_number_is_given(
+    needs: Requirements, n_eigenpairs: int
+) -> None:
     """64 or more, on which the order of the samples depends; a mesh has room for 250 in any case."""
     completed = needs.apply_to(SignatureConfig(resolution=17))
     assert (completed.n_eigenpairs, completed.resolution) == (n_eigenpairs, 17)

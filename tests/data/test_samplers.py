@@ -10,7 +10,9 @@ SIZES = torch.randint(1000, 4000, (403,), generator=torch.Generator().manual_see
 
 @pytest.mark.parametrize("drop_last", [False, True])
 def test_every_shape_comes_once_in_batches_of_the_size_asked(drop_last: bool) -> None:
-    sampler = BucketBatchSampler(SIZES, 8, drop_last=drop_last, generator=torch.Generator().manual_seed(0))
+    sampler = BucketBatchSampler(
+        SIZES, 8, drop_last=drop_last, generator=torch.Generator().manual_seed(0)
+    )
     batches = list(sampler)
     assert len(batches) == len(sampler) == (50 if drop_last else 51)
     assert sorted(map(len, batches))[0] == (8 if drop_last else 3)
@@ -20,7 +22,11 @@ def test_every_shape_comes_once_in_batches_of_the_size_asked(drop_last: bool) ->
 
 def padding(batches: list[list[int]]) -> float:
     """Padding rows of all batches, over the rows of their shapes."""
-    return sum(len(one) * int(SIZES[one].max()) for one in batches) / sum(int(SIZES[one].sum()) for one in batches) - 1
+    return (
+        sum(len(one) * int(SIZES[one].max()) for one in batches)
+        / sum(int(SIZES[one].sum()) for one in batches)
+        - 1
+    )
 
 
 def test_padding_is_a_small_part_of_that_of_random_batches() -> None:

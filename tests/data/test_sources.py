@@ -17,7 +17,15 @@ def touch(root: Path, *names: str) -> None:
 
 
 def test_folder_per_class(tmp_path: Path) -> None:
-    touch(tmp_path, "cat/2.off", "cat/1.off", "dog/deep/3.ply", "dog/readme.txt", ".hidden/4.off", "empty/5.txt")
+    touch(
+        tmp_path,
+        "cat/2.off",
+        "cat/1.off",
+        "dog/deep/3.ply",
+        "dog/readme.txt",
+        ".hidden/4.off",
+        "empty/5.txt",
+    )
     touch(tmp_path, "cat/.git/annex/1.off", "cat/._1.off", "__MACOSX/cat/._1.off")
     files = find_bodies(tmp_path)
     assert files.names == ("cat/1.off", "cat/2.off", "dog/deep/3.ply")
@@ -56,7 +64,10 @@ def test_meshes_alone_have_no_classes(tmp_path: Path) -> None:
         ("file,label\n1.off,cat\n./1.off,cat\n", r"\./1\.off is listed twice"),
         ("file,label\n1.off,cat\na/../1.off,cat\n", r"1\.off is listed twice"),
         ("file,label\n1\0.off,cat\n", "line 2 lacks the name of a file"),
-        ("file,label,age\n1.off,cat,40,5\n", "line 2 has more values than columns. Put a value with a comma in quotes"),
+        (
+            "file,label,age\n1.off,cat,40,5\n",
+            "line 2 has more values than columns. Put a value with a comma in quotes",
+        ),
     ],
 )
 def test_bad_labels_file(tmp_path: Path, text: str, message: str) -> None:
@@ -91,7 +102,9 @@ def test_what_is_left_out_of_a_folder_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     touch(tmp_path, "cat/1.off", "dog/2.off", "alone.off")
-    (tmp_path / "cat" / "lost.off").symlink_to(tmp_path / "not there.off")  # as of a file that was not fetched
+    (tmp_path / "cat" / "lost.off").symlink_to(
+        tmp_path / "not there.off"
+    )  # as of a file that was not fetched
     (tmp_path / "elsewhere").mkdir()
     touch(tmp_path / "elsewhere", "5.off")
     (tmp_path / "linked").symlink_to(tmp_path / "elsewhere")
@@ -119,7 +132,9 @@ def test_names_that_are_no_words_are_refused(tmp_path: Path) -> None:
     touch(name, "1.off")
     with pytest.raises(ValueError, match=r"m\\xfcll': expected a name in UTF-8"):
         find_bodies(name)
-    with pytest.raises(ValueError, match=r"paths: expected names in UTF-8, got b'.*m\\xfcll/1.off'"):
+    with pytest.raises(
+        ValueError, match=r"paths: expected names in UTF-8, got b'.*m\\xfcll/1.off'"
+    ):
         bodies_of_files([name / "1.off"])
 
 
@@ -137,7 +152,9 @@ def test_nothing_there(tmp_path: Path) -> None:
         find_bodies(tmp_path)
     with pytest.raises(FileNotFoundError, match="no such folder"):
         find_bodies(tmp_path / "nowhere")
-    with pytest.raises(FileNotFoundError, match=r"nowhere: no such file or folder\. Check the path\."):
+    with pytest.raises(
+        FileNotFoundError, match=r"nowhere: no such file or folder\. Check the path\."
+    ):
         bodies_of(tmp_path / "nowhere")
 
 

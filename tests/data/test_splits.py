@@ -5,7 +5,9 @@ import torch
 
 from igps.data.splits import Split, split_seen, split_unseen
 
-LABELS = torch.arange(8).repeat_interleave(6)[torch.randperm(48, generator=torch.Generator().manual_seed(1))]
+LABELS = torch.arange(8).repeat_interleave(6)[
+    torch.randperm(48, generator=torch.Generator().manual_seed(1))
+]
 
 
 def classes(indices: tuple[int, ...]) -> list[int]:
@@ -42,10 +44,15 @@ def test_a_whole_number_may_be_a_float() -> None:
 def test_shares_leave_two_of_each_class_to_validate_and_to_test() -> None:
     labels = torch.arange(3).repeat_interleave(torch.tensor([5, 8, 20]))
     split = split_seen(labels, 0.75, n_validation=0.25)
-    counts = [torch.bincount(labels[list(part)]).tolist() for part in (split.train, split.validation, split.test)]
+    counts = [
+        torch.bincount(labels[list(part)]).tolist()
+        for part in (split.train, split.validation, split.test)
+    ]
     assert counts == [[1, 4, 11], [2, 2, 4], [2, 2, 5]]
     of_classes = split_unseen(labels, 0.5, n_validation=0.5)
-    assert [len(set(labels[list(part)].tolist())) for part in (of_classes.train, of_classes.test)] == [1, 1]
+    assert [
+        len(set(labels[list(part)].tolist())) for part in (of_classes.train, of_classes.test)
+    ] == [1, 1]
 
 
 def test_fewer_training_classes_keep_the_test_classes() -> None:

@@ -9,7 +9,15 @@ import torch
 import trimesh
 from scipy.spatial.distance import cdist
 
-from igps.data.transforms import Compose, FewerEigenpairs, FewerSamples, FlipSigns, Noise, Scale, Transform
+from igps.data.transforms import (
+    Compose,
+    FewerEigenpairs,
+    FewerSamples,
+    FlipSigns,
+    Noise,
+    Scale,
+    Transform,
+)
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
@@ -44,11 +52,16 @@ def arrays(signature: Signature) -> list[np.ndarray]:
 
 
 def same(one: Signature, other: Signature) -> bool:
-    return all(a.shape == b.shape and (a == b).all() for a, b in zip(arrays(one), arrays(other), strict=True))
+    return all(
+        a.shape == b.shape and (a == b).all()
+        for a, b in zip(arrays(one), arrays(other), strict=True)
+    )
 
 
 @pytest.mark.parametrize("transform", EVERY, ids=lambda one: type(one).__name__)
-def test_a_seed_says_all_and_no_input_is_changed(signature: Signature, transform: Transform) -> None:
+def test_a_seed_says_all_and_no_input_is_changed(
+    signature: Signature, transform: Transform
+) -> None:
     before = [array.copy() for array in arrays(signature)]
     for array in arrays(signature):
         array.flags.writeable = False
@@ -65,7 +78,9 @@ def test_a_seed_says_all_and_no_input_is_changed(signature: Signature, transform
 
 
 @pytest.mark.parametrize("transform", EVERY, ids=lambda one: type(one).__name__)
-def test_without_a_seed_the_global_generator_draws(signature: Signature, transform: Transform) -> None:
+def test_without_a_seed_the_global_generator_draws(
+    signature: Signature, transform: Transform
+) -> None:
     torch.manual_seed(0)
     first, second = transform(signature), transform(signature)
     torch.manual_seed(0)
@@ -111,22 +126,31 @@ def test_scaled_is_the_signature_of_the_scaled_body(signature: Signature) -> Non
     """Computed from a mesh of twice the size; eigenfunctions to their signs, so that products of them are compared."""
     scaled, expected = Scale(smallest=2.0, largest=2.0, seed=0)(signature), of_egg(2.0)
     np.testing.assert_allclose(scaled.eigenvalues, expected.eigenvalues, rtol=1e-6)
-    assert (scaled.area, scaled.volume) == (pytest.approx(expected.area), pytest.approx(expected.volume))
+    assert (scaled.area, scaled.volume) == (
+        pytest.approx(expected.area),
+        pytest.approx(expected.volume),
+    )
     np.testing.assert_allclose(scaled.interior.points, expected.interior.points, atol=1e-9)
     for one, other in ((scaled.interior, expected.interior), (scaled.surface, expected.surface)):
-        np.testing.assert_allclose(np.abs(one.eigenfunctions), np.abs(other.eigenfunctions), atol=1e-4)
+        np.testing.assert_allclose(
+            np.abs(one.eigenfunctions), np.abs(other.eigenfunctions), atol=1e-4
+        )
     with pytest.raises(ValueError, match="0 < smallest ≤ largest"):
         Scale(smallest=2.0, largest=1.0)
 
 
-def test_signs_are_flipped_for_all_samples_alike_and_change_no_distance(signature: Signature) -> None:
+def test_signs_are_flipped_for_all_samples_alike_and_change_no_distance(
+    signature: Signature,
+) -> None:
     flipped = FlipSigns(seed=1)(signature)
     inside, outside = signature.interior.eigenfunctions, signature.surface.eigenfunctions
     signs = flipped.interior.eigenfunctions / inside
     assert set(np.unique(signs)) == {-1.0, 1.0}
     assert (signs == signs[0]).all()
     before = cdist(inside, outside)
-    np.testing.assert_allclose(cdist(flipped.interior.eigenfunctions, flipped.surface.eigenfunctions), before)
+    np.testing.assert_allclose(
+        cdist(flipped.interior.eigenfunctions, flipped.surface.eigenfunctions), before
+    )
 
 
 def test_composed_are_one_after_the_other(signature: Signature) -> None:

@@ -22,8 +22,18 @@ def of_signature(signature: Signature) -> Body:
     return next(collate([signature]).bodies())
 
 
-def of_points(points: NDArray[np.float64], area: float = 1.0, eigenvalues: NDArray[np.float64] | None = None) -> Body:
+def of_points(
+    points: NDArray[np.float64], area: float = 1.0, eigenvalues: NDArray[np.float64] | None = None
+) -> Body:
     """A body of which the samples of the surface, the area and the eigenvalues are known, and nothing else."""
     samples = Samples(points, np.zeros((len(points), 1), dtype=np.float32))
     nothing = Samples(np.zeros((0, 3)), np.zeros((0, 1), dtype=np.float32))
-    return Body(np.ones(1) if eigenvalues is None else eigenvalues, nothing, samples, area, 1.0, "points", None)
+    return Body(
+        np.ones(1) if eigenvalues is None else eigenvalues,
+        nothing,
+        samples,
+        area,
+        1.0,
+        "points",
+        None,
+    )

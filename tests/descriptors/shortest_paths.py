@@ -11,6 +11,8 @@ from igps.descriptors._geodesics import edge_graph
 from igps.mesh.mesh import Mesh
 
 
-def geodesic_distances(mesh: Mesh, sources: Sequence[int] | np.ndarray, points_per_edge: int = 2) -> np.ndarray:
+def geodesic_distances(
+    mesh: Mesh, sources: Sequence[int] | np.ndarray, points_per_edge: int = 2
+) -> np.ndarray:
     """(S, V) from some vertices to all, length."""
     return dijkstra(edge_graph(mesh, points_per_edge), indices=sources)[:, : len(mesh.vertices)]

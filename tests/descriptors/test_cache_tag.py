@@ -43,7 +43,10 @@ def test_what_is_not_the_librarys_has_none() -> None:
 
 def test_a_hook_is_not_the_librarys() -> None:
     """It changes descriptions, which came from the cache without it."""
-    for register in (torch.nn.Module.register_forward_hook, torch.nn.Module.register_forward_pre_hook):
+    for register in (
+        torch.nn.Module.register_forward_hook,
+        torch.nn.Module.register_forward_pre_hook,
+    ):
         hooked = descriptor("interior")
         handle = register(next(hooked.children()), lambda *given: None)
         assert cache_tag(hooked) is None
@@ -52,7 +55,10 @@ def test_a_hook_is_not_the_librarys() -> None:
 
 
 def test_what_it_was_made_with_changes_the_words() -> None:
-    one, other = (PairHistogram([EuclideanDistance(8), Attribute(name, [0.1, 0.2])]) for name in ("depth", "twist"))
+    one, other = (
+        PairHistogram([EuclideanDistance(8), Attribute(name, [0.1, 0.2])])
+        for name in ("depth", "twist")
+    )
     assert cache_tag(HistogramDescriptor(one)) != cache_tag(HistogramDescriptor(other))
     assert (
         cache_tag(own_descriptors.small_interior())
@@ -87,6 +93,8 @@ def test_versions_change_the_words(monkeypatch: pytest.MonkeyPatch) -> None:
     fingerprint._code_tag.cache_clear()
     version = fingerprint.importlib.metadata.version
     monkeypatch.setattr(
-        fingerprint.importlib.metadata, "version", lambda name: version(name) + (name == "torch") * "+1"
+        fingerprint.importlib.metadata,
+        "version",
+        lambda name: version(name) + (name == "torch") * "+1",
     )
     assert words() != before

@@ -30,19 +30,31 @@ def distance(a: np.ndarray, b: np.ndarray, descriptor: CanonicalForm) -> float:
 
 def sheet(curvature: float) -> Mesh:
     """A thin sheet of 2 × 1, rolled up along its length to a circular arc of the given curvature."""
-    u, v = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 2, 33), np.linspace(0, 1, 17), indexing="ij"))
-    bent = np.stack([np.sin(curvature * u), 1 - np.cos(curvature * u)], axis=1) / curvature if curvature else None
+    u, v = (
+        axis.ravel()
+        for axis in np.meshgrid(np.linspace(0, 2, 33), np.linspace(0, 1, 17), indexing="ij")
+    )
+    bent = (
+        np.stack([np.sin(curvature * u), 1 - np.cos(curvature * u)], axis=1) / curvature
+        if curvature
+        else None
+    )
     x, z = (u, 0 * u) if bent is None else bent.T
     inner = np.stack([x, v, z], axis=1)
     normal = np.stack([-np.sin(curvature * u), 0 * u, np.cos(curvature * u)], axis=1)
     index = np.arange(33 * 17).reshape(33, 17)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    a, b, c, d = (
+        part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
+    )
     top = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     rim = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
     following = np.roll(rim, -1)
     n = index.size
     sides = np.concatenate(
-        [np.stack([following, rim, rim + n], axis=1), np.stack([following, rim + n, following + n], axis=1)]
+        [
+            np.stack([following, rim, rim + n], axis=1),
+            np.stack([following, rim + n, following + n], axis=1),
+        ]
     )
     vertices = np.concatenate([inner + 0.005 * normal, inner - 0.005 * normal])
     return Mesh(vertices, np.concatenate([top, top[:, ::-1] + n, sides]), "sheet")
@@ -56,7 +68,10 @@ def test_a_rolled_up_sheet_has_the_form_of_the_flat_one() -> None:
     assert flat.shape == (len(exponents(4)),)
     assert distance(flat, rolled, descriptor) < 0.05 * distance(flat, other, descriptor)
     # The rigid moments tell the two apart.
-    rigid = [moments(m.vertices / np.sqrt(m.area), 4).astype(np.float32) for m in (sheet(0.0), sheet(2.0))]
+    rigid = [
+        moments(m.vertices / np.sqrt(m.area), 4).astype(np.float32)
+        for m in (sheet(0.0), sheet(2.0))
+    ]
     assert distance(*rigid, descriptor) > 10 * distance(flat, rolled, descriptor)
 
 
@@ -65,7 +80,9 @@ def test_the_geodesics_of_the_rolled_up_sheet_are_straight_when_flat() -> None:
     source = 5 * 17 + 3
     distances = geodesic_distances(sheet(2.0), [source])[0][: 33 * 17]
     flat = sheet(0.0).vertices[: 33 * 17]
-    np.testing.assert_allclose(distances, np.linalg.norm(flat - flat[source], axis=1), rtol=0.05, atol=0.02)
+    np.testing.assert_allclose(
+        distances, np.linalg.norm(flat - flat[source], axis=1), rtol=0.05, atol=0.02
+    )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -86,7 +103,13 @@ def test_least_squares_equals_scikit_learn(sphere: Mesh) -> None:
     start = classical_scaling(distances)
     form = least_squares_scaling(distances, start)
     reference, stress = smacof(
-        distances, n_components=3, init=start, n_init=1, max_iter=500, eps=1e-9, normalized_stress=False
+        distances,
+        n_components=3,
+        init=start,
+        n_init=1,
+        max_iter=500,
+        eps=1e-9,
+        normalized_stress=False,
     )
     ours = np.square(cdist(form, form) - distances).sum() / 2
     before = np.square(cdist(start, start) - distances).sum() / 2
@@ -102,7 +125,10 @@ def test_no_step_raises_the_stress() -> None:
     start[3] = start[4]  # coincident points must not divide by zero
     form = least_squares_scaling(distances, start)
     assert np.isfinite(form).all()
-    assert np.square(cdist(form, form) - distances).sum() < np.square(cdist(start, start) - distances).sum() / 4
+    assert (
+        np.square(cdist(form, form) - distances).sum()
+        < np.square(cdist(start, start) - distances).sum() / 4
+    )
 
 
 def test_moments_of_a_box_by_closed_form() -> None:
@@ -119,7 +145,11 @@ def test_moments_of_a_box_by_closed_form() -> None:
 
 
 def test_exponents_are_complete() -> None:
-    every = {e for e in product(range(5), repeat=3) if 2 <= sum(e) <= 4} - {(1, 1, 0), (1, 0, 1), (0, 1, 1)}
+    every = {e for e in product(range(5), repeat=3) if 2 <= sum(e) <= 4} - {
+        (1, 1, 0),
+        (1, 0, 1),
+        (0, 1, 1),
+    }
     assert {tuple(e) for e in exponents(4).tolist()} == every
     assert len(exponents(4)) == len(every)
 
@@ -153,9 +183,9 @@ def test_motion_reflection_and_scale(blob: Mesh) -> None:
     mirrored = Mesh(blob.vertices * [1, -1, 1], blob.faces[:, ::-1])
     described = descriptor.describe_body(of_mesh(blob))
     for mesh in (moved, mirrored):
-        assert distance(described, descriptor.describe_body(of_mesh(mesh)), descriptor) < 1e-5 * np.linalg.norm(
-            described
-        )
+        assert distance(
+            described, descriptor.describe_body(of_mesh(mesh)), descriptor
+        ) < 1e-5 * np.linalg.norm(described)
 
 
 def test_the_form_is_that_of_least_squares(blob: Mesh) -> None:
@@ -165,7 +195,9 @@ def test_the_form_is_that_of_least_squares(blob: Mesh) -> None:
     descriptor = CanonicalForm()
     found = descriptor.describe_body(of_mesh(blob))
     # the signs of the axes are arbitrary, and rounding decides them: the distance takes the best reflection
-    apart = [distance(found.astype(float), form, descriptor) / np.linalg.norm(form) for form in forms]
+    apart = [
+        distance(found.astype(float), form, descriptor) / np.linalg.norm(form) for form in forms
+    ]
     assert apart[0] < 1e-6
     assert apart[1] > 1e-2
 
@@ -186,4 +218,6 @@ def test_the_numbers_of_vertices_do_not_matter(blob: Mesh) -> None:
     order = np.random.default_rng(3).permutation(len(blob.vertices))
     renumbered = Mesh(blob.vertices[order], np.argsort(order)[blob.faces][::-1])
     expected = descriptor.describe_body(of_mesh(blob))
-    np.testing.assert_allclose(descriptor.describe_body(of_mesh(renumbered)), expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        descriptor.describe_body(of_mesh(renumbered)), expected, rtol=1e-4, atol=1e-6
+    )

@@ -76,9 +76,14 @@ def test_d2_distance_is_half_the_l1_norm() -> None:
         (lambda: D2(reach=0.0), "reach"),
         (lambda: D2(reach=float("inf")), "reach"),
         (lambda: D2().describe_body(of_points(np.zeros((1, 3)))), "surface samples.*at least 2"),
-        (lambda: D2(function="a3").describe_body(of_points(np.zeros((2, 3)))), "surface samples.*at least 3"),
+        (
+            lambda: D2(function="a3").describe_body(of_points(np.zeros((2, 3)))),
+            "surface samples.*at least 3",
+        ),
     ],
 )
-def test_parameters_and_signatures_out_of_range_are_named(make: Callable[[], object], message: str) -> None:
+def test_parameters_and_signatures_out_of_range_are_named(
+    make: Callable[[], object], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         make()

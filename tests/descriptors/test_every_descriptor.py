@@ -42,7 +42,14 @@ def rod() -> NDArray[np.float64]:
     ring = np.maximum(np.hypot(y, z), 1e-12)
     # Caps as on a capsule, a tube between them.
     profile = np.sqrt(np.clip(1 - np.abs(x) ** 6, 0, 1))
-    return np.stack([1.6 * np.sign(x) * np.abs(x) ** 1.2, radius * profile * y / ring, radius * profile * z / ring], 1)
+    return np.stack(
+        [
+            1.6 * np.sign(x) * np.abs(x) ** 1.2,
+            radius * profile * y / ring,
+            radius * profile * z / ring,
+        ],
+        1,
+    )
 
 
 @cache
@@ -74,11 +81,15 @@ def body(kind: str) -> SignatureBatch:
     # Mesh turns what a reflection has turned inside out.
     mesh = Mesh(change[kind](rod()), np.asarray(unit_sphere().faces), name=kind)
     everything = reduce(or_, (descriptor(name).requirements for name in NAMES), Requirements())
-    config = SignatureConfig(n_eigenpairs=250, resolution=24, min_samples=400, n_surface_samples=600)
+    config = SignatureConfig(
+        n_eigenpairs=250, resolution=24, min_samples=400, n_surface_samples=600
+    )
     return collate([compute_signature(mesh, everything.apply_to(config))], [mesh])
 
 
-def signature(eigenvalues: NDArray[np.float64], interior: Samples, surface: Samples, of: Body) -> Signature:
+def signature(
+    eigenvalues: NDArray[np.float64], interior: Samples, surface: Samples, of: Body
+) -> Signature:
     config = SignatureConfig(n_eigenpairs=len(eigenvalues))
     return Signature(eigenvalues, interior, surface, of.area, of.volume, config, of.id)
 
@@ -129,7 +140,9 @@ def test_padding_changes_no_description(name: str) -> None:
 
 def with_individuals(name: str) -> Descriptor:
     """A descriptor that keeps size and side, too, where the name ends in "+"."""
-    return descriptor(name.strip("+"), **{"size": "keep", "mirror": "distinct"} if name.endswith("+") else {})
+    return descriptor(
+        name.strip("+"), **{"size": "keep", "mirror": "distinct"} if name.endswith("+") else {}
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -163,7 +176,9 @@ def test_tensors_are_made_on_the_device_of_the_bodies(
 
 
 def fewer_samples(batch: SignatureBatch, n: int) -> SignatureBatch:
-    return replace(batch, interior=batch.interior.subset(n, seed=0), surface=batch.surface.subset(n, seed=0))
+    return replace(
+        batch, interior=batch.interior.subset(n, seed=0), surface=batch.surface.subset(n, seed=0)
+    )
 
 
 class Counting(TorchDispatchMode):
@@ -179,10 +194,14 @@ class Counting(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("name", ON_TENSORS)
-def test_a_batch_on_a_device_is_described_at_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_on_a_device_is_described_at_once(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The number of operations does not depend on the number of bodies; descriptions equal those of single bodies."""
     found = descriptor(name)
-    pair = SignatureBatch.concatenate([fewer_samples(body("rod"), 200), fewer_samples(body("other"), 150)])
+    pair = SignatureBatch.concatenate(
+        [fewer_samples(body("rod"), 200), fewer_samples(body("other"), 150)]
+    )
     with torch.inference_mode():
         expected = torch.cat([found(pair[:1]), found(pair[1:])] * 3)
     monkeypatch.setattr(blocks, "uses_loops", lambda _: False)
@@ -195,7 +214,9 @@ def test_a_batch_on_a_device_is_described_at_once(name: str, monkeypatch: pytest
             together = found(several)
         counts.append(counting.found)
     assert counts[0] == counts[1]
-    torch.testing.assert_close(together, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+    torch.testing.assert_close(
+        together, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max())
+    )
 
 
 @pytest.mark.parametrize("name", ON_TENSORS)
@@ -220,10 +241,14 @@ def test_cuda_describes_as_the_cpu_does(name: str) -> None:
         found_distances = found.distances(described, described)
     scale = float(expected.abs().max())
     torch.testing.assert_close(described.cpu(), expected, rtol=1e-4, atol=1e-5 * scale)
-    torch.testing.assert_close(found_distances.cpu(), distances, rtol=1e-3, atol=1e-4 * float(distances.max()))
+    torch.testing.assert_close(
+        found_distances.cpu(), distances, rtol=1e-3, atol=1e-4 * float(distances.max())
+    )
 
 
-@pytest.mark.parametrize("name", ["gps", "multiscale", "rich", "rich+", "pretrained", "pretrained+"])
+@pytest.mark.parametrize(
+    "name", ["gps", "multiscale", "rich", "rich+", "pretrained", "pretrained+"]
+)
 def test_descriptors_are_traced_whole(name: str) -> None:
     found = with_individuals(name)
     torch.compiler.reset()
@@ -248,13 +273,18 @@ def test_distances_are_a_matrix_of_what_pairs_give(name: str) -> None:
     for i in range(2):
         for j in range(3):
             pair = distance(queries[i : i + 1], gallery[j : j + 1])
-            torch.testing.assert_close(pair, matrix[i : i + 1, j : j + 1], rtol=1e-4, atol=1e-5 * scale)
+            torch.testing.assert_close(
+                pair, matrix[i : i + 1, j : j + 1], rtol=1e-4, atol=1e-5 * scale
+            )
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_bent_body_is_closer_than_another(name: str) -> None:
     distance = descriptor(name).distances
-    bent_rod, other = (float(distance(description(name, "rod"), description(name, kind))) for kind in ("pose", "other"))
+    bent_rod, other = (
+        float(distance(description(name, "rod"), description(name, kind)))
+        for kind in ("pose", "other")
+    )
     assert bent_rod < 0.75 * other
 
 
@@ -267,11 +297,16 @@ def test_descriptions_are_invariant_as_claimed(name: str, change: str) -> None:
     assert changed < {"scale": 0.05, "motion": 0.2, "pose": 0.35}[change] * other
     if isinstance(descriptor(name), EmbeddedDescriptor) and change != "pose":
         # The distance of its head may be blind to small movements of the vector.
-        moved, apart = (float(cosine(description(name, "rod"), description(name, kind))) for kind in (change, "other"))
+        moved, apart = (
+            float(cosine(description(name, "rod"), description(name, kind)))
+            for kind in (change, "other")
+        )
         assert moved < {"scale": 0.05, "motion": 0.2}[change] * apart
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if "pose" not in descriptor(name).invariant_to])
+@pytest.mark.parametrize(
+    "name", [name for name in NAMES if "pose" not in descriptor(name).invariant_to]
+)
 def test_descriptors_not_claimed_pose_invariant_change_with_pose(name: str) -> None:
     distance = descriptor(name).distances
     changed = float(distance(description(name, "rod"), description(name, "pose")))
@@ -286,7 +321,10 @@ def test_a_batch_without_what_is_needed_is_refused(name: str) -> None:
     (one,) = whole.bodies()
     if found.requirements.n_eigenpairs:
         n = found.requirements.n_eigenpairs - 1
-        fewer = [Samples(of.points, of.eigenfunctions[:, :n], of.attributes) for of in (one.interior, one.surface)]
+        fewer = [
+            Samples(of.points, of.eigenfunctions[:, :n], of.attributes)
+            for of in (one.interior, one.surface)
+        ]
         batch = collate([signature(one.eigenvalues[:n], *fewer, one)], whole.meshes)
         with pytest.raises(ValueError, match=f"^n_eigenpairs: .* at least {n + 1}, got {n}"):
             found(batch)
@@ -294,7 +332,8 @@ def test_a_batch_without_what_is_needed_is_refused(name: str) -> None:
         bare = [Samples(of.points, of.eigenfunctions) for of in (one.interior, one.surface)]
         batch = collate([signature(one.eigenvalues, *bare, one)], whole.meshes)
         with pytest.raises(
-            ValueError, match=f"^attributes: .* needs signatures with {', '.join(found.requirements.attributes)}"
+            ValueError,
+            match=f"^attributes: .* needs signatures with {', '.join(found.requirements.attributes)}",
         ):
             found(batch)
     if found.requirements.mesh:

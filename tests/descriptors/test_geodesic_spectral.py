@@ -19,7 +19,10 @@ def sphere_eigenvalues(count: int) -> np.ndarray:
     nodes, weights = np.polynomial.legendre.leggauss(400)
     angle = (nodes + 1) * np.pi / 2
     kernel = np.exp(-(angle**2) / (2 * np.pi**2)) * np.sin(angle) * weights * np.pi / 4
-    values = [[(kernel * eval_legendre(degree, np.cos(angle))).sum()] * (2 * degree + 1) for degree in range(12)]
+    values = [
+        [(kernel * eval_legendre(degree, np.cos(angle))).sum()] * (2 * degree + 1)
+        for degree in range(12)
+    ]
     return np.sort(np.concatenate(values))[::-1][:count]
 
 
@@ -68,7 +71,9 @@ def test_motion_scale_and_bending(blob: Mesh) -> None:
     described = descriptor.describe_body(of_mesh(blob))
     turn = special_ortho_group.rvs(3, random_state=1) * 2.5
     np.testing.assert_allclose(
-        descriptor.describe_body(of_mesh(Mesh(blob.vertices @ turn + 3, blob.faces))), described, rtol=1e-5
+        descriptor.describe_body(of_mesh(Mesh(blob.vertices @ turn + 3, blob.faces))),
+        described,
+        rtol=1e-5,
     )
     # A bent tube stays close to the straight one, and a sphere is far.
     straight, bent = (_tube(angle) for angle in (0.0, 2.0))
@@ -76,9 +81,9 @@ def test_motion_scale_and_bending(blob: Mesh) -> None:
         descriptor.describe_body(of_mesh(m))
         for m in (straight, bent, as_mesh(trimesh.creation.icosphere(subdivisions=3)))
     ]
-    near, far = descriptor.distances(torch.from_numpy(shapes[0])[None], torch.from_numpy(np.stack(shapes[1:])))[
-        0
-    ].tolist()
+    near, far = descriptor.distances(
+        torch.from_numpy(shapes[0])[None], torch.from_numpy(np.stack(shapes[1:]))
+    )[0].tolist()
     assert 0 < near < 0.02 * far
 
 
@@ -97,13 +102,18 @@ def _tube(angle: float) -> Mesh:
     if angle == 0:
         return as_mesh(surface)
     radius, turn = 6 / angle, z * angle / 6
-    return Mesh(np.stack([(radius + x) * np.cos(turn), y, (radius + x) * np.sin(turn)], axis=1), surface.faces)
+    return Mesh(
+        np.stack([(radius + x) * np.cos(turn), y, (radius + x) * np.sin(turn)], axis=1),
+        surface.faces,
+    )
 
 
 def test_distances_are_chi_square() -> None:
     a, b = np.array([[0.9, 0.3]], dtype=np.float32), np.array([[0.5, 0.1]], dtype=np.float32)
     expected = (0.4**2 / 1.4 + 0.2**2 / 0.4) / 2
-    found = GeodesicSpectral(n_eigenvalues=2).distances(torch.from_numpy(a), torch.from_numpy(b)).item()
+    found = (
+        GeodesicSpectral(n_eigenvalues=2).distances(torch.from_numpy(a), torch.from_numpy(b)).item()
+    )
     assert found == pytest.approx(expected, rel=1e-5)
 
 

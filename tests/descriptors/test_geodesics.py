@@ -34,7 +34,9 @@ def corner_distances(points: np.ndarray) -> np.ndarray:
 def exact(mesh: Mesh, source: int) -> np.ndarray:
     none = np.array([], dtype=np.int64)
     vertices, faces = np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces)
-    return igl.exact_geodesic(vertices, faces, np.array([source]), none, np.arange(len(vertices)), none)
+    return igl.exact_geodesic(
+        vertices, faces, np.array([source]), none, np.arange(len(vertices)), none
+    )
 
 
 def test_great_circles_of_the_sphere(sphere: Mesh) -> None:
@@ -101,13 +103,17 @@ def test_equivariance(blob: Mesh) -> None:
     new = np.argsort(order)
     moved = Mesh(3 * blob.vertices[order][:, [1, 2, 0]] + 5, new[blob.faces])
     np.testing.assert_allclose(
-        geodesic_distances(moved, new[[5, 9]])[:, new], 3 * geodesic_distances(blob, [5, 9]), rtol=1e-12
+        geodesic_distances(moved, new[[5, 9]])[:, new],
+        3 * geodesic_distances(blob, [5, 9]),
+        rtol=1e-12,
     )
 
 
 def test_farthest_points_are_greedy(blob: Mesh) -> None:
     samples = farthest_points(blob, 30)
-    np.testing.assert_allclose(samples.distances, geodesic_distances(blob, samples.vertices), rtol=1e-12)
+    np.testing.assert_allclose(
+        samples.distances, geodesic_distances(blob, samples.vertices), rtol=1e-12
+    )
     for i in range(1, 30):
         nearest = samples.distances[:i].min(axis=0)
         assert nearest[samples.vertices[i]] == nearest.max()
@@ -145,7 +151,9 @@ def test_rounding_does_not_decide_between_equally_far_points() -> None:
     expected = np.sort(farthest_points(mesh, 40).mutual, axis=None)
     for number, factor in enumerate((0.1, 1 / 3, 7.7)):
         moved, _ = renumbered(Mesh(mesh.vertices * factor + factor, mesh.faces), number)
-        np.testing.assert_allclose(np.sort(farthest_points(moved, 40).mutual, axis=None), factor * expected, rtol=1e-9)
+        np.testing.assert_allclose(
+            np.sort(farthest_points(moved, 40).mutual, axis=None), factor * expected, rtol=1e-9
+        )
 
 
 def test_all_vertices_can_be_sampled() -> None:

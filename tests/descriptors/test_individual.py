@@ -25,15 +25,25 @@ from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.signature.signature import Signature
 
-CONFIG = SignatureConfig(n_eigenpairs=250, attributes=("depth", "electrostatic_potential", "surface_direction"))
+CONFIG = SignatureConfig(
+    n_eigenpairs=250, attributes=("depth", "electrostatic_potential", "surface_direction")
+)
 SURFACE = trimesh.creation.icosphere(subdivisions=3)
 
 
-def twisted(turns: float, scale: float = 1.0, unit: str | None = None, mirrored: bool = False) -> Mesh:
+def twisted(
+    turns: float, scale: float = 1.0, unit: str | None = None, mirrored: bool = False
+) -> Mesh:
     """An ellipsoid whose flat side turns along its axis, which is no mirror image of itself."""
     x, y, z = (SURFACE.vertices * [1.4, 0.6, 2.2]).T
     angle = turns * z
-    points = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z], axis=1) * scale
+    points = (
+        np.stack(
+            [np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z],
+            axis=1,
+        )
+        * scale
+    )
     if mirrored:
         return Mesh(points * [1, -1, 1], SURFACE.faces[:, ::-1], unit=unit)
     return Mesh(points, SURFACE.faces, unit=unit)
@@ -55,11 +65,19 @@ def from_body(name: str, signatures: dict[str, Signature]) -> dict[str, float]:
     """The distances from the first body by a descriptor."""
     descriptor = igps.descriptor(name)
     descriptions = torch.cat([descriptor(collate([one])) for one in signatures.values()])
-    return dict(zip(signatures, descriptor.distances(descriptions[:1], descriptions)[0].tolist(), strict=True))
+    return dict(
+        zip(
+            signatures,
+            descriptor.distances(descriptions[:1], descriptions)[0].tolist(),
+            strict=True,
+        )
+    )
 
 
 @pytest.mark.parametrize("name", ["interior", "pretrained"])
-def test_distances_with_size_are_those_of_the_formula(name: str, signatures: dict[str, Signature]) -> None:
+def test_distances_with_size_are_those_of_the_formula(
+    name: str, signatures: dict[str, Signature]
+) -> None:
     plain, sized = from_body(name, signatures), from_body(f"{name}+size", signatures)
     for other in ("body", "centimetres", "mirrored"):
         assert sized[other] == pytest.approx(plain[other], rel=1e-2, abs=1e-3 * SCALES[name])
@@ -69,13 +87,17 @@ def test_distances_with_size_are_those_of_the_formula(name: str, signatures: dic
     assert sized["larger"] == pytest.approx(expected, rel=1e-3)
 
 
-def test_vectors_count_a_small_difference_in_size_as_distances_do(signatures: dict[str, Signature]) -> None:
+def test_vectors_count_a_small_difference_in_size_as_distances_do(
+    signatures: dict[str, Signature],
+) -> None:
     descriptor = igps.descriptor("interior", size="keep")
     body = descriptor(collate([signatures["body"]]))
     other = body.clone()
     other[:, -1] += 1e-6
     # The slope at nothing, along one of the two numbers.
-    assert float(descriptor.distances(body, other)) == pytest.approx(float((body - other).norm()), rel=1e-2)
+    assert float(descriptor.distances(body, other)) == pytest.approx(
+        float((body - other).norm()), rel=1e-2
+    )
 
 
 def test_short_vectors_keep_the_numbers_of_size_and_side(signatures: dict[str, Signature]) -> None:
@@ -89,7 +111,9 @@ def test_short_vectors_keep_the_numbers_of_size_and_side(signatures: dict[str, S
 
 
 @pytest.mark.parametrize("name", ["interior", "rich"])
-def test_a_mirror_image_is_the_body_unless_it_is_distinct(name: str, signatures: dict[str, Signature]) -> None:
+def test_a_mirror_image_is_the_body_unless_it_is_distinct(
+    name: str, signatures: dict[str, Signature]
+) -> None:
     same, distinct = from_body(name, signatures), from_body(f"{name}+side", signatures)
     assert same["mirrored"] < 0.1 * SCALES[name]
     assert distinct["mirrored"] > SCALES[name] / 2
@@ -111,12 +135,16 @@ def test_a_body_that_is_turned_is_far_nearer_than_its_mirror_image(seed: int) ->
     random = np.random.default_rng(seed)
     ball = SURFACE.vertices
     middles = random.normal(size=(12, 3))
-    squares = ((ball[:, None] - middles / np.linalg.norm(middles, axis=1)[:, None]) ** 2).sum(axis=2)
+    squares = ((ball[:, None] - middles / np.linalg.norm(middles, axis=1)[:, None]) ** 2).sum(
+        axis=2
+    )
     heights = np.exp(-squares / random.uniform(0.1, 0.5, 12)) @ random.uniform(-0.3, 0.7, 12)
     body = ball * (1 + heights)[:, None] * [1, 1.3, 0.8]
     turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
     turn *= np.linalg.det(turn)
-    meshes = [Mesh(body @ one, SURFACE.faces) for one in (np.eye(3), turn, -np.eye(3), -turn)]  # turned outwards again
+    meshes = [
+        Mesh(body @ one, SURFACE.faces) for one in (np.eye(3), turn, -np.eye(3), -turn)
+    ]  # turned outwards again
     descriptor = igps.descriptor("interior+side")
     found = descriptor(collate([compute_signature(one, CONFIG) for one in meshes]))
     _, turned, *mirrored = descriptor.distances(found[:1], found)[0].tolist()
@@ -127,16 +155,23 @@ def bent(mirrored: bool = False, turn: np.ndarray | None = None) -> Mesh:
     """A limb that grows thicker and bends to one side, and to another at its end."""
     x, y, z = SURFACE.vertices.T
     wide, along = 0.45 * (1 + 0.5 * z), 2 * z
-    points = np.stack([wide * x + 0.35 * along**2, wide * y + 0.6 * np.maximum(along, 0) ** 2, along], axis=1)
+    points = np.stack(
+        [wide * x + 0.35 * along**2, wide * y + 0.6 * np.maximum(along, 0) ** 2, along], axis=1
+    )
     if mirrored:
         return Mesh(points * [1, 1, -1], SURFACE.faces[:, ::-1])
     return Mesh(points if turn is None else points @ turn.T * 3 + 5, SURFACE.faces)
 
 
-def test_signed_volumes_turn_their_signs_with_a_mirror_image_and_are_blind_to_motion_scale_and_padding() -> None:
+def test_signed_volumes_turn_their_signs_with_a_mirror_image_and_are_blind_to_motion_scale_and_padding() -> (
+    None
+):
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     turn *= np.linalg.det(turn)
-    made = [compute_signature(one, CONFIG) for one in (bent(), bent(True), bent(turn=turn), twisted(0.0))]
+    made = [
+        compute_signature(one, CONFIG)
+        for one in (bent(), bent(True), bent(turn=turn), twisted(0.0))
+    ]
     found = signed_volumes(collate(made))
     alone = torch.cat([signed_volumes(collate([one])) for one in made])
     torch.testing.assert_close(found, alone, atol=1e-6, rtol=0)
@@ -155,8 +190,16 @@ def test_a_signed_volume_is_that_of_its_three_vectors() -> None:
     )
     decay = np.exp(-0.01 * signature.area * signature.eigenvalues[:16])
     heat = np.square(signature.surface.eigenfunctions[:, :16].astype(float)) @ decay
-    weighted = [(inside, np.linalg.norm(inside, axis=1)), (outside, np.linalg.norm(outside, axis=1))]
-    three = np.stack([weights @ points / len(points) for points, weights in (*weighted, (outside, heat / heat.mean()))])
+    weighted = [
+        (inside, np.linalg.norm(inside, axis=1)),
+        (outside, np.linalg.norm(outside, axis=1)),
+    ]
+    three = np.stack(
+        [
+            weights @ points / len(points)
+            for points, weights in (*weighted, (outside, heat / heat.mean()))
+        ]
+    )
     expected = np.linalg.det(three) / np.linalg.norm(three, axis=1).prod() ** (2 / 3)
     assert abs(expected) > 1e-4
     assert float(signed_volumes(collate([signature]))[0, 0]) == pytest.approx(expected, rel=1e-3)
@@ -174,7 +217,9 @@ def test_names_carry_the_choice() -> None:
 
 
 def test_what_cannot_be_weighed_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"size: expected .* or \"auto\" with the units of the bodies"):
+    with pytest.raises(
+        ValueError, match=r"size: expected .* or \"auto\" with the units of the bodies"
+    ):
         igps.descriptor("gps", size="auto")
     with pytest.raises(ValueError, match="mirror: expected one of same, distinct, got 'different'"):
         igps.descriptor("gps", mirror="different")  # type: ignore[arg-type]
@@ -182,11 +227,17 @@ def test_what_cannot_be_weighed_is_refused() -> None:
         igps.descriptor("gps", size=True)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="size: expected one of auto, keep, ignore, got 'kept'"):
         keeps_size("kept", ["mm"])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"expected \+NAME or \+NAME=WEIGHT .*got 'gps\+colour=red'"):
+    with pytest.raises(
+        ValueError, match=r"expected \+NAME or \+NAME=WEIGHT .*got 'gps\+colour=red'"
+    ):
         igps.descriptor("gps+colour=red")
-    with pytest.raises(ValueError, match=r"expected \+NAME or \+NAME=WEIGHT .*got 'gps\+ct=1\.5\.2'"):
+    with pytest.raises(
+        ValueError, match=r"expected \+NAME or \+NAME=WEIGHT .*got 'gps\+ct=1\.5\.2'"
+    ):
         igps.descriptor("gps+ct=1.5.2")
-    with pytest.raises(ValueError, match="expected a descriptor that ignores size by itself, got 'molecular'"):
+    with pytest.raises(
+        ValueError, match="expected a descriptor that ignores size by itself, got 'molecular'"
+    ):
         igps.descriptor("molecular", size="keep")
     own = igps.descriptor("gps")
     own.name = "own"
@@ -204,7 +255,12 @@ def test_what_cannot_be_weighed_is_refused() -> None:
         ("auto", ["mm", None], False, "size is ignored: 1 of 2 bodies have no unit of length; if"),
         ("auto", ["mm", "furlong"], False, "size is ignored: 1 of 2"),
         ("keep", [None, None], True, ""),
-        ("keep", ["mm", None], True, "size is kept: 1 of 2 bodies have no unit of length; their coordinates are"),
+        (
+            "keep",
+            ["mm", None],
+            True,
+            "size is kept: 1 of 2 bodies have no unit of length; their coordinates are",
+        ),
         ("ignore", ["mm", "mm"], False, ""),
     ],
 )
@@ -230,23 +286,39 @@ def write_3mf(path: Path, radius: float, unit: str, body: trimesh.Trimesh | Mesh
         )
 
 
-def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_balls_of_one_size_find_each_other_in_whatever_unit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = tmp_path / "balls"
-    for name, radius, unit in (("1/a", 1, "inch"), ("1/b", 25.4, "millimeter"), ("2/c", 28, "millimeter"),
-                               ("2/d", 2.8, "centimeter")):  # fmt: skip
+    for name, radius, unit in (
+        ("1/a", 1, "inch"),
+        ("1/b", 25.4, "millimeter"),
+        ("2/c", 28, "millimeter"),
+        ("2/d", 2.8, "centimeter"),
+    ):
         write_3mf(root / f"{name}.3mf", radius, unit)
     options: dict[str, Any] = {"cache_dir": tmp_path / "cache", "n_workers": 1}
     summary = retrieve(root, "shape_dna", **options)
     assert summary["config"]["descriptor"] == "shape_dna+size"
     assert summary["nn"] == 1
-    assert retrieve(root, "shape_dna", size="ignore", **options)["config"]["descriptor"] == "shape_dna"
+    assert (
+        retrieve(root, "shape_dna", size="ignore", **options)["config"]["descriptor"] == "shape_dna"
+    )
     dataset = igps.SignatureDataset(root, cache_dir=tmp_path / "cache", descriptor="shape_dna")
     assert dataset.units() == ["in", "mm", "mm", "cm"]
     Gallery.build(tmp_path / "index", dataset, "shape_dna+size", n_workers=1)
     found = query(root / "1/a.3mf", gallery=tmp_path / "index", top=2, cache_dir=tmp_path / "cache")
     assert [row["name"] for row in found] == ["1/a.3mf", "1/b.3mf"]
-    with pytest.raises(ValueError, match=r"expected a gallery with descriptor \"shape_dna\", got \"shape_dna\+size\""):
-        query(root / "1/a.3mf", gallery=tmp_path / "index", size="ignore", cache_dir=tmp_path / "cache")
+    with pytest.raises(
+        ValueError,
+        match=r"expected a gallery with descriptor \"shape_dna\", got \"shape_dna\+size\"",
+    ):
+        query(
+            root / "1/a.3mf",
+            gallery=tmp_path / "index",
+            size="ignore",
+            cache_dir=tmp_path / "cache",
+        )
     retrieve(root, "own_descriptors:Height", size="keep", **options)
     assert "has no effect: own_descriptors:Height does not declare" in capsys.readouterr().out
     retrieve(root, "own_descriptors:Height", size="ignore", **options)
@@ -266,7 +338,11 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, caps
 def test_copies_of_another_size_are_no_duplicates_where_size_counts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name, factor, unit in (("a", 1, "inch"), ("b", 25.4, "millimeter"), ("c", 30, "millimeter")):
+    for name, factor, unit in (
+        ("a", 1, "inch"),
+        ("b", 25.4, "millimeter"),
+        ("c", 30, "millimeter"),
+    ):
         write_3mf(tmp_path / f"{name}.3mf", factor, unit, twisted(0.5))
     dataset = igps.SignatureDataset(tmp_path, cache_dir=tmp_path / "cache", descriptor="pretrained")
     assert duplicates(dataset, n_workers=1).groups == (("a.3mf", "b.3mf"),)
@@ -282,7 +358,9 @@ def test_copies_of_another_size_are_no_duplicates_where_size_counts(
 def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_path: Path) -> None:
     shapes = igps.ArticulatedShapes(n_classes=2, n_per_class=4, n_vertices=600)
     shapes.write(tmp_path / "shapes")
-    dataset = igps.SignatureDataset(tmp_path / "shapes", cache_dir=tmp_path / "cache", descriptor="interior+side")
+    dataset = igps.SignatureDataset(
+        tmp_path / "shapes", cache_dir=tmp_path / "cache", descriptor="interior+side"
+    )
     model = igps.fit(dataset, "interior+side+size", head="whitened", n_workers=1)
     assert isinstance(model, IndividualDescriptor)
     assert isinstance(model.descriptor, EmbeddedDescriptor)
@@ -290,9 +368,13 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
     model.save(tmp_path / "mine.safetensors")
     batch = dataset.batch(range(8))
     loaded = igps.descriptor(tmp_path / "mine.safetensors")
-    assert igps.descriptor(f"{tmp_path}/mine.safetensors+size", mirror="distinct").name == loaded.name
+    assert (
+        igps.descriptor(f"{tmp_path}/mine.safetensors+size", mirror="distinct").name == loaded.name
+    )
     torch.testing.assert_close(loaded(batch), model(batch))
-    torch.testing.assert_close(loaded.distances(loaded(batch), loaded(batch)), model.distances(*[model(batch)] * 2))
+    torch.testing.assert_close(
+        loaded.distances(loaded(batch), loaded(batch)), model.distances(*[model(batch)] * 2)
+    )
 
 
 @pytest.mark.parametrize("command", ["retrieve", "compare", "gallery build"])
@@ -305,7 +387,11 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
     ],
 )
 def test_a_name_that_contradicts_an_option_is_refused_before_anything_is_computed(
-    command: str, name: str, options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: str,
+    name: str,
+    options: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     write_3mf(tmp_path / "balls" / "1" / "a.3mf", 1, "inch")
     igps.descriptor("d2+size").save(tmp_path / "kept.safetensors", {})
@@ -317,21 +403,30 @@ def test_a_name_that_contradicts_an_option_is_refused_before_anything_is_compute
         "compare": partial(compare, root, [name, "shape_dna"]),
         "gallery build": partial(build, root, tmp_path / "gallery", name),
     }[command]
-    with pytest.raises(ValueError, match=rf"{next(iter(options))}: expected no .* with d2\+si[zd]e"):
+    with pytest.raises(
+        ValueError, match=rf"{next(iter(options))}: expected no .* with d2\+si[zd]e"
+    ):
         run(**options)
 
 
 def test_a_descriptor_is_compared_with_itself_that_keeps_size(tmp_path: Path) -> None:
     for name, radius in (("1/a", 1), ("1/b", 1.1), ("2/c", 3), ("2/d", 3.3)):
         write_3mf(tmp_path / "balls" / f"{name}.3mf", radius, "inch")
-    rows = compare(tmp_path / "balls", ["shape_dna", "shape_dna+size"], cache_dir=tmp_path / "cache", n_workers=1)
+    rows = compare(
+        tmp_path / "balls",
+        ["shape_dna", "shape_dna+size"],
+        cache_dir=tmp_path / "cache",
+        n_workers=1,
+    )
     assert [row["descriptor"] for row in rows] == ["shape_dna", "shape_dna+size"]
     assert rows[1]["nn"] == 1
     with pytest.raises(ValueError, match="expected different names, got shape_dna more than once"):
         compare(tmp_path / "nowhere", ["shape_dna", "shape_dna+size"], size="keep")
 
 
-def test_coordinates_keep_size_beside_those_of_the_descriptor(signatures: dict[str, Signature]) -> None:
+def test_coordinates_keep_size_beside_those_of_the_descriptor(
+    signatures: dict[str, Signature],
+) -> None:
     sized = igps.descriptor("interior+size")
     descriptions = sized(collate([signatures["body"], signatures["larger"]]))
     rows = sized.coordinates(descriptions)

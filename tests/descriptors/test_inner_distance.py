@@ -54,7 +54,9 @@ def test_bound_is_that_of_the_98_directions() -> None:
     steps = np.array([s for s in product(range(-2, 3), repeat=3) if gcd(*s) == 1], dtype=float)
     assert len(steps) == 98
     # A path made of the steps is longest for its span where the hull of the unit steps is nearest to the origin.
-    inradius = -ConvexHull(steps / np.linalg.norm(steps, axis=1, keepdims=True)).equations[:, 3].max()
+    inradius = (
+        -ConvexHull(steps / np.linalg.norm(steps, axis=1, keepdims=True)).equations[:, 3].max()
+    )
     assert 1 / inradius <= METRICATION < 1 / inradius + 1e-3
 
 
@@ -94,8 +96,12 @@ def test_path_goes_round_both_corners_of_a_u() -> None:
 
 def test_pieces_are_joined_at_their_closest_samples() -> None:
     points = np.concatenate([block(3, 3, 3), block(3, 3, 3) + np.array([7, 0, 0])])
-    length = inner_distances(points, np.array([index_of(points, (0, 1, 1))]))[0, index_of(points, (9, 1, 1))]
-    assert 9 <= length <= 9 * METRICATION + 4  # one link of 5 cells, at any of the equally close pairs
+    length = inner_distances(points, np.array([index_of(points, (0, 1, 1))]))[
+        0, index_of(points, (9, 1, 1))
+    ]
+    assert (
+        9 <= length <= 9 * METRICATION + 4
+    )  # one link of 5 cells, at any of the equally close pairs
 
 
 def test_chain_of_single_cells_is_walked_along() -> None:
@@ -140,7 +146,9 @@ def test_scale_motion_and_symmetry_do_not_matter() -> None:
     points = block(10, 4, 5)[np.random.default_rng(1).random(200) < 0.7]
     descriptor = InnerDistance(n_sources=1000)
     moved = points[::-1][:, [2, 0, 1]] * [1, -1, 1] * 7.0 + [100, 20, -3]
-    here, there = (descriptor.describe_body(body) for body in (body_of(points), body_of(moved, 49.0)))
+    here, there = (
+        descriptor.describe_body(body) for body in (body_of(points), body_of(moved, 49.0))
+    )
     np.testing.assert_allclose(there, here, atol=1e-6)
 
 
@@ -152,7 +160,9 @@ def test_few_sources_estimate_the_whole() -> None:
     assert 0 < np.abs(few - whole).sum() < 0.05
 
 
-@pytest.mark.parametrize(("name", "value"), [("n_bins", 1), ("n_sources", 0), ("max_distance", 0.0)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("n_bins", 1), ("n_sources", 0), ("max_distance", 0.0)]
+)
 def test_bad_parameters_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         InnerDistance(**{name: value})  # type: ignore[arg-type]

@@ -27,7 +27,9 @@ def signature(blob: Mesh) -> Signature:
 def test_histograms_are_those_of_the_layout(signature: Signature, samples: str) -> None:
     """4 classes of [0, 1.5], and 64 bins of [0, 4] with a linear kernel, of φ/√λ at the samples of that name."""
     found = {"interior": interior, "surface": gps}[samples](N_EIGENPAIRS)
-    expected = paper_histogram(getattr(signature, samples).eigenfunctions, signature.eigenvalues, N_EIGENPAIRS)
+    expected = paper_histogram(
+        getattr(signature, samples).eigenfunctions, signature.eigenvalues, N_EIGENPAIRS
+    )
     with torch.inference_mode():
         np.testing.assert_allclose(found(igps.collate([signature]))[0], expected, atol=2e-6)
     assert (expected > 0).any(axis=1).sum() >= 3, "several classes are seen"
@@ -37,5 +39,8 @@ def test_the_paper_takes_250_eigenpairs(signature: Signature) -> None:
     for name in ("interior", "gps"):
         found = igps.descriptor(name)
         assert found.requirements.n_eigenpairs == 250
-        with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 80"):
+        with pytest.raises(
+            ValueError,
+            match="n_eigenpairs: this descriptor needs signatures of at least 250, got 80",
+        ):
             found(igps.collate([signature]))

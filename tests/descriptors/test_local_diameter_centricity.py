@@ -38,9 +38,13 @@ def test_local_diameter_of_a_sphere_is_its_mean_chord(sphere: Mesh, angle: float
     # A chord at the angle t to the normal is 2 r cos t long; over a solid angle, cos t is uniform, so that neither the
     # median nor the trimming moves the mean.
     radius = 3.0
-    diameters = local_diameters(Mesh(sphere.vertices * radius, sphere.faces), *centres(sphere), 200, angle)
+    diameters = local_diameters(
+        Mesh(sphere.vertices * radius, sphere.faces), *centres(sphere), 200, angle
+    )
     expected = radius * (1 + np.cos(np.radians(angle / 2)))
-    assert diameters.mean() == pytest.approx(expected, rel=0.004)  # the polyhedron lies within the sphere
+    assert diameters.mean() == pytest.approx(
+        expected, rel=0.004
+    )  # the polyhedron lies within the sphere
     assert diameters.std() < 0.004 * expected
 
 
@@ -60,13 +64,17 @@ def test_local_diameter_of_a_long_cylinder() -> None:
 def test_rays_that_leave_through_a_hole_do_not_count(sphere: Mesh) -> None:
     # The lower half of the sphere: seen from near the pole, the narrow cone leads out through the opening.
     height = sphere.vertices[sphere.faces, 2].mean(axis=1)
-    faces = sphere.faces[np.argsort(height)][: (height < 0.3).sum()]  # the last one faces upwards, along the rays
+    faces = sphere.faces[np.argsort(height)][
+        : (height < 0.3).sum()
+    ]  # the last one faces upwards, along the rays
     used, index = np.unique(faces, return_inverse=True)
     bowl = Mesh(sphere.vertices[used], index.reshape(-1, 3), allow_open=True)
     height = bowl.vertices[bowl.faces].mean(axis=1)[:, 2]
     diameters = local_diameters(bowl, *centres(bowl), 30, 20.0)
     assert np.isnan(diameters[height < -0.95]).all()
-    np.testing.assert_allclose(diameters[np.abs(height) < 0.05], 1 + np.cos(np.radians(10)), rtol=0.02)
+    np.testing.assert_allclose(
+        diameters[np.abs(height) < 0.05], 1 + np.cos(np.radians(10)), rtol=0.02
+    )
 
 
 def test_surface_that_no_ray_meets_again_is_refused(sphere: Mesh) -> None:
@@ -92,10 +100,15 @@ def test_centricity_of_a_thin_tube_rises_from_a_quarter_to_half_its_length() -> 
 
 def test_sources_are_a_quadrature_of_the_whole_surface(blob: Mesh) -> None:
     everything = np.arange(len(blob.vertices))
-    area = np.bincount(blob.faces.ravel(), np.repeat(igl.doublearea(np.array(blob.vertices), np.array(blob.faces)), 3))
+    area = np.bincount(
+        blob.faces.ravel(),
+        np.repeat(igl.doublearea(np.array(blob.vertices), np.array(blob.faces)), 3),
+    )
     values = centricity(blob, 60)
     for vertex in (0, 17, 333):
-        exact = igl.exact_geodesic(np.array(blob.vertices), np.array(blob.faces), VS=np.array([vertex]), VT=everything)
+        exact = igl.exact_geodesic(
+            np.array(blob.vertices), np.array(blob.faces), VS=np.array([vertex]), VT=everything
+        )
         assert values[vertex] == pytest.approx(exact @ area / area.sum(), rel=0.04)
 
 
@@ -114,7 +127,9 @@ def test_histogram_lies_where_the_sphere_is(sphere: Mesh) -> None:
 
 
 def test_values_beyond_the_range_go_to_the_last_bins(sphere: Mesh) -> None:
-    histogram = LocalDiameterCentricity(max_diameter=0.1, max_centricity=0.1).describe_body(of_mesh(sphere))
+    histogram = LocalDiameterCentricity(max_diameter=0.1, max_centricity=0.1).describe_body(
+        of_mesh(sphere)
+    )
     assert histogram[-1, -1] == pytest.approx(1, abs=1e-5)
 
 
@@ -132,9 +147,14 @@ def test_histogram_equals_a_loop_over_the_samples() -> None:
 
 
 def test_seed_chooses_the_samples(blob: Mesh) -> None:
-    one, other = (LocalDiameterCentricity(n_samples=20, seed=seed).describe_body(of_mesh(blob)) for seed in (0, 1))
+    one, other = (
+        LocalDiameterCentricity(n_samples=20, seed=seed).describe_body(of_mesh(blob))
+        for seed in (0, 1)
+    )
     assert not np.allclose(one, other)
-    np.testing.assert_array_equal(LocalDiameterCentricity(n_samples=20).describe_body(of_mesh(blob)), one)
+    np.testing.assert_array_equal(
+        LocalDiameterCentricity(n_samples=20).describe_body(of_mesh(blob)), one
+    )
 
 
 def test_triangles_count_by_their_area() -> None:
@@ -146,7 +166,9 @@ def test_triangles_count_by_their_area() -> None:
         profile = np.stack([radius, np.concatenate([z[:1], z, z[-1:]])], axis=1)
         mesh = as_mesh(trimesh.creation.revolve(profile, sections=24))
         rows.append(
-            LocalDiameterCentricity(n_diameter_bins=8, n_centricity_bins=2).describe_body(of_mesh(mesh)).sum(axis=1)
+            LocalDiameterCentricity(n_diameter_bins=8, n_centricity_bins=2)
+            .describe_body(of_mesh(mesh))
+            .sum(axis=1)
         )
     assert np.abs(rows[0] - rows[1]).sum() < 0.1
 
@@ -163,10 +185,14 @@ def test_scale_and_motion_do_not_matter(blob: Mesh) -> None:
 def test_bending_matters_less_than_thickness() -> None:
     straight = tube(0.5, 12.0, 24, 80)
     x, y, z = straight.vertices.T
-    bent = Mesh(np.stack([8 - (8 - x) * np.cos(z / 8), y, (8 - x) * np.sin(z / 8)], axis=1), straight.faces)
+    bent = Mesh(
+        np.stack([8 - (8 - x) * np.cos(z / 8), y, (8 - x) * np.sin(z / 8)], axis=1), straight.faces
+    )
     thicker = tube(0.8, 12.0, 24, 80)
     descriptor = LocalDiameterCentricity()
-    rows = torch.from_numpy(np.stack([descriptor.describe_body(of_mesh(mesh)) for mesh in (straight, bent, thicker)]))
+    rows = torch.from_numpy(
+        np.stack([descriptor.describe_body(of_mesh(mesh)) for mesh in (straight, bent, thicker)])
+    )
     distance = descriptor.distances(rows[:1], rows)[0]
     assert distance[0] == 0
     assert distance[1] < 0.5 * distance[2]

@@ -35,7 +35,14 @@ def trace(seed: int, bend: float, n: int = 60) -> Molecule:
     coil = np.stack([1.5 * t, 5 * np.cos(1.3 * t), 5 * np.sin(1.3 * t)], axis=1)
     if bend:
         radius, angle = 1.5 * n / bend, coil[:, 0] * bend / (1.5 * n)
-        coil = np.stack([(radius + coil[:, 1]) * np.sin(angle), (radius + coil[:, 1]) * np.cos(angle), coil[:, 2]], 1)
+        coil = np.stack(
+            [
+                (radius + coil[:, 1]) * np.sin(angle),
+                (radius + coil[:, 1]) * np.cos(angle),
+                coil[:, 2],
+            ],
+            1,
+        )
     charges = np.array([sum(CHARGED_ATOMS.get(name, {}).values()) for name in names])
     radii = np.array([residue_ball(name) for name in names])
     return Molecule(f"{seed} {bend}", coil, radii, charges, t, names, coil, np.zeros(n))
@@ -45,14 +52,21 @@ def moved(molecule: Molecule) -> Molecule:
     def move(at: NDArray[np.float64]) -> NDArray[np.float64]:
         return at @ ROTATION.T + [10.0, -4.0, 3.0]
 
-    return replace(molecule, positions=move(molecule.positions), residue_positions=move(molecule.residue_positions))
+    return replace(
+        molecule,
+        positions=move(molecule.positions),
+        residue_positions=move(molecule.residue_positions),
+    )
 
 
 def signature_of(molecule: Molecule) -> Signature:
     surface = molecular_surface(molecule, spacing=1.0, max_vertices=1200)
 
     def added(samples: Samples) -> Samples:
-        found = {name: residue_attribute(molecule, samples.points, name) for name in molecular().requirements.sources}
+        found = {
+            name: residue_attribute(molecule, samples.points, name)
+            for name in molecular().requirements.sources
+        }
         return samples.with_attributes(found)
 
     return compute_signature(surface, CONFIG).map_samples(added)
@@ -96,7 +110,8 @@ def test_a_bent_molecule_is_nearest_to_itself() -> None:
 
 def test_motion_changes_little() -> None:
     here, there, other = (
-        described(one) for one in (signature(0, 0.0), signature_of(moved(trace(0, 0.0))), signature(1, 0.0))
+        described(one)
+        for one in (signature(0, 0.0), signature_of(moved(trace(0, 0.0))), signature(1, 0.0))
     )
     distances = molecular(size=False).distances
     assert distances(here[:, :-2], there[:, :-2]) < 0.2 * distances(here[:, :-2], other[:, :-2])
@@ -128,13 +143,17 @@ def test_it_has_a_name_but_is_not_for_any_body() -> None:
     assert descriptor("molecular").name == "molecular"
     assert "molecular" not in NAMES
     bare = replace(signature(0, 0.0), interior=replace(signature(0, 0.0).interior, attributes={}))
-    with pytest.raises(ValueError, match="attributes: expected the interior samples to have 'residue_shares'"):
+    with pytest.raises(
+        ValueError, match="attributes: expected the interior samples to have 'residue_shares'"
+    ):
         described(bare)
 
 
 def test_shares_of_another_kind_are_named() -> None:
     with pytest.raises(ValueError, match="expected 'residue_shares' with 7 shares for each sample"):
-        PairHistogram([Shares("residue_shares", 7), InteriorDistance(4)])(collate([signature(0, 0.0)]))
+        PairHistogram([Shares("residue_shares", 7), InteriorDistance(4)])(
+            collate([signature(0, 0.0)])
+        )
     with pytest.raises(ValueError, match="expected finite shares"):
         Shares("residue_shares", 2).memberships(torch.tensor([[float("nan"), 1.0]]))
 
@@ -148,6 +167,10 @@ def test_a_head_is_fitted_to_the_histograms_and_an_explanation_holds_the_size() 
     torch.testing.assert_close(histograms(batch), found[:, :-2])
     assert histograms.n_features == found.shape[1] - 2
     told = explain(molecular(), collate([signature(0, 0)]), collate([signature(1, 0)]))
-    assert told.distance == pytest.approx(float(molecular().distances(found[:1], found[1:])), rel=1e-3)
+    assert told.distance == pytest.approx(
+        float(molecular().distances(found[:1], found[1:])), rel=1e-3
+    )
     assert sum(told.parts.values()) == pytest.approx(told.distance, rel=1e-6)
-    assert sum(one.sum() for of_body in told.samples for one in of_body.values()) == pytest.approx(told.distance)
+    assert sum(one.sum() for of_body in told.samples for one in of_body.values()) == pytest.approx(
+        told.distance
+    )

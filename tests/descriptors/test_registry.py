@@ -16,9 +16,20 @@ from igps.descriptors.d2 import D2
 from igps.signature.signature import SignatureConfig
 
 THIRTEEN = (
-    "interior", "gps", "multiscale", "rich", "pretrained", "d2", "shape_dna", "volume_shape_dna",
-    "local_diameter_centricity", "inner_distance", "canonical_form", "geodesic_spectral", "spectral_gw",
-)  # fmt: skip
+    "interior",
+    "gps",
+    "multiscale",
+    "rich",
+    "pretrained",
+    "d2",
+    "shape_dna",
+    "volume_shape_dna",
+    "local_diameter_centricity",
+    "inner_distance",
+    "canonical_form",
+    "geodesic_spectral",
+    "spectral_gw",
+)
 
 OWN = """
 import numpy as np
@@ -67,7 +78,9 @@ def test_names_are_the_thirteen() -> None:
 
 def test_a_wrong_name_lists_all() -> None:
     names = ", ".join((*THIRTEEN, "molecular"))
-    with pytest.raises(ValueError, match=f"^descriptor: expected one of {names}, or .*, got 'best'"):
+    with pytest.raises(
+        ValueError, match=f"^descriptor: expected one of {names}, or .*, got 'best'"
+    ):
         igps.descriptor("best")
 
 
@@ -91,7 +104,10 @@ def test_own_class_function_and_object_by_import_path(own: str, blob: igps.Mesh)
 @pytest.mark.parametrize(
     ("path", "message"),
     [
-        ("no.such.module:NAME", "expected package.module:NAME to be importable, got 'no.such.module:NAME'"),
+        (
+            "no.such.module:NAME",
+            "expected package.module:NAME to be importable, got 'no.such.module:NAME'",
+        ),
         ("OWN:missing", "to be importable, .*missing"),
         ("OWN:number", "number to be or to make an igps.Descriptor, got int"),
         ("OWN:nothing", "nothing to be or to make an igps.Descriptor, got NoneType"),
@@ -108,11 +124,19 @@ def test_what_a_descriptor_needs_is_added_or_asked_for() -> None:
         config, attributes=("electrostatic_potential", "depth", "surface_direction")
     )
     assert igps.descriptor("d2").requirements.apply_to(config) == config
-    for name, least in {"pretrained": 90, "rich": 50, "interior": 250, "gps": 250, "multiscale": 250}.items():
+    for name, least in {
+        "pretrained": 90,
+        "rich": 50,
+        "interior": 250,
+        "gps": 250,
+        "multiscale": 250,
+    }.items():
         needs = igps.descriptor(name).requirements
         assert needs.n_eigenpairs == least
         needs.apply_to(SignatureConfig(n_eigenpairs=least))
-        message = re.escape(f"n_eigenpairs: this descriptor needs signatures of at least {least}, got {least - 1}")
+        message = re.escape(
+            f"n_eigenpairs: this descriptor needs signatures of at least {least}, got {least - 1}"
+        )
         with pytest.raises(ValueError, match=message):
             needs.apply_to(SignatureConfig(n_eigenpairs=least - 1))
 
@@ -121,5 +145,8 @@ def test_needs_together_are_the_most_of_each() -> None:
     one = Requirements(n_eigenpairs=5, attributes=("depth",))
     other = Requirements(n_eigenpairs=3, attributes=("surface_direction", "depth"), mesh=True)
     assert one | other == Requirements(5, ("depth", "surface_direction"), mesh=True)
-    with pytest.raises(ValueError, match=r"^attributes: .* needs signatures with surface_direction, depth, got \[\]"):
+    with pytest.raises(
+        ValueError,
+        match=r"^attributes: .* needs signatures with surface_direction, depth, got \[\]",
+    ):
         other.check_config(SignatureConfig(n_eigenpairs=5))

@@ -25,7 +25,9 @@ def round_body(sphere: Mesh) -> Body:
 def test_shape_dna_of_a_sphere_is_known(round_body: Body) -> None:
     """l(l+1) with multiplicity 2l+1, and the area 4π."""
     expected = 4 * np.pi * np.repeat([2, 6, 12], [3, 5, 7])
-    np.testing.assert_allclose(ShapeDNA(n_eigenvalues=15).describe_body(round_body), expected, rtol=0.01)
+    np.testing.assert_allclose(
+        ShapeDNA(n_eigenvalues=15).describe_body(round_body), expected, rtol=0.01
+    )
 
 
 @pytest.mark.parametrize("area", [0.3, 12.0])
@@ -56,7 +58,9 @@ def test_shape_dna_distance_is_euclidean() -> None:
         (lambda: ShapeDNA(normalisation="volume"), "normalisation"),  # type: ignore[arg-type]
     ],
 )
-def test_parameters_and_signatures_out_of_range_are_named(make: Callable[[], object], message: str) -> None:
+def test_parameters_and_signatures_out_of_range_are_named(
+    make: Callable[[], object], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         make()
 

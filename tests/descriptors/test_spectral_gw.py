@@ -63,15 +63,19 @@ def test_heat_kernel_of_the_sphere(round_signature: Signature) -> None:
     cosine = np.clip(points @ points.T, -1, 1)
     for time, kernel in zip(times, kernels, strict=True):
         assert kernel.shape == (400, 400)
-        np.testing.assert_allclose(kernel, sphere_kernel(cosine, time), atol=0.02 * sphere_kernel(np.ones(1), time)[0])
+        np.testing.assert_allclose(
+            kernel, sphere_kernel(cosine, time), atol=0.02 * sphere_kernel(np.ones(1), time)[0]
+        )
 
 
-def test_signature_bound_on_the_sphere_is_the_heat_kernel_signature(round_signature: Signature) -> None:
+def test_signature_bound_on_the_sphere_is_the_heat_kernel_signature(
+    round_signature: Signature,
+) -> None:
     # Every point of the sphere has the same signature √(4π k_2t(x, x)).
     for bound in ("trace", "signature"):
-        described = SpectralGromovWasserstein(bound=bound, times=(1.0,), n_quantiles=20).describe_body(
-            of_signature(round_signature)
-        )
+        described = SpectralGromovWasserstein(
+            bound=bound, times=(1.0,), n_quantiles=20
+        ).describe_body(of_signature(round_signature))
         expected = time_weight(1.0) * np.sqrt(sphere_kernel(np.ones(1), 2.0))
         assert described.shape == (1, 1 if bound == "trace" else 20)
         np.testing.assert_allclose(described, np.full(described.shape, expected), rtol=0.06)
@@ -109,14 +113,22 @@ def test_distances_are_wasserstein_distances_of_exponent_two(
 ) -> None:
     # The linear programme of optimal transport, over all couplings of few points.
     times = (0.5, 2.0)
-    descriptor = SpectralGromovWasserstein(bound="signature", times=times, n_samples=12, n_quantiles=12)
+    descriptor = SpectralGromovWasserstein(
+        bound="signature", times=times, n_samples=12, n_quantiles=12
+    )
     signatures = (round_signature, blob_signature)
-    described = [torch.from_numpy(descriptor.describe_body(of_signature(s)))[None] for s in signatures]
+    described = [
+        torch.from_numpy(descriptor.describe_body(of_signature(s)))[None] for s in signatures
+    ]
     expected = []
-    for time, first, second in zip(times, *(heat_kernels(s, "surface", times, 12) for s in signatures), strict=True):
+    for time, first, second in zip(
+        times, *(heat_kernels(s, "surface", times, 12) for s in signatures), strict=True
+    ):
         norms = [np.sqrt(np.square(kernel).mean(axis=1)) for kernel in (first, second)]
         cost = np.subtract.outer(*norms) ** 2
-        marginals = np.concatenate([np.kron(np.eye(12), np.ones(12)), np.kron(np.ones(12), np.eye(12))])
+        marginals = np.concatenate(
+            [np.kron(np.eye(12), np.ones(12)), np.kron(np.ones(12), np.eye(12))]
+        )
         optimum = linprog(cost.ravel(), A_eq=marginals, b_eq=np.full(24, 1 / 12)).fun
         expected.append(time_weight(time) * np.sqrt(optimum))
     assert descriptor.distances(*described).item() == pytest.approx(max(expected), rel=1e-4)
@@ -132,14 +144,17 @@ def test_time_weight_peaks_at_one() -> None:
 
 
 @pytest.mark.parametrize("where", ["surface", "interior"])
-def test_lower_bounds_and_their_order(where: str, round_signature: Signature, blob_signature: Signature) -> None:
+def test_lower_bounds_and_their_order(
+    where: str, round_signature: Signature, blob_signature: Signature
+) -> None:
     pytest.importorskip("ot", reason="Gromov-Wasserstein needs POT")
     above = gromov_wasserstein(round_signature, blob_signature, samples=where, n_samples=30)  # type: ignore[arg-type]
     below = {}
     for bound in BOUNDS:
         descriptor = SpectralGromovWasserstein(samples=where, bound=bound, n_samples=30)  # type: ignore[arg-type]
         described = [
-            torch.from_numpy(descriptor.describe_body(of_signature(s)))[None] for s in (round_signature, blob_signature)
+            torch.from_numpy(descriptor.describe_body(of_signature(s)))[None]
+            for s in (round_signature, blob_signature)
         ]
         below[bound] = descriptor.distances(*described).item()
     # The trace says less than the signature and than the pairs (Mémoli 2009, 2011).
@@ -170,11 +185,15 @@ def test_gromov_wasserstein_by_brute_force() -> None:
     found = gromov_wasserstein(*shapes, times=(1.0,), n_samples=3)
     assert 0 < found <= time_weight(1.0) * best * (1 + 1e-6)
     # Between a shape and its relabelled self there is nothing.
-    relabelled = with_surface(shapes[0], shapes[0].surface.points, -shapes[0].surface.eigenfunctions[[2, 0, 1]])
+    relabelled = with_surface(
+        shapes[0], shapes[0].surface.points, -shapes[0].surface.eigenfunctions[[2, 0, 1]]
+    )
     assert gromov_wasserstein(shapes[0], relabelled, n_samples=3) < 1e-6
 
 
-def test_gromov_wasserstein_names_the_extra(blob_signature: Signature, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gromov_wasserstein_names_the_extra(
+    blob_signature: Signature, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "ot", None)
     with pytest.raises(ImportError, match=r"interior-gps\[transport\]"):
         gromov_wasserstein(blob_signature, blob_signature)
@@ -199,7 +218,10 @@ def test_signs_multiplets_and_scale(bound: str, blob_signature: Signature) -> No
         blob_signature.config,
     )
     np.testing.assert_allclose(
-        descriptor.describe_body(of_signature(scaled)), described, rtol=1e-5, atol=1e-6 * described.max()
+        descriptor.describe_body(of_signature(scaled)),
+        described,
+        rtol=1e-5,
+        atol=1e-6 * described.max(),
     )
 
 
@@ -207,7 +229,9 @@ def test_few_samples_and_the_draw(blob_signature: Signature) -> None:
     few = SpectralGromovWasserstein(samples="interior", n_samples=3)
     assert few.describe_body(of_signature(blob_signature)).shape == (5, 200)
     a, b, c = (
-        SpectralGromovWasserstein(n_samples=50, seed=seed).describe_body(of_signature(blob_signature))
+        SpectralGromovWasserstein(n_samples=50, seed=seed).describe_body(
+            of_signature(blob_signature)
+        )
         for seed in (0, 0, 1)
     )
     np.testing.assert_array_equal(a, b)
@@ -216,9 +240,14 @@ def test_few_samples_and_the_draw(blob_signature: Signature) -> None:
 
 def test_parameters_are_checked(blob_signature: Signature) -> None:
     wrong: list[dict] = [  # type: ignore[type-arg]
-        {"samples": "edges"}, {"bound": "upper"}, {"times": ()}, {"times": (1.0, 0.0)}, {"times": (np.nan,)},
-        {"n_samples": 0}, {"n_quantiles": 0},
-    ]  # fmt: skip
+        {"samples": "edges"},
+        {"bound": "upper"},
+        {"times": ()},
+        {"times": (1.0, 0.0)},
+        {"times": (np.nan,)},
+        {"n_samples": 0},
+        {"n_quantiles": 0},
+    ]
     for parameters in wrong:
         with pytest.raises(ValueError, match=next(iter(parameters))):
             SpectralGromovWasserstein(**parameters)
@@ -229,10 +258,15 @@ def test_parameters_are_checked(blob_signature: Signature) -> None:
 def test_some_samples_stand_for_all(blob_signature: Signature) -> None:
     # Steps along the order of form: whatever the first one, no part of the body is left out or taken twice.
     few = [SpectralGromovWasserstein(n_samples=100, n_quantiles=20, seed=seed) for seed in range(4)]
-    of_all = SpectralGromovWasserstein(n_samples=400, n_quantiles=20).describe_body(of_signature(blob_signature))
+    of_all = SpectralGromovWasserstein(n_samples=400, n_quantiles=20).describe_body(
+        of_signature(blob_signature)
+    )
     for descriptor in few:
         described = descriptor.describe_body(of_signature(blob_signature))
         assert np.abs(described - of_all).max() < 0.05 * np.abs(of_all).max()
-    kernels = [heat_kernels(blob_signature, "surface", (1.0,), n, seed=s)[0] for n, s in ((400, 0), (400, 1), (300, 1))]
+    kernels = [
+        heat_kernels(blob_signature, "surface", (1.0,), n, seed=s)[0]
+        for n, s in ((400, 0), (400, 1), (300, 1))
+    ]
     np.testing.assert_array_equal(kernels[0], kernels[1])
     assert len(np.unique(np.diag(kernels[2]))) == 300

@@ -27,7 +27,11 @@ def two_balls(second: float, neck: float) -> Mesh:
     """A ball of radius 1 and another, joined by a neck."""
     gap, up = 0.2, np.linspace(0, np.pi, 25)
     lower = [(np.sin(t), -np.cos(t)) for t in up if t <= np.pi - np.arcsin(neck)]
-    upper = [(second * np.sin(t), 1 + gap + second - second * np.cos(t)) for t in up if t >= np.arcsin(neck / second)]
+    upper = [
+        (second * np.sin(t), 1 + gap + second - second * np.cos(t))
+        for t in up
+        if t >= np.arcsin(neck / second)
+    ]
     profile = [*lower, (neck, np.cos(np.arcsin(neck))), (neck, 1 + gap), *upper]
     profile[0], profile[-1] = (0.0, profile[0][1]), (0.0, profile[-1][1])
     return revolved(profile)
@@ -67,13 +71,19 @@ def test_cube_has_the_spectrum_of_its_grid_with_all_multiplets(boundary: Boundar
 def test_cube_converges_with_order_two(boundary: Boundary) -> None:
     exact = np.pi**2 * np.square(cube_frequencies(boundary, 20)).sum(axis=1)
     cube = as_mesh(trimesh.creation.box((1, 1, 1)))
-    coarse, fine = (np.abs(volume_spectrum(cube, 20, boundary, n**3 - 1) / exact - 1).mean() for n in (8, 16))
+    coarse, fine = (
+        np.abs(volume_spectrum(cube, 20, boundary, n**3 - 1) / exact - 1).mean() for n in (8, 16)
+    )
     assert fine < 0.02
     assert np.log2(coarse / fine) == pytest.approx(2, abs=0.1)
 
 
-@pytest.mark.parametrize(("boundary", "largest", "order"), [("dirichlet", 0.04, 1.8), ("neumann", 0.05, 1.25)])
-def test_ball_tends_to_zeros_of_bessel_functions(boundary: Boundary, largest: float, order: float) -> None:
+@pytest.mark.parametrize(
+    ("boundary", "largest", "order"), [("dirichlet", 0.04, 1.8), ("neumann", 0.05, 1.25)]
+)
+def test_ball_tends_to_zeros_of_bessel_functions(
+    boundary: Boundary, largest: float, order: float
+) -> None:
     exact = ball_eigenvalues(boundary, 30)
     ball = as_mesh(trimesh.creation.icosphere(subdivisions=4))
     coarse, fine = (np.abs(volume_spectrum(ball, 30, boundary, n) / exact - 1) for n in (500, 8000))
@@ -87,7 +97,9 @@ def test_turned_cube_is_still_a_cube(boundary: Boundary) -> None:
     exact = np.pi**2 * np.square(cube_frequencies(boundary, 20)).sum(axis=1)
     surface = trimesh.creation.box((1, 1, 1))
     surface.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
-    np.testing.assert_allclose(volume_spectrum(as_mesh(surface), 20, boundary, 4000), exact, rtol=0.055)
+    np.testing.assert_allclose(
+        volume_spectrum(as_mesh(surface), 20, boundary, 4000), exact, rtol=0.055
+    )
 
 
 def test_walls_lie_between_the_cells_where_the_surface_is() -> None:
@@ -95,7 +107,9 @@ def test_walls_lie_between_the_cells_where_the_surface_is() -> None:
     cube, generator = trimesh.creation.box((1, 1, 1)), np.random.default_rng(0)
     for _ in range(4):
         turn, _ = np.linalg.qr(generator.standard_normal((3, 3)))
-        first = volume_spectrum(Mesh(np.asarray(cube.vertices) @ turn, cube.faces), 1, "dirichlet", 4000)
+        first = volume_spectrum(
+            Mesh(np.asarray(cube.vertices) @ turn, cube.faces), 1, "dirichlet", 4000
+        )
         assert first[0] == pytest.approx(3 * np.pi**2, rel=0.006)
 
 
@@ -136,7 +150,9 @@ def test_crumb_is_left_out() -> None:
 
 def test_distances_are_euclidean() -> None:
     rows = torch.tensor([[0.0, 0.0], [3.0, 4.0]])
-    torch.testing.assert_close(VolumeShapeDNA().distances(rows, rows), torch.tensor([[0.0, 5.0], [5.0, 0.0]]))
+    torch.testing.assert_close(
+        VolumeShapeDNA().distances(rows, rows), torch.tensor([[0.0, 5.0], [5.0, 0.0]])
+    )
 
 
 def test_too_few_cells_are_refused(blob: Mesh) -> None:

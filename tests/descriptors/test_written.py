@@ -71,7 +71,8 @@ def bodies(tmp_path: Path) -> SignatureDataset:
 
 
 @pytest.mark.parametrize(
-    ("text", "named"), [(INTERIOR, lambda: igps.descriptor("interior")), (PRETRAINED, pretrained_parts)]
+    ("text", "named"),
+    [(INTERIOR, lambda: igps.descriptor("interior")), (PRETRAINED, pretrained_parts)],
 )
 def test_a_descriptor_of_the_library_written_down_gives_the_same_numbers(
     bodies: SignatureDataset, tmp_path: Path, text: str, named: object
@@ -85,21 +86,41 @@ def test_a_descriptor_of_the_library_written_down_gives_the_same_numbers(
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("parts: [{axes: [colour]}]", r"axes: expected one of potential, .*, or an attribute with centres.*'colour'"),
-        ("parts: [{axes: [interior_distance], bins: 4}]", r"pairs: expected axes, samples, .*eigenpairs, got 'bins'"),
-        ("parts: [{axes: [interior_distance: {bins: 4}]}]", r"interior_distance: expected n_bins, reach.*, got 'bins'"),
-        ("parts: [{histogram: cloud}]", "histogram: expected one of pairs, points, axial, .*, got 'cloud'"),
+        (
+            "parts: [{axes: [colour]}]",
+            r"axes: expected one of potential, .*, or an attribute with centres.*'colour'",
+        ),
+        (
+            "parts: [{axes: [interior_distance], bins: 4}]",
+            r"pairs: expected axes, samples, .*eigenpairs, got 'bins'",
+        ),
+        (
+            "parts: [{axes: [interior_distance: {bins: 4}]}]",
+            r"interior_distance: expected n_bins, reach.*, got 'bins'",
+        ),
+        (
+            "parts: [{histogram: cloud}]",
+            "histogram: expected one of pairs, points, axial, .*, got 'cloud'",
+        ),
         ("parts: [5]", "histogram: expected one of pairs, .* got '5'"),
         ("part: []", "a descriptor: expected parts, name, .*, got 'part'"),
         ("name: x", "expected a list of `parts`"),
         ("parts: []", "expected at least one in each part"),
-        ("parts: [{axes: [interior_distance: {n_bins: 100000000}]}]", "numbers of at most 10000, got 100000000"),
-        ("parts: [{axes: [ct: {quantiles: 1}, interior_distance]}]", "ct: expected centres, or at least 2 quantiles"),
+        (
+            "parts: [{axes: [interior_distance: {n_bins: 100000000}]}]",
+            "numbers of at most 10000, got 100000000",
+        ),
+        (
+            "parts: [{axes: [ct: {quantiles: 1}, interior_distance]}]",
+            "ct: expected centres, or at least 2 quantiles",
+        ),
         ("!!python/object/apply:os.system ['touch hacked']", "could not determine a constructor"),
         ("parts: [", "while parsing"),
     ],
 )
-def test_what_is_no_descriptor_is_told_with_what_there_is(tmp_path: Path, text: str, sentence: str) -> None:
+def test_what_is_no_descriptor_is_told_with_what_there_is(
+    tmp_path: Path, text: str, sentence: str
+) -> None:
     with pytest.raises(ValueError, match=rf"mine\.yaml: expected a descriptor \(.*{sentence}.*"):
         igps.descriptor(str(write(tmp_path, text)))
     assert not Path("hacked").exists()
@@ -107,20 +128,30 @@ def test_what_is_no_descriptor_is_told_with_what_there_is(tmp_path: Path, text: 
         igps.descriptor("none.yaml")
 
 
-def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tmp_path: Path) -> None:
+def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(
+    tmp_path: Path,
+) -> None:
     for i in range(2):
         trimesh.creation.icosphere(subdivisions=2, radius=1 + i).export(tmp_path / f"{i}.off")
     text = "parts: [{eigenpairs: 20, axes: [height: {quantiles: 4, soft: true}, interior_distance: {n_bins: 8}]}]"
     own = igps.descriptor(write(tmp_path, text))
     heights = {"height": lambda points: points[:, 2]}
     files = [tmp_path / f"{i}.off" for i in range(2)]
-    dataset = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=own, attributes=heights)
-    with pytest.raises(ValueError, match="height: expected centres, got 4 quantiles that are not fitted"):
+    dataset = SignatureDataset(
+        files, cache_dir=tmp_path / "cache", descriptor=own, attributes=heights
+    )
+    with pytest.raises(
+        ValueError, match="height: expected centres, got 4 quantiles that are not fitted"
+    ):
         own(dataset.batch([0]))
     assert fit_centres(own, dataset)
-    values = np.concatenate([one.interior.attributes["height"][:500] for one in dataset.signatures()])
+    values = np.concatenate(
+        [one.interior.attributes["height"][:500] for one in dataset.signatures()]
+    )
     centres = own.histograms[0].axes[0].centres()
-    np.testing.assert_allclose(centres, np.quantile(values, [0.125, 0.375, 0.625, 0.875]), rtol=1e-5)
+    np.testing.assert_allclose(
+        centres, np.quantile(values, [0.125, 0.375, 0.625, 0.875]), rtol=1e-5
+    )
     described = describe(dataset, own)
     assert not fit_centres(own, dataset[[0]])
     own.save(tmp_path / "kept.safetensors")
@@ -128,7 +159,8 @@ def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tm
     assert torch.equal(describe(dataset[[0]], again), described[:1])
     bare = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=own)
     with pytest.raises(
-        ValueError, match=r"attributes: expected 'height' of each body, got \[\]. Give it as --attribute"
+        ValueError,
+        match=r"attributes: expected 'height' of each body, got \[\]. Give it as --attribute",
     ):
         fit_centres(igps.descriptor(write(tmp_path, text)), bare)
 
@@ -147,7 +179,9 @@ def texture(kind: str, generator: np.random.Generator, points: np.ndarray) -> np
     return 2 * np.exp(-np.square(points).sum(axis=1) / 0.3) - 0.5
 
 
-def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp_path: Path) -> None:
+def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(
+    tmp_path: Path,
+) -> None:
     nibabel = pytest.importorskip("nibabel")
     generator = np.random.default_rng(0)
     affine = np.diag([0.1, 0.1, 0.1, 1.0])
@@ -166,25 +200,35 @@ def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp
     images = {"ct": ImageAttribute("ct/{file}.nii.gz", tmp_path / "root")}
     found = {}
     files = [
-        tmp_path / "root" / kind / f"{i}.off" for kind in ("graded", "layered", "mottled", "core") for i in range(4)
+        tmp_path / "root" / kind / f"{i}.off"
+        for kind in ("graded", "layered", "mottled", "core")
+        for i in range(4)
     ]
     labels = [path.parent.name for path in files]
     for name in ("interior", "interior+ct"):
         chosen = igps.descriptor(name)
-        dataset = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=chosen, attributes=images)
+        dataset = SignatureDataset(
+            files, cache_dir=tmp_path / "cache", descriptor=chosen, attributes=images
+        )
         fit_centres(chosen, dataset)
         described = describe(dataset, chosen)
-        found[name] = float(retrieval_scores(chosen.distances(described, described), labels).mean()["nn"])
+        found[name] = float(
+            retrieval_scores(chosen.distances(described, described), labels).mean()["nn"]
+        )
     assert found["interior+ct"] >= 0.95
     assert found["interior"] < 0.6
 
 
-def test_an_attribute_adds_its_histograms_with_its_weight(bodies: SignatureDataset, tmp_path: Path) -> None:
+def test_an_attribute_adds_its_histograms_with_its_weight(
+    bodies: SignatureDataset, tmp_path: Path
+) -> None:
     files = [tmp_path / f"{i}.off" for i in range(3)]
     heights = {"height": lambda points: points[:, 2]}
     whole = igps.descriptor("pretrained+height=0.5")
     assert isinstance(whole, WithAttributes)
-    dataset = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=whole, attributes=heights)
+    dataset = SignatureDataset(
+        files, cache_dir=tmp_path / "cache", descriptor=whole, attributes=heights
+    )
     fit_centres(whole, dataset)
     described = describe(dataset, whole)
     form = describe(dataset, descriptor("pretrained"))
@@ -198,7 +242,9 @@ def test_an_attribute_adds_its_histograms_with_its_weight(bodies: SignatureDatas
     rows = whole.coordinates(described, within_class=True)
     kept = descriptor("pretrained").coordinates(form, within_class=True)
     np.testing.assert_allclose(rows[:, : kept.shape[1]], kept, atol=1e-6)
-    np.testing.assert_allclose(rows[:, kept.shape[1] :].square(), 0.5 * 0.083 / 0.017 * inside.flatten(1), atol=1e-5)
+    np.testing.assert_allclose(
+        rows[:, kept.shape[1] :].square(), 0.5 * 0.083 / 0.017 * inside.flatten(1), atol=1e-5
+    )
     assert igps.descriptor("pretrained+height=0.5+size").name == "pretrained+height=0.5+size"
     with pytest.raises(ValueError, match="with: expected positive weights"):
         igps.descriptor("interior+height=0")

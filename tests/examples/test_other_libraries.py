@@ -19,7 +19,9 @@ from igps.retrieval.metric import RetrievalScoresMetric
 from own_descriptors import small_interior, write_egg
 
 pytest.importorskip("torch_geometric", reason="the extra geometric is not installed")
-distances = pytest.importorskip("pytorch_metric_learning.distances", reason="the extra metric is not installed")
+distances = pytest.importorskip(
+    "pytorch_metric_learning.distances", reason="the extra metric is not installed"
+)
 
 
 @pytest.fixture(scope="module")
@@ -29,13 +31,17 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> igps.SignatureDataset:
     for label, height in (("flat", 0.5), ("long", 2.0)):
         for i in range(4):
             write_egg(root / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2)
-    config = igps.SignatureConfig(n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=80)
+    config = igps.SignatureConfig(
+        n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=80
+    )
     found = igps.SignatureDataset(root / "eggs", config, root / "cache")
     found.precompute(n_workers=1, progress=False)
     return found.to_memory()
 
 
-def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(dataset: igps.SignatureDataset) -> None:
+def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(
+    dataset: igps.SignatureDataset,
+) -> None:
     from torch_geometric.loader import DataLoader as GeometricLoader
     from torch_geometric.nn import global_add_pool
 
@@ -50,7 +56,9 @@ def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(dataset: ig
     assert batch.y.tolist() == dataset.labels.tolist()
     # A heat kernel signature (Sun, Ovsjanikov and Guibas 2009) of each sample, pooled over each body: the heat trace.
     weights = (-0.05 * batch.eigenvalues * batch.area[:, None]).exp()[batch.batch]
-    traces = global_add_pool((batch.mass[:, None] * weights * batch.eigenfunctions**2).sum(dim=1), batch.batch)
+    traces = global_add_pool(
+        (batch.mass[:, None] * weights * batch.eigenfunctions**2).sum(dim=1), batch.batch
+    )
     for trace, item in zip(traces.tolist(), dataset, strict=True):
         expected = np.exp(-0.05 * item.signature.eigenvalues * item.signature.area).sum()
         assert trace == pytest.approx(expected, rel=0.5)  # samples of 80 points
@@ -65,17 +73,27 @@ class DiffusionBlock(nn.Module):
     def __init__(self, n_channels: int) -> None:
         super().__init__()
         self.log_time = nn.Parameter(torch.full((n_channels,), -3.0))
-        self.mix = nn.Sequential(nn.Linear(2 * n_channels, n_channels), nn.ReLU(), nn.Linear(n_channels, n_channels))
+        self.mix = nn.Sequential(
+            nn.Linear(2 * n_channels, n_channels), nn.ReLU(), nn.Linear(n_channels, n_channels)
+        )
 
-    def diffused(self, x: Tensor, eigenvalues: Tensor, eigenfunctions: Tensor, mass: Tensor) -> Tensor:
+    def diffused(
+        self, x: Tensor, eigenvalues: Tensor, eigenfunctions: Tensor, mass: Tensor
+    ) -> Tensor:
         """(P, D) values after a time, the constant eigenfunction included, which spectra leave out."""
         mean = (mass @ x) / mass.sum()
         spectral = eigenfunctions.T @ (mass[:, None] * (x - mean))
-        return mean + eigenfunctions @ ((-eigenvalues[:, None] * self.log_time.exp()).exp() * spectral)
+        return mean + eigenfunctions @ (
+            (-eigenvalues[:, None] * self.log_time.exp()).exp() * spectral
+        )
 
-    def forward(self, x: Tensor, eigenvalues: Tensor, eigenfunctions: Tensor, mass: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, eigenvalues: Tensor, eigenfunctions: Tensor, mass: Tensor
+    ) -> Tensor:
         """(P, D) features of points to (P, D)."""
-        return x + self.mix(torch.cat([x, self.diffused(x, eigenvalues, eigenfunctions, mass)], dim=1))
+        return x + self.mix(
+            torch.cat([x, self.diffused(x, eigenvalues, eigenfunctions, mass)], dim=1)
+        )
 
 
 def test_a_diffusion_net_reads_the_spectrum_of_a_surface() -> None:
@@ -91,12 +109,15 @@ def test_a_diffusion_net_reads_the_spectrum_of_a_surface() -> None:
     stiffness, mass = laplacian(mesh)
     spectrum = eigenpairs(stiffness, mass, 200)
     eigenvalues, functions, weights = (
-        torch.from_numpy(np.asarray(one)).float() for one in (spectrum.eigenvalues, spectrum.eigenfunctions, mass)
+        torch.from_numpy(np.asarray(one)).float()
+        for one in (spectrum.eigenvalues, spectrum.eigenfunctions, mass)
     )
     block, x = DiffusionBlock(3), torch.from_numpy(np.array(mesh.vertices)).float()
     found = block.diffused(x, eigenvalues, functions, weights).detach().numpy()
     time, n_steps = float(block.log_time[0].detach().exp()), 400
-    step = scipy.sparse.linalg.factorized((scipy.sparse.diags(mass) + time / n_steps * stiffness).tocsc())
+    step = scipy.sparse.linalg.factorized(
+        (scipy.sparse.diags(mass) + time / n_steps * stiffness).tocsc()
+    )
     expected = np.array(mesh.vertices)
     for _ in range(n_steps):
         expected = np.column_stack([step(mass * column) for column in expected.T])
@@ -125,7 +146,9 @@ class AsTheirs(distances.BaseDistance):  # type: ignore[misc]
         return self.distances(query, reference)
 
     def pairwise_distance(self, query: Tensor, reference: Tensor) -> Tensor:
-        return torch.stack([self.distances(q[None], r[None])[0, 0] for q, r in zip(query, reference, strict=True)])
+        return torch.stack(
+            [self.distances(q[None], r[None])[0, 0] for q, r in zip(query, reference, strict=True)]
+        )
 
 
 def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back(
@@ -142,12 +165,17 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
 
     torch.manual_seed(0)
     axes = [Potential(3, learnable=True), InteriorDistance(12, learnable=True)]
-    descriptor = igps.HistogramDescriptor(igps.PairHistogram(axes, SpectralEmbedding(n_eigenpairs=20)))
+    descriptor = igps.HistogramDescriptor(
+        igps.PairHistogram(axes, SpectralEmbedding(n_eigenpairs=20))
+    )
     head = ProjectionHead(width=8, n_hidden=0, cell_dropout=0).fit(
         igps.describe(dataset, descriptor).flatten(1), dataset.labels
     )
     distance = AsTheirs(head.distances)
-    miner, loss = BatchHardMiner(distance=distance), TripletMarginLoss(margin=0.2, distance=distance)
+    miner, loss = (
+        BatchHardMiner(distance=distance),
+        TripletMarginLoss(margin=0.2, distance=distance),
+    )
     head(torch.ones(1, descriptor.n_features))
     optimizer = torch.optim.Adam([*descriptor.parameters(), *head.parameters()], lr=0.01)
     sampler = MPerClassSampler(dataset.labels, m=4, batch_size=8, length_before_new_iter=160)
@@ -169,9 +197,14 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     ours = igps.retrieval_scores(plain.distances(cells, cells), dataset.labels).mean()["nn"]
     assert found == pytest.approx(ours)
 
-    how: dict[str, Any] = {"dataloader_num_workers": 0, "data_and_label_getter": lambda batch: (batch, batch.labels)}
+    how: dict[str, Any] = {
+        "dataloader_num_workers": 0,
+        "data_and_label_getter": lambda batch: (batch, batch.labels),
+    }
     trunk = nn.Sequential(plain, nn.Flatten())
-    tester = GlobalEmbeddingSpaceTester(batch_size=3, accuracy_calculator=calculator, normalize_embeddings=False, **how)
+    tester = GlobalEmbeddingSpaceTester(
+        batch_size=3, accuracy_calculator=calculator, normalize_embeddings=False, **how
+    )
     tested = tester.test({"eggs": dataset}, 0, trunk, collate_fn=igps.collate)["eggs"]
     assert tested["precision_at_1_level0"] == pytest.approx(ours)
 
@@ -179,7 +212,13 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     before, models = layer.weight.detach().clone(), {"trunk": trunk, "embedder": layer}
     optimizers = {"embedder_optimizer": torch.optim.Adam(layer.parameters(), lr=0.01)}
     MetricLossOnly(
-        models, optimizers, 8, {"metric_loss": TripletMarginLoss()}, dataset=dataset, collate_fn=igps.collate, **how
+        models,
+        optimizers,
+        8,
+        {"metric_loss": TripletMarginLoss()},
+        dataset=dataset,
+        collate_fn=igps.collate,
+        **how,
     ).train()
     assert not torch.equal(layer.weight, before)
 
@@ -194,11 +233,17 @@ def test_retrieval_scores_accumulate_step_by_step(dataset: igps.SignatureDataset
     for batch in DataLoader(dataset, batch_size=3, collate_fn=igps.collate):
         metric.update(descriptor(batch), batch.labels, batch.ids)
     histograms = igps.describe(dataset, descriptor)
-    expected = igps.retrieval_scores(descriptor.distances(histograms, histograms), dataset.labels).mean()
-    assert {name: float(value) for name, value in metric.compute().items()} == pytest.approx(expected)
+    expected = igps.retrieval_scores(
+        descriptor.distances(histograms, histograms), dataset.labels
+    ).mean()
+    assert {name: float(value) for name, value in metric.compute().items()} == pytest.approx(
+        expected
+    )
 
 
-def test_missing_extras_are_named(monkeypatch: pytest.MonkeyPatch, dataset: igps.SignatureDataset) -> None:
+def test_missing_extras_are_named(
+    monkeypatch: pytest.MonkeyPatch, dataset: igps.SignatureDataset
+) -> None:
     monkeypatch.setitem(__import__("sys").modules, "torch_geometric.data", None)
     with pytest.raises(ImportError, match=r"interior-gps\[geometric\]"):
         to_pyg(dataset[0].signature)

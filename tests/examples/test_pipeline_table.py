@@ -14,7 +14,10 @@ import torch
 import igps
 
 PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "pipelines.md").read_text(encoding="utf-8")
-ROWS = {int(n): (what, code) for n, what, code in re.findall(r"^\| (\d+) \| (.*?) \| `(.*)` \|$", PAGE, re.MULTILINE)}
+ROWS = {
+    int(n): (what, code)
+    for n, what, code in re.findall(r"^\| (\d+) \| (.*?) \| `(.*)` \|$", PAGE, re.MULTILINE)
+}
 CHECKS: dict[int, Callable[[Any, dict[str, Any]], bool]] = {
     1: lambda found, space: found[0] == 0 and found[1].name == "biped/00.off",
     2: lambda found, space: [len(one) for one in found] == [3, 3],
@@ -23,7 +26,9 @@ CHECKS: dict[int, Callable[[Any, dict[str, Any]], bool]] = {
     6: lambda found, space: [len(one) for one in found] == [4, 2],
     7: lambda found, space: sorted(i for one in found for i in one) == list(range(6)),
     8: lambda found, space: len(list(found)) == 6,
-    9: lambda found, space: sorted(one.id for one in found) == sorted(space["dataset"].bodies.names),
+    9: lambda found, space: (
+        sorted(one.id for one in found) == sorted(space["dataset"].bodies.names)
+    ),
     10: lambda found, space: found[3].id == space["dataset"][3].id,
     11: lambda found, space: found[1].bodies.names == space["dataset"].bodies.names,
     12: lambda found, space: len(found) == 8 and found.ids[6:] == space["batch"].ids[:2],
@@ -32,12 +37,18 @@ CHECKS: dict[int, Callable[[Any, dict[str, Any]], bool]] = {
     15: lambda found, space: not found.missing_keys,
     16: lambda found, space: bool((found.diagonal() == 0).all() and (found[:3, 3:] > 0).all()),
     17: lambda found, space: torch.allclose(found, space["descriptor"](space["batch"]), atol=1e-6),
-    18: lambda found, space: torch.allclose(found[1].float(), space["descriptor"](space["batch"]), atol=1e-4),
+    18: lambda found, space: torch.allclose(
+        found[1].float(), space["descriptor"](space["batch"]), atol=1e-4
+    ),
     20: lambda found, space: found.argmax(dim=1).tolist() == [0, 0, 0, 1, 1, 1],
     21: lambda found, space: found.pos.shape == space["dataset"][0].signature.surface.points.shape,
-    22: lambda found, space: torch.equal(found[1](space["batch"]), space["descriptor"](space["batch"])),
-    23: lambda found, space: torch.equal(found[1](space["batch"]), space["descriptor"](space["batch"])),
-}  # fmt: skip
+    22: lambda found, space: torch.equal(
+        found[1](space["batch"]), space["descriptor"](space["batch"])
+    ),
+    23: lambda found, space: torch.equal(
+        found[1](space["batch"]), space["descriptor"](space["batch"])
+    ),
+}
 NOTHING_COMES_BACK = {19}
 
 
@@ -66,7 +77,9 @@ def test_there_are_twenty_things_that_work_and_reasons_for_the_rest() -> None:
 
 
 @pytest.mark.parametrize("number", [number for number in ROWS if number != 4])
-def test_a_line_of_the_table_works(space: dict[str, Any], number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_of_the_table_works(
+    space: dict[str, Any], number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(space["folder"])
     monkeypatch.setattr("igps.data.dataset.default_cache_dir", lambda: space["folder"] / "cache")
     torch.compiler.reset()
@@ -78,7 +91,9 @@ def test_a_line_of_the_table_works(space: dict[str, Any], number: int, monkeypat
         assert CHECKS[number](found, space), ROWS[number][0]
 
 
-def test_a_transform_is_set_and_taken_away(space: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_transform_is_set_and_taken_away(
+    space: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(space["folder"])
     dataset: igps.SignatureDataset = space["dataset"]
     whole = len(dataset[0].signature.interior)

@@ -10,7 +10,12 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
+from igps.gallery._alignment import (
+    SurfaceSamples,
+    TriangleSurface,
+    offset_in_place,
+    surface_distance,
+)
 
 Array = NDArray[np.float64]
 
@@ -28,7 +33,9 @@ def ellipsoid(axes: tuple[float, float, float], n: int = 1500, seed: int = 0) ->
     """Samples of an ellipsoid, denser where it is pointed."""
     directions = even_directions(n, seed)
     normals = directions / axes
-    return SurfaceSamples.of(directions * axes, normals / np.linalg.norm(normals, axis=1, keepdims=True), 1.0)
+    return SurfaceSamples.of(
+        directions * axes, normals / np.linalg.norm(normals, axis=1, keepdims=True), 1.0
+    )
 
 
 def bumpy(amplitude: float, n: int = 2000, seed: int = 0) -> SurfaceSamples:
@@ -38,7 +45,9 @@ def bumpy(amplitude: float, n: int = 2000, seed: int = 0) -> SurfaceSamples:
     value, slope = (35 * z**4 - 30 * z**2 + 3) / 8, (140 * z**3 - 60 * z) / 8
     radius = 1 + amplitude * value
     # ∇(|x| − a·P₄(z/|x|)) = u − a·P₄′·(e_z − z·u)/r
-    normals = directions - amplitude * (slope / radius)[:, None] * (np.eye(3)[2] - z[:, None] * directions)
+    normals = directions - amplitude * (slope / radius)[:, None] * (
+        np.eye(3)[2] - z[:, None] * directions
+    )
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return SurfaceSamples.of(radius[:, None] * directions, normals, 4 * np.pi)
 
@@ -50,12 +59,16 @@ def moved(samples: SurfaceSamples, seed: int, mirror: bool, scale: float) -> Sur
     return SurfaceSamples.of(points, (samples.normals @ turn.T)[shuffled], scale**2)
 
 
-@pytest.mark.parametrize(("seed", "mirror", "scale"), [(1, False, 1.0), (2, True, 7.0), (3, True, 0.05)])
+@pytest.mark.parametrize(
+    ("seed", "mirror", "scale"), [(1, False, 1.0), (2, True, 7.0), (3, True, 0.05)]
+)
 def test_a_motion_a_mirror_and_a_scale_leave_nothing(seed: int, mirror: bool, scale: float) -> None:
     """Of a body without any symmetry: two ellipsoids beside each other."""
     one, other = ellipsoid((1.0, 0.6, 0.4)), ellipsoid((0.5, 0.3, 0.7), 500, seed=4)
     beside = other.points + np.array([0.9, 0.5, 0.3])
-    body = SurfaceSamples.of(np.concatenate([one.points, beside]), np.concatenate([one.normals, other.normals]), 1.0)
+    body = SurfaceSamples.of(
+        np.concatenate([one.points, beside]), np.concatenate([one.normals, other.normals]), 1.0
+    )
     again = moved(body, seed, mirror, scale)
     np.testing.assert_allclose(again.extents, body.extents, rtol=1e-9)
     assert surface_distance(body, again) < 1e-5
@@ -70,7 +83,9 @@ def test_other_samples_of_one_surface_are_nearer_than_the_gaps_between_them() ->
 def test_a_ball_and_a_bumpy_one_are_as_far_apart_as_the_bumps_are_high(amplitude: float) -> None:
     """P₄ is orthogonal to all that a shift or a scale does to a ball, so that its mean square, 1/9, stays."""
     expected = amplitude / 3 / np.sqrt(4 * np.pi)
-    assert surface_distance(bumpy(0.0), bumpy(amplitude, seed=5)) == pytest.approx(expected, rel=0.15)
+    assert surface_distance(bumpy(0.0), bumpy(amplitude, seed=5)) == pytest.approx(
+        expected, rel=0.15
+    )
 
 
 def test_a_rotated_body_with_equal_principal_axes_is_aligned() -> None:
@@ -94,7 +109,9 @@ def rough(amplitude: float, n: int, seed: int) -> tuple[Array, Array]:
 def test_fine_relief_cancels_but_another_shape_does_not() -> None:
     """Ripples within a patch of ten samples average out; their root mean square is amplitude/√2."""
     amplitude, area = 0.01, 6.1
-    plain, ruffled = (SurfaceSamples.of(*rough(a, 2000, seed), area) for a, seed in ((0.0, 1), (amplitude, 2)))
+    plain, ruffled = (
+        SurfaceSamples.of(*rough(a, 2000, seed), area) for a, seed in ((0.0, 1), (amplitude, 2))
+    )
     high = amplitude / np.sqrt(2) / np.sqrt(area)
     lost = surface_distance(plain, ruffled)
     assert lost < 0.55 * high
@@ -104,7 +121,9 @@ def test_fine_relief_cancels_but_another_shape_does_not() -> None:
     assert surface_distance(plain, SurfaceSamples.of(turned, normals, area)) > 2 * lost
 
 
-def triangles(axes: tuple[float, float, float], subdivisions: int) -> tuple[Array, NDArray[np.int64]]:
+def triangles(
+    axes: tuple[float, float, float], subdivisions: int
+) -> tuple[Array, NDArray[np.int64]]:
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     return np.asarray(ball.vertices * axes), np.asarray(ball.faces)
 
@@ -121,10 +140,15 @@ def test_the_surface_itself_tells_more_than_samples() -> None:
 def test_nearest_points_of_a_surface() -> None:
     """Against trimesh's loop over all triangles, and above the middle of each face, where its normal stands."""
     vertices, faces = triangles((1.0, 0.6, 0.4), 2)
-    surface, body = TriangleSurface(vertices, faces), trimesh.Trimesh(vertices, faces, process=False)
+    surface, body = (
+        TriangleSurface(vertices, faces),
+        trimesh.Trimesh(vertices, faces, process=False),
+    )
     anywhere = np.random.default_rng(0).uniform(-1, 1, (40, 3))
     expected, _, _ = trimesh.proximity.closest_point_naive(body, anywhere)
-    np.testing.assert_allclose(surface.nearest(SurfaceSamples(anywhere, anywhere))[0], expected, atol=1e-12)
+    np.testing.assert_allclose(
+        surface.nearest(SurfaceSamples(anywhere, anywhere))[0], expected, atol=1e-12
+    )
     above = body.triangles_center + 0.01 * body.face_normals
     points, normals = surface.nearest(SurfaceSamples(above, body.face_normals))
     np.testing.assert_allclose(points, body.triangles_center, atol=1e-12)
@@ -136,8 +160,12 @@ def test_in_place_nothing_is_moved() -> None:
     vertices, faces = triangles((1.0, 1.0, 1.0), 5)
     step = np.array([0.0, 0.0, 0.02])
     ball = replace(ellipsoid((1.0, 1.0, 1.0)), surface=lambda: TriangleSurface(vertices, faces))
-    beside = SurfaceSamples(ball.points + step, ball.normals, lambda: TriangleSurface(vertices + step, faces))
-    assert offset_in_place(ball, TriangleSurface(vertices + step, faces)) == pytest.approx(0.02 / np.sqrt(3), rel=0.03)
+    beside = SurfaceSamples(
+        ball.points + step, ball.normals, lambda: TriangleSurface(vertices + step, faces)
+    )
+    assert offset_in_place(ball, TriangleSurface(vertices + step, faces)) == pytest.approx(
+        0.02 / np.sqrt(3), rel=0.03
+    )
     assert surface_distance(ball, beside) < 1e-4
 
 
@@ -161,7 +189,11 @@ def wheel(thinned: float, seed: int) -> SurfaceSamples:
     radius, turning = 1 + 0.06 * bumps, 0.06 * slope
     points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
     normals = np.column_stack(
-        [radius * np.cos(angle) + turning * np.sin(angle), radius * np.sin(angle) - turning * np.cos(angle), 0 * z]
+        [
+            radius * np.cos(angle) + turning * np.sin(angle),
+            radius * np.sin(angle) - turning * np.cos(angle),
+            0 * z,
+        ]
     )
     kept = (np.abs(np.cos(angle - thinned)) < 0.6) | (np.arange(len(z)) % 4 == 0)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -208,7 +240,9 @@ def test_what_is_hopeless_stays_beyond_that() -> None:
 
 
 def test_samples_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"points, normals: expected both \(P, 3\) .* got \(5, 3\) and \(4, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"points, normals: expected both \(P, 3\) .* got \(5, 3\) and \(4, 3\)"
+    ):
         SurfaceSamples.of(np.zeros((5, 3)), np.zeros((4, 3)), 1.0)
 
 

@@ -47,7 +47,9 @@ def test_the_share_that_is_closer_is_the_one_that_is_counted(
     calibration: Calibration, drawn: dict[str, np.ndarray], distance: float
 ) -> None:
     for kind, values in drawn.items():
-        assert calibration.share_closer(kind, distance) == pytest.approx((values < distance).mean(), abs=0.02)
+        assert calibration.share_closer(kind, distance) == pytest.approx(
+            (values < distance).mean(), abs=0.02
+        )
 
 
 def test_shares_at_the_ends(calibration: Calibration) -> None:
@@ -56,7 +58,9 @@ def test_shares_at_the_ends(calibration: Calibration) -> None:
         assert calibration.share_closer(kind, 1e9) == 1.0
 
 
-def test_the_words_say_what_is_counted(calibration: Calibration, drawn: dict[str, np.ndarray]) -> None:
+def test_the_words_say_what_is_counted(
+    calibration: Calibration, drawn: dict[str, np.ndarray]
+) -> None:
     distance = float(np.quantile(drawn["poses"], 0.6))
     parts = calibration.words(distance).split(", ")
     assert [part.split(" of ", 1)[1] for part in parts] == [
@@ -80,20 +84,29 @@ def test_a_share_is_never_rounded_up(calibration: Calibration) -> None:
     assert "closer than 98 % of poses of one body" in ends.words(0.011)
 
 
-def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(calibration: Calibration) -> None:
+def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(
+    calibration: Calibration,
+) -> None:
     calibration.check("same", Same(), CONFIG)
-    with pytest.raises(ValueError, match="descriptor: expected same, whose distances are calibrated, got interior"):
+    with pytest.raises(
+        ValueError, match="descriptor: expected same, whose distances are calibrated, got interior"
+    ):
         calibration.check("interior", descriptor("interior"), CONFIG)
     with pytest.raises(ValueError, match="same: its calibration was made for other parameters"):
         replace(calibration, model="0").check("same", Same(), CONFIG)
-    with pytest.raises(ValueError, match=r"resolution: expected 32, for which same is calibrated, got 16\. Use the"):
+    with pytest.raises(
+        ValueError, match=r"resolution: expected 32, for which same is calibrated, got 16\. Use the"
+    ):
         calibration.check("same", Same(), replace(CONFIG, resolution=16))
 
 
 @pytest.mark.parametrize(
-    ("coarseness", "limit"), [(0.0, 0.00006), (0.001, 0.006), (0.02, 0.12), (1.0, 0.5), (np.inf, 0.5)]
+    ("coarseness", "limit"),
+    [(0.0, 0.00006), (0.001, 0.006), (0.02, 0.12), (1.0, 0.5), (np.inf, 0.5)],
 )
-def test_what_is_coarse_may_be_farther_apart(calibration: Calibration, coarseness: float, limit: float) -> None:
+def test_what_is_coarse_may_be_farther_apart(
+    calibration: Calibration, coarseness: float, limit: float
+) -> None:
     """Six times the coarseness, of which there is a least, and never more than any copies are."""
     assert calibration.limit(coarseness) == pytest.approx(limit)
 
@@ -106,7 +119,9 @@ def test_what_is_saved_is_loaded(calibration: Calibration, tmp_path: Path) -> No
 @pytest.mark.parametrize("text", ["", "[]", "{}", json.dumps({"descriptor": "pretrained"})])
 def test_what_is_no_calibration_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "c.json").write_text(text)
-    with pytest.raises(ValueError, match=r"c\.json: expected a calibration as training/calibrate\.py writes it"):
+    with pytest.raises(
+        ValueError, match=r"c\.json: expected a calibration as training/calibrate\.py writes it"
+    ):
         Calibration.load(tmp_path / "c.json")
 
 

@@ -9,7 +9,9 @@ from igps.gallery import _codes
 from igps.gallery._codes import CodeIndex, Coder
 
 
-def families(n_families: int, n_members: int, noise: float, width: int = 64, seed: int = 0) -> np.ndarray:
+def families(
+    n_families: int, n_members: int, noise: float, width: int = 64, seed: int = 0
+) -> np.ndarray:
     generator = np.random.default_rng(seed)
     members = generator.standard_normal((n_families, 1, width)) + noise * generator.standard_normal(
         (n_families, n_members, width)
@@ -38,7 +40,9 @@ def test_estimates_are_right_on_average(width: int) -> None:
         lengths = np.linalg.norm(rest, axis=1) * np.linalg.norm(away, axis=1)
         # A vector that is a centre is known exactly.
         far = lengths > 1e-3
-        errors.append(((found - np.square(vectors - query).sum(axis=1)) / 2 / np.maximum(lengths, 1e-3))[far])
+        errors.append(
+            ((found - np.square(vectors - query).sum(axis=1)) / 2 / np.maximum(lengths, 1e-3))[far]
+        )
     off = np.concatenate(errors)
     assert abs(off.mean()) < 0.003
     assert off.std() < 1.1 * np.sqrt((np.pi / 2 - 1) / 256)

@@ -96,7 +96,9 @@ def grouped(groups: tuple[tuple[str, ...], ...]) -> set[frozenset[str]]:
     return set(map(frozenset, groups))
 
 
-def test_copies_are_grouped_and_neither_poses_nor_siblings(dataset: SignatureDataset, root: Path) -> None:
+def test_copies_are_grouped_and_neither_poses_nor_siblings(
+    dataset: SignatureDataset, root: Path
+) -> None:
     found = duplicates(dataset, n_workers=1)
     assert grouped(found.groups) == SAME
     assert found.n_files == 7
@@ -118,7 +120,13 @@ def test_pairs_are_graded(tmp_path: Path) -> None:
     renumbered = trimesh.Trimesh(body.vertices[order], np.argsort(order)[body.faces], process=False)
     longer = renumbered.copy()
     longer.vertices += np.outer(longer.vertices[:, 0] > 0, [0.005 * body.area**0.5, 0, 0])
-    files = {"a.off": body, "b.ply": copied(body, 2, 0.2), "c.off": renumbered, "d.off": bar(3), "e.off": longer}
+    files = {
+        "a.off": body,
+        "b.ply": copied(body, 2, 0.2),
+        "c.off": renumbered,
+        "d.off": bar(3),
+        "e.off": longer,
+    }
     for name, one in files.items():
         one.export(tmp_path / name)
     shutil.copy(tmp_path / "a.off", tmp_path / "f.off")
@@ -131,18 +139,29 @@ def test_pairs_are_graded(tmp_path: Path) -> None:
     assert 0.001 < found[3][1] < 0.005
 
 
-def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_crop(tmp_path: Path) -> None:
+def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_crop(
+    tmp_path: Path,
+) -> None:
     """On another grid they are other bodies, as near as a fraction of a voxel, and never those of another label."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
 
     def labels(side: float) -> np.ndarray:
         x, y, z = np.meshgrid(*(np.arange(0, n, side) for n in (60, 36, 30)), indexing="ij")
-        one = (x - 18) ** 2 / 14**2 + (y - 18) ** 2 / 11**2 + (z - 12 - (x - 8) * y / 90) ** 2 / 8**2 < 1
-        other = (x - 45) ** 2 / 9**2 + (y - 18) ** 2 / 15**2 + (z - 15 + (y - 18) * (x - 39) / 70) ** 2 / 10**2 < 1
+        one = (x - 18) ** 2 / 14**2 + (y - 18) ** 2 / 11**2 + (
+            z - 12 - (x - 8) * y / 90
+        ) ** 2 / 8**2 < 1
+        other = (x - 45) ** 2 / 9**2 + (y - 18) ** 2 / 15**2 + (
+            z - 15 + (y - 18) * (x - 39) / 70
+        ) ** 2 / 10**2 < 1
         return np.select([one, other], [1, 2]).astype(np.uint8)
 
     given, turn = labels(1.0), np.zeros((4, 4))
-    turn[[0, 1, 2, 3], [1, 2, 0, 3]] = (-1, 1, 1, 1)  # of indices: the first axis runs back, and comes second
+    turn[[0, 1, 2, 3], [1, 2, 0, 3]] = (
+        -1,
+        1,
+        1,
+        1,
+    )  # of indices: the first axis runs back, and comes second
     turn[0, 3] = len(given) - 1
     inner = given[2:, 1:-1, 3:]
     nibabel.save(nibabel.Nifti1Image(given, np.eye(4)), tmp_path / "given.nii.gz")
@@ -151,13 +170,19 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
     shifted = np.eye(4)
     shifted[:3, 3] = (2, 1, 3)
     nibabel.save(nibabel.Nifti1Image(inner, shifted), tmp_path / "cropped.nii")
-    nibabel.save(nibabel.Nifti1Image(labels(1.4), np.diag([1.4, 1.4, 1.4, 1])), tmp_path / "sampled.nii")
+    nibabel.save(
+        nibabel.Nifti1Image(labels(1.4), np.diag([1.4, 1.4, 1.4, 1])), tmp_path / "sampled.nii"
+    )
     found = duplicates(SignatureDataset(tmp_path, CONFIG), tolerance=0.01)
     names = ("given.nii.gz", "mgh.mgz", "turned.nii", "cropped.nii")
-    assert grouped(found.groups) == {frozenset(f"{name}#{label}" for name in names) for label in (1, 2)}
+    assert grouped(found.groups) == {
+        frozenset(f"{name}#{label}" for name in names) for label in (1, 2)
+    }
     assert set(found.grades.values()) == {"same mesh"}
     assert {pair for pair in found.nearly if "sampled" in str(pair)} == {
-        tuple(sorted((f"{name}#{label}", f"sampled.nii#{label}"))) for name in names for label in (1, 2)
+        tuple(sorted((f"{name}#{label}", f"sampled.nii#{label}")))
+        for name in names
+        for label in (1, 2)
     }
 
 
@@ -197,7 +222,11 @@ def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path: Path) -> None:
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     coarse, longer_one, one = range(3)
     surfaces, calibration = Surfaces(dataset), Calibration.load()
-    assert surfaces.distance(coarse, one, calibration) < surfaces.distance(coarse, longer_one, calibration) < math.inf
+    assert (
+        surfaces.distance(coarse, one, calibration)
+        < surfaces.distance(coarse, longer_one, calibration)
+        < math.inf
+    )
     found = duplicates(dataset, n_workers=1)
     assert grouped(found.groups) == {frozenset({"one.off", "coarse.off"})}
     assert list(found.pairs) == [("one.off", "coarse.off")]
@@ -214,7 +243,10 @@ def test_each_file_of_a_group_has_one_finer_file_beside_it() -> None:
         def distance(self, i: int, j: int, calibration: Calibration) -> float:
             return apart.get((min(i, j), max(i, j)), math.inf)
 
-    calibration, joined = Calibration.load(), {(0, 1): 0.1, (1, 2): 0.05, (2, 3): 0.3, (3, 4): 0.1, (5, 6): 0.4}
+    calibration, joined = (
+        Calibration.load(),
+        {(0, 1): 0.1, (1, 2): 0.05, (2, 3): 0.3, (3, 4): 0.1, (5, 6): 0.4},
+    )
     found = _regroup(joined, Table(), calibration, 1, progress=False)  # type: ignore[arg-type]
     # 3 is as fine as 0 and leads; 2 is the same as 3, which leads, and as 1, which does not.
     assert found == {(5, 6): 0.4, (0, 1): 0.1, (3, 2): 0.3, (3, 4): 0.1}
@@ -226,8 +258,15 @@ def test_each_file_of_a_group_has_one_finer_file_beside_it() -> None:
 def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None:
     """But not where mending may have made them, or closed them."""
     ring = trimesh.creation.torus(1.0, 0.3, 40, 20)
-    cut = ring.submesh([~np.isin(np.arange(len(ring.faces)), ring.vertex_faces[5])], append=True, repair=False)
-    for name, body in (("ball", ball(3)), ("cut", cut), ("ring", ring), ("turned", copied(ring, 1, 3.0))):
+    cut = ring.submesh(
+        [~np.isin(np.arange(len(ring.faces)), ring.vertex_faces[5])], append=True, repair=False
+    )
+    for name, body in (
+        ("ball", ball(3)),
+        ("cut", cut),
+        ("ring", ring),
+        ("turned", copied(ring, 1, 3.0)),
+    ):
         body.export(tmp_path / f"{name}.off")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     a_ball, a_cut, a_ring, turned = range(4)
@@ -237,7 +276,9 @@ def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None
     assert surfaces.limit(a_ring, turned, calibration) > 0
     assert surfaces.limit(a_ball, a_cut, calibration) > 0
     assert not body_distance(dataset.subset([a_ball, a_ring])).same
-    assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"ring.off", "turned.off", "cut.off"})}
+    assert grouped(duplicates(dataset, n_workers=1).groups) == {
+        frozenset({"ring.off", "turned.off", "cut.off"})
+    }
 
 
 def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
@@ -245,7 +286,9 @@ def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
     for name, hole in (("one", 0.5), ("half", 0.5025), ("whole", 0.505)):
         trimesh.creation.annulus(hole, 1.0, 0.3, sections=32).export(tmp_path / f"{name}.off")
     mirrored = trimesh.creation.annulus(0.5, 1.0, 0.3, sections=32)
-    mirrored.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9])))
+    mirrored.apply_transform(
+        trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9]))
+    )
     mirrored.apply_scale([-2, 2, 2])
     mirrored.export(tmp_path / "mirrored.off")
     found = duplicates(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"), n_workers=1)
@@ -253,11 +296,17 @@ def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("numbered", ["alike", "otherwise"])
-def test_a_small_hole_that_is_a_little_larger_is_another_surface(tmp_path: Path, numbered: str) -> None:
+def test_a_small_hole_that_is_a_little_larger_is_another_surface(
+    tmp_path: Path, numbered: str
+) -> None:
     """The hole is larger by 0.5 %; the largest distance is the difference of the radii over √area."""
-    one, larger = (trimesh.creation.annulus(hole, 1.0, 0.3, sections=64) for hole in (0.05, 0.05025))
+    one, larger = (
+        trimesh.creation.annulus(hole, 1.0, 0.3, sections=64) for hole in (0.05, 0.05025)
+    )
     for name, body in (("one", one), ("copy", one.subdivide()), ("larger", larger)):
-        (body.subdivide() if name == "larger" and numbered == "otherwise" else body).export(tmp_path / f"{name}.off")
+        (body.subdivide() if name == "larger" and numbered == "otherwise" else body).export(
+            tmp_path / f"{name}.off"
+        )
     surfaces = Surfaces(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"))
     # in order of names: copy, larger, one
     assert surfaces.grade(2, 0)[0] == "same surface"
@@ -279,7 +328,9 @@ def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path: Pat
 def test_poses_are_grouped_by_the_descriptor_alone(dataset: SignatureDataset) -> None:
     """A descriptor that sees no difference takes all for poses of one body; their surfaces still tell."""
     shipped = Calibration.load()
-    calibration = replace(shipped, descriptor="same", model=fingerprint(Same()), signatures=calibration_params(CONFIG))
+    calibration = replace(
+        shipped, descriptor="same", model=fingerprint(Same()), signatures=calibration_params(CONFIG)
+    )
     all_of_them = duplicates(dataset, Same(), poses=True, calibration=calibration, n_workers=1)
     assert grouped(all_of_them.groups) == {frozenset(dataset.bodies.names)}
     assert set(all_of_them.pairs.values()) == {0.0}
@@ -303,7 +354,10 @@ def test_a_gallery_gives_the_same_groups_and_tells_of_files_that_are_gone(
     found = duplicates(gallery, cache_dir=cache, calibration=calibration)
     assert grouped(found.groups) == {group for group in SAME if "bar.off" in group}
     (failure,) = found.failures
-    assert failure.error == f"{moved / 'lump.stl'}: cannot be read (No such file or directory). Check the path."
+    assert (
+        failure.error
+        == f"{moved / 'lump.stl'}: cannot be read (No such file or directory). Check the path."
+    )
 
 
 def test_a_distance_and_what_it_means(dataset: SignatureDataset) -> None:
@@ -320,12 +374,18 @@ def test_a_distance_and_what_it_means(dataset: SignatureDataset) -> None:
     assert between("bar.off", "bar.ply")[1]
     assert not between("bar.off", "bent.off")[1]
     assert not between("bar.off", "longer.off")[1]
-    with pytest.raises(ValueError, match=r"dataset: expected two meshes to compare, got 7: .* as FILE#PART"):
+    with pytest.raises(
+        ValueError, match=r"dataset: expected two meshes to compare, got 7: .* as FILE#PART"
+    ):
         body_distance(dataset)
 
 
 def test_the_commands(
-    root: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path,
+    cache: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     options = ["--cache_dir", cache, "--n_workers", 1]
     run(monkeypatch, "duplicates", root, "--out", tmp_path / "out" / "groups.csv", *options)
@@ -351,7 +411,9 @@ def test_the_page_runs(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
+    )
     assert done.returncode == 0, done.stderr
     groups, meaning, surfaces = done.stdout.splitlines()
     ((one, other),) = ast.literal_eval(groups)
@@ -365,12 +427,20 @@ def test_the_page_runs(tmp_path: Path) -> None:
 
 
 def test_what_is_wrong_is_one_sentence(
-    root: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path,
+    cache: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     options = ["--cache_dir", cache, "--n_workers", 1]
-    assert "meshes: expected two files, got 1" in error_of(monkeypatch, capsys, "distance", root / "bar.off", *options)
+    assert "meshes: expected two files, got 1" in error_of(
+        monkeypatch, capsys, "distance", root / "bar.off", *options
+    )
     fewer = ["--signature.n_surface_samples", "300"]
-    words = error_of(monkeypatch, capsys, "distance", root / "bar.off", root / "bar.off", *options, *fewer)
+    words = error_of(
+        monkeypatch, capsys, "distance", root / "bar.off", root / "bar.off", *options, *fewer
+    )
     assert "n_surface_samples: expected 2000, for which pretrained is calibrated, got 300" in words
     pytest.importorskip("lancedb")
     dataset = SignatureDataset([root / "bar.off", root / "lump.off"], None, cache)

@@ -26,7 +26,9 @@ def apart(one: trimesh.Trimesh, other: trimesh.Trimesh, scale: float = 1.0) -> f
     return float(distance_bounds(some, others))
 
 
-def lump(stretch: tuple[float, float, float], bumps: float = 0.0, subdivisions: int = 3) -> trimesh.Trimesh:
+def lump(
+    stretch: tuple[float, float, float], bumps: float = 0.0, subdivisions: int = 3
+) -> trimesh.Trimesh:
     """An ellipsoid; with bumps, without any symmetry."""
     body = trimesh.creation.icosphere(subdivisions=subdivisions)
     x, y, z = body.vertices.T
@@ -41,7 +43,9 @@ def test_moments_of_a_box_are_its_closed_forms() -> None:
     body.apply_translation([3.0, -2.0, 1.0])
     volume, (a, b, c) = 6.0, sides**2
     fourth = volume * ((a * a + b * b + c * c) / 80 + (a * b + b * c + a * c) / 72)
-    expected = np.log([volume / area**1.5, *(volume * sides**2 / 12 / area**2.5), fourth / area**3.5])
+    expected = np.log(
+        [volume / area**1.5, *(volume * sides**2 / 12 / area**2.5), fourth / area**3.5]
+    )
     np.testing.assert_allclose(of(body)[0], [*expected, 0.0], rtol=1e-9, atol=1e-5)
 
 
@@ -60,28 +64,41 @@ def test_moments_of_a_tetrahedron_are_those_of_its_points() -> None:
     square = np.square(points).sum(axis=1)
     volume, second = density.sum(), np.linalg.eigvalsh((density[:, None] * points).T @ points)
     third = np.linalg.norm((density * square) @ points) * volume**0.5 / second.sum() ** 1.5
-    np.testing.assert_allclose(of(body)[0], [*np.log([volume, *second, density @ square**2]), third], rtol=1e-9)
+    np.testing.assert_allclose(
+        of(body)[0], [*np.log([volume, *second, density @ square**2]), third], rtol=1e-9
+    )
 
 
 def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing() -> None:
     body = lump((1.0, 0.7, 0.4), 0.1)
     turn = -Rotation.random(random_state=1).as_matrix()
-    again = trimesh.Trimesh(7 * body.vertices @ turn.T + 5.0, body.faces[:, ::-1], process=False).subdivide()
+    again = trimesh.Trimesh(
+        7 * body.vertices @ turn.T + 5.0, body.faces[:, ::-1], process=False
+    ).subdivide()
     assert apart(body, again) < 1e-7
 
 
 @pytest.mark.parametrize("bumps", [0.0, 0.1])
-@pytest.mark.parametrize("stretch", [(1.0, 1.0, 1.0), (1.0, 1.0, 0.4), (3.0, 0.5, 0.5), (3.0, 0.8, 0.5)])
-def test_the_lower_bound_does_not_exceed_the_displacement(stretch: tuple[float, float, float], bumps: float) -> None:
+@pytest.mark.parametrize(
+    "stretch", [(1.0, 1.0, 1.0), (1.0, 1.0, 0.4), (3.0, 0.5, 0.5), (3.0, 0.8, 0.5)]
+)
+def test_the_lower_bound_does_not_exceed_the_displacement(
+    stretch: tuple[float, float, float], bumps: float
+) -> None:
     """Normal displacements by polynomials, scaled to a known root mean square; bodies with and without symmetry."""
     body = lump(stretch, bumps)
-    normals, weights = np.asarray(body.vertex_normals), np.bincount(body.faces.ravel(), np.repeat(body.area_faces, 3))
+    normals, weights = (
+        np.asarray(body.vertex_normals),
+        np.bincount(body.faces.ravel(), np.repeat(body.area_faces, 3)),
+    )
     places, told = body.vertices / np.abs(body.vertices).max(axis=0), []
     for powers in product(range(4), repeat=3):
         if sum(powers) <= 4:
             move = np.prod(places**powers, axis=1)
             move *= MOST / np.sqrt(np.average(move**2, weights=weights))
-            moved = trimesh.Trimesh(body.vertices + body.area**0.5 * move[:, None] * normals, body.faces, process=False)
+            moved = trimesh.Trimesh(
+                body.vertices + body.area**0.5 * move[:, None] * normals, body.faces, process=False
+            )
             told.append(apart(body, moved, (moved.area / body.area) ** 0.5) / MOST)
     assert max(told) < 1.1
     assert max(told) > 0.6
@@ -90,8 +107,14 @@ def test_the_lower_bound_does_not_exceed_the_displacement(stretch: tuple[float, 
 def test_the_lower_bound_is_tight_for_displacements_along_gradients() -> None:
     """Gradients of scale-invariant combinations of moments, by finite differences at each vertex."""
     body = lump((0.7, 0.5, 1.5), 0.05)
-    body.vertices[:, :2] *= np.exp(-0.65 * body.vertices[:, 2:])  # one end is thick, so that the middle moves
-    vertices, faces, normals = body.vertices / body.area**0.5, np.asarray(body.faces), body.vertex_normals
+    body.vertices[:, :2] *= np.exp(
+        -0.65 * body.vertices[:, 2:]
+    )  # one end is thick, so that the middle moves
+    vertices, faces, normals = (
+        body.vertices / body.area**0.5,
+        np.asarray(body.faces),
+        body.vertex_normals,
+    )
     gradients, step = np.zeros((len(vertices), 6)), 1e-4
     for i, normal in enumerate(normals):
         moved = [vertices.copy(), vertices.copy()]
@@ -101,7 +124,12 @@ def test_the_lower_bound_is_tight_for_displacements_along_gradients() -> None:
         gradients[i] = (above - below) / (2 * step)
     shares = np.bincount(faces.ravel(), np.repeat(body.area_faces, 3)) / body.area_faces.sum() / 3
     far = MOST / 10  # where the first order is all
-    for which in ([0, 0, 0, 0, 0, 1], [-7 / 3, 0, 0, 0, 1, 0], [-5 / 3, 1, 0, 0, 0, 0], [-5 / 3, 0, 0, 1, 0, 0]):
+    for which in (
+        [0, 0, 0, 0, 0, 1],
+        [-7 / 3, 0, 0, 0, 1, 0],
+        [-5 / 3, 1, 0, 0, 0, 0],
+        [-5 / 3, 0, 0, 1, 0, 0],
+    ):
         move = gradients @ which / shares
         move *= far / np.sqrt(shares @ move**2)
         some = [moments(one, faces, MOST) for one in (vertices, vertices + move[:, None] * normals)]

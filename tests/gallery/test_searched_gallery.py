@@ -56,7 +56,9 @@ def dataset(root: Path, tmp_path: Path) -> SignatureDataset:
     return SignatureDataset(root, CONFIG, tmp_path / "cache")
 
 
-def test_it_ranks_as_the_descriptor_does(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:
+def test_it_ranks_as_the_descriptor_does(
+    dataset: SignatureDataset, root: Path, tmp_path: Path
+) -> None:
     gallery, failures = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert failures == []
     histograms = describe(dataset, small_interior())
@@ -66,7 +68,9 @@ def test_it_ranks_as_the_descriptor_does(dataset: SignatureDataset, root: Path, 
     assert [match.name for match in found] == [dataset.bodies.names[i] for i in nearest]
     assert [match.label for match in found] == [(dataset.bodies.labels or ())[i] for i in nearest]
     assert [match.path for match in found] == [dataset.bodies.paths[i].resolve() for i in nearest]
-    np.testing.assert_allclose([match.distance for match in found], distances[nearest], rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(
+        [match.distance for match in found], distances[nearest], rtol=2e-3, atol=1e-6
+    )
 
 
 def test_more_are_ranked_under_a_head(
@@ -83,13 +87,20 @@ def test_more_are_ranked_under_a_head(
     monkeypatch.setattr(gallery_module, "nearest_rows", spied)
     histograms = describe(dataset, small_interior())
     embedded = EmbeddedDescriptor(small_interior(), TwoLevelHead().fit(histograms, dataset.labels))
-    for descriptor, descriptions in ((small_interior(), histograms), (embedded, embedded.head(histograms))):
-        gallery, _ = Gallery.build(tmp_path / f"{len(asked)}.igps", dataset, descriptor, n_workers=1)
+    for descriptor, descriptions in (
+        (small_interior(), histograms),
+        (embedded, embedded.head(histograms)),
+    ):
+        gallery, _ = Gallery.build(
+            tmp_path / f"{len(asked)}.igps", dataset, descriptor, n_workers=1
+        )
         gallery.nearest(descriptions[:1], top=3)
     assert asked[1] > asked[0] >= CANDIDATES
 
 
-def test_adding_and_merging_are_building(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:
+def test_adding_and_merging_are_building(
+    dataset: SignatureDataset, root: Path, tmp_path: Path
+) -> None:
     whole, _ = Gallery.build(tmp_path / "whole.igps", dataset, INTERIOR, n_workers=1)
     added, _ = Gallery.build(tmp_path / "a.igps", dataset.subset([0, 1, 2]), INTERIOR, n_workers=1)
     added.add(dataset.subset([2, 3, 4]), n_workers=1)
@@ -114,7 +125,9 @@ def test_bodies_of_one_file_are_entries_of_their_own(tmp_path: Path) -> None:
         one.apply_translation((3 * i, 0, 0))
     trimesh.Scene({f"part {i}": one for i, one in enumerate(boxes)}).export(tmp_path / "plate.glb")
     bodies = find_bodies(tmp_path, LoadOptions(bodies="objects"))
-    dataset = SignatureDataset(bodies, CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="objects"))
+    dataset = SignatureDataset(
+        bodies, CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="objects")
+    )
     gallery, _ = Gallery.build(tmp_path / "plate.igps", dataset, INTERIOR, n_workers=1)
     gallery.add(dataset, n_workers=1)
     assert {(row["file"], row["part"]) for row in gallery.rows("file", "part")} == {
@@ -127,7 +140,9 @@ def test_bodies_of_one_file_are_entries_of_their_own(tmp_path: Path) -> None:
 
 def test_what_cannot_be_described_is_told(root: Path, tmp_path: Path) -> None:
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
-    gallery, failures = Gallery.build(tmp_path / "g.igps", dataset, "own_descriptors:picky", n_workers=1)
+    gallery, failures = Gallery.build(
+        tmp_path / "g.igps", dataset, "own_descriptors:picky", n_workers=1
+    )
     assert [failure.id for failure in failures] == ["egg/1.off"]
     assert len(gallery) == 5
     failures = gallery.add(dataset, n_workers=1)
@@ -135,7 +150,9 @@ def test_what_cannot_be_described_is_told(root: Path, tmp_path: Path) -> None:
     assert "too much" in failures[0].error
     assert len(gallery) == 5
     alone = dataset[["egg/1.off"]]
-    with pytest.raises(ValueError, match=r"none of 1 bodies could be described; the first: .*1\.off: .*too much"):
+    with pytest.raises(
+        ValueError, match=r"none of 1 bodies could be described; the first: .*1\.off: .*too much"
+    ):
         Gallery.build(tmp_path / "none.igps", alone, "own_descriptors:picky", n_workers=1)
 
 
@@ -145,7 +162,13 @@ def test_a_checksum_tells_descriptors_apart() -> None:
     other = small_interior()
     buffer = next(other.buffers())
     buffer += 1e-3
-    several = [small_interior(), other, igps.descriptor("rich"), igps.descriptor("pretrained"), igps.descriptor("d2")]
+    several = [
+        small_interior(),
+        other,
+        igps.descriptor("rich"),
+        igps.descriptor("pretrained"),
+        igps.descriptor("d2"),
+    ]
     assert len({fingerprint(one) for one in several}) == 5
 
 
@@ -153,22 +176,70 @@ def test_commands(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     index, cache = tmp_path / "gallery.igps", ["--cache_dir", tmp_path / "cache"]
-    run(monkeypatch, "gallery", "build", root / "egg", "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
+    run(
+        monkeypatch,
+        "gallery",
+        "build",
+        root / "egg",
+        "--out",
+        index,
+        "--descriptor",
+        INTERIOR,
+        *cache,
+        *SMALL,
+    )
     assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 3 bodies by {INTERIOR}"
     run(monkeypatch, "gallery", "add", root, "--gallery", index, *cache, "--n_workers", 1)
     # Those of the folder of one class have no class: they are known already.
     assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 6 bodies by {INTERIOR}"
-    run(monkeypatch, "gallery", "build", root, "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
+    run(
+        monkeypatch,
+        "gallery",
+        "build",
+        root,
+        "--out",
+        index,
+        "--descriptor",
+        INTERIOR,
+        *cache,
+        *SMALL,
+    )
     run(monkeypatch, "gallery", "merge", index, "--out", tmp_path / "copy.igps")
-    assert capsys.readouterr().out.splitlines()[-1] == f"{tmp_path / 'copy.igps'}: 6 bodies by {INTERIOR}"
+    assert (
+        capsys.readouterr().out.splitlines()[-1]
+        == f"{tmp_path / 'copy.igps'}: 6 bodies by {INTERIOR}"
+    )
 
     wanted = root / "egg" / "1.off"
-    run(monkeypatch, "query", wanted, "--gallery", root, "--descriptor", INTERIOR, "--top", 4, *cache, *SMALL)
+    run(
+        monkeypatch,
+        "query",
+        wanted,
+        "--gallery",
+        root,
+        "--descriptor",
+        INTERIOR,
+        "--top",
+        4,
+        *cache,
+        *SMALL,
+    )
     expected = capsys.readouterr().out
     for which in (index, tmp_path / "copy.igps"):
         run(monkeypatch, "query", wanted, "--gallery", which, "--top", 4, *cache)
         assert capsys.readouterr().out == expected
-    run(monkeypatch, "query", wanted, "--gallery", root, "--descriptor", INTERIOR, "--rerank", *cache, *SMALL)
+    run(
+        monkeypatch,
+        "query",
+        wanted,
+        "--gallery",
+        root,
+        "--descriptor",
+        INTERIOR,
+        "--rerank",
+        *cache,
+        *SMALL,
+    )
     reranked = capsys.readouterr().out
     assert len(reranked.splitlines()) == 7
     assert reranked.splitlines()[:5] != expected.splitlines()[:5]
@@ -178,13 +249,19 @@ def test_commands(
     run(monkeypatch, "query", wanted, "--gallery", index, "--top", 4, *cache)
     out = capsys.readouterr().out
     assert out.startswith(expected)
-    assert out.splitlines()[-1] == "1 of these 4 files were moved or deleted since they were described."
+    assert (
+        out.splitlines()[-1]
+        == "1 of these 4 files were moved or deleted since they were described."
+    )
 
 
 def test_what_does_not_fit_is_refused_in_a_sentence(
-    dataset: SignatureDataset, root: Path, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    dataset: SignatureDataset,
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     index, mesh = tmp_path / "g.igps", root / "egg" / "1.off"
     Gallery.build(index, dataset, INTERIOR, n_workers=1)
     query = ["query", mesh, "--gallery", index, "--cache_dir", tmp_path / "cache"]
@@ -193,13 +270,23 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
             ["--descriptor", "rich"],
             f'expected a gallery with descriptor "rich", got "{INTERIOR}". Use the parameters of',
         ),
-        (["--signature.n_eigenpairs", 20, "--signature.resolution", 12], "expected a gallery with signature."),
+        (
+            ["--signature.n_eigenpairs", 20, "--signature.resolution", 12],
+            "expected a gallery with signature.",
+        ),
         (["--mend", "never"], 'expected a gallery with reading.mend "never", got "auto"'),
-        (["--where", "weight > 3"], "where: expected a condition on the columns id, name, class, file, part"),
+        (
+            ["--where", "weight > 3"],
+            "where: expected a condition on the columns id, name, class, file, part",
+        ),
     ):
         assert words in error_of(monkeypatch, capsys, *query, *options)
-    assert "no such folder" in error_of(monkeypatch, capsys, "query", mesh, "--gallery", tmp_path / "none.igps")
-    of_meshes = error_of(monkeypatch, capsys, "query", mesh, "--gallery", root, "--where", "volume > 3")
+    assert "no such folder" in error_of(
+        monkeypatch, capsys, "query", mesh, "--gallery", tmp_path / "none.igps"
+    )
+    of_meshes = error_of(
+        monkeypatch, capsys, "query", mesh, "--gallery", root, "--where", "volume > 3"
+    )
     assert "where: expected a gallery" in of_meshes
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
     assert "version" in error_of(monkeypatch, capsys, *query)
@@ -219,7 +306,11 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
 
 def test_rows_tell_size_class_and_what_labels_tell(root: Path, tmp_path: Path) -> None:
     """Volumes and areas are those of the meshes, and a condition keeps what NumPy keeps."""
-    labelled = [(f"{one}/{i}.off", f"{one}s", 10 * i, "A" if i else "") for one in ("ball", "egg") for i in range(3)]
+    labelled = [
+        (f"{one}/{i}.off", f"{one}s", 10 * i, "A" if i else "")
+        for one in ("ball", "egg")
+        for i in range(3)
+    ]
     lines = ["file,label,age,scanner", *(",".join(map(str, row)) for row in labelled)]
     (root / "labels.csv").write_text("\n".join(lines))
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
@@ -230,21 +321,31 @@ def test_rows_tell_size_class_and_what_labels_tell(root: Path, tmp_path: Path) -
     for name, label, age, scanner in labelled:
         assert told[name]["volume"] == pytest.approx(meshes[name].volume)
         assert told[name]["area"] == pytest.approx(meshes[name].area)
-        assert (told[name]["class"], told[name]["age"], told[name]["scanner"]) == (label, age, scanner or None)
+        assert (told[name]["class"], told[name]["age"], told[name]["scanner"]) == (
+            label,
+            age,
+            scanner or None,
+        )
         picture = PIL.Image.open(io.BytesIO(told[name]["thumbnail"]))
         assert np.asarray(picture.convert("L")).max() > 200
     description = describe(dataset, small_interior())[:1]
     volume = meshes["ball/1.off"].volume * 1.001
-    found = gallery.nearest(description, where=f"age >= 10 AND class = 'eggs' AND volume > {volume}")[0]
+    found = gallery.nearest(
+        description, where=f"age >= 10 AND class = 'eggs' AND volume > {volume}"
+    )[0]
     wanted = {
-        name for name, label, age, _ in labelled if age >= 10 and label == "eggs" and meshes[name].volume > volume
+        name
+        for name, label, age, _ in labelled
+        if age >= 10 and label == "eggs" and meshes[name].volume > volume
     }
     assert {one.name for one in found} == wanted
     assert [one.distance for one in found] == sorted(one.distance for one in found)
     assert gallery.nearest(description, where="age > 99") == [[]]
 
 
-def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sync_finds_what_is_new_changed_and_gone(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Afterwards it is what building makes; what has not changed is neither described nor written."""
     cache = tmp_path / "cache"
     monkeypatch.setattr(rows, "MIN_AGE", 10**18)  # however busy the machine, no file is old
@@ -270,8 +371,14 @@ def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path, mon
     n_new, n_gone, (failure,) = sync(gallery, dataset, root, n_workers=1)
     assert (n_new, n_gone, failure.id) == (2, 1, "egg/broken.off")
     (root / "egg" / "broken.off").unlink()
-    (root / "labels.csv").write_text("\n".join(["file,label", *(f"{name},round" for name in dataset.bodies.names
-                                                               if "broken" not in name)]))  # fmt: skip
+    (root / "labels.csv").write_text(
+        "\n".join(
+            [
+                "file,label",
+                *(f"{name},round" for name in dataset.bodies.names if "broken" not in name),
+            ]
+        )
+    )
     dataset = SignatureDataset(root, CONFIG, cache)
     assert sync(gallery, dataset, root, n_workers=1) == (0, 0, [])
     assert gallery.remove("name = 'o''clock.off'") == 1
@@ -297,11 +404,15 @@ def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(
     (root / "ball" / "0.off").unlink()
     with monkeypatch.context() as context:  # whoever runs tests may read everything
         context.setattr(os, "scandir", refused)
-        context.setattr(os, "access", lambda path, how: Path(path).name != "egg" and access(path, how))
+        context.setattr(
+            os, "access", lambda path, how: Path(path).name != "egg" and access(path, how)
+        )
         seen = SignatureDataset(root, CONFIG, cache)
     assert len(seen) == len(dataset) - 4
     with monkeypatch.context() as context:
-        context.setattr(os, "access", lambda path, how: Path(path).name != "egg" and access(path, how))
+        context.setattr(
+            os, "access", lambda path, how: Path(path).name != "egg" and access(path, how)
+        )
         assert sync(gallery, seen, root, n_workers=1) == (0, 1, [])
     assert {row["name"] for row in gallery.rows("name")} == {*dataset.bodies.names} - {"ball/0.off"}
 
@@ -320,40 +431,86 @@ def test_it_opens_where_it_was_moved_to(dataset: SignatureDataset, tmp_path: Pat
 def test_commands_that_change_a_gallery(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    gallery, cache = tmp_path / "gallery.igps", ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
+    gallery, cache = (
+        tmp_path / "gallery.igps",
+        ["--cache_dir", tmp_path / "cache", "--n_workers", 1],
+    )
 
     def lines(*arguments: object) -> list[str]:
         run(monkeypatch, "gallery", *arguments)
         return capsys.readouterr().out.splitlines()
 
     lines("build", root, "--out", gallery, "--descriptor", INTERIOR, *cache, *SMALL)
-    assert lines("update", gallery, "--where", "name LIKE 'ball/%'", "--to", "class=round", "unit=mm") == [
-        "3 bodies updated"
-    ]
+    assert lines(
+        "update", gallery, "--where", "name LIKE 'ball/%'", "--to", "class=round", "unit=mm"
+    ) == ["3 bodies updated"]
     assert lines("remove", gallery, "--where", "name = 'egg/0.off'")[0] == "1 bodies removed"
     (root / "egg" / "1.off").unlink()
     synced = lines("sync", root, "--gallery", gallery, *cache)
     assert synced[-2:] == ["1 bodies described, 1 removed", f"{gallery}: 5 bodies by {INTERIOR}"]
     told = json.loads("\n".join(lines("info", gallery, "--json")))
     assert (told["bodies"], told["descriptor"], told["columns"]["volume"]) == (5, INTERIOR, "float")
-    found = lines("query", root / "egg" / "2.off", "--gallery", gallery, "--where", "class = 'ball'", "--exact", *cache)
+    found = lines(
+        "query",
+        root / "egg" / "2.off",
+        "--gallery",
+        gallery,
+        "--where",
+        "class = 'ball'",
+        "--exact",
+        *cache,
+    )
     assert len(found) == 1 + 3  # what update told was overridden by the folder
     versions = json.loads("\n".join(lines("versions", gallery, "--json")))
     assert [one["bodies"] for one in versions][:2] == [6, 6]
-    assert lines("restore", gallery, "--version", versions[0]["version"]) == [f"{gallery}: 6 bodies by {INTERIOR}"]
+    assert lines("restore", gallery, "--version", versions[0]["version"]) == [
+        f"{gallery}: 6 bodies by {INTERIOR}"
+    ]
     assert "version: expected one that" in error_of(
         monkeypatch, capsys, "gallery", "restore", gallery, "--version", 999
     )
-    wrong = error_of(monkeypatch, capsys, "gallery", "update", gallery, "--where", "area > 0", "--to", "volume=much")
+    wrong = error_of(
+        monkeypatch,
+        capsys,
+        "gallery",
+        "update",
+        gallery,
+        "--where",
+        "area > 0",
+        "--to",
+        "volume=much",
+    )
     assert "values: expected numbers" in wrong
-    wrong = error_of(monkeypatch, capsys, "gallery", "update", gallery, "--where", "area > 0", "--to", "colour=red")
+    wrong = error_of(
+        monkeypatch,
+        capsys,
+        "gallery",
+        "update",
+        gallery,
+        "--where",
+        "area > 0",
+        "--to",
+        "colour=red",
+    )
     assert "colour: expected one of the columns name, class" in wrong
     for column in ("name", "file"):
-        wrong = error_of(monkeypatch, capsys, "gallery", "update", gallery, "--where", "area > 0", "--to", f"{column}=")
+        wrong = error_of(
+            monkeypatch,
+            capsys,
+            "gallery",
+            "update",
+            gallery,
+            "--where",
+            "area > 0",
+            "--to",
+            f"{column}=",
+        )
         assert f"{column}: expected a value, got none" in wrong
 
 
-def test_sync_notices_a_table_of_names_that_was_edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sync_notices_a_table_of_names_that_was_edited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With its two names swapped the rows have the same names, and the bodies of each other."""
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
@@ -377,10 +534,14 @@ def test_sync_notices_a_table_of_names_that_was_edited(tmp_path: Path, monkeypat
     assert after == {"block": before["bar"], "bar": before["block"]}
 
 
-def test_a_column_with_a_dot_is_told_before_anything_is_described(root: Path, tmp_path: Path) -> None:
+def test_a_column_with_a_dot_is_told_before_anything_is_described(
+    root: Path, tmp_path: Path
+) -> None:
     (root / "labels.csv").write_text("file,label,scan.age\nball/0.off,ball,3\n")
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
-    with pytest.raises(ValueError, match=r"labels.csv: expected column names without dots .* got 'scan.age'"):
+    with pytest.raises(
+        ValueError, match=r"labels.csv: expected column names without dots .* got 'scan.age'"
+    ):
         Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert not (tmp_path / "g.igps").exists()
 
@@ -391,15 +552,28 @@ def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gall
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     (root / "labels.csv").write_text("file,label,_rowid\nball/0.off,ball,3\n")
     for change in (Gallery.add, lambda one, other, **_: sync(one, other, root)):
-        with pytest.raises(ValueError, match=r"labels.csv: .* do not begin with an underscore, got '_rowid'"):
+        with pytest.raises(
+            ValueError, match=r"labels.csv: .* do not begin with an underscore, got '_rowid'"
+        ):
             change(gallery, SignatureDataset(root, CONFIG, tmp_path / "cache"), n_workers=1)
     assert len([*Gallery(tmp_path / "g.igps", small_interior()).rows("name")]) == 6
 
 
 @pytest.mark.parametrize(
-    "rest", ["; junk", " junk", ") OR (true", " LIMIT 1", " ORDER BY name", "; DELETE FROM t", " -- note\n junk"]
+    "rest",
+    [
+        "; junk",
+        " junk",
+        ") OR (true",
+        " LIMIT 1",
+        " ORDER BY name",
+        "; DELETE FROM t",
+        " -- note\n junk",
+    ],
 )
-def test_a_condition_is_read_to_its_end(dataset: SignatureDataset, tmp_path: Path, rest: str) -> None:
+def test_a_condition_is_read_to_its_end(
+    dataset: SignatureDataset, tmp_path: Path, rest: str
+) -> None:
     """Any text after a valid condition is an error, since it may have been meant to restrict the condition."""
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     where = "name = 'ball/0.off'"
@@ -409,7 +583,9 @@ def test_a_condition_is_read_to_its_end(dataset: SignatureDataset, tmp_path: Pat
         lambda where: gallery.update(where, {"class": "egg"}),
         lambda where: gallery.nearest(described, where=where),
     ):
-        with pytest.raises(ValueError, match=r"where: expected a condition on the columns id, name") as told:
+        with pytest.raises(
+            ValueError, match=r"where: expected a condition on the columns id, name"
+        ) as told:
             ask(where + rest)
         assert "/" not in str(told.value).partition("parser error")[2]
     assert [one["class"] for one in gallery.rows("class")].count("ball") == 3
@@ -436,7 +612,9 @@ def test_update_takes_finite_numbers_alone(dataset: SignatureDataset, tmp_path: 
     """A condition would keep what is no number as if it were more than all numbers."""
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     for wrong in ("nan", "inf", float("nan"), "1e999"):
-        with pytest.raises(ValueError, match=r"values: expected numbers in columns of numbers, got .* for volume"):
+        with pytest.raises(
+            ValueError, match=r"values: expected numbers in columns of numbers, got .* for volume"
+        ):
             gallery.update("true", {"volume": wrong})
     with pytest.raises(ValueError, match="values: expected at least one column, got none"):
         gallery.update("true", {})
@@ -446,7 +624,9 @@ def test_update_takes_finite_numbers_alone(dataset: SignatureDataset, tmp_path: 
 
 def test_a_gallery_is_no_file(dataset: SignatureDataset, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match=r"notes.txt: expected a gallery or a new folder, got a file"):
+    with pytest.raises(
+        ValueError, match=r"notes.txt: expected a gallery or a new folder, got a file"
+    ):
         Gallery.build(tmp_path / "notes.txt", dataset, small_interior(), n_workers=1)
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
@@ -462,7 +642,9 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path: Path) -> 
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "other.nii.gz")
 
     def now() -> SignatureDataset:
-        return SignatureDataset(tmp_path / "scans", CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="labels"))
+        return SignatureDataset(
+            tmp_path / "scans", CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="labels")
+        )
 
     gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
     scan.write_bytes(b"being copied")
@@ -478,7 +660,9 @@ def test_numbers_stay_as_they_are_written_in_a_column_of_text(root: Path, tmp_pa
     for label, ages in (("ball", ("old", "young", "")), ("egg", ("03", "4", ""))):
         lines = [f"{i}.off,{label},{age}" for i, age in enumerate(ages)]
         (root / label / "labels.csv").write_text("\n".join(["file,label,age", *lines]))
-    balls, eggs = (SignatureDataset(root / one, CONFIG, tmp_path / "cache") for one in ("ball", "egg"))
+    balls, eggs = (
+        SignatureDataset(root / one, CONFIG, tmp_path / "cache") for one in ("ball", "egg")
+    )
     gallery, _ = Gallery.build(tmp_path / "g.igps", balls, small_interior(), n_workers=1)
     gallery.add(eggs, n_workers=1)
     assert {row["age"] for row in gallery.rows("age")} == {"old", "young", "03", "4", None}
@@ -490,22 +674,30 @@ def test_numbers_stay_as_they_are_written_in_a_column_of_text(root: Path, tmp_pa
 def test_what_labels_tell_no_more_sync_empties(root: Path, tmp_path: Path) -> None:
     table, cache = root / "labels.csv", tmp_path / "cache"
     table.write_text("file,label,age,scanner\nball/0.off,ball,41,A\negg/0.off,egg,3,B\n")
-    gallery, _ = Gallery.build(tmp_path / "g", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1
+    )
     table.write_text("file,label,scanner\nball/0.off,ball,A\negg/0.off,egg,C\n")
     assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
-    told = {row["name"]: (row["age"], row["scanner"]) for row in gallery.rows("name", "age", "scanner")}
+    told = {
+        row["name"]: (row["age"], row["scanner"]) for row in gallery.rows("name", "age", "scanner")
+    }
     assert told == {"ball/0.off": (None, "A"), "egg/0.off": (None, "C")}
     n_versions = len(gallery.versions())
     sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
     assert len(gallery.versions()) == n_versions
 
 
-def test_galleries_whose_columns_do_not_fit_are_not_merged_by_half(root: Path, tmp_path: Path) -> None:
+def test_galleries_whose_columns_do_not_fit_are_not_merged_by_half(
+    root: Path, tmp_path: Path
+) -> None:
     for label, age in (("ball", "41"), ("egg", "old")):
         (root / label / "labels.csv").write_text(f"file,label,age\n0.off,{label},{age}\n")
         dataset = SignatureDataset(root / label, CONFIG, tmp_path / "cache")
         Gallery.build(tmp_path / label, dataset, small_interior(), n_workers=1)
-    with pytest.raises(ValueError, match=r"age: expected numbers as in .*ball, got text\. Correct the labels"):
+    with pytest.raises(
+        ValueError, match=r"age: expected numbers as in .*ball, got text\. Correct the labels"
+    ):
         Gallery.merge(tmp_path / "all", [tmp_path / "ball", tmp_path / "egg"], small_interior())
     assert not (tmp_path / "all").exists()
     both = Gallery.merge(tmp_path / "all", [tmp_path / "egg", tmp_path / "ball"], small_interior())
@@ -515,7 +707,9 @@ def test_galleries_whose_columns_do_not_fit_are_not_merged_by_half(root: Path, t
 def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    monkeypatch.setattr(
+        SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
+    )
     words = ["gallery", "build", root, "--descriptor", INTERIOR]
     told = error_of(monkeypatch, capsys, *words, "--out", root)
     assert "expected a gallery or a new folder, got a folder with ball" in told
@@ -537,14 +731,37 @@ def test_a_gallery_remembers_the_table_of_names(
     (tmp_path / "other.json").write_text('{"1": "cube", "2": "bar"}')
     monkeypatch.chdir(tmp_path)
     cache = ["--cache_dir", "cache", "--n_workers", 1]
-    build = ["gallery", "build", "scans", "--out", "g.igps", "--descriptor", INTERIOR, "--size", "ignore", *SMALL]
+    build = [
+        "gallery",
+        "build",
+        "scans",
+        "--out",
+        "g.igps",
+        "--descriptor",
+        INTERIOR,
+        "--size",
+        "ignore",
+        *SMALL,
+    ]
     run(monkeypatch, *build, "--names", "names.json", *cache)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     cache = ["--cache_dir", "../cache", "--n_workers", 1]
-    run(monkeypatch, "query", "../scans/scan.nii.gz#bar", "--gallery", "../g.igps", "--top", 1, *cache)
+    run(
+        monkeypatch,
+        "query",
+        "../scans/scan.nii.gz#bar",
+        "--gallery",
+        "../g.igps",
+        "--top",
+        1,
+        *cache,
+    )
     assert "scan.nii.gz#bar" in capsys.readouterr().out
-    for given, changes in (([], "0 bodies described, 0 removed"), (["--names", "../other.json"], "1 removed")):
+    for given, changes in (
+        ([], "0 bodies described, 0 removed"),
+        (["--names", "../other.json"], "1 removed"),
+    ):
         run(monkeypatch, "gallery", "sync", "../scans", "--gallery", "../g.igps", *given, *cache)
         assert changes in capsys.readouterr().out
     assert {row["part"] for row in Gallery("../g.igps").rows("part")} == {"cube", "bar"}

@@ -48,11 +48,19 @@ def units(n: int, width: int = 16, seed: int = 0) -> torch.Tensor:
 
 def told(number: int, mark: str = "a") -> dict[str, Any]:
     label = "odd" if number % 2 else None
-    return {"id": f"{number:05}", "name": f"mesh {number}", "class": label, "checksum": mark, "volume": 2.0 * number,
-            "age": float(number % 90)}  # fmt: skip
+    return {
+        "id": f"{number:05}",
+        "name": f"mesh {number}",
+        "class": label,
+        "checksum": mark,
+        "volume": 2.0 * number,
+        "age": float(number % 90),
+    }
 
 
-def batches(rows: torch.Tensor, first: int = 0, mark: str = "a") -> Iterator[tuple[torch.Tensor, list[dict[str, Any]]]]:
+def batches(
+    rows: torch.Tensor, first: int = 0, mark: str = "a"
+) -> Iterator[tuple[torch.Tensor, list[dict[str, Any]]]]:
     for start in range(0, len(rows), 700):
         part = rows[start : start + 700]
         yield part, [told(first + start + i, mark) for i in range(len(part))]
@@ -67,10 +75,14 @@ def numbers(found: tuple[list[dict[str, Any]], torch.Tensor, torch.Tensor]) -> l
     return [int(row["id"]) for row in found[0]]
 
 
-def recall(table: BodyTable, asked: torch.Tensor, rows: torch.Tensor, distance: Any, **options: Any) -> float:
+def recall(
+    table: BodyTable, asked: torch.Tensor, rows: torch.Tensor, distance: Any, **options: Any
+) -> float:
     exact = search(asked, rows, top=10, distance=distance).indices.tolist()
     found = [numbers(nearest_rows(table, one[None], distance, top=10, **options)) for one in asked]
-    return float(np.mean([len(set(one) & set(other)) / 10 for one, other in zip(found, exact, strict=True)]))
+    return float(
+        np.mean([len(set(one) & set(other)) / 10 for one, other in zip(found, exact, strict=True)])
+    )
 
 
 @pytest.fixture
@@ -102,7 +114,9 @@ def test_the_nearest_of_many_are_those_of_all(tmp_path: Path) -> None:
     exact = search(asked[:3], rows, top=10)
     found = [nearest_rows(table, one[None], chi_square, top=10, exact=True) for one in asked[:3]]
     assert [numbers(one) for one in found] == exact.indices.tolist()
-    torch.testing.assert_close(torch.stack([one[1] for one in found]), exact.distances, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        torch.stack([one[1] for one in found]), exact.distances, rtol=1e-5, atol=1e-6
+    )
 
 
 @pytest.mark.usefixtures("few_are_many")
@@ -114,17 +128,30 @@ def test_a_condition_keeps_what_numpy_keeps(tmp_path: Path) -> None:
         ("class = 'odd' AND volume > 3000", (every % 2 == 1) & (2 * every > 3000)),
         ("age = 17", every % 90 == 17),
         ("id IN ('00004', '02222')", (every == 4) | (every == 2222)),
-        ("class IS NULL AND name LIKE 'mesh 1%'", (every % 2 == 0) & np.array([str(i)[0] == "1" for i in every])),
+        (
+            "class IS NULL AND name LIKE 'mesh 1%'",
+            (every % 2 == 0) & np.array([str(i)[0] == "1" for i in every]),
+        ),
         ("age > 1000", every < 0),
     ):
         left = np.flatnonzero(kept)
         for query in rows[:2]:
-            expected = left[torch.sort(1 - rows[left] @ query, stable=True).indices[:10].numpy()].tolist()
-            assert numbers(nearest_rows(table, query[None], cosine, top=10, where=where)) == expected, where
-            assert numbers(nearest_rows(table, query[None], cosine, top=10, where=where, exact=True)) == expected, where
+            expected = left[
+                torch.sort(1 - rows[left] @ query, stable=True).indices[:10].numpy()
+            ].tolist()
+            assert (
+                numbers(nearest_rows(table, query[None], cosine, top=10, where=where)) == expected
+            ), where
+            assert (
+                numbers(nearest_rows(table, query[None], cosine, top=10, where=where, exact=True))
+                == expected
+            ), where
     for wrong in ("weight > 3", "volume >", "volume > 'much' AND"):
         for exact in (False, True):
-            with pytest.raises(ValueError, match=r"where: expected a condition on the columns id, name, .* age, got"):
+            with pytest.raises(
+                ValueError,
+                match=r"where: expected a condition on the columns id, name, .* age, got",
+            ):
                 nearest_rows(table, rows[:1], cosine, top=1, where=wrong, exact=exact)
 
 
@@ -148,7 +175,9 @@ def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
     kept = torch.cat([table.decoded(some)[0] for some in table.batches()])
     torch.testing.assert_close(kept, rows, rtol=2**-11, atol=1e-11)
     found = nearest_rows(table, rows[:1], chi_square, top=5)
-    torch.testing.assert_close(found[1], search(rows[:1], rows, top=5).distances[0], rtol=2e-3, atol=1e-6)
+    torch.testing.assert_close(
+        found[1], search(rows[:1], rows, top=5).distances[0], rtol=2e-3, atol=1e-6
+    )
 
 
 @pytest.mark.usefixtures("few_are_many")
@@ -165,7 +194,9 @@ def test_codes_are_fitted_again_when_a_gallery_has_grown(tmp_path: Path) -> None
     """Recall of later families is below 0.9 by the first codes, and at least 0.98 after the codes are fitted again."""
     generator = torch.Generator().manual_seed(5)
     families = units(16, seed=6).repeat_interleave(500, dim=0)
-    rows = torch.nn.functional.normalize(families + 0.02 * torch.randn(8000, 16, generator=generator), dim=1)
+    rows = torch.nn.functional.normalize(
+        families + 0.02 * torch.randn(8000, 16, generator=generator), dim=1
+    )
     table = written(tmp_path / "g.igps", rows[:1000], "cosine")
     table.add(rows[1000:7900], [told(i) for i in range(1000, 7900)], {})
     asked = rows[1100:7900:250]
@@ -186,7 +217,10 @@ def test_rows_are_added_replaced_and_removed(tmp_path: Path) -> None:
     assert table.columns["site"] is str
     changed, few = rows[1800:2000], [{**told(i, "b"), "site": "A"} for i in range(200)]
     table.add(changed, few, {"site": str})
-    assert (len(table), len(list(table.table.search().where("site = 'A'").to_list()))) == (1800, 200)
+    assert (len(table), len(list(table.table.search().where("site = 'A'").to_list()))) == (
+        1800,
+        200,
+    )
     with table.changing() as engine:
         engine.delete("id < '00100'")
     now = torch.cat([changed[100:], rows[200:1800]])
@@ -210,21 +244,31 @@ def test_each_change_is_a_version_to_return_to(tmp_path: Path) -> None:
     first = table.table.version
     table.add(rows[30:], [told(i) for i in range(30, 40)], {})
     written(tmp_path / "g.igps", rows[:3], "cosine")
-    assert [len(BodyTable(table.path, version)) for version in (first, table.table.version, None)] == [30, 40, 3]
+    assert [
+        len(BodyTable(table.path, version)) for version in (first, table.table.version, None)
+    ] == [30, 40, 3]
     before = BodyTable(table.path, first)
     assert numbers(nearest_rows(before, rows[29:30], cosine, top=1)) == [29]
-    with pytest.raises(ValueError, match=r"version: expected one that `igps gallery versions` lists, got 99"):
+    with pytest.raises(
+        ValueError, match=r"version: expected one that `igps gallery versions` lists, got 99"
+    ):
         BodyTable(table.path, 99)
 
 
 def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
     table = written(tmp_path / "g.igps", units(10), "cosine")
     other = {"descriptor": "test", "signature": {"resolution": 20}}
-    with pytest.raises(ValueError, match=r"g\.igps: expected a gallery with signature\.resolution 20, got 32"):
+    with pytest.raises(
+        ValueError, match=r"g\.igps: expected a gallery with signature\.resolution 20, got 32"
+    ):
         check_alike(table.path, table.about, other)
-    with pytest.raises(ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(5,\)"):
+    with pytest.raises(
+        ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(5,\)"
+    ):
         nearest_rows(table, units(1, 5), cosine, top=1)
-    with pytest.raises(ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(4, 4\)"):
+    with pytest.raises(
+        ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(4, 4\)"
+    ):
         table.add(units(1).reshape(1, 4, 4), [told(0)], {})
     with pytest.raises(ValueError, match="expected finite numbers"):
         table.add(units(1) / 0, [told(0)], {})
@@ -239,7 +283,9 @@ def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
 
 def test_a_strangers_gallery_runs_nothing(tmp_path: Path) -> None:
     """LanceDB would load the model that a table names; a head that does not fit is told in a sentence."""
-    for i, (name, value) in enumerate((("embedding_functions", b"[]"), ("gallery", b"{"), ("gallery", b"[1]"))):
+    for i, (name, value) in enumerate(
+        (("embedding_functions", b"[]"), ("gallery", b"{"), ("gallery", b"[1]"))
+    ):
         table = written(tmp_path / f"{i}.igps", units(3), "cosine")
         arrow = table.table.to_arrow()
         changed = arrow.replace_schema_metadata({**arrow.schema.metadata, name.encode(): value})
@@ -268,7 +314,9 @@ def test_no_damaged_file_gives_a_wrong_answer(tmp_path: Path, how: str) -> None:
 
     written(tmp_path / "g.igps", rows, "chi_square")
     right = answers()
-    files = [path for path in (tmp_path / "g.igps").rglob("*") if path.is_file() and path.name != "lock"]
+    files = [
+        path for path in (tmp_path / "g.igps").rglob("*") if path.is_file() and path.name != "lock"
+    ]
     n_told = 0
     for path in files:
         content = path.read_bytes()
@@ -288,7 +336,10 @@ def test_no_damaged_file_gives_a_wrong_answer(tmp_path: Path, how: str) -> None:
 
 
 def _answers(path: Path) -> list[list[int]]:
-    return [numbers(nearest_rows(BodyTable(path), one[None], cosine, top=3)) for one in units(1500)[::150]]
+    return [
+        numbers(nearest_rows(BodyTable(path), one[None], cosine, top=3))
+        for one in units(1500)[::150]
+    ]
 
 
 def test_several_processes_read_while_one_adds(tmp_path: Path) -> None:
@@ -301,14 +352,20 @@ def test_several_processes_read_while_one_adds(tmp_path: Path) -> None:
         after = _answers(table.path)
         assert all(future.result() in (before, after) for future in futures)
     # What was opened before stays what it was.
-    assert [numbers(nearest_rows(opened, one[None], cosine, top=3)) for one in rows[::150]] == before != after
+    assert (
+        [numbers(nearest_rows(opened, one[None], cosine, top=3)) for one in rows[::150]]
+        == before
+        != after
+    )
 
 
 def test_an_index_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
     """Its signatures are of version 4: with these nothing is compared."""
     (tmp_path / "manifest.json").write_text('{"format": "igps-index-1"}')
     assert is_gallery(tmp_path)
-    with pytest.raises(ValueError, match=r"an index of version 0\.2\.0, of other signatures\. Build a gallery"):
+    with pytest.raises(
+        ValueError, match=r"an index of version 0\.2\.0, of other signatures\. Build a gallery"
+    ):
         open_table(tmp_path)
 
 
@@ -340,8 +397,14 @@ def killed_writers(folder: Path, n_kills: int, longest: float = 0.25) -> int:
     wrong, generator = 0, random.Random(0)
     words = _WRITER.format(tests=str(Path(__file__).parent), folder=str(folder))
     for _ in range(n_kills):
-        both = [subprocess.Popen([sys.executable, "-c", words, str(who)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-                for who in (1, 2)]  # fmt: skip
+        both = [
+            subprocess.Popen(
+                [sys.executable, "-c", words, str(who)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+            )
+            for who in (1, 2)
+        ]
         for child in both:
             assert child.stdout is not None
             child.stdout.readline()
@@ -360,10 +423,15 @@ def killed_writers(folder: Path, n_kills: int, longest: float = 0.25) -> int:
 def is_whole(table: BodyTable) -> bool:
     rows = [row for some in table.batches() for row in zip(*table.decoded(some), strict=True)]
     still = {row["id"]: values for values, row in rows if row["checksum"] == "still"}
-    good = len(still) == 50 and all(torch.equal(still[f"{i:05}"], one) for i, one in enumerate(units(50, seed=1)))
+    good = len(still) == 50 and all(
+        torch.equal(still[f"{i:05}"], one) for i, one in enumerate(units(50, seed=1))
+    )
     for who in (1, 2):
-        own = sorted((row["id"], row["checksum"], row["class"], values) for values, row in rows
-                     if row["id"].startswith(f"0{who}"))  # fmt: skip
+        own = sorted(
+            (row["id"], row["checksum"], row["class"], values)
+            for values, row in rows
+            if row["id"].startswith(f"0{who}")
+        )
         marks = {mark for _, mark, _, _ in own}
         good &= len(own) in ((0,) if not own else (30, 40)) and len(marks) <= 1
         if own and good:
@@ -377,7 +445,16 @@ def is_whole(table: BodyTable) -> bool:
 @pytest.mark.skipif(os.name == "nt", reason="no SIGKILL")
 def test_kills_of_two_writers_leave_whole_changes(tmp_path: Path) -> None:
     assert killed_writers(tmp_path / "g.igps", 1, longest=0.8) == 0
-    assert len({row["checksum"] for some in BodyTable(tmp_path / "g.igps").batches() for row in some.to_pylist()}) > 1
+    assert (
+        len(
+            {
+                row["checksum"]
+                for some in BodyTable(tmp_path / "g.igps").batches()
+                for row in some.to_pylist()
+            }
+        )
+        > 1
+    )
 
 
 def test_is_whole_detects_a_change_stored_in_part(tmp_path: Path) -> None:

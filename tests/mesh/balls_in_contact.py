@@ -12,10 +12,15 @@ from igps.mesh.formats.molecules import Molecule
 
 
 def molecule(positions: ArrayLike, radii: ArrayLike) -> Molecule:
-    positions, radii = np.atleast_2d(np.asarray(positions, dtype=float)), np.atleast_1d(np.asarray(radii, dtype=float))
+    positions, radii = (
+        np.atleast_2d(np.asarray(positions, dtype=float)),
+        np.atleast_1d(np.asarray(radii, dtype=float)),
+    )
     n = len(radii)
     names = tuple("X" * n)
-    return Molecule("balls", positions, radii, np.zeros(n), np.arange(n), names, positions, np.zeros(n))
+    return Molecule(
+        "balls", positions, radii, np.zeros(n), np.arange(n), names, positions, np.zeros(n)
+    )
 
 
 def ball(r: float) -> tuple[float, float]:
@@ -52,7 +57,12 @@ def saddle(r: float, s: float, apart: float, probe: float) -> tuple[float, float
     area = volume = 0.0
     for low, high in ((ends[0], -cusp), (cusp, ends[1])):
         area += 2 * math.pi * probe * quad(lambda t: radius - probe * math.cos(t), low, high)[0]
-        volume += math.pi * quad(lambda t: (radius - probe * math.cos(t)) ** 2 * probe * math.cos(t), low, high)[0]
+        volume += (
+            math.pi
+            * quad(lambda t: (radius - probe * math.cos(t)) ** 2 * probe * math.cos(t), low, high)[
+                0
+            ]
+        )
     return area, volume, from_first, from_second
 
 

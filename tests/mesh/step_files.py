@@ -18,7 +18,9 @@ class _Lines:
 Place = tuple[float, float, float]
 
 
-def write_step(path: Path, parts: dict[str, list[tuple[Place, Place]]], unit: str = ".MILLI.") -> None:
+def write_step(
+    path: Path, parts: dict[str, list[tuple[Place, Place]]], unit: str = ".MILLI."
+) -> None:
     """Parts of boxes from their least to their greatest corners, each a solid.
 
     `unit` is a prefix of metres, ".MILLI." or "$".
@@ -27,7 +29,9 @@ def write_step(path: Path, parts: dict[str, list[tuple[Place, Place]]], unit: st
     length = add(f"(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT({unit},.METRE.))")
     angle = add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
     solid_angle = add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())")
-    blur = add(f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-7),{length},'distance_accuracy_value','')")
+    blur = add(
+        f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-7),{length},'distance_accuracy_value','')"
+    )
     context = add(
         f"(GEOMETRIC_REPRESENTATION_CONTEXT(3)GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT(({blur}))"
         f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({length},{angle},{solid_angle}))REPRESENTATION_CONTEXT('',''))"
@@ -57,16 +61,21 @@ def _direction(add: _Lines, way: tuple[float, ...]) -> str:
     return add(f"DIRECTION('',({','.join(f'{float(x):.6f}' for x in way)}))")
 
 
-def _placement(add: _Lines, place: tuple[float, ...], axis: tuple[float, ...], reference: tuple[float, ...]) -> str:
+def _placement(
+    add: _Lines, place: tuple[float, ...], axis: tuple[float, ...], reference: tuple[float, ...]
+) -> str:
     parts = _point(add, place), _direction(add, axis), _direction(add, reference)
     return add(f"AXIS2_PLACEMENT_3D('',{','.join(parts)})")
 
 
 def _box(add: _Lines, low: tuple[float, float, float], high: tuple[float, float, float]) -> str:
     corners = {
-        bits: tuple(high[i] if bits[i] else low[i] for i in range(3)) for bits in itertools.product((0, 1), repeat=3)
+        bits: tuple(high[i] if bits[i] else low[i] for i in range(3))
+        for bits in itertools.product((0, 1), repeat=3)
     }
-    vertices = {bits: add(f"VERTEX_POINT('',{_point(add, place)})") for bits, place in corners.items()}
+    vertices = {
+        bits: add(f"VERTEX_POINT('',{_point(add, place)})") for bits, place in corners.items()
+    }
     edges: dict[tuple[tuple[int, ...], tuple[int, ...]], str] = {}
     for bits, axis in itertools.product(corners, range(3)):
         if not bits[axis]:
@@ -74,7 +83,9 @@ def _box(add: _Lines, low: tuple[float, float, float], high: tuple[float, float,
             way = _direction(add, tuple(float(i == axis) for i in range(3)))
             vector = add(f"VECTOR('',{way},1.)")
             line = add(f"LINE('',{_point(add, corners[bits])},{vector})")
-            edges[bits, other] = add(f"EDGE_CURVE('',{vertices[bits]},{vertices[other]},{line},.T.)")
+            edges[bits, other] = add(
+                f"EDGE_CURVE('',{vertices[bits]},{vertices[other]},{line},.T.)"
+            )
     faces = []
     for axis, side in itertools.product(range(3), (0, 1)):
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -91,7 +102,9 @@ def _box(add: _Lines, low: tuple[float, float, float], high: tuple[float, float,
         loop = add(f"EDGE_LOOP('',({','.join(oriented)}))")
         bound = add(f"FACE_OUTER_BOUND('',{loop},.T.)")
         outward = tuple((1.0 if side else -1.0) * (i == axis) for i in range(3))
-        plane = add(f"PLANE('',{_placement(add, corners[ring[0]], outward, tuple(float(i == u) for i in range(3)))})")
+        plane = add(
+            f"PLANE('',{_placement(add, corners[ring[0]], outward, tuple(float(i == u) for i in range(3)))})"
+        )
         faces.append(add(f"ADVANCED_FACE('',({bound}),{plane},.T.)"))
     shell = add(f"CLOSED_SHELL('',({','.join(faces)}))")
     return add(f"MANIFOLD_SOLID_BREP('',{shell})")

@@ -16,8 +16,13 @@ from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
 OBJECTS, PIECES = LoadOptions(bodies="objects"), LoadOptions(bodies="pieces")
-CORNERS = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)))
-FACES = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)))
+CORNERS = "".join(
+    f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+)
+FACES = "".join(
+    f'<triangle v1="{a}" v2="{b}" v3="{c}"/>'
+    for a, b, c in ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
+)
 MESH = f"<mesh><vertices>{CORNERS}</vertices><triangles>{FACES}</triangles></mesh>"
 
 
@@ -25,10 +30,14 @@ def plate(path: Path, objects: str, items: str, unit: str = ' unit="inch"', **me
     """A 3MF file."""
     names = 'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02" xmlns:p="http://p"'
     with zipfile.ZipFile(path, "w") as archive:
-        text = f"<model {names}{unit}><resources>{objects}</resources><build>{items}</build></model>"
+        text = (
+            f"<model {names}{unit}><resources>{objects}</resources><build>{items}</build></model>"
+        )
         archive.writestr("3D/3dmodel.model", text)
         for name, content in members.items():
-            archive.writestr(f"3D/{name}.model", f"<model {names}><resources>{content}</resources></model>")
+            archive.writestr(
+                f"3D/{name}.model", f"<model {names}><resources>{content}</resources></model>"
+            )
     return path
 
 
@@ -37,7 +46,9 @@ def parts(path: Path, options: LoadOptions) -> list[str | None]:
 
 
 def test_six_copies_on_a_plate_are_six_bodies_in_its_unit(tmp_path: Path) -> None:
-    items = "".join(f'<item objectid="1" transform="1 0 0 0 1 0 0 0 1 {3 * i} 0 0"/>' for i in range(6))
+    items = "".join(
+        f'<item objectid="1" transform="1 0 0 0 1 0 0 0 1 {3 * i} 0 0"/>' for i in range(6)
+    )
     path = plate(tmp_path / "plate.3mf", f'<object id="1" name="part">{MESH}</object>', items)
     names = ["part", *(f"part ({i})" for i in range(2, 7))]
     assert parts(path, OBJECTS) == names
@@ -53,9 +64,13 @@ def test_six_copies_on_a_plate_are_six_bodies_in_its_unit(tmp_path: Path) -> Non
     assert len(read_surface(path).faces) == 24
 
 
-def test_an_object_of_objects_is_one_body_turned_and_mirrored_as_the_plan_says(tmp_path: Path) -> None:
+def test_an_object_of_objects_is_one_body_turned_and_mirrored_as_the_plan_says(
+    tmp_path: Path,
+) -> None:
     """The second component lies in another member; mirrored, its faces still look outward."""
-    mirrored = '<component objectid="7" p:path="/3D/more.model" transform="-2 0 0 0 1 0 0 0 1 0 0 0"/>'
+    mirrored = (
+        '<component objectid="7" p:path="/3D/more.model" transform="-2 0 0 0 1 0 0 0 1 0 0 0"/>'
+    )
     components = f'<component objectid="1"/>{mirrored}'
     objects = f'<object id="1">{MESH}</object><object id="2" name="pair"><components>{components}</components></object>'
     item = '<item objectid="2" transform="0 1 0 -1 0 0 0 0 1 10 20 30"/>'
@@ -87,7 +102,9 @@ def test_places_in_a_scene_are_bodies(tmp_path: Path) -> None:
     scene = trimesh.Scene()
     box = trimesh.creation.box((1, 2, 3))
     for i, name in enumerate(("left", "right")):
-        scene.add_geometry(box, node_name=name, geom_name="box", transform=np.diag([1, 1, 1 + i, 1.0]))
+        scene.add_geometry(
+            box, node_name=name, geom_name="box", transform=np.diag([1, 1, 1 + i, 1.0])
+        )
     scene.export(tmp_path / "pair.glb")
     assert sorted(map(str, parts(tmp_path / "pair.glb", OBJECTS))) == ["left", "right"]
     right = load_mesh(tmp_path / "pair.glb", OBJECTS, part="right")
@@ -115,7 +132,10 @@ def test_objects_of_an_obj_file_are_bodies_and_without_them_its_groups(tmp_path:
 def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path: Path) -> None:
     """Also in a file of loose triangles; a crumb is no piece, and points are one body."""
     sizes = [1.0, 3.0, 2.0, 0.01]
-    boxes = [trimesh.creation.box([size] * 3).apply_translation([5 * i, 0, 0]) for i, size in enumerate(sizes)]
+    boxes = [
+        trimesh.creation.box([size] * 3).apply_translation([5 * i, 0, 0])
+        for i, size in enumerate(sizes)
+    ]
     whole = trimesh.util.concatenate(boxes)
     whole.unmerge_vertices()
     whole.export(tmp_path / "boxes.ply")
@@ -133,7 +153,9 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path: Pat
     assert parts(tmp_path / "cloud.xyz", PIECES) == [None]
 
 
-def test_one_bad_body_does_not_cost_the_others(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_one_bad_body_does_not_cost_the_others(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     flat = '<triangles><triangle v1="0" v2="0" v3="0"/></triangles>'
     flat = f'<mesh><vertices><vertex x="0" y="0" z="0"/></vertices>{flat}</mesh>'
     objects = f'<object id="1" name="good">{MESH}</object><object id="2" name="bad">{flat}</object>'
@@ -150,12 +172,16 @@ def test_one_bad_body_does_not_cost_the_others(tmp_path: Path, caplog: pytest.Lo
 def test_several_bodies_and_unknown_parts_are_told_with_the_names_there_are(tmp_path: Path) -> None:
     items = '<item objectid="1"/><item objectid="1"/>'
     path = plate(tmp_path / "two.3mf", f'<object id="1" name="part">{MESH}</object>', items)
-    with pytest.raises(MeshError, match=r"holds 2 bodies: 'part', 'part \(2\)'\. Name one as part="):
+    with pytest.raises(
+        MeshError, match=r"holds 2 bodies: 'part', 'part \(2\)'\. Name one as part="
+    ):
         load_mesh(path, OBJECTS)
     with pytest.raises(MeshError, match=r"has no body 'lid'; there are: 'part', 'part \(2\)'"):
         load_mesh(path, OBJECTS, part="lid")
     trimesh.creation.box().export(tmp_path / "box.off")
-    with pytest.raises(MeshError, match=r"box\.off: is a single body, and has no body 'lid'\. Leave out the name\."):
+    with pytest.raises(
+        MeshError, match=r"box\.off: is a single body, and has no body 'lid'\. Leave out the name\."
+    ):
         load_mesh(tmp_path / "box.off", part="lid")
     with pytest.raises(ValueError, match="bodies: expected one of whole, labels"):
         LoadOptions(bodies="organs")  # type: ignore[arg-type]
@@ -168,7 +194,9 @@ def test_what_a_format_does_not_have_is_its_usual_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("unit", "scale"), [(".MILLI.", 1.0), ("$", 1000.0)])
-def test_solids_of_a_step_file_are_bodies_in_millimetres(unit: str, scale: float, tmp_path: Path) -> None:
+def test_solids_of_a_step_file_are_bodies_in_millimetres(
+    unit: str, scale: float, tmp_path: Path
+) -> None:
     """A part of one solid, and one of two; the file is in millimetres or in metres."""
     path = tmp_path / "parts.step"
     pair = [((5, 0, 0), (6, 1, 1)), ((10, 0, 0), (12, 2, 2))]
@@ -187,7 +215,9 @@ def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path
     """Two boxes of voxels that touch, beside a label of seven voxels; the whole is both boxes."""
     labels = np.zeros((20, 20, 12), dtype=np.uint8)
     labels[2:8, 2:14, 2:10], labels[8:14, 2:14, 2:10], labels[18, 18, 2:9] = 1, 5, 9
-    nibabel.save(nibabel.Nifti1Image(labels, np.diag([1.0, 1.0, 2.0, 1.0])), tmp_path / "organs.nii.gz")
+    nibabel.save(
+        nibabel.Nifti1Image(labels, np.diag([1.0, 1.0, 2.0, 1.0])), tmp_path / "organs.nii.gz"
+    )
     (tmp_path / "names.csv").write_text("label,name\n1,left\n5,right\n9,speck\n")
     path, options = tmp_path / "organs.nii.gz", LoadOptions(names=str(tmp_path / "names.csv"))
     assert parts(path, options) == ["left", "right", "speck"]
@@ -199,7 +229,9 @@ def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path
         assert body.volume == pytest.approx(6 * 12 * 16, rel=1e-6)
         assert body.unit == "mm"
         np.testing.assert_array_equal(body.vertices, outcomes[name].vertices)  # type: ignore[union-attr]
-    assert load_mesh(path, LoadOptions(bodies="whole")).volume == pytest.approx(2 * 6 * 12 * 16, rel=0.02)
+    assert load_mesh(path, LoadOptions(bodies="whole")).volume == pytest.approx(
+        2 * 6 * 12 * 16, rel=0.02
+    )
 
 
 def test_chains_of_a_structure_are_bodies_in_angstrom(tmp_path: Path) -> None:

@@ -10,7 +10,16 @@ import torch
 import trimesh
 from scipy import ndimage
 
-from igps import LoadOptions, Mesh, MeshError, SignatureConfig, collate, compute_signature, descriptor, load_mesh
+from igps import (
+    LoadOptions,
+    Mesh,
+    MeshError,
+    SignatureConfig,
+    collate,
+    compute_signature,
+    descriptor,
+    load_mesh,
+)
 from igps.descriptors.interior import interior
 from igps.mesh.label_surface import voxel_surface
 from igps.mesh.mending import mend, repair_steps
@@ -68,18 +77,26 @@ def test_a_cavity_is_one_though_the_outer_surface_is_inside_out(inwards: bool) -
 
 def test_loose_triangles_are_welded_before() -> None:
     vertices, faces = joined(ball(1), ball(0.5))
-    hollow = mend(vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), cavities="keep")
+    hollow = mend(
+        vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), cavities="keep"
+    )
     assert hollow.volume == pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-12)
 
 
 @pytest.mark.parametrize(
     "other",
-    [ball(0.5), ball(0.5, 3.0, inwards=True), ball(0.5, 0.8, inwards=True),
-     joined(ball(0.5, inwards=True), ball(0.2, inwards=True))],
+    [
+        ball(0.5),
+        ball(0.5, 3.0, inwards=True),
+        ball(0.5, 0.8, inwards=True),
+        joined(ball(0.5, inwards=True), ball(0.2, inwards=True)),
+    ],
     ids=["turned outwards", "outside", "across", "in another"],
-)  # fmt: skip
+)
 def test_what_is_no_cavity_is_refused(other: Surface) -> None:
-    with pytest.raises(MeshError, match=r"closed surfaces bounds no cavity: .*--mend auto, or without cavities"):
+    with pytest.raises(
+        MeshError, match=r"closed surfaces bounds no cavity: .*--mend auto, or without cavities"
+    ):
         Mesh(*joined(ball(1), other), cavities=True)
     with pytest.raises(MeshError, match="connected components"):
         Mesh(*joined(ball(1), other))
@@ -90,19 +107,27 @@ def test_samples_lie_in_the_wall_and_on_all_surfaces() -> None:
     radii = np.linalg.norm(interior_samples(hollow, 32, 1000), axis=1)
     assert radii.min() > 0.69
     assert radii.max() < 1
-    signature = compute_signature(hollow, SignatureConfig(n_eigenpairs=30, attributes=("surface_direction", "depth")))
+    signature = compute_signature(
+        hollow, SignatureConfig(n_eigenpairs=30, attributes=("surface_direction", "depth"))
+    )
     on_cavity = np.linalg.norm(signature.surface.points, axis=1) < 0.85
     assert on_cavity.mean() == pytest.approx(0.49 / 1.49, abs=0.01)
     # Normals of the body point into its cavity, and its depth is that of the wall.
-    radial = (signature.surface.attributes["surface_direction"] * signature.surface.points).sum(axis=1)
+    radial = (signature.surface.attributes["surface_direction"] * signature.surface.points).sum(
+        axis=1
+    )
     assert radial[on_cavity].max() < 0 < radial[~on_cavity].min()
-    assert signature.interior.attributes["depth"].max() * np.sqrt(hollow.area) == pytest.approx(0.15, abs=0.02)
+    assert signature.interior.attributes["depth"].max() * np.sqrt(hollow.area) == pytest.approx(
+        0.15, abs=0.02
+    )
 
 
 def test_eigenfunctions_of_the_outside_go_on_through_the_wall() -> None:
     """The first three of a ball extend to linear functions in the wall: the sum of squares is 3 |x|² / 4π."""
     config = SignatureConfig(n_eigenpairs=30, accuracy=None)
-    hollow = compute_signature(Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True), config)
+    hollow = compute_signature(
+        Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True), config
+    )
     full = compute_signature(Mesh(*ball(1)), config)
     np.testing.assert_allclose(hollow.eigenvalues, full.eigenvalues, rtol=1e-6)
     for samples in (hollow.interior, hollow.surface):
@@ -149,7 +174,9 @@ def test_a_cavity_behind_a_wall_with_gaps_is_noted() -> None:
     radius = np.linalg.norm(offset, axis=0)
     thin, closed = np.abs(radius - 14) < 0.45, np.abs(radius - 14) < 0.75
     assert ndimage.label(np.pad(~thin, 1, constant_values=True))[1] == 1  # the cavity is open
-    assert [("gaps of up to two voxels" in note) for note in voxel_surface(thin, cavities=True)[2]] == [True]
+    assert [
+        ("gaps of up to two voxels" in note) for note in voxel_surface(thin, cavities=True)[2]
+    ] == [True]
     for mask in (closed, (radius < 14) & (radius > 11) & (offset[2] < 3)):
         assert voxel_surface(mask, cavities=True)[2] == ()
 
@@ -157,17 +184,30 @@ def test_a_cavity_behind_a_wall_with_gaps_is_noted() -> None:
 def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path: Path) -> None:
     """A ball with a core that is another label, as a kidney with a cyst, and a ring around both."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
-    x, y, z = np.meshgrid(np.arange(57) - 28, np.arange(57) - 28, 1.5 * np.arange(28) - 20.25, indexing="ij")
+    x, y, z = np.meshgrid(
+        np.arange(57) - 28, np.arange(57) - 28, 1.5 * np.arange(28) - 20.25, indexing="ij"
+    )
     radius = np.sqrt(x**2 + y**2 + z**2)
-    labels = np.select([radius < 8, radius < 15, (np.hypot(x, y) - 22) ** 2 + z**2 < 5**2], [2, 1, 3])
+    labels = np.select(
+        [radius < 8, radius < 15, (np.hypot(x, y) - 22) ** 2 + z**2 < 5**2], [2, 1, 3]
+    )
     for name, of in (("x", labels), ("full", labels * (labels != 2) + (labels == 2))):
-        nibabel.save(nibabel.Nifti1Image(of.astype(np.uint8), np.diag([1.0, 1, 1.5, 1])), tmp_path / f"{name}.nii")
+        nibabel.save(
+            nibabel.Nifti1Image(of.astype(np.uint8), np.diag([1.0, 1, 1.5, 1])),
+            tmp_path / f"{name}.nii",
+        )
     ball = load_mesh(tmp_path / "full.nii", part="1")
-    expected = {"1": 4 / 3 * np.pi * (15**3 - 8**3), "2": 4 / 3 * np.pi * 8**3, "3": 2 * np.pi**2 * 22 * 5**2}
+    expected = {
+        "1": 4 / 3 * np.pi * (15**3 - 8**3),
+        "2": 4 / 3 * np.pi * 8**3,
+        "3": 2 * np.pi**2 * 22 * 5**2,
+    }
     for part, volume in expected.items():
         kept = load_mesh(tmp_path / "x.nii", LoadOptions(cavities="keep"), part=part)
         filled = load_mesh(tmp_path / "x.nii", part=part)
-        assert kept.volume == pytest.approx(volume, rel=0.04)  # as well as voxels of this size tell it
+        assert kept.volume == pytest.approx(
+            volume, rel=0.04
+        )  # as well as voxels of this size tell it
         assert kept.volume == pytest.approx(1.5 * np.count_nonzero(labels == int(part)), rel=1e-3)
         assert filled.genus == (part == "3")
         of = ball if part == "1" else kept
@@ -187,13 +227,18 @@ def test_a_piece_of_a_label_in_its_cavity_is_told() -> None:
     radius = np.linalg.norm(np.indices((41, 41, 41)) - 20.0, axis=0)
     shell, seed = (radius > 14) & (radius < 18), radius < 8
     vertices, faces, notes = voxel_surface(shell | seed, cavities=True)
-    assert Mesh(vertices, faces, cavities=True).volume == pytest.approx(np.count_nonzero(shell), rel=1e-3)
+    assert Mesh(vertices, faces, cavities=True).volume == pytest.approx(
+        np.count_nonzero(shell), rel=1e-3
+    )
     assert notes == (f"in a cavity: filled holes of {np.count_nonzero(seed)} voxels",)
 
 
 def test_the_larger_the_cavity_the_farther_from_the_ball() -> None:
     bodies = [Mesh(*ball(1))]
-    bodies += [Mesh(*joined(ball(1), ball(radius, inwards=True)), cavities=True) for radius in (0.2, 0.5, 0.8)]
+    bodies += [
+        Mesh(*joined(ball(1), ball(radius, inwards=True)), cavities=True)
+        for radius in (0.2, 0.5, 0.8)
+    ]
     names = ("depth", "electrostatic_potential", "surface_direction")
     config = SignatureConfig(n_eigenpairs=90, resolution=16, min_samples=500, attributes=names)
     batches = [collate([compute_signature(body, config)]) for body in bodies]
@@ -218,6 +263,8 @@ def test_of_two_cavities_that_meet_at_a_vertex_both_are_turned_inwards() -> None
         return Mesh(vertices[last], number[faces], cavities=True)
 
     volume = (1 - 0.25**3 - 0.2**3) * BALL.volume
-    assert hollow(BALL.faces).volume == pytest.approx(volume, rel=1e-12)  # the mirror has turned them
+    assert hollow(BALL.faces).volume == pytest.approx(
+        volume, rel=1e-12
+    )  # the mirror has turned them
     with pytest.raises(MeshError, match="bounds no cavity: it is oriented outward"):
         hollow(inwards)

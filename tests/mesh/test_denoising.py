@@ -54,7 +54,8 @@ def test_area_and_volume_come_back(sphere: Mesh) -> None:
     assert smooth.area == pytest.approx(sphere.area, rel=0.01)
     assert smooth.volume == pytest.approx(sphere.volume, rel=0.01)
     assert (
-        np.abs(np.linalg.norm(smooth.vertices, axis=1) - 1).std() < 0.6 * np.linalg.norm(noisy.vertices, axis=1).std()
+        np.abs(np.linalg.norm(smooth.vertices, axis=1) - 1).std()
+        < 0.6 * np.linalg.norm(noisy.vertices, axis=1).std()
     )
 
 
@@ -68,7 +69,9 @@ def test_passes_follow_the_noise(ratio: float, subdivisions: int) -> None:
     lengths = np.random.default_rng(0).normal(0, noise_length, len(vertices))
     noisy = vertices * (1 + lengths)[:, None]
     # The noise makes the edges longer.
-    assert _noise_over_edge(noisy, faces) == pytest.approx(ratio / np.sqrt(1 + 2 * ratio**2), rel=0.08)
+    assert _noise_over_edge(noisy, faces) == pytest.approx(
+        ratio / np.sqrt(1 + 2 * ratio**2), rel=0.08
+    )
     assert is_noisy(noisy, faces)
     smooth = Mesh(remove_noise(noisy, faces), faces)
     assert smooth.area == pytest.approx(ball.area, rel=0.008)
@@ -97,7 +100,9 @@ def test_turned_parts_of_thin_triangles_come_back(steps: int, sections: int) -> 
     assert smooth.volume == pytest.approx(part.volume, rel=0.01)
     # Steps between rims stay sharp: no corner has moved farther than the noise moved it.
     moved = np.linalg.norm(smooth.vertices - part.vertices, axis=1)
-    assert np.quantile(moved, 0.95) < np.quantile(np.linalg.norm(rough.vertices - part.vertices, axis=1), 0.95)
+    assert np.quantile(moved, 0.95) < np.quantile(
+        np.linalg.norm(rough.vertices - part.vertices, axis=1), 0.95
+    )
 
 
 @pytest.mark.parametrize("amplitude", [0.002, 0.003])
@@ -127,7 +132,10 @@ def plate_with_holes(seed: int, longest_edge: float | None = None) -> Mesh:
         hole = manifold3d.Manifold.cylinder(1, random.uniform(0.1, 0.25), -1, 256, True)
         plate -= hole.translate((x, random.uniform(-0.2, 0.2), 0))
     drawn = (plate if longest_edge is None else plate.refine_to_length(longest_edge)).to_mesh64()
-    return Mesh(np.asarray(drawn.vert_properties)[:, :3].copy(), np.asarray(drawn.tri_verts).astype(np.int64))
+    return Mesh(
+        np.asarray(drawn.vert_properties)[:, :3].copy(),
+        np.asarray(drawn.tri_verts).astype(np.int64),
+    )
 
 
 @pytest.mark.parametrize("longest_edge", [None, 0.06])
@@ -147,9 +155,16 @@ def test_a_fan_of_thousands_of_slivers_does_not_fold_up() -> None:
     import manifold3d
 
     ball = trimesh.creation.icosphere(subdivisions=5)
-    whole = manifold3d.Manifold(manifold3d.Mesh64(np.array(ball.vertices), np.array(ball.faces, dtype=np.uint64)))
-    drawn = (whole + manifold3d.Manifold.cylinder(1.2, 0.3, 0, 3000).translate((0, 0, 0.9))).to_mesh64()
-    part = Mesh(np.asarray(drawn.vert_properties)[:, :3].copy(), np.asarray(drawn.tri_verts).astype(np.int64))
+    whole = manifold3d.Manifold(
+        manifold3d.Mesh64(np.array(ball.vertices), np.array(ball.faces, dtype=np.uint64))
+    )
+    drawn = (
+        whole + manifold3d.Manifold.cylinder(1.2, 0.3, 0, 3000).translate((0, 0, 0.9))
+    ).to_mesh64()
+    part = Mesh(
+        np.asarray(drawn.vert_properties)[:, :3].copy(),
+        np.asarray(drawn.tri_verts).astype(np.int64),
+    )
     assert np.bincount(part.faces.ravel()).max() > 3000
     rough = noise(part, 0.002, seed=0)
     smooth = Mesh(remove_noise(rough.vertices, rough.faces), part.faces)
@@ -212,7 +227,9 @@ def test_coarse_bodies_are_told_apart_from_noisy_ones(index: int) -> None:
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.005, True), (0.05, False)])
-def test_what_is_full_of_holes_is_no_surface_to_look_over(sphere: Mesh, share: float, expected: bool) -> None:
+def test_what_is_full_of_holes_is_no_surface_to_look_over(
+    sphere: Mesh, share: float, expected: bool
+) -> None:
     rough = noise(sphere, 0.004, 0)
     faces = rough.faces[np.random.default_rng(0).random(len(rough.faces)) >= share]
     assert is_noisy(rough.vertices, faces) is expected

@@ -26,7 +26,9 @@ from igps.signature.signature import Signature
 
 BALL = trimesh.creation.icosphere(subdivisions=2)
 # Exactly representable in single precision; no two faces and no two vertices are alike.
-VERTICES = np.asarray(BALL.vertices * [1, 0.8, 1.3] + 0.1 * BALL.vertices**2, dtype=np.float32).astype(np.float64)
+VERTICES = np.asarray(
+    BALL.vertices * [1, 0.8, 1.3] + 0.1 * BALL.vertices**2, dtype=np.float32
+).astype(np.float64)
 FACES = np.asarray(BALL.faces, dtype=np.int64)
 
 
@@ -48,7 +50,12 @@ def relative_obj() -> str:
 def polydata(version: str) -> str:
     head = f"# vtk DataFile Version {version}\na ball\nASCII\nDATASET POLYDATA\nPOINTS {len(VERTICES)} double\n"
     if version < "5":
-        return head + lines(VERTICES) + f"POLYGONS {len(FACES)} {4 * len(FACES)}\n" + lines(FACES, "3 ")
+        return (
+            head
+            + lines(VERTICES)
+            + f"POLYGONS {len(FACES)} {4 * len(FACES)}\n"
+            + lines(FACES, "3 ")
+        )
     offsets = " ".join(map(str, range(0, 3 * len(FACES) + 1, 3)))
     cells = f"POLYGONS {len(FACES) + 1} {3 * len(FACES)}\nOFFSETS vtktypeint64\n{offsets}\nCONNECTIVITY vtktypeint64\n"
     return head + lines(VERTICES) + cells + lines(FACES) + f"CELL_DATA {len(FACES)}\n"
@@ -57,7 +64,12 @@ def polydata(version: str) -> str:
 def binary_polydata() -> bytes:
     head = f"# vtk DataFile Version 3.0\na ball\nBINARY\nDATASET POLYDATA\nPOINTS {len(VERTICES)} float\n".encode()
     cells = np.column_stack([np.full(len(FACES), 3), FACES]).astype(">i4").tobytes()
-    return head + VERTICES.astype(">f4").tobytes() + f"\nPOLYGONS {len(FACES)} {4 * len(FACES)}\n".encode() + cells
+    return (
+        head
+        + VERTICES.astype(">f4").tobytes()
+        + f"\nPOLYGONS {len(FACES)} {4 * len(FACES)}\n".encode()
+        + cells
+    )
 
 
 def polydata_of_vtk_9() -> bytes:
@@ -65,13 +77,24 @@ def polydata_of_vtk_9() -> bytes:
     head = f"# vtk DataFile Version 5.1\nvtk output\nBINARY\nDATASET POLYDATA\nPOINTS {len(VERTICES)} float\n".encode()
     notes = b"\nMETADATA\nCOMPONENT_NAMES\nPOLYGONS\ny\nz\nINFORMATION 0\n\n"
     cells = f"POLYGONS {len(FACES) + 1} {3 * len(FACES)}\nOFFSETS vtktypeint64\n".encode()
-    cells += np.arange(0, 3 * len(FACES) + 1, 3).astype(">i8").tobytes() + b"\nCONNECTIVITY vtkIdType\n"
-    return head + VERTICES.astype(">f4").tobytes() + notes + cells + FACES.astype(">i4").tobytes() + b"\n"
+    cells += (
+        np.arange(0, 3 * len(FACES) + 1, 3).astype(">i8").tobytes() + b"\nCONNECTIVITY vtkIdType\n"
+    )
+    return (
+        head
+        + VERTICES.astype(">f4").tobytes()
+        + notes
+        + cells
+        + FACES.astype(">i4").tobytes()
+        + b"\n"
+    )
 
 
 def polydata_of_windows() -> bytes:
     """Text with notes about an array, and carriage returns, also in the blank line behind the notes."""
-    notes = "METADATA\nINFORMATION 1\nNAME L2_NORM_RANGE LOCATION vtkDataArray\nDATA 2 0 1 \n\nPOLYGONS"
+    notes = (
+        "METADATA\nINFORMATION 1\nNAME L2_NORM_RANGE LOCATION vtkDataArray\nDATA 2 0 1 \n\nPOLYGONS"
+    )
     return polydata("5.1").replace("POLYGONS", notes).replace("\n", "\r\n").encode()
 
 
@@ -93,14 +116,22 @@ def vtp(form: str) -> bytes:
         appended += np.uint32(array.nbytes).tobytes() + array.tobytes()
     points, connectivity, offsets = (text + "</DataArray>" for text in written.values())
     body = f"<PolyData><Piece><Points>{points}</Points><Polys>{connectivity}{offsets}</Polys></Piece></PolyData>"
-    tail = b"" if form == "ascii" else b'<AppendedData encoding="raw">\n_' + appended + b"\n</AppendedData>"
+    tail = (
+        b""
+        if form == "ascii"
+        else b'<AppendedData encoding="raw">\n_' + appended + b"\n</AppendedData>"
+    )
     head = '<?xml version="1.0"?><VTKFile type="PolyData" byte_order="LittleEndian">'
     return (head + body).encode() + tail + b"</VTKFile>"
 
 
 def gifti(path: Path, encoding: str) -> None:
-    points = nibabel.gifti.GiftiDataArray(VERTICES.astype("f4"), "NIFTI_INTENT_POINTSET", encoding=encoding)
-    triangles = nibabel.gifti.GiftiDataArray(FACES.astype("i4"), "NIFTI_INTENT_TRIANGLE", encoding=encoding)
+    points = nibabel.gifti.GiftiDataArray(
+        VERTICES.astype("f4"), "NIFTI_INTENT_POINTSET", encoding=encoding
+    )
+    triangles = nibabel.gifti.GiftiDataArray(
+        FACES.astype("i4"), "NIFTI_INTENT_TRIANGLE", encoding=encoding
+    )
     nibabel.save(nibabel.gifti.GiftiImage(darrays=[points, triangles]), path)
 
 
@@ -120,11 +151,17 @@ def strips_ply(order: str) -> bytes:
     """A list of strips of one triangle each, as text without an order."""
     kind = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
     head = f"ply\nformat {kind} 1.0\nelement vertex {len(VERTICES)}\nproperty float x\nproperty float y\n"
-    head += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
-    row = np.concatenate([[4 * len(FACES)], np.column_stack([FACES, np.full(len(FACES), -1)]).ravel()])
+    head += (
+        "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    )
+    row = np.concatenate(
+        [[4 * len(FACES)], np.column_stack([FACES, np.full(len(FACES), -1)]).ravel()]
+    )
     if not order:
         return (head + lines(VERTICES) + lines(row[None])).encode()
-    return head.encode() + VERTICES.astype(f"{order}f4").tobytes() + row.astype(f"{order}i4").tobytes()
+    return (
+        head.encode() + VERTICES.astype(f"{order}f4").tobytes() + row.astype(f"{order}i4").tobytes()
+    )
 
 
 SOLID = trimesh.Trimesh(VERTICES, FACES, process=False)
@@ -165,7 +202,13 @@ UNITS = {".glb": "m", ".3mf": "mm", ".gii": "mm", ".pial": "mm"}
 
 def numbers(signature: Signature) -> bytes:
     inside, outside = signature.interior, signature.surface
-    arrays = signature.eigenvalues, inside.points, inside.eigenfunctions, outside.points, outside.eigenfunctions
+    arrays = (
+        signature.eigenvalues,
+        inside.points,
+        inside.eigenfunctions,
+        outside.points,
+        outside.eigenfunctions,
+    )
     return b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
 
 
@@ -173,18 +216,25 @@ def numbers(signature: Signature) -> bytes:
 def expected(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("plain") / "plain.off"
     path.write_text(off())
-    return numbers(compute_signature(load_mesh(path), SignatureConfig(n_eigenpairs=10, min_samples=100)))
+    return numbers(
+        compute_signature(load_mesh(path), SignatureConfig(n_eigenpairs=10, min_samples=100))
+    )
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
-def test_every_format_gives_the_same_signature_to_the_byte(name: str, tmp_path: Path, expected: bytes) -> None:
+def test_every_format_gives_the_same_signature_to_the_byte(
+    name: str, tmp_path: Path, expected: bytes
+) -> None:
     WRITERS[name](tmp_path / name)
     mesh = load_mesh(tmp_path / name, LoadOptions("never"))
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
     assert len(mesh.vertices) == len(VERTICES)
     assert mesh.notes == ()
     assert mesh.unit == UNITS.get(Path(name).suffix)
-    assert numbers(compute_signature(mesh, SignatureConfig(n_eigenpairs=10, min_samples=100))) == expected
+    assert (
+        numbers(compute_signature(mesh, SignatureConfig(n_eigenpairs=10, min_samples=100)))
+        == expected
+    )
 
 
 def test_a_binary_stl_with_a_wrong_count_gives_what_is_there(tmp_path: Path) -> None:
@@ -204,7 +254,9 @@ def test_a_binary_stl_with_a_wrong_count_gives_what_is_there(tmp_path: Path) -> 
 
 def test_corners_in_one_place_are_one_vertex_in_the_order_in_which_they_come() -> None:
     generator = np.random.default_rng(0)
-    corners = generator.integers(-1, 2, (300, 3)) * generator.choice([1.0, -1.0], (300, 3))  # zeros of both signs
+    corners = generator.integers(-1, 2, (300, 3)) * generator.choice(
+        [1.0, -1.0], (300, 3)
+    )  # zeros of both signs
     vertices, faces = merged(corners)
     np.testing.assert_array_equal(vertices[faces.ravel()], corners)
     places = list(dict.fromkeys(map(tuple, corners.tolist())))
@@ -216,12 +268,19 @@ def test_volumes_of_cells_give_the_surface_around_them(tmp_path: Path) -> None:
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     cube = np.vstack([square, square + np.array([0, 0, 1])])
     twice = np.vstack([cube, square + np.array([0, 0, 2])])
-    hexahedra = meshio.Mesh(twice, [("hexahedron", [[0, 1, 2, 3, 4, 5, 6, 7], [4, 5, 6, 7, 8, 9, 10, 11]])])
+    hexahedra = meshio.Mesh(
+        twice, [("hexahedron", [[0, 1, 2, 3, 4, 5, 6, 7], [4, 5, 6, 7, 8, 9, 10, 11]])]
+    )
     wedges = meshio.Mesh(cube, [("wedge", [[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]])])
     tips = np.vstack([square, [[0.5, 0.5, 1], [0.5, 0.5, -1]]])
     pyramids = meshio.Mesh(tips, [("pyramid", [[0, 1, 2, 3, 4], [0, 3, 2, 1, 5]])])
     tetrahedra = meshio.Mesh(tips, [("tetra", [[0, 1, 2, 4], [0, 2, 3, 4]])])
-    for cells, n_faces, volume in ((hexahedra, 20, 2), (wedges, 12, 1), (pyramids, 8, 2 / 3), (tetrahedra, 6, 1 / 3)):
+    for cells, n_faces, volume in (
+        (hexahedra, 20, 2),
+        (wedges, 12, 1),
+        (pyramids, 8, 2 / 3),
+        (tetrahedra, 6, 1 / 3),
+    ):
         for suffix in ("vtk", "vtu"):
             meshio.write(tmp_path / f"cells.{suffix}", cells)
             mesh = load_mesh(tmp_path / f"cells.{suffix}")
@@ -233,7 +292,9 @@ def test_volumes_of_cells_give_the_surface_around_them(tmp_path: Path) -> None:
 def test_a_strip_of_a_ply_file_turns_its_triangles_alike(tmp_path: Path) -> None:
     head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     head += "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
-    (tmp_path / "a.ply").write_text(head + "0 0 0\n1 0 0\n0 1 0\n0 0 1\n9 1 0 2 3 1 0 -1 0 1\n")  # the last is none
+    (tmp_path / "a.ply").write_text(
+        head + "0 0 0\n1 0 0\n0 1 0\n0 0 1\n9 1 0 2 3 1 0 -1 0 1\n"
+    )  # the last is none
     mesh = load_mesh(tmp_path / "a.ply", LoadOptions(mend="never"))
     strip = trimesh.util.triangle_strips_to_faces([[1, 0, 2, 3, 1, 0]])
     np.testing.assert_array_equal(mesh.faces, strip)
@@ -262,14 +323,27 @@ FAULTY = {
     "four.off": (b"4" + off().replace("\n3 ", " 2\n3 ").encode(), "4OFF"),
     "binary.off": (b"OFF BINARY\n\0\0\0\4\0\0\0\4\0\0\0\0" + bytes(112), "OFF BINARY"),
     "strips.ply": (strips_ply("")[:-40], "declares faces"),
-    "cut.ply": (trimesh.exchange.ply.export_ply(SOLID, encoding="ascii")[:-40], "expected .* faces, got .* lines"),
+    "cut.ply": (
+        trimesh.exchange.ply.export_ply(SOLID, encoding="ascii")[:-40],
+        "expected .* faces, got .* lines",
+    ),
     "cut.vtk": (polydata("3.0")[:4000].encode(), "expected .* numbers, got"),
-    "huge.vtk": (b"# vtk DataFile Version 3.0\nx\nBINARY\nDATASET POLYDATA\nPOINTS 1000000000 float\n", "numbers, got"),
-    "image.vtk": (b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET STRUCTURED_POINTS\n", "STRUCTURED_POINTS"),
-    "cut.vtp": (vtp("raw").replace(np.uint32(12 * len(VERTICES)).tobytes(), b"\xff\xff\xff\x7f", 1), "bytes, got"),
+    "huge.vtk": (
+        b"# vtk DataFile Version 3.0\nx\nBINARY\nDATASET POLYDATA\nPOINTS 1000000000 float\n",
+        "numbers, got",
+    ),
+    "image.vtk": (
+        b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET STRUCTURED_POINTS\n",
+        "STRUCTURED_POINTS",
+    ),
+    "cut.vtp": (
+        vtp("raw").replace(np.uint32(12 * len(VERTICES)).tobytes(), b"\xff\xff\xff\x7f", 1),
+        "bytes, got",
+    ),
     "lz4.vtu": (b'<VTKFile compressor="vtkLZ4DataCompressor"/>', "vtkLZ4DataCompressor"),
     "curved.vtk": (
-        b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 6 float\n" + b"0 0 1\n" * 6
+        b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 6 float\n"
+        + b"0 0 1\n" * 6
         + b"CELLS 1 7\n6 0 1 2 3 4 5\nCELL_TYPES 1\n22\n",
         "type 22",
     ),
@@ -277,17 +351,28 @@ FAULTY = {
         b"<GIFTI><DataArray Intent='NIFTI_INTENT_POINTSET' DataType='NIFTI_TYPE_INT32' Dimensionality='7'/></GIFTI>",
         "7 axes",
     ),
-    "map.gii": (b"<GIFTI><DataArray Intent='NIFTI_INTENT_SHAPE'/></GIFTI>", "expected points and triangles"),
+    "map.gii": (
+        b"<GIFTI><DataArray Intent='NIFTI_INTENT_SHAPE'/></GIFTI>",
+        "expected points and triangles",
+    ),
     "lh.white": (b"\xff\xff\xfemade\n\n" + b"\x7f\xff\xff\xff" * 2, "expected .* vertices"),
     "zero.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "counted from 1"),
-    "entities.vtu": (b'<!DOCTYPE a [<!ENTITY b "bb"><!ENTITY c "&b;&b;">]><VTKFile>&c;</VTKFile>', "entity"),
-    "file.gii": (b'<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]><GIFTI>&b;</GIFTI>', "entity"),
+    "entities.vtu": (
+        b'<!DOCTYPE a [<!ENTITY b "bb"><!ENTITY c "&b;&b;">]><VTKFile>&c;</VTKFile>',
+        "entity",
+    ),
+    "file.gii": (
+        b'<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]><GIFTI>&b;</GIFTI>',
+        "entity",
+    ),
     "empty.3mf": (b"PK\x05\x06" + bytes(18), "no model"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", sorted(FAULTY))
-def test_what_is_wrong_with_a_file_is_told_in_a_sentence_that_names_it(name: str, tmp_path: Path) -> None:
+def test_what_is_wrong_with_a_file_is_told_in_a_sentence_that_names_it(
+    name: str, tmp_path: Path
+) -> None:
     content, words = FAULTY[name]
     (tmp_path / name).write_bytes(content)
     with pytest.raises(MeshError, match=rf"{name}: not readable as .*{words}.*\. .*[Ee]xport"):
@@ -312,7 +397,10 @@ def test_arrays_in_one_place_count_as_often_as_they_are_named(tmp_path: Path) ->
     head, piece, tail = re.split(rb"(<Piece>.*</Piece>)", vtp("raw"), maxsplit=1)
     (tmp_path / "a.vtp").write_bytes(head + 20 * piece + tail)
     once = 12 * len(VERTICES) + 32 * len(FACES)
-    assert len(list_bodies(tmp_path / "a.vtp", LoadOptions(bodies="objects", max_unpacked=20 * once))) == 20
+    assert (
+        len(list_bodies(tmp_path / "a.vtp", LoadOptions(bodies="objects", max_unpacked=20 * once)))
+        == 20
+    )
     with pytest.raises(MeshError, match=r"a\.vtp: unpacks to .*max_unpacked="):
         load_mesh(tmp_path / "a.vtp", LoadOptions(max_unpacked=10 * once))
 
@@ -345,15 +433,22 @@ def ply_of(vertices: np.ndarray, faces: list[list[int]], order: str = "") -> byt
     kind = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
     head = f"ply\nformat {kind} 1.0\ncomment made here\nelement vertex {len(vertices)}\n"
     head += "property float x\nproperty float y\nproperty float z\nproperty uchar red\n"
-    head += f"element face {len(faces)}\nproperty short group\nproperty list uchar int vertex_indices\n"
+    head += (
+        f"element face {len(faces)}\nproperty short group\nproperty list uchar int vertex_indices\n"
+    )
     head += "property uchar red\nend_header\n"
     if not order:
         rows = "".join(" ".join(map(str, row)) + " 9\n" for row in vertices.tolist())
-        return (head + rows + "".join(f"5 {len(row)} {' '.join(map(str, row))} 9\n" for row in faces)).encode()
+        return (
+            head + rows + "".join(f"5 {len(row)} {' '.join(map(str, row))} 9\n" for row in faces)
+        ).encode()
     body = b"".join(np.array(row, f"{order}f4").tobytes() + b"\x09" for row in vertices)
     for row in faces:
         body += (
-            np.array(5, f"{order}i2").tobytes() + bytes([len(row)]) + np.array(row, f"{order}i4").tobytes() + b"\x09"
+            np.array(5, f"{order}i2").tobytes()
+            + bytes([len(row)])
+            + np.array(row, f"{order}i4").tobytes()
+            + b"\x09"
         )
     return head.encode() + body
 
@@ -361,7 +456,10 @@ def ply_of(vertices: np.ndarray, faces: list[list[int]], order: str = "") -> byt
 def polygon_files() -> dict[str, bytes]:
     vertices, faces = bracket()
     places = "".join(" ".join(map(str, row)) + "\n" for row in vertices.tolist())
-    size, offsets = sum(len(row) + 1 for row in faces), " ".join(map(str, np.cumsum([len(row) for row in faces])))
+    size, offsets = (
+        sum(len(row) + 1 for row in faces),
+        " ".join(map(str, np.cumsum([len(row) for row in faces]))),
+    )
     arrays = (
         f'<Points><DataArray type="Float64" NumberOfComponents="3" format="ascii">{places}</DataArray></Points><Polys>'
         f'<DataArray type="Int64" Name="connectivity" format="ascii">{text_of(faces, False)}</DataArray>'
@@ -394,17 +492,25 @@ def test_concave_polygons_of_any_format_do_not_fold(name: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("n_corners", [3, 4])
-def test_triangles_and_squares_are_what_trimesh_makes_of_them(n_corners: int, tmp_path: Path) -> None:
+def test_triangles_and_squares_are_what_trimesh_makes_of_them(
+    n_corners: int, tmp_path: Path
+) -> None:
     ball = trimesh.creation.icosphere(subdivisions=1)
     quads = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
     cube = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
     vertices, faces = (
-        (cube, quads) if n_corners == 4 else (ball.vertices.astype("f4").astype(float), ball.faces.tolist())
+        (cube, quads)
+        if n_corners == 4
+        else (ball.vertices.astype("f4").astype(float), ball.faces.tolist())
     )
     places = "".join(" ".join(map(repr, row)) + "\n" for row in vertices.tolist())
-    (tmp_path / "one.off").write_text(f"OFF\n{len(vertices)} {len(faces)} 0\n{places}{text_of(faces)}")
+    (tmp_path / "one.off").write_text(
+        f"OFF\n{len(vertices)} {len(faces)} 0\n{places}{text_of(faces)}"
+    )
     for order in ("", "<", ">"):
-        (tmp_path / f"one{'t<>'.find(order or 't')}.ply").write_bytes(ply_of(vertices, faces, order))
+        (tmp_path / f"one{'t<>'.find(order or 't')}.ply").write_bytes(
+            ply_of(vertices, faces, order)
+        )
     for path in tmp_path.iterdir():
         found, expected = load_mesh(path), trimesh.load(path, process=False)
         np.testing.assert_array_equal(found.vertices, expected.vertices)

@@ -40,31 +40,48 @@ def solid(kind: str, thickness: float) -> Solid:
         axes = r * np.array([1, 1.3, 2])
         a, b, c = axes
         area = 4 * np.pi * float(elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2))
-        return Solid(lambda p: ((p / axes) ** 2).sum(-1) < 1, axes, 4 / 3 * np.pi * axes.prod(), area)
+        return Solid(
+            lambda p: ((p / axes) ** 2).sum(-1) < 1, axes, 4 / 3 * np.pi * axes.prod(), area
+        )
     if kind == "torus":
         ring = 2.5 * r
         return Solid(
             lambda p: (np.hypot(p[..., 0], p[..., 1]) - ring) ** 2 + p[..., 2] ** 2 < r**2,
-            np.array([ring + r, ring + r, r]), 2 * np.pi**2 * ring * r**2, 4 * np.pi**2 * ring * r, 1,
-        )  # fmt: skip
+            np.array([ring + r, ring + r, r]),
+            2 * np.pi**2 * ring * r**2,
+            4 * np.pi**2 * ring * r,
+            1,
+        )
     if kind == "capsule":
         return Solid(
-            lambda p: np.hypot(p[..., 0], p[..., 1]) ** 2 + np.maximum(abs(p[..., 2]) - 2 * r, 0) ** 2 < r**2,
-            np.array([r, r, 3 * r]), (4 + 4 / 3) * np.pi * r**3, (8 + 4) * np.pi * r**2,
-        )  # fmt: skip
+            lambda p: (
+                np.hypot(p[..., 0], p[..., 1]) ** 2 + np.maximum(abs(p[..., 2]) - 2 * r, 0) ** 2
+                < r**2
+            ),
+            np.array([r, r, 3 * r]),
+            (4 + 4 / 3) * np.pi * r**3,
+            (8 + 4) * np.pi * r**2,
+        )
     if kind == "rod":
         return Solid(
             lambda p: (np.hypot(p[..., 0], p[..., 1]) < r) & (abs(p[..., 2]) < 4 * r),
-            np.array([r, r, 4 * r]), 8 * np.pi * r**3, 18 * np.pi * r**2,
-        )  # fmt: skip
+            np.array([r, r, 4 * r]),
+            8 * np.pi * r**3,
+            18 * np.pi * r**2,
+        )
     half = r * np.array([3, 4, 1])
     a, b, c = half
-    return Solid(lambda p: (abs(p) < half).all(-1), half, 8 * a * b * c, 8 * (a * b + b * c + a * c))
+    return Solid(
+        lambda p: (abs(p) < half).all(-1), half, 8 * a * b * c, 8 * (a * b + b * c + a * c)
+    )
 
 
 def ball(radius: float) -> Solid:
     return Solid(
-        lambda p: (p**2).sum(-1) < radius**2, np.full(3, radius), 4 / 3 * np.pi * radius**3, 4 * np.pi * radius**2
+        lambda p: (p**2).sum(-1) < radius**2,
+        np.full(3, radius),
+        4 / 3 * np.pi * radius**3,
+        4 * np.pi * radius**2,
     )
 
 
@@ -98,7 +115,9 @@ KINDS = ("ellipsoid", "torus", "capsule", "rod", "plate")
 
 @pytest.mark.parametrize("length", [1, 2.5, 6])
 @pytest.mark.parametrize(("n_voxels", "most"), [(9, (0.01, 0.02)), (4, (0.05, 0.08))])
-def test_voxelised_bodies_give_back_volume_and_area(length: float, n_voxels: int, most: tuple[float, float]) -> None:
+def test_voxelised_bodies_give_back_volume_and_area(
+    length: float, n_voxels: int, most: tuple[float, float]
+) -> None:
     rng = np.random.default_rng([n_voxels, int(length)])
     matrix = 0.8 * np.diag(rng.permutation([1, 1, length]))
     found = [errors(solid(kind, 0.8 * n_voxels * length), matrix, rng) for kind in KINDS]
@@ -145,7 +164,9 @@ def test_a_thin_ring_in_a_large_box_needs_little_memory_and_has_no_seams() -> No
     """It is solved in blocks; as a whole it took 88 bytes a voxel, so that the vessels of a CT needed 10 GB."""
     tube, ring = 2.2, 100.0
     turn = Rotation.from_euler("xy", [40, 35], degrees=True).as_matrix()
-    index = np.stack(np.meshgrid(*(np.arange(-105.0, 106),) * 3, indexing="ij"), axis=-1).astype(np.float32)
+    index = np.stack(np.meshgrid(*(np.arange(-105.0, 106),) * 3, indexing="ij"), axis=-1).astype(
+        np.float32
+    )
     x, y, z = np.moveaxis((index + 0.3) @ turn.astype(np.float32), -1, 0)
     mask = (np.hypot(x, y) - ring) ** 2 + z**2 < tube**2
     del index, x, y, z
@@ -230,7 +251,9 @@ def test_small_pieces_apart_are_dropped_and_large_ones_stay() -> None:
     assert Mesh(*largest(vertices, faces)).volume == pytest.approx(16**3, rel=0.01)
 
 
-@pytest.mark.parametrize(("more", "lost"), [(0, "100% of the voxels lie in 121"), (20, "94% of the voxels lie in 120")])
+@pytest.mark.parametrize(
+    ("more", "lost"), [(0, "100% of the voxels lie in 121"), (20, "94% of the voxels lie in 120")]
+)
 def test_a_label_that_is_mostly_small_pieces_is_refused(more: int, lost: str) -> None:
     """Many small lesions: dropping all of them, or all but one, would be wrong."""
     mask = np.zeros((54, 54, 36), dtype=np.uint8)
@@ -238,14 +261,18 @@ def test_a_label_that_is_mostly_small_pieces_is_refused(more: int, lost: str) ->
     for corner in np.ndindex(5, 6, 4):
         x, y, z = 9 * np.array(corner) + (9, 0, 0)
         mask[x : x + 4, y : y + 4, z : z + 4] = 1
-    with pytest.raises(MeshError, match=rf"lesions: {lost} separate pieces, each below 2% .* --bodies pieces; or"):
+    with pytest.raises(
+        MeshError, match=rf"lesions: {lost} separate pieces, each below 2% .* --bodies pieces; or"
+    ):
         voxel_surface(mask, joins=True, name="lesions")
     pieces = label_bodies(LabelVolume((mask,), np.eye(4)), LoadOptions(bodies="pieces"))
     assert len(pieces) == 121
     assert pieces[0].made().fault is None
 
 
-def rod_across(angle: float, radius: float = 6.0, length: float = 30.0, n: int = 52) -> NDArray[np.bool_]:
+def rod_across(
+    angle: float, radius: float = 6.0, length: float = 30.0, n: int = 52
+) -> NDArray[np.bool_]:
     """A capsule so many degrees off the third axis, in voxels of side 1."""
     axis = np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
     points = np.moveaxis(np.indices((n, n, n)), 0, -1) - (n - 1) / 2
@@ -253,7 +280,9 @@ def rod_across(angle: float, radius: float = 6.0, length: float = 30.0, n: int =
     return np.asarray(np.linalg.norm(points - along[..., None] * axis, axis=-1) < radius)
 
 
-@pytest.mark.parametrize(("angle", "axis", "n_missed"), [(0, 2, 3), (25, 2, 1), (40, 2, 2), (60, 0, 2)])
+@pytest.mark.parametrize(
+    ("angle", "axis", "n_missed"), [(0, 2, 3), (25, 2, 1), (40, 2, 2), (60, 0, 2)]
+)
 def test_slices_that_were_missed_are_filled(angle: float, axis: int, n_missed: int) -> None:
     """Closed forms of the whole capsule; joining the parts by a bar would lose a tenth of the volume and add area."""
     mask = rod_across(angle)
@@ -289,7 +318,9 @@ def test_a_bar_is_as_thick_on_every_grid(side: float) -> None:
     vertices, faces, notes = voxel_surface(mask, affine, joins=True)
     assert notes == ("joined 2 pieces by bars",)
     assert Mesh(vertices, faces).genus == 0
-    ((_, y, z),) = (line.T for line in trimesh.Trimesh(vertices, faces).section([1, 0, 0], [0, 0, 0]).discrete)
+    ((_, y, z),) = (
+        line.T for line in trimesh.Trimesh(vertices, faces).section([1, 0, 0], [0, 0, 0]).discrete
+    )
     section = abs(y[1:] @ z[:-1] - y[:-1] @ z[1:]) / 2
     assert np.sqrt(section / np.pi) == pytest.approx(1.5, abs=0.3)
 

@@ -54,7 +54,9 @@ def under_limits(program: str, most: int, *words: str) -> list[str]:
         "    resource.setrlimit(kind, (soft, hard))",
     ]
     command = [sys.executable, "-c", "\n".join(lines), *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout.splitlines()
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=True
+    ).stdout.splitlines()
 
 
 def test_ten_million_triangles_in_two_gibibytes(tmp_path: Path) -> None:
@@ -62,7 +64,9 @@ def test_ten_million_triangles_in_two_gibibytes(tmp_path: Path) -> None:
     with file.open("wb") as stream:  # a sparse file: only its head is on the disk
         stream.write(bytes(80) + (10_000_000).to_bytes(4, "little"))
         stream.truncate(84 + 50 * 10_000_000)
-    program = "try:\n    check_memory(Path(sys.argv[1]))\nexcept ValueError as error:\n    print(error)"
+    program = (
+        "try:\n    check_memory(Path(sys.argv[1]))\nexcept ValueError as error:\n    print(error)"
+    )
     messages = under_limits(program, 2 << 30, str(file))
     assert len(messages) == 2
     for message in messages:
@@ -91,7 +95,11 @@ def test_some_memory_is_available() -> None:
 def group(folder: Path, version: int, most: object, used: int, cached: int) -> None:
     """Files of a control group."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = ("memory.max", "memory.current") if version == 2 else ("memory.limit_in_bytes", "memory.usage_in_bytes")
+    names = (
+        ("memory.max", "memory.current")
+        if version == 2
+        else ("memory.limit_in_bytes", "memory.usage_in_bytes")
+    )
     for name, value in zip(names, (most, used), strict=True):
         (folder / name).write_text(f"{value}\n")
     cache = "inactive_file" if version == 2 else "total_inactive_file"
@@ -137,7 +145,8 @@ def test_a_grid_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(limits, "available_memory", lambda: free)
     assert len(interior_samples(mesh, 100)) > 100_000  # 40 MB
     with pytest.raises(
-        MeshError, match=r"ball: a grid of 8,000,000 cells needs 0\.3 GB of memory, and 0\.1 GB are free"
+        MeshError,
+        match=r"ball: a grid of 8,000,000 cells needs 0\.3 GB of memory, and 0\.1 GB are free",
     ):
         interior_samples(mesh, 200)
     # Nor is a grid refined into what does not fit.

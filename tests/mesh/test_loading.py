@@ -27,7 +27,11 @@ def test_missing_and_unreadable_files(tmp_path: Path) -> None:
         load_mesh(tmp_path / "nowhere.off")
     with pytest.raises(MeshError, match="expected a file, got a folder"):
         load_mesh(tmp_path)
-    for name, text in (("blank.off", "\n"), ("words.off", "hello"), ("cut.ply", "ply\nformat ascii 1.0\n")):
+    for name, text in (
+        ("blank.off", "\n"),
+        ("words.off", "hello"),
+        ("cut.ply", "ply\nformat ascii 1.0\n"),
+    ):
         (tmp_path / name).write_text(text)
         with pytest.raises(MeshError, match=rf"{name}: not readable"):
             load_mesh(tmp_path / name)
@@ -36,7 +40,9 @@ def test_missing_and_unreadable_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "xyz", "3mf"])
 def test_an_empty_file_is_called_empty(tmp_path: Path, suffix: str) -> None:
     (tmp_path / f"none.{suffix}").write_bytes(b"")
-    with pytest.raises(MeshError, match=rf"none\.{suffix}: the file is empty \(0 bytes\)\. Export it again"):
+    with pytest.raises(
+        MeshError, match=rf"none\.{suffix}: the file is empty \(0 bytes\)\. Export it again"
+    ):
         load_mesh(tmp_path / f"none.{suffix}")
 
 
@@ -49,14 +55,20 @@ def test_formats_keep_vertices_in_order(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_array_equal(mesh.faces, surface.faces)
 
 
-@pytest.mark.parametrize(("suffix", "comment"), [("off", "# {}"), ("obj", "# {}"), ("ply", "comment {}")])
+@pytest.mark.parametrize(
+    ("suffix", "comment"), [("off", "# {}"), ("obj", "# {}"), ("ply", "comment {}")]
+)
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "shift_jis"])
-def test_comments_may_be_in_any_encoding(tmp_path: Path, suffix: str, comment: str, encoding: str) -> None:
+def test_comments_may_be_in_any_encoding(
+    tmp_path: Path, suffix: str, comment: str, encoding: str
+) -> None:
     surface = trimesh.creation.icosphere(subdivisions=1)
     options = {"encoding": "ascii"} if suffix == "ply" else {}
     text = surface.export(file_type=suffix, **options)
     lines = (text if isinstance(text, str) else text.decode()).split("\n")
-    words = {"utf-8": "Größe – 大きさ", "latin-1": "Größe, né à Paris", "shift_jis": "球の大きさ"}[encoding]
+    words = {"utf-8": "Größe – 大きさ", "latin-1": "Größe, né à Paris", "shift_jis": "球の大きさ"}[
+        encoding
+    ]
     lines.insert(2 if suffix == "ply" else 1, comment.format(words))
     path = tmp_path / f"mesh.{suffix}"
     path.write_bytes("\n".join(lines).encode(encoding))
@@ -64,21 +76,29 @@ def test_comments_may_be_in_any_encoding(tmp_path: Path, suffix: str, comment: s
     np.testing.assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
     np.testing.assert_array_equal(mesh.faces, surface.faces)
     (tmp_path / "cloud.xyz").write_bytes(f"# {words}\n0 0 1\n0 1 0\n".encode(encoding))
-    np.testing.assert_array_equal(read_surface(tmp_path / "cloud.xyz").vertices, [[0, 0, 1], [0, 1, 0]])
+    np.testing.assert_array_equal(
+        read_surface(tmp_path / "cloud.xyz").vertices, [[0, 0, 1], [0, 1, 0]]
+    )
 
 
 def test_a_byte_order_mark_costs_no_vertex(tmp_path: Path) -> None:
     """Editors on Windows put it first, before the first vertex where no comment stands above."""
     surface = trimesh.creation.icosphere(subdivisions=1)
-    text = "\n".join(line for line in surface.export(file_type="obj").split("\n") if not line.startswith("#"))
+    text = "\n".join(
+        line for line in surface.export(file_type="obj").split("\n") if not line.startswith("#")
+    )
     (tmp_path / "mesh.obj").write_text(text, encoding="utf-8-sig")
     assert (tmp_path / "mesh.obj").read_bytes()[3:5] == b"v "
-    np.testing.assert_allclose(load_mesh(tmp_path / "mesh.obj").vertices, surface.vertices, atol=1e-6)
+    np.testing.assert_allclose(
+        load_mesh(tmp_path / "mesh.obj").vertices, surface.vertices, atol=1e-6
+    )
 
 
 def test_quads_become_triangles(tmp_path: Path) -> None:
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
-    quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]])
+    quads = np.array(
+        [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]]
+    )
     mesh = load_mesh(write_off(tmp_path / "cube.off", corners, quads))
     assert mesh.faces.shape == (12, 3)
     assert mesh.volume == pytest.approx(1)
@@ -89,7 +109,11 @@ def test_quads_become_triangles(tmp_path: Path) -> None:
 def test_polygons_with_corners_turned_inwards_do_not_fold(start: int, tmp_path: Path) -> None:
     """Prisms over stars, whose area and volume are those of the polygon (Gauss's formula)."""
     random = np.random.default_rng(start)
-    angle = np.sort(random.uniform(0, 2 * np.pi, 4)) if start == 3 else np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    angle = (
+        np.sort(random.uniform(0, 2 * np.pi, 4))
+        if start == 3
+        else np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    )
     radius = np.where(np.arange(len(angle)) % 2, 1.0, random.uniform(0.1, 0.5, len(angle)))
     x, y = np.roll(radius * (np.cos(angle), np.sin(angle)), start, axis=1)
     area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
@@ -110,7 +134,9 @@ def test_polygons_with_corners_turned_inwards_do_not_fold(start: int, tmp_path: 
 def test_a_polygon_around_a_hole_does_not_fold(tmp_path: Path) -> None:
     """A square with a square hole, reached by an edge that is run through twice, as CAD programs write it."""
     square = [(0, 0), (3, 0), (3, 3), (0, 3), (1, 1), (1, 2), (2, 2), (2, 1)]
-    (tmp_path / "ring.obj").write_text("\n".join(f"v {x} {y} 0" for x, y in square) + "\nf 1 2 3 4 1 5 6 7 8 5\n")
+    (tmp_path / "ring.obj").write_text(
+        "\n".join(f"v {x} {y} 0" for x, y in square) + "\nf 1 2 3 4 1 5 6 7 8 5\n"
+    )
     corners = (surface := read_surface(tmp_path / "ring.obj")).vertices[surface.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (normals[:, 2] >= 0).all()
@@ -118,14 +144,20 @@ def test_a_polygon_around_a_hole_does_not_fold(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("n_corners", [60, 5000])
-def test_a_polygon_that_crosses_itself_or_has_many_corners_is_cut_all_the_same(n_corners: int, tmp_path: Path) -> None:
+def test_a_polygon_that_crosses_itself_or_has_many_corners_is_cut_all_the_same(
+    n_corners: int, tmp_path: Path
+) -> None:
     """Into triangles that use every corner, each side of the polygon once."""
     places = np.random.default_rng(0).normal(size=(n_corners, 2)).tolist()
     face = " ".join(str(i + 1) for i in range(n_corners))
-    (tmp_path / "scribble.obj").write_text("\n".join(f"v {x!r} {y!r} 0" for x, y in places) + f"\nf {face}\n")
+    (tmp_path / "scribble.obj").write_text(
+        "\n".join(f"v {x!r} {y!r} 0" for x, y in places) + f"\nf {face}\n"
+    )
     faces = read_surface(tmp_path / "scribble.obj").faces
     assert len(faces) == n_corners - 2
-    sides = {(int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)}
+    sides = {
+        (int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)
+    }
     assert {(i, (i + 1) % n_corners) for i in range(n_corners)} <= sides
     assert len(sides) == 3 * len(faces)
 
@@ -133,7 +165,9 @@ def test_a_polygon_that_crosses_itself_or_has_many_corners_is_cut_all_the_same(n
 def by_trimesh(text: str, path: Path) -> trimesh.Trimesh:
     """The surface of an OFF file; it knows no comments but in the first line, and reads files that are cut short."""
     text = "\n".join(line.partition("#")[0] for line in text.split("\n"))
-    (n_vertices, n_faces, *_), *rows = [row.split() for row in text.partition("OFF")[2].splitlines() if row.strip()]
+    (n_vertices, n_faces, *_), *rows = [
+        row.split() for row in text.partition("OFF")[2].splitlines() if row.strip()
+    ]
     faces = rows[int(n_vertices) :][: int(n_faces)]
     if len(faces) < int(n_faces) or any(len(face) <= int(face[0]) for face in faces):
         raise ValueError("cut short")
@@ -154,7 +188,17 @@ def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:
         plain.replace("\n", "\n\n"),
         plain.replace("OFF\n", "OFF "),
         "# a ball\n" + plain,
-        "\n".join([*lines[:2], "# vertices", *lines[2:14], "# faces", *lines[14:-1], "# the last", lines[-1]]),
+        "\n".join(
+            [
+                *lines[:2],
+                "# vertices",
+                *lines[2:14],
+                "# faces",
+                *lines[14:-1],
+                "# the last",
+                lines[-1],
+            ]
+        ),
         plain + "# a ball\n",
         plain + "3 0 1 2\n",
         "\n".join(lines[:-1]),
@@ -174,7 +218,9 @@ def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:
     for _ in range(800):
         text = list(plain)
         for place in random.integers(0, len(text), random.integers(1, 4)):
-            text[place] = random.choice(["", random.choice(alphabet), text[place] + random.choice(alphabet)])
+            text[place] = random.choice(
+                ["", random.choice(alphabet), text[place] + random.choice(alphabet)]
+            )
         texts.append("".join(text))
     outcomes = []
     for text in texts:
@@ -207,8 +253,12 @@ def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:
     rows = [f"{x} {y} {z} {z}" for x, y, z in TETRAHEDRON]
     rows += [f"3 {a} {b} {c} 6 0.{i} 0 1 0.{i} 0.{i} 1" for i, (a, b, c) in enumerate(FACES)]
     (tmp_path / "seams.ply").write_text(head + "end_header\n" + "\n".join(rows) + "\n")
-    np.testing.assert_allclose(load_mesh(tmp_path / "seams.ply", LoadOptions(mend="never")).vertices, TETRAHEDRON)
-    np.testing.assert_allclose(vertex_values.read(tmp_path / "seams.ply")["height"], np.array(TETRAHEDRON)[:, 2])
+    np.testing.assert_allclose(
+        load_mesh(tmp_path / "seams.ply", LoadOptions(mend="never")).vertices, TETRAHEDRON
+    )
+    np.testing.assert_allclose(
+        vertex_values.read(tmp_path / "seams.ply")["height"], np.array(TETRAHEDRON)[:, 2]
+    )
 
 
 @pytest.mark.parametrize("away", [0.0, 1e-9])
@@ -234,12 +284,16 @@ def test_each_fault_is_mended_at_any_scale(tmp_path: Path, scale: float) -> None
     faulty[::3] = faulty[::3, ::-1]
     faulty[5, 0] = len(vertices)
     faulty = np.vstack([faulty, faulty[7], [[0, 0, 1]]])
-    vertices = np.vstack([vertices, vertices[faces[5, 0] if 5 % 3 else faces[5, 2]], [[4, 4, 4]]]) * scale
+    vertices = (
+        np.vstack([vertices, vertices[faces[5, 0] if 5 % 3 else faces[5, 2]], [[4, 4, 4]]]) * scale
+    )
     mesh = load_mesh(write_off(tmp_path / "faulty.off", vertices, faulty))
     assert mesh.volume == pytest.approx(surface.volume * scale**3, rel=1e-6)
     assert len(mesh.vertices) == len(surface.vertices)
     said = " ".join(mesh.notes)
-    assert all(word in said for word in ("welded 1", "degenerate", "duplicate", "unreferenced", "orient"))
+    assert all(
+        word in said for word in ("welded 1", "degenerate", "duplicate", "unreferenced", "orient")
+    )
 
 
 def test_largest_component_is_that_of_the_largest_area(tmp_path: Path) -> None:
@@ -263,9 +317,13 @@ def test_open_files_are_read_when_allowed(tmp_path: Path) -> None:
     assert len(mesh.faces) == 3
 
 
-def test_the_largest_component_of_loose_triangles_is_what_they_make_together(tmp_path: Path) -> None:
+def test_the_largest_component_of_loose_triangles_is_what_they_make_together(
+    tmp_path: Path,
+) -> None:
     small, large = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 2, 3))
-    beside = trimesh.creation.box((1, 1, 1)).apply_translation([0, 1.5, 0])  # it touches the large one
+    beside = trimesh.creation.box((1, 1, 1)).apply_translation(
+        [0, 1.5, 0]
+    )  # it touches the large one
     vertices = np.concatenate([small.triangles + 9, large.triangles]).reshape(-1, 3)
     path = write_off(tmp_path / "loose.off", vertices, np.arange(len(vertices)).reshape(-1, 3))
     assert load_mesh(path, LoadOptions(component="largest")).volume == pytest.approx(6)
@@ -275,7 +333,9 @@ def test_the_largest_component_of_loose_triangles_is_what_they_make_together(tmp
 
 
 def test_unknown_component_is_refused() -> None:
-    with pytest.raises(ValueError, match="component: expected one of largest, None, got 'smallest'"):
+    with pytest.raises(
+        ValueError, match="component: expected one of largest, None, got 'smallest'"
+    ):
         LoadOptions(component="smallest")  # type: ignore[arg-type]
 
 
@@ -286,13 +346,20 @@ def test_unknown_way_to_mend_is_refused() -> None:
 
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("suffix", ["xyz", "ply"])
-def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path: Path, suffix: str, normals: bool) -> None:
+def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(
+    tmp_path: Path, suffix: str, normals: bool
+) -> None:
     surface = trimesh.creation.icosphere(subdivisions=4)
     rows = np.asarray(surface.vertices) * [1, 0.8, 1.3]
     names = ["x", "y", "z"]
     if normals:
         rows, names = np.hstack([rows, surface.vertex_normals]), [*names, "nx", "ny", "nz"]
-    header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *(f"property float {n}" for n in names)]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(rows)}",
+        *(f"property float {n}" for n in names),
+    ]
     lines = [*header, "end_header"] if suffix == "ply" else []
     lines += [" ".join(f"{x:.7f}" for x in row) for row in rows]
     path = tmp_path / f"cloud.{suffix}"
@@ -323,7 +390,9 @@ def test_too_few_vertices_for_the_eigenpairs_are_made_more(tmp_path: Path) -> No
     assert mesh.area == pytest.approx(6)
 
 
-def test_a_format_without_its_module_says_which_extra_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_format_without_its_module_says_which_extra_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "part.dae").write_bytes(b"<COLLADA/>")
 
     def missing(*_: object, **__: object) -> None:
@@ -341,11 +410,15 @@ def test_places_that_single_precision_rounds_off_are_told(where: str, tmp_path: 
     vertices = ball.vertices + (0.0 if where == "at the origin" else np.array([5e5, 5.4e6, 0.0]))
     if where == "far in double precision":
         text = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
-        (tmp_path / "a.obj").write_text(text + "".join(f"f {a} {b} {c}\n" for a, b, c in (ball.faces + 1).tolist()))
+        (tmp_path / "a.obj").write_text(
+            text + "".join(f"f {a} {b} {c}\n" for a, b, c in (ball.faces + 1).tolist())
+        )
         assert load_mesh(tmp_path / "a.obj").notes == ()
         return
     trimesh.Trimesh(vertices, ball.faces, process=False).export(tmp_path / "a.ply")
     mesh = load_mesh(tmp_path / "a.ply")
     steps = np.diff(np.unique(mesh.vertices[:, 1]))
-    told = [note for note in mesh.notes if "coordinates are rounded to 0.5, 1.4% of the size" in note]
+    told = [
+        note for note in mesh.notes if "coordinates are rounded to 0.5, 1.4% of the size" in note
+    ]
     assert bool(told) == (steps.min() == 0.5) == (where == "far")

@@ -36,7 +36,9 @@ def same_surface(a: Mesh, b: Mesh) -> bool:
         rank = np.empty(len(first), dtype=int)
         rank[first] = np.arange(len(first))
         start = rank.reshape(-1, 3).argmin(axis=1)
-        turned = corners[np.arange(len(corners))[:, None], (start[:, None] + np.arange(3)) % 3].reshape(-1, 9)
+        turned = corners[
+            np.arange(len(corners))[:, None], (start[:, None] + np.arange(3)) % 3
+        ].reshape(-1, 9)
         return turned[np.lexsort(turned.T[::-1])]
 
     return len(a.faces) == len(b.faces) and bool(np.allclose(canonical(a), canonical(b), atol=2e-5))
@@ -75,7 +77,9 @@ def test_holes_that_touch_are_filled_one_by_one(sphere: Mesh, seed: int) -> None
     kept = np.ones(len(sphere.faces), dtype=bool)
     kept[np.random.default_rng(seed).choice(len(kept), len(kept) // 20, replace=False)] = False
     _, faces = fill_small_holes(sphere.vertices, sphere.faces[kept], [])
-    _, counts = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    _, counts = np.unique(
+        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
+    )
     assert (counts == 2).all()
 
 
@@ -90,7 +94,9 @@ def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere: Mesh) -> None:
     kept = sphere.faces[(away[sphere.faces] > 0.11 * np.ptp(sphere.vertices)).all(axis=1)]
     used, faces = np.unique(kept, return_inverse=True)
     faces = faces.reshape(-1, 3)
-    _, counts = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    _, counts = np.unique(
+        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
+    )
     n = int((counts == 1).sum())
     assert n > 15
     vertices, _ = fill_small_holes(sphere.vertices[used], faces, [])
@@ -121,12 +127,18 @@ def test_a_cup_is_not_filled() -> None:
     surface = trimesh.creation.icosphere(subdivisions=3)
     open_faces = np.asarray(surface.faces)[surface.triangles_center[:, 2] < 0.2]
     mesh = mend(np.asarray(surface.vertices), open_faces)
-    assert repair_steps(mesh.notes) == ("welded", "watertight")  # the cap's vertices were left unused
+    assert repair_steps(mesh.notes) == (
+        "welded",
+        "watertight",
+    )  # the cap's vertices were left unused
     assert mesh.volume < 0.1 * surface.volume
 
 
 def test_a_part_that_sticks_out_is_not_hidden() -> None:
-    surface, knob = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    surface, knob = (
+        trimesh.creation.icosphere(subdivisions=3),
+        trimesh.creation.icosphere(subdivisions=2, radius=0.3),
+    )
     knob.apply_translation([1, 0, 0])
     whole = trimesh.util.concatenate([surface, knob])
     mesh = mend(np.asarray(whole.vertices), np.asarray(whole.faces))
@@ -190,13 +202,21 @@ def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertig
     assert mend(crossing.vertices, crossing.faces).notes == ()
     mesh = mend(crossing.vertices, crossing.faces, how="always")
     assert repair_steps(mesh.notes) == ("watertight",)
-    points = np.random.default_rng(0).uniform(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), (100_000, 3))
+    points = np.random.default_rng(0).uniform(
+        mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), (100_000, 3)
+    )
     turn = np.linspace(0, 2.2, 3000)
     middles = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn), 0.3 * turn], axis=1)
     away, nearest = cKDTree(middles).query(points)
     # Without the half balls beyond the flat ends; the radius is that of a circle of the polygon's area.
-    inside = (away < 0.2 * np.sqrt(8 / np.pi * np.sin(np.pi / 8))) & (nearest > 0) & (nearest < len(middles) - 1)
-    assert mesh.volume == pytest.approx(inside.mean() * np.prod(np.ptp(mesh.vertices, axis=0)), rel=0.02)
+    inside = (
+        (away < 0.2 * np.sqrt(8 / np.pi * np.sin(np.pi / 8)))
+        & (nearest > 0)
+        & (nearest < len(middles) - 1)
+    )
+    assert mesh.volume == pytest.approx(
+        inside.mean() * np.prod(np.ptp(mesh.vertices, axis=0)), rel=0.02
+    )
     assert mesh.volume < 0.95 * crossing.volume
 
 
@@ -215,7 +235,9 @@ def coil(turns: float, pitch: float, radius: float = 0.2) -> Mesh:
     i, j = np.meshgrid(np.arange(n - 1), np.arange(around), indexing="ij")
     a, b = i * around + j, i * around + (j + 1) % around
     c, d = a + around, b + around
-    walls = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(-1, 3)
+    walls = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(
+        -1, 3
+    )
     ring, following = np.arange(around), (np.arange(around) + 1) % around
     last = (n - 1) * around
     start = np.stack([following, ring, np.full(around, n * around)], axis=1)
@@ -245,13 +267,18 @@ def test_neighbours_are_turned_alike_in_every_part(blob: Mesh) -> None:
 
 
 def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob: Mesh) -> None:
-    mesh = mend(np.vstack([blob.vertices[:9], [[1e9, 0, 0]], blob.vertices[9:]]), blob.faces + (blob.faces >= 9))
+    mesh = mend(
+        np.vstack([blob.vertices[:9], [[1e9, 0, 0]], blob.vertices[9:]]),
+        blob.faces + (blob.faces >= 9),
+    )
     assert same_surface(mesh, blob)
     assert mesh.notes == ("dropped 1 unreferenced vertices",)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.5])
-def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(blob: Mesh, share: float) -> None:
+def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(
+    blob: Mesh, share: float
+) -> None:
     generator = np.random.default_rng(0)
     corners = blob.vertices[blob.faces].reshape(-1, 3).astype(np.float32)
     moved = np.nextafter(corners, generator.choice(np.float32([-9, 9]), corners.shape))
@@ -285,10 +312,22 @@ UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], st
         lambda: (np.outer(np.linspace(0, 1, 30), [1, 2, 3]).astype(np.float32) + 5, None),
         "all 30 points lie on one line",
     ),
-    "huge": (lambda: (1e200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])), "from 1e-30 to 1e\\+30"),
-    "tiny": (lambda: (1e-200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])), "from 1e-30 to 1e\\+30"),
-    "huge cloud": (lambda: (1e200 * np.random.default_rng(0).random((400, 3)), None), "from 1e-30 to 1e\\+30"),
-    "tiny cloud": (lambda: (1e-200 * np.random.default_rng(0).random((400, 3)), None), "from 1e-30 to 1e\\+30"),
+    "huge": (
+        lambda: (1e200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])),
+        "from 1e-30 to 1e\\+30",
+    ),
+    "tiny": (
+        lambda: (1e-200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])),
+        "from 1e-30 to 1e\\+30",
+    ),
+    "huge cloud": (
+        lambda: (1e200 * np.random.default_rng(0).random((400, 3)), None),
+        "from 1e-30 to 1e\\+30",
+    ),
+    "tiny cloud": (
+        lambda: (1e-200 * np.random.default_rng(0).random((400, 3)), None),
+        "from 1e-30 to 1e\\+30",
+    ),
     "nan": (lambda: (np.full((4, 3), np.nan), np.array([[0, 1, 2], [1, 2, 3]])), "NaN"),
     "nan cloud": (lambda: (np.full((40, 3), np.nan), None), "NaN"),
     "out of range": (lambda: (np.eye(3), np.array([[0, 1, 9], [0, 1, 2]])), "out of range"),

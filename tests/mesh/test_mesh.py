@@ -49,18 +49,32 @@ def test_inside_out_mesh_is_turned_and_says_so() -> None:
         (TETRAHEDRON, np.vstack([FACES[:3], FACES[3:, ::-1]]), "inconsistent orientation, 3 edges"),
         (TETRAHEDRON, np.vstack([FACES, [[0, 0, 1]]]), "1 faces use a vertex twice"),
         (np.vstack([TETRAHEDRON, [[5, 5, 5]]]), FACES, "1 vertices belong to no face"),
-        (np.vstack([TETRAHEDRON, [[5, 5, 5]]]), np.vstack([FACES, [[0, 1, 4]]]), "1 non-manifold edges"),
-        (np.vstack([TETRAHEDRON, TETRAHEDRON + 3]), np.vstack([FACES, FACES + 4]), "2 connected components"),
+        (
+            np.vstack([TETRAHEDRON, [[5, 5, 5]]]),
+            np.vstack([FACES, [[0, 1, 4]]]),
+            "1 non-manifold edges",
+        ),
+        (
+            np.vstack([TETRAHEDRON, TETRAHEDRON + 3]),
+            np.vstack([FACES, FACES + 4]),
+            "2 connected components",
+        ),
         (TETRAHEDRON * [1, 1, 0], FACES, "encloses no volume"),
     ],
 )
-def test_bad_mesh_is_named_and_explained(vertices: np.ndarray, faces: np.ndarray, message: str) -> None:
+def test_bad_mesh_is_named_and_explained(
+    vertices: np.ndarray, faces: np.ndarray, message: str
+) -> None:
     with pytest.raises(MeshError, match=rf"(?s)bad\.off: .*{message}"):
         Mesh(vertices, faces, name="bad.off")
 
 
 def test_every_message_of_a_repairable_fault_names_the_remedy() -> None:
-    for faces in (FACES[:3], np.vstack([FACES, [[0, 0, 1]]]), np.vstack([FACES[:3], FACES[3:, ::-1]])):
+    for faces in (
+        FACES[:3],
+        np.vstack([FACES, [[0, 0, 1]]]),
+        np.vstack([FACES[:3], FACES[3:, ::-1]]),
+    ):
         with pytest.raises(MeshError, match="mend="):
             Mesh(TETRAHEDRON, faces)
 
@@ -72,7 +86,12 @@ def test_open_mesh_passes_when_allowed() -> None:
 
 def test_genus_and_diagonal() -> None:
     ring = as_mesh(trimesh.creation.torus(1, 0.1, major_sections=64, minor_sections=16))
-    for mesh, expected in ((Mesh(TETRAHEDRON, FACES), 0), (ring, 1), (horseshoe(), 0), (weld_gap(horseshoe()), 1)):
+    for mesh, expected in (
+        (Mesh(TETRAHEDRON, FACES), 0),
+        (ring, 1),
+        (horseshoe(), 0),
+        (weld_gap(horseshoe()), 1),
+    ):
         assert mesh.genus == surface_genus(mesh) == expected
     assert Mesh(TETRAHEDRON * [1, 2, 2], FACES).diagonal == pytest.approx(3)
     with pytest.raises(MeshError, match="open surface has no genus"):
@@ -82,7 +101,10 @@ def test_genus_and_diagonal() -> None:
 def test_numbered_by_faces_is_the_same_surface_whatever_the_numbers(blob: Mesh) -> None:
     order = np.random.default_rng(0).permutation(len(blob.vertices))
     rank = np.argsort(order)
-    found, again = blob.numbered_by_faces(), Mesh(blob.vertices[order], rank[blob.faces]).numbered_by_faces()
+    found, again = (
+        blob.numbered_by_faces(),
+        Mesh(blob.vertices[order], rank[blob.faces]).numbered_by_faces(),
+    )
     np.testing.assert_array_equal(found.vertices[found.faces], blob.vertices[blob.faces])
     np.testing.assert_array_equal(found.vertices, again.vertices)
     np.testing.assert_array_equal(found.faces, again.faces)
@@ -119,7 +141,8 @@ def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself() -> None:
 @pytest.mark.parametrize("body", [None, "box.ply", np.zeros((3, 3)), trimesh.Scene()])
 def test_what_is_no_mesh_is_named(body: object) -> None:
     with pytest.raises(
-        TypeError, match=rf"mesh: expected a Mesh, a trimesh.Trimesh, .* got .*{type(body).__name__}\. Read"
+        TypeError,
+        match=rf"mesh: expected a Mesh, a trimesh.Trimesh, .* got .*{type(body).__name__}\. Read",
     ):
         Mesh.of(body)  # type: ignore[arg-type]
 
@@ -141,8 +164,15 @@ def test_meshes_of_other_libraries(blob: Mesh) -> None:
         np.testing.assert_array_equal(mesh.faces, blob.faces)
         assert (mesh.name, mesh.unit) == ("mesh", unit)
     quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]]
-    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float32)
-    assert Mesh.of(SimpleNamespace(points=corners, faces=np.ravel([[4, *quad] for quad in quads]))).volume == 1
+    corners = np.array(
+        [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float32
+    )
+    assert (
+        Mesh.of(
+            SimpleNamespace(points=corners, faces=np.ravel([[4, *quad] for quad in quads]))
+        ).volume
+        == 1
+    )
 
 
 def test_voxels_of_one_label_are_a_mesh() -> None:
@@ -153,7 +183,9 @@ def test_voxels_of_one_label_are_a_mesh() -> None:
         sides = 1 if unit is None else 2
         assert mesh.volume == pytest.approx(sides * ball.sum(), rel=1e-3)
         assert (mesh.name, mesh.unit) == ("volume", unit)
-    with pytest.raises(MeshError, match=r"expected one label, got 1, 3\. Select one, such as labels == 1"):
+    with pytest.raises(
+        MeshError, match=r"expected one label, got 1, 3\. Select one, such as labels == 1"
+    ):
         Mesh.of(ball + 2 * (ball & (np.arange(20) < 9)))
     with pytest.raises(MeshError, match=r"three sides of a voxel, got .*spacing \(1, 2\)"):
         Mesh.of(ball, (1, 2))

@@ -44,7 +44,9 @@ def line(
     )
 
 
-def residue(number: int, name: str = "ALA", atoms: list[tuple[str, float, float]] = ALANINE, **said: object) -> str:
+def residue(
+    number: int, name: str = "ALA", atoms: list[tuple[str, float, float]] = ALANINE, **said: object
+) -> str:
     place = said.pop("place", f"{number:>4} ")
     return "".join(
         line(i, atom, x, y, 3.8 * number, residue=name, place=place, **said)  # type: ignore[arg-type]
@@ -63,8 +65,12 @@ def backbone(atoms: int = 4) -> list[tuple[str, float, float]]:
 
 
 def test_atoms_have_the_radii_of_their_elements(tmp_path: Path) -> None:
-    (molecule,) = read_molecule(written(tmp_path, residue(1) + residue(2, "MET", [*ALANINE, ("SD", 3.0, -2.0)])))
-    np.testing.assert_allclose(molecule.radii[:5], [1.55, 1.70, 1.70, 1.52, 1.70], atol=1e-6)  # Bondi 1964
+    (molecule,) = read_molecule(
+        written(tmp_path, residue(1) + residue(2, "MET", [*ALANINE, ("SD", 3.0, -2.0)]))
+    )
+    np.testing.assert_allclose(
+        molecule.radii[:5], [1.55, 1.70, 1.70, 1.52, 1.70], atol=1e-6
+    )  # Bondi 1964
     assert molecule.radii[-1] == pytest.approx(1.80)
     assert molecule.residue_names == ("ALA", "MET")
     assert molecule.residue_of.tolist() == [0] * 5 + [1] * 6
@@ -99,7 +105,9 @@ def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path: Path) -> None
 
     blocks = []
     for name, n_residues in (("one", 1), ("chainless", 2)):
-        structure = gemmi.read_pdb_string("".join(residue(i) for i in range(1, n_residues + 1)) + "END\n")
+        structure = gemmi.read_pdb_string(
+            "".join(residue(i) for i in range(1, n_residues + 1)) + "END\n"
+        )
         structure.name = name
         structure.setup_entities()
         blocks.append(structure.make_mmcif_document().as_string())
@@ -107,7 +115,10 @@ def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path: Path) -> None
     found = read_molecule(path)
     assert [one.name for one in found] == [f"{path}#one chain A", f"{path}#chainless chain A"]
     assert [len(one.radii) for one in found] == [5, 10]
-    assert [one.name for one in read_molecule(path, "models")] == [f"{path}#one", f"{path}#chainless"]
+    assert [one.name for one in read_molecule(path, "models")] == [
+        f"{path}#one",
+        f"{path}#chainless",
+    ]
     for part, n_residues in (("chainless chain A", 2), ("chainless", 2), ("one", 1)):
         assert len(_molecule(BodyRef(path, part)).residue_names) == n_residues
 
@@ -129,10 +140,21 @@ def test_long_numbers_of_a_pqr_file_leave_no_blank_before_them(tmp_path: Path) -
     rows += "HETATM10000  O   HOH B1001       9.000   2.000   3.000 -0.8000 1.6000\n"
     rows += "HETATM10001  CA  ALA B1002A     12.000   2.000   3.000  0.2000 1.9000\n"
     one, other = read_molecule(written(tmp_path, rows, "made.pqr"))
-    assert [one.name[-7:], one.residue_names, one.radii.round(2).tolist()] == ["chain A", ("ALA",), [1.85]]
-    assert [other.name[-7:], other.residue_names, other.radii.round(2).tolist()] == ["chain B", ("ALA",), [1.9]]
+    assert [one.name[-7:], one.residue_names, one.radii.round(2).tolist()] == [
+        "chain A",
+        ("ALA",),
+        [1.85],
+    ]
+    assert [other.name[-7:], other.residue_names, other.radii.round(2).tolist()] == [
+        "chain B",
+        ("ALA",),
+        [1.9],
+    ]
     fused = written(tmp_path, "ATOM 1 HG11VAL A 1 0.0 0.0 0.0 -0.30 1.85\n", "fused.pqr")
-    with pytest.raises(MeshError, match=r"fused\.pqr: line 1 is no atom .* Write it again, with blanks between fields"):
+    with pytest.raises(
+        MeshError,
+        match=r"fused\.pqr: line 1 is no atom .* Write it again, with blanks between fields",
+    ):
         read_molecule(fused)
 
 
@@ -146,8 +168,13 @@ def test_charges_are_those_of_residues_at_ph_7(tmp_path: Path) -> None:
         "SER": "OG",
         "DA": "OP1",
     }
-    side = {name: [(atom, 3.0 + i, -2.0) for i, atom in enumerate(atoms.split())] for name, atoms in names.items()}
-    text = "".join(residue(i, name, [*ALANINE, *side[name]]) for i, name in enumerate(names, start=1))
+    side = {
+        name: [(atom, 3.0 + i, -2.0) for i, atom in enumerate(atoms.split())]
+        for name, atoms in names.items()
+    }
+    text = "".join(
+        residue(i, name, [*ALANINE, *side[name]]) for i, name in enumerate(names, start=1)
+    )
     (molecule,) = read_molecule(written(tmp_path, text))
     sums = np.bincount(molecule.residue_of, molecule.charges)
     np.testing.assert_allclose(sums, [-1, -1, 1, 1, 0.1, 0, -0.5])
@@ -155,7 +182,8 @@ def test_charges_are_those_of_residues_at_ph_7(tmp_path: Path) -> None:
 
 def test_models_and_chains_are_bodies_of_their_own(tmp_path: Path) -> None:
     models = "".join(
-        f"MODEL     {i:>4}\n{residue(1)}{residue(2)}TER\n{residue(1, chain='B')}ENDMDL\n" for i in range(1, 21)
+        f"MODEL     {i:>4}\n{residue(1)}{residue(2)}TER\n{residue(1, chain='B')}ENDMDL\n"
+        for i in range(1, 21)
     )
     path = written(tmp_path, models)
     of_models = read_molecule(path, "models")
@@ -185,11 +213,15 @@ def test_an_assembly_is_built_by_its_operators(tmp_path: Path) -> None:
 
 
 def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_path: Path) -> None:
-    rows = "".join(f"REMARK 350   BIOMT{i}   1 {a:9.6f}{b:10.6f}{c:10.6f}        0.00000\n" for i, (a, b, c) in
-                   enumerate(np.eye(3), start=1))  # fmt: skip
+    rows = "".join(
+        f"REMARK 350   BIOMT{i}   1 {a:9.6f}{b:10.6f}{c:10.6f}        0.00000\n"
+        for i, (a, b, c) in enumerate(np.eye(3), start=1)
+    )
     text = f"REMARK 350 BIOMOLECULE: 1\nREMARK 350 APPLY THE FOLLOWING TO CHAINS: A, Q\n{rows}"
     path = written(tmp_path, text + residue(1))
-    with pytest.raises(MeshError, match=r"made\.pdb: assembly 1 cannot be made .*no chain Q.*bodies"):
+    with pytest.raises(
+        MeshError, match=r"made\.pdb: assembly 1 cannot be made .*no chain Q.*bodies"
+    ):
         read_molecule(path, "assembly")
 
 
@@ -211,9 +243,24 @@ def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path: Pat
     """A nucleotide whose name gemmi does not know, by the sequence that the file lists; else TER may mean anything."""
     import gemmi
 
-    sugar = [("P", 0.0, 0.0), ("O5'", 1.5, 0.0), ("C5'", 2.2, 1.2), ("C1'", 3.0, 2.0), ("N9", 4.0, 2.0)]
-    chain = residue(1, "A", sugar) + residue(2, "QQQ", sugar, record="HETATM") + residue(3, "U", sugar) + "TER\n"
-    atoms = chain + residue(4, "QQX", sugar, record="HETATM") + residue(5, "NH2", [("N", 9.0, 9.0)], record="HETATM")
+    sugar = [
+        ("P", 0.0, 0.0),
+        ("O5'", 1.5, 0.0),
+        ("C5'", 2.2, 1.2),
+        ("C1'", 3.0, 2.0),
+        ("N9", 4.0, 2.0),
+    ]
+    chain = (
+        residue(1, "A", sugar)
+        + residue(2, "QQQ", sugar, record="HETATM")
+        + residue(3, "U", sugar)
+        + "TER\n"
+    )
+    atoms = (
+        chain
+        + residue(4, "QQX", sugar, record="HETATM")
+        + residue(5, "NH2", [("N", 9.0, 9.0)], record="HETATM")
+    )
     listed = written(tmp_path, "SEQRES   1 A    3    A QQQ   U\n" + atoms, "listed.pdb")
     structure = gemmi.read_structure(str(listed))
     structure.setup_entities()
@@ -225,7 +272,12 @@ def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path: Pat
 
 def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path: Path) -> None:
     water = [("OW", 9.0, 9.0), ("HW1", 9.5, 9.0), ("HW2", 9.0, 9.5), ("MW", 9.1, 9.1)]
-    text = residue(1) + residue(2, "SOL", water) + residue(3, "SOD", [("NA", 9.0, 0.0)]) + residue(4, "QQQ")
+    text = (
+        residue(1)
+        + residue(2, "SOL", water)
+        + residue(3, "SOD", [("NA", 9.0, 0.0)])
+        + residue(4, "QQQ")
+    )
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.residue_names == ("ALA", "QQQ")
 
@@ -237,7 +289,11 @@ def test_hydrogens_are_left_out_unless_asked_for(tmp_path: Path) -> None:
 
 
 def test_a_backbone_gets_balls_of_its_side_chains(tmp_path: Path) -> None:
-    text = residue(1, "LEU", backbone()) + residue(2, "GLY", backbone()) + residue(3, "LYS", backbone())
+    text = (
+        residue(1, "LEU", backbone())
+        + residue(2, "GLY", backbone())
+        + residue(3, "LYS", backbone())
+    )
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.notes == ("2 residues without a side chain: a ball of its volume was used",)
     assert np.bincount(molecule.residue_of).tolist() == [5, 4, 5]
@@ -267,15 +323,24 @@ def test_of_alternatives_the_most_occupied_is_taken(tmp_path: Path) -> None:
         line(5, "CB", 2, -0.8, 3.8, alternative="A", occupancy=0.4),
         line(6, "CB", 2, -0.9, 3.8, alternative="B", occupancy=0.6),
     ]
-    kinds = residue(2, "SER", alternative="A", occupancy=0.3) + residue(2, "THR", alternative="B", occupancy=0.7)
-    (molecule,) = read_molecule(written(tmp_path, residue(1, atoms=backbone()) + "".join(atoms) + kinds))
+    kinds = residue(2, "SER", alternative="A", occupancy=0.3) + residue(
+        2, "THR", alternative="B", occupancy=0.7
+    )
+    (molecule,) = read_molecule(
+        written(tmp_path, residue(1, atoms=backbone()) + "".join(atoms) + kinds)
+    )
     assert molecule.positions[4, 1] == pytest.approx(-0.9)
     assert molecule.residue_names == ("ALA", "THR")
     assert molecule.notes == ("2 alternative locations: the one of the highest occupancy was used",)
 
 
 def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path: Path) -> None:
-    text = residue(1, place="  -5 ") + residue(2, place="  -5A") + residue(3, "GLY") + residue(4, "SER", place="   3 ")
+    text = (
+        residue(1, place="  -5 ")
+        + residue(2, place="  -5A")
+        + residue(3, "GLY")
+        + residue(4, "SER", place="   3 ")
+    )
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.residue_names == ("ALA", "ALA", "GLY", "SER")
     assert len(molecule.radii) == 20
@@ -301,8 +366,12 @@ def test_atoms_without_a_position_are_left_out_not_put_at_the_origin(tmp_path: P
     assert "1 atoms without a position were left out" in molecule.notes
 
 
-def test_a_chain_without_atoms_costs_no_other_chain(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    lost = line(1, "N", 0, 0, 0, chain="B").replace("   0.000   0.000   0.000", "     nan     nan     nan")
+def test_a_chain_without_atoms_costs_no_other_chain(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lost = line(1, "N", 0, 0, 0, chain="B").replace(
+        "   0.000   0.000   0.000", "     nan     nan     nan"
+    )
     path = written(tmp_path, residue(1) + lost)
     with caplog.at_level(logging.WARNING):
         (molecule,) = read_molecule(path)
@@ -310,7 +379,9 @@ def test_a_chain_without_atoms_costs_no_other_chain(tmp_path: Path, caplog: pyte
     assert f"{path}#chain B: no atoms of a polymer, left out" in caplog.text
 
 
-def test_a_surface_that_fails_in_any_way_costs_no_other_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_surface_that_fails_in_any_way_costs_no_other_chain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = written(tmp_path, residue(1) + residue(1, chain="B") + residue(1, chain="C"))
 
     def faulty(molecule: Molecule) -> Mesh:
@@ -320,8 +391,13 @@ def test_a_surface_that_fails_in_any_way_costs_no_other_chain(tmp_path: Path, mo
 
     monkeypatch.setattr("igps.mesh.molecular_surface.molecular_surface", faulty)
     found = {body.part: mesh for body, mesh in each_body(path)}
-    assert [name for name, mesh in found.items() if isinstance(mesh, Mesh)] == ["chain A", "chain C"]
-    assert str(found["chain B"]).startswith(f"{path}#chain B: not readable as a structure (ValueError: ")
+    assert [name for name, mesh in found.items() if isinstance(mesh, Mesh)] == [
+        "chain A",
+        "chain C",
+    ]
+    assert str(found["chain B"]).startswith(
+        f"{path}#chain B: not readable as a structure (ValueError: "
+    )
 
 
 def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:
@@ -334,7 +410,11 @@ def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:
     [
         ("cut.pdb", residue(1) + "ATOM      6  N   ALA A   2      11.1", "cut short"),
         ("cut.cif", "data_x\nloop_\n_atom_site.id\n_atom_site.Cartn_x\n1 2\n3\n", "cut short"),
-        ("cut.pqr", "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\nATOM 2 CA ALA A 1 0.0", "line 2 .*cut short"),
+        (
+            "cut.pqr",
+            "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\nATOM 2 CA ALA A 1 0.0",
+            "line 2 .*cut short",
+        ),
         ("negative.pqr", "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 -1.85\n", "radius of at least 0"),
         ("empty.pdb", "  \n", "the file is empty"),
         ("words.pdb", "no structure at all\n", "no atoms of a molecule"),
@@ -342,7 +422,9 @@ def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:
         ("other.xyz", "1\n", "expected a structure"),
     ],
 )
-def test_bad_files_are_named_with_the_remedy(tmp_path: Path, name: str, text: str, said: str) -> None:
+def test_bad_files_are_named_with_the_remedy(
+    tmp_path: Path, name: str, text: str, said: str
+) -> None:
     with pytest.raises(MeshError, match=rf"{name}: .*{said}"):
         read_molecule(written(tmp_path, text, name))
 
@@ -389,17 +471,26 @@ def test_b_factors_that_a_file_lacks_are_unknown(tmp_path: Path) -> None:
     for name, text in texts.items():
         (molecule,) = read_molecule(written(tmp_path, text, name))
         assert np.isnan(molecule.b_factors).all(), name
-    assert read_molecule(written(tmp_path, f"{known} 7\n", "known.cif"))[0].b_factors.tolist() == [7]
+    assert read_molecule(written(tmp_path, f"{known} 7\n", "known.cif"))[0].b_factors.tolist() == [
+        7
+    ]
     with pytest.raises(MeshError, match="no label_alt_id"):
-        read_molecule(written(tmp_path, pairs.replace("_atom_site.label_alt_id .\n", ""), "lacking.cif"))
+        read_molecule(
+            written(tmp_path, pairs.replace("_atom_site.label_alt_id .\n", ""), "lacking.cif")
+        )
 
 
 def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> None:
     names = ["N", "CA", "C", "O", "CB", "CD", "NE", "HG"]
     atoms = [(name, float(i), 0.0) for i, name in enumerate(names)]
-    rows = [f"{row[:12]}{row[12:16].strip():<4}{row[16:66]}" for row in residue(1, "GLN", atoms).splitlines()]
+    rows = [
+        f"{row[:12]}{row[12:16].strip():<4}{row[16:66]}"
+        for row in residue(1, "GLN", atoms).splitlines()
+    ]
     (molecule,) = read_molecule(written(tmp_path, "\n".join(rows)))
-    np.testing.assert_allclose(molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.55], atol=1e-6)  # Bondi 1964
+    np.testing.assert_allclose(
+        molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.55], atol=1e-6
+    )  # Bondi 1964
     # And calcium, which some write as an atom of the polymer, is no residue.
     ion = line(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA")
     (molecule,) = read_molecule(written(tmp_path, residue(1) + ion))
@@ -410,7 +501,9 @@ def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> Non
 def test_no_line_is_lost_to_marks_of_text_or_to_frames(tmp_path: Path) -> None:
     text = residue(1) + residue(2)
     (usual,) = read_molecule(written(tmp_path, text))
-    for number, other in enumerate((f"\ufeff{text}", text.replace("\n", "\r"), text.replace("\n", "\r\n"))):
+    for number, other in enumerate(
+        (f"\ufeff{text}", text.replace("\n", "\r"), text.replace("\n", "\r\n"))
+    ):
         path = tmp_path / f"{number}.pdb"
         path.write_bytes(other.encode())
         np.testing.assert_array_equal(read_molecule(path)[0].positions, usual.positions)

@@ -13,14 +13,20 @@ from igps.mesh.mesh import Mesh
 
 def test_areas_and_normals(blob: Mesh) -> None:
     oracle = as_trimesh(blob)
-    np.testing.assert_allclose(surface.face_areas(blob.vertices, blob.faces), oracle.area_faces, rtol=1e-12)
+    np.testing.assert_allclose(
+        surface.face_areas(blob.vertices, blob.faces), oracle.area_faces, rtol=1e-12
+    )
     of_vertices, sums = np.zeros(len(blob.vertices)), np.zeros_like(blob.vertices)
     for face, area, normal in zip(blob.faces, oracle.area_faces, oracle.face_normals, strict=True):
         of_vertices[face] += area / 3
         sums[face] += area * normal
-    np.testing.assert_allclose(surface.vertex_areas(blob.vertices, blob.faces), of_vertices, rtol=1e-12)
+    np.testing.assert_allclose(
+        surface.vertex_areas(blob.vertices, blob.faces), of_vertices, rtol=1e-12
+    )
     normals = sums / np.linalg.norm(sums, axis=1, keepdims=True)
-    np.testing.assert_allclose(surface.vertex_normals(blob.vertices, blob.faces), normals, atol=1e-12)
+    np.testing.assert_allclose(
+        surface.vertex_normals(blob.vertices, blob.faces), normals, atol=1e-12
+    )
 
 
 def test_the_mean_of_neighbours_is_that_of_a_loop(blob: Mesh) -> None:
@@ -29,7 +35,9 @@ def test_the_mean_of_neighbours_is_that_of_a_loop(blob: Mesh) -> None:
         beside = blob.vertices[neighbours]
         weights = 1 / np.square(beside - blob.vertices[i]).sum(axis=1)
         expected[i] = weights @ beside / weights.sum()
-    np.testing.assert_allclose(surface.mean_of_neighbours(blob.vertices, blob.faces), expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        surface.mean_of_neighbours(blob.vertices, blob.faces), expected, rtol=1e-9
+    )
 
 
 def test_a_neighbour_in_the_same_place_is_the_mean(blob: Mesh) -> None:
@@ -41,7 +49,8 @@ def test_a_neighbour_in_the_same_place_is_the_mean(blob: Mesh) -> None:
 
 def test_unit_vectors() -> None:
     np.testing.assert_allclose(
-        surface.unit(np.array([[3.0, 0, 4], [0, 0, 0], [0, -1e-100, 0]])), [[0.6, 0, 0.8], [0, 0, 0], [0, -1, 0]]
+        surface.unit(np.array([[3.0, 0, 4], [0, 0, 0], [0, -1e-100, 0]])),
+        [[0.6, 0, 0.8], [0, 0, 0], [0, -1, 0]],
     )
 
 
@@ -49,15 +58,22 @@ def test_edges(blob: Mesh) -> None:
     n_vertices = len(blob.vertices)
     edges, edge_of = surface.undirected_edges(blob.faces, n_vertices)
     sides = [(int(face[i]), int(face[(i + 1) % 3])) for face in blob.faces for i in range(3)]
-    assert list(zip(*(side.tolist() for side in surface.directed_edges(blob.faces)), strict=True)) == sides
-    assert edges.tolist() == [list(edge) for edge in sorted({(min(side), max(side)) for side in sides})]
+    assert (
+        list(zip(*(side.tolist() for side in surface.directed_edges(blob.faces)), strict=True))
+        == sides
+    )
+    assert edges.tolist() == [
+        list(edge) for edge in sorted({(min(side), max(side)) for side in sides})
+    ]
     np.testing.assert_array_equal(edges[edge_of], np.sort(sides, axis=1))
 
 
 @pytest.mark.parametrize("n_pieces", [1, 3])
 def test_components(n_pieces: int) -> None:
     piece = trimesh.creation.icosphere(subdivisions=1)
-    pieces = trimesh.util.concatenate([piece.copy().apply_translation([3 * i, 0, 0]) for i in range(n_pieces)])
+    pieces = trimesh.util.concatenate(
+        [piece.copy().apply_translation([3 * i, 0, 0]) for i in range(n_pieces)]
+    )
     count, label = surface.components(np.asarray(pieces.faces), len(pieces.vertices))
     assert count == n_pieces
     np.testing.assert_array_equal(label, np.repeat(np.arange(n_pieces), len(piece.vertices)))
@@ -74,14 +90,19 @@ def test_genus_counts_handles(n_handles: int) -> None:
 
 
 def test_parts_of_faces_and_their_areas() -> None:
-    pieces = [trimesh.creation.icosphere(subdivisions=k, radius=radius) for k, radius in ((2, 1.0), (1, 3.0), (0, 2.0))]
+    pieces = [
+        trimesh.creation.icosphere(subdivisions=k, radius=radius)
+        for k, radius in ((2, 1.0), (1, 3.0), (0, 2.0))
+    ]
     whole = trimesh.util.concatenate(pieces)
     # A vertex of no face in between is no part.
     vertices = np.insert(np.asarray(whole.vertices), 162, [9, 9, 9], axis=0)
     faces = np.where(whole.faces >= 162, whole.faces + 1, whole.faces)
     shuffled = np.random.default_rng(0).permutation(len(faces))
     part, areas = surface.face_parts(vertices, faces[shuffled])
-    np.testing.assert_array_equal(part, np.repeat([0, 1, 2], [len(piece.faces) for piece in pieces])[shuffled])
+    np.testing.assert_array_equal(
+        part, np.repeat([0, 1, 2], [len(piece.faces) for piece in pieces])[shuffled]
+    )
     np.testing.assert_allclose(areas, [piece.area for piece in pieces], rtol=1e-12)
 
 

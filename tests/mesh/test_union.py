@@ -17,7 +17,9 @@ def box(low, high, subdivisions=2):
 
 def together(*surfaces):
     at = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
-    return np.vstack([v for v, _ in surfaces]), np.vstack([f + n for (_, f), n in zip(surfaces, at, strict=False)])
+    return np.vstack([v for v, _ in surfaces]), np.vstack(
+        [f + n for (_, f), n in zip(surfaces, at, strict=False)]
+    )
 
 
 def test_boxes_that_overlap_are_one_body_of_the_right_volume_and_area():
@@ -42,7 +44,10 @@ def test_parts_that_do_not_touch_or_are_open_are_left_to_the_grid():
 def with_wall():
     """A body of two boxes of one size, with the wall between them still there."""
     vertices, faces = box([0, 0, 0], [1, 1, 1])
-    mirrored = vertices * [-1, 1, 1] + [2, 0, 0], faces[:, ::-1]  # the same triangles on both sides of the wall
+    mirrored = (
+        vertices * [-1, 1, 1] + [2, 0, 0],
+        faces[:, ::-1],
+    )  # the same triangles on both sides of the wall
     return together((vertices, faces), mirrored)
 
 
@@ -61,8 +66,17 @@ def test_two_halves_with_a_wall_each_that_overlap_are_the_body_that_they_were_cu
     centred = shape.vertices - shape.vertices.mean(axis=0)
     solid = manifold3d.Manifold(manifold3d.Mesh64(centred.copy(), shape.faces.astype(np.uint64)))
     reach = 0.02 * np.ptp(centred, axis=0).max()
-    meshes = [solid.trim_by_plane(normal, -reach).to_mesh64() for normal in ([1.0, 0, 0], [-1.0, 0, 0])]
-    body = mend(*together(*((np.asarray(m.vert_properties)[:, :3], np.asarray(m.tri_verts, np.int64)) for m in meshes)))
+    meshes = [
+        solid.trim_by_plane(normal, -reach).to_mesh64() for normal in ([1.0, 0, 0], [-1.0, 0, 0])
+    ]
+    body = mend(
+        *together(
+            *(
+                (np.asarray(m.vert_properties)[:, :3], np.asarray(m.tri_verts, np.int64))
+                for m in meshes
+            )
+        )
+    )
     assert "watertight" not in repair_steps(body.notes)
     np.testing.assert_allclose((body.volume, body.area), (shape.volume, shape.area), rtol=1e-9)
 

@@ -43,11 +43,17 @@ def zip_of(members: dict[str, bytes]) -> bytes:
 
 
 def packed(content: dict[str, bytes]) -> dict[str, bytes]:
-    tars = {"a.tar.gz": tar_of(content, "gz"), "a.tar.xz": tar_of(content, "xz"), "a.txz": tar_of(content, "xz")}
+    tars = {
+        "a.tar.gz": tar_of(content, "gz"),
+        "a.tar.xz": tar_of(content, "xz"),
+        "a.txz": tar_of(content, "xz"),
+    }
     return {"a.zip": zip_of(content), "a.tar": tar_of(content), **tars}
 
 
-@pytest.mark.parametrize("name", ["a.zip", "a.tar.gz", "a.tar.xz", "a.tar", "a.off.gz", "a.3mf", "a.zae"])
+@pytest.mark.parametrize(
+    "name", ["a.zip", "a.tar.gz", "a.tar.xz", "a.tar", "a.off.gz", "a.3mf", "a.zae"]
+)
 def test_more_than_is_allowed_is_refused_and_the_remedy_named(name: str, tmp_path: Path) -> None:
     contents = packed({"a.off": BOMB}) | {
         "a.off.gz": gzip.compress(BOMB),
@@ -57,25 +63,40 @@ def test_more_than_is_allowed_is_refused_and_the_remedy_named(name: str, tmp_pat
     (tmp_path / name).write_bytes(contents[name])
     with pytest.raises(MeshError, match=rf"{name}: unpacks to .*LoadOptions\(max_unpacked="):
         load_mesh(tmp_path / name, LoadOptions(max_unpacked=LIMIT))
-    with pytest.raises(MeshError, match="not readable"):  # nor is it a mesh where it may be unpacked
+    with pytest.raises(
+        MeshError, match="not readable"
+    ):  # nor is it a mesh where it may be unpacked
         load_mesh(tmp_path / name)
 
 
 def test_a_size_that_lies_does_not_help(tmp_path: Path) -> None:
     """The sizes that a ZIP declares are made small; no more than them is unpacked."""
     content = zip_of({"a.off": BOMB})
-    (tmp_path / "a.zip").write_bytes(content.replace(len(BOMB).to_bytes(4, "little"), (100).to_bytes(4, "little")))
+    (tmp_path / "a.zip").write_bytes(
+        content.replace(len(BOMB).to_bytes(4, "little"), (100).to_bytes(4, "little"))
+    )
     with pytest.raises(MeshError, match=r"a\.zip: not readable"):
         load_mesh(tmp_path / "a.zip", LoadOptions(max_unpacked=LIMIT))
 
 
 @pytest.mark.parametrize("name", ["a.zip", "a.tar.gz", "a.tar.xz", "a.txz", "a.tar"])
-def test_files_in_an_archive_are_bodies_and_none_is_written_outside(name: str, tmp_path: Path) -> None:
+def test_files_in_an_archive_are_bodies_and_none_is_written_outside(
+    name: str, tmp_path: Path
+) -> None:
     stl = trimesh.creation.icosphere(subdivisions=1).export(file_type="stl")
     outside = tmp_path / "outside"
-    members = {"in/box.off": BOX, "ball.stl": stl, "notes.txt": b"x", "../evil.off": BOX, f"{outside}/evil.off": BOX}
+    members = {
+        "in/box.off": BOX,
+        "ball.stl": stl,
+        "notes.txt": b"x",
+        "../evil.off": BOX,
+        f"{outside}/evil.off": BOX,
+    }
     (tmp_path / name).write_bytes(packed(members)[name])
-    assert [body.part for body in list_bodies(tmp_path / name, OBJECTS)] == ["in/box.off", "ball.stl"]
+    assert [body.part for body in list_bodies(tmp_path / name, OBJECTS)] == [
+        "in/box.off",
+        "ball.stl",
+    ]
     assert load_mesh(tmp_path / name, OBJECTS, part="in/box.off").volume == pytest.approx(6)
     assert len(read_surface(tmp_path / name).faces) == 12 + 80
     assert not outside.exists()
@@ -117,7 +138,10 @@ def gltf(uri: str) -> str:
             "nodes": [{"mesh": 0}],
             "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
             "buffers": [{"uri": uri, "byteLength": 48 + 48}],
-            "bufferViews": [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": 48}],
+            "bufferViews": [
+                {"buffer": 0, "byteLength": 48},
+                {"buffer": 0, "byteOffset": 48, "byteLength": 48},
+            ],
             "accessors": [
                 {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
                 {"bufferView": 1, "componentType": 5125, "count": 12, "type": "SCALAR"},
@@ -127,7 +151,9 @@ def gltf(uri: str) -> str:
 
 
 @pytest.mark.parametrize("suffix", ["gltf", "glb"])
-@pytest.mark.parametrize("how", [{"normalized": True}, {"sparse": {"count": 1, "indices": {}, "values": {}}}, {}])
+@pytest.mark.parametrize(
+    "how", [{"normalized": True}, {"sparse": {"count": 1, "indices": {}, "values": {}}}, {}]
+)
 def test_coordinates_that_would_be_taken_for_others_are_refused(
     how: dict[str, object], suffix: str, tmp_path: Path
 ) -> None:
@@ -148,10 +174,14 @@ def test_coordinates_that_would_be_taken_for_others_are_refused(
             len(text).to_bytes(4, "little") + b"JSON" + text,
             len(numbers).to_bytes(4, "little") + b"BIN\0" + numbers,
         ]
-        text = b"glTF\2\0\0\0" + (12 + len(b"".join(chunks))).to_bytes(4, "little") + b"".join(chunks)
+        text = (
+            b"glTF\2\0\0\0" + (12 + len(b"".join(chunks))).to_bytes(4, "little") + b"".join(chunks)
+        )
     (tmp_path / f"a.{suffix}").write_bytes(text)
     if how:
-        with pytest.raises(MeshError, match=rf"a\.{suffix}: not readable as glTF.*sparse or normalized"):
+        with pytest.raises(
+            MeshError, match=rf"a\.{suffix}: not readable as glTF.*sparse or normalized"
+        ):
             load_mesh(tmp_path / f"a.{suffix}")
     else:
         assert load_mesh(tmp_path / f"a.{suffix}").volume == pytest.approx(9**3 / 6)
@@ -160,8 +190,14 @@ def test_coordinates_that_would_be_taken_for_others_are_refused(
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "not readable as .*compressed by KHR_draco"),
-        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "not readable as .*compressed by EXT_meshopt"),
+        (
+            {"extensionsRequired": ["KHR_draco_mesh_compression"]},
+            "not readable as .*compressed by KHR_draco",
+        ),
+        (
+            {"extensionsRequired": ["EXT_meshopt_compression"]},
+            "not readable as .*compressed by EXT_meshopt",
+        ),
         ({"mode": 6}, "not readable as .*fans of triangles"),
         ({"count": 10**9}, "unpacks to .*max_unpacked="),
         ({"primitives": 10**4}, "unpacks to .*max_unpacked="),
@@ -196,19 +232,25 @@ def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path: Path) -> Non
     assert load_mesh(folder / "a.gltf").volume == pytest.approx(1 / 6)
     for elsewhere in ("../numbers.bin", str(tmp_path / "numbers.bin")):
         (folder / "a.gltf").write_text(gltf(elsewhere))
-        with pytest.raises(MeshError, match=r"a\.gltf: not readable as glTF.*outside of its folder"):
+        with pytest.raises(
+            MeshError, match=r"a\.gltf: not readable as glTF.*outside of its folder"
+        ):
             load_mesh(folder / "a.gltf")
 
 
 @pytest.mark.parametrize("name", ["a.zip", "a.tar.gz"])
-def test_hidden_files_that_a_mac_packs_beside_each_are_passed_over(name: str, tmp_path: Path) -> None:
+def test_hidden_files_that_a_mac_packs_beside_each_are_passed_over(
+    name: str, tmp_path: Path
+) -> None:
     content = {"b.off": BOX, "__MACOSX/._b.off": b"\0\5\x16\7\0\2Mac OS X", ".git/c.off": BOX}
     (tmp_path / name).write_bytes(packed(content)[name])
     assert load_mesh(tmp_path / name).volume == pytest.approx(6)
     assert [body.part for body in list_bodies(tmp_path / name, OBJECTS)] == ["b.off"]
 
 
-def test_a_faulty_file_of_an_archive_leaves_the_others_and_is_missed_in_the_whole(tmp_path: Path) -> None:
+def test_a_faulty_file_of_an_archive_leaves_the_others_and_is_missed_in_the_whole(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "a.zip").write_bytes(zip_of({"bad.off": b"OFF\n8 12 0\n0 0 0\n", "good.off": BOX}))
     with pytest.raises(MeshError, match=r"a\.zip: bad\.off: not readable as OFF"):
         load_mesh(tmp_path / "a.zip")

@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from igps.mesh.formats import dependencies_of
 from igps.mesh.formats._volume_files import _WORK_BYTES
 from igps.mesh.formats.label_names import read_label_names
-from igps.mesh.formats.volumes import LabelVolume, label_surface, read_label_volume, volume_in_memory
+from igps.mesh.formats.volumes import (
+    LabelVolume,
+    label_surface,
+    read_label_volume,
+    volume_in_memory,
+)
 from igps.mesh.loading import each_body, list_bodies, load_mesh
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
@@ -41,7 +46,9 @@ def two_boxes() -> NDArray[np.uint8]:
     return labels
 
 
-def itk_image(labels: NDArray[Any], affine: NDArray[np.float64] = AFFINE, vector: bool = False) -> Any:
+def itk_image(
+    labels: NDArray[Any], affine: NDArray[np.float64] = AFFINE, vector: bool = False
+) -> Any:
     image = sitk.GetImageFromArray(np.ascontiguousarray(np.swapaxes(labels, 0, 2)), isVector=vector)
     lps = np.diag([-1, -1, 1, 1]) @ affine
     spacing = np.linalg.norm(lps[:3, :3], axis=0)
@@ -84,17 +91,40 @@ def write_segmentation(path: Path, masks: NDArray[Any], names: list[str], *kind:
         plane.file_meta = FileMetaDataset()
         plane.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
         plane.SOPClassUID, plane.SOPInstanceUID = "1.2.840.10008.5.1.4.1.1.2", generate_uid()
-        plane.StudyInstanceUID, plane.SeriesInstanceUID, plane.FrameOfReferenceUID = study, series, frame
-        plane.PatientID, plane.PatientName, plane.PatientBirthDate, plane.PatientSex = "1", "A^B", "", ""
-        plane.StudyDate, plane.StudyTime, plane.StudyID, plane.AccessionNumber = "20200101", "000000", "1", ""
-        plane.ReferringPhysicianName, plane.SeriesNumber, plane.InstanceNumber, plane.Modality = "", 1, k + 1, "CT"
+        plane.StudyInstanceUID, plane.SeriesInstanceUID, plane.FrameOfReferenceUID = (
+            study,
+            series,
+            frame,
+        )
+        plane.PatientID, plane.PatientName, plane.PatientBirthDate, plane.PatientSex = (
+            "1",
+            "A^B",
+            "",
+            "",
+        )
+        plane.StudyDate, plane.StudyTime, plane.StudyID, plane.AccessionNumber = (
+            "20200101",
+            "000000",
+            "1",
+            "",
+        )
+        plane.ReferringPhysicianName, plane.SeriesNumber, plane.InstanceNumber, plane.Modality = (
+            "",
+            1,
+            k + 1,
+            "CT",
+        )
         plane.Rows, plane.Columns = masks.shape[1], masks.shape[0]
         plane.PixelSpacing = [spacing[1], spacing[0]]
         plane.SliceThickness = spacing[2]
         plane.ImageOrientationPatient = [*(lps[:3, 0] / spacing[0]), *(lps[:3, 1] / spacing[1])]
         plane.ImagePositionPatient = list(lps[:3, 3] + k * lps[:3, 2])
         plane.BitsAllocated = plane.BitsStored = 16
-        plane.SamplesPerPixel, plane.PhotometricInterpretation, plane.PixelRepresentation = 1, "MONOCHROME2", 0
+        plane.SamplesPerPixel, plane.PhotometricInterpretation, plane.PixelRepresentation = (
+            1,
+            "MONOCHROME2",
+            0,
+        )
         planes.append(plane)
     described = [
         SegmentDescription(number, name, codes.SCT.Organ, codes.SCT.Organ, "MANUAL")
@@ -103,9 +133,20 @@ def write_segmentation(path: Path, masks: NDArray[Any], names: list[str], *kind:
     method, *fractions = kind
     how = dict(zip(("fractional_type", "max_fractional_value"), fractions, strict=False))
     Segmentation(
-        planes, masks.transpose(2, 1, 0, 3), method, described, generate_uid(), 1, generate_uid(), 1, "maker", "model",
-        "1", "1", **how,
-    ).save_as(path)  # fmt: skip
+        planes,
+        masks.transpose(2, 1, 0, 3),
+        method,
+        described,
+        generate_uid(),
+        1,
+        generate_uid(),
+        1,
+        "maker",
+        "model",
+        "1",
+        "1",
+        **how,
+    ).save_as(path)
 
 
 def label_bodies(volume: LabelVolume) -> list[tuple[int, str, int]]:
@@ -145,9 +186,12 @@ def test_every_format_gives_the_same_bodies_in_the_world(name: str, tmp_path: Pa
 def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path: Path) -> None:
     stack = np.ascontiguousarray(two_boxes().T)
     tifffile.imwrite(
-        tmp_path / "x.tif", stack, imagej=True, resolution=(1 / 0.5, 1 / 0.25),
+        tmp_path / "x.tif",
+        stack,
+        imagej=True,
+        resolution=(1 / 0.5, 1 / 0.25),
         metadata={"spacing": 2.0, "unit": "um", "axes": "ZYX"},
-    )  # fmt: skip
+    )
     volume = read_label_volume(tmp_path / "x.tif")
     np.testing.assert_allclose(np.diag(volume.affine), [0.5e-3, 0.25e-3, 2e-3, 1])
     assert volume.unit == "mm"
@@ -173,7 +217,12 @@ def test_imagej_escapes_units_and_leaves_a_spacing_of_one_out(
     stack = np.ascontiguousarray(two_boxes().T)
     about = f"ImageJ=1.53t\nimages={len(stack)}\nslices={len(stack)}\n{words}loop=false\n"
     tifffile.imwrite(
-        tmp_path / "x.tif", stack, photometric="minisblack", description=about, metadata=None, resolution=(2, 4)
+        tmp_path / "x.tif",
+        stack,
+        photometric="minisblack",
+        description=about,
+        metadata=None,
+        resolution=(2, 4),
     )
     volume = read_label_volume(tmp_path / "x.tif")
     np.testing.assert_allclose(np.diag(volume.affine)[:3], sides)
@@ -226,14 +275,20 @@ def test_lengths_of_a_nrrd_file_are_in_its_unit(
 def test_a_nrrd_axis_without_a_direction_is_refused(lost: str, tmp_path: Path) -> None:
     space = "space: right-anterior-superior"
     write_nrrd(tmp_path / "x.nrrd", space, "space directions: (1,0,0) (0,1.5,0) (0,0,2.5)")
-    assert label_surface(read_label_volume(tmp_path / "x.nrrd"), 3).volume == pytest.approx(1440, rel=1e-3)
+    assert label_surface(read_label_volume(tmp_path / "x.nrrd"), 3).volume == pytest.approx(
+        1440, rel=1e-3
+    )
     write_nrrd(tmp_path / "x.nrrd", space, f"space directions: {lost} (0,1.5,0) (0,0,2.5)")
-    with pytest.raises(MeshError, match=r"x\.nrrd: expected directions of three axes in space, got 2"):
+    with pytest.raises(
+        MeshError, match=r"x\.nrrd: expected directions of three axes in space, got 2"
+    ):
         read_label_volume(tmp_path / "x.nrrd")
 
 
 @pytest.mark.parametrize("kind", ["Nifti1Image", "Nifti1Pair", "Nifti2Image", "Nifti2Pair"])
-@pytest.mark.parametrize(("unit", "side"), [("meter", 1e-3), ("mm", 1), ("micron", 1e3), ("unknown", 1)])
+@pytest.mark.parametrize(
+    ("unit", "side"), [("meter", 1e-3), ("mm", 1), ("micron", 1e3), ("unknown", 1)]
+)
 def test_lengths_of_nifti_are_in_its_unit(kind: str, unit: str, side: float) -> None:
     """Pairs of a header and its voxels, too, which nibabel reads."""
     image = getattr(nibabel, kind)(two_boxes(), np.diag([side, side, side, 1.0]) @ AFFINE)
@@ -243,7 +298,9 @@ def test_lengths_of_nifti_are_in_its_unit(kind: str, unit: str, side: float) -> 
 
 @pytest.mark.parametrize("order", ["RAS", "LPS", "ASR", "PIL"])
 @pytest.mark.parametrize("suffix", ["nii.gz", "nrrd", "mha"])
-def test_the_order_of_the_axes_in_a_file_is_no_matter(order: str, suffix: str, tmp_path: Path) -> None:
+def test_the_order_of_the_axes_in_a_file_is_no_matter(
+    order: str, suffix: str, tmp_path: Path
+) -> None:
     sitk.WriteImage(sitk.DICOMOrient(itk_image(two_boxes()), order), str(tmp_path / f"x.{suffix}"))
     expected = label_surface(LabelVolume((two_boxes(),), AFFINE), 3)
     found = load_mesh(tmp_path / f"x.{suffix}", part="3")
@@ -253,24 +310,41 @@ def test_the_order_of_the_axes_in_a_file_is_no_matter(order: str, suffix: str, t
 
 @pytest.mark.parametrize(
     ("space", "axes"),
-    [("left-posterior-superior", (-1, -1, 1)), ("right-anterior-superior", (1, 1, 1)), ("LAS", (-1, 1, 1))],
+    [
+        ("left-posterior-superior", (-1, -1, 1)),
+        ("right-anterior-superior", (1, 1, 1)),
+        ("LAS", (-1, 1, 1)),
+    ],
 )
 @pytest.mark.parametrize("last", [False, True])
 def test_a_list_of_layers_in_a_nrrd_file_may_be_any_axis(
     space: str, axes: tuple[int, int, int], last: bool, tmp_path: Path
 ) -> None:
     layers = [two_boxes() * (two_boxes() == value) for value in (3, 7)]
-    vectors = [f"({','.join(map(str, axis * axes))})" for axis in (*AFFINE[:3, :3].T, AFFINE[:3, 3])]
+    vectors = [
+        f"({','.join(map(str, axis * axes))})" for axis in (*AFFINE[:3, :3].T, AFFINE[:3, 3])
+    ]
     kinds, directions = ["domain"] * 3, vectors[:3]
     kinds.insert(3 * last, "list")
     directions.insert(3 * last, "none")
     sizes = (14, 12, 10, 2) if last else (2, 14, 12, 10)
     header = [
-        "NRRD0005", "type: uint8", "dimension: 4", f"space: {space}", f"sizes: {' '.join(map(str, sizes))}",
-        f"space directions: {' '.join(directions)}", f"kinds: {' '.join(kinds)}", "encoding: raw",
-        f"space origin: {vectors[3]}", "Segment0_Name:=liver", "Segment0_LabelValue:=3", "Segment0_Layer:=0",
-        "Segment1_Name:=spleen", "Segment1_LabelValue:=7", "Segment1_Layer:=1",
-    ]  # fmt: skip
+        "NRRD0005",
+        "type: uint8",
+        "dimension: 4",
+        f"space: {space}",
+        f"sizes: {' '.join(map(str, sizes))}",
+        f"space directions: {' '.join(directions)}",
+        f"kinds: {' '.join(kinds)}",
+        "encoding: raw",
+        f"space origin: {vectors[3]}",
+        "Segment0_Name:=liver",
+        "Segment0_LabelValue:=3",
+        "Segment0_Layer:=0",
+        "Segment1_Name:=spleen",
+        "Segment1_LabelValue:=7",
+        "Segment1_Layer:=1",
+    ]
     voxels = np.stack(layers, axis=3 if last else 0).tobytes(order="F")
     (tmp_path / "x.seg.nrrd").write_bytes("\n".join(header).encode() + b"\n\n" + voxels)
     volume = read_label_volume(tmp_path / "x.seg.nrrd")
@@ -299,9 +373,13 @@ def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:
     one, two = two_boxes() == 3, two_boxes() > 0
     image = itk_image(np.stack([one, two], axis=-1).astype(np.uint8), vector=True)
     for key, value in {
-        "Segment0_Name": "liver", "Segment0_LabelValue": "1", "Segment0_Layer": "0",
-        "Segment1_Name": "body", "Segment1_LabelValue": "1", "Segment1_Layer": "1",
-    }.items():  # fmt: skip
+        "Segment0_Name": "liver",
+        "Segment0_LabelValue": "1",
+        "Segment0_Layer": "0",
+        "Segment1_Name": "body",
+        "Segment1_LabelValue": "1",
+        "Segment1_Layer": "1",
+    }.items():
         image.SetMetaData(key, value)
     sitk.WriteImage(image, str(tmp_path / "x.seg.nrrd"))
     volume = read_label_volume(tmp_path / "x.seg.nrrd")
@@ -326,12 +404,17 @@ def test_groups_of_labels_of_mitk_have_names_and_may_overlap(tmp_path: Path) -> 
 
 def test_segments_of_slicer_before_4_11_each_have_a_layer(tmp_path: Path) -> None:
     """It wrote no values and no layers; names are on one line, as in every table."""
-    image = itk_image(np.stack([two_boxes() == 3, two_boxes() > 0], axis=-1).astype(np.uint8), vector=True)
+    image = itk_image(
+        np.stack([two_boxes() == 3, two_boxes() > 0], axis=-1).astype(np.uint8), vector=True
+    )
     for number, name in enumerate(("left  kidney ", "body")):
         image.SetMetaData(f"Segment{number}_Name", name)
         image.SetMetaData(f"Segment{number}_ID", f"Segment_{number + 1}")
     sitk.WriteImage(image, str(tmp_path / "x.seg.nrrd"))
-    assert label_bodies(read_label_volume(tmp_path / "x.seg.nrrd")) == [(1, "left kidney", 384), (2, "body", 704)]
+    assert label_bodies(read_label_volume(tmp_path / "x.seg.nrrd")) == [
+        (1, "left kidney", 384),
+        (2, "body", 704),
+    ]
     one = itk_image((two_boxes() == 3).astype(np.uint8))
     one.SetMetaData("Segment0_Name", "liver")
     sitk.WriteImage(one, str(tmp_path / "y.seg.nrrd"))
@@ -354,18 +437,27 @@ def test_fractional_segments_of_dicom_are_cut_at_the_threshold(most: int, tmp_pa
     """Three that overlap, in other slices each, the last all or nothing; the frames are read by pydicom."""
     place = np.moveaxis(np.indices((24, 20, 16)), 0, -1)
     soft = (((9, 9, 6), 5), ((14, 10, 9), 4))
-    shares = [np.clip(1.5 - np.linalg.norm(place - centre, axis=-1) / radius, 0, 1) for centre, radius in soft]
+    shares = [
+        np.clip(1.5 - np.linalg.norm(place - centre, axis=-1) / radius, 0, 1)
+        for centre, radius in soft
+    ]
     shares.append(np.linalg.norm(place - (8, 9, 8), axis=-1) < 4)
     names = ["liver", "tumour  (left)", "vessel"]
     path = tmp_path / "x.dcm"
-    write_segmentation(path, np.stack(shares, axis=-1).astype(np.float32), names, "FRACTIONAL", "PROBABILITY", most)
+    write_segmentation(
+        path, np.stack(shares, axis=-1).astype(np.float32), names, "FRACTIONAL", "PROBABILITY", most
+    )
     import pydicom
 
     dataset = pydicom.dcmread(path)
     assert dataset.MaximumFractionalValue == most
     shared = dataset.SharedFunctionalGroupsSequence[0]
-    axes = np.reshape(shared.PlaneOrientationSequence[0].ImageOrientationPatient, (2, 3)).astype(float)
-    between_rows, between_columns = (float(side) for side in shared.PixelMeasuresSequence[0].PixelSpacing)
+    axes = np.reshape(shared.PlaneOrientationSequence[0].ImageOrientationPatient, (2, 3)).astype(
+        float
+    )
+    between_rows, between_columns = (
+        float(side) for side in shared.PixelMeasuresSequence[0].PixelSpacing
+    )
     thick = float(shared.PixelMeasuresSequence[0].SpacingBetweenSlices)
     for threshold in (0.5, 0.25, 0.9):
         volume = read_label_volume(path, LoadOptions(threshold=threshold))
@@ -374,16 +466,24 @@ def test_fractional_segments_of_dicom_are_cut_at_the_threshold(most: int, tmp_pa
             index = np.argwhere(volume.mask(part.label)) + [side.start for side in part.box]
             found[part.name] = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
         assert list(found) == ["liver", "tumour (left)", "vessel"]
-        assert abs(np.linalg.det(volume.affine)) == pytest.approx(between_rows * between_columns * thick)
+        assert abs(np.linalg.det(volume.affine)) == pytest.approx(
+            between_rows * between_columns * thick
+        )
         for number, points in enumerate(found.values(), 1):
             expected = []
-            for frame, about in zip(dataset.pixel_array, dataset.PerFrameFunctionalGroupsSequence, strict=True):
+            for frame, about in zip(
+                dataset.pixel_array, dataset.PerFrameFunctionalGroupsSequence, strict=True
+            ):
                 if about.SegmentIdentificationSequence[0].ReferencedSegmentNumber == number:
                     row, column = np.nonzero(frame >= threshold * most)
-                    corner = np.array(about.PlanePositionSequence[0].ImagePositionPatient, dtype=float)
+                    corner = np.array(
+                        about.PlanePositionSequence[0].ImagePositionPatient, dtype=float
+                    )
                     steps = np.stack([column * between_columns, row * between_rows], axis=1)
                     expected.append((corner + steps @ axes) * [-1, -1, 1])
-            sets = [np.unique(np.round(one, 2), axis=0) for one in (points, np.concatenate(expected))]
+            sets = [
+                np.unique(np.round(one, 2), axis=0) for one in (points, np.concatenate(expected))
+            ]
             np.testing.assert_allclose(*sets, atol=0.02)
 
 
@@ -413,9 +513,13 @@ def test_a_table_beside_the_volume_names_its_labels(name: str, text: str, tmp_pa
 
 
 def test_names_of_fsleyes_are_the_rest_of_the_line_and_colours_are_none(tmp_path: Path) -> None:
-    (tmp_path / "x.lut").write_text("2 0.0 1.0 0.5 3rd ventricle\n3  0.80392 0.24314 0. Left Caudate\n")
+    (tmp_path / "x.lut").write_text(
+        "2 0.0 1.0 0.5 3rd ventricle\n3  0.80392 0.24314 0. Left Caudate\n"
+    )
     assert read_label_names(tmp_path / "x.lut") == {2: "3rd ventricle", 3: "Left Caudate"}
-    (tmp_path / "teeth.lut").write_text("2 11 10 20 30 255\n3 21 10 20 30\n")  # index, name, colours
+    (tmp_path / "teeth.lut").write_text(
+        "2 11 10 20 30 255\n3 21 10 20 30\n"
+    )  # index, name, colours
     assert read_label_names(tmp_path / "teeth.lut") == {2: "11", 3: "21"}
 
 
@@ -424,7 +528,10 @@ def test_names_come_from_the_header_and_a_given_table_goes_first(tmp_path: Path)
     xml = b'<LabelTable><Label Key="3" Red="1"><![CDATA[left & right]]></Label></LabelTable>'
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, xml))
     nibabel.save(image, tmp_path / "x.nii.gz")
-    assert [body.name for body in read_label_volume(tmp_path / "x.nii.gz").bodies] == ["left & right", "7"]
+    assert [body.name for body in read_label_volume(tmp_path / "x.nii.gz").bodies] == [
+        "left & right",
+        "7",
+    ]
     (tmp_path / "names.csv").write_text("label,name\n7,spleen\n")
     given = read_label_volume(tmp_path / "x.nii.gz", LoadOptions(names=str(tmp_path / "names.csv")))
     assert [body.name for body in given.bodies] == ["3", "spleen"]
@@ -432,9 +539,15 @@ def test_names_come_from_the_header_and_a_given_table_goes_first(tmp_path: Path)
 
 def mgh_tags(names: dict[int, bytes], n_names: int | None = None) -> bytes:
     """What FreeSurfer puts behind the voxels: a transform, a colour table, and the command that made the file."""
-    table = struct.pack(">iii", -2, max(names) + 1, 8) + b"LUT.txt\0" + struct.pack(">i", n_names or len(names))
+    table = (
+        struct.pack(">iii", -2, max(names) + 1, 8)
+        + b"LUT.txt\0"
+        + struct.pack(">i", n_names or len(names))
+    )
     for label, name in names.items():
-        table += struct.pack(">ii", label, len(name) + 1) + name + struct.pack(">x4i", 220, 20, 60, 0)
+        table += (
+            struct.pack(">ii", label, len(name) + 1) + name + struct.pack(">x4i", 220, 20, 60, 0)
+        )
     transform, command = b"talairach.xfm\0", b"mri_convert\0"
     tags = struct.pack(">iq", 31, len(transform)) + transform + struct.pack(">i", 1) + table
     return tags + struct.pack(">iq", 3, len(command)) + command
@@ -454,7 +567,12 @@ def test_an_mgh_file_has_names_in_its_colour_table(kind: str, tmp_path: Path) ->
 
     given = {0: b"Unknown", 3: b"Left-Hippocampus", 7: "Corne d’Ammon".encode()}
     assert names(mgh_tags(given)) == ["Left-Hippocampus", "Corne d’Ammon"]
-    assert names(b"") == names(struct.pack(">i", 1)) == names(struct.pack(">iq", 31, 2**62)) == ["3", "7"]
+    assert (
+        names(b"")
+        == names(struct.pack(">i", 1))
+        == names(struct.pack(">iq", 31, 2**62))
+        == ["3", "7"]
+    )
     assert names(struct.pack(">iq", 31, -5) + bytes(99)) == ["3", "7"]
     # A table that is cut short, or announces more than there is, gives what it has
     for n_names in (2**31 - 1, -1):
@@ -477,8 +595,14 @@ def test_a_mask_without_names_is_called_by_its_file(tmp_path: Path) -> None:
 def test_a_mask_of_255_is_called_by_its_file_too(tmp_path: Path) -> None:
     write_nibabel(tmp_path / "prostate.nii.gz", (two_boxes() == 3).astype(np.uint8) * 255)
     assert label_bodies(read_label_volume(tmp_path / "prostate.nii.gz")) == [(255, "prostate", 384)]
-    write_nibabel(tmp_path / "labels.nii.gz", (two_boxes() == 3) * np.uint8(255) + (two_boxes() == 7) * np.uint8(254))
-    assert label_bodies(read_label_volume(tmp_path / "labels.nii.gz")) == [(254, "254", 320), (255, "255", 384)]
+    write_nibabel(
+        tmp_path / "labels.nii.gz",
+        (two_boxes() == 3) * np.uint8(255) + (two_boxes() == 7) * np.uint8(254),
+    )
+    assert label_bodies(read_label_volume(tmp_path / "labels.nii.gz")) == [
+        (254, "254", 320),
+        (255, "255", 384),
+    ]
 
 
 def test_labels_that_were_given_as_numbers_with_a_fraction_are_whole_again(tmp_path: Path) -> None:
@@ -493,20 +617,33 @@ def test_labels_that_were_given_as_numbers_with_a_fraction_are_whole_again(tmp_p
 
 def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
     ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0)
-    nibabel.save(nibabel.Nifti1Image(np.clip(1.5 - ball / 8, 0, 1).astype(np.float32), np.eye(4)), tmp_path / "x.nii")
+    nibabel.save(
+        nibabel.Nifti1Image(np.clip(1.5 - ball / 8, 0, 1).astype(np.float32), np.eye(4)),
+        tmp_path / "x.nii",
+    )
     radius = {}
     for threshold in (0.5, 0.75):
-        mesh = label_surface(read_label_volume(tmp_path / "x.nii", LoadOptions(threshold=threshold)), 1)
+        mesh = label_surface(
+            read_label_volume(tmp_path / "x.nii", LoadOptions(threshold=threshold)), 1
+        )
         radius[threshold] = (mesh.volume * 3 / 4 / np.pi) ** (1 / 3)
         assert any("probabilities" in note for note in mesh.notes)
     assert radius == pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
-    nibabel.save(nibabel.Nifti1Image(np.clip(0.9 - ball / 8, 0, 1).astype(np.float32), np.eye(4)), tmp_path / "y.nii")
-    with pytest.raises(MeshError, match=r"no voxel has a label, all are 0 \(probabilities: .* from 0\.95 on\)\. Check"):
+    nibabel.save(
+        nibabel.Nifti1Image(np.clip(0.9 - ball / 8, 0, 1).astype(np.float32), np.eye(4)),
+        tmp_path / "y.nii",
+    )
+    with pytest.raises(
+        MeshError,
+        match=r"no voxel has a label, all are 0 \(probabilities: .* from 0\.95 on\)\. Check",
+    ):
         read_label_volume(tmp_path / "y.nii", LoadOptions(threshold=0.95))
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_labels_as_floating_point_numbers_take_no_more_memory_than_is_asked_for(order: Literal["C", "F"]) -> None:
+def test_labels_as_floating_point_numbers_take_no_more_memory_than_is_asked_for(
+    order: Literal["C", "F"],
+) -> None:
     labels = np.zeros((120, 120, 120), order=order)
     labels[20:90, 30:80, 10:100], labels[100:110] = 7, 300.004
     tracemalloc.start()
@@ -519,7 +656,9 @@ def test_labels_as_floating_point_numbers_take_no_more_memory_than_is_asked_for(
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float64])
 def test_an_array_without_voxels_is_refused_in_a_sentence(dtype: type) -> None:
-    with pytest.raises(MeshError, match=r"^crop: expected labels of shape \(X, Y, Z\).* of shape \(0, 3, 3\)"):
+    with pytest.raises(
+        MeshError, match=r"^crop: expected labels of shape \(X, Y, Z\).* of shape \(0, 3, 3\)"
+    ):
         volume_in_memory(np.zeros((0, 3, 3), dtype), name="crop")
 
 
@@ -533,7 +672,10 @@ def test_probabilities_may_overshoot(tmp_path: Path) -> None:
     header[344:348] = b"n+1\0"
     (tmp_path / "x.nii").write_bytes(header + bytes(4) + image.dataobj.tobytes(order="F"))
     assert np.asarray(nibabel.load(tmp_path / "x.nii").dataobj).max() > 1
-    nibabel.save(nibabel.Nifti1Image((share - 1e-6 * (share == 0)).astype(np.float32), np.eye(4)), tmp_path / "y.nii")
+    nibabel.save(
+        nibabel.Nifti1Image((share - 1e-6 * (share == 0)).astype(np.float32), np.eye(4)),
+        tmp_path / "y.nii",
+    )
     for name in ("x.nii", "y.nii"):
         (body,) = read_label_volume(tmp_path / name).bodies
         assert body.n_voxels == (ball <= 8).sum()
@@ -543,7 +685,10 @@ def test_large_labels_are_kept(tmp_path: Path) -> None:
     labels = two_boxes().astype(np.int32) * 100_000_000
     nibabel.save(nibabel.Nifti1Image(labels, AFFINE), tmp_path / "x.nii.gz")
     volume = read_label_volume(tmp_path / "x.nii.gz")
-    assert label_bodies(volume) == [(300_000_000, "300000000", 384), (700_000_000, "700000000", 320)]
+    assert label_bodies(volume) == [
+        (300_000_000, "300000000", 384),
+        (700_000_000, "700000000", 320),
+    ]
     assert label_surface(volume, 700_000_000).volume == pytest.approx(320 * 3.75, rel=1e-3)
 
 
@@ -609,7 +754,9 @@ def broken(path: Path, kind: str) -> None:
         ("bytes", "look like an image and not like labels. Export the labels"),
     ],
 )
-def test_what_is_no_label_volume_is_refused_in_a_sentence(kind: str, words: str, tmp_path: Path) -> None:
+def test_what_is_no_label_volume_is_refused_in_a_sentence(
+    kind: str, words: str, tmp_path: Path
+) -> None:
     path = tmp_path / "x.nii.gz"
     broken(path, kind)
     with pytest.raises(MeshError, match=f"^{re.escape(str(path))}: .*{words}"):
@@ -639,12 +786,18 @@ def test_labels_of_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> N
     nifti(tmp_path / "x.nii", labels)
     (tmp_path / "x.csv").write_text("label,name\n3,rib\n5,liver\n7,rib\n")
     volume = read_label_volume(tmp_path / "x.nii")
-    assert [(body.label, body.name) for body in volume.bodies] == [(3, "rib (3)"), (5, "liver"), (7, "rib (7)")]
+    assert [(body.label, body.name) for body in volume.bodies] == [
+        (3, "rib (3)"),
+        (5, "liver"),
+        (7, "rib (7)"),
+    ]
     rib = label_surface(volume, "rib (7)")
     assert rib.volume == pytest.approx((labels == 7).sum() * 3.75, rel=1e-3)
     assert "another label has the same name" in rib.notes[0]
     assert label_surface(volume, "liver").notes == ()
-    with pytest.raises(MeshError, match=r"x\.nii: no label 'rib'\. It has 3: rib \(3\), liver, rib \(7\)"):
+    with pytest.raises(
+        MeshError, match=r"x\.nii: no label 'rib'\. It has 3: rib \(3\), liver, rib \(7\)"
+    ):
         volume.body("rib")
     with pytest.raises(MeshError, match=r"labels 3 and 5 are both named 'rib \(3\)'.*Rename"):
         LabelVolume((labels,), AFFINE, names={3: "rib", 7: "rib", 5: "rib (3)"})
@@ -654,7 +807,11 @@ def test_a_name_that_is_the_number_of_another_label_is_the_name(tmp_path: Path) 
     """Dentists call teeth by numbers."""
     nifti(tmp_path / "x.nii", two_boxes())
     (tmp_path / "x.csv").write_text("label,name\n3,11\n7,3\n")
-    volumes = {str(ref.part): mesh.volume for ref, mesh in each_body(tmp_path / "x.nii") if isinstance(mesh, Mesh)}
+    volumes = {
+        str(ref.part): mesh.volume
+        for ref, mesh in each_body(tmp_path / "x.nii")
+        if isinstance(mesh, Mesh)
+    }
     assert volumes == pytest.approx({"11": 384 * 3.75, "3": 320 * 3.75}, rel=1e-3)
     assert load_mesh(tmp_path / "x.nii", part="3").volume == pytest.approx(320 * 3.75, rel=1e-3)
     volume = read_label_volume(tmp_path / "x.nii")
@@ -695,7 +852,9 @@ def test_one_small_label_leaves_the_others() -> None:
 def test_no_header_leads_out_of_its_folder(tmp_path: Path) -> None:
     write_itk(tmp_path / "x.mhd", two_boxes())
     text = (tmp_path / "x.mhd").read_text()
-    (tmp_path / "x.mhd").write_text(re.sub("ElementDataFile = .*", "ElementDataFile = ../../etc/passwd", text))
+    (tmp_path / "x.mhd").write_text(
+        re.sub("ElementDataFile = .*", "ElementDataFile = ../../etc/passwd", text)
+    )
     with pytest.raises(MeshError, match="expected voxels in a file of the same folder"):
         read_label_volume(tmp_path / "x.mhd")
     header = "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 4 4\nencoding: raw\ndata file: /etc/passwd\n\n"
@@ -704,7 +863,9 @@ def test_no_header_leads_out_of_its_folder(tmp_path: Path) -> None:
         read_label_volume(tmp_path / "x.nrrd")
 
 
-@pytest.mark.parametrize("line", ["\n\nElementDataFile =", " ElementDataFile =", "ElementDataFile :"])
+@pytest.mark.parametrize(
+    "line", ["\n\nElementDataFile =", " ElementDataFile =", "ElementDataFile :"]
+)
 def test_no_header_of_metaimage_leads_out_however_it_is_written(line: str, tmp_path: Path) -> None:
     """ITK reads these, too."""
     write_itk(tmp_path / "x.mhd", two_boxes())
@@ -739,7 +900,9 @@ def test_thin_branches_are_not_taken_for_noise() -> None:
     for _ in range(60):
         start = ends[random.integers(len(ends))]
         ends.append(np.clip(start + random.normal(0, 18, 3), 4, 91))
-        for at in np.round(start + (ends[-1] - start) * np.linspace(0, 1, 200)[:, None]).astype(int):
+        for at in np.round(start + (ends[-1] - start) * np.linspace(0, 1, 200)[:, None]).astype(
+            int
+        ):
             mask[tuple(slice(i, i + 2) for i in at)] = 1
     mesh = label_surface(LabelVolume((mask,), np.eye(4)), 1)
     assert mesh.volume == pytest.approx(mask.sum(), rel=2e-3)

@@ -29,7 +29,9 @@ def arrays(*parts: trimesh.Trimesh) -> Surface:
     return np.asarray(whole.vertices, dtype=np.float64), np.asarray(whole.faces, dtype=np.int64)
 
 
-def ball(radius: float = 1.0, centre: tuple[float, float, float] = (0, 0, 0), subdivisions: int = 3) -> trimesh.Trimesh:
+def ball(
+    radius: float = 1.0, centre: tuple[float, float, float] = (0, 0, 0), subdivisions: int = 3
+) -> trimesh.Trimesh:
     surface = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     surface.apply_translation(centre)
     return surface
@@ -38,7 +40,9 @@ def ball(radius: float = 1.0, centre: tuple[float, float, float] = (0, 0, 0), su
 def cut_ball(height: float) -> Surface:
     """The unit sphere without its cap above `height`."""
     surface = ball(subdivisions=4)
-    return np.asarray(surface.vertices), np.asarray(surface.faces)[surface.triangles_center[:, 2] < height]
+    return np.asarray(surface.vertices), np.asarray(surface.faces)[
+        surface.triangles_center[:, 2] < height
+    ]
 
 
 def turned_profile(profile: list[tuple[float, float]]) -> Surface:
@@ -77,10 +81,14 @@ def test_ball_of_loose_turned_triangles() -> None:
 
 @pytest.mark.parametrize(
     "solid",
-    [trimesh.creation.box((1, 0.9, 0.8)), trimesh.creation.box((1, 1, 0.1)), trimesh.creation.box((1, 1, 0.05)),
-     trimesh.creation.cylinder(0.05, 1, sections=64)],
+    [
+        trimesh.creation.box((1, 0.9, 0.8)),
+        trimesh.creation.box((1, 1, 0.1)),
+        trimesh.creation.box((1, 1, 0.05)),
+        trimesh.creation.cylinder(0.05, 1, sections=64),
+    ],
     ids=["block", "plate", "thin plate", "rod"],
-)  # fmt: skip
+)
 def test_the_volume_is_kept_by_the_grid_and_by_the_simplification(solid: trimesh.Trimesh) -> None:
     body = watertight(*arrays(solid))
     assert len(body.vertices) <= 5000
@@ -116,11 +124,19 @@ def test_the_neck_of_a_bottle_is_closed_unless_its_wall_has_two_sides() -> None:
     assert is_inside(watertight(*turned_profile(outer), resolution=48), (0, 0, 0.8)) == [True]
     inner = [(0.14, 2.2), (0.14, 1.75), (0.94, 1.45), (0.94, 0.06), (0.0, 0.06)]
     vase = watertight(*turned_profile(outer + inner), resolution=64)
-    assert is_inside(vase, (0, 0, 0.8), (0, 0, 0.03), (0, 0, 2.0), (0.97, 0, 0.8)) == [False, True, False, True]
+    assert is_inside(vase, (0, 0, 0.8), (0, 0, 0.03), (0, 0, 2.0), (0.97, 0, 0.8)) == [
+        False,
+        True,
+        False,
+        True,
+    ]
 
 
 def test_what_is_hidden_is_filled() -> None:
-    body = watertight(*arrays(ball(), ball(0.3, (0.2, 0, 0)), trimesh.creation.box((0.5, 0.4, 0.3))), resolution=64)
+    body = watertight(
+        *arrays(ball(), ball(0.3, (0.2, 0, 0)), trimesh.creation.box((0.5, 0.4, 0.3))),
+        resolution=64,
+    )
     alone = watertight(*arrays(ball()), resolution=64)
     assert body.volume == pytest.approx(alone.volume, rel=1e-4)
     assert np.linalg.norm(body.vertices, axis=1).min() > 0.98
@@ -137,7 +153,9 @@ def test_overlapping_parts_are_one() -> None:
 @pytest.mark.parametrize("turned", [(False, True), (True, False), (True, True)])
 def test_parts_are_turned_outward_by_their_winding_numbers(turned: tuple[bool, bool]) -> None:
     # Two rings: the far sides of each face its middle, so that no simple rule tells their outside.
-    rings = [trimesh.creation.torus(10.0, 1.0, major_sections=48, minor_sections=16) for _ in range(2)]
+    rings = [
+        trimesh.creation.torus(10.0, 1.0, major_sections=48, minor_sections=16) for _ in range(2)
+    ]
     rings[1].apply_transform(trimesh.transformations.rotation_matrix(1.2, [1, 0, 0]))
     for ring, inverted in zip(rings, turned, strict=True):
         if inverted:
@@ -147,7 +165,9 @@ def test_parts_are_turned_outward_by_their_winding_numbers(turned: tuple[bool, b
     away = np.linalg.norm(vertices[faces].mean(axis=1) - [10, 0, 0], axis=1)
     surface = OrientedSurface.of(vertices, faces[np.argsort(away)[len(faces) // 40 :]])
     assert surface.is_nearly_closed
-    places = np.array([[-10, 0, 0], [0, 10, 0], [0, 10 * np.cos(1.2), 10 * np.sin(1.2)], [0, 0, 0], [0, 0, 9]])
+    places = np.array(
+        [[-10, 0, 0], [0, 10, 0], [0, 10 * np.cos(1.2), 10 * np.sin(1.2)], [0, 0, 0], [0, 0, 9]]
+    )
     np.testing.assert_allclose(surface.winding(places), [2, 1, 1, 0, 0], atol=0.05)
 
 
@@ -158,8 +178,11 @@ def test_faces_between_solids_are_left_out_of_the_winding_numbers() -> None:
     bare = OrientedSurface(20 * vertices, faces, False)._drop_hidden_faces()
     np.testing.assert_array_equal(bare.faces, faces[: len(outer.faces)])
     assert bare.is_nearly_closed
-    np.testing.assert_allclose(bare.winding(20 * np.array([[0, 0, 0.005], [0, 0.1, 0], [0, 0, 0.9], [0, 0, 1.1]])),
-                               [1, 1, 1, 0], atol=5e-3)  # fmt: skip
+    np.testing.assert_allclose(
+        bare.winding(20 * np.array([[0, 0, 0.005], [0, 0.1, 0], [0, 0, 0.9], [0, 0, 1.1]])),
+        [1, 1, 1, 0],
+        atol=5e-3,
+    )
     # An open cup hides nothing: it is asked with all of its faces.
     cup_vertices, cup_faces = cut_ball(0.3)
     cup = OrientedSurface(20 * cup_vertices, cup_faces, False)._drop_hidden_faces()
@@ -189,7 +212,9 @@ def test_parts_that_share_an_edge_are_one() -> None:
 
 def test_a_wall_inside_that_lies_on_points_of_the_grid_is_filled() -> None:
     left = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
-    right = left.copy().apply_translation([1, 0, 0])  # whose squares in the wall are cut along the other diagonal
+    right = left.copy().apply_translation(
+        [1, 0, 0]
+    )  # whose squares in the wall are cut along the other diagonal
     mesh = watertight(*arrays(left, right))
     assert mesh.genus == 0
     assert mesh.area == pytest.approx(10, rel=0.03)
@@ -200,7 +225,9 @@ def test_a_sheet_gets_about_a_cell() -> None:
     x, y = (values.ravel() for values in np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5)))
     vertices = np.stack([x, y, np.zeros_like(x)], axis=1)
     start = np.array([5 * i + j for i in range(4) for j in range(4)])
-    faces = np.vstack([np.stack([start, start + 1, start + 6], 1), np.stack([start, start + 6, start + 5], 1)])
+    faces = np.vstack(
+        [np.stack([start, start + 1, start + 6], 1), np.stack([start, start + 6, start + 5], 1)]
+    )
     body = watertight(vertices, faces, resolution=48)
     assert_closed(body)
     thickness = np.ptp(body.vertices[:, 2])
@@ -279,9 +306,15 @@ def test_inputs_stay_as_they_are() -> None:
 
 
 def test_what_is_no_surface_is_refused() -> None:
-    with pytest.raises(MeshError, match=r"line\.obj: expected a surface, but no triangle has an area"):
-        watertight(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), name="line.obj")
-    with pytest.raises(MeshError, match=r"five\.xyz: expected at least 10 points for a surface, got 5"):
+    with pytest.raises(
+        MeshError, match=r"line\.obj: expected a surface, but no triangle has an area"
+    ):
+        watertight(
+            np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), name="line.obj"
+        )
+    with pytest.raises(
+        MeshError, match=r"five\.xyz: expected at least 10 points for a surface, got 5"
+    ):
         watertight(np.random.default_rng(0).random((5, 3)), name="five.xyz")
     with pytest.raises(MeshError, match="finite"):
         watertight(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))

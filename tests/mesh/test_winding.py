@@ -9,11 +9,15 @@ from bodies import Mesh, bumpy_sphere, cube, exterior_points, interior_points, t
 from igps.mesh.winding import winding_number
 
 
-@pytest.mark.parametrize("mesh", [bumpy_sphere(3), cube(), torus(20, 12)], ids=["bumpy", "cube", "torus"])
+@pytest.mark.parametrize(
+    "mesh", [bumpy_sphere(3), cube(), torus(20, 12)], ids=["bumpy", "cube", "torus"]
+)
 def test_winding_number_is_one_inside_and_zero_outside(mesh: Mesh) -> None:
     np.testing.assert_allclose(winding_number(*mesh, interior_points(mesh, 100)), 1, atol=1e-12)
     np.testing.assert_allclose(winding_number(*mesh, exterior_points(mesh, 100)), 0, atol=1e-12)
-    np.testing.assert_allclose(winding_number(mesh[0], mesh[1][:, ::-1], mesh[0][:1] / 2 + 100), 0, atol=1e-12)
+    np.testing.assert_allclose(
+        winding_number(mesh[0], mesh[1][:, ::-1], mesh[0][:1] / 2 + 100), 0, atol=1e-12
+    )
 
 
 def winding_by_loops(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -22,10 +26,18 @@ def winding_by_loops(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
     for i, point in enumerate(points):
         for corners in vertices[faces] - point:
             a, b, c = corners / np.linalg.norm(corners, axis=1, keepdims=True)
-            sides = [2 * np.arctan2(np.linalg.norm(p - q), np.linalg.norm(p + q)) for p, q in ((b, c), (c, a), (a, b))]
+            sides = [
+                2 * np.arctan2(np.linalg.norm(p - q), np.linalg.norm(p + q))
+                for p, q in ((b, c), (c, a), (a, b))
+            ]
             half = sum(sides) / 2
             tangents = np.tan(half / 2) * np.prod([np.tan((half - side) / 2) for side in sides])
-            total[i] += np.sign(np.linalg.det(corners)) * 4 * np.arctan(np.sqrt(max(tangents, 0))) / (4 * np.pi)
+            total[i] += (
+                np.sign(np.linalg.det(corners))
+                * 4
+                * np.arctan(np.sqrt(max(tangents, 0)))
+                / (4 * np.pi)
+            )
     return total
 
 
@@ -44,7 +56,9 @@ def test_winding_number_is_the_sum_of_solid_angles(kind: str) -> None:
     flat = np.array([[0, 1, 1], [2, 2, 2]])
     for more in (np.concatenate([faces, flat]), np.concatenate([np.tile(flat, (40, 1)), faces])):
         np.testing.assert_allclose(winding_number(vertices, more, points), expected, atol=1e-7)
-    np.testing.assert_allclose(winding_number(1e3 + vertices, faces, 1e3 + points), expected, atol=1e-7)
+    np.testing.assert_allclose(
+        winding_number(1e3 + vertices, faces, 1e3 + points), expected, atol=1e-7
+    )
 
 
 def test_winding_number_of_flat_faces_alone_is_refused() -> None:

@@ -7,7 +7,12 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from batches import N_POINTS, alone, embedded, scaled, two_bodies
-from igps.nn.batch_features import BatchFeatures, SampleFeatures, nearest_directions, nearest_neighbours
+from igps.nn.batch_features import (
+    BatchFeatures,
+    SampleFeatures,
+    nearest_directions,
+    nearest_neighbours,
+)
 from igps.nn.embedding import SpectralEmbedding
 
 
@@ -30,8 +35,12 @@ def test_nearest_directions_are_those_of_a_loop() -> None:
     mask = torch.ones(20, dtype=torch.bool)
     found = nearest_directions(points, targets, mask, n_nearest=3)
     for point, direction in zip(points, found, strict=True):
-        nearest = sorted(targets, key=lambda target, point=point: float((target - point).norm()))[:3]  # type: ignore[misc]
-        torch.testing.assert_close(direction, normalize(torch.stack(nearest).mean(dim=0) - point, dim=0))
+        nearest = sorted(targets, key=lambda target, point=point: float((target - point).norm()))[
+            :3
+        ]  # type: ignore[misc]
+        torch.testing.assert_close(
+            direction, normalize(torch.stack(nearest).mean(dim=0) - point, dim=0)
+        )
     whole = nearest_directions(points, targets, mask, n_nearest=50)
     torch.testing.assert_close(whole, normalize(targets.mean(dim=0) - points, dim=1))
     few = nearest_directions(
@@ -57,7 +66,9 @@ def test_an_embedding_is_computed_once() -> None:
 def test_positions_do_not_change_with_scale() -> None:
     batch, large = two_bodies(), scaled(two_bodies(), 8.0)
     expected = SampleFeatures(batch, "interior", batch.interior).positions()
-    torch.testing.assert_close(SampleFeatures(large, "interior", large.interior).positions(), expected)
+    torch.testing.assert_close(
+        SampleFeatures(large, "interior", large.interior).positions(), expected
+    )
     by_hand = batch.interior.points.numpy() / np.sqrt([2.0, 3.0])[:, None, None]
     np.testing.assert_allclose(expected, by_hand, rtol=1e-6)
 
@@ -73,7 +84,9 @@ def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind: st
         expected = sign * normalize(other[nearest].mean(dim=1) - own, dim=1)
         np.testing.assert_allclose(directions[i, :n], expected, atol=1e-4)
         single = alone(batch, i)
-        unpadded = SampleFeatures(single, kind, getattr(single, kind)).embedded_directions(embedding)  # type: ignore[arg-type]
+        unpadded = SampleFeatures(single, kind, getattr(single, kind)).embedded_directions(
+            embedding
+        )  # type: ignore[arg-type]
         torch.testing.assert_close(unpadded[0], directions[i, :n])
 
 
@@ -92,7 +105,8 @@ def test_subsets() -> None:
     batch = two_bodies()
     assert BatchFeatures(batch, training=False).of("interior", None, 5).samples is batch.interior
     fixed, again, drawn, other = (
-        BatchFeatures(batch, training).of("interior", 9, 5).samples for training in (False, False, True, True)
+        BatchFeatures(batch, training).of("interior", 9, 5).samples
+        for training in (False, False, True, True)
     )
     assert fixed.mask.sum(dim=1).tolist() == [9, 9]
     assert torch.equal(fixed.points, again.points)
@@ -106,12 +120,18 @@ def test_subsets() -> None:
 def test_nearest_points_are_those_of_a_loop() -> None:
     points = torch.randn(30, 4, generator=torch.Generator().manual_seed(3))
     for i, found in enumerate(nearest_neighbours(points, 5).tolist()):
-        others = sorted((j for j in range(30) if j != i), key=lambda j, i=i: float((points[j] - points[i]).norm()))  # type: ignore[misc]
+        others = sorted(
+            (j for j in range(30) if j != i),
+            key=lambda j, i=i: float((points[j] - points[i]).norm()),
+        )  # type: ignore[misc]
         assert found == others[:5]
     assert nearest_neighbours(points[:3], 5).shape == (3, 2)
     few = torch.arange(30) % 10 == 4
     for i, found in enumerate(nearest_neighbours(points, 5, few).tolist()):
-        others = sorted((j for j in (4, 14, 24) if j != i), key=lambda j, i=i: float((points[j] - points[i]).norm()))  # type: ignore[misc]
+        others = sorted(
+            (j for j in (4, 14, 24) if j != i),
+            key=lambda j, i=i: float((points[j] - points[i]).norm()),
+        )  # type: ignore[misc]
         assert found == [*others, *[i] * 5][:5]
     with pytest.raises(ValueError, match="samples: expected at least one of each body, got none"):
         nearest_neighbours(torch.zeros(0, 3), 4)

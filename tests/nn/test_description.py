@@ -71,7 +71,9 @@ class Area(BodyDescriptor):
 
 
 @pytest.mark.parametrize(("batch_size", "n_workers"), [(1, 1), (3, 1), (1, 3)])
-def test_describe_is_the_descriptor_of_each_batch(dataset: SignatureDataset, batch_size: int, n_workers: int) -> None:
+def test_describe_is_the_descriptor_of_each_batch(
+    dataset: SignatureDataset, batch_size: int, n_workers: int
+) -> None:
     descriptor = histogram()
     expected = torch.cat([descriptor(dataset.batch([i])) for i in range(4)])
     threads = torch.get_num_threads()
@@ -93,7 +95,9 @@ def test_meshes_come_to_descriptors_that_need_them(dataset: SignatureDataset) ->
     np.testing.assert_allclose(describe(dataset, Area(), n_workers=1), expected, rtol=1e-6)
 
 
-def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(dataset: SignatureDataset) -> None:
+def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(
+    dataset: SignatureDataset,
+) -> None:
     modes: list[bool] = []
 
     class Looking(torch.nn.Module):
@@ -128,24 +132,32 @@ def test_modes_are_put_back_after_an_error() -> None:
 def test_training_subsets_are_for_training_alone(dataset: SignatureDataset) -> None:
     drawn = HistogramDescriptor(PairHistogram(["interior_distance"], n_training_samples=5)).train()
     torch.testing.assert_close(
-        describe(dataset, drawn), describe(dataset, HistogramDescriptor(PairHistogram(["interior_distance"])))
+        describe(dataset, drawn),
+        describe(dataset, HistogramDescriptor(PairHistogram(["interior_distance"]))),
     )
 
 
 @pytest.mark.parametrize("function", [describe, describe_usable])
 def test_a_descriptor_that_needs_more_refuses(dataset: SignatureDataset, function) -> None:  # type: ignore[no-untyped-def]
     """Before anything is computed, and names what is missing."""
-    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 13, got 12"):
+    with pytest.raises(
+        ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 13, got 12"
+    ):
         function(dataset, histogram(13))
     cosines = HistogramDescriptor(PairHistogram(["pair_cosines"]))
-    with pytest.raises(ValueError, match=r"attributes: this descriptor needs signatures with surface_direction, got "):
+    with pytest.raises(
+        ValueError,
+        match=r"attributes: this descriptor needs signatures with surface_direction, got ",
+    ):
         function(dataset, cosines)
 
 
 def test_what_cannot_be_described_is_listed(dataset: SignatureDataset) -> None:
     area = Area(refused="2.off")
     values, failures = describe_usable(dataset, area, n_workers=1)
-    np.testing.assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 1, 3)], rtol=1e-6)
+    np.testing.assert_allclose(
+        values[:, 1], [dataset[i].signature.area for i in (0, 1, 3)], rtol=1e-6
+    )
     (failure,) = failures
     assert failure.path == dataset.bodies.paths[2]
     assert failure.error == f"{failure.path}: it is not to my liking"
@@ -167,9 +179,13 @@ def test_a_mesh_that_cannot_be_read_is_listed(dataset: SignatureDataset, tmp_pat
         describe(both, histogram(), n_workers=1)
 
 
-def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset: SignatureDataset) -> None:
+def test_a_body_that_kills_its_process_costs_no_other_its_description(
+    dataset: SignatureDataset,
+) -> None:
     values, failures = describe_usable(dataset, Area(refused="1.off", dies=True), n_workers=2)
-    np.testing.assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 2, 3)], rtol=1e-6)
+    np.testing.assert_allclose(
+        values[:, 1], [dataset[i].signature.area for i in (0, 2, 3)], rtol=1e-6
+    )
     assert [failure.path for failure in failures] == [dataset.bodies.paths[1]]
     assert "was killed twice" in failures[0].error
 
@@ -185,7 +201,9 @@ def test_descriptions_that_are_not_finite_are_failures(dataset: SignatureDataset
 
 
 def test_an_empty_dataset_is_refused(dataset: SignatureDataset) -> None:
-    with pytest.raises(ValueError, match="dataset: expected at least one mesh to describe, got none"):
+    with pytest.raises(
+        ValueError, match="dataset: expected at least one mesh to describe, got none"
+    ):
         describe(dataset.subset([]), histogram())
 
 
@@ -215,7 +233,10 @@ def fresh(tmp_path: Path) -> SignatureDataset:
         body.vertices *= [1.0, 1.0 + 0.2 * i, 1.5]
         body.export(tmp_path / f"{i}.off")
     paths = sorted(tmp_path.glob("*.off"))
-    assert SignatureDataset(paths, CONFIG, tmp_path / "cache").precompute(n_workers=1, progress=False) == []
+    assert (
+        SignatureDataset(paths, CONFIG, tmp_path / "cache").precompute(n_workers=1, progress=False)
+        == []
+    )
     return SignatureDataset(paths, CONFIG, tmp_path / "cache")  # which looks at the files again
 
 
@@ -243,7 +264,9 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
     asked(more)
     assert plain.cached_keys() == more.cached_keys()
     assert describe_usable(plain, Area(), cache_tag="one", n_workers=1)[0].shape == (3, 2)
-    with_own = SignatureDataset(paths, CONFIG, fresh.pipeline.cache_dir, attributes={"height": lambda x: x[:, 2]})
+    with_own = SignatureDataset(
+        paths, CONFIG, fresh.pipeline.cache_dir, attributes={"height": lambda x: x[:, 2]}
+    )
     assert asked(with_own)[0] == asked(with_own)[0] == ["0", "1", "2"]
     body = trimesh.creation.icosphere(subdivisions=2)
     body.vertices *= [2.0, 0.7, 0.5]
@@ -254,7 +277,9 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
     assert not torch.equal(other[1], values[1])
 
 
-def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(fresh: SignatureDataset) -> None:
+def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(
+    fresh: SignatureDataset,
+) -> None:
     """Two files change places while they are described: neither description is kept as that of the other."""
     first, second = fresh.bodies.paths[:2]
     _, values = asked(fresh, cache_tag=None)
@@ -272,7 +297,9 @@ def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(fresh: Si
     assert torch.equal(asked(fresh)[1], values[[1, 0, 2]])
 
 
-def test_damaged_descriptions_are_made_again(fresh: SignatureDataset, caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_descriptions_are_made_again(
+    fresh: SignatureDataset, caplog: pytest.LogCaptureFixture
+) -> None:
     _, values = asked(fresh)
     first, second, _ = sorted((fresh.pipeline.cache_dir / "descriptions").rglob("*.safetensors"))
     content = bytearray(first.read_bytes())
@@ -297,7 +324,11 @@ def test_where_descriptions_cannot_be_kept_they_are_made(
 
 def test_failures_are_not_kept(fresh: SignatureDataset) -> None:
     for refused in ("1.off", "2.off"):
-        values, failures = describe_usable(fresh, Area(refused=refused), cache_tag="area", n_workers=1)
+        values, failures = describe_usable(
+            fresh, Area(refused=refused), cache_tag="area", n_workers=1
+        )
         assert len(values) + len(failures) == 3
         # What was refused at first is described the second time, and what is kept is not refused any more.
-        assert [Path(failure.id).name for failure in failures] == (["1.off"] if refused == "1.off" else [])
+        assert [Path(failure.id).name for failure in failures] == (
+            ["1.off"] if refused == "1.off" else []
+        )

@@ -12,7 +12,14 @@ from torch import Tensor, nn
 from batches import alone, scaled, two_bodies
 from igps.data.batch import Body, SignatureBatch
 from igps.data.requirements import Requirements
-from igps.nn.axes import Attribute, EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairCosines, Potential
+from igps.nn.axes import (
+    Attribute,
+    EmbeddedPairCosines,
+    EuclideanDistance,
+    InteriorDistance,
+    PairCosines,
+    Potential,
+)
 from igps.nn.descriptor import BodyDescriptor, Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.heads.closed_form import WhitenedHead
@@ -38,17 +45,27 @@ def learned() -> HistogramDescriptor:
 def oriented(*, in_embedding: bool = False, learnable: bool = False) -> HistogramDescriptor:
     angles = EmbeddedPairCosines if in_embedding else PairCosines
     axes = [InteriorDistance(4, 3.0, learnable=learnable), angles(3, learnable=learnable)]
-    return HistogramDescriptor(PairHistogram(axes, SpectralEmbedding(n_knots=6 if learnable else 0)))
+    return HistogramDescriptor(
+        PairHistogram(axes, SpectralEmbedding(n_knots=6 if learnable else 0))
+    )
 
 
 def combined() -> HistogramDescriptor:
     """Every kind of part."""
     fine, coarse = (SpectralEmbedding(n_eigenpairs=n) for n in (5, 2))
-    two_scales = PairHistogram([Potential(2), InteriorDistance(6), InteriorDistance(4, 1.0, embedding=coarse)], fine)
+    two_scales = PairHistogram(
+        [Potential(2), InteriorDistance(6), InteriorDistance(4, 1.0, embedding=coarse)], fine
+    )
     surface = PairHistogram([EuclideanDistance(6), PairCosines(5)], samples="surface")
     nested = [*learned().histograms, *paper().histograms]
     return HistogramDescriptor(
-        [nested, two_scales, *oriented().histograms, *oriented(in_embedding=True).histograms, surface]  # type: ignore[list-item]
+        [
+            nested,
+            two_scales,
+            *oriented().histograms,
+            *oriented(in_embedding=True).histograms,
+            surface,
+        ]  # type: ignore[list-item]
     )
 
 
@@ -61,14 +78,18 @@ def test_padding_never_shows(batch: SignatureBatch, make: Callable[[], Descripto
     with torch.no_grad():
         together = descriptor(batch)
         for i in range(2):
-            torch.testing.assert_close(descriptor(alone(batch, i))[0], together[i], rtol=0, atol=1e-6)
+            torch.testing.assert_close(
+                descriptor(alone(batch, i))[0], together[i], rtol=0, atol=1e-6
+            )
 
 
 @pytest.mark.parametrize("make", MAKERS)
 def test_does_not_change_with_scale(batch: SignatureBatch, make: Callable[[], Descriptor]) -> None:
     descriptor = make()
     with torch.no_grad():
-        torch.testing.assert_close(descriptor(scaled(batch, 8.0)), descriptor(batch), rtol=0, atol=1e-6)
+        torch.testing.assert_close(
+            descriptor(scaled(batch, 8.0)), descriptor(batch), rtol=0, atol=1e-6
+        )
 
 
 def test_everything_learns(batch: SignatureBatch) -> None:
@@ -102,7 +123,9 @@ def check_gradients(parameters: dict[str, nn.Parameter]) -> None:
         assert (parameter.grad != 0).any(), name
 
 
-def gradients(module: nn.Module, batch: SignatureBatch, parameters: list[nn.Parameter]) -> tuple[Tensor, ...]:
+def gradients(
+    module: nn.Module, batch: SignatureBatch, parameters: list[nn.Parameter]
+) -> tuple[Tensor, ...]:
     result = module(batch)
     return result.detach(), *torch.autograd.grad(result.square().sum(), parameters)
 
@@ -113,7 +136,10 @@ def test_compiled_equals_eager(batch: SignatureBatch) -> None:
     torch.compiler.reset()
     compiled = torch.compile(descriptor, backend="aot_eager")
     torch.testing.assert_close(
-        gradients(compiled, batch, parameters), gradients(descriptor, batch, parameters), rtol=1e-4, atol=1e-7
+        gradients(compiled, batch, parameters),
+        gradients(descriptor, batch, parameters),
+        rtol=1e-4,
+        atol=1e-7,
     )
 
 
@@ -123,7 +149,9 @@ def test_cuda_equals_cpu(batch: SignatureBatch) -> None:
     expected = gradients(descriptor, batch, list(descriptor.parameters()))
     descriptor.cuda()
     result = gradients(descriptor, batch.to("cuda"), list(descriptor.parameters()))
-    torch.testing.assert_close([value.cpu() for value in result], list(expected), rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(
+        [value.cpu() for value in result], list(expected), rtol=1e-3, atol=1e-6
+    )
 
 
 def test_cells_are_counted_by_part(batch: SignatureBatch) -> None:
@@ -134,7 +162,9 @@ def test_cells_are_counted_by_part(batch: SignatureBatch) -> None:
     assert paper().part_cells == (640,)
 
 
-def test_a_single_histogram_keeps_its_shape_and_a_list_of_one_is_flat(batch: SignatureBatch) -> None:
+def test_a_single_histogram_keeps_its_shape_and_a_list_of_one_is_flat(
+    batch: SignatureBatch,
+) -> None:
     histogram = PairHistogram()
     single, listed = HistogramDescriptor(histogram)(batch), HistogramDescriptor([histogram])(batch)
     assert torch.equal(single, histogram(batch))
@@ -149,7 +179,10 @@ def small(n_eigenpairs: int, n_classes: int, **options: int) -> PairHistogram:
 def test_parts_have_equal_shares_and_so_have_their_histograms(batch: SignatureBatch) -> None:
     first, second, third = histograms = [small(3, 2), small(5, 3), small(4, 1)]
     result = HistogramDescriptor([[first, second], third])(batch)
-    expected = [share * one(batch).flatten(1) for share, one in zip((1 / 4, 1 / 4, 1 / 2), histograms, strict=True)]
+    expected = [
+        share * one(batch).flatten(1)
+        for share, one in zip((1 / 4, 1 / 4, 1 / 2), histograms, strict=True)
+    ]
     torch.testing.assert_close(result, torch.cat(expected, dim=1))
     torch.testing.assert_close(result.sum(dim=1), torch.ones(2))
 
@@ -158,7 +191,9 @@ def test_chi_square_of_parts_is_the_mean(batch: SignatureBatch) -> None:
     parts = [small(3, 2), small(5, 3)]
     descriptor = HistogramDescriptor(parts)
     combined = descriptor(batch)
-    separate = [chi_square(histograms, histograms) for histograms in (part(batch) for part in parts)]
+    separate = [
+        chi_square(histograms, histograms) for histograms in (part(batch) for part in parts)
+    ]
     expected = torch.stack(separate).mean(dim=0)
     torch.testing.assert_close(descriptor.distances(combined, combined), expected)
 
@@ -189,7 +224,9 @@ def test_what_histograms_share_is_computed_once(batch: SignatureBatch) -> None:
 def test_sharing_changes_no_number(batch: SignatureBatch) -> None:
     shared = SpectralEmbedding(n_eigenpairs=5)
     made = [
-        HistogramDescriptor([PairHistogram([Potential(n), InteriorDistance(8)], embedding) for n in (2, 3)])
+        HistogramDescriptor(
+            [PairHistogram([Potential(n), InteriorDistance(8)], embedding) for n in (2, 3)]
+        )
         for embedding in (shared, None)
     ]
     for histogram in made[1].histograms:
@@ -213,11 +250,15 @@ def test_training_draws_another_subset_each_time(batch: SignatureBatch) -> None:
     assert not torch.equal(one[:, :first], other[:, :first])
     assert torch.equal(one[:, first:], other[:, first:])
     descriptor.eval()
-    torch.testing.assert_close(descriptor(batch), HistogramDescriptor([small(5, 2), small(5, 1)])(batch))
+    torch.testing.assert_close(
+        descriptor(batch), HistogramDescriptor([small(5, 2), small(5, 1)])(batch)
+    )
 
 
 def test_histograms_that_draw_alike_draw_the_same_subset(batch: SignatureBatch) -> None:
-    twice = HistogramDescriptor([small(5, 2, n_training_samples=5), small(5, 2, n_training_samples=5)])
+    twice = HistogramDescriptor(
+        [small(5, 2, n_training_samples=5), small(5, 2, n_training_samples=5)]
+    )
     first, second = twice(batch).chunk(2, dim=1)
     assert torch.equal(first, second)
 
@@ -226,19 +267,27 @@ def test_needs_are_those_of_all_histograms(batch: SignatureBatch) -> None:
     descriptor = HistogramDescriptor([[small(5, 2), oriented().histograms[0]], small(9, 1)])  # type: ignore[list-item]
     # The embedding of the oriented one takes all that there are.
     assert descriptor.requirements == Requirements(9, ("surface_direction",), whole_spectrum=True)
-    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 9, got 7"):
+    with pytest.raises(
+        ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 9, got 7"
+    ):
         descriptor(batch)
     bare = replace(batch, interior=replace(batch.interior, attributes={}))
-    with pytest.raises(ValueError, match="expected the interior samples to have 'surface_direction'"):
+    with pytest.raises(
+        ValueError, match="expected the interior samples to have 'surface_direction'"
+    ):
         oriented()(bare)
     barest = replace(bare, surface=replace(batch.surface, attributes={}))
-    with pytest.raises(ValueError, match="attributes: this descriptor needs signatures with surface_direction"):
+    with pytest.raises(
+        ValueError, match="attributes: this descriptor needs signatures with surface_direction"
+    ):
         oriented()(barest)
 
 
 @pytest.mark.parametrize("histograms", [[], [[]], [PairHistogram(), []]])
 def test_no_histogram_is_refused(histograms: list) -> None:
-    with pytest.raises(ValueError, match="histograms: expected at least one in each part, got none"):
+    with pytest.raises(
+        ValueError, match="histograms: expected at least one in each part, got none"
+    ):
         HistogramDescriptor(histograms)
 
 
@@ -266,24 +315,39 @@ def test_a_descriptor_of_bodies_sees_each_without_padding(batch: SignatureBatch)
 
 
 @pytest.mark.parametrize("make", [*MAKERS, Extent])
-def test_a_batch_without_shapes_is_refused(batch: SignatureBatch, make: Callable[[], Descriptor]) -> None:
+def test_a_batch_without_shapes_is_refused(
+    batch: SignatureBatch, make: Callable[[], Descriptor]
+) -> None:
     with pytest.raises(ValueError, match="batch: expected at least one shape, got none"):
         make()(batch[batch.labels == 7])
 
 
 def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch: SignatureBatch) -> None:
-    below = HistogramDescriptor([small(5, 2), small(3, 1)], name="two", invariant_to=("motion", "scale"))
+    below = HistogramDescriptor(
+        [small(5, 2), small(3, 1)], name="two", invariant_to=("motion", "scale")
+    )
     descriptor = EmbeddedDescriptor(below, WhitenedHead().centre(below(batch)), source="nobody")
     assert (descriptor.name, descriptor.source) == ("embedded", "nobody")
-    assert (descriptor.invariant_to, descriptor.requirements) == (below.invariant_to, below.requirements)
+    assert (descriptor.invariant_to, descriptor.requirements) == (
+        below.invariant_to,
+        below.requirements,
+    )
     embedding = descriptor(batch)
     roots = below(batch).sqrt() - below(batch).sqrt().mean(dim=0)
-    torch.testing.assert_close(embedding, roots / roots.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)
-    torch.testing.assert_close(descriptor.distances(embedding, embedding), cosine(embedding, embedding))
+    torch.testing.assert_close(
+        embedding, roots / roots.norm(dim=1, keepdim=True), atol=1e-5, rtol=0
+    )
+    torch.testing.assert_close(
+        descriptor.distances(embedding, embedding), cosine(embedding, embedding)
+    )
     assert descriptor.shorten(embedding) is embedding
-    with pytest.raises(ValueError, match=r"expected a head that shortens its embeddings.*WhitenedHead.*300 numbers"):
+    with pytest.raises(
+        ValueError, match=r"expected a head that shortens its embeddings.*WhitenedHead.*300 numbers"
+    ):
         descriptor.shorten(torch.rand(2, 300))
-    assert EmbeddedDescriptor(below, descriptor.head, invariant_to=["pose"]).invariant_to == ("pose",)
+    assert EmbeddedDescriptor(below, descriptor.head, invariant_to=["pose"]).invariant_to == (
+        "pose",
+    )
 
 
 def test_coordinates_of_histograms_are_their_roots(batch: SignatureBatch) -> None:

@@ -26,8 +26,12 @@ def spectrum() -> tuple[Tensor, Tensor]:
     return torch.randn(20, 12, generator=generator, dtype=torch.float64), eigenvalues
 
 
-def embed(kind: str, time: float | None, functions: Tensor, values: Tensor, area: float = AREA) -> Tensor:
-    return spectral_embedding(functions, values, torch.tensor(area, dtype=torch.float64), kind=kind, time=time)  # type: ignore[arg-type]
+def embed(
+    kind: str, time: float | None, functions: Tensor, values: Tensor, area: float = AREA
+) -> Tensor:
+    return spectral_embedding(
+        functions, values, torch.tensor(area, dtype=torch.float64), kind=kind, time=time
+    )  # type: ignore[arg-type]
 
 
 def learned(kind: str, time: float | None) -> SpectralEmbedding:
@@ -46,12 +50,16 @@ def learned(kind: str, time: float | None) -> SpectralEmbedding:
         ("biharmonic", None, lambda value: 1 / (value * math.sqrt(AREA))),
     ],
 )
-def test_weights_are_the_definition(spectrum: tuple[Tensor, Tensor], kind: str, time: float | None, weight) -> None:
+def test_weights_are_the_definition(
+    spectrum: tuple[Tensor, Tensor], kind: str, time: float | None, weight
+) -> None:
     functions, values = spectrum
     expected = functions.numpy() * [weight(float(value)) for value in values]
     np.testing.assert_allclose(embed(kind, time, functions, values), expected, rtol=1e-12)
     module = SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
-    np.testing.assert_allclose(module(functions, values, torch.tensor(AREA, dtype=torch.float64)), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        module(functions, values, torch.tensor(AREA, dtype=torch.float64)), expected, rtol=1e-12
+    )
 
 
 def test_default_is_the_commute_time(spectrum: tuple[Tensor, Tensor]) -> None:
@@ -61,18 +69,24 @@ def test_default_is_the_commute_time(spectrum: tuple[Tensor, Tensor]) -> None:
 
 @pytest.mark.parametrize(("kind", "time"), KINDS)
 @pytest.mark.parametrize("is_learned", [False, True])
-def test_does_not_change_with_scale(spectrum: tuple[Tensor, Tensor], kind: str, time: float, is_learned: bool) -> None:
+def test_does_not_change_with_scale(
+    spectrum: tuple[Tensor, Tensor], kind: str, time: float, is_learned: bool
+) -> None:
     functions, values = spectrum
     module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
     scale = 7.0
-    scaled = module(functions / scale, values / scale**2, torch.tensor(AREA * scale**2, dtype=torch.float64))
+    scaled = module(
+        functions / scale, values / scale**2, torch.tensor(AREA * scale**2, dtype=torch.float64)
+    )
     expected = module(functions, values, torch.tensor(AREA, dtype=torch.float64))
     torch.testing.assert_close(scaled, expected, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize(("kind", "time"), KINDS)
 @pytest.mark.parametrize("is_learned", [False, True])
-def test_padding_has_no_weight(spectrum: tuple[Tensor, Tensor], kind: str, time: float, is_learned: bool) -> None:
+def test_padding_has_no_weight(
+    spectrum: tuple[Tensor, Tensor], kind: str, time: float, is_learned: bool
+) -> None:
     functions, values = spectrum
     module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
     padded_values = torch.full((2, 12), math.inf, dtype=torch.float64)
@@ -95,13 +109,19 @@ def test_keeps_the_first_eigenpairs(spectrum: tuple[Tensor, Tensor]) -> None:
     functions, values = spectrum
     area = torch.tensor(AREA)
     for module in (SpectralEmbedding(n_eigenpairs=4), SpectralEmbedding(n_eigenpairs=4, n_knots=3)):
-        assert torch.equal(module(functions, values, area), commute_time_embedding(functions[:, :4], values[:4]))
-    assert torch.equal(spectral_embedding(functions, values, area, n_eigenpairs=4), module(functions, values, area))
+        assert torch.equal(
+            module(functions, values, area), commute_time_embedding(functions[:, :4], values[:4])
+        )
+    assert torch.equal(
+        spectral_embedding(functions, values, area, n_eigenpairs=4), module(functions, values, area)
+    )
     assert SpectralEmbedding(n_eigenpairs=99)(functions, values, area).shape == (20, 12)
 
 
 @pytest.mark.parametrize(("kind", "time"), KINDS)
-def test_learned_filter_starts_at_its_kind(spectrum: tuple[Tensor, Tensor], kind: str, time: float | None) -> None:
+def test_learned_filter_starts_at_its_kind(
+    spectrum: tuple[Tensor, Tensor], kind: str, time: float | None
+) -> None:
     area = torch.tensor(AREA)
     start = SpectralEmbedding(kind, time=time, n_knots=16)  # type: ignore[arg-type]
     plain = SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
@@ -113,7 +133,9 @@ def test_learned_filter_interpolates_its_knots_in_log() -> None:
     assert module.log_gain is not None
     gain = module.log_gain.detach().double().numpy()
     x = np.geomspace(0.5, 20_000, 333)
-    expected = x**-0.5 * np.exp(np.interp(np.log(x), np.linspace(math.log(2), math.log(5000), 9), gain))
+    expected = x**-0.5 * np.exp(
+        np.interp(np.log(x), np.linspace(math.log(2), math.log(5000), 9), gain)
+    )
     weights = module.weights(torch.from_numpy(x), torch.tensor(1.0)).detach()
     np.testing.assert_allclose(weights, expected, rtol=1e-6)
     assert (weights >= 0).all()
@@ -122,7 +144,9 @@ def test_learned_filter_interpolates_its_knots_in_log() -> None:
 def test_gradient_of_the_filter(spectrum: tuple[Tensor, Tensor]) -> None:
     functions, values = spectrum
     module = SpectralEmbedding(n_knots=6).double()
-    gain = torch.randn(6, generator=torch.Generator().manual_seed(2), dtype=torch.float64, requires_grad=True)
+    gain = torch.randn(
+        6, generator=torch.Generator().manual_seed(2), dtype=torch.float64, requires_grad=True
+    )
 
     def embedding(gain: Tensor) -> Tensor:
         area = torch.tensor(AREA, dtype=torch.float64)

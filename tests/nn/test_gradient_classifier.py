@@ -42,7 +42,10 @@ def test_a_sequence_with_a_linear_layer_trains() -> None:
     assert descriptor.n_features == 6 * 7
     before = [one.clone() for one in descriptor.parameters()]
     assert trained(model) < 0.95
-    assert all(not torch.equal(one, other) for one, other in zip(descriptor.parameters(), before, strict=True))
+    assert all(
+        not torch.equal(one, other)
+        for one, other in zip(descriptor.parameters(), before, strict=True)
+    )
 
 
 def test_one_call_builds_a_classifier() -> None:

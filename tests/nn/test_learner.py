@@ -42,9 +42,15 @@ def shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def data(shapes: Path) -> SignatureDataModule:
     return SignatureDataModule(
-        shapes / "meshes", n_train=4, n_validation=2, classes_per_batch=3, shapes_per_class=3, config=CONFIG,
-        cache_dir=shapes / "cache", n_workers=1,
-    )  # fmt: skip
+        shapes / "meshes",
+        n_train=4,
+        n_validation=2,
+        classes_per_batch=3,
+        shapes_per_class=3,
+        config=CONFIG,
+        cache_dir=shapes / "cache",
+        n_workers=1,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -87,12 +93,20 @@ def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) ->
 
 def trainer(epochs: int, root: Path) -> Trainer:
     return Trainer(
-        max_epochs=epochs, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
-        enable_model_summary=False, default_root_dir=root, num_sanity_val_steps=0,
-    )  # fmt: skip
+        max_epochs=epochs,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=root,
+        num_sanity_val_steps=0,
+    )
 
 
-def test_training_moves_bins_filter_and_head_and_is_reproducible(shapes: Path, tmp_path: Path) -> None:
+def test_training_moves_bins_filter_and_head_and_is_reproducible(
+    shapes: Path, tmp_path: Path
+) -> None:
     states = []
     for _ in range(2):
         model = learner()
@@ -102,7 +116,14 @@ def test_training_moves_bins_filter_and_head_and_is_reproducible(shapes: Path, t
         states.append(model.state_dict())
         assert {"val_ft", "val_nn", "val_dcg", "train_loss"} <= set(run.callback_metrics)
     moved = {name for name, value in states[0].items() if not torch.equal(value, before[name])}
-    for part in ("log_gain", "axes.0.centres", "axes.1.centres", "head.layers", "plain_unit", "learned_unit"):
+    for part in (
+        "log_gain",
+        "axes.0.centres",
+        "axes.1.centres",
+        "head.layers",
+        "plain_unit",
+        "learned_unit",
+    ):
         assert any(part in name for name in moved), part
     for name, value in states[0].items():
         torch.testing.assert_close(states[1][name], value, atol=0, rtol=0)
@@ -114,7 +135,9 @@ def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes: Path, tmp_path: Pat
     run = trainer(1, tmp_path)
     run.limit_val_batches = 0
     # Saved at the end of an epoch that is not validated, and before the end of the fit.
-    run.callbacks.append(ModelCheckpoint(tmp_path, filename="last", every_n_epochs=1, save_on_train_epoch_end=True))  # type: ignore[attr-defined]
+    run.callbacks.append(
+        ModelCheckpoint(tmp_path, filename="last", every_n_epochs=1, save_on_train_epoch_end=True)
+    )  # type: ignore[attr-defined]
     run.fit(model, module)
     state = torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]
     fresh = learner()
@@ -133,12 +156,19 @@ def test_the_loss_uses_what_the_miner_chose(shapes: Path, tmp_path: Path) -> Non
     class First(torch.nn.Module):
         """One triplet."""
 
-        def forward(self, embeddings: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        def forward(
+            self, embeddings: torch.Tensor, labels: torch.Tensor
+        ) -> tuple[torch.Tensor, ...]:
             anchor, positive = (labels == labels[0]).nonzero().flatten()[:2]
-            return tuple(i.reshape(1) for i in (anchor, positive, (labels != labels[0]).nonzero().flatten()[0]))
+            return tuple(
+                i.reshape(1)
+                for i in (anchor, positive, (labels != labels[0]).nonzero().flatten()[0])
+            )
 
     class Loss(TripletMarginLoss):
-        def forward(self, embeddings: torch.Tensor, labels: torch.Tensor, chosen: tuple) -> torch.Tensor:  # type: ignore[override]
+        def forward(
+            self, embeddings: torch.Tensor, labels: torch.Tensor, chosen: tuple
+        ) -> torch.Tensor:  # type: ignore[override]
             seen.append([len(indices) for indices in chosen])
             return super().forward(embeddings, labels, chosen)
 
@@ -150,7 +180,9 @@ def test_the_loss_uses_what_the_miner_chose(shapes: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("validated", [True, False])
-def test_a_head_in_closed_form_follows_the_bins(shapes: Path, tmp_path: Path, validated: bool) -> None:
+def test_a_head_in_closed_form_follows_the_bins(
+    shapes: Path, tmp_path: Path, validated: bool
+) -> None:
     seed_everything(3, verbose=False)
     model = RetrievalLearner(two_parts(), BlendedDistance(WhitenedHead(4), share=1.0))
     module = data(shapes)
@@ -163,7 +195,9 @@ def test_a_head_in_closed_form_follows_the_bins(shapes: Path, tmp_path: Path, va
     assert cells == (3 * 16, 9)
     expected = WhitenedHead(4).fit(describe(part, model.descriptor), part.labels, cells)
     for name, value in expected.state_dict().items():
-        torch.testing.assert_close(model.distance.head.state_dict()[name].abs(), value.abs(), atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            model.distance.head.state_dict()[name].abs(), value.abs(), atol=1e-4, rtol=0
+        )
 
 
 @pytest.mark.parametrize("make", [ProjectionHead, WhitenedHead, KernelHead])
@@ -174,11 +208,19 @@ def test_any_loader_of_labelled_batches_trains(
     model = learner(make())
     before = state_of(model.descriptor)
     run = Trainer(
-        max_epochs=2, accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False,
-        default_root_dir=tmp_path, callbacks=[ModelCheckpoint(save_on_train_epoch_end=True)],
-    )  # fmt: skip
+        max_epochs=2,
+        accelerator="cpu",
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=tmp_path,
+        callbacks=[ModelCheckpoint(save_on_train_epoch_end=True)],
+    )
     run.fit(model, loader(items))
-    assert any(not torch.equal(value, before[name]) for name, value in model.descriptor.state_dict().items())
+    assert any(
+        not torch.equal(value, before[name])
+        for name, value in model.descriptor.state_dict().items()
+    )
     (checkpoint,) = tmp_path.rglob("*.ckpt")
     loaded = RetrievalLearner.load_from_checkpoint(
         checkpoint, descriptor=bins(), distance=BlendedDistance(make())
@@ -188,7 +230,9 @@ def test_any_loader_of_labelled_batches_trains(
         descriptions = loaded(collate(items))
         found = loaded.distances(descriptions, descriptions)
         model.eval()
-        torch.testing.assert_close(found, model.distances(descriptions, descriptions), atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(
+            found, model.distances(descriptions, descriptions), atol=1e-5, rtol=1e-4
+        )
         torch.testing.assert_close(model(collate(items)), descriptions, atol=1e-6, rtol=0)
     head = loaded.distance.head
     fitted = head.whitened if isinstance(head, KernelHead) else head
@@ -196,7 +240,9 @@ def test_any_loader_of_labelled_batches_trains(
         assert len(fitted.mean) == 48
         assert (fitted.mean > 0).any()
     else:
-        torch.testing.assert_close(fitted.mean, descriptions.flatten(1).sqrt().mean(dim=0), atol=1e-6, rtol=1e-4)
+        torch.testing.assert_close(
+            fitted.mean, descriptions.flatten(1).sqrt().mean(dim=0), atol=1e-6, rtol=1e-4
+        )
     # Both parts of the distance on the scale of the training shapes.
     pairs = torch.triu_indices(len(items), len(items), 1).unbind()
     plain = chi_square(descriptions, descriptions)[pairs].median()
@@ -214,7 +260,9 @@ def test_saving_a_checkpoint_changes_nothing(
     class Save(Callback):
         """In the midst of an epoch, in training mode."""
 
-        def on_train_batch_end(self, trainer: Trainer, module: RetrievalLearner, *_: object) -> None:  # type: ignore[override]
+        def on_train_batch_end(
+            self, trainer: Trainer, module: RetrievalLearner, *_: object
+        ) -> None:  # type: ignore[override]
             before, modes = state_of(module), [one.training for one in module.modules()]
             generator = torch.get_rng_state()
             trainer.save_checkpoint(tmp_path / "now.ckpt")
@@ -232,14 +280,18 @@ def test_saving_a_checkpoint_changes_nothing(
     assert_same(state_of(model), before)
 
 
-def test_the_mode_of_each_module_outlives_a_fit(items: list[LabelledSignature], tmp_path: Path) -> None:
+def test_the_mode_of_each_module_outlives_a_fit(
+    items: list[LabelledSignature], tmp_path: Path
+) -> None:
     """A module that the caller froze in evaluation mode stays there, whenever the head is fitted."""
     modes: list[list[bool]] = []
     frozen = learner()
     frozen.descriptor.eval()
 
     class Look(Callback):
-        def on_train_batch_start(self, trainer: Trainer, module: RetrievalLearner, *_: object) -> None:  # type: ignore[override]
+        def on_train_batch_start(
+            self, trainer: Trainer, module: RetrievalLearner, *_: object
+        ) -> None:  # type: ignore[override]
             modes.append([module.training, module.descriptor.training, module.distance.training])
 
     run = trainer(2, tmp_path)
@@ -248,7 +300,9 @@ def test_the_mode_of_each_module_outlives_a_fit(items: list[LabelledSignature], 
     assert modes == [[True, False, True]] * 2
 
 
-def test_a_checkpoint_that_names_a_foreign_class_is_refused(items: list[LabelledSignature], tmp_path: Path) -> None:
+def test_a_checkpoint_that_names_a_foreign_class_is_refused(
+    items: list[LabelledSignature], tmp_path: Path
+) -> None:
     model, run = learner(), trainer(1, tmp_path)
     run.fit(model, loader(items))
     run.save_checkpoint(tmp_path / "own.ckpt")
@@ -259,19 +313,31 @@ def test_a_checkpoint_that_names_a_foreign_class_is_refused(items: list[Labelled
     foreign = tmp_path / "foreign.ckpt"
     for miner in (
         {"class_path": "elsewhere.miners.Harmless"},
-        {"class_path": "torch.nn.Identity", "init_args": {"inner": [{"class_path": "elsewhere.Harmless"}]}},
+        {
+            "class_path": "torch.nn.Identity",
+            "init_args": {"inner": [{"class_path": "elsewhere.Harmless"}]},
+        },
         {"_class_path": "elsewhere.Harmless"},
     ):
-        torch.save({**stored, "hyper_parameters": {**stored["hyper_parameters"], "miner": miner}}, foreign)
-        with pytest.raises(ValueError, match=r"foreign.ckpt: names the class elsewhere\..*pass trusted=\[...\]"):
+        torch.save(
+            {**stored, "hyper_parameters": {**stored["hyper_parameters"], "miner": miner}}, foreign
+        )
+        with pytest.raises(
+            ValueError, match=r"foreign.ckpt: names the class elsewhere\..*pass trusted=\[...\]"
+        ):
             RetrievalLearner.load_from_checkpoint(foreign, **made)
-        with foreign.open("rb") as stream, pytest.raises(ValueError, match=r"names the class elsewhere\."):
+        with (
+            foreign.open("rb") as stream,
+            pytest.raises(ValueError, match=r"names the class elsewhere\."),
+        ):
             RetrievalLearner.load_from_checkpoint(stream, **made)
         RetrievalLearner.load_from_checkpoint(foreign, **made, miner=None, trusted=["elsewhere"])
     with foreign.open("wb") as stream:
         torch.save(stored, stream)
     with foreign.open("rb") as stream:
-        assert_same(RetrievalLearner.load_from_checkpoint(stream, **made).state_dict(), model.state_dict())
+        assert_same(
+            RetrievalLearner.load_from_checkpoint(stream, **made).state_dict(), model.state_dict()
+        )
 
 
 def test_a_lazy_head_has_its_size_before_the_optimiser_is_made() -> None:
@@ -296,7 +362,9 @@ def test_any_module_describes(items: list[LabelledSignature], tmp_path: Path) ->
             self.cells = torch.nn.Parameter(torch.zeros(5))
 
         def forward(self, batch: SignatureBatch) -> torch.Tensor:
-            return (self.cells + batch.interior.points.abs().mean(dim=1)[:, [0, 1, 2, 0, 1]]).softmax(dim=1)
+            return (
+                self.cells + batch.interior.points.abs().mean(dim=1)[:, [0, 1, 2, 0, 1]]
+            ).softmax(dim=1)
 
     seed_everything(3, verbose=False)
     model = RetrievalLearner(Plain(), BlendedDistance(WhitenedHead(2)))
@@ -305,7 +373,9 @@ def test_any_module_describes(items: list[LabelledSignature], tmp_path: Path) ->
     assert (model.descriptor.cells != 0).any()
 
 
-def test_bodies_of_unknown_classes_are_refused(items: list[LabelledSignature], tmp_path: Path) -> None:
+def test_bodies_of_unknown_classes_are_refused(
+    items: list[LabelledSignature], tmp_path: Path
+) -> None:
     """As −1 all would be of one class, and every score the best."""
     unknown = [replace(item, label=-1) for item in items]
     with pytest.raises(ValueError, match="labels: expected the class of each body, got −1"):
@@ -314,7 +384,9 @@ def test_bodies_of_unknown_classes_are_refused(items: list[LabelledSignature], t
         trainer(1, tmp_path).test(learner(), loader(unknown), verbose=False)
 
 
-def test_several_training_loaders_are_refused(items: list[LabelledSignature], tmp_path: Path) -> None:
+def test_several_training_loaders_are_refused(
+    items: list[LabelledSignature], tmp_path: Path
+) -> None:
     with pytest.raises(ValueError, match="train_dataloaders: expected one DataLoader, got list"):
         trainer(1, tmp_path).fit(learner(), [loader(items), loader(items)])
 
@@ -327,7 +399,9 @@ def test_without_head_the_test_scores_are_the_plain_ones(shapes: Path, tmp_path:
     part = module.dataset.subset(module.split.test)
     histograms = describe(part, HistogramDescriptor(PairHistogram()))
     expected = retrieval_scores(chi_square(histograms, histograms), part.labels).mean()
-    assert {name.removeprefix("test_"): value for name, value in logged.items()} == pytest.approx(expected, abs=1e-6)
+    assert {name.removeprefix("test_"): value for name, value in logged.items()} == pytest.approx(
+        expected, abs=1e-6
+    )
     with pytest.raises(ValueError, match="expected a head to train"):
         trainer(1, tmp_path).fit(model, module)
 
@@ -345,8 +419,21 @@ def test_a_repeated_shape_counts_once(shapes: Path, tmp_path: Path) -> None:
 def test_smoke_configuration_trains_and_its_checkpoint_loads_without_running_code(
     shapes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arguments = ["fit", "--config", PROJECT / "configs/default.yaml", "--config", PROJECT / "configs/smoke.yaml"]
-    arguments += ["--data.root", shapes / "meshes", "--data.cache_dir", shapes / "cache", "--data.n_train", "4"]
+    arguments = [
+        "fit",
+        "--config",
+        PROJECT / "configs/default.yaml",
+        "--config",
+        PROJECT / "configs/smoke.yaml",
+    ]
+    arguments += [
+        "--data.root",
+        shapes / "meshes",
+        "--data.cache_dir",
+        shapes / "cache",
+        "--data.n_train",
+        "4",
+    ]
     arguments += [
         "--data.config.n_eigenpairs",
         "20",

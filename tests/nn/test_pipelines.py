@@ -34,7 +34,9 @@ def filtered() -> SpectralEmbedding:
 
 
 MODULES: dict[str, Callable[[], DescriptionPart]] = {
-    "hard": lambda: PairHistogram([Potential(3), InteriorDistance(7)], SpectralEmbedding(n_eigenpairs=6)),
+    "hard": lambda: PairHistogram(
+        [Potential(3), InteriorDistance(7)], SpectralEmbedding(n_eigenpairs=6)
+    ),
     "learned": lambda: PairHistogram(
         [
             Potential(2, learnable=True),
@@ -44,9 +46,13 @@ MODULES: dict[str, Callable[[], DescriptionPart]] = {
         filtered(),
     ),
     "in space": lambda: PairHistogram([PairCosines(3, learnable=True)]),
-    "in the embedding": lambda: PairHistogram([InteriorDistance(4), EmbeddedPairCosines(3)], filtered()),
+    "in the embedding": lambda: PairHistogram(
+        [InteriorDistance(4), EmbeddedPairCosines(3)], filtered()
+    ),
     "twists": lambda: PairHistogram([PairTwist(4), InteriorDistance(4)], filtered()),
-    "of points": lambda: PointHistogram([BallRadius("inside"), Potential(3, learnable=True)], filtered()),
+    "of points": lambda: PointHistogram(
+        [BallRadius("inside"), Potential(3, learnable=True)], filtered()
+    ),
 }
 
 
@@ -76,7 +82,8 @@ def test_what_is_compiled_does_not_grow_with_the_samples(
     monkeypatch.setattr(count_by_torch, "_BLOCK", 1)
     batch, nodes = two_bodies(), []
     twice = {
-        kind: getattr(batch, kind).map(lambda one: torch.cat([one, one], dim=1)) for kind in ("interior", "surface")
+        kind: getattr(batch, kind).map(lambda one: torch.cat([one, one], dim=1))
+        for kind in ("interior", "surface")
     }
 
     def backend(program: torch.fx.GraphModule, _: object) -> Callable[..., object]:
@@ -111,20 +118,33 @@ def test_a_compiled_program_serves_any_number_of_bodies(name: str) -> None:
 def test_a_description_of_a_padded_batch_is_exported() -> None:
     descriptor = HistogramDescriptor([make() for make in MODULES.values()]).eval()
     batch = two_bodies()
-    other = replace(batch, interior=replace(batch.interior, points=batch.interior.points.flip(2) * 1.5))
+    other = replace(
+        batch, interior=replace(batch.interior, points=batch.interior.points.flip(2) * 1.5)
+    )
     with torch.no_grad():
         program = torch.export.export(OfTensors(descriptor, batch), tensors(batch)).module()
-        assert not any("igps" in str(node.target) for node in program.graph.nodes if node.op == "call_function")
+        assert not any(
+            "igps" in str(node.target) for node in program.graph.nodes if node.op == "call_function"
+        )
         for one in (batch, other):
             torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 
 
-def test_an_exported_program_takes_any_number_of_bodies_and_samples(module: DescriptionPart) -> None:
+def test_an_exported_program_takes_any_number_of_bodies_and_samples(
+    module: DescriptionPart,
+) -> None:
     descriptor, batch = HistogramDescriptor(module).eval(), two_bodies()
-    fewer = {kind: getattr(batch, kind).map(lambda one: one[:, :30]) for kind in ("interior", "surface")}
+    fewer = {
+        kind: getattr(batch, kind).map(lambda one: one[:, :30]) for kind in ("interior", "surface")
+    }
     with torch.no_grad():
         program = exported(descriptor, batch)
-        for one in (batch, batch[:1], SignatureBatch.concatenate([batch, batch[1:]]), replace(batch, **fewer)):
+        for one in (
+            batch,
+            batch[:1],
+            SignatureBatch.concatenate([batch, batch[1:]]),
+            replace(batch, **fewer),
+        ):
             torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 
 
@@ -133,14 +153,18 @@ def test_double_precision_stays_double(module: DescriptionPart) -> None:
     result = module.double()(two_bodies().to(torch.float64))
     assert result.dtype == torch.float64
     torch.testing.assert_close(result.detach(), single.double(), rtol=0, atol=1e-5)
-    torch.testing.assert_close(result.flatten(1).sum(dim=1).detach(), torch.ones(2).double(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        result.flatten(1).sum(dim=1).detach(), torch.ones(2).double(), rtol=0, atol=1e-12
+    )
 
 
 def test_transforms_of_functions_follow_a_histogram(module: DescriptionPart) -> None:
     """`torch.func.grad` gives what a backward pass gives, and `jvp` what it says of a direction."""
     batch = two_bodies().to(torch.float64)
     module = module.double().eval()
-    upstream = torch.randn(2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    upstream = torch.randn(
+        2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
 
     def loss(area: Tensor) -> Tensor:
         return (module(replace(batch, area=area)) * upstream).sum()
@@ -149,18 +173,28 @@ def test_transforms_of_functions_follow_a_histogram(module: DescriptionPart) -> 
     (expected,) = torch.autograd.grad(loss(area) + 0 * area.sum(), area)
     torch.testing.assert_close(torch.func.grad(loss)(batch.area), expected)
     direction = torch.tensor([1.0, -2.0]).double()
-    torch.testing.assert_close(torch.func.jvp(loss, (batch.area,), (direction,))[1], expected @ direction)
+    torch.testing.assert_close(
+        torch.func.jvp(loss, (batch.area,), (direction,))[1], expected @ direction
+    )
     with forward_ad.dual_level():
         along = forward_ad.unpack_dual(loss(forward_ad.make_dual(batch.area, direction))).tangent
-        torch.testing.assert_close(torch.zeros(()).double() if along is None else along, expected @ direction)
+        torch.testing.assert_close(
+            torch.zeros(()).double() if along is None else along, expected @ direction
+        )
 
 
-def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(module: DescriptionPart) -> None:
+def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(
+    module: DescriptionPart,
+) -> None:
     """Finite differences at the largest entry; the gradient at padding is 0, also at its infinite eigenvalues."""
     batch, module = two_bodies().to(torch.float64), module.double()
-    interior, surface = (one.points.clone().requires_grad_() for one in (batch.interior, batch.surface))
+    interior, surface = (
+        one.points.clone().requires_grad_() for one in (batch.interior, batch.surface)
+    )
     eigenvalues = batch.eigenvalues.clone().requires_grad_()
-    upstream = torch.randn(2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    upstream = torch.randn(
+        2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
 
     def loss() -> Tensor:
         moved = replace(
@@ -178,7 +212,13 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
         if gradient is None or not gradient.any():
             continue
         assert torch.isfinite(gradient).all()
-        padding = ~batch.interior.mask if leaf is interior else ~batch.surface.mask if leaf is surface else leaf.isinf()
+        padding = (
+            ~batch.interior.mask
+            if leaf is interior
+            else ~batch.surface.mask
+            if leaf is surface
+            else leaf.isinf()
+        )
         assert not gradient[padding].any()
         entry, moved = int(gradient.abs().argmax()), []
         with torch.no_grad():
@@ -186,7 +226,9 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
                 leaf.view(-1)[entry] += step
                 moved.append(float(loss()))
             leaf.view(-1)[entry] += 1e-6
-        assert float(gradient.view(-1)[entry]) == pytest.approx((moved[0] - moved[1]) / 2e-6, rel=1e-3)
+        assert float(gradient.view(-1)[entry]) == pytest.approx(
+            (moved[0] - moved[1]) / 2e-6, rel=1e-3
+        )
         compared += 1
     assert compared > 0
 
@@ -194,16 +236,26 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
 def test_padding_leaves_second_derivatives_as_they_are(module: DescriptionPart) -> None:
     """Of a body whose samples and eigenvalues are padded, and of the same body alone."""
     if any(isinstance(one, EmbeddedPairCosines) for one in module.modules()):
-        pytest.skip("first derivatives only: between points of many coordinates PyTorch has no others")
+        pytest.skip(
+            "first derivatives only: between points of many coordinates PyTorch has no others"
+        )
     batch, module = two_bodies().to(torch.float64), module.double()
-    upstream = torch.randn(module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    upstream = torch.randn(
+        module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     found = []
     for one, row in ((batch, 1), (alone(batch, 1), 0)):
         leaves = (one.eigenvalues.clone().requires_grad_(), one.area.clone().requires_grad_())
         cells = module(replace(one, eigenvalues=leaves[0], area=leaves[1]))[row] * upstream
         gradients = torch.autograd.grad(cells.sum(), leaves, create_graph=True, allow_unused=True)
-        total = sum((g.square().sum() for g in gradients if g is not None), torch.zeros(()).double())
-        second = torch.autograd.grad(total, leaves, allow_unused=True) if total.requires_grad else (None, None)
+        total = sum(
+            (g.square().sum() for g in gradients if g is not None), torch.zeros(()).double()
+        )
+        second = (
+            torch.autograd.grad(total, leaves, allow_unused=True)
+            if total.requires_grad
+            else (None, None)
+        )
         found.append([None if values is None else values[row].flatten()[:7] for values in second])
     for padded, plain in zip(*found, strict=True):
         assert (padded is None) == (plain is None)
@@ -212,7 +264,9 @@ def test_padding_leaves_second_derivatives_as_they_are(module: DescriptionPart) 
 
 
 def test_a_state_is_read_back_to_the_last_key(module: DescriptionPart) -> None:
-    state = {name: value + 0.1 if "log" in name else value for name, value in module.state_dict().items()}
+    state = {
+        name: value + 0.1 if "log" in name else value for name, value in module.state_dict().items()
+    }
     module.load_state_dict(state, strict=True)
     with pytest.raises(RuntimeError, match="Unexpected key"):
         module.load_state_dict({**state, "axes.9.start": torch.zeros(1)}, strict=True)

@@ -77,7 +77,10 @@ def kernels() -> list[Tensor]:
     cosines = torch.linspace(-0.8, 0.8, 5)
     oriented = joint_histogram(
         torch.ones(300, 1),
-        [euclidean_distances(embedding, centres[::5]), oriented_pairs(points, directions, cosines, cosines)],
+        [
+            euclidean_distances(embedding, centres[::5]),
+            oriented_pairs(points, directions, cosines, cosines),
+        ],
     )
     (gradient,) = torch.autograd.grad(joint.square().sum(), leaf)  # counts all pairs once more
     return [
@@ -85,7 +88,9 @@ def kernels() -> list[Tensor]:
         joint.detach(),
         oriented,
         gradient,
-        nearest_directions(embedding, embedding.flip(0) * 1.1, torch.ones(300, dtype=torch.bool), 3),
+        nearest_directions(
+            embedding, embedding.flip(0) * 1.1, torch.ones(300, dtype=torch.bool), 3
+        ),
     ]
 
 

@@ -29,21 +29,32 @@ from igps.nn.specification import specification
 def learnable() -> HistogramDescriptor:
     """Two histograms that share one embedding with parameters."""
     embedding = SpectralEmbedding(n_eigenpairs=6, n_knots=5)
-    one = PairHistogram([Potential(2, learnable=True), InteriorDistance(n_bins=5)], embedding, n_samples=40)
+    one = PairHistogram(
+        [Potential(2, learnable=True), InteriorDistance(n_bins=5)], embedding, n_samples=40
+    )
     return HistogramDescriptor([one, PairHistogram(["interior_distance"], embedding)], name="mine")
 
 
-def test_a_folder_to_share_has_the_model_and_its_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_to_share_has_the_model_and_its_card(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """By the names that hubs of models expect; a folder that is called as a descriptor of the library hides none."""
     descriptor, batch = learnable(), two_bodies()
     monkeypatch.chdir(tmp_path)
     for folder in ("shared", "rich"):
         descriptor.save(folder, {"author": "me", "classes": ["cat", "dog"]})
-        assert sorted(path.name for path in Path(folder).iterdir()) == ["README.md", "model.safetensors"]
+        assert sorted(path.name for path in Path(folder).iterdir()) == [
+            "README.md",
+            "model.safetensors",
+        ]
     card = Path("shared/README.md").read_text()
     assert card.startswith("---\nlibrary_name: igps\n")
     assert '| classes | `["cat", "dog"]` |' in card
-    for found in (igps.load("shared"), igps.descriptor("shared"), igps.descriptor(tmp_path / "shared")):
+    for found in (
+        igps.load("shared"),
+        igps.descriptor("shared"),
+        igps.descriptor(tmp_path / "shared"),
+    ):
         assert torch.equal(found(batch), descriptor(batch))
         assert found.card["author"] == "me"
     assert igps.descriptor("rich").name == "rich"
@@ -54,7 +65,9 @@ def test_a_folder_to_share_has_the_model_and_its_card(tmp_path: Path, monkeypatc
         igps.load("empty")
 
 
-def test_the_umask_says_who_may_read_a_model_and_the_system_why_none_is_written(tmp_path: Path) -> None:
+def test_the_umask_says_who_may_read_a_model_and_the_system_why_none_is_written(
+    tmp_path: Path,
+) -> None:
     before = os.umask(0o027)
     try:
         igps.descriptor("interior").save(tmp_path / "mine.safetensors")
@@ -72,7 +85,11 @@ def test_every_descriptor_of_the_library_comes_back(name: str, tmp_path: Path) -
     descriptor = igps.descriptor(name)
     descriptor.save(tmp_path / "mine.safetensors")
     found = igps.load(tmp_path / "mine.safetensors")
-    assert (type(found), found.name, found.requirements) == (type(descriptor), name, descriptor.requirements)
+    assert (type(found), found.name, found.requirements) == (
+        type(descriptor),
+        name,
+        descriptor.requirements,
+    )
     assert not found.training
     assert fingerprint(found) == fingerprint(descriptor)
 
@@ -81,7 +98,9 @@ def test_trained_parameters_and_what_is_shared_come_back(tmp_path: Path) -> None
     descriptor, batch = learnable(), two_bodies()
     with torch.no_grad():
         for parameter in descriptor.parameters():
-            parameter += 0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0))
+            parameter += 0.1 * torch.randn(
+                parameter.shape, generator=torch.Generator().manual_seed(0)
+            )
     descriptor.save(tmp_path / "mine.safetensors", {"fitted to": "nothing"})
     found = igps.descriptor(tmp_path / "mine.safetensors")
     assert found.card == {"fitted to": "nothing"}
@@ -122,7 +141,11 @@ def test_what_was_changed_since_it_was_made_is_not_saved_as_it_was(tmp_path: Pat
     def replaced(one: HistogramDescriptor) -> None:
         one.histograms[1].axes[0] = EuclideanDistance(64)  # type: ignore[index, operator]
 
-    for change, said in ((named, "name"), (fewer, r"histograms\.0\.n_samples"), (replaced, r"histograms\.1\.axes\.0")):
+    for change, said in (
+        (named, "name"),
+        (fewer, r"histograms\.0\.n_samples"),
+        (replaced, r"histograms\.1\.axes\.0"),
+    ):
         descriptor = learnable()
         change(descriptor)
         with pytest.raises(ValueError, match=f"^{said}: expected its initial value, got another"):
@@ -131,7 +154,9 @@ def test_what_was_changed_since_it_was_made_is_not_saved_as_it_was(tmp_path: Pat
 
 
 def test_what_is_of_others_is_not_saved(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"made of modules of igps and numbers, got own_descriptors\.Height"):
+    with pytest.raises(
+        ValueError, match=r"made of modules of igps and numbers, got own_descriptors\.Height"
+    ):
         own_descriptors.Height().save(tmp_path / "mine.safetensors")
     assert not (tmp_path / "mine.safetensors").exists()
 
@@ -142,31 +167,47 @@ def histogram(**arguments: Any) -> dict[str, Any]:
 
 HOSTILE: dict[str, Callable[[], object]] = {
     "another package": lambda: {"class_path": "subprocess.Popen", "init_args": {"args": "true"}},
-    "a function": lambda: {"class_path": "igps.nn.specification.load_module", "init_args": {"path": "x"}},
+    "a function": lambda: {
+        "class_path": "igps.nn.specification.load_module",
+        "init_args": {"path": "x"},
+    },
     "an imported class": lambda: {"class_path": "igps.nn.specification.Path", "init_args": {}},
-    "another room": lambda: {"class_path": "igps.data.dataset.SignatureDataset", "init_args": {"root_or_paths": "/"}},
+    "another room": lambda: {
+        "class_path": "igps.data.dataset.SignatureDataset",
+        "init_args": {"root_or_paths": "/"},
+    },
     "no class": lambda: {"class_path": "igps.nn.histograms.pairs.Nothing"},
     "no module": lambda: {"class_path": "igps.nn.no_such.Thing"},
     "no descriptor": lambda: histogram(),
     "wrong words": lambda: {**specification(learnable()), "init_args": {"nothing": 1}},
     "more keys": lambda: {**specification(learnable()), "run": "rm"},
     "too large": lambda: {
-        "class_path": "igps.nn.heads.learned.ProjectionHead", "init_args": {"width": 90_000, "n_hidden": 90_000}},
+        "class_path": "igps.nn.heads.learned.ProjectionHead",
+        "init_args": {"width": 90_000, "n_hidden": 90_000},
+    },
     "too many": lambda: {
-        "class_path": "igps.nn.descriptor.HistogramDescriptor", "init_args": {"histograms": [histogram()] * 300}},
+        "class_path": "igps.nn.descriptor.HistogramDescriptor",
+        "init_args": {"histograms": [histogram()] * 300},
+    },
     "a long number": lambda: histogram(n_samples=10**9),
     "itself": lambda: {"same_as": 0},
-    "other sizes": lambda: specification(HistogramDescriptor(PairHistogram([Potential(3), InteriorDistance(5)]))),
+    "other sizes": lambda: specification(
+        HistogramDescriptor(PairHistogram([Potential(3), InteriorDistance(5)]))
+    ),
     "a list": lambda: [1],
     "deep": lambda: json.loads("[" * 900 + "]" * 900),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", HOSTILE)
 def test_a_hostile_file_is_refused_in_a_sentence(what: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.safetensors"
     learnable().save(path)
-    words = {"format": "igps-descriptor-1", "specification": json.dumps(HOSTILE[what]()), "card": "{}"}
+    words = {
+        "format": "igps-descriptor-1",
+        "specification": json.dumps(HOSTILE[what]()),
+        "card": "{}",
+    }
     save_file(load_file(path), path, metadata=words)
     with pytest.raises(ValueError, match=r"mine\.safetensors: expected a descriptor") as caught:
         igps.load(path)
@@ -177,19 +218,31 @@ def test_a_hostile_file_is_refused_in_a_sentence(what: str, tmp_path: Path) -> N
     ("parameter", "shape"),
     [("temperature", (2,)), ("members", (2,)), ("coefficients", (3, 7)), ("whitened.mean", (3,))],
 )
-def test_a_head_whose_sizes_do_not_fit_is_refused(parameter: str, shape: tuple[int, ...], tmp_path: Path) -> None:
+def test_a_head_whose_sizes_do_not_fit_is_refused(
+    parameter: str, shape: tuple[int, ...], tmp_path: Path
+) -> None:
     """Else it shows when all bodies are described, and not which file is at fault."""
     path = tmp_path / "mine.safetensors"
     histograms = torch.rand(6, 4, generator=torch.Generator().manual_seed(1))
     base = HistogramDescriptor(PairHistogram([EuclideanDistance(4)]))
-    model = EmbeddedDescriptor(base, ClassifierHead().fit(histograms, torch.tensor([0, 0, 1, 1, 2, 2])), name="mine")
+    model = EmbeddedDescriptor(
+        base, ClassifierHead().fit(histograms, torch.tensor([0, 0, 1, 1, 2, 2])), name="mine"
+    )
     model.save(path)
-    assert torch.equal(igps.load(path).head.state_dict()["coefficients"], model.head.state_dict()["coefficients"])
-    words = {"format": "igps-descriptor-1", "specification": json.dumps(specification(model)), "card": "{}"}
+    assert torch.equal(
+        igps.load(path).head.state_dict()["coefficients"], model.head.state_dict()["coefficients"]
+    )
+    words = {
+        "format": "igps-descriptor-1",
+        "specification": json.dumps(specification(model)),
+        "card": "{}",
+    }
     state = load_file(path)
     state[f"head.{parameter}"] = torch.zeros(shape, dtype=state[f"head.{parameter}"].dtype)
     save_file(state, path, metadata=words)
-    with pytest.raises(ValueError, match=r"mine\.safetensors: expected a (descriptor|head for 4 cells)"):
+    with pytest.raises(
+        ValueError, match=r"mine\.safetensors: expected a (descriptor|head for 4 cells)"
+    ):
         igps.load(path)
 
 
@@ -197,7 +250,13 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.safetensors"
     learnable().save(path)
     content, state = path.read_bytes(), load_file(path)
-    for wrong in (b"", b"nothing", content[:-9], pickle.dumps([1]), (2**40).to_bytes(8, "little") + content[8:]):
+    for wrong in (
+        b"",
+        b"nothing",
+        content[:-9],
+        pickle.dumps([1]),
+        (2**40).to_bytes(8, "little") + content[8:],
+    ):
         path.write_bytes(wrong)
         with pytest.raises(ValueError, match="expected a descriptor in the format"):
             igps.load(path)
@@ -206,7 +265,11 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
         igps.load(path)
     path.write_bytes(content)
     state = {name: torch.full_like(value, torch.nan) for name, value in state.items()}
-    words = {"format": "igps-descriptor-1", "specification": json.dumps(specification(learnable())), "card": "{}"}
+    words = {
+        "format": "igps-descriptor-1",
+        "specification": json.dumps(specification(learnable())),
+        "card": "{}",
+    }
     save_file(state, path, metadata=words)
     with pytest.raises(ValueError, match="a parameter is not finite"):
         igps.load(path)
@@ -226,7 +289,11 @@ def test_a_card_that_is_no_table_is_refused(card: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.safetensors"
     learnable().save(path, {"scale": "1:100"})
     assert igps.load(path).scale is None  # a word of one's own, and no distance
-    words = {"format": "igps-descriptor-1", "specification": json.dumps(specification(learnable())), "card": card}
+    words = {
+        "format": "igps-descriptor-1",
+        "specification": json.dumps(specification(learnable())),
+        "card": card,
+    }
     save_file(load_file(path), path, metadata=words)
     with pytest.raises(ValueError, match=r"mine\.safetensors: expected a descriptor"):
         igps.load(path)

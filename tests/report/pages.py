@@ -37,11 +37,15 @@ def distances_of(seed: int) -> np.ndarray:
     return np.linalg.norm(points[:, None] - points[None], axis=2).astype(np.float32)
 
 
-def worst_by_a_loop(distances: np.ndarray, labels: tuple[str, ...], names: tuple[str, ...]) -> list[dict[str, Any]]:
+def worst_by_a_loop(
+    distances: np.ndarray, labels: tuple[str, ...], names: tuple[str, ...]
+) -> list[dict[str, Any]]:
     """The worst confusions from their definition: each query is looked at alone, walking down its ranking."""
     found = []
     for query, label in enumerate(labels):
-        others = sorted((j for j in range(len(labels)) if j != query), key=lambda j: (distances[query][j], j))
+        others = sorted(
+            (j for j in range(len(labels)) if j != query), key=lambda j: (distances[query][j], j)
+        )
         n_right = sum(labels[j] == label for j in others)
         if n_right == 0:
             continue
@@ -53,7 +57,9 @@ def worst_by_a_loop(distances: np.ndarray, labels: tuple[str, ...], names: tuple
             continue
         before = range(1, rank) if rank > 1 else range(1, n_right + 1)
         wrong = [place for place in before if labels[others[place - 1]] != label]
-        found.append(((-rank, tier, names[query]), {"query": query, "rank": rank, "wrong": wrong[:3]}))
+        found.append(
+            ((-rank, tier, names[query]), {"query": query, "rank": rank, "wrong": wrong[:3]})
+        )
     return [one for _, one in sorted(found, key=lambda pair: pair[0])][:20]
 
 
@@ -66,11 +72,16 @@ def retrieval_folder(folder: Path, labels: tuple[str, ...] = LABELS, seed: int =
     """What `igps retrieve` writes."""
     folder.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
-        folder / "distances.npz", distances=distances_of(seed), names=np.array(NAMES), labels=np.array(labels)
+        folder / "distances.npz",
+        distances=distances_of(seed),
+        names=np.array(NAMES),
+        labels=np.array(labels),
     )
     config = {"descriptor": "interior", "n_eigenpairs": 20, "attributes": [], "max_vertices": None}
     (folder / "scores.json").write_text(json.dumps({"config": config}))
-    write_rows(folder / "failures.csv", [("name", "error"), ("bad<b>.off", "bad<b>.off: it is open.")])
+    write_rows(
+        folder / "failures.csv", [("name", "error"), ("bad<b>.off", "bad<b>.off: it is open.")]
+    )
     write_rows(folder / "notes.csv", [("name", "note"), (NAMES[2], NOTE)])
     return folder
 
@@ -79,10 +90,19 @@ def answers_folder(folder: Path) -> Path:
     """What `igps retrieve`, `groups` and `outliers` write, with columns of labels.csv."""
     retrieval_folder(folder)
     bodies = [{"file": name} for name in NAMES]
-    columns = {"age": [str(50 + i) for i in range(len(NAMES) - 1)] + [None], EVIL: ["x", "y"] * 3 + ["x"]}
+    columns = {
+        "age": [str(50 + i) for i in range(len(NAMES) - 1)] + [None],
+        EVIL: ["x", "y"] * 3 + ["x"],
+    }
     columns["dose"] = [str(i + 0.5) for i in range(len(NAMES))]
     (folder / "meshes.json").write_text(json.dumps({"meshes": bodies, "columns": columns}))
-    tested = {"permanova_p": 0.001, "permanova_q": 0.002, "kernel_p": 0.01, "kernel_q": 0.02, "effect": 0.25}
+    tested = {
+        "permanova_p": 0.001,
+        "permanova_q": 0.002,
+        "kernel_p": 0.01,
+        "kernel_q": 0.02,
+        "effect": 0.25,
+    }
     tested |= {"effect_low": 0.125, "effect_high": 0.375, "auc": 0.875, "refused": None}
     groups = [
         {"body": EVIL, "sizes": "a:8 b:9", **tested},
@@ -90,7 +110,12 @@ def answers_folder(folder: Path) -> Path:
     ]
     (folder / "groups.json").write_text(json.dumps(groups))
     outliers = [
-        {"name": NAMES[5], "class": EVIL, "score": 7.25, "reason": "its shape is <b>unlike</b> its class"},
+        {
+            "name": NAMES[5],
+            "class": EVIL,
+            "score": 7.25,
+            "reason": "its shape is <b>unlike</b> its class",
+        },
         {"name": "gone.off", "class": "egg", "score": 1.0, "reason": "nothing unusual"},
     ]
     (folder / "outliers.json").write_text(json.dumps(outliers))
@@ -103,7 +128,11 @@ def comparison_folder(folder: Path) -> Path:
     rows = []
     for seed, name in enumerate(DESCRIPTORS):
         n = len(NAMES) - seed
-        arrays = {"distances": distances_of(seed)[:n, :n], "names": np.array(NAMES[:n]), "labels": np.array(LABELS[:n])}
+        arrays = {
+            "distances": distances_of(seed)[:n, :n],
+            "names": np.array(NAMES[:n]),
+            "labels": np.array(LABELS[:n]),
+        }
         np.savez_compressed(folder / "distances" / f"{name}.npz", **arrays)
         rows.append({"descriptor": name, "n_models": n, "seconds_per_mesh": 0.25})
     rows.append({"descriptor": "broken", "n_models": 0, "seconds_per_mesh": None})
@@ -117,7 +146,11 @@ def comparison_folder(folder: Path) -> Path:
 def robustness_folder(folder: Path) -> Path:
     """What `igps robustness` writes."""
     folder.mkdir(parents=True)
-    noise = {"mean": 0.125, "each": {NAMES[0]: 0.05, NAMES[1]: 0.2}, "notes": {NAMES[2]: "no surface left."}}
+    noise = {
+        "mean": 0.125,
+        "each": {NAMES[0]: 0.05, NAMES[1]: 0.2},
+        "notes": {NAMES[2]: "no surface left."},
+    }
     pose = {"mean": None, "each": {}, "notes": {}}
     summary = {
         "disturbances": {"noise": "random"},

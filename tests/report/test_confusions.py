@@ -14,7 +14,9 @@ from igps.report.page_data import data_of
 from igps.report.results import Results, System, read_results
 
 
-def random_collection(n: int, n_classes: int, spread: float, seed: int) -> tuple[np.ndarray, tuple[str, ...]]:
+def random_collection(
+    n: int, n_classes: int, spread: float, seed: int
+) -> tuple[np.ndarray, tuple[str, ...]]:
     """Whole numbers as distances, so that many are equal, between shapes that lie nearer to those of their class."""
     rng = np.random.default_rng(seed)
     codes = rng.integers(n_classes, size=n)
@@ -55,7 +57,9 @@ def test_a_wrong_nearest_comes_before_a_right_one() -> None:
 def test_of_many_the_twenty_worst_and_of_right_ones_none() -> None:
     distances, labels = random_collection(60, 5, 30.0, seed=2)
     assert len(worst_of(distances, labels, tuple(map(str, range(60))))) == 20
-    together = np.array([[0.0 if one == other else 1.0 for other in labels] for one in labels], dtype=np.float32)
+    together = np.array(
+        [[0.0 if one == other else 1.0 for other in labels] for one in labels], dtype=np.float32
+    )
     assert worst_of(together, labels, tuple(map(str, range(60)))) == []
 
 
@@ -67,7 +71,9 @@ def test_each_descriptor_has_its_own(tmp_path: Path) -> None:
         assert system["worst"] == worst_by_a_loop(distances_of(seed)[:n, :n], LABELS[:n], NAMES[:n])
     assert systems[0]["worst"] != systems[1]["worst"]
     for labels in ((), NAMES):
-        (system,) = data_of(read_results(retrieval_folder(tmp_path / "retrieve", labels)), {})["systems"]
+        (system,) = data_of(read_results(retrieval_folder(tmp_path / "retrieve", labels)), {})[
+            "systems"
+        ]
         assert system["worst"] is None
 
 

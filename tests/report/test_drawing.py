@@ -40,7 +40,12 @@ def test_ranked_results_show_each_class_with_hits_and_misses(
     drawing.ranked_results(root, root / "ranking.csv", root / "out" / "ranked.png", top=3)
     axes = np.array(made[0].axes).reshape(2, 4)
     titles = [[axis.get_title() for axis in row] for row in axes]
-    assert titles[0] == ["query ball/0.off", "ball/1.off\n0.100", "egg/0.off\n0.200", "egg/1.off\n0.300"]
+    assert titles[0] == [
+        "query ball/0.off",
+        "ball/1.off\n0.100",
+        "egg/0.off\n0.200",
+        "egg/1.off\n0.300",
+    ]
     assert titles[1][0] == "query egg/0.off"
     styles = [[axis.spines["top"].get_linestyle() for axis in row] for row in axes]
     assert styles == [["-", "-", "--", "--"], ["-", "--", "--", "-"]]

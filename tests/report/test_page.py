@@ -58,7 +58,9 @@ class Elements(HTMLParser):
         return re.sub(r"\s+", " ", " ".join(self.texts))
 
     def data(self) -> dict[str, Any]:
-        return json.loads(next(script for script in self.scripts if script.startswith('{"classes"')))
+        return json.loads(
+            next(script for script in self.scripts if script.startswith('{"classes"'))
+        )
 
 
 @pytest.fixture
@@ -69,7 +71,11 @@ def page(tmp_path: Path, blob: Mesh) -> str:
 
 def test_no_script_or_style_closes_its_own_element() -> None:
     """They are written into the page as they are."""
-    sources = [one for one in (files("igps.report") / "template").iterdir() if one.name.endswith((".js", ".css"))]
+    sources = [
+        one
+        for one in (files("igps.report") / "template").iterdir()
+        if one.name.endswith((".js", ".css"))
+    ]
     assert len(sources) >= 7
     for source in sources:
         assert not re.search(r"</(script|style)", source.read_text("utf-8"), re.IGNORECASE), source
@@ -99,7 +105,9 @@ def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:
     assert system["scores"] == pytest.approx(scores.mean(), abs=1e-5)
     alone, egg = data["classes"].index("alone"), data["classes"].index("egg")
     assert system["per_class"][alone] is None
-    assert system["per_class"][egg]["ft"] == pytest.approx(scores.per_class()["egg"]["ft"], abs=1e-5)
+    assert system["per_class"][egg]["ft"] == pytest.approx(
+        scores.per_class()["egg"]["ft"], abs=1e-5
+    )
     assert system["per_query"]["nn"][-1] is None  # it has no other of its class
     assert system["per_query"]["nn"][:-1] == scores.nn[:-1].tolist()
     curve = precision_recall_curve(torch.from_numpy(distances), LABELS)
@@ -110,7 +118,9 @@ def test_names_from_files_are_harmless_everywhere(page: str) -> None:
     seen = Elements(page)
     tags = {tag for tag, _ in seen.elements}
     assert not {"img", "b", "i", "iframe"} & tags
-    assert sum(tag == "script" for tag, _ in seen.elements) == 8  # numbers, surfaces, three.js, and five of ours
+    assert (
+        sum(tag == "script" for tag, _ in seen.elements) == 8
+    )  # numbers, surfaces, three.js, and five of ours
     assert not any(name.startswith("on") for _, attributes in seen.elements for name in attributes)
     for told in (*NAMES, EVIL, NOTE, "bad<b>.off: it is open."):
         assert told in seen.text
@@ -121,13 +131,24 @@ def test_names_from_files_are_harmless_everywhere(page: str) -> None:
 
 def test_nothing_is_loaded(page: str) -> None:
     seen = Elements(page)
-    links = [attributes.get(name) for _, attributes in seen.elements for name in ("src", "href", "action", "data")]
-    assert {link for link in links if link} <= {"data:,"} | {link for link in links if link and link[0] == "#"}
-    policy = next(attributes["content"] for _, attributes in seen.elements if "http-equiv" in attributes) or ""
+    links = [
+        attributes.get(name)
+        for _, attributes in seen.elements
+        for name in ("src", "href", "action", "data")
+    ]
+    assert {link for link in links if link} <= {"data:,"} | {
+        link for link in links if link and link[0] == "#"
+    }
+    policy = (
+        next(attributes["content"] for _, attributes in seen.elements if "http-equiv" in attributes)
+        or ""
+    )
     assert "default-src 'none'" in policy
     assert "unsafe" not in policy
     targets = {link[1:] for link in links if link and link[0] == "#"}
-    assert {target for target in targets if not target.startswith("shape-")} <= {a.get("id") for _, a in seen.elements}
+    assert {target for target in targets if not target.startswith("shape-")} <= {
+        a.get("id") for _, a in seen.elements
+    }
 
 
 def test_surfaces_lie_in_the_order_of_the_shapes(tmp_path: Path, blob: Mesh) -> None:
@@ -149,7 +170,9 @@ def test_without_classes_only_rankings(tmp_path: Path) -> None:
     seen = Elements(render_page(results, {}))
     (system,) = seen.data()["systems"]
     assert seen.data()["classes"] == []
-    assert [system[name] for name in ("scores", "curve", "confusion", "per_query", "worst")] == [None] * 5
+    assert [system[name] for name in ("scores", "curve", "confusion", "per_query", "worst")] == [
+        None
+    ] * 5
     ids = {attributes.get("id") for _, attributes in seen.elements}
     assert {"shapes", "unused", "repaired"} <= ids
     assert not {"scores", "confusion", "precision-recall", "worst"} & ids
@@ -200,6 +223,10 @@ def test_what_is_no_folder_of_results_is_told(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no results found"):
         read_results(tmp_path)
     retrieval_folder(tmp_path)
-    np.savez(tmp_path / "distances.npz", distances=np.zeros((2, 2)), names=np.array(["a", "b", "c"]))
-    with pytest.raises(ValueError, match=r"expected distances and labels \(or no labels\) of 3 meshes"):
+    np.savez(
+        tmp_path / "distances.npz", distances=np.zeros((2, 2)), names=np.array(["a", "b", "c"])
+    )
+    with pytest.raises(
+        ValueError, match=r"expected distances and labels \(or no labels\) of 3 meshes"
+    ):
         read_results(tmp_path)

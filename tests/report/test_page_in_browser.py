@@ -41,7 +41,9 @@ from igps.report.page import render_page
 from igps.report.results import read_results
 from igps.shapes import ArticulatedShapes
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: it drives the browser")
+playwright = pytest.importorskip(
+    "playwright.sync_api", reason="playwright is not installed: it drives the browser"
+)
 
 # Software renders in place of a graphics card; in containers root must go without the sandbox.
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -50,7 +52,11 @@ PATIENCE = 60_000  # milliseconds
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    path = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
     if path is None:
         pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
     flags = [*FLAGS, "--no-sandbox"] if os.geteuid() == 0 else FLAGS
@@ -75,7 +81,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "answers": answers_folder(root / "answers"),
     }
     for name, results in made.items():
-        page = render_page(read_results(results), pictures, EXPLAINED if name == "answers" else None)
+        page = render_page(
+            read_results(results), pictures, EXPLAINED if name == "answers" else None
+        )
         (root / f"{name}.html").write_text(page, encoding="utf-8")
     return root
 
@@ -92,12 +100,16 @@ class Visit:
     """A page in the browser, and what went wrong or over the network."""
 
     def __init__(self, browser: Any, path: Path, **options: Any) -> None:
-        self.context = browser.new_context(**{"viewport": {"width": 1200, "height": 900}, **options})
+        self.context = browser.new_context(
+            **{"viewport": {"width": 1200, "height": 900}, **options}
+        )
         self.context.set_default_timeout(PATIENCE)
         self.page = self.context.new_page()
         self.complaints: list[str] = []
         self.requests: list[str] = []
-        self.page.on("console", lambda message: self.complaints.append(f"{message.type}: {message.text}"))
+        self.page.on(
+            "console", lambda message: self.complaints.append(f"{message.type}: {message.text}")
+        )
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.address = path.as_uri()
@@ -141,16 +153,25 @@ def retrieval(browser: Any, folder: Path) -> Iterator[Visit]:
 
 
 @pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled", "answers"])
-def test_every_kind_opens_without_complaint_or_request(browser: Any, folder: Path, kind: str) -> None:
+def test_every_kind_opens_without_complaint_or_request(
+    browser: Any, folder: Path, kind: str
+) -> None:
     with Visit(browser, folder / f"{kind}.html") as visit:
         assert len(visit.shown()) == (3 if kind == "robustness" else len(NAMES))
         visit.open(1).locator("#close").click()
         visit.page.locator("dialog[open]").wait_for(state="detached")
 
 
-def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(browser: Any, tmp_path: Path) -> None:
+def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(
+    browser: Any, tmp_path: Path
+) -> None:
     names = ("1.nii#liver", "1.nii#spleen", "2.nii#liver")
-    np.savez(tmp_path / "distances.npz", distances=1 - np.eye(3), names=names, labels=("liver", "spleen", "liver"))
+    np.savez(
+        tmp_path / "distances.npz",
+        distances=1 - np.eye(3),
+        names=names,
+        labels=("liver", "spleen", "liver"),
+    )
     files = [{"file": name, "part": name[6:]} for name in names]
     (tmp_path / "meshes.json").write_text(json.dumps({"meshes": files}))
     body = as_mesh(trimesh.creation.icosphere(subdivisions=2)).annotated(unit="mm")
@@ -184,11 +205,14 @@ def places_on_the_map(visit: Visit) -> np.ndarray:
 
 def selected(visit: Visit) -> set[int]:
     return {
-        int(one.get_attribute("data-point")) for one in visit.page.locator('[data-point][aria-selected="true"]').all()
+        int(one.get_attribute("data-point"))
+        for one in visit.page.locator('[data-point][aria-selected="true"]').all()
     }
 
 
-def test_the_map_has_the_places_of_the_distances_and_tells_the_one_under_the_mouse(answers: Visit) -> None:
+def test_the_map_has_the_places_of_the_distances_and_tells_the_one_under_the_mouse(
+    answers: Visit,
+) -> None:
     places = places_on_the_map(answers)
     points = body_map(distances_of(0)).points
     scale = np.ptp(places[:, 0]) / np.ptp(points[:, 0])
@@ -240,7 +264,12 @@ def test_the_map_is_walked_through_by_the_keyboard(answers: Visit) -> None:
         return int(page.evaluate("document.activeElement.dataset.point"))
 
     walked = {here()}
-    for key, axis, sign in 2 * (("ArrowRight", 0, 1), ("ArrowDown", 1, 1), ("ArrowLeft", 0, -1), ("ArrowUp", 1, -1)):
+    for key, axis, sign in 2 * (
+        ("ArrowRight", 0, 1),
+        ("ArrowDown", 1, 1),
+        ("ArrowLeft", 0, -1),
+        ("ArrowUp", 1, -1),
+    ):
         while True:
             before = here()
             page.keyboard.press(key)
@@ -267,13 +296,18 @@ def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answer
     distances = (distances + distances.T) / 2
     groups, expected = {frozenset([i]) for i in range(len(NAMES))}, []
     while len(groups) > 1:  # by hand: the two groups that are nearest in the mean
-        apart = {pair: distances[np.ix_(*map(sorted, pair))].mean() for pair in itertools.combinations(groups, 2)}
+        apart = {
+            pair: distances[np.ix_(*map(sorted, pair))].mean()
+            for pair in itertools.combinations(groups, 2)
+        }
         one, other = min(apart, key=lambda pair: apart[pair])
         groups = groups - {one, other} | {one | other}
         expected.append((one | other, apart[one, other]))
     page.locator("#tree-plot").scroll_into_view_if_needed()
     stability = clusters_of(distances, n_resamples=50).stability
-    told = f"{np.count_nonzero(np.array(stability) >= 0.75)} of {len(stability)} clusters are stable."
+    told = (
+        f"{np.count_nonzero(np.array(stability) >= 0.75)} of {len(stability)} clusters are stable."
+    )
     assert page.locator("#tree-summary").inner_text() == told
     branches = page.locator("#tree-plot .branch").all()[::-1]
     assert len(branches) == len(expected)
@@ -283,20 +317,24 @@ def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answer
         assert selected(answers) == members
         assert branch.get_attribute("aria-selected") == "true"
         assert f"distance {distance:.3g}" in str(branch.get_attribute("aria-label"))
-        faint = {int(one.get_attribute("data-leaf")) for one in page.locator("#tree-plot .faint").all()}
+        faint = {
+            int(one.get_attribute("data-leaf")) for one in page.locator("#tree-plot .faint").all()
+        }
         assert faint == set(range(len(NAMES))) - members
     lowest, (pair, _) = branches[0], expected[0]
     box = lowest.bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     assert selected(answers) == pair
     walked = [lowest.get_attribute("aria-label")]
-    while page.evaluate("document.activeElement.getAttribute('aria-label')") != branches[-1].get_attribute(
-        "aria-label"
-    ):
+    while page.evaluate("document.activeElement.getAttribute('aria-label')") != branches[
+        -1
+    ].get_attribute("aria-label"):
         page.keyboard.press("ArrowUp")
         walked.append(page.evaluate("document.activeElement.getAttribute('aria-label')"))
     assert walked == [
-        one.get_attribute("aria-label") for one, (members, _) in zip(branches, expected, strict=True) if members >= pair
+        one.get_attribute("aria-label")
+        for one, (members, _) in zip(branches, expected, strict=True)
+        if members >= pair
     ]
     page.keyboard.press("Escape")
     assert selected(answers) == set()
@@ -306,8 +344,12 @@ def test_leaves_of_the_tree_have_the_colours_of_the_map(answers: Visit) -> None:
     for colour in ("class", "cluster", "column dose"):
         answers.page.locator("#map-colour").select_option(colour)
         for i in range(len(NAMES)):
-            point, leaf = (answers.page.locator(f'[data-{kind}="{i}"]') for kind in ("point", "leaf"))
-            filled = [one.evaluate("(mark) => getComputedStyle(mark).fill") for one in (point, leaf)]
+            point, leaf = (
+                answers.page.locator(f'[data-{kind}="{i}"]') for kind in ("point", "leaf")
+            )
+            filled = [
+                one.evaluate("(mark) => getComputedStyle(mark).fill") for one in (point, leaf)
+            ]
             assert filled[0] == filled[1] != "rgb(0, 0, 0)"
 
 
@@ -322,17 +364,22 @@ def test_leaves_of_the_tree_have_the_colours_of_the_map(answers: Visit) -> None:
 )
 def test_the_map_is_coloured(answers: Visit, colour: str, legend: list[str] | None) -> None:
     answers.page.locator("#map-colour").select_option(colour)
-    entries = [" ".join(one.split()) for one in answers.page.locator("#map-legend li").all_inner_texts()]
+    entries = [
+        " ".join(one.split()) for one in answers.page.locator("#map-legend li").all_inner_texts()
+    ]
     if legend is None:
         found = clusters_of(distances_of(0), n_resamples=50)
         legend = [
-            f"cluster {i + 1}" + f", stability {one:.2f}" * bool(np.isfinite(one)) + f" {(found.labels == i).sum()}"
+            f"cluster {i + 1}"
+            + f", stability {one:.2f}" * bool(np.isfinite(one))
+            + f" {(found.labels == i).sum()}"
             for i, one in enumerate(found.stability)
         ]
     assert entries == legend
     assert answers.page.evaluate("window.ran") is None
     marks = {
-        (mark.get_attribute("class"), mark.get_attribute("d")) for mark in answers.page.locator("[data-point]").all()
+        (mark.get_attribute("class"), mark.get_attribute("d"))
+        for mark in answers.page.locator("[data-point]").all()
     }
     assert len(marks) == len(legend)
 
@@ -350,11 +397,28 @@ def test_numbers_have_a_scale_of_colours(answers: Visit) -> None:
 
 
 def test_groups_and_outliers_of_the_same_folder_are_told(answers: Visit) -> None:
-    groups = [row.inner_text().split("\t") for row in answers.page.locator("#groups tbody tr").all()]
-    assert groups[0] == [EVIL, "0.0010", "0.0020", "0.0100", "0.0200", "0.250", "0.125 to 0.375", "0.88", "a:8 b:9"]
+    groups = [
+        row.inner_text().split("\t") for row in answers.page.locator("#groups tbody tr").all()
+    ]
+    assert groups[0] == [
+        EVIL,
+        "0.0010",
+        "0.0020",
+        "0.0100",
+        "0.0200",
+        "0.250",
+        "0.125 to 0.375",
+        "0.88",
+        "a:8 b:9",
+    ]
     assert groups[1] == ["liver", "not tested: a has 3.", "a:3 b:9"]
     outliers = answers.page.locator("#outliers tbody tr")
-    assert outliers.all_inner_texts()[1].split("\t") == ["gone.off", "1.0", "egg", "nothing unusual"]
+    assert outliers.all_inner_texts()[1].split("\t") == [
+        "gone.off",
+        "1.0",
+        "egg",
+        "nothing unusual",
+    ]
     assert outliers.locator("a").count() == 1
     outliers.locator("a").click()
     answers.wait_until(lambda: answers.page.locator("dialog[open]").count() == 1)
@@ -393,8 +457,10 @@ def test_names_run_nothing(retrieval: Visit) -> None:
 
 def test_no_other_script_could_run(browser: Any, folder: Path) -> None:
     with Visit(browser, folder / "retrieve.html") as visit:
-        visit.page.evaluate("() => { const s = document.createElement('script'); s.text = 'window.ran = 3'; "
-                            "document.body.append(s); }")  # fmt: skip
+        visit.page.evaluate(
+            "() => { const s = document.createElement('script'); s.text = 'window.ran = 3'; "
+            "document.body.append(s); }"
+        )
         assert visit.page.evaluate("window.ran") is None
         assert "Content Security Policy" in visit.complaints.pop()
 
@@ -493,7 +559,9 @@ def test_a_body_turns(retrieval: Visit) -> None:
     focused = canvas.screenshot()
     page.keyboard.press("ArrowLeft")
     assert canvas.screenshot() != focused
-    assert page.locator("#shape-name").inner_text() == NAMES[0]  # the arrow turned the body and led nowhere
+    assert (
+        page.locator("#shape-name").inner_text() == NAMES[0]
+    )  # the arrow turned the body and led nowhere
     page.keyboard.press("Home")
     page.locator("#close").focus()
     assert canvas.screenshot() == before
@@ -581,10 +649,14 @@ def test_the_worst_confusions_follow_the_descriptor(browser: Any, folder: Path) 
             assert rows.count() == len(expected)
             for row, one in zip(rows.all(), expected, strict=True):
                 query = one["query"]
-                order = sorted((j for j in range(n) if j != query), key=lambda j: distances[query, j])
+                order = sorted(
+                    (j for j in range(n) if j != query), key=lambda j: distances[query, j]
+                )
                 wrong = [order[rank - 1] for rank in one["wrong"]]
                 assert row.locator(".name").all_inner_texts() == [NAMES[j] for j in (query, *wrong)]
-                assert row.locator(".name + .about").all_inner_texts() == [LABELS[j] for j in (query, *wrong)]
+                assert row.locator(".name + .about").all_inner_texts() == [
+                    LABELS[j] for j in (query, *wrong)
+                ]
                 ranks = [text.split()[-1] for text in row.locator(".rank").all_inner_texts()]
                 assert ranks == [str(rank) for rank in one["wrong"]]
                 marks = [text.split() for text in row.locator(".mark").all_inner_texts()]
@@ -615,11 +687,15 @@ def test_a_worst_confusion_opens_its_rankings(retrieval: Visit) -> None:
     ranked.first.click()  # and on to another ranking within the window
     retrieval.wait_until(lambda: retrieval.name() != wrong)
     page.locator("#close").click()
-    retrieval.wait_until(lambda: pictures.nth(1).evaluate("button => button === document.activeElement"))
+    retrieval.wait_until(
+        lambda: pictures.nth(1).evaluate("button => button === document.activeElement")
+    )
     opened = retrieval.open(0)  # the wall has its own way back
     opened.locator("#close").click()
     retrieval.wait_until(
-        lambda: page.evaluate("document.activeElement === document.querySelector('#shapes [data-shape=\"0\"]')")
+        lambda: page.evaluate(
+            "document.activeElement === document.querySelector('#shapes [data-shape=\"0\"]')"
+        )
     )
 
 
@@ -657,7 +733,9 @@ def test_confusion_and_sorted_scores(retrieval: Visit) -> None:
     table.locator("thead button", has_text="class").click()
     assert table.locator("tbody th").all_inner_texts() == names[::-1]
     table.locator("thead button", has_text="FT").click()
-    values = [text for text in table.locator("tbody td:nth-child(4)").all_inner_texts() if text != "–"]
+    values = [
+        text for text in table.locator("tbody td:nth-child(4)").all_inner_texts() if text != "–"
+    ]
     assert [float(value) for value in values] == sorted(map(float, values))
     assert table.locator("thead th[aria-sort=ascending]").inner_text().startswith("FT")
 
@@ -715,14 +793,20 @@ def test_print_has_all_pictures_and_no_controls(retrieval: Visit) -> None:
 @pytest.fixture
 def violations() -> Callable[[Any], list[dict[str, Any]]]:
     """What axe-core finds wrong with a page."""
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+    axe = pytest.importorskip(
+        "axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed"
+    )
     return lambda page: list(axe.Axe().run(page).response["violations"])
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled", "answers"])
 def test_nothing_serious_for_accessibility(
-    browser: Any, folder: Path, violations: Callable[[Any], list[dict[str, Any]]], scheme: str, kind: str
+    browser: Any,
+    folder: Path,
+    violations: Callable[[Any], list[dict[str, Any]]],
+    scheme: str,
+    kind: str,
 ) -> None:
     with Visit(browser, folder / f"{kind}.html", color_scheme=scheme) as visit:
 
@@ -743,7 +827,9 @@ def test_nothing_serious_for_accessibility(
         assert serious() == []
 
 
-def test_the_checker_would_see_a_fault(retrieval: Visit, violations: Callable[[Any], list[dict[str, Any]]]) -> None:
+def test_the_checker_would_see_a_fault(
+    retrieval: Visit, violations: Callable[[Any], list[dict[str, Any]]]
+) -> None:
     retrieval.page.locator("#theme").evaluate(
         "button => { button.removeAttribute('aria-label'); button.textContent = ''; }"
     )
@@ -751,11 +837,16 @@ def test_the_checker_would_see_a_fault(retrieval: Visit, violations: Callable[[A
 
 
 def test_the_demo_ends_with_its_page(
-    browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    browser: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """A smaller demo, the last line of which names a page that opens."""
     monkeypatch.setattr(
-        sys.modules["igps.cli.demo"], "ArticulatedShapes", lambda **_: ArticulatedShapes(n_classes=2, n_per_class=2)
+        sys.modules["igps.cli.demo"],
+        "ArticulatedShapes",
+        lambda **_: ArticulatedShapes(n_classes=2, n_per_class=2),
     )
     monkeypatch.setattr(sys, "argv", ["igps", "demo", "--out", str(tmp_path), "--n_workers", "1"])
     main()

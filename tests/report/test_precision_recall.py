@@ -15,11 +15,16 @@ from igps.report import answers
 from igps.retrieval import precision_recall_curve
 
 
-def test_curves_are_drawn_in_percent_and_told_apart(tmp_path: Path, figures_of: Callable[[Any], list[Figure]]) -> None:
+def test_curves_are_drawn_in_percent_and_told_apart(
+    tmp_path: Path, figures_of: Callable[[Any], list[Figure]]
+) -> None:
     made = figures_of(answers)
     labels = [0, 0, 0, 1, 1, 1]
     draws = np.random.default_rng(0).random((12, 6, 6))
-    curves = {f"descriptor {i}": precision_recall_curve(torch.from_numpy(draw), labels) for i, draw in enumerate(draws)}
+    curves = {
+        f"descriptor {i}": precision_recall_curve(torch.from_numpy(draw), labels)
+        for i, draw in enumerate(draws)
+    }
     answers.precision_recall(curves, tmp_path / "deep" / "curves.png")
     (axes,) = made[0].axes
     assert len(axes.lines) == 12

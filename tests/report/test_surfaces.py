@@ -39,7 +39,9 @@ def test_a_surface_keeps_the_form_with_few_vertices() -> None:
     np.testing.assert_allclose(np.ptp(points, axis=0), [1.0 / 2.5, 1.0, 0.7 / 2.5], rtol=0.06)
     body = trimesh.Trimesh(points, one.faces, process=False)
     assert body.is_watertight
-    assert body.volume == pytest.approx(np.pi / 6 * 0.4 * 0.28, rel=0.06)  # positive: not a mirror image
+    assert body.volume == pytest.approx(
+        np.pi / 6 * 0.4 * 0.28, rel=0.06
+    )  # positive: not a mirror image
     assert (one.n_vertices, one.n_faces) == (642, 1280)
     assert one.volume == pytest.approx(4 / 3 * np.pi * 1.75, rel=0.02)
 
@@ -55,7 +57,9 @@ def test_the_potential_is_that_of_the_nearest_samples() -> None:
     assert potential.min() == 0
     assert potential.max() == 1
     low, high = one.potential_range
-    for vertex in range(0, len(mesh.vertices), 50):  # small enough: the vertices are those of the mesh
+    for vertex in range(
+        0, len(mesh.vertices), 50
+    ):  # small enough: the vertices are those of the mesh
         away = np.linalg.norm(signature.surface.points - mesh.vertices[vertex], axis=1)
         total = weights = 0.0
         for sample in np.argsort(away)[:4]:
@@ -63,13 +67,19 @@ def test_the_potential_is_that_of_the_nearest_samples() -> None:
             weight = 1 / (away[sample] + 1e-6 * mesh.diagonal)
             total += weight * np.sqrt(sum(phi**2 / signature.eigenvalues))
             weights += weight
-        assert low + potential[vertex] * (high - low) == pytest.approx(total / weights, abs=(high - low) / 400)
+        assert low + potential[vertex] * (high - low) == pytest.approx(
+            total / weights, abs=(high - low) / 400
+        )
 
 
 def test_turned_and_moved_bodies_look_alike() -> None:
     mesh = horseshoe()
-    turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).uniform(size=3))[:3, :3]
-    other = as_mesh(trimesh.Trimesh(3 * mesh.vertices @ turn.T + [5, 1, 2], mesh.faces, process=False))
+    turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).uniform(size=3))[
+        :3, :3
+    ]
+    other = as_mesh(
+        trimesh.Trimesh(3 * mesh.vertices @ turn.T + [5, 1, 2], mesh.faces, process=False)
+    )
     one, two = (surface_of(body, compute_signature(body, CONFIG), 1000) for body in (mesh, other))
     np.testing.assert_allclose(one.vertices / 65535, two.vertices / 65535, atol=2e-3)
 
@@ -124,12 +134,16 @@ def test_kept_surfaces_follow_their_files(tmp_path: Path, caplog: pytest.LogCapt
 
     def keep() -> dict[str, surfaces.PageSurface]:
         dataset = SignatureDataset(files, CONFIG, tmp_path / "cache")
-        return {Path(name).name: one for name, one in keep_surfaces(kept, dataset, n_workers=1).items()}
+        return {
+            Path(name).name: one for name, one in keep_surfaces(kept, dataset, n_workers=1).items()
+        }
 
     first = keep()
     assert list(first) == ["0.off", "1.off", "2.off"]
     time_made = kept.stat().st_mtime_ns
-    assert {name: one.key for name, one in keep().items()} == {name: one.key for name, one in first.items()}
+    assert {name: one.key for name, one in keep().items()} == {
+        name: one.key for name, one in first.items()
+    }
     assert kept.stat().st_mtime_ns == time_made
 
     changed = egg()

@@ -43,9 +43,16 @@ def histograms(n: int, cells: tuple[int, ...], *, seed: int, filled: float = 0.6
 @pytest.mark.usefixtures("either_device")
 @pytest.mark.parametrize("distance", ALL)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 4e-6)])
-@pytest.mark.parametrize(("n_queries", "n_gallery", "cells"), [(7, 5, (3, 8)), (1, 90, (10, 64)), (3, 2, (9000,))])
+@pytest.mark.parametrize(
+    ("n_queries", "n_gallery", "cells"), [(7, 5, (3, 8)), (1, 90, (10, 64)), (3, 2, (9000,))]
+)
 def test_agrees_with_another_library(
-    distance: Distance, dtype: torch.dtype, tolerance: float, n_queries: int, n_gallery: int, cells: tuple[int, ...]
+    distance: Distance,
+    dtype: torch.dtype,
+    tolerance: float,
+    n_queries: int,
+    n_gallery: int,
+    cells: tuple[int, ...],
 ) -> None:
     queries, gallery = histograms(n_queries, cells, seed=1), histograms(n_gallery, cells, seed=2)
     expected = ORACLES[distance](queries.flatten(1).numpy(), gallery.flatten(1).numpy())
@@ -66,17 +73,25 @@ def test_a_set_with_itself_has_a_zero_diagonal_and_is_symmetric(distance: Distan
 
 
 @pytest.mark.usefixtures("either_device")
-@pytest.mark.parametrize(("distance", "farthest"), [(chi_square, 1.0), (euclidean, 2**0.5), (cosine, 1)])
-def test_histograms_without_a_common_cell_are_at_the_largest_distance(distance: Distance, farthest: float) -> None:
+@pytest.mark.parametrize(
+    ("distance", "farthest"), [(chi_square, 1.0), (euclidean, 2**0.5), (cosine, 1)]
+)
+def test_histograms_without_a_common_cell_are_at_the_largest_distance(
+    distance: Distance, farthest: float
+) -> None:
     corners = torch.eye(3, dtype=torch.float64)
-    torch.testing.assert_close(distance(corners, corners), farthest * (1 - corners), rtol=0, atol=1e-15)
+    torch.testing.assert_close(
+        distance(corners, corners), farthest * (1 - corners), rtol=0, atol=1e-15
+    )
 
 
 def test_near_vectors_keep_their_cosine_distance() -> None:
     angle = 1e-3
     a = torch.tensor([[1.0, 0.0]])
     b = torch.tensor([[np.cos(angle), np.sin(angle)]], dtype=torch.float32)
-    assert cosine(a, b).item() == pytest.approx(angle**2 / 2, rel=1e-4)  # 1 − cos in float32 would be 6 % off
+    assert cosine(a, b).item() == pytest.approx(
+        angle**2 / 2, rel=1e-4
+    )  # 1 − cos in float32 would be 6 % off
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
@@ -105,38 +120,54 @@ def test_threads_change_no_bit(
 
 @pytest.mark.usefixtures("either_device")
 def test_chi_square_of_tiny_entries_does_not_underflow() -> None:
-    assert chi_square(torch.tensor([[1e-30]]), torch.tensor([[0.0]])).item() == pytest.approx(5e-31, rel=1e-6, abs=0)
+    assert chi_square(torch.tensor([[1e-30]]), torch.tensor([[0.0]])).item() == pytest.approx(
+        5e-31, rel=1e-6, abs=0
+    )
 
 
 def test_half_precision_is_computed_in_float32() -> None:
     queries = histograms(4, (5, 8), seed=4).half()
     for distance in ALL:
-        torch.testing.assert_close(distance(queries, queries[:2]), distance(queries.float(), queries[:2].float()))
+        torch.testing.assert_close(
+            distance(queries, queries[:2]), distance(queries.float(), queries[:2].float())
+        )
 
 
 @pytest.mark.usefixtures("either_device")
 def test_cells_that_are_multiplied_in_both_weigh_so_much_in_chi_square() -> None:
     queries, gallery = histograms(4, (3, 8), seed=5), histograms(6, (3, 8), seed=6)
     for shape in [(3, 8), (3, 1), (8,), ()]:
-        weights = 2 * torch.rand(shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+        weights = 2 * torch.rand(
+            shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64
+        )
         expected = np.zeros((4, 6))
         for q, g, i, j in np.ndindex(4, 6, 3, 8):
             a, b = float(queries[q, i, j]), float(gallery[g, i, j])
             if a + b > 0:
-                expected[q, g] += 0.5 * float(weights.broadcast_to(3, 8)[i, j]) * (a - b) ** 2 / (a + b)
-        np.testing.assert_allclose(chi_square(weights * queries, weights * gallery).numpy(), expected, atol=1e-14)
+                expected[q, g] += (
+                    0.5 * float(weights.broadcast_to(3, 8)[i, j]) * (a - b) ** 2 / (a + b)
+                )
+        np.testing.assert_allclose(
+            chi_square(weights * queries, weights * gallery).numpy(), expected, atol=1e-14
+        )
 
 
 @pytest.mark.parametrize("distance", ALL)
 def test_gradients_agree_with_finite_differences(distance: Distance) -> None:
-    queries, gallery = histograms(3, (2, 5), seed=8, filled=2), histograms(4, (2, 5), seed=9, filled=2)
+    queries, gallery = (
+        histograms(3, (2, 5), seed=8, filled=2),
+        histograms(4, (2, 5), seed=9, filled=2),
+    )
     queries, gallery = (10 * queries + 0.1).requires_grad_(), (10 * gallery + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(distance, (queries, gallery))
 
 
 @pytest.mark.parametrize("distance", ALL)
 def test_gradients_of_one_side_are_those_of_both(distance: Distance) -> None:
-    both = [histograms(3, (4,), seed=23, filled=2).requires_grad_(), histograms(2, (4,), seed=24, filled=2)]
+    both = [
+        histograms(3, (4,), seed=23, filled=2).requires_grad_(),
+        histograms(2, (4,), seed=24, filled=2),
+    ]
     both[1].requires_grad_()
     expected = torch.autograd.grad(distance(*both).sum(), both)
     for side in (0, 1):
@@ -147,27 +178,43 @@ def test_gradients_of_one_side_are_those_of_both(distance: Distance) -> None:
 
 @pytest.mark.parametrize("distance", ALL)
 @pytest.mark.parametrize("side", [0, 1])
-def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(distance: Distance, side: int) -> None:
+def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(
+    distance: Distance, side: int
+) -> None:
     both = [histograms(3, (40,), seed=25), histograms(2, (40,), seed=26)]
     both[1][1] = both[0][2]  # at distance zero
-    along, upstream = histograms(len(both[side]), (40,), seed=29, filled=2), histograms(3, (2,), seed=30, filled=2)
+    along, upstream = (
+        histograms(len(both[side]), (40,), seed=29, filled=2),
+        histograms(3, (2,), seed=30, filled=2),
+    )
     leaf = both[side].requires_grad_()
     expected = (torch.autograd.grad((distance(*both) * upstream).sum(), leaf)[0] * along).sum()
 
     def of_side(rows: Tensor) -> Tensor:
-        return (distance(*(rows if i == side else one.detach() for i, one in enumerate(both))) * upstream).sum()
+        return (
+            distance(*(rows if i == side else one.detach() for i, one in enumerate(both)))
+            * upstream
+        ).sum()
 
     plain = leaf.detach()
     with forward_ad.dual_level():
         found = [forward_ad.unpack_dual(of_side(forward_ad.make_dual(plain, along))).tangent]
-    found += [torch.func.jvp(of_side, (plain,), (along,))[1], (torch.func.grad(of_side)(plain) * along).sum()]
+    found += [
+        torch.func.jvp(of_side, (plain,), (along,))[1],
+        (torch.func.grad(of_side)(plain) * along).sum(),
+    ]
     for one in found:
         torch.testing.assert_close(one, expected, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("distance", ALL)
-def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_differences(distance: Distance) -> None:
-    queries, gallery = histograms(3, (20,), seed=31, filled=2), histograms(4, (20,), seed=32, filled=2)
+def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_differences(
+    distance: Distance,
+) -> None:
+    queries, gallery = (
+        histograms(3, (20,), seed=31, filled=2),
+        histograms(4, (20,), seed=32, filled=2),
+    )
     along = histograms(3, (20,), seed=33, filled=2)
     gradient = torch.func.grad(lambda rows: distance(rows, gallery).square().sum())
     found = torch.func.jvp(gradient, (queries,), (along,))[1]
@@ -176,22 +223,32 @@ def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_diffe
 
 
 def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula() -> None:
-    queries, gallery = histograms(40, (9000,), seed=10, filled=2), histograms(30, (9000,), seed=11, filled=2)
+    queries, gallery = (
+        histograms(40, (9000,), seed=10, filled=2),
+        histograms(30, (9000,), seed=11, filled=2),
+    )
     upstream = torch.rand(40, 30, generator=torch.Generator().manual_seed(13), dtype=torch.float64)
     arguments = [tensor.requires_grad_() for tensor in (queries, gallery)]
     gradients = torch.autograd.grad((chi_square(*arguments) * upstream).sum(), arguments)
     a, b = queries[:, None], gallery[None]
     plain = ((a - b) ** 2 / (a + b)).sum(-1) / 2
-    for ours, expected in zip(gradients, torch.autograd.grad((plain * upstream).sum(), arguments), strict=True):
+    for ours, expected in zip(
+        gradients, torch.autograd.grad((plain * upstream).sum(), arguments), strict=True
+    ):
         torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_chi_square_has_second_derivatives_and_none_at_empty_cells() -> None:
-    queries, gallery = histograms(3, (6,), seed=27, filled=2), histograms(4, (6,), seed=28, filled=2)
+    queries, gallery = (
+        histograms(3, (6,), seed=27, filled=2),
+        histograms(4, (6,), seed=28, filled=2),
+    )
     leaves = [one.requires_grad_() for one in (queries, gallery)]
     assert torch.autograd.gradgradcheck(chi_square, leaves)
     empty = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
-    [first] = torch.autograd.grad(chi_square(empty, torch.zeros(1, 2).double()).sum(), empty, create_graph=True)
+    [first] = torch.autograd.grad(
+        chi_square(empty, torch.zeros(1, 2).double()).sum(), empty, create_graph=True
+    )
     assert torch.autograd.grad(first.sum(), empty)[0].tolist() == [[0, 0]]
 
 
@@ -210,7 +267,9 @@ def test_chi_square_never_holds_all_triples_of_query_gallery_and_cell() -> None:
     class LargestBlock(TorchDispatchMode):
         n_bytes = 0
 
-        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        def __torch_dispatch__(
+            self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+        ) -> Any:
             result = func(*args, **(kwargs or {}))
             if isinstance(result, Tensor) and result.ndim == 3:  # (queries, gallery, cells)
                 self.n_bytes = max(self.n_bytes, result.nbytes)
@@ -246,12 +305,26 @@ def test_inputs_are_left_as_they_were(distance: Distance) -> None:
         (torch.ones(3), torch.ones(2, 3), "queries: expected shape"),
         (torch.ones(2, 3), np.ones((2, 3)), "gallery: expected a tensor, got ndarray"),
         (torch.ones(2, 3), torch.ones(2, 0), "gallery: expected shape"),
-        (torch.ones(2, 3, dtype=torch.int64), torch.ones(2, 3), "queries: expected a real floating dtype"),
-        (torch.ones(2, 3), torch.tensor([[1.0, float("nan"), 1.0]]), "gallery: expected finite entries"),
-        (torch.tensor([[1.0, float("inf"), 1.0]]), torch.ones(2, 3), "queries: expected finite entries"),
+        (
+            torch.ones(2, 3, dtype=torch.int64),
+            torch.ones(2, 3),
+            "queries: expected a real floating dtype",
+        ),
+        (
+            torch.ones(2, 3),
+            torch.tensor([[1.0, float("nan"), 1.0]]),
+            "gallery: expected finite entries",
+        ),
+        (
+            torch.tensor([[1.0, float("inf"), 1.0]]),
+            torch.ones(2, 3),
+            "queries: expected finite entries",
+        ),
     ],
 )
-def test_wrong_descriptors_are_refused(distance: Distance, queries: Tensor, gallery: Tensor, message: str) -> None:
+def test_wrong_descriptors_are_refused(
+    distance: Distance, queries: Tensor, gallery: Tensor, message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         distance(queries, gallery)
 
@@ -262,5 +335,7 @@ def test_chi_square_refuses_negative_entries() -> None:
 
 
 def test_cosine_refuses_a_descriptor_without_direction() -> None:
-    with pytest.raises(ValueError, match="queries: expected descriptors of non-zero length, 1 of 2"):
+    with pytest.raises(
+        ValueError, match="queries: expected descriptors of non-zero length, 1 of 2"
+    ):
         cosine(torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.ones(1, 2))

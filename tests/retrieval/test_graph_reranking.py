@@ -8,7 +8,15 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from igps.retrieval import SearchResult, euclidean, graph_reranking, rerank, rerank_graph, reranking, retrieval_scores
+from igps.retrieval import (
+    SearchResult,
+    euclidean,
+    graph_reranking,
+    rerank,
+    rerank_graph,
+    reranking,
+    retrieval_scores,
+)
 from igps.retrieval.graph_reranking import jaccard, walks
 
 
@@ -28,9 +36,14 @@ def mean_of(distances: Tensor) -> float:
 
 @pytest.mark.parametrize(
     "numbers",
-    [{}, {"diffusion": 0}, {"n_neighbours": 6, "n_expanded": 3, "share": 0.5, "diffusion": 0.8}, {"share": 0.1},
-     {"n_neighbours": 4, "n_expanded": 7}],
-)  # fmt: skip
+    [
+        {},
+        {"diffusion": 0},
+        {"n_neighbours": 6, "n_expanded": 3, "share": 0.5, "diffusion": 0.8},
+        {"share": 0.1},
+        {"n_neighbours": 4, "n_expanded": 7},
+    ],
+)
 def test_complete_lists_give_the_distances_of_the_dense_solution(
     numbers: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -39,7 +52,9 @@ def test_complete_lists_give_the_distances_of_the_dense_solution(
     expected = rerank(distances, **numbers)  # type: ignore[arg-type]
     monkeypatch.setattr(graph_reranking, "MAX_DENSE", 0)
     found = rerank_graph(nearest(distances, 59), mean_of(distances), **numbers)  # type: ignore[arg-type]
-    torch.testing.assert_close(found.distances, expected.gather(1, found.indices), rtol=0, atol=2e-5)
+    torch.testing.assert_close(
+        found.distances, expected.gather(1, found.indices), rtol=0, atol=2e-5
+    )
     assert (found.distances.diff(dim=1) >= 0).all()
     assert torch.equal(found.indices.sort().values, nearest(distances, 59).indices.sort().values)
 
@@ -47,13 +62,17 @@ def test_complete_lists_give_the_distances_of_the_dense_solution(
 def test_short_lists_find_classes_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     """Twelve of twenty points each, scattered; each point is tied to half of all, as `rerank` does of many."""
     generator = torch.Generator().manual_seed(0)
-    points = (torch.randn(12, 1, 20, generator=generator) + torch.randn(12, 20, 20, generator=generator)).flatten(0, 1)
+    points = (
+        torch.randn(12, 1, 20, generator=generator) + torch.randn(12, 20, 20, generator=generator)
+    ).flatten(0, 1)
     labels, own = torch.arange(12).repeat_interleave(20), own_distances(points)
     whole = rerank(own)
     monkeypatch.setattr(reranking, "MAX_DENSE", 200)
     monkeypatch.setattr(reranking, "_LIST_LIMITS", (120, 120))
     found = rerank(own)
-    before, expected, tier = (retrieval_scores(one, labels).mean()["ft"] for one in (own, whole, found))
+    before, expected, tier = (
+        retrieval_scores(one, labels).mean()["ft"] for one in (own, whole, found)
+    )
     assert expected > before + 0.1
     assert tier > expected - 0.02
     assert not torch.equal(found, whole)
@@ -67,7 +86,9 @@ def test_walks_are_those_inside_the_list() -> None:
     generator = np.random.default_rng(0)
     steps = sparse.random_array((40, 40), density=0.1, random_state=generator).toarray()
     steps = 0.9 * (steps + steps.T) / np.abs(np.linalg.eigvalsh(steps + steps.T)).max()
-    lists = np.array([[i, *generator.permutation(np.delete(np.arange(40), i))[:14]] for i in range(40)])
+    lists = np.array(
+        [[i, *generator.permutation(np.delete(np.arange(40), i))[:14]] for i in range(40)]
+    )
     rows, found = sparse.csr_array(steps), np.zeros(lists.shape)
     walks(lists, rows.indptr, rows.indices, rows.data, 200, found)
     for here, row in zip(lists, found, strict=True):
@@ -81,13 +102,19 @@ def test_distances_by_the_sums_of_the_smaller_weights() -> None:
     weights = sparse.csr_array(sparse.diags_array(1 / weights.sum(axis=1)) @ weights)
     pairs = sparse.random_array((50, 50), density=0.2, random_state=generator, format="csr")
     dense, rows = weights.toarray(), np.repeat(np.arange(50), np.diff(pairs.indptr))
-    smaller, larger = (one(dense[rows], dense[pairs.indices]).sum(axis=1) for one in (np.minimum, np.maximum))
+    smaller, larger = (
+        one(dense[rows], dense[pairs.indices]).sum(axis=1) for one in (np.minimum, np.maximum)
+    )
     np.testing.assert_allclose(jaccard(weights, pairs, False), 1 - smaller / larger, atol=1e-12)
 
 
 def test_what_it_refuses() -> None:
-    lists = nearest(own_distances(torch.randn(30, 3, generator=torch.Generator().manual_seed(0))), 10)
-    with pytest.raises(ValueError, match="at least 20 neighbours of each shape and a mean above 0, got 10 and 1"):
+    lists = nearest(
+        own_distances(torch.randn(30, 3, generator=torch.Generator().manual_seed(0))), 10
+    )
+    with pytest.raises(
+        ValueError, match="at least 20 neighbours of each shape and a mean above 0, got 10 and 1"
+    ):
         rerank_graph(lists, 1.0)
     with pytest.raises(ValueError, match="a mean above 0, got 10 and 0"):
         rerank_graph(lists, 0.0, 5)

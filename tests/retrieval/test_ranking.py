@@ -22,7 +22,10 @@ def test_many_ties_keep_the_order_of_the_gallery() -> None:
 def test_search_returns_the_closest_with_their_distances() -> None:
     gallery = torch.tensor([[10.0], [4.0], [7.0], [1.0]])
     result = search(torch.tensor([[5.0], [11.0]]), gallery, top=3, distance=euclidean)
-    assert result.indices.tolist() == [[1, 2, 3], [0, 2, 1]]  # 4 and 7 are 1 and 2 from 5, 1 is 4 from it
+    assert result.indices.tolist() == [
+        [1, 2, 3],
+        [0, 2, 1],
+    ]  # 4 and 7 are 1 and 2 from 5, 1 is 4 from it
     assert result.distances.tolist() == [[1.0, 2.0, 4.0], [1.0, 4.0, 7.0]]
 
 
@@ -43,7 +46,9 @@ def test_search_uses_the_distance_it_is_given() -> None:
 
 @pytest.mark.parametrize("top", [0, 4, -1])
 def test_search_refuses_more_than_the_gallery_holds(top: int) -> None:
-    with pytest.raises(ValueError, match=f"top: expected 1 to 3, the size of the gallery, got {top}"):
+    with pytest.raises(
+        ValueError, match=f"top: expected 1 to 3, the size of the gallery, got {top}"
+    ):
         search(torch.ones(1, 2), torch.ones(3, 2), top=top)
 
 
@@ -51,7 +56,10 @@ def test_search_refuses_more_than_the_gallery_holds(top: int) -> None:
     ("distances", "message"),
     [
         (torch.ones(3), "expected a real matrix"),
-        (np.ones((2, 2)), "distances: expected a tensor, got ndarray; convert with torch.as_tensor"),
+        (
+            np.ones((2, 2)),
+            "distances: expected a tensor, got ndarray; convert with torch.as_tensor",
+        ),
         (torch.ones(2, 2, 2), "expected a real matrix"),
         (torch.ones(2, 2, dtype=torch.complex64), "expected a real matrix"),
         (torch.ones(2, 2, dtype=torch.bool), "expected a real matrix"),

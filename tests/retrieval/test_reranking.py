@@ -12,10 +12,15 @@ from torch import Tensor
 from igps.retrieval import euclidean, rerank, rerank_candidates, retrieval_scores, search
 
 
-def by_hand(distances: list[list[float]], k: int, n_expanded: int, share: float) -> list[list[float]]:
+def by_hand(
+    distances: list[list[float]], k: int, n_expanded: int, share: float
+) -> list[list[float]]:
     """Zhong, Zheng, Cao and Li 2017, equations 2, 3, 7, 10, 11 and 12; the units of distance are this library's."""
     n = len(distances)
-    ranked = [[i, *sorted((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j])] for i in range(n)]
+    ranked = [
+        [i, *sorted((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j])]
+        for i in range(n)
+    ]
 
     def reciprocal(i: int, k: int) -> set[int]:
         return {j for j in ranked[i][: k + 1] if i in ranked[j][: k + 1]}
@@ -30,7 +35,10 @@ def by_hand(distances: list[list[float]], k: int, n_expanded: int, share: float)
         near = sum(distances[i][j] for j in ranked[i][1 : k + 1]) / k
         row = [math.exp(-distances[i][j] / near) if j in members else 0.0 for j in range(n)]
         weights.append([value / sum(row) for value in row])
-    weights = [[sum(weights[m][j] for m in ranked[i][:n_expanded]) / n_expanded for j in range(n)] for i in range(n)]
+    weights = [
+        [sum(weights[m][j] for m in ranked[i][:n_expanded]) / n_expanded for j in range(n)]
+        for i in range(n)
+    ]
     mean = sum(map(sum, distances)) / (n * (n - 1))
     found = []
     for i in range(n):
@@ -38,19 +46,30 @@ def by_hand(distances: list[list[float]], k: int, n_expanded: int, share: float)
         for j in range(n):
             smaller = sum(min(a, b) for a, b in zip(weights[i], weights[j], strict=True))
             larger = sum(max(a, b) for a, b in zip(weights[i], weights[j], strict=True))
-            row.append((1 - share) * (1 - smaller / larger) + share * distances[i][j] / mean if i != j else 0.0)
+            row.append(
+                (1 - share) * (1 - smaller / larger) + share * distances[i][j] / mean
+                if i != j
+                else 0.0
+            )
         found.append(row)
     return found
 
 
-def diffused_by_hand(distances: list[list[float]], k: int, share: float, fading: float) -> list[list[float]]:
+def diffused_by_hand(
+    distances: list[list[float]], k: int, share: float, fading: float
+) -> list[list[float]]:
     """All walks of up to 300 steps, step by step, over the graph of the k nearest."""
     n = len(distances)
-    near = [sorted((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j])[:k] for i in range(n)]
+    near = [
+        sorted((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j])[:k]
+        for i in range(n)
+    ]
     scale = [sum(distances[i][j] for j in near[i]) / k for i in range(n)]
     weights = [
         [
-            math.exp(-(distances[i][j] ** 2) / (scale[i] * scale[j])) if j in near[i] or i in near[j] else 0.0
+            math.exp(-(distances[i][j] ** 2) / (scale[i] * scale[j]))
+            if j in near[i] or i in near[j]
+            else 0.0
             for j in range(n)
         ]
         for i in range(n)
@@ -61,14 +80,25 @@ def diffused_by_hand(distances: list[list[float]], k: int, share: float, fading:
         walks = [float(j == i) for j in range(n)]
         total = walks
         for _ in range(300):
-            steps = [[weights[m][j] / math.sqrt(degree[m] * degree[j]) for m in range(n)] for j in range(n)]
-            walks = [fading * sum(a * b for a, b in zip(step, walks, strict=True)) for step in steps]
+            steps = [
+                [weights[m][j] / math.sqrt(degree[m] * degree[j]) for m in range(n)]
+                for j in range(n)
+            ]
+            walks = [
+                fading * sum(a * b for a, b in zip(step, walks, strict=True)) for step in steps
+            ]
             total = [a + b for a, b in zip(total, walks, strict=True)]
         alike.append(total)
-    apart = [[1 - alike[i][j] / math.sqrt(alike[i][i] * alike[j][j]) for j in range(n)] for i in range(n)]
+    apart = [
+        [1 - alike[i][j] / math.sqrt(alike[i][i] * alike[j][j]) for j in range(n)] for i in range(n)
+    ]
     means = [sum(map(sum, matrix)) / (n * (n - 1)) for matrix in (apart, distances)]
     return [
-        [(1 - share) * apart[i][j] / means[0] + share * distances[i][j] / means[1] for j in range(n)] for i in range(n)
+        [
+            (1 - share) * apart[i][j] / means[0] + share * distances[i][j] / means[1]
+            for j in range(n)
+        ]
+        for i in range(n)
     ]
 
 
@@ -77,7 +107,9 @@ def points() -> Tensor:
     return torch.randn(30, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-@pytest.mark.parametrize(("k", "n_expanded", "share"), [(6, 3, 0.3), (9, 1, 0.0), (4, 6, 1.0), (12, 4, 0.5)])
+@pytest.mark.parametrize(
+    ("k", "n_expanded", "share"), [(6, 3, 0.3), (9, 1, 0.0), (4, 6, 1.0), (12, 4, 0.5)]
+)
 def test_sets_and_sums_of_the_paper(k: int, n_expanded: int, share: float, points: Tensor) -> None:
     distances = euclidean(points, points)
     expected = torch.tensor(by_hand(distances.tolist(), k, n_expanded, share), dtype=torch.float64)
@@ -98,10 +130,14 @@ def test_nearest_pairs_are_moved_forward_after_diffusion(points: Tensor) -> None
     """Against loops over walks, nearest pairs and reciprocal sets; the second step must see the moved pairs."""
     k, share, fading, n = 6, 0.3, 0.8, 12
     distances = euclidean(points[:n], points[:n]).tolist()
-    nearest = [min((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j]) for i in range(n)]
+    nearest = [
+        min((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j]) for i in range(n)
+    ]
     pairs = {pair for i, j in enumerate(nearest) for pair in ((i, j), (j, i))}
     diffused = diffused_by_hand(distances, k // 2, share, fading)
-    least = min(diffused[i][j] for i in range(n) for j in range(n) if i != j and (i, j) not in pairs)
+    least = min(
+        diffused[i][j] for i in range(n) for j in range(n) if i != j and (i, j) not in pairs
+    )
     largest = max(distances[i][j] for i, j in pairs)
     for i, j in pairs:
         diffused[i][j] = least / 2 * distances[i][j] / largest
@@ -131,7 +167,10 @@ def test_the_nearest_stays_the_nearest(n_copies: int, dtype: torch.dtype, diffus
     points = torch.cat([points, *[points[:n_copies]] * 2])
     own = euclidean(points, points).to(dtype).fill_diagonal_(0)
     own = torch.minimum(own, own.T)
-    found, moved = rerank(own, diffusion=diffusion), rerank(own, diffusion=diffusion, keep_nearest=False)
+    found, moved = (
+        rerank(own, diffusion=diffusion),
+        rerank(own, diffusion=diffusion, keep_nearest=False),
+    )
     torch.testing.assert_close(found, found.T, rtol=0, atol=0)
     alone = own.clone().fill_diagonal_(torch.inf)
     for i, row in enumerate(found.clone().fill_diagonal_(torch.inf)):
@@ -150,7 +189,9 @@ def test_the_nearest_stays_the_nearest(n_copies: int, dtype: torch.dtype, diffus
 def test_the_order_of_shapes_does_not_matter(points: Tensor) -> None:
     order = torch.randperm(30, generator=torch.Generator().manual_seed(1))
     found = rerank(euclidean(points, points))
-    torch.testing.assert_close(rerank(euclidean(points[order], points[order])), found[order][:, order])
+    torch.testing.assert_close(
+        rerank(euclidean(points[order], points[order])), found[order][:, order]
+    )
     torch.testing.assert_close(found, found.T)
     torch.testing.assert_close(rerank(3 * euclidean(points, points)), found)
 
@@ -177,19 +218,25 @@ def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points: Ten
         together = torch.cat([query[None], gallery])
         expected = rerank(euclidean(together, together))[0, 1:]
         assert found.indices[i].tolist() == expected.argsort()[:5].tolist()
-        torch.testing.assert_close(found.distances[i], expected.sort().values[:5], rtol=0, atol=1e-9)
+        torch.testing.assert_close(
+            found.distances[i], expected.sort().values[:5], rtol=0, atol=1e-9
+        )
 
 
 def test_a_query_is_put_in_order_by_its_nearest_alone() -> None:
     """Of 240 points the nearest 100 tell as much as all do; the nearest 20 can only change places."""
     generator = torch.Generator().manual_seed(1)
     labels = torch.arange(12).repeat_interleave(20)
-    scattered = torch.randn(12, 1, 20, generator=generator) + torch.randn(12, 20, 20, generator=generator)
+    scattered = torch.randn(12, 1, 20, generator=generator) + torch.randn(
+        12, 20, 20, generator=generator
+    )
     points, queries = scattered.flatten(0, 1), torch.arange(0, 240, 7)
     precision = []
     for n_near in (20, 60, 100, 240):
         near = search(points[queries], points, top=n_near, distance=euclidean)
-        found = rerank_candidates(points[queries], near, lambda indices: points[indices], euclidean, top=20)
+        found = rerank_candidates(
+            points[queries], near, lambda indices: points[indices], euclidean, top=20
+        )
         precision.append(float((labels[found.indices] == labels[queries][:, None]).double().mean()))
     assert precision[1] > precision[0] + 0.15
     assert abs(precision[2] - precision[3]) < 0.05
@@ -212,8 +259,16 @@ def test_few_shapes_and_equal_ones() -> None:
         (-torch.ones(2, 2), {}, "finite numbers ≥ 0"),
         (torch.full((2, 2), math.nan), {}, "finite numbers ≥ 0"),
         (torch.zeros(2, 2), {"n_neighbours": 0}, "n_neighbours: expected at least 1, got 0"),
-        (torch.zeros(2, 2), {"share": 1.5}, "share, diffusion: expected 0 to 1, .* got 1.5 and 0.95"),
-        (torch.zeros(2, 2), {"diffusion": 1.0}, "share, diffusion: .* 0 to less than 1, got 0.3 and 1.0"),
+        (
+            torch.zeros(2, 2),
+            {"share": 1.5},
+            "share, diffusion: expected 0 to 1, .* got 1.5 and 0.95",
+        ),
+        (
+            torch.zeros(2, 2),
+            {"diffusion": 1.0},
+            "share, diffusion: .* 0 to less than 1, got 0.3 and 1.0",
+        ),
     ],
 )
 def test_what_it_refuses(distances: Tensor, numbers: dict[str, float], message: str) -> None:

@@ -37,7 +37,9 @@ def random_case(*, n: int, n_classes: int, seed: int, ties: bool = False) -> tup
 
 def ranked_relevance(distances: Tensor, labels: list[Any], query: int) -> list[bool]:
     """Leave-one-out rel(1), rel(2), … of one query, by sorting (distance, index) pairs."""
-    others = sorted((float(distances[query, other]), other) for other in range(len(labels)) if other != query)
+    others = sorted(
+        (float(distances[query, other]), other) for other in range(len(labels)) if other != query
+    )
     return [labels[other] == labels[query] for _, other in others]
 
 
@@ -63,7 +65,8 @@ def scores_by_loops(relevant: list[bool]) -> dict[str, float]:
         "e": 2 / (1 / precision + 1 / recall) if precision else 0.0,
         "dcg": gain / ideal,
         "adr": sum(hits(i) / i for i in range(1, n_relevant + 1)) / n_relevant,
-        "adr_self": sum(sum(with_self[:i]) / i for i in range(1, n_relevant + 2)) / (n_relevant + 1),
+        "adr_self": sum(sum(with_self[:i]) / i for i in range(1, n_relevant + 2))
+        / (n_relevant + 1),
         "map": sum(hits(k) / k for k, rel in enumerate(relevant, start=1) if rel) / n_relevant,
     }
 
@@ -96,8 +99,13 @@ def test_hand_worked_leave_one_out_ranking() -> None:
 
 def test_distances_may_be_an_array_as_a_file_gives_them() -> None:
     labels, distances = ["a", "a", "a", "a", "b", "b", "b"], line_distances([1, 4, 2, 5, 6, 3], 7)
-    assert retrieval_scores(distances.numpy(), labels).mean() == retrieval_scores(distances, labels).mean()
-    curves = [precision_recall_curve(given, labels).precision for given in (distances.numpy(), distances)]
+    assert (
+        retrieval_scores(distances.numpy(), labels).mean()
+        == retrieval_scores(distances, labels).mean()
+    )
+    curves = [
+        precision_recall_curve(given, labels).precision for given in (distances.numpy(), distances)
+    ]
     assert torch.equal(*curves)
 
 
@@ -137,8 +145,13 @@ def test_agrees_with_loops_over_ranks(n: int, n_classes: int, ties: bool) -> Non
     scores = retrieval_scores(distances, labels)
     assert scores.n_queries == n
     for query in range(n):
-        for name, value in scores_by_loops(ranked_relevance(distances, labels.tolist(), query)).items():
-            assert getattr(scores, name)[query].item() == pytest.approx(value, abs=1e-12), (name, query)
+        for name, value in scores_by_loops(
+            ranked_relevance(distances, labels.tolist(), query)
+        ).items():
+            assert getattr(scores, name)[query].item() == pytest.approx(value, abs=1e-12), (
+                name,
+                query,
+            )
 
 
 def test_mean_average_precision_is_that_of_scikit_learn() -> None:
@@ -148,7 +161,9 @@ def test_mean_average_precision_is_that_of_scikit_learn() -> None:
         others = np.arange(40) != query
         is_relevant = (labels == labels[query]).numpy()[others]
         expected.append(average_precision_score(is_relevant, -distances[query].numpy()[others]))
-    np.testing.assert_allclose(retrieval_scores(distances, labels).map.numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        retrieval_scores(distances, labels).map.numpy(), expected, atol=1e-12
+    )
 
 
 def test_perfect_retrieval_scores_one_and_the_worst_misses_all_tiers() -> None:
@@ -159,7 +174,9 @@ def test_perfect_retrieval_scores_one_and_the_worst_misses_all_tiers() -> None:
     assert perfect == pytest.approx(dict.fromkeys(perfect, 1.0), abs=1e-12)
     worst = retrieval_scores(same, labels).mean()
     assert [worst[name] for name in ("nn", "ft", "st", "e", "adr")] == [0.0] * 5
-    assert worst["adr_self"] == pytest.approx(sum(1 / i for i in range(1, 41)) / 40)  # only the query itself is found
+    assert worst["adr_self"] == pytest.approx(
+        sum(1 / i for i in range(1, 41)) / 40
+    )  # only the query itself is found
 
 
 def test_the_query_is_removed_by_its_index_whatever_its_distance() -> None:
@@ -171,7 +188,9 @@ def test_the_query_is_removed_by_its_index_whatever_its_distance() -> None:
 
 def test_ties_break_by_index() -> None:
     labels = [0, 1, 0, 1]
-    scores = retrieval_scores(torch.zeros(4, 4), labels)  # every query ranks the others 0, 1, 2, 3 without itself
+    scores = retrieval_scores(
+        torch.zeros(4, 4), labels
+    )  # every query ranks the others 0, 1, 2, 3 without itself
     assert scores.nn.tolist() == [0.0, 0.0, 1.0, 0.0]
     assert scores.map.tolist() == pytest.approx([1 / 2, 1 / 3, 1.0, 1 / 2])
 
@@ -181,15 +200,21 @@ def test_leave_one_out_is_a_separate_gallery_without_the_query() -> None:
     together = retrieval_scores(distances, labels)
     for query in range(15):
         others = torch.arange(15) != query
-        alone = retrieval_scores(distances[query, others][None], labels[query : query + 1], labels[others]).mean()
-        assert alone == pytest.approx({name: getattr(together, name)[query].item() for name in alone})
+        alone = retrieval_scores(
+            distances[query, others][None], labels[query : query + 1], labels[others]
+        ).mean()
+        assert alone == pytest.approx(
+            {name: getattr(together, name)[query].item() for name in alone}
+        )
 
 
 def test_the_order_of_the_gallery_does_not_matter_without_ties() -> None:
     distances, labels = random_case(n=30, n_classes=3, seed=4)
     order = torch.randperm(30, generator=torch.Generator().manual_seed(5))
     expected = retrieval_scores(distances, labels).mean()
-    assert retrieval_scores(distances[order][:, order], labels[order]).mean() == pytest.approx(expected, abs=1e-12)
+    assert retrieval_scores(distances[order][:, order], labels[order]).mean() == pytest.approx(
+        expected, abs=1e-12
+    )
 
 
 def test_only_the_order_of_distances_matters() -> None:
@@ -214,7 +239,9 @@ def test_a_query_alone_in_its_class_is_left_out_and_counted() -> None:
     assert (scores.n_queries, scores.n_excluded) == (5, 2)
     assert scores.scored.tolist() == [True, True, False, True, True, True, False]
     assert all(getattr(scores, name)[[2, 6]].isnan().all() for name in SCORE_NAMES)
-    loops = [scores_by_loops(ranked_relevance(distances, labels, query)) for query in (0, 1, 3, 4, 5)]
+    loops = [
+        scores_by_loops(ranked_relevance(distances, labels, query)) for query in (0, 1, 3, 4, 5)
+    ]
     expected = {name: sum(values[name] for values in loops) / 5 for name in SCORE_NAMES}
     assert scores.mean() == pytest.approx(expected)
 
@@ -240,12 +267,32 @@ def test_per_class_means_are_those_of_the_members() -> None:
         (-torch.eye(2), [0, 0], None, "similarities"),
         (torch.ones(2, 2), [0], None, "query_labels: expected 2 labels"),
         (torch.ones(2, 3), [0, 0], [0, 0], "gallery_labels: expected 3 labels"),
-        (torch.ones(2, 2), torch.zeros(2, 1, dtype=torch.int64), None, "query_labels: expected shape"),
+        (
+            torch.ones(2, 2),
+            torch.zeros(2, 1, dtype=torch.int64),
+            None,
+            "query_labels: expected shape",
+        ),
         (torch.ones(2, 2), torch.zeros(2), None, "query_labels: expected an integer tensor"),
-        (torch.ones(2, 2), [torch.tensor(0), torch.tensor(0)], None, "query_labels: expected an integer tensor"),
-        (torch.ones(2, 2), torch.tensor([-1, -1]), None, "query_labels: .* got −1, which means unknown"),
+        (
+            torch.ones(2, 2),
+            [torch.tensor(0), torch.tensor(0)],
+            None,
+            "query_labels: expected an integer tensor",
+        ),
+        (
+            torch.ones(2, 2),
+            torch.tensor([-1, -1]),
+            None,
+            "query_labels: .* got −1, which means unknown",
+        ),
         (torch.ones(2, 2), "aa", None, "query_labels: expected an integer tensor"),
-        (torch.ones(2, 2), [0.5] * 1000, None, r"got \[0\.5, (0\.5, ){5}\.\.\.\]$"),  # long sequences are cut
+        (
+            torch.ones(2, 2),
+            [0.5] * 1000,
+            None,
+            r"got \[0\.5, (0\.5, ){5}\.\.\.\]$",
+        ),  # long sequences are cut
         (torch.ones(2, 2), ["a", "b"], None, "nothing to score"),
         (torch.ones(1, 2), ["1"], [1, 1], "nothing to score"),
         (torch.ones(1, 1), ["a"], None, "nothing to score"),
@@ -307,9 +354,13 @@ def test_metric_over_batches_is_the_function_over_all(distance: Any) -> None:
         metric.update(descriptors[start : start + 7].requires_grad_(), labels[start : start + 7])
     result = metric.compute()
     expected = retrieval_scores(distance(descriptors, descriptors).detach(), labels).mean()
-    assert {name: value.item() for name, value in result.items()} == pytest.approx(expected, abs=1e-6)
+    assert {name: value.item() for name, value in result.items()} == pytest.approx(
+        expected, abs=1e-6
+    )
     assert tuple(result) == SCORE_NAMES
-    assert not any(batch.requires_grad for batch in metric.descriptors)  # no batch keeps its graph alive
+    assert not any(
+        batch.requires_grad for batch in metric.descriptors
+    )  # no batch keeps its graph alive
 
 
 def test_metric_starts_afresh_after_reset() -> None:
@@ -326,7 +377,9 @@ def test_metric_compares_by_chi_square_unless_told() -> None:
     metric.update(shapes, labels)
     expected = retrieval_scores(chi_square(shapes, shapes), labels).mean()
     assert expected != retrieval_scores(euclidean(shapes, shapes), labels).mean()
-    assert {name: value.item() for name, value in metric.compute().items()} == pytest.approx(expected)
+    assert {name: value.item() for name, value in metric.compute().items()} == pytest.approx(
+        expected
+    )
 
 
 @pytest.mark.parametrize(
@@ -345,7 +398,9 @@ def test_metric_refuses_labels_that_are_not_aligned(descriptors: Tensor, labels:
 
 def _score_part(process: int, folder: str, with_ids: bool) -> None:
     """One of two processes: its part of 7 shapes as a distributed sampler deals them out, the first one twice."""
-    torch.distributed.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=process, world_size=2)
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"file://{folder}/meeting", rank=process, world_size=2
+    )
     descriptors, labels = seven_shapes()
     part = [0, 2, 4, 6] if process == 0 else [1, 3, 5, 0]
     metric = RetrievalScoresMetric(euclidean)
@@ -357,7 +412,9 @@ def _score_part(process: int, folder: str, with_ids: bool) -> None:
 
 
 def seven_shapes() -> tuple[Tensor, Tensor]:
-    return torch.tensor([[0.0], [0.4], [1.1], [1.9], [3.0], [3.2], [5.0]]), torch.tensor([0, 1, 0, 1, 0, 1, 1])
+    return torch.tensor([[0.0], [0.4], [1.1], [1.9], [3.0], [3.2], [5.0]]), torch.tensor(
+        [0, 1, 0, 1, 0, 1, 1]
+    )
 
 
 @pytest.mark.parametrize("with_ids", [True, False])
@@ -366,7 +423,10 @@ def test_metric_counts_a_shape_once_over_processes(with_ids: bool, tmp_path: Pat
     descriptors, labels = seven_shapes()
     expected = retrieval_scores(euclidean(descriptors, descriptors), labels).mean()
     for process in range(2):
-        result = {name: value.item() for name, value in torch.load(tmp_path / f"scores-{process}.pt").items()}
+        result = {
+            name: value.item()
+            for name, value in torch.load(tmp_path / f"scores-{process}.pt").items()
+        }
         if with_ids:
             assert result == pytest.approx(expected)
         else:  # what the repeated shape does

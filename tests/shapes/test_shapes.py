@@ -69,12 +69,18 @@ def test_one_component_of_the_recorded_genus(all_shapes: list[GeneratedShape]) -
         for a, b in edges:
             parent[root(a)] = root(b)
         assert len({root(i) for i in range(len(parent))}) == 1, shape.name
-        assert len(shape.vertices) - len(edges) // 2 + len(shape.faces) == 2 - 2 * shape.genus, shape.name
+        assert len(shape.vertices) - len(edges) // 2 + len(shape.faces) == 2 - 2 * shape.genus, (
+            shape.name
+        )
 
 
 def test_genus_of_known_objects() -> None:
     shapes = ArticulatedShapes(n_classes=10, n_per_class=1)
-    genus = {name: shapes[i].genus for i, name in enumerate(shapes.class_names) if name in ("biped", "mug", "glasses")}
+    genus = {
+        name: shapes[i].genus
+        for i, name in enumerate(shapes.class_names)
+        if name in ("biped", "mug", "glasses")
+    }
     assert genus == {"biped": 0, "mug": 1, "glasses": 2}
 
 
@@ -117,7 +123,10 @@ def test_a_shape_does_not_depend_on_the_others(all_shapes: list[GeneratedShape])
 def test_shapes_of_a_class_differ(default_shapes: list[GeneratedShape]) -> None:
     """In more than the rigid motion: their areas and volumes differ too."""
     for start in range(0, 24, 3):
-        meshes = [trimesh.Trimesh(s.vertices, s.faces, process=False) for s in default_shapes[start : start + 3]]
+        meshes = [
+            trimesh.Trimesh(s.vertices, s.faces, process=False)
+            for s in default_shapes[start : start + 3]
+        ]
         compactness = [mesh.volume / mesh.area**1.5 for mesh in meshes]
         assert np.ptp(compactness) > 1e-3 * np.mean(compactness), default_shapes[start].name
 
@@ -164,7 +173,8 @@ def test_no_such_shape(index: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"n_classes": 0}, {"n_classes": 13}, {"n_per_class": 0}, {"seed": -1}, {"n_vertices": 10}]
+    "arguments",
+    [{"n_classes": 0}, {"n_classes": 13}, {"n_per_class": 0}, {"seed": -1}, {"n_vertices": 10}],
 )
 def test_arguments_out_of_range_are_named(arguments: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=next(iter(arguments))):
@@ -189,9 +199,17 @@ def test_write_gives_the_same_meshes_and_resumes(tmp_path: Path) -> None:
     files[0].write_bytes(before[files[0]][0][:5000])  # as a full disk would leave it
     files[1].unlink()
     shapes.write(tmp_path)
-    assert sorted(p for p in tmp_path.rglob("*") if p.is_file()) == [*files, tmp_path / "shapes.json"]
+    assert sorted(p for p in tmp_path.rglob("*") if p.is_file()) == [
+        *files,
+        tmp_path / "shapes.json",
+    ]
     assert all(file.read_bytes() == before[file][0] for file in files)
-    assert [file.stat().st_mtime_ns == before[file][1] for file in files] == [False, False, True, True]
+    assert [file.stat().st_mtime_ns == before[file][1] for file in files] == [
+        False,
+        False,
+        True,
+        True,
+    ]
 
 
 def test_write_refuses_a_folder_of_other_shapes(tmp_path: Path) -> None:
@@ -213,13 +231,20 @@ def test_contact_sheet_shows_every_class(tmp_path: Path) -> None:
         contact_sheet(shapes, tmp_path / "sheet.png", n_shown=3)
 
 
-def test_contact_sheet_shows_mirrored_shapes_right_side_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_contact_sheet_shows_mirrored_shapes_right_side_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shapes = GradedShapes(n_classes=3, n_bodies=1, n_poses=2, n_vertices=(1500, 1500))
-    assert {np.linalg.det(shapes[i].motion) > 0 for i in range(len(shapes))} == {True, False}  # some are mirrored
+    assert {np.linalg.det(shapes[i].motion) > 0 for i in range(len(shapes))} == {
+        True,
+        False,
+    }  # some are mirrored
     drawn: list[trimesh.Trimesh] = []
     monkeypatch.setattr(
         "training.studies.contact_sheet.paint",
-        lambda axis, vertices, faces, colour: drawn.append(trimesh.Trimesh(vertices, faces, process=False)),
+        lambda axis, vertices, faces, colour: drawn.append(
+            trimesh.Trimesh(vertices, faces, process=False)
+        ),
     )
     contact_sheet(shapes, tmp_path / "sheet.png", n_shown=2)
     assert len(drawn) == len(shapes)
@@ -243,21 +268,31 @@ def swept(solid: Solid) -> NDArray[np.float64]:
     zero = np.zeros_like(t)
     match solid:
         case Cone(length, start, end):
-            return nearest_sphere(np.column_stack([zero, zero, t * length]), start + t * (end - start))
+            return nearest_sphere(
+                np.column_stack([zero, zero, t * length]), start + t * (end - start)
+            )
         case Arc(bend, angle, start, end):
             line = np.column_stack([zero, bend * (1 - np.cos(t * angle)), bend * np.sin(t * angle)])
             return nearest_sphere(line, start + t * (end - start))
         case Ring(radius, tube, side):
             x, z = radius * np.cos(2 * np.pi * t), radius * np.sin(2 * np.pi * t)
             bows = np.column_stack([x, zero, z + np.sign(z) * side])
-            sides = [np.column_stack([zero + s * radius, zero, (2 * t - 1) * side]) for s in (-1, 1)]
+            sides = [
+                np.column_stack([zero + s * radius, zero, (2 * t - 1) * side]) for s in (-1, 1)
+            ]
             return nearest_sphere(np.concatenate([bows, *sides]), np.full(1, tube))
     raise AssertionError(solid)
 
 
 @pytest.mark.parametrize(
     "solid",
-    [Cone(0.9, 0.3, 0.1), Cone(0.7, 0.1, 0.3), Arc(0.6, 2.2, 0.15, 0.15), Ring(0.5, 0.2), Ring(0.4, 0.1, 0.3)],
+    [
+        Cone(0.9, 0.3, 0.1),
+        Cone(0.7, 0.1, 0.3),
+        Arc(0.6, 2.2, 0.15, 0.15),
+        Ring(0.5, 0.2),
+        Ring(0.4, 0.1, 0.3),
+    ],
 )
 def test_distance_to_swept_solids(solid: Solid) -> None:
     outside = swept(solid) > 0.0

@@ -34,7 +34,9 @@ def test_depth_in_a_box_is_to_the_nearest_wall(box: Mesh, points: np.ndarray) ->
     np.testing.assert_allclose(depth(box, points), expected, atol=1e-12)
 
 
-def test_direction_in_a_box_is_the_normal_of_the_nearest_wall(box: Mesh, points: np.ndarray) -> None:
+def test_direction_in_a_box_is_the_normal_of_the_nearest_wall(
+    box: Mesh, points: np.ndarray
+) -> None:
     gap = np.array([0.5, 1.0, 1.5]) - np.abs(points)
     expected = np.sign(points) * (gap == gap.min(axis=1, keepdims=True))
     np.testing.assert_allclose(surface_direction(box, points), expected, atol=1e-12)
@@ -53,7 +55,9 @@ def test_direction_on_the_surface_is_the_outward_normal(sphere: Mesh) -> None:
 def test_potential_in_a_charged_ball_is_constant(sphere: Mesh) -> None:
     points = np.random.default_rng(1).normal(size=(30, 3))
     points *= np.linspace(0, 0.9, 30)[:, None] / np.linalg.norm(points, axis=1)[:, None]
-    np.testing.assert_allclose(electrostatic_potential(sphere, points), np.sqrt(4 * np.pi), rtol=2e-3)
+    np.testing.assert_allclose(
+        electrostatic_potential(sphere, points), np.sqrt(4 * np.pi), rtol=2e-3
+    )
 
 
 def test_potential_in_a_box_is_the_surface_integral(box: Mesh) -> None:
@@ -64,12 +68,19 @@ def test_potential_in_a_box_is_the_surface_integral(box: Mesh) -> None:
         for side in (-0.5, 0.5):
             height = side * size[axis] - point[axis]
             value, _ = scipy.integrate.dblquad(
-                lambda y, x, u=u, v=v, h=height: 1 / np.sqrt((x - point[u]) ** 2 + (y - point[v]) ** 2 + h**2),
-                -size[u] / 2, size[u] / 2, -size[v] / 2, size[v] / 2,
-            )  # fmt: skip
+                lambda y, x, u=u, v=v, h=height: (
+                    1 / np.sqrt((x - point[u]) ** 2 + (y - point[v]) ** 2 + h**2)
+                ),
+                -size[u] / 2,
+                size[u] / 2,
+                -size[v] / 2,
+                size[v] / 2,
+            )
             total += value
     finer = Mesh(*trimesh.remesh.subdivide(box.vertices, box.faces))
-    np.testing.assert_allclose(electrostatic_potential(finer, point[None]), total / np.sqrt(22), rtol=1e-3)
+    np.testing.assert_allclose(
+        electrostatic_potential(finer, point[None]), total / np.sqrt(22), rtol=1e-3
+    )
 
 
 def test_potential_stays_finite_on_a_vertex(sphere: Mesh) -> None:
@@ -93,7 +104,10 @@ def test_potential_does_not_depend_on_the_triangles(n_subdivisions: int) -> None
 def test_attributes_do_not_change_with_scale_or_place(box: Mesh, points: np.ndarray) -> None:
     names = ("depth", "electrostatic_potential", "surface_direction")
     moved = Mesh(box.vertices * 7 + [100.0, 0, 5], box.faces)
-    here, there = (interior_attributes(m, p, names) for m, p in ((box, points), (moved, points * 7 + [100.0, 0, 5])))
+    here, there = (
+        interior_attributes(m, p, names)
+        for m, p in ((box, points), (moved, points * 7 + [100.0, 0, 5]))
+    )
     for name in names:
         np.testing.assert_allclose(here[name], there[name], rtol=1e-5, atol=1e-6)
         assert here[name].dtype == np.float32
@@ -101,5 +115,7 @@ def test_attributes_do_not_change_with_scale_or_place(box: Mesh, points: np.ndar
 
 @pytest.mark.parametrize("names", [("height",), ("depth", "depth")])
 def test_unknown_or_repeated_names_are_refused(names: tuple[str, ...]) -> None:
-    with pytest.raises(ValueError, match="attributes: expected distinct names among depth, electrostatic_potential"):
+    with pytest.raises(
+        ValueError, match="attributes: expected distinct names among depth, electrostatic_potential"
+    ):
         SignatureConfig(attributes=names)  # type: ignore[arg-type]

@@ -55,7 +55,10 @@ def test_approximation_tends_to_the_exact_result() -> None:
     functions = smooth_functions(mesh[0])
     exact = extend(*mesh, functions, points)
     assert np.array_equal(extend(*mesh, functions, points, accuracy=1e-9), exact)  # nothing is far
-    errors = [np.abs(extend(*mesh, functions, points, accuracy=10.0**-k) - exact).max() for k in (3, 4, 5, 9)]
+    errors = [
+        np.abs(extend(*mesh, functions, points, accuracy=10.0**-k) - exact).max()
+        for k in (3, 4, 5, 9)
+    ]
     assert errors[-1] < 1e-10  # all near
     assert all(after < before / 4 for before, after in itertools.pairwise(errors))
 
@@ -72,7 +75,9 @@ def test_far_rule_error_falls_with_the_third_power_in_a_flat_hat_and_the_second_
     bend: float, factor: float
 ) -> None:
     """One hat, seen from ever farther away."""
-    ring = np.array([[1.0, 0, 0.2], [0.2, 1.1, 0], [-0.9, 0.4, 0.3], [-0.5, -0.8, -0.1], [0.6, -0.9, 0.1]])
+    ring = np.array(
+        [[1.0, 0, 0.2], [0.2, 1.1, 0], [-0.9, 0.4, 0.3], [-0.5, -0.8, -0.1], [0.6, -0.9, 0.1]]
+    )
     vertices = np.concatenate([[[0.1, 0, 0.4]], ring]) * [1, 1, bend]
     faces = np.array([[0, i + 1, (i + 1) % 5 + 1] for i in range(5)])
     surface = HatSurface(vertices, faces)
@@ -111,17 +116,23 @@ def test_surface_points_are_interpolated_also_where_most_of_the_surface_is_far()
 def test_small_clusters_keep_the_accuracy(accuracy: float) -> None:
     mesh = torus(80, 30)
     points, functions = interior_points(mesh, 250), smooth_functions(mesh[0])
-    exact, near = (pdist(extend(*mesh, functions, points, accuracy=each)) for each in (None, accuracy))
+    exact, near = (
+        pdist(extend(*mesh, functions, points, accuracy=each)) for each in (None, accuracy)
+    )
     assert np.quantile(np.abs(near - exact) / exact, 0.99) < accuracy
 
 
 def test_clusters_turn_with_the_mesh() -> None:
     vertices, faces = bumpy_sphere(4)
-    vertices = vertices + 1e-3 * np.random.default_rng(0).normal(size=vertices.shape)  # no mirror symmetry, no ties
+    vertices = vertices + 1e-3 * np.random.default_rng(0).normal(
+        size=vertices.shape
+    )  # no mirror symmetry, no ties
     points, functions = interior_points((vertices, faces), 400), smooth_functions(vertices)
     rotation = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix().T
     exact, still, turned = (
-        extend(vertices @ turn, faces, functions, points @ turn, accuracy=accuracy, dtype=np.float64)
+        extend(
+            vertices @ turn, faces, functions, points @ turn, accuracy=accuracy, dtype=np.float64
+        )
         for accuracy, turn in ((None, np.eye(3)), (1e-3, np.eye(3)), (1e-3, rotation))
     )
     np.testing.assert_allclose(turned, still, atol=1e-9)
@@ -215,10 +226,14 @@ def test_clusters_of_point_elements_leave_an_error_of_third_order() -> None:
     radii = np.linalg.norm(offsets, axis=1, keepdims=True)
     hats = np.concatenate(
         [centres, radii, unused, one + two, unused, np.full((50, 3), np.nan)]
-        + [(form + form.transpose(0, 2, 1))[:, i, [j]] / (2 if i == j else 1)
-           for form in (-4 * tilts, 12 * covariances) for i in range(3) for j in range(i, 3)],
+        + [
+            (form + form.transpose(0, 2, 1))[:, i, [j]] / (2 if i == j else 1)
+            for form in (-4 * tilts, 12 * covariances)
+            for i in range(3)
+            for j in range(i, 3)
+        ],
         axis=1,
-    )  # fmt: skip
+    )
     functions = rng.normal(size=(50, 3))
     tree = HatClusters.from_hats(hats, functions)
     clusters = np.arange(2)
@@ -231,7 +246,9 @@ def test_clusters_of_point_elements_leave_an_error_of_third_order() -> None:
         kernel = (np.stack([one, two]) * r).sum(axis=-1) / np.square(r).sum(axis=-1) ** 2
         exact = kernel.sum(axis=0) @ functions
         far = terms[:, 0] @ tree.sums[clusters].reshape(-1, 3)
-        errors.append(np.abs((far - exact) / (np.abs(kernel).sum(axis=0) @ np.abs(functions))).max())
+        errors.append(
+            np.abs((far - exact) / (np.abs(kernel).sum(axis=0) @ np.abs(functions))).max()
+        )
     assert errors[0] < 1e-5
     assert errors[1] / errors[0] == pytest.approx(1 / 8, rel=0.1)
     assert errors[2] / errors[1] == pytest.approx(1 / 8, rel=0.1)
@@ -282,7 +299,9 @@ def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(
     assert "evaluated again" in caplog.text
 
 
-def test_where_no_approximation_serves_the_closed_form_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_no_approximation_serves_the_closed_form_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     mesh = bumpy_sphere(5)
     points, functions = interior_points(mesh, 60), smooth_functions(mesh[0])
     settings = []

@@ -38,13 +38,17 @@ def test_stiffness_equals_lapy_and_libigl(blob: Mesh) -> None:
 
 
 def test_mixed_voronoi_mass_equals_libigl(blob: Mesh) -> None:
-    libigl = igl.massmatrix(np.array(blob.vertices), np.array(blob.faces), igl.MASSMATRIX_TYPE_VORONOI)
+    libigl = igl.massmatrix(
+        np.array(blob.vertices), np.array(blob.faces), igl.MASSMATRIX_TYPE_VORONOI
+    )
     np.testing.assert_allclose(laplacian(blob)[1], libigl.diagonal(), rtol=1e-10)
 
 
 def test_robust_backend_equals_its_library(blob: Mesh) -> None:
     stiffness, mass = laplacian(blob, "robust")
-    expected, expected_mass = robust_laplacian.mesh_laplacian(np.array(blob.vertices), np.array(blob.faces))
+    expected, expected_mass = robust_laplacian.mesh_laplacian(
+        np.array(blob.vertices), np.array(blob.faces)
+    )
     assert abs(stiffness - expected).max() < 1e-4  # mollification is relative to the longest side
     np.testing.assert_allclose(mass, expected_mass.diagonal(), rtol=1e-4)
 
@@ -63,7 +67,9 @@ def test_obtuse_triangle_shares_by_hand() -> None:
             if max(angle, after, before) > np.pi / 2:
                 by_hand[vertex] += area / 2 if angle > np.pi / 2 else area / 4
             else:
-                to_after, to_before = (np.linalg.norm(corners[(i + k) % 3] - corners[i]) for k in (1, 2))
+                to_after, to_before = (
+                    np.linalg.norm(corners[(i + k) % 3] - corners[i]) for k in (1, 2)
+                )
                 by_hand[vertex] += (to_after**2 / np.tan(before) + to_before**2 / np.tan(after)) / 8
     np.testing.assert_allclose(laplacian(mesh)[1], by_hand, rtol=1e-12)
 

@@ -47,7 +47,11 @@ def published_loop(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) -
                 weights[face[i]] = math.sin(theta[i]) * d[(i + 1) % 3] * d[(i + 2) % 3]
             return weights / weights.sum()
         c = [
-            2 * math.sin(h) * math.sin(h - theta[i]) / (math.sin(theta[(i + 1) % 3]) * math.sin(theta[(i + 2) % 3])) - 1
+            2
+            * math.sin(h)
+            * math.sin(h - theta[i])
+            / (math.sin(theta[(i + 1) % 3]) * math.sin(theta[(i + 2) % 3]))
+            - 1
             for i in range(3)
         ]
         sign = math.copysign(1, np.linalg.det(u))
@@ -56,13 +60,19 @@ def published_loop(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) -
             continue
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
-            weights[face[i]] += (theta[i] - c[j] * theta[k] - c[k] * theta[j]) / (d[i] * math.sin(theta[j]) * s[k])
+            weights[face[i]] += (theta[i] - c[j] * theta[k] - c[k] * theta[j]) / (
+                d[i] * math.sin(theta[j]) * s[k]
+            )
     return weights / weights.sum()
 
 
-@pytest.mark.parametrize("mesh", [bumpy_sphere(2), cube(), torus(14, 9)], ids=["bumpy", "cube", "torus"])
+@pytest.mark.parametrize(
+    "mesh", [bumpy_sphere(2), cube(), torus(14, 9)], ids=["bumpy", "cube", "torus"]
+)
 @pytest.mark.parametrize("sample", [interior_points, exterior_points])
-def test_weights_sum_to_one_and_reproduce_linear_functions(mesh: Mesh, sample: Callable[..., np.ndarray]) -> None:
+def test_weights_sum_to_one_and_reproduce_linear_functions(
+    mesh: Mesh, sample: Callable[..., np.ndarray]
+) -> None:
     points = sample(mesh, 60)
     weights = mean_value_coordinates(*mesh, points)
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-12)
@@ -110,7 +120,9 @@ def test_weights_are_continuous_towards_faces_edges_and_vertices(distance: float
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     points = np.einsum("pi,pix->px", barycentric, vertices[faces[chosen]]) + distance * directions
     limit = np.einsum("pi,pik->pk", barycentric, functions[faces[chosen]])
-    np.testing.assert_allclose(extend(vertices, faces, functions, points), limit, atol=60 * distance + 1e-7)
+    np.testing.assert_allclose(
+        extend(vertices, faces, functions, points), limit, atol=60 * distance + 1e-7
+    )
     assert np.abs(extend(vertices, faces, vertices, points) - points).max() < 1e-7
 
 
@@ -121,12 +133,16 @@ def test_points_in_the_planes_of_faces_are_exact(subdivisions: int, offset: floa
     box = trimesh.creation.box(extents=(2, 2, 2))
     for _ in range(subdivisions):
         box = box.subdivide()
-    grid = np.stack(np.meshgrid(*[[-2.0, -1.0 + offset, -0.51, 0.0, 1.0 + offset, 1.53]] * 3), -1).reshape(-1, 3)
+    grid = np.stack(
+        np.meshgrid(*[[-2.0, -1.0 + offset, -0.51, 0.0, 1.0 + offset, 1.53]] * 3), -1
+    ).reshape(-1, 3)
     turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix().T
     vertices, points = box.vertices @ turn, grid @ turn
     weights = mean_value_coordinates(vertices, box.faces, points)
     np.testing.assert_allclose(weights @ vertices, points, atol=1e-7)
-    np.testing.assert_allclose(mean_value_coordinates(box.vertices, box.faces, grid) @ box.vertices, grid, atol=1e-7)
+    np.testing.assert_allclose(
+        mean_value_coordinates(box.vertices, box.faces, grid) @ box.vertices, grid, atol=1e-7
+    )
 
 
 @pytest.mark.parametrize("accuracy", [None, 1e-2])
@@ -146,10 +162,14 @@ def test_orientation_and_order_do_not_matter() -> None:
     vertices, faces = bumpy_sphere(2)
     points = interior_points((vertices, faces), 30)
     expected = mean_value_coordinates(vertices, faces, points)
-    np.testing.assert_allclose(mean_value_coordinates(vertices, faces[:, ::-1], points), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        mean_value_coordinates(vertices, faces[:, ::-1], points), expected, atol=1e-12
+    )
     shuffled = np.random.default_rng(0).permutation(faces)
     rolled = np.roll(shuffled, 1, axis=1)
-    np.testing.assert_allclose(mean_value_coordinates(vertices, rolled, points[::-1])[::-1], expected, atol=1e-12)
+    np.testing.assert_allclose(
+        mean_value_coordinates(vertices, rolled, points[::-1])[::-1], expected, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("accuracy", [None, 7e-3])
@@ -179,7 +199,9 @@ def test_pieces_do_not_change_the_result(
     np.testing.assert_allclose(limited, whole, atol=tolerance)
     dense = mean_value_coordinates(vertices, faces, points)
     monkeypatch.undo()
-    np.testing.assert_allclose(dense, mean_value_coordinates(vertices, faces, points), atol=tolerance)
+    np.testing.assert_allclose(
+        dense, mean_value_coordinates(vertices, faces, points), atol=tolerance
+    )
 
 
 def test_weights_stay_within_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,7 +209,9 @@ def test_weights_stay_within_their_memory(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(coordinates, "_BLOCK_BYTES", 7 * 8 * len(mesh[0]))
     sizes = []
 
-    def fill_weights(surface: HatSurface, x: np.ndarray, hats: np.ndarray, ratio: float, out: np.ndarray) -> None:
+    def fill_weights(
+        surface: HatSurface, x: np.ndarray, hats: np.ndarray, ratio: float, out: np.ndarray
+    ) -> None:
         sizes.append(out.shape)
         original(surface, x, hats, ratio, out)
 
@@ -200,8 +224,12 @@ def test_weights_stay_within_their_memory(monkeypatch: pytest.MonkeyPatch) -> No
 def test_angles_over_lengths_are_those_of_numpy() -> None:
     """All around, at every length; where both vanish the angle is a right one."""
     generator = np.random.default_rng(2)
-    angle = np.concatenate([generator.uniform(0, np.pi, 4000), 10.0 ** generator.uniform(-14, 0, 4000)])
-    angle = np.concatenate([angle, np.pi - angle, [0.0, np.pi / 8, np.pi / 4, np.pi / 2, 3 * np.pi / 4]])
+    angle = np.concatenate(
+        [generator.uniform(0, np.pi, 4000), 10.0 ** generator.uniform(-14, 0, 4000)]
+    )
+    angle = np.concatenate(
+        [angle, np.pi - angle, [0.0, np.pi / 8, np.pi / 4, np.pi / 2, 3 * np.pi / 4]]
+    )
     length = 10.0 ** generator.uniform(-9, 9, len(angle))
     y, x = length * np.sin(angle), length * np.cos(angle)
     found = y**2
@@ -216,14 +244,19 @@ def test_single_precision_agrees_with_double(accuracy: float | None, tolerance: 
     points = interior_points(mesh, 80)
     functions = smooth_functions(mesh[0])
     single, double = (
-        extend(*mesh, functions, points, accuracy=accuracy, dtype=dtype) for dtype in (np.float32, np.float64)
+        extend(*mesh, functions, points, accuracy=accuracy, dtype=dtype)
+        for dtype in (np.float32, np.float64)
     )
     np.testing.assert_allclose(single, double, atol=tolerance)
     assert not np.array_equal(single, double)
 
 
-@pytest.mark.parametrize(("accuracy", "dtype"), [(1e-3, np.float32), (1e-5, np.float64), (None, np.float64)])
-def test_the_cheapest_precision_that_keeps_the_accuracy_is_taken(accuracy: float | None, dtype: type) -> None:
+@pytest.mark.parametrize(
+    ("accuracy", "dtype"), [(1e-3, np.float32), (1e-5, np.float64), (None, np.float64)]
+)
+def test_the_cheapest_precision_that_keeps_the_accuracy_is_taken(
+    accuracy: float | None, dtype: type
+) -> None:
     mesh = bumpy_sphere(3)
     arguments = *mesh, smooth_functions(mesh[0]), interior_points(mesh, 30)
     chosen, given = (extend(*arguments, accuracy=accuracy, dtype=d) for d in (None, dtype))
@@ -262,8 +295,14 @@ def test_read_only_and_single_precision_input_is_accepted_and_kept() -> None:
         ({"functions": np.ones(8)}, "functions: expected shape"),
         ({"functions": np.ones((7, 2))}, "functions: expected shape"),
         ({"functions": np.full((8, 2), np.nan)}, "functions: expected finite"),
-        ({"functions": np.array([[1.0, np.inf]] * 4 + [[1.0, -np.inf]] * 4)}, "functions: expected finite"),
-        ({"divisors": np.ones(3)}, r"divisors: expected shape \(2,\), one per function, got \(3,\)"),
+        (
+            {"functions": np.array([[1.0, np.inf]] * 4 + [[1.0, -np.inf]] * 4)},
+            "functions: expected finite",
+        ),
+        (
+            {"divisors": np.ones(3)},
+            r"divisors: expected shape \(2,\), one per function, got \(3,\)",
+        ),
         ({"accuracy": 0.0}, "accuracy: expected"),
         ({"accuracy": float("nan")}, "accuracy: expected"),
         ({"dtype": np.float16}, "dtype: expected"),
@@ -271,7 +310,12 @@ def test_read_only_and_single_precision_input_is_accepted_and_kept() -> None:
 )
 def test_invalid_arguments_are_named(change: dict[str, object], message: str) -> None:
     vertices, faces = cube()
-    arguments = {"vertices": vertices, "faces": faces, "functions": np.ones((8, 2)), "points": np.zeros((1, 3))}
+    arguments = {
+        "vertices": vertices,
+        "faces": faces,
+        "functions": np.ones((8, 2)),
+        "points": np.zeros((1, 3)),
+    }
     with pytest.raises(ValueError, match=message):
         extend(**(arguments | change))
 
@@ -280,7 +324,10 @@ def test_invalid_arguments_are_named(change: dict[str, object], message: str) ->
 def test_functions_are_divided_on_the_way(accuracy: float | None) -> None:
     mesh = bumpy_sphere(3)
     generator = np.random.default_rng(5)
-    functions, points = generator.standard_normal((len(mesh[0]), 4)), generator.uniform(-0.4, 0.4, (30, 3))
+    functions, points = (
+        generator.standard_normal((len(mesh[0]), 4)),
+        generator.uniform(-0.4, 0.4, (30, 3)),
+    )
     divisors = np.array([0.5, 1.0, 3.0, 7.0])
     result = extend(*mesh, functions, points, divisors=divisors, accuracy=accuracy)
     assert np.array_equal(result, extend(*mesh, functions / divisors, points, accuracy=accuracy))
@@ -306,6 +353,8 @@ def test_coarse_meshes_are_evaluated_more_accurately(monkeypatch: pytest.MonkeyP
 
     def error(few_vertices: int) -> float:
         monkeypatch.setattr(coordinates, "_MIN_FINE_VERTICES", few_vertices)
-        return float(np.abs(extend(*mesh, functions, points, accuracy=1e-3, dtype=np.float64) - exact).max())
+        return float(
+            np.abs(extend(*mesh, functions, points, accuracy=1e-3, dtype=np.float64) - exact).max()
+        )
 
     assert 0 < error(643) < error(642) / 2

@@ -35,7 +35,9 @@ def renumbered(mesh: Mesh, seed: int = 5) -> Mesh:
     order = generator.permutation(len(mesh.vertices))
     faces = np.argsort(order)[mesh.faces][generator.permutation(len(mesh.faces))]
     shifts = generator.integers(0, 3, len(faces))
-    return Mesh(mesh.vertices[order], np.stack([np.roll(f, s) for f, s in zip(faces, shifts, strict=True)]))
+    return Mesh(
+        mesh.vertices[order], np.stack([np.roll(f, s) for f, s in zip(faces, shifts, strict=True)])
+    )
 
 
 def spectrum_of(n_points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -48,7 +50,9 @@ def test_places_go_with_the_points_and_leave_signs_and_bases_alone() -> None:
     eigenvalues[7:10] = eigenvalues[7]  # a multiplet, of which any basis may come
     expected = ordering_keys(functions, eigenvalues, 1.0)
     order = np.random.default_rng(0).permutation(500)
-    np.testing.assert_allclose(ordering_keys(functions[order], eigenvalues, 1.0), expected[order], rtol=1e-12)
+    np.testing.assert_allclose(
+        ordering_keys(functions[order], eigenvalues, 1.0), expected[order], rtol=1e-12
+    )
     np.testing.assert_allclose(
         ordering_keys(functions * np.where(np.arange(30) % 2, -1, 1), eigenvalues, 1.0), expected
     )
@@ -79,7 +83,8 @@ def test_spacings_and_area_shares_by_hand() -> None:
     np.testing.assert_allclose(nearest_spacing(line), expected / expected.mean())
     areas = np.array([1.0, 2.0, 4.0])
     np.testing.assert_allclose(
-        vertex_area_shares(np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]), areas) * 21 / 4, [3, 5, 7, 6]
+        vertex_area_shares(np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]), areas) * 21 / 4,
+        [3, 5, 7, 6],
     )
 
 
@@ -91,8 +96,13 @@ def test_systematic_samples_follow_the_sizes() -> None:
     assert (np.diff(drawn) >= 0).all()
     assert not set(drawn) & {0, 20, 49}
     counts = np.bincount(drawn, minlength=50)
-    assert (np.abs(counts - 400 * sizes / ends[-1]) < 2).all()  # a plain draw would be off by up to twenty
-    many = sum(np.bincount(systematic_sample(sizes, 7, np.random.default_rng(i)), minlength=50) for i in range(3000))
+    assert (
+        np.abs(counts - 400 * sizes / ends[-1]) < 2
+    ).all()  # a plain draw would be off by up to twenty
+    many = sum(
+        np.bincount(systematic_sample(sizes, 7, np.random.default_rng(i)), minlength=50)
+        for i in range(3000)
+    )
     np.testing.assert_allclose(many / 21000, sizes / ends[-1], atol=0.004)
 
 
@@ -102,7 +112,11 @@ def bodies() -> dict[str, Mesh]:
     for name, lean in (("blob", 0.2), ("mirrored", 0.0)):
         body = trimesh.creation.icosphere(subdivisions=3)
         x, y, z = body.vertices.T
-        body.vertices *= (1 + lean * x + 0.2 * np.sin(2.3 * y + 0.4) + 0.3 * z * x**2)[:, None] * [1.0, 0.8, 1.3]
+        body.vertices *= (1 + lean * x + 0.2 * np.sin(2.3 * y + 0.4) + 0.3 * z * x**2)[:, None] * [
+            1.0,
+            0.8,
+            1.3,
+        ]
         made[name] = as_mesh(body)
     mirrored = made["mirrored"].vertices
     assert cKDTree(mirrored).query(mirrored * [-1, 1, 1])[0].max() < 1e-12
@@ -111,7 +125,9 @@ def bodies() -> dict[str, Mesh]:
 
 MOVES = {
     "axes": lambda mesh: Mesh(mesh.vertices[:, [1, 2, 0]], mesh.faces),
-    "quarter turn": lambda mesh: Mesh(mesh.vertices @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), mesh.faces),
+    "quarter turn": lambda mesh: Mesh(
+        mesh.vertices @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), mesh.faces
+    ),
     "mirror image": lambda mesh: Mesh(mesh.vertices * [1, -1, 1], mesh.faces[:, ::-1]),
     "numbering": renumbered,
 }
@@ -121,14 +137,18 @@ MOVES = {
 def histograms() -> list[PairHistogram]:
     """Of half of the samples, inside and on the surface; with Euclidean distances, which no symmetry of U explains."""
     axes = [Potential(3), InteriorDistance(16), EuclideanDistance(12)]
-    return [PairHistogram(axes, samples=kind, n_samples=200).eval() for kind in ("interior", "surface")]
+    return [
+        PairHistogram(axes, samples=kind, n_samples=200).eval() for kind in ("interior", "surface")
+    ]
 
 
 @pytest.mark.parametrize("move", MOVES)
 def test_histograms_of_subsets_do_not_move(move: str, histograms: list[PairHistogram]) -> None:
     still = {name: collate([compute_signature(mesh, CONFIG)]) for name, mesh in bodies().items()}
     for histogram in histograms:
-        assert all(len(batch.interior.mask[0]) > 300 for batch in still.values())  # the subsets are some
+        assert all(
+            len(batch.interior.mask[0]) > 300 for batch in still.values()
+        )  # the subsets are some
         before = torch.cat([histogram(batch) for batch in still.values()])
         between = chi_square(before, before)[0, 1]
         for (name, mesh), one in zip(bodies().items(), before, strict=True):
@@ -137,10 +157,14 @@ def test_histograms_of_subsets_do_not_move(move: str, histograms: list[PairHisto
 
 
 def test_numbering_leaves_the_surface_samples_in_place(blob: Mesh) -> None:
-    points, others = (compute_signature(mesh, CONFIG).surface.points for mesh in (blob, renumbered(blob)))
+    points, others = (
+        compute_signature(mesh, CONFIG).surface.points for mesh in (blob, renumbered(blob))
+    )
     distance, _ = cKDTree(others).query(points)
     assert np.quantile(distance, 0.99) < 1e-5
-    other_seed = compute_signature(blob, SignatureConfig(**{**CONFIG.__dict__, "seed": 1})).surface.points
+    other_seed = compute_signature(
+        blob, SignatureConfig(**{**CONFIG.__dict__, "seed": 1})
+    ).surface.points
     assert np.quantile(cKDTree(other_seed).query(points)[0], 0.5) > 1e-3
 
 
@@ -148,7 +172,9 @@ def test_subsets_take_equal_steps() -> None:
     lengths = (10, 7, 3)
     mask = torch.arange(10) < torch.tensor(lengths)[:, None]
     places = torch.arange(10.0).expand(3, -1)
-    batch = SampleBatch(places[..., None].expand(-1, -1, 3), places[..., None], mask, {"depth": places})
+    batch = SampleBatch(
+        places[..., None].expand(-1, -1, 3), places[..., None], mask, {"depth": places}
+    )
     part = batch.subset(4, seed=0)
     assert part.mask.sum(dim=1).tolist() == [4, 4, 3]
     for row, length in enumerate(lengths):
@@ -158,9 +184,13 @@ def test_subsets_take_equal_steps() -> None:
         else:
             assert ((chosen.diff() - length / 4).abs() < 1).all()
             assert chosen[0] < length / 4
-            alone = SampleBatch(*(v[row : row + 1, :length] for v in (batch.points, batch.eigenfunctions, mask)), {})
+            alone = SampleBatch(
+                *(v[row : row + 1, :length] for v in (batch.points, batch.eigenfunctions, mask)), {}
+            )
             assert alone.subset(4, seed=0).points[0, :, 0].tolist() == chosen.tolist()
-    starts = {tuple(batch.subset(4, seed=seed).attributes["depth"][0].tolist()) for seed in range(20)}
+    starts = {
+        tuple(batch.subset(4, seed=seed).attributes["depth"][0].tolist()) for seed in range(20)
+    }
     assert len(starts) > 1
     assert set().union(*starts) == set(range(10))  # none is left out by every start
 
@@ -190,4 +220,6 @@ def test_the_order_of_form_does_not_depend_on_place_and_scale(blob: Mesh) -> Non
     moved = replace(blob, vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2])
     expected, found = in_canonical_order(blob), in_canonical_order(moved)
     np.testing.assert_array_equal(found.faces, expected.faces)
-    np.testing.assert_allclose(found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12)
+    np.testing.assert_allclose(
+        found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12
+    )

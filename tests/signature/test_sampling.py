@@ -31,10 +31,14 @@ def test_points_are_even_within_a_face() -> None:
 def test_linear_functions_are_interpolated_exactly(blob: Mesh) -> None:
     points = surface_points(blob, 500, seed=2)
     slopes = np.random.default_rng(0).normal(size=(3, 4))
-    np.testing.assert_allclose(points.interpolate(blob.vertices @ slopes), points.positions @ slopes, atol=1e-12)
+    np.testing.assert_allclose(
+        points.interpolate(blob.vertices @ slopes), points.positions @ slopes, atol=1e-12
+    )
     corners = blob.vertices[blob.faces[points.face]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    np.testing.assert_allclose(np.einsum("ij,ij->i", points.positions - corners[:, 0], normals), 0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.einsum("ij,ij->i", points.positions - corners[:, 0], normals), 0, atol=1e-12
+    )
 
 
 def test_the_seed_alone_decides(blob: Mesh) -> None:

@@ -18,11 +18,15 @@ from igps.signature.laplacian import laplacian
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 from igps.spectra import ConvergenceError, eigenpairs
 
-CONFIG = SignatureConfig(n_eigenpairs=40, resolution=12, min_samples=0, n_surface_samples=300, accuracy=None)
+CONFIG = SignatureConfig(
+    n_eigenpairs=40, resolution=12, min_samples=0, n_surface_samples=300, accuracy=None
+)
 
 
 def histogram(signature: Signature, samples: str = "interior") -> np.ndarray:
-    return PairHistogram([Potential(4), InteriorDistance(64)], samples=samples)(collate([signature]))[0].numpy()  # type: ignore[arg-type]
+    return PairHistogram([Potential(4), InteriorDistance(64)], samples=samples)(
+        collate([signature])
+    )[0].numpy()  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +35,9 @@ def signature(blob: Mesh) -> Signature:
 
 
 def test_another_default_device_changes_nothing(signature: Signature) -> None:
-    mesh = as_mesh(trimesh.creation.icosphere(subdivisions=4))  # eigenpairs by the solver for large meshes
+    mesh = as_mesh(
+        trimesh.creation.icosphere(subdivisions=4)
+    )  # eigenpairs by the solver for large meshes
     expected = compute_signature(mesh, CONFIG)
     with torch.device("meta"):  # whose tensors have no numbers to go on with
         found = compute_signature(mesh, CONFIG)
@@ -51,7 +57,9 @@ def test_shapes_types_and_measures(blob: Mesh, signature: Signature) -> None:
     assert signature.volume == pytest.approx(trimesh.Trimesh(blob.vertices, blob.faces).volume)
 
 
-def test_distance_and_potential_equal_the_papers_gram_form(blob: Mesh, signature: Signature) -> None:
+def test_distance_and_potential_equal_the_papers_gram_form(
+    blob: Mesh, signature: Signature
+) -> None:
     # Rustamov 2010: d²(p,q) = (w(p) − w(q))ᵀ A (w(p) − w(q)) and U²(p) = w(p)ᵀ A w(p), A the Gram matrix of the GPS.
     spectrum = eigenpairs(*laplacian(blob), 40, positions=blob.vertices)
     gps = spectrum.eigenfunctions / np.sqrt(spectrum.eigenvalues)
@@ -94,14 +102,18 @@ def test_scale_does_not_matter(blob: Mesh, signature: Signature, scale: float) -
     scaled = compute_signature(Mesh(blob.vertices * scale, blob.faces), CONFIG)
     np.testing.assert_allclose(scaled.eigenvalues * scale**2, signature.eigenvalues, rtol=1e-7)
     for samples in ("interior", "surface"):
-        np.testing.assert_allclose(histogram(scaled, samples), histogram(signature, samples), atol=1e-5)
+        np.testing.assert_allclose(
+            histogram(scaled, samples), histogram(signature, samples), atol=1e-5
+        )
 
 
 def test_grid_symmetries_and_shifts_do_not_matter(blob: Mesh, signature: Signature) -> None:
     turn = np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], dtype=float)
     moved = compute_signature(Mesh(blob.vertices @ turn.T + [10, -200, 3], blob.faces), CONFIG)
     for samples in ("interior", "surface"):
-        np.testing.assert_allclose(histogram(moved, samples), histogram(signature, samples), atol=1e-5)
+        np.testing.assert_allclose(
+            histogram(moved, samples), histogram(signature, samples), atol=1e-5
+        )
 
 
 def test_numbering_of_vertices_and_faces_does_not_matter(blob: Mesh, signature: Signature) -> None:
@@ -122,7 +134,9 @@ def test_signs_of_eigenfunctions_do_not_matter(signature: Signature) -> None:
         surface=Samples(signature.surface.points, signature.surface.eigenfunctions * signs),
     )
     for samples in ("interior", "surface"):
-        np.testing.assert_allclose(histogram(flipped, samples), histogram(signature, samples), atol=1e-6)
+        np.testing.assert_allclose(
+            histogram(flipped, samples), histogram(signature, samples), atol=1e-6
+        )
 
 
 def test_surface_samples_lie_on_the_surface_and_follow_its_area() -> None:
@@ -160,7 +174,9 @@ def test_robust_backend_and_seed_are_honoured(blob: Mesh, signature: Signature) 
     np.testing.assert_allclose(robust.eigenvalues, signature.eigenvalues, rtol=0.05)
     other = compute_signature(blob, replace(CONFIG, seed=1))
     assert not np.array_equal(other.surface.points, signature.surface.points)
-    np.testing.assert_array_equal(compute_signature(blob, CONFIG).surface.points, signature.surface.points)
+    np.testing.assert_array_equal(
+        compute_signature(blob, CONFIG).surface.points, signature.surface.points
+    )
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +188,9 @@ def needles(blob: Mesh) -> Mesh:
     return Mesh(vertices, blob.faces, name="needles")
 
 
-def test_other_matrices_serve_where_the_cotangent_ones_fail(needles: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_matrices_serve_where_the_cotangent_ones_fail(
+    needles: Mesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plain = compute_signature(needles, CONFIG)
     assert 1e-12 < plain.residual < 1e-6
     assert plain.notes == ()
@@ -190,10 +208,15 @@ def test_other_matrices_serve_where_the_cotangent_ones_fail(needles: Mesh, monke
     np.testing.assert_array_equal(signature.interior.eigenfunctions, robust.interior.eigenfunctions)
 
 
-def test_a_mesh_that_no_matrices_serve_is_refused(needles: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mesh_that_no_matrices_serve_is_refused(
+    needles: Mesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("igps.signature.signature._MAX_RESIDUAL", 1e-18)
     monkeypatch.setattr("igps.spectra.eigensolver.RESIDUAL_LIMIT", 1e-18)
-    with pytest.raises(ConvergenceError, match=r"needles: .* cotangent matrices .* intrinsic-Delaunay ones .*remesh"):
+    with pytest.raises(
+        ConvergenceError,
+        match=r"needles: .* cotangent matrices .* intrinsic-Delaunay ones .*remesh",
+    ):
         compute_signature(needles, CONFIG)
 
 
@@ -201,38 +224,59 @@ def test_a_trimesh_has_the_signature_of_its_mesh(blob: Mesh, signature: Signatur
     surface = trimesh.Trimesh(blob.vertices, blob.faces, process=False)
     found = compute_signature(surface, CONFIG)
     np.testing.assert_array_equal(found.interior.eigenfunctions, signature.interior.eigenfunctions)
-    with pytest.raises(TypeError, match=r"expected a Mesh, a trimesh\.Trimesh, .* got builtins\.str"):
+    with pytest.raises(
+        TypeError, match=r"expected a Mesh, a trimesh\.Trimesh, .* got builtins\.str"
+    ):
         compute_signature("blob.off", CONFIG)  # type: ignore[arg-type]
 
 
 def test_attributes_are_added_to_samples_and_nothing_else_changes(signature: Signature) -> None:
     samples = signature.interior
     height, away = samples.points[:, 2], samples.points - samples.points.mean(axis=0)
-    more = samples.with_attributes({"height": height, "away": away}).with_attributes({"height": 2 * height})
-    assert {name: values.dtype for name, values in more.attributes.items()} == {"height": "float32", "away": "float32"}
+    more = samples.with_attributes({"height": height, "away": away}).with_attributes(
+        {"height": 2 * height}
+    )
+    assert {name: values.dtype for name, values in more.attributes.items()} == {
+        "height": "float32",
+        "away": "float32",
+    }
     np.testing.assert_allclose(more.attributes["height"], 2 * height, rtol=1e-6)
     np.testing.assert_allclose(more.attributes["away"], away, rtol=1e-6)
     assert more.eigenfunctions is samples.eigenfunctions
     assert samples.attributes == {}
     wrong = height.copy()
     wrong[3] = np.nan
-    for values, message in ((height[:-1], f"for each of {len(samples)} points"), (wrong, "1 values that are not")):
+    for values, message in (
+        (height[:-1], f"for each of {len(samples)} points"),
+        (wrong, "1 values that are not"),
+    ):
         with pytest.raises(ValueError, match=f"height: expected a finite number.*{message}"):
             samples.with_attributes({"height": values})
 
 
 def test_too_few_vertices_say_so(blob: Mesh) -> None:
     with pytest.raises(
-        MeshError, match=r"blob: expected at least 643 vertices for 641 eigenpairs, got 642.*lower n_eigenpairs"
+        MeshError,
+        match=r"blob: expected at least 643 vertices for 641 eigenpairs, got 642.*lower n_eigenpairs",
     ):
         compute_signature(blob, replace(CONFIG, n_eigenpairs=641))
 
 
 @pytest.mark.parametrize(
     "field",
-    [{"n_eigenpairs": 0}, {"resolution": 0}, {"min_samples": -1}, {"n_surface_samples": 0}, {"backend": "x"},
-     {"backend": None}, {"max_vertices": 100}, {"accuracy": 2.0}, {"attributes": ("x",)}, {"seed": -1}],
-)  # fmt: skip
+    [
+        {"n_eigenpairs": 0},
+        {"resolution": 0},
+        {"min_samples": -1},
+        {"n_surface_samples": 0},
+        {"backend": "x"},
+        {"backend": None},
+        {"max_vertices": 100},
+        {"accuracy": 2.0},
+        {"attributes": ("x",)},
+        {"seed": -1},
+    ],
+)
 def test_bad_configuration_is_named(field: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(field))):
         SignatureConfig(**field)  # type: ignore[arg-type]
@@ -242,7 +286,9 @@ def test_bad_configuration_is_named(field: dict[str, object]) -> None:
 def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs: int) -> None:
     """Samples, their order and the eigenvalues; the eigenfunctions but for the sign, which a single one has free."""
     exact = replace(CONFIG, n_eigenpairs=n_eigenpairs)
-    more = replace(exact, n_eigenpairs=250, attributes=("electrostatic_potential", "surface_direction"))
+    more = replace(
+        exact, n_eigenpairs=250, attributes=("electrostatic_potential", "surface_direction")
+    )
     alone, whole = compute_signature(blob, exact), compute_signature(blob, more)
     found = whole.truncated(exact)
     assert (found.config, found.interior.attributes, found.surface.attributes) == (exact, {}, {})
@@ -255,7 +301,11 @@ def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs:
         signs = np.sign((one.eigenfunctions * other.eigenfunctions).sum(axis=0))
         np.testing.assert_allclose(one.eigenfunctions * signs, other.eigenfunctions, atol=1e-4)
     attributed = whole.truncated(replace(exact, attributes=("surface_direction",)))
-    assert set(attributed.interior.attributes) == set(attributed.surface.attributes) == {"surface_direction"}
+    assert (
+        set(attributed.interior.attributes)
+        == set(attributed.surface.attributes)
+        == {"surface_direction"}
+    )
     np.testing.assert_allclose(histogram(found), histogram(alone), atol=1e-6)
     with pytest.raises(AssertionError):  # the number does matter
         np.testing.assert_allclose(histogram(whole), histogram(alone), atol=1e-4)
@@ -263,10 +313,18 @@ def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs:
 
 def test_no_number_of_eigenpairs_is_the_usual_one(blob: Mesh) -> None:
     config = SignatureConfig(resolution=6, min_samples=0, n_surface_samples=20)
-    assert config.as_dict() == replace(config, n_eigenpairs=250).as_dict() == config.resolved().as_dict()
+    assert (
+        config.as_dict()
+        == replace(config, n_eigenpairs=250).as_dict()
+        == config.resolved().as_dict()
+    )
     assert config.as_dict()["n_eigenpairs"] == 250
     assert "least_vertices" not in config.as_dict()
-    assert config.with_eigenpairs(50).as_dict() == {**config.as_dict(), "n_eigenpairs": 64, "least_vertices": 252}
+    assert config.with_eigenpairs(50).as_dict() == {
+        **config.as_dict(),
+        "n_eigenpairs": 64,
+        "least_vertices": 252,
+    }
     signature = compute_signature(blob, config)
     assert len(signature.eigenvalues) == signature.config.n_eigenpairs == 250
 
@@ -282,16 +340,31 @@ def test_larger_configurations_have_all_and_more() -> None:
         assert same == small
     # What a plain dataset, and what one for `rich`, has in its cache.
     plain = SignatureConfig(resolution=17).as_dict()
-    assert plain in [one.as_dict() for one in SignatureConfig(resolution=17).with_eigenpairs(0).larger()]
+    assert plain in [
+        one.as_dict() for one in SignatureConfig(resolution=17).with_eigenpairs(0).larger()
+    ]
     rich = ("depth", "electrostatic_potential", "surface_direction")
-    assert {**plain, "attributes": rich} in [one.as_dict() for one in SignatureConfig(resolution=17).larger()]
-    assert {one.n_kept for one in SignatureConfig(n_eigenpairs=40).larger()} == {40}  # other samples
-    assert {one.n_kept for one in SignatureConfig(n_eigenpairs=64, max_vertices=120).larger()} == {64, 90, 100}
+    assert {**plain, "attributes": rich} in [
+        one.as_dict() for one in SignatureConfig(resolution=17).larger()
+    ]
+    assert {one.n_kept for one in SignatureConfig(n_eigenpairs=40).larger()} == {
+        40
+    }  # other samples
+    assert {one.n_kept for one in SignatureConfig(n_eigenpairs=64, max_vertices=120).larger()} == {
+        64,
+        90,
+        100,
+    }
 
 
 def test_paper_is_the_paper() -> None:
     paper = SignatureConfig.paper()
-    assert (paper.n_eigenpairs, paper.resolution, paper.min_samples, paper.backend) == (250, 32, 0, "cotangent")
+    assert (paper.n_eigenpairs, paper.resolution, paper.min_samples, paper.backend) == (
+        250,
+        32,
+        0,
+        "cotangent",
+    )
     assert paper.max_vertices is None
 
 

@@ -20,13 +20,18 @@ def by_quadrature(triangle: np.ndarray, point: np.ndarray) -> float:
     total = 0.0
     for p, q in ((a, b), (b, c), (c, a)):
         along = (q - p) / np.linalg.norm(q - p)
-        distance = np.cross(along, normal) @ (p - foot)  # of the side's line from the foot, positive inside
+        distance = np.cross(along, normal) @ (
+            p - foot
+        )  # of the side's line from the foot, positive inside
         if abs(distance) < 1e-14:
             continue
         angles = [np.arctan2((end - foot) @ along, abs(distance)) for end in (p, q)]
         # ∫ r dr / √(r² + h²) from the foot to the side, for each direction.
         value, _ = scipy.integrate.quad(
-            lambda t, d=distance: np.hypot(d / np.cos(t), height) - abs(height), *angles, epsabs=1e-13, epsrel=1e-12
+            lambda t, d=distance: np.hypot(d / np.cos(t), height) - abs(height),
+            *angles,
+            epsabs=1e-13,
+            epsrel=1e-12,
         )
         total += np.sign(distance) * value
     return total
@@ -36,9 +41,11 @@ def triangle_of(kind: str) -> np.ndarray:
     generator = np.random.default_rng(3)
     if kind == "any":
         return generator.normal(size=(3, 3))
-    return np.array([[0, 0, 0], [1, 0.2, 0.1], [0.4, 0.1, 0.3]]) if kind == "obtuse" else np.array(
-        [[0, 0, 0], [3, 1, 2], [3, 1, 2.001]], dtype=float
-    )  # fmt: skip
+    return (
+        np.array([[0, 0, 0], [1, 0.2, 0.1], [0.4, 0.1, 0.3]])
+        if kind == "obtuse"
+        else np.array([[0, 0, 0], [3, 1, 2], [3, 1, 2.001]], dtype=float)
+    )
 
 
 @pytest.mark.parametrize("kind", ["any", "obtuse", "needle"])
@@ -47,7 +54,9 @@ def test_triangle_equals_quadrature(kind: str, height: float) -> None:
     triangle = triangle_of(kind)
     normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
     normal /= np.linalg.norm(normal)
-    weights = np.array([[0.2, 0.3, 0.5], [0.9, 0.05, 0.05], [1.4, -0.2, -0.2], [-0.6, 0.9, 0.7], [2.5, -3.0, 1.5]])
+    weights = np.array(
+        [[0.2, 0.3, 0.5], [0.9, 0.05, 0.05], [1.4, -0.2, -0.2], [-0.6, 0.9, 0.7], [2.5, -3.0, 1.5]]
+    )
     points = weights @ triangle + height * normal
     expected = [by_quadrature(triangle, point) for point in points]
     result = surface_potential(triangle, np.array([[0, 1, 2]]), points)
@@ -62,7 +71,11 @@ def test_quadrature_itself_is_that_of_a_double_integral() -> None:
     a, b, c = triangle
     area = np.linalg.norm(np.cross(b - a, c - a))
     value, _ = scipy.integrate.dblquad(
-        lambda v, u: area / np.linalg.norm(a + u * (b - a) + v * (c - a) - point), 0, 1, 0, lambda u: 1 - u
+        lambda v, u: area / np.linalg.norm(a + u * (b - a) + v * (c - a) - point),
+        0,
+        1,
+        0,
+        lambda u: 1 - u,
     )
     assert by_quadrature(triangle, point) == pytest.approx(value, rel=1e-8)
 
@@ -72,12 +85,16 @@ def test_square_from_its_centre_side_and_corner() -> None:
         np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float),
         np.array([[0, 1, 2], [0, 2, 3]]),
     )
-    points = np.array([[0.5, 0.5, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])  # on the diagonal, and at its ends or not
+    points = np.array(
+        [[0.5, 0.5, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]]
+    )  # on the diagonal, and at its ends or not
     expected = np.log(1 + np.sqrt(2)) * np.array([4, 2, 2, 2])
     np.testing.assert_allclose(surface_potential(square, faces, points), expected, rtol=1e-12)
     # A side's middle sees two rectangles of 1 × ½.
     middle = 2 * (np.arcsinh(0.5) + 0.5 * np.arcsinh(2))
-    np.testing.assert_allclose(surface_potential(square, faces, np.array([[0.5, 0, 0]])), middle, rtol=1e-12)
+    np.testing.assert_allclose(
+        surface_potential(square, faces, np.array([[0.5, 0, 0]])), middle, rtol=1e-12
+    )
 
 
 def test_disc_on_its_axis() -> None:
@@ -139,7 +156,9 @@ def test_every_value_has_the_accuracy() -> None:
     exact = surface_potential(vertices, faces, points, accuracy=1e-13)
     assert np.isfinite(exact).all()
     errors = {
-        accuracy: np.abs(surface_potential(vertices, faces, points, accuracy=accuracy) / exact - 1).max()
+        accuracy: np.abs(
+            surface_potential(vertices, faces, points, accuracy=accuracy) / exact - 1
+        ).max()
         for accuracy in (1e-1, 1e-3, 1e-6)
     }
     assert 1e-7 < errors[1e-1] < 1e-2
@@ -151,8 +170,12 @@ def test_exact_values_are_the_sum_over_the_triangles() -> None:
     vertices, faces = body()
     points = samples(vertices, faces)[::40]
     exact = surface_potential(vertices, faces, points, accuracy=1e-13)
-    expected = [sum(by_quadrature(vertices[face], point) for face in faces[::37]) for point in points]
-    np.testing.assert_allclose(surface_potential(vertices, faces[::37], points, accuracy=1e-13), expected, rtol=1e-7)
+    expected = [
+        sum(by_quadrature(vertices[face], point) for face in faces[::37]) for point in points
+    ]
+    np.testing.assert_allclose(
+        surface_potential(vertices, faces[::37], points, accuracy=1e-13), expected, rtol=1e-7
+    )
     assert (exact > expected).all()
 
 
@@ -162,11 +185,15 @@ def test_motion_scale_numbering_and_company_do_not_matter() -> None:
     expected = surface_potential(vertices, faces, points)
     generator = np.random.default_rng(1)
     turn = trimesh.transformations.random_rotation_matrix(generator.random(3))[:3, :3]
-    moved = surface_potential(1e-4 * vertices @ turn.T + [3, -1, 2], faces, 1e-4 * points @ turn.T + [3, -1, 2])
+    moved = surface_potential(
+        1e-4 * vertices @ turn.T + [3, -1, 2], faces, 1e-4 * points @ turn.T + [3, -1, 2]
+    )
     np.testing.assert_allclose(moved, 1e-4 * expected, rtol=1e-5)
     order = generator.permutation(len(vertices))
     renumbered = np.argsort(order)[faces][generator.permutation(len(faces))][:, [1, 2, 0]]
-    np.testing.assert_allclose(surface_potential(vertices[order], renumbered, points), expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        surface_potential(vertices[order], renumbered, points), expected, rtol=1e-5
+    )
     alone = [surface_potential(vertices, faces, point[None])[0] for point in points[::25]]
     np.testing.assert_allclose(alone, expected[::25], rtol=1e-5)
 
@@ -176,7 +203,9 @@ def test_faces_without_area_add_nothing_and_no_points_give_none() -> None:
     points = samples(vertices, faces)
     flat = np.vstack([faces, [[0, 0, 5], [7, 8, 8]]])
     np.testing.assert_allclose(
-        surface_potential(vertices, flat, points), surface_potential(vertices, faces, points), rtol=1e-5
+        surface_potential(vertices, flat, points),
+        surface_potential(vertices, faces, points),
+        rtol=1e-5,
     )
     assert surface_potential(vertices, faces, np.empty((0, 3))).shape == (0,)
     assert (surface_potential(vertices, flat[-2:], points[:2]) == 0).all()

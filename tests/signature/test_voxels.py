@@ -34,7 +34,9 @@ def test_radial_law_of_a_ball(sphere: Mesh) -> None:
     assert kstest(radius, lambda r: np.clip(r, 0, 1) ** 3).statistic < 0.02
 
 
-@pytest.mark.parametrize("make", [lambda: trimesh.creation.torus(1, 0.3), lambda: trimesh.creation.capsule(2, 0.5)])
+@pytest.mark.parametrize(
+    "make", [lambda: trimesh.creation.torus(1, 0.3), lambda: trimesh.creation.capsule(2, 0.5)]
+)
 def test_inside_equals_libigl_winding_number(make) -> None:  # type: ignore[no-untyped-def]
     mesh = as_mesh(make())
     axes = grid_axes(mesh, 19)
@@ -52,8 +54,12 @@ def test_grid_lines_through_vertices_and_edges() -> None:
 
 
 def _octahedron() -> tuple[np.ndarray, np.ndarray]:
-    vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
-    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    vertices = np.array(
+        [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float
+    )
+    faces = np.array(
+        [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+    )
     return vertices, faces
 
 
@@ -71,7 +77,9 @@ def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(spher
     axes = grid_axes(sphere, 24)
     whole = inside_grid(sphere, axes)
     few = np.delete(sphere.faces, [3, 700, 2222], axis=0)
-    np.testing.assert_array_equal(inside_grid(Mesh(sphere.vertices, few, allow_open=True), axes), whole)
+    np.testing.assert_array_equal(
+        inside_grid(Mesh(sphere.vertices, few, allow_open=True), axes), whole
+    )
     cap = sphere.faces[sphere.vertices[sphere.faces, 2].mean(axis=1) < 0.75]
     used, faces = np.unique(cap, return_inverse=True)
     bowl = Mesh(sphere.vertices[used], faces.reshape(-1, 3), allow_open=True)
@@ -80,7 +88,9 @@ def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(spher
     np.testing.assert_array_equal(inside_grid(bowl, axes).ravel()[clear], (winding > 0.5)[clear])
 
 
-def test_solid_angles_are_needed_near_a_hole_only(sphere: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_solid_angles_are_needed_near_a_hole_only(
+    sphere: Mesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[np.ndarray] = []
 
     def recording(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -113,22 +123,30 @@ def test_min_samples_refines_the_grid(blob: Mesh) -> None:
 
 def test_body_too_thin_for_the_grid() -> None:
     sheet = trimesh.creation.box((1, 1, 1e-3))
-    sheet.vertices = sheet.vertices @ trimesh.transformations.rotation_matrix(0.4, [1, 2, 0])[:3, :3].T
+    sheet.vertices = (
+        sheet.vertices @ trimesh.transformations.rotation_matrix(0.4, [1, 2, 0])[:3, :3].T
+    )
     with pytest.raises(MeshError, match="set min_samples to refine it"):
         interior_samples(as_mesh(sheet, "sheet"), resolution=2)
 
 
 def test_limits_of_the_grid_are_named(blob: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(voxels, "_MAX_RESOLUTION", 8)
-    with pytest.raises(MeshError, match=r"at least 1000 cells inside, got \d+ in a grid of 8 .*lower min_samples"):
+    with pytest.raises(
+        MeshError, match=r"at least 1000 cells inside, got \d+ in a grid of 8 .*lower min_samples"
+    ):
         interior_samples(blob, 4, min_samples=1000)
-    with pytest.raises(MeshError, match=r"resolution of at most 8 \(8 cells along the longest side, .* got 9\."):
+    with pytest.raises(
+        MeshError, match=r"resolution of at most 8 \(8 cells along the longest side, .* got 9\."
+    ):
         interior_samples(blob, 9)
 
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("depth", "n_inside"), [(5e-6, 16 * 16), (5e-7, 0)])
-def test_surface_is_as_thick_where_the_grid_has_one_layer(axis: int, depth: float, n_inside: int) -> None:
+def test_surface_is_as_thick_where_the_grid_has_one_layer(
+    axis: int, depth: float, n_inside: int
+) -> None:
     # The cell centres of a plate lie so many cells below its two faces; closer than 1e-6 cells is on the surface.
     extents = np.roll([2 * depth / 16, 1.0, 1.0], axis)
     axes = grid_axes(plate := as_mesh(trimesh.creation.box(extents)), 16)
@@ -136,7 +154,9 @@ def test_surface_is_as_thick_where_the_grid_has_one_layer(axis: int, depth: floa
     assert inside_grid(plate, axes).sum() == n_inside
 
 
-@pytest.mark.parametrize(("resolution", "min_samples", "name"), [(0, 0, "resolution"), (4, -1, "min_samples")])
+@pytest.mark.parametrize(
+    ("resolution", "min_samples", "name"), [(0, 0, "resolution"), (4, -1, "min_samples")]
+)
 def test_bad_arguments(blob: Mesh, resolution: int, min_samples: int, name: str) -> None:
     with pytest.raises(ValueError, match=name):
         interior_samples(blob, resolution, min_samples)

@@ -20,12 +20,16 @@ def cotangent_problem(mesh: trimesh.Trimesh) -> Problem:
         weight = 0.5 * (a * b).sum(1) / np.linalg.norm(np.cross(a, b), axis=1)
         i, j = mesh.faces[:, one], mesh.faces[:, two]
         entries = np.r_[weight, weight, -weight, -weight], (np.r_[i, j, i, j], np.r_[i, j, j, i])
-        stiffness = stiffness + sparse.csr_array(sparse.coo_array(entries, shape=(n_vertices, n_vertices)))
+        stiffness = stiffness + sparse.csr_array(
+            sparse.coo_array(entries, shape=(n_vertices, n_vertices))
+        )
     mass = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area_faces / 3, 3), n_vertices)
     return stiffness, mass, np.array(mesh.vertices)
 
 
 def torus(n_major: int = 48, n_minor: int = 24, jitter: float = 0.2) -> trimesh.Trimesh:
     mesh = trimesh.creation.torus(1.0, 0.4, major_sections=n_major, minor_sections=n_minor)
-    mesh.vertices += np.random.default_rng(0).uniform(-jitter, jitter, mesh.vertices.shape) / n_minor
+    mesh.vertices += (
+        np.random.default_rng(0).uniform(-jitter, jitter, mesh.vertices.shape) / n_minor
+    )
     return mesh

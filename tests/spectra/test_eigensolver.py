@@ -44,8 +44,12 @@ def assert_pairs(spectrum: Spectrum, problem: Problem, tolerance: float = 1e-7) 
     values, functions = spectrum.eigenvalues, spectrum.eigenfunctions
     assert np.all(np.diff(values) >= 0)
     residual = stiffness @ functions - mass[:, None] * functions * values
-    assert np.max(np.linalg.norm(residual / np.sqrt(mass)[:, None], axis=0) / values) <= 2 * tolerance
-    np.testing.assert_allclose(functions.T @ (mass[:, None] * functions), np.eye(len(values)), atol=1e-10)
+    assert (
+        np.max(np.linalg.norm(residual / np.sqrt(mass)[:, None], axis=0) / values) <= 2 * tolerance
+    )
+    np.testing.assert_allclose(
+        functions.T @ (mass[:, None] * functions), np.eye(len(values)), atol=1e-10
+    )
     assert np.abs(mass @ functions).max() < 1e-9 * np.sqrt(mass.sum())
 
 
@@ -56,7 +60,9 @@ def test_agrees_with_a_dense_solver(
 ) -> None:
     stiffness, mass, positions = torus_problem
     spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions)
-    np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1 : n_eigenpairs + 1], rtol=1e-10)
+    np.testing.assert_allclose(
+        spectrum.eigenvalues, torus_oracle[0][1 : n_eigenpairs + 1], rtol=1e-10
+    )
     assert_pairs(spectrum, torus_problem)
 
 
@@ -90,7 +96,9 @@ def copies_of_a_patch(n_copies: int, side: int) -> Problem:
     hub = np.zeros_like(tips)
     rows, columns = np.r_[copies.coords[0] + 1, hub, tips], np.r_[copies.coords[1] + 1, tips, hub]
     n_vertices = 1 + n_copies * side**2
-    adjacency = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(n_vertices, n_vertices))
+    adjacency = sparse.csr_array(
+        (np.ones(len(rows)), (rows, columns)), shape=(n_vertices, n_vertices)
+    )
     stiffness = sparse.csr_array(sparse.diags_array(adjacency.sum(axis=1)) - adjacency)
     return stiffness, np.linspace(1, 1, n_vertices), np.zeros((n_vertices, 3))
 
@@ -150,7 +158,9 @@ def filled(vectors: np.ndarray, steps: list[Callable[[], None]]) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("either_processor")
-def test_krylov_basis_projection_and_residuals(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_krylov_basis_projection_and_residuals(
+    torus_problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Orthonormal rows, the projection of the operator, and residuals recomputed by NumPy; also after widening."""
     monkeypatch.setattr(krylov, "PIECE_COLUMNS", 100)  # the eigenvectors take many steps
     stiffness, mass, positions = torus_problem
@@ -162,11 +172,15 @@ def test_krylov_basis_projection_and_residuals(torus_problem: Problem, monkeypat
         if widen:
             space.widen()
     basis = space._basis[: space._stop]
-    torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-12, rtol=0
+    )
     inside = basis[1 : space.size + 1]
     assert len(inside) == 3 * 16 + 2 * 2 * 16
     projected = inside @ factors.solve(inside.T.contiguous())
-    torch.testing.assert_close(space._projected[1 : space.size + 1, 1 : space.size + 1], projected, atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        space._projected[1 : space.size + 1, 1 : space.size + 1], projected, atol=1e-12, rtol=0
+    )
     ritz = space.ritz_pairs(300.0)
     largest = torch.argsort((ritz.eigenvalues - 300).abs())[:40]
     values = ritz.eigenvalues[largest].numpy()
@@ -194,7 +208,9 @@ def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
         space.expand()
     ritz = space.ritz_pairs(shift)
     basis = space._basis[: space._stop]
-    torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-10, rtol=0)
+    torch.testing.assert_close(
+        basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-10, rtol=0
+    )
     exact = torus_oracle[0] * area
     exact = np.sort(exact[np.abs(exact - shift).argsort()[:20]])
     nearest = torch.argsort((ritz.eigenvalues - shift).abs())[:20]
@@ -213,7 +229,9 @@ def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem: Problem) 
 
 @pytest.mark.usefixtures("either_processor")
 def test_a_large_basis_gives_its_place_to_the_eigenvectors(
-    torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+    torus_problem: Problem,
+    torus_oracle: tuple[np.ndarray, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stiffness, mass, positions = torus_problem
     monkeypatch.setattr(basis, "MAX_SINGLE_ENTRIES", 1000)
@@ -235,7 +253,9 @@ def test_scale_of_the_coordinates(scale: float, torus_problem: Problem) -> None:
 
 def test_same_seed_same_bits_other_seed_same_space(torus_problem: Problem) -> None:
     stiffness, mass, positions = torus_problem
-    one, again, other = (eigenpairs(stiffness, mass, 40, positions=positions, seed=seed) for seed in (0, 0, 1))
+    one, again, other = (
+        eigenpairs(stiffness, mass, 40, positions=positions, seed=seed) for seed in (0, 0, 1)
+    )
     np.testing.assert_array_equal(one.eigenfunctions, again.eigenfunctions)
     assert not np.array_equal(one.eigenfunctions, other.eigenfunctions)
     np.testing.assert_allclose(one.eigenvalues, other.eigenvalues, rtol=1e-10)
@@ -244,7 +264,9 @@ def test_same_seed_same_bits_other_seed_same_space(torus_problem: Problem) -> No
 def test_positions_change_only_the_work(torus_problem: Problem) -> None:
     stiffness, mass, positions = torus_problem
     with_positions = eigenpairs(stiffness, mass, 60, positions=positions)
-    np.testing.assert_allclose(eigenpairs(stiffness, mass, 60).eigenvalues, with_positions.eigenvalues, rtol=1e-10)
+    np.testing.assert_allclose(
+        eigenpairs(stiffness, mass, 60).eigenvalues, with_positions.eigenvalues, rtol=1e-10
+    )
 
 
 @pytest.mark.parametrize("n_vertices", [4, 12])
@@ -261,7 +283,9 @@ def test_flat_triangles_with_huge_cotangents() -> None:
     mesh = torus(jitter=0.0)
     squashed = np.random.default_rng(3).choice(len(mesh.faces), 40, replace=False)
     for a, b, c in mesh.faces[squashed]:
-        mesh.vertices[a] = (mesh.vertices[b] + mesh.vertices[c]) / 2 + 1e-5 * (mesh.vertices[a] - mesh.vertices[b])
+        mesh.vertices[a] = (mesh.vertices[b] + mesh.vertices[c]) / 2 + 1e-5 * (
+            mesh.vertices[a] - mesh.vertices[b]
+        )
     problem = cotangent_problem(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     assert abs(problem[0]).max() > 1e3
     spectrum = eigenpairs(problem[0], problem[1], 80, positions=problem[2])
@@ -272,7 +296,9 @@ def test_flat_triangles_with_huge_cotangents() -> None:
 def test_arpack_agrees(torus_problem: Problem) -> None:
     stiffness, mass, positions = torus_problem
     one = eigenpairs(stiffness, mass, 80, positions=positions)
-    arpack = Spectrum(*eigensolver._arpack(sparse.csr_array(stiffness), mass, 80, seed=0), mass, residual=0.0)
+    arpack = Spectrum(
+        *eigensolver._arpack(sparse.csr_array(stiffness), mass, 80, seed=0), mass, residual=0.0
+    )
     np.testing.assert_allclose(one.eigenvalues, arpack.eigenvalues, rtol=1e-9)
     assert_pairs(arpack, torus_problem)
 
@@ -333,7 +359,9 @@ def test_a_shift_below_the_spectrum_takes_over(
     assert "ARPACK" not in caplog.text
 
 
-def test_the_fallback_too_is_proved_complete(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fallback_too_is_proved_complete(
+    torus_problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
     arpack = eigensolver._arpack
 
     def lossy(*arguments: object) -> tuple[np.ndarray, np.ndarray]:
@@ -346,13 +374,20 @@ def test_the_fallback_too_is_proved_complete(torus_problem: Problem, monkeypatch
         eigenpairs(*torus_problem[:2], 30)
 
 
-def test_wrong_pairs_are_not_returned(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_pairs_are_not_returned(
+    torus_problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stiffness, mass, _ = torus_problem
-    values, vectors = np.arange(1.0, 11), np.linalg.qr(np.random.default_rng(0).normal(size=(len(mass), 10)))[0]
+    values, vectors = (
+        np.arange(1.0, 11),
+        np.linalg.qr(np.random.default_rng(0).normal(size=(len(mass), 10)))[0],
+    )
     monkeypatch.setattr(eigensolver, "lanczos", lambda *arguments: (values, vectors))
     monkeypatch.setattr(eigensolver, "_arpack", lambda *arguments: (values, vectors))
     monkeypatch.setattr(eigensolver, "_prove_complete", lambda *arguments: None)
-    with pytest.raises(ConvergenceError, match="10 of eigenpairs 1 to 10 have a relative residual above"):
+    with pytest.raises(
+        ConvergenceError, match="10 of eigenpairs 1 to 10 have a relative residual above"
+    ):
         eigenpairs(stiffness, mass, 10)
 
 
@@ -367,8 +402,12 @@ def test_the_residual_is_that_of_the_worst_pair(n_eigenpairs: int, torus_problem
     assert 0 < spectrum.residual < 1e-4
 
 
-@pytest.mark.parametrize("pack", [sparse.diags_array, sparse.diags, lambda mass: sparse.csc_matrix(np.diag(mass))])
-def test_mass_may_be_a_diagonal_matrix(pack: Callable[[np.ndarray], Any], torus_problem: Problem) -> None:
+@pytest.mark.parametrize(
+    "pack", [sparse.diags_array, sparse.diags, lambda mass: sparse.csc_matrix(np.diag(mass))]
+)
+def test_mass_may_be_a_diagonal_matrix(
+    pack: Callable[[np.ndarray], Any], torus_problem: Problem
+) -> None:
     stiffness, mass, positions = torus_problem
     of_vector = eigenpairs(stiffness, mass, 20, positions=positions)
     of_matrix = eigenpairs(stiffness, pack(mass), 20, positions=positions)
@@ -383,7 +422,9 @@ def test_takes_the_matrices_of_other_libraries() -> None:
     solver = lapy.Solver(lapy.TriaMesh(vertices, faces), lump=True, use_cholmod=False)
     values = solver.eigs(25)[0][1:]
     of_lapy = eigenpairs(solver.stiffness, solver.mass, 24)
-    np.testing.assert_allclose(of_lapy.eigenvalues, values, rtol=1e-5)  # LaPy computes in single precision
+    np.testing.assert_allclose(
+        of_lapy.eigenvalues, values, rtol=1e-5
+    )  # LaPy computes in single precision
     of_igl = eigenpairs(-igl.cotmatrix(vertices, faces), igl.massmatrix(vertices, faces, 0), 24)
     np.testing.assert_allclose(of_igl.eigenvalues, values, rtol=1e-5)
 

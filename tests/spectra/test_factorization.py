@@ -25,12 +25,18 @@ def grid_matrix(n: int, seed: int = 0) -> tuple[sparse.csr_array, np.ndarray]:
     """A symmetric indefinite matrix on a jittered, triangulated n × n grid, and the places of its vertices."""
     rng = np.random.default_rng(seed)
     index = np.arange(n * n).reshape(n, n)
-    pairs = [(index[1:], index[:-1]), (index[:, 1:], index[:, :-1]), (index[1:, 1:], index[:-1, :-1])]
+    pairs = [
+        (index[1:], index[:-1]),
+        (index[:, 1:], index[:, :-1]),
+        (index[1:, 1:], index[:-1, :-1]),
+    ]
     rows, columns = (np.concatenate([pair[side].ravel() for pair in pairs]) for side in (0, 1))
     weights = rng.uniform(0.5, 2, len(rows))
     off_diagonal = sparse.coo_array((weights, (rows, columns)), shape=(n * n, n * n))
     matrix = off_diagonal + off_diagonal.T + sparse.diags_array(rng.normal(size=n * n))
-    places = np.stack(np.meshgrid(range(n), range(n)), axis=-1).reshape(-1, 2) + rng.uniform(0, 0.3, (n * n, 2))
+    places = np.stack(np.meshgrid(range(n), range(n)), axis=-1).reshape(-1, 2) + rng.uniform(
+        0, 0.3, (n * n, 2)
+    )
     return sparse.csr_array(matrix), places
 
 
@@ -57,7 +63,9 @@ def sliver_eigenvalues() -> np.ndarray:
     return np.linalg.eigvalsh(sliver_matrix()[0].toarray())
 
 
-def backward_error(matrix: np.ndarray, solution: np.ndarray, right: np.ndarray, norm: float | None = None) -> float:
+def backward_error(
+    matrix: np.ndarray, solution: np.ndarray, right: np.ndarray, norm: float | None = None
+) -> float:
     """The relative change of the matrix for which the solution would be exact (Rigal and Gaches 1967)."""
     residual = np.linalg.norm(matrix @ solution - right)
     return float(residual / ((norm or np.linalg.norm(matrix, 2)) * np.linalg.norm(solution)))
@@ -75,7 +83,9 @@ def eliminations(factors: Factors) -> list[np.ndarray]:
 
 def elimination_growth(factors: Factors) -> float:
     """The largest norm of the multipliers E of one elimination, at least 1."""
-    return max([1.0, *(float(np.linalg.norm(elimination)) for elimination in eliminations(factors))])
+    return max(
+        [1.0, *(float(np.linalg.norm(elimination)) for elimination in eliminations(factors))]
+    )
 
 
 @pytest.mark.parametrize("shift", [-20.0, 0.37, 3.0])
@@ -84,7 +94,9 @@ def test_solve_and_inertia_on_a_grid(shift: float, leaf_size: int, with_places: 
     matrix, places = grid_matrix(23)
     dense = matrix.toarray() - shift * np.eye(matrix.shape[0])
     right = np.random.default_rng(1).normal(size=(len(dense), 5))
-    factors = analyse(matrix, places if with_places else None, leaf_size=leaf_size).factorize(matrix, shift)
+    factors = analyse(matrix, places if with_places else None, leaf_size=leaf_size).factorize(
+        matrix, shift
+    )
     solution = factors.solve(torch.from_numpy(right)).numpy()
     # Pivoting only within blocks, only the growth of what is eliminated costs digits: none where the matrix is definite
     # or a single block. The square is the bound for any matrix, and far too large for most.
@@ -125,7 +137,9 @@ def test_solve_and_inertia_on_random_graphs(n: int) -> None:
     dense = matrix.toarray()
     factors = analyse(matrix, leaf_size=8).factorize(matrix)
     right = np.random.default_rng(n).normal(size=(n, 2))
-    assert backward_error(dense, factors.solve(torch.from_numpy(right)).numpy(), right) < 10 * EPSILON
+    assert (
+        backward_error(dense, factors.solve(torch.from_numpy(right)).numpy(), right) < 10 * EPSILON
+    )
     assert factors.n_negative == (np.linalg.eigvalsh(dense) < 0).sum()
 
 
@@ -191,23 +205,32 @@ def test_one_dissection_serves_other_values() -> None:
     other.data *= 3
     right = torch.ones(225, 1, dtype=torch.float64)
     thrice = structure.factorize(other, 0.3).solve(right)
-    torch.testing.assert_close(thrice, structure.factorize(matrix, 0.1).solve(right) / 3, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        thrice, structure.factorize(matrix, 0.1).solve(right) / 3, rtol=1e-9, atol=1e-12
+    )
     with pytest.raises(ValueError, match="Analyse it anew"):
         structure.factorize(grid_matrix(16)[0])
 
 
 def test_arguments_are_left_alone() -> None:
     matrix, places = grid_matrix(10)
-    unsorted = sparse.csr_array((matrix.data.copy(), matrix.indices.copy(), matrix.indptr.copy()), shape=matrix.shape)
+    unsorted = sparse.csr_array(
+        (matrix.data.copy(), matrix.indices.copy(), matrix.indptr.copy()), shape=matrix.shape
+    )
     row = slice(matrix.indptr[5], matrix.indptr[6])
-    unsorted.indices[row], unsorted.data[row] = unsorted.indices[row][::-1], unsorted.data[row][::-1]
+    unsorted.indices[row], unsorted.data[row] = (
+        unsorted.indices[row][::-1],
+        unsorted.data[row][::-1],
+    )
     before = unsorted.indices.copy(), unsorted.data.copy(), places.copy()
     right = torch.ones(100, 2, dtype=torch.float64)
     solution = analyse(unsorted, places).factorize(unsorted, 0.1).solve(right)
     for now, then in zip((unsorted.indices, unsorted.data, places), before, strict=True):
         np.testing.assert_array_equal(now, then)
     assert torch.equal(right, torch.ones(100, 2, dtype=torch.float64))
-    torch.testing.assert_close(solution, analyse(matrix, places).factorize(matrix, 0.1).solve(right))
+    torch.testing.assert_close(
+        solution, analyse(matrix, places).factorize(matrix, 0.1).solve(right)
+    )
 
 
 def test_what_is_refused() -> None:

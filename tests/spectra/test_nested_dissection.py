@@ -40,7 +40,10 @@ def smallest_cut(graph: np.ndarray, places: np.ndarray, part: np.ndarray) -> int
 @pytest.mark.parametrize("n", [1, 2, 17, 300, 0])
 def test_every_separator_is_the_smallest_and_separates(n: int, leaf_size: int) -> None:
     if n:
-        graph, places = random_graph(n, seed=n), np.random.default_rng(n).integers(0, 9, (n, 2)).astype(float)
+        graph, places = (
+            random_graph(n, seed=n),
+            np.random.default_rng(n).integers(0, 9, (n, 2)).astype(float),
+        )
     else:
         graph, places = mesh_graph()
     node, n_levels = ordering.nested_dissection(graph, places, leaf_size)
@@ -53,6 +56,8 @@ def test_every_separator_is_the_smallest_and_separates(n: int, leaf_size: int) -
             members[place].append(vertex)
             place = (place - 1) // 2 if place else -1
     for place in range(2 ** (n_levels - 1) - 1):
-        part, left, right = (np.array(members[k], dtype=int) for k in (place, 2 * place + 1, 2 * place + 2))
+        part, left, right = (
+            np.array(members[k], dtype=int) for k in (place, 2 * place + 1, 2 * place + 2)
+        )
         assert not dense[np.ix_(left, right)].any()
         assert (node[part] == place).sum() == smallest_cut(dense, places, part)

@@ -9,7 +9,17 @@ from llvmlite import binding
 
 from igps.spectra._products import loops_beat_blas, overlaps, product, subtract
 
-SHAPES = [(1, 1, 1), (6, 8, 5), (7, 9, 3), (13, 7, 20), (5, 1, 40), (30, 31, 30), (12, 12, 0), (0, 8, 4), (2, 16, 1)]
+SHAPES = [
+    (1, 1, 1),
+    (6, 8, 5),
+    (7, 9, 3),
+    (13, 7, 20),
+    (5, 1, 40),
+    (30, 31, 30),
+    (12, 12, 0),
+    (0, 8, 4),
+    (2, 16, 1),
+]
 N_ROWS = [(1, 1), (3, 2), (4, 6), (5, 7), (8, 13), (12, 24), (24, 41)]
 # A short one, and one that is longer than a chunk
 PIECES = [(0, 9), (17, 4999)]
@@ -29,9 +39,14 @@ def test_a_product_in_tiles(shape: tuple[int, int, int], transposed: bool, keep:
     laid_out = np.ascontiguousarray(a.T) if transposed else a
     strides = (1, k) if transposed else (m, 1)
     product(
-        shape, -0.5, (laid_out.ravel(), 0, *strides), (x.ravel(), 1, n + 2), keep, (source.ravel(), 0, n + 1),
+        shape,
+        -0.5,
+        (laid_out.ravel(), 0, *strides),
+        (x.ravel(), 1, n + 2),
+        keep,
+        (source.ravel(), 0, n + 1),
         (out.ravel(), n + 5 + 3, n + 5),
-    )  # fmt: skip
+    )
     expected = before.copy()
     expected[1 : m + 1, 3 : n + 3] = keep * source[:, :n] - 0.5 * a.T @ x[:, 1 : n + 1]
     np.testing.assert_allclose(out, expected, rtol=0, atol=1e-13)
@@ -53,7 +68,9 @@ def rows(n: int, seed: int) -> np.ndarray:
 @pytest.mark.usefixtures("either_processor")
 @pytest.mark.parametrize("piece", PIECES)
 @pytest.mark.parametrize("n_rows", N_ROWS)
-def test_overlaps_are_the_products_of_the_rows(n_rows: tuple[int, int], piece: tuple[int, int]) -> None:
+def test_overlaps_are_the_products_of_the_rows(
+    n_rows: tuple[int, int], piece: tuple[int, int]
+) -> None:
     a, b = rows(n_rows[0], seed=0), rows(n_rows[1], seed=1)
     columns = slice(*piece)
     found = overlaps(torch.from_numpy(a), torch.from_numpy(b), columns)

@@ -48,4 +48,6 @@ def test_two_balls() -> None:
     ball = trimesh.creation.icosphere(2)
     for gap, crossed in ((2.1, False), (1.5, True)):
         both = trimesh.util.concatenate([ball, ball.copy().apply_translation([gap, 0.013, 0.007])])
-        assert bool(len(crossing_faces(np.asarray(both.vertices), np.asarray(both.faces)))) == crossed
+        assert (
+            bool(len(crossing_faces(np.asarray(both.vertices), np.asarray(both.faces)))) == crossed
+        )

@@ -35,7 +35,10 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *arguments: object) -> 
 
 
 def test_table_and_file_say_what_the_study_finds(
-    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    meshes: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "deep" / "out"
     options = ["--descriptors", ROOT, "--damages", "soup", "fins", "--seed", "4", "--out", out]
@@ -53,17 +56,32 @@ def test_table_and_file_say_what_the_study_finds(
         used, nn, ft = row.split()[1:]
         assert row.split()[0] == name
         assert used == "100%"
-        assert (float(nn), float(ft)) == pytest.approx((100 * one.loss("nn"), 100 * one.loss("ft")), abs=0.051)
+        assert (float(nn), float(ft)) == pytest.approx(
+            (100 * one.loss("nn"), 100 * one.loss("ft")), abs=0.051
+        )
     assert f"  soup: {DAMAGES['soup'].description}" in rows
     assert not any(line.startswith("  holes") for line in rows)
     assert rows[-1] == f"written to {out}"
 
 
 def test_never_mending_uses_nothing_of_a_soup(
-    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    meshes: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (meshes / "low" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    run(monkeypatch, tmp_path, meshes, "--descriptors", ROOT, "--damages", "soup", "--mend_by", "never")
+    run(
+        monkeypatch,
+        tmp_path,
+        meshes,
+        "--descriptors",
+        ROOT,
+        "--damages",
+        "soup",
+        "--mend_by",
+        "never",
+    )
     lines = capsys.readouterr().out.splitlines()
     assert lines[2].split() == ["soup", "0%", "nan", "nan"]
     assert any(re.match(r"root, soup: 4 of 4 missing; .*boundary edges", line) for line in lines)
@@ -71,9 +89,24 @@ def test_never_mending_uses_nothing_of_a_soup(
 
 
 def test_every_so_many(
-    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    meshes: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    run(monkeypatch, tmp_path, meshes, "--descriptors", ROOT, "--damages", "turned", "--every", "3", "--out", tmp_path)
+    run(
+        monkeypatch,
+        tmp_path,
+        meshes,
+        "--descriptors",
+        ROOT,
+        "--damages",
+        "turned",
+        "--every",
+        "3",
+        "--out",
+        tmp_path,
+    )
     result = json.loads((tmp_path / "damage.json").read_text())["results"]["root"]["turned"]
     assert result["n_given"] == 2
     assert capsys.readouterr().out.splitlines()[2].split()[:2] == ["turned", "100%"]
@@ -88,19 +121,33 @@ def test_every_so_many(
     ],
 )
 def test_errors_are_said_in_one_line(
-    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    arguments: list[str], message: str,
-) -> None:  # fmt: skip
+    meshes: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
     chosen = [] if "--descriptors" in arguments else ["--descriptors", ROOT]
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, tmp_path, meshes, *chosen, *arguments)
     assert re.search(f"igps: .*{message}", capsys.readouterr().err)
 
 
-def test_help_explains_every_option(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_explains_every_option(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(sys, "argv", ["igps", "damage", "--help"])
     with pytest.raises(SystemExit, match="0"):
         main()
     text = capsys.readouterr().out
-    for word in ("--damages", "--mend_by", "--every", "--seed", "--cache_dir", "--strict", "--signature.min_samples"):
+    for word in (
+        "--damages",
+        "--mend_by",
+        "--every",
+        "--seed",
+        "--cache_dir",
+        "--strict",
+        "--signature.min_samples",
+    ):
         assert word in text, word

@@ -35,7 +35,9 @@ def study(dataset: SignatureDataset, *descriptors: igps.Descriptor, **options): 
     return damage(dataset, descriptors, n_workers=1, **options)
 
 
-def nearest_neighbours(queries: list[float], gallery: list[float], labels: tuple[str, ...]) -> float:
+def nearest_neighbours(
+    queries: list[float], gallery: list[float], labels: tuple[str, ...]
+) -> float:
     """Share of the queries whose nearest of the gallery, but for its own twin, is of its class."""
     hits = 0
     for i, query in enumerate(queries):
@@ -48,13 +50,17 @@ def first_tier(queries: list[float], gallery: list[float], labels: tuple[str, ..
     """Mean share of a query's class, but for its own twin, among as many of the nearest."""
     shares = []
     for i, query in enumerate(queries):
-        others = sorted((j for j in range(len(gallery)) if j != i), key=lambda j: abs(query - gallery[j]))
+        others = sorted(
+            (j for j in range(len(gallery)) if j != i), key=lambda j: abs(query - gallery[j])
+        )
         size = sum(label == labels[i] for label in labels) - 1
         shares.append(sum(labels[j] == labels[i] for j in others[:size]) / size)
     return float(np.mean(shares))
 
 
-def test_scores_are_those_of_damaged_queries_in_the_clean_gallery(dataset: SignatureDataset) -> None:
+def test_scores_are_those_of_damaged_queries_in_the_clean_gallery(
+    dataset: SignatureDataset,
+) -> None:
     names = ["soup", "holes", "noise"]
     found = study(dataset, Root(), damages=names, seed=3)["root"]
     assert list(found) == names
@@ -70,7 +76,9 @@ def test_scores_are_those_of_damaged_queries_in_the_clean_gallery(dataset: Signa
         for score, of in (("nn", nearest_neighbours), ("ft", first_tier)):
             assert result.scores[score] == pytest.approx(of(spoiled, clean, labels))
             assert result.clean[score] == pytest.approx(of(clean, clean, labels))
-            assert result.loss(score) == pytest.approx(of(clean, clean, labels) - of(spoiled, clean, labels))
+            assert result.loss(score) == pytest.approx(
+                of(clean, clean, labels) - of(spoiled, clean, labels)
+            )
     # The classes overlap: the loops tell right from wrong, and the damages differ.
     assert 0 < found["soup"].clean["ft"] < 1
 
@@ -93,7 +101,10 @@ def test_where_nothing_is_mended_most_damage_is_refused(dataset: SignatureDatase
     assert found["soup"].usable == 0
     assert found["soup"].scores == {}
     assert np.isnan(found["soup"].loss("nn"))
-    assert all("(soup): open surface with 960 boundary edges" in note for note in found["soup"].notes.values())
+    assert all(
+        "(soup): open surface with 960 boundary edges" in note
+        for note in found["soup"].notes.values()
+    )
     assert found["noise"].usable == 1
 
 
@@ -135,6 +146,10 @@ def test_wrong_arguments_are_named(dataset: SignatureDataset) -> None:
 def test_the_dictionary_is_for_a_file() -> None:
     result = DamageResult(4, {"nn": 0.5}, {"nn": 0.75}, {"a.off": "why"})
     assert result.as_dict() == {
-        "n_given": 4, "usable": 0.75, "scores": {"nn": 0.5}, "clean": {"nn": 0.75}, "notes": {"a.off": "why"},
-    }  # fmt: skip
+        "n_given": 4,
+        "usable": 0.75,
+        "scores": {"nn": 0.5},
+        "clean": {"nn": 0.75},
+        "notes": {"a.off": "why"},
+    }
     assert result.loss("nn") == 0.25

@@ -58,7 +58,9 @@ def test_soup(blob: Mesh) -> None:
 
 def test_turned(blob: Mesh) -> None:
     vertices, faces = damage.turned(blob, seed=1)
-    along = np.einsum("ij,ij->i", area_vectors(vertices, faces), area_vectors(blob.vertices, blob.faces))
+    along = np.einsum(
+        "ij,ij->i", area_vectors(vertices, faces), area_vectors(blob.vertices, blob.faces)
+    )
     assert (along < 0).mean() == pytest.approx(1 / 3, abs=1e-3)
 
 

@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from training.studies.disturbances import DISTURBANCES, clip, hole, move, noise, remesh, scale, simplified
+from training.studies.disturbances import (
+    DISTURBANCES,
+    clip,
+    hole,
+    move,
+    noise,
+    remesh,
+    scale,
+    simplified,
+)
 from training.studies.weld import weld_gap
 
 from conftest import as_trimesh, horseshoe, surface_genus
@@ -64,7 +73,9 @@ def test_hole_is_one_patch_of_the_wanted_area(sphere: Mesh) -> None:
 
 def test_hole_does_not_cut_the_body_in_two() -> None:
     mesh = horseshoe()
-    whole = [hole(mesh, 0.3, seed=seed) for seed in range(8)]  # a Mesh of two pieces would have been refused
+    whole = [
+        hole(mesh, 0.3, seed=seed) for seed in range(8)
+    ]  # a Mesh of two pieces would have been refused
     lost = np.array([1 - holed.area / mesh.area for holed in whole])
     assert (lost > 0).all()
     assert (lost <= 0.3).all()
@@ -76,18 +87,26 @@ def test_clip_takes_a_cap_off_a_ball(sphere: Mesh) -> None:
     cut = clip(turned, 0.1)
     assert surface_genus(cut) == 0
     height = 0.2
-    assert sphere.volume - cut.volume == pytest.approx(np.pi * height**2 * (3 - height) / 3, rel=0.02)
-    lost_area = 2 * np.pi * height - np.pi * height * (2 - height)  # a spherical cap, closed by a disc
+    assert sphere.volume - cut.volume == pytest.approx(
+        np.pi * height**2 * (3 - height) / 3, rel=0.02
+    )
+    lost_area = 2 * np.pi * height - np.pi * height * (
+        2 - height
+    )  # a spherical cap, closed by a disc
     assert sphere.area - cut.area == pytest.approx(lost_area, rel=0.05)
     # All that remains is where it was.
-    np.testing.assert_allclose(np.linalg.norm(cut.vertices - turned.vertices.mean(axis=0), axis=1).max(), 1, atol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(cut.vertices - turned.vertices.mean(axis=0), axis=1).max(), 1, atol=1e-6
+    )
 
 
 def test_clip_keeps_the_largest_piece() -> None:
     ring = horseshoe(0.4)
     x, y, _ = ring.vertices.T
     # Its bend far away from its ends, of which one is thicker.
-    stretched = ring.vertices * np.stack([np.where(x < 0, 2.5, 1), 1 + 0 * y, np.where(y > 0, 1.5, 1)], axis=1)
+    stretched = ring.vertices * np.stack(
+        [np.where(x < 0, 2.5, 1), 1 + 0 * y, np.where(y > 0, 1.5, 1)], axis=1
+    )
     mesh = Mesh(stretched, ring.faces)
     cut = clip(mesh, 0.8)
     assert cut.vertices[:, 1].min() > 0  # both ends remain; the thinner one is on the other side
@@ -121,7 +140,9 @@ def test_every_disturbance_says_what_it_did(name: str) -> None:
     assert disturbed.name == mesh.name
     assert len(disturbed.notes) == 1
     assert disturbed.allow_open == (name == "hole")
-    changed = len(disturbed.faces) != len(mesh.faces) or not np.allclose(disturbed.vertices, mesh.vertices)
+    changed = len(disturbed.faces) != len(mesh.faces) or not np.allclose(
+        disturbed.vertices, mesh.vertices
+    )
     assert changed
     np.testing.assert_array_equal(mesh.vertices, before[0])
     np.testing.assert_array_equal(mesh.faces, before[1])

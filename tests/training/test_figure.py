@@ -31,7 +31,14 @@ from igps.signature.laplacian import laplacian
 from igps.signature.signature import SignatureConfig
 from igps.signature.voxels import interior_samples
 
-SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
+SMALL = [
+    "--signature.n_eigenpairs",
+    "20",
+    "--signature.resolution",
+    "10",
+    "--signature.min_samples",
+    "0",
+]
 SMALL += ["--signature.n_surface_samples", "60", "--n_workers", "1"]
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 
@@ -79,7 +86,11 @@ def embedding(mesh: Mesh, points: NDArray[np.float64], n_eigenpairs: int) -> NDA
 
 
 def test_pose_draws_the_histogram_of_every_mesh(
-    root: Path, tmp_path: Path, drawn: list[Figure], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path,
+    tmp_path: Path,
+    drawn: list[Figure],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "new" / "pose.png"
     arguments = ["--out", out, "--cache_dir", tmp_path / "cache", *SMALL]
@@ -122,7 +133,11 @@ def test_pose_draws_the_histogram_of_every_mesh(
 
 
 def test_pose_takes_all_classes_and_refuses_unknown_ones(
-    root: Path, tmp_path: Path, drawn: list[Figure], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path,
+    tmp_path: Path,
+    drawn: list[Figure],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     arguments = ["--out", tmp_path / "pose.png", "--cache_dir", tmp_path / "cache", *SMALL]
     igps(monkeypatch, "figure", "pose", root, *arguments)
@@ -134,9 +149,12 @@ def test_pose_takes_all_classes_and_refuses_unknown_ones(
 
 
 def test_topology_measures_the_change_of_the_same_pairs(
-    open_ring: Path, tmp_path: Path, drawn: list[Figure],
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    open_ring: Path,
+    tmp_path: Path,
+    drawn: list[Figure],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     out = tmp_path / "topology.png"
     small = ["--n_eigenpairs", "30", "--resolution", "16"]
     igps(monkeypatch, "figure", "topology", open_ring, "--out", out, *small, "--json")
@@ -163,7 +181,9 @@ def test_topology_measures_the_change_of_the_same_pairs(
     found = json.loads(told)
     assert (found["genus"], found["n_samples"]) == ([0, 1], len(points))
     shares = [np.mean(change < limit) for limit in (3, 10, 14)]
-    assert [found["changed_below"][limit] for limit in ("0.03", "0.1", "0.14")] == pytest.approx(shares, abs=2e-3)
+    assert [found["changed_below"][limit] for limit in ("0.03", "0.1", "0.14")] == pytest.approx(
+        shares, abs=2e-3
+    )
     assert found["largest_change"] == pytest.approx(change.max() / 100, rel=0.01)
     assert found["first_eigenvalues"][1] == pytest.approx(eigenvalues, rel=1e-6)
 
@@ -173,7 +193,8 @@ def test_topology_measures_the_change_of_the_same_pairs(
     assert left.get_yscale() == "log"
     assert "(%)" in left.get_xlabel()
     tube, rest = (
-        sum(len(part.get_paths()) for part in right.collections if _is_orange(part) == orange) for orange in (1, 0)
+        sum(len(part.get_paths()) for part in right.collections if _is_orange(part) == orange)
+        for orange in (1, 0)
     )
     assert tube == TUBE_FACES
     assert rest > TUBE_FACES
@@ -187,9 +208,20 @@ def _is_orange(part: Any) -> bool:
 
 
 def test_topology_welds_where_it_is_told(
-    open_ring: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    open_ring: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    arguments = ["figure", "topology", open_ring, "--out", tmp_path / "t.png", "--n_eigenpairs", "10"]
+    arguments = [
+        "figure",
+        "topology",
+        open_ring,
+        "--out",
+        tmp_path / "t.png",
+        "--n_eigenpairs",
+        "10",
+    ]
     igps(monkeypatch, *arguments, "--weld", "3", "357")
     assert "welded at vertices 3 and 357" in capsys.readouterr().out
     bad = {("3",): "two vertices, got 1", ("3", "400"): "b: expected a vertex index from 0 to 361"}
@@ -200,7 +232,10 @@ def test_topology_welds_where_it_is_told(
 
 
 def test_potential_is_least_in_the_middle(
-    tmp_path: Path, drawn: list[Figure], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    drawn: list[Figure],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     body = trimesh.creation.icosphere(subdivisions=3)
     body.vertices = body.vertices * [0.7, 2, 1] + [5, 6, 7]
@@ -208,7 +243,9 @@ def test_potential_is_least_in_the_middle(
     body.export(path, digits=17)
     slices: list[tuple[Any, ...]] = []
     draw = paper.draw_potential_slice
-    monkeypatch.setattr(paper, "draw_potential_slice", lambda *args: (slices.append(args), draw(*args)))
+    monkeypatch.setattr(
+        paper, "draw_potential_slice", lambda *args: (slices.append(args), draw(*args))
+    )
     igps(monkeypatch, "figure", "potential", path, "--out", out, "--n_eigenpairs", "40", "--json")
     told, printed = capsys.readouterr()
     (x, y), values, outline, centre, _ = slices[0]
@@ -221,7 +258,9 @@ def test_potential_is_least_in_the_middle(
     assert not inside[ellipse > 1.01].any()
     assert np.linalg.norm((outline - centre) / [1, 2], axis=2) == pytest.approx(1, abs=0.02)
     mesh = load_mesh(path)
-    exact = np.linalg.norm(embedding(mesh, np.array([[5.0, 6.0, 7.0], [5.0, 7.5, 7.0]]), 40), axis=1)
+    exact = np.linalg.norm(
+        embedding(mesh, np.array([[5.0, 6.0, 7.0], [5.0, 7.5, 7.0]]), 40), axis=1
+    )
     (least,) = re.findall(r"potential (\S+) at the barycentroid", printed)
     assert float(least) == pytest.approx(exact[0], rel=0.01)
     assert json.loads(told)["least"] == pytest.approx(exact[0], rel=0.01)

@@ -27,7 +27,18 @@ CLASSES = body_classes(0)
 FIRST = {one.name.split("-")[0]: i for i, one in reversed(list(enumerate(CLASSES)))}
 COUNTS, SUM = [(3614, 7224), (2924, 5844)], 6960.694254095106
 N_VERTICES = (1500, 2500)
-BENDING = ["biped", "octopus", "snake", "hand", "star", "beast", "chain", "serpent", "sheet", "coil"]
+BENDING = [
+    "biped",
+    "octopus",
+    "snake",
+    "hand",
+    "star",
+    "beast",
+    "chain",
+    "serpent",
+    "sheet",
+    "coil",
+]
 
 
 def drawn(kind: str, number: int = 0) -> Pose:
@@ -77,7 +88,9 @@ def test_animals_bend_and_things_do_not(poses: dict[str, Pose]) -> None:
 
     def change(pose: Pose) -> float:
         some = np.random.default_rng(0).choice(len(pose.rest), 300, replace=False)
-        rest, bent = (np.linalg.norm(v[some, None] - v[None, some], axis=2) for v in (pose.rest, pose.bent))
+        rest, bent = (
+            np.linalg.norm(v[some, None] - v[None, some], axis=2) for v in (pose.rest, pose.bent)
+        )
         return float(np.abs(rest - bent).max() / rest.max())
 
     for kind in ("mug", "chair", "vessel", "table", "stack", "machine"):
@@ -91,7 +104,11 @@ def test_every_sheet_has_the_holes_that_its_name_tells() -> None:
     for outline in SHEETS:
         without, *others = (sheet(np.random.default_rng(3), outline, n).genus for n in (0, 1, 2, 4))
         assert others == [without + 1, without + 2, without + 4]
-    stars = [i for i, one in enumerate(CLASSES) if one.name.startswith("sheet-star-") and "-0-" not in one.name]
+    stars = [
+        i
+        for i, one in enumerate(CLASSES)
+        if one.name.startswith("sheet-star-") and "-0-" not in one.name
+    ]
     assert len(stars) == 3
     for i in stars:
         draw_body(CLASSES[i], [0, i], [1, i])  # its surface has that genus, or there is none
@@ -131,10 +148,15 @@ def test_poses_differ_in_triangles_and_bodies_in_compactness(made: list[GradedSh
     compactness: dict[str, list[float]] = {}
     for shape in made:
         surface = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
-        compactness.setdefault(shape.body, []).append(float(np.log(surface.area**1.5 / surface.volume)))
+        compactness.setdefault(shape.body, []).append(
+            float(np.log(surface.area**1.5 / surface.volume))
+        )
     within = max(np.ptp(values) for values in compactness.values())
     bodies = {body: np.mean(values) for body, values in compactness.items()}
-    between = [abs(bodies[f"{name}/00"] - bodies[f"{name}/01"]) for name in {body.split("/")[0] for body in bodies}]
+    between = [
+        abs(bodies[f"{name}/00"] - bodies[f"{name}/01"])
+        for name in {body.split("/")[0] for body in bodies}
+    ]
     assert within < 0.1, (within, between)
     assert max(between) > 0.1
 
@@ -150,13 +172,19 @@ def test_same_seed_same_arrays_other_seed_others(made: list[GradedShape]) -> Non
         np.testing.assert_array_equal(again.vertices, shape.vertices)
         np.testing.assert_array_equal(again.faces, shape.faces)
     other = GradedShapes(3, 2, 3, seed=3, n_vertices=N_VERTICES)[4]
-    assert other.vertices.shape != made[4].vertices.shape or not np.allclose(other.vertices, made[4].vertices)
+    assert other.vertices.shape != made[4].vertices.shape or not np.allclose(
+        other.vertices, made[4].vertices
+    )
 
 
 def test_both_levels_are_labels(shapes: GradedShapes, made: list[GradedShape]) -> None:
     assert len(shapes) == len(made) == 18
     assert shapes.names[:4] == ["biped/00/00", "biped/00/01", "biped/00/02", "biped/01/00"]
-    assert shapes.labels == [shape.label for shape in made] == [name.split("/")[0] for name in shapes.names]
+    assert (
+        shapes.labels
+        == [shape.label for shape in made]
+        == [name.split("/")[0] for name in shapes.names]
+    )
     assert [shape.body for shape in made] == [body_of(name) for name in shapes.names]
     assert shapes[-1].name == "octopus/01/02"
     with pytest.raises(IndexError, match="18"):
@@ -190,7 +218,12 @@ def test_write_makes_folders_of_classes_and_bodies(tmp_path: Path) -> None:
     files = find_bodies(tmp_path)
     assert files.names == tuple(f"{name}.off" for name in shapes.names)
     assert files.labels == tuple(shapes.labels)
-    assert [body_of(name) for name in files.names] == ["biped/00", "biped/00", "biped/01", "biped/01"]
+    assert [body_of(name) for name in files.names] == [
+        "biped/00",
+        "biped/00",
+        "biped/01",
+        "biped/01",
+    ]
     read = trimesh.load(files.paths[3], process=False)
     np.testing.assert_array_equal(read.vertices, shapes[3].vertices)
 
@@ -198,7 +231,12 @@ def test_write_makes_folders_of_classes_and_bodies(tmp_path: Path) -> None:
     files.paths[1].write_bytes(before[files.paths[1]][0][:4000])  # as a full disk would leave it
     shapes.write(tmp_path)
     assert all(path.read_bytes() == before[path][0] for path in files.paths)
-    assert [path.stat().st_mtime_ns == before[path][1] for path in files.paths] == [True, False, True, True]
+    assert [path.stat().st_mtime_ns == before[path][1] for path in files.paths] == [
+        True,
+        False,
+        True,
+        True,
+    ]
     with pytest.raises(ValueError, match="root="):
         GradedShapes(1, 2, 2, seed=5, n_vertices=(1600, 2000)).write(tmp_path)
 

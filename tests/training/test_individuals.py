@@ -16,7 +16,9 @@ def shapes() -> GradedShapes:
     return GradedShapes(2, 1, 2, seed=3, n_vertices=(1500, 1800), n_individuals=N_INDIVIDUALS)
 
 
-def test_individuals_are_changed_by_a_hundredth_to_a_twentieth_of_the_root_of_the_area(shapes: GradedShapes) -> None:
+def test_individuals_are_changed_by_a_hundredth_to_a_twentieth_of_the_root_of_the_area(
+    shapes: GradedShapes,
+) -> None:
     """On a grid of their own; and no motion and scale, found by trimesh, takes the change back."""
     for number in range(2):
         body = shapes._body(number, 0)
@@ -32,7 +34,10 @@ def test_individuals_are_changed_by_a_hundredth_to_a_twentieth_of_the_root_of_th
             _, aligned, _ = trimesh.registration.procrustes(after, before, reflection=False)
             left = np.linalg.norm(aligned - before, axis=1).max() / size
             assert 0.7 * step < left < 1.3 * step
-        between = [np.linalg.norm(found[i] - found[j], axis=1).max() / size for i, j in ((0, 1), (0, 2), (1, 2))]
+        between = [
+            np.linalg.norm(found[i] - found[j], axis=1).max() / size
+            for i, j in ((0, 1), (0, 2), (1, 2))
+        ]
         assert min(between) > SHARES[0] * 0.5
         assert max(between) < 2.1 * SHARES[1]
 
@@ -51,7 +56,9 @@ def test_poses_of_individuals_are_bodies_that_names_tell_apart(shapes: GradedSha
         f"{name}/00/{one:02d}" for name in shapes.class_names for one in range(N_INDIVIDUALS)
     ]
     assert len({body_of(name) for name in shapes.names}) == 2
-    more = GradedShapes(3, 2, 3, seed=3, n_vertices=(1500, 1800), n_individuals=5)[7]  # whatever else there is
+    more = GradedShapes(3, 2, 3, seed=3, n_vertices=(1500, 1800), n_individuals=5)[
+        7
+    ]  # whatever else there is
     assert (more.name, made.name) == (shapes.names[5], shapes.names[11])
     assert np.array_equal(shapes[5].vertices, more.vertices)
 
@@ -73,7 +80,9 @@ def test_sides_differ_by_the_asymmetry_and_rigid_bodies_only_by_a_motion() -> No
         assert np.array_equal(before.rest, before.bent)
         assert np.array_equal(before.faces, after.faces)
         size = trimesh.Trimesh(before.rest, before.faces, process=False).area ** 0.5
-        volumes = (trimesh.Trimesh(one.rest, one.faces, process=False).volume for one in (after, before))
+        volumes = (
+            trimesh.Trimesh(one.rest, one.faces, process=False).volume for one in (after, before)
+        )
         growths.append(next(volumes) / next(volumes))
         step = np.linalg.norm(after.rest - before.rest, axis=1).max() / size
         assert 0.003 * 0.9 < step < 0.012 * 1.1

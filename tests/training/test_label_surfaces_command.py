@@ -10,7 +10,9 @@ from training.study import COMMANDS
 def test_medians_of_each_kind_are_printed_in_percent(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def measured(n_voxels: tuple[int, ...], descriptors: list[str], n_turns: int) -> list[label_surfaces.Measured]:
+    def measured(
+        n_voxels: tuple[int, ...], descriptors: list[str], n_turns: int
+    ) -> list[label_surfaces.Measured]:
         errors = [-0.01, 0.03, 0.02][:n_turns]
         away = dict.fromkeys(descriptors, 0.05)
         return [

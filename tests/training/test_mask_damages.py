@@ -8,7 +8,9 @@ from skimage.measure import euler_number, label
 from training.studies.mask_damages import DAMAGES, VARIED, damaged, varied
 
 SPACING = np.array([1.0, 1.0, 1.5])
-BALL = ((np.indices((48, 48, 36)).transpose(1, 2, 3, 0) - [23, 23, 17]) ** 2 * SPACING**2).sum(axis=-1) <= 14**2
+BALL = ((np.indices((48, 48, 36)).transpose(1, 2, 3, 0) - [23, 23, 17]) ** 2 * SPACING**2).sum(
+    axis=-1
+) <= 14**2
 NONE = np.zeros_like(BALL)
 
 
@@ -36,8 +38,10 @@ def test_a_varied_damage_is_what_it_is_called(seed: int) -> None:
 
 
 def test_blocks_are_of_two_voxels_a_side() -> None:
-    edges = [np.flatnonzero(np.diff(after("blocks").astype(int), axis=axis).any(axis=others)) % 2
-             for axis, others in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1)))]  # fmt: skip
+    edges = [
+        np.flatnonzero(np.diff(after("blocks").astype(int), axis=axis).any(axis=others)) % 2
+        for axis, others in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1)))
+    ]
     assert [len(set(one.tolist())) for one in edges] == [1, 1, 1]
 
 

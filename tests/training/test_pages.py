@@ -10,13 +10,18 @@ from training.studies import pages
 
 from igps.signature.signature import SignatureConfig
 
-PAGES = {page.relative_to(pages.DOCS).as_posix(): page.read_text("utf-8") for page in pages.DOCS.rglob("*.md")}
+PAGES = {
+    page.relative_to(pages.DOCS).as_posix(): page.read_text("utf-8")
+    for page in pages.DOCS.rglob("*.md")
+}
 SHOWN = [(page, name) for page, text in sorted(PAGES.items()) for name in pages.table_names(text)]
 
 
 @pytest.mark.parametrize(("page", "name"), SHOWN)
 def test_a_table_is_of_the_signatures_of_today(page: str, name: str) -> None:
-    assert pages.load_results(name)["signatures"] == SignatureConfig.ALGORITHM_VERSION, f"{page}: measure {name} again"
+    assert pages.load_results(name)["signatures"] == SignatureConfig.ALGORITHM_VERSION, (
+        f"{page}: measure {name} again"
+    )
 
 
 @pytest.mark.parametrize("page", sorted({page for page, _ in SHOWN}))
@@ -33,7 +38,15 @@ def test_results_become_a_table_of_a_page(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(pages, "RESULTS", tmp_path / "results")
     page = tmp_path / "page.md"
     page.write_text("# Title\n\n<!-- results: mine -->\nold\n<!-- end of results -->\n\nrest\n")
-    row = {"descriptor": "d2", "nn": 0.5, "ft": 0.25, "st": 1, "dcg": 0, "adr_self": 0.1234, "map": None}
+    row = {
+        "descriptor": "d2",
+        "nn": 0.5,
+        "ft": 0.25,
+        "st": 1,
+        "dcg": 0,
+        "adr_self": 0.1234,
+        "map": None,
+    }
     (tmp_path / "compare.json").write_text(json.dumps([{**row, "seconds_per_mesh": 0.042}]))
     pages.record("mine", "scores", tmp_path, "igps compare ROOT")
     lines = page.read_text("utf-8").splitlines()

@@ -35,7 +35,9 @@ def test_the_changed_surface_bends_with_the_pose():
     assert np.linalg.norm(_centred(moved) - _centred(_bend(rest)), axis=1).max() > 0.04
 
 
-def test_individuals_in_rigid_poses_are_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_individuals_in_rigid_poses_are_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Rigid poses do not change the spectrum, so that each individual is nearest to itself."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     for pose in range(3):
@@ -44,7 +46,14 @@ def test_individuals_in_rigid_poses_are_found(tmp_path: Path, capsys: pytest.Cap
         turned = ball.vertices * [1.0, 1.2, 1.5] @ Rotation.from_euler("x", pose).as_matrix()
         trimesh.Trimesh(turned, ball.faces, process=False).export(path)
     cache = tmp_path / "cache"
-    people(tmp_path / "bodies", tmp_path / "made", ["shape_dna"], n_individuals=4, cache_dir=cache, n_workers=1)
+    people(
+        tmp_path / "bodies",
+        tmp_path / "made",
+        ["shape_dna"],
+        n_individuals=4,
+        cache_dir=cache,
+        n_workers=1,
+    )
     assert "ball shape_dna: NN 100.0 FT 100.0" in capsys.readouterr().out
     assert len(list((tmp_path / "made").rglob("*.off"))) == 4 * 3
     ball.invert()

@@ -30,7 +30,9 @@ def of(source: Path | list[Path] | Bodies, tmp_path: Path) -> SignatureDataset:
     return SignatureDataset(source, CONFIG, tmp_path / "cache")
 
 
-def run(tmp_path: Path, meshes: list[Path], *chosen: Descriptor, **options: SignatureDataset) -> Robustness:
+def run(
+    tmp_path: Path, meshes: list[Path], *chosen: Descriptor, **options: SignatureDataset
+) -> Robustness:
     return robustness(of(meshes, tmp_path), chosen, n_workers=1, **options)
 
 
@@ -55,22 +57,28 @@ def test_movements_are_shares_of_the_distance_between_the_meshes(tmp_path: Path)
     assert movements["weld"].mean is None  # an egg has no gap
     written = found.as_dict()
     assert written["movements"]["root"]["hole"] == {
-        "mean": None, "each": {}, "notes": dict.fromkeys(map(str, meshes), "a hole has no area"),
-    }  # fmt: skip
+        "mean": None,
+        "each": {},
+        "notes": dict.fromkeys(map(str, meshes), "a hole has no area"),
+    }
     assert written["disturbances"] == {name: one.description for name, one in DISTURBANCES.items()}
 
 
 def test_gallery_tells_the_distance_between_classes(tmp_path: Path) -> None:
     heights = {"low": (1.0, 1.3), "high": (2.0, 2.4, 5.0)}
     size = {
-        label: [root_area(write_egg(tmp_path / "gallery" / label / f"{x}.off", x, 2)) for x in several]
+        label: [
+            root_area(write_egg(tmp_path / "gallery" / label / f"{x}.off", x, 2)) for x in several
+        ]
         for label, several in heights.items()
     }
     mesh = write_egg(tmp_path / "one.off", 1.2)
     found = run(tmp_path, [mesh], Root(), gallery=of(tmp_path / "gallery", tmp_path))
     unit = np.median([abs(low - high) for low in size["low"] for high in size["high"]])
     assert found.units["root"] == pytest.approx(unit, rel=1e-4)
-    assert found.movements["root"]["scale"].mean == pytest.approx(6 * root_area(mesh) / unit, rel=1e-4)
+    assert found.movements["root"]["scale"].mean == pytest.approx(
+        6 * root_area(mesh) / unit, rel=1e-4
+    )
 
 
 def test_poses_are_compared_within_each_body(tmp_path: Path) -> None:
@@ -90,7 +98,9 @@ def test_poses_are_compared_within_each_body(tmp_path: Path) -> None:
 
     for name in ("a/1.off", "b/1.off", "b/2.off"):  # now two bodies, one of them in two poses
         write_egg(tmp_path / "bodies" / name, 1 + 0.2 * len(name), 2)
-    movement = run(tmp_path, meshes, Root(), poses=of(tmp_path / "bodies", tmp_path)).movements["root"][POSE]
+    movement = run(tmp_path, meshes, Root(), poses=of(tmp_path / "bodies", tmp_path)).movements[
+        "root"
+    ][POSE]
     assert list(movement.distances) == ["b/1.off - b/2.off"]
 
 
@@ -129,14 +139,20 @@ def test_real_descriptors_on_a_body_with_a_gap(tmp_path: Path) -> None:
                 egg, whole, after = (one(batch) for batch in batches)
             expected = float(one.distances(whole, after) / one.distances(egg, whole))
             assert expected > 1e-3
-            assert found.movements[one.name][way].distances[str(paths[1])] == pytest.approx(expected, rel=0.02)
+            assert found.movements[one.name][way].distances[str(paths[1])] == pytest.approx(
+                expected, rel=0.02
+            )
 
 
 def test_too_little_is_refused(tmp_path: Path) -> None:
     meshes = [write_egg(tmp_path / name, 1.5, 2) for name in ("a.off", "b.off")]
     with pytest.raises(ValueError, match=r"dataset: expected at least two meshes, .* or a gallery"):
         run(tmp_path, meshes[:1], Root())
-    with pytest.raises(ValueError, match="descriptors: expected different names, got root more than once"):
+    with pytest.raises(
+        ValueError, match="descriptors: expected different names, got root more than once"
+    ):
         run(tmp_path, meshes, Root(), Root())
-    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 20"):
+    with pytest.raises(
+        ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 20"
+    ):
         run(tmp_path, meshes, descriptor("interior"))

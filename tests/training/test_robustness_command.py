@@ -36,7 +36,9 @@ def test_table_and_file_say_what_the_study_finds(
     meshes = [write_egg(tmp_path / f"{height}.off", height) for height in (1.0, 1.5, 3.0)]
     written = run(monkeypatch, tmp_path, *meshes, "--descriptors", "own_descriptors:Root", *SMALL)
     header, row, *rest = capsys.readouterr().out.splitlines()
-    found = study.robustness(SignatureDataset(meshes, CONFIG, tmp_path / "cache"), [Root()], n_workers=1).as_dict()
+    found = study.robustness(
+        SignatureDataset(meshes, CONFIG, tmp_path / "cache"), [Root()], n_workers=1
+    ).as_dict()
     assert {key: written[key] for key in found} == json.loads(json.dumps(found))
     assert written["config"] == json.loads(json.dumps(CONFIG.as_dict()))
     size = np.array([root_area(path) for path in meshes])
@@ -48,7 +50,10 @@ def test_table_and_file_say_what_the_study_finds(
     assert cells["hole"] == cells["weld"] == "-"
     assert float(cells["scale"]) == pytest.approx(100 * np.mean(6 * size / unit), abs=0.06)
     assert "root, hole: 3 of 3 missing; a hole has no area" in rest
-    assert any(re.match("root, weld: 3 of 3 missing; .*no two places face each other", line) for line in rest)
+    assert any(
+        re.match("root, weld: 3 of 3 missing; .*no two places face each other", line)
+        for line in rest
+    )
     for name, disturbance in DISTURBANCES.items():
         assert f"  {name}: {disturbance.description}" in rest
 
@@ -59,11 +64,15 @@ def test_gallery_and_poses_are_read(
     mesh = write_egg(tmp_path / "one.off", 1.2, 2)
     size = {}
     for label, heights in {"low": (1.0, 1.3), "high": (2.0, 5.0)}.items():
-        size[label] = [root_area(write_egg(tmp_path / "gallery" / label / f"{x}.off", x, 2)) for x in heights]
+        size[label] = [
+            root_area(write_egg(tmp_path / "gallery" / label / f"{x}.off", x, 2)) for x in heights
+        ]
     poses = [root_area(write_egg(tmp_path / "poses" / f"{x}.off", x, 2)) for x in (1.0, 1.4)]
     (tmp_path / "poses" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     options = ["--gallery", tmp_path / "gallery", "--poses", tmp_path / "poses"]
-    written = run(monkeypatch, tmp_path, mesh, "--descriptors", "own_descriptors:Root", *options, *SMALL)
+    written = run(
+        monkeypatch, tmp_path, mesh, "--descriptors", "own_descriptors:Root", *options, *SMALL
+    )
     unit = np.median([abs(low - high) for low in size["low"] for high in size["high"]])
     assert written["median_between_classes"]["root"] == pytest.approx(unit, rel=1e-4)
     assert written["movements"]["root"]["pose"]["each"] == {
@@ -78,9 +87,18 @@ def test_gallery_and_poses_are_read(
 def test_rich_and_pretrained_are_measured_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ArticulatedShapes(n_classes=2, n_per_class=1, seed=3, n_vertices=1000).write(tmp_path / "meshes")
+    ArticulatedShapes(n_classes=2, n_per_class=1, seed=3, n_vertices=1000).write(
+        tmp_path / "meshes"
+    )
     meshes = sorted((tmp_path / "meshes").rglob("*.off"))
-    options = ["--signature.n_eigenpairs", "90", "--signature.resolution", "12", "--signature.min_samples", "0"]
+    options = [
+        "--signature.n_eigenpairs",
+        "90",
+        "--signature.resolution",
+        "12",
+        "--signature.min_samples",
+        "0",
+    ]
     options += ["--signature.n_surface_samples", "100", "--n_workers", "1"]
     written = run(monkeypatch, tmp_path, *meshes, "--descriptors", "rich", "pretrained", *options)
     rows = [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:3]]
@@ -89,21 +107,32 @@ def test_rich_and_pretrained_are_measured_too(
         movements = written["movements"][name]
         assert movements["scale"]["mean"] < 0.02
         assert movements["tenth"]["mean"] > movements["scale"]["mean"]
-        assert all(len(movements[way]["each"]) + len(movements[way]["notes"]) == 2 for way in DISTURBANCES)
+        assert all(
+            len(movements[way]["each"]) + len(movements[way]["notes"]) == 2 for way in DISTURBANCES
+        )
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--descriptors", "magic"], "descriptor: expected one of interior, gps, .*spectral_gw, .*, got 'magic'"),
+        (
+            ["--descriptors", "magic"],
+            "descriptor: expected one of interior, gps, .*spectral_gw, .*, got 'magic'",
+        ),
         (["--descriptors", "d2"], "expected at least two.* or a gallery"),
-        (["--descriptors", "d2", "interior"], "this descriptor needs signatures of at least 250, got 20"),
+        (
+            ["--descriptors", "d2", "interior"],
+            "this descriptor needs signatures of at least 250, got 20",
+        ),
     ],
 )
 def test_errors_are_said_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    arguments: list[str], message: str,
-) -> None:  # fmt: skip
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, tmp_path, write_egg(tmp_path / "egg.off", 1.5, 2), *arguments, *SMALL)
     assert re.search(f"igps: .*{message}", capsys.readouterr().err)

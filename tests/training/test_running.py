@@ -28,16 +28,35 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def train(root: Path, out: Path, *more: object, epochs: int = 4) -> None:
     """A run whose file is configs/own.yaml with its three values changed, on small signatures."""
-    own = {**yaml.safe_load(OWN.read_text()), "root": str(root / "meshes"), "out": str(out), "epochs": epochs}
+    own = {
+        **yaml.safe_load(OWN.read_text()),
+        "root": str(root / "meshes"),
+        "out": str(out),
+        "epochs": epochs,
+    }
     file = out.with_suffix(".yaml")
     file.write_text(yaml.safe_dump(own))
-    small = ["--data.config.n_eigenpairs=40", "--data.config.resolution=15", "--data.config.min_samples=0"]
+    small = [
+        "--data.config.n_eigenpairs=40",
+        "--data.config.resolution=15",
+        "--data.config.min_samples=0",
+    ]
     quiet = ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
     options = [
-        "--data.cache_dir", root / "cache", "--data.n_workers", 1, "--trainer.check_val_every_n_epoch", 2,
-        "--trainer.accelerator", "cpu", "--data.shapes_per_class", 2,
-        *small, *quiet, *more,
-    ]  # fmt: skip
+        "--data.cache_dir",
+        root / "cache",
+        "--data.n_workers",
+        1,
+        "--trainer.check_val_every_n_epoch",
+        2,
+        "--trainer.accelerator",
+        "cpu",
+        "--data.shapes_per_class",
+        2,
+        *small,
+        *quiet,
+        *more,
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train.py", "fit", "--config", str(file), *map(str, options)])
         Run()
@@ -73,13 +92,19 @@ def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(
     train(root, tmp_path / "broken", "--resume", "last", "--seed_everything", 7)
 
     whole, resumed = state(tmp_path / "whole"), state(tmp_path / "broken")
-    start = RetrievalLearner.load_from_checkpoint(tmp_path / "whole" / "checkpoints" / "last.ckpt").descriptor
-    assert not torch.equal(start.histograms[0].axes[1].centres(), start.histograms[0].axes[1].centres.start)
+    start = RetrievalLearner.load_from_checkpoint(
+        tmp_path / "whole" / "checkpoints" / "last.ckpt"
+    ).descriptor
+    assert not torch.equal(
+        start.histograms[0].axes[1].centres(), start.histograms[0].axes[1].centres.start
+    )
     assert (whole["epoch"], whole["global_step"]) == (resumed["epoch"], resumed["global_step"])
     assert whole["lr_schedulers"] == resumed["lr_schedulers"]
     assert whole["state_dict"].keys() == resumed["state_dict"].keys()
     for name, values in whole["state_dict"].items():
-        torch.testing.assert_close(resumed["state_dict"][name], values, rtol=1e-6, atol=1e-7, msg=name)
+        torch.testing.assert_close(
+            resumed["state_dict"][name], values, rtol=1e-6, atol=1e-7, msg=name
+        )
     rows = curve(tmp_path / "whole")
     assert [row["epoch"] for row in rows] == ["0", "1", "2", "3"]
     assert [bool(row["val_ft"]) for row in rows] == [False, True, False, True]
@@ -105,7 +130,10 @@ def test_training_stops_when_validation_no_longer_improves(root: Path, tmp_path:
     ("words", "told"),
     [
         ("evaluate checkpoint none.ckpt", "No such file or directory: 'none.ckpt'"),
-        ("evaluate checkpoint text.ckpt", "text.ckpt: expected a checkpoint, got another or a damaged file."),
+        (
+            "evaluate checkpoint text.ckpt",
+            "text.ckpt: expected a checkpoint, got another or a damaged file.",
+        ),
         (
             "train test --root ROOT --ckpt_path none.ckpt",
             "ckpt_path: expected a checkpoint, got none.ckpt, which does not exist.",

@@ -19,10 +19,16 @@ def test_an_embedding_does_not_depend_on_the_order_of_samples() -> None:
 
 def test_features_do_not_depend_on_scale(blob: igps.Mesh) -> None:
     config = igps.SignatureConfig(
-        n_eigenpairs=80, resolution=10, min_samples=0, n_surface_samples=60, attributes=("surface_direction",)
+        n_eigenpairs=80,
+        resolution=10,
+        min_samples=0,
+        n_surface_samples=60,
+        attributes=("surface_direction",),
     )
     large = igps.Mesh(blob.vertices * 3, blob.faces)
-    one, other = (features(igps.collate([igps.compute_signature(mesh, config)])) for mesh in (blob, large))
+    one, other = (
+        features(igps.collate([igps.compute_signature(mesh, config)])) for mesh in (blob, large)
+    )
     assert one.shape == (1, 2 * N_SAMPLES, 6)
     assert_close(one, other, rtol=0, atol=0.02)
 

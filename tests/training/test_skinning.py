@@ -10,7 +10,15 @@ from scipy.spatial.transform import Rotation
 from training.graded.kinds import KINDS
 from training.graded.rigging import bones_at_rest, limb_rig
 from training.graded.rods import Binding, Rig, Rod, bend, bind, rod_motions
-from training.graded.skinning import Motions, compose, motion, normalized, product, rotations_about, transform
+from training.graded.skinning import (
+    Motions,
+    compose,
+    motion,
+    normalized,
+    product,
+    rotations_about,
+    transform,
+)
 
 from igps.shapes.skeleton import Part, Skeleton, limb
 from igps.shapes.solids import Blob, Solid
@@ -50,9 +58,13 @@ def test_a_turn_about_a_point_leaves_it_where_it_is() -> None:
 
 
 def test_one_motion_after_another() -> None:
-    first, second = (rotations_about(g.normal(size=(50, 3)), g.normal(size=(50, 3))) for _ in range(2))
+    first, second = (
+        rotations_about(g.normal(size=(50, 3)), g.normal(size=(50, 3))) for _ in range(2)
+    )
     np.testing.assert_allclose(
-        transform(compose(first, second), POINTS), transform(first, transform(second, POINTS)), atol=1e-13
+        transform(compose(first, second), POINTS),
+        transform(first, transform(second, POINTS)),
+        atol=1e-13,
     )
 
 
@@ -68,7 +80,9 @@ def test_a_blend_is_rigid_and_half_way_between() -> None:
 
 def cylinder(length: float, radius: float) -> trimesh.Trimesh:
     """A round bar along z from 0, of triangles much smaller than it is thick."""
-    angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, 48, endpoint=False), np.linspace(0, length, 121), indexing="ij")
+    angle, z = np.meshgrid(
+        np.linspace(0, 2 * np.pi, 48, endpoint=False), np.linspace(0, length, 121), indexing="ij"
+    )
     side = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(48), np.arange(120), indexing="ij")
     a, b = (i * 121 + j).ravel(), ((i + 1) % 48 * 121 + j).ravel()
@@ -77,7 +91,9 @@ def cylinder(length: float, radius: float) -> trimesh.Trimesh:
     low, high = len(side), len(side) + 1
     caps = [[low, b, a] for a, b in zip(ring, np.roll(ring, -1), strict=True)]
     caps += [[high, a + 120, b + 120] for a, b in zip(ring, np.roll(ring, -1), strict=True)]
-    return trimesh.Trimesh(np.vstack([side, [[0, 0, 0], [0, 0, length]]]), np.vstack([walls, caps]), process=False)
+    return trimesh.Trimesh(
+        np.vstack([side, [[0, 0, 0], [0, 0, length]]]), np.vstack([walls, caps]), process=False
+    )
 
 
 def straight_rod(length: float, radius: float, n: int = 61) -> Rod:
@@ -99,7 +115,9 @@ def test_one_element_that_turns_carries_everything_rigidly() -> None:
     turns = np.zeros((61, 3))
     turns[0] = (0.3, -1.1, 0.4)
     bar, moved_bar = bent_bar(turns)
-    np.testing.assert_allclose(moved_bar.vertices, Rotation.from_rotvec(turns[0]).apply(bar.vertices), atol=1e-12)
+    np.testing.assert_allclose(
+        moved_bar.vertices, Rotation.from_rotvec(turns[0]).apply(bar.vertices), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("degrees", [60.0, 130.0])
@@ -122,7 +140,9 @@ def test_a_hinge_keeps_lengths_near_both_bones() -> None:
     bar = cylinder(3.0, 0.2)
     z = bar.vertices[:, 2]
     first = Rod(-1, 0.0, np.zeros((1, 3)), np.zeros(1), np.ones(1), np.ones(1), np.zeros((1, 3, 2)))
-    second = Rod(0, 0.0, np.array([[0, 0, 1.5]]), np.zeros(1), np.ones(1), np.ones(1), np.zeros((1, 3, 2)))
+    second = Rod(
+        0, 0.0, np.array([[0, 0, 1.5]]), np.zeros(1), np.ones(1), np.ones(1), np.zeros((1, 3, 2))
+    )
     rig = Rig((first, second), np.arange(2))
     share = np.clip((z - 1.2) / 0.6, 0.0, 1.0)
     binding = Binding(np.stack([1 - share, share], axis=1), np.zeros((len(z), 2)))
@@ -130,7 +150,10 @@ def test_a_hinge_keeps_lengths_near_both_bones() -> None:
     bent = bend(bar.vertices, rig, binding, motions)
     edges = bar.edges_unique
     outside = (np.abs(z[edges] - 1.5) > 0.31).all(axis=1)
-    lengths = [np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1)[outside] for v in (bar.vertices, bent)]
+    lengths = [
+        np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1)[outside]
+        for v in (bar.vertices, bent)
+    ]
     assert outside.sum() > 1000
     np.testing.assert_allclose(lengths[1], lengths[0], rtol=1e-9)
     top = z > 1.85
@@ -142,14 +165,20 @@ def test_a_hinge_keeps_lengths_near_both_bones() -> None:
 def test_weights_are_shares_and_follow_the_nearest_rod() -> None:
     arm = limb("arm", [0.6, 0.6], [0.15, 0.13, 0.12], [(20, 10), (25, 0)])
     hub: Solid = Blob((0.4, 0.4, 0.4))
-    skeleton = Skeleton(Part(hub, children=tuple(arm.joined((0, 0, 0.3 * s), (0, 0, s)) for s in (-1, 1))))
+    skeleton = Skeleton(
+        Part(hub, children=tuple(arm.joined((0, 0, 0.3 * s), (0, 0, s)) for s in (-1, 1)))
+    )
     bones = bones_at_rest(skeleton, {})
     rig = limb_rig(bones)
     assert [rod.parent for rod in rig.rods] == [-1, 0, 0]  # the hub, and two arms of two bones each
     assert rig.rod_of_solid.tolist() == [0, 1, 1, 2, 2]
     bar = cylinder(1.6, 0.13)
-    both = trimesh.util.concatenate([bar, trimesh.creation.icosphere(4, 0.4).apply_translation([2, 0, 0])])
-    binding = bind(np.asarray(both.vertices), np.asarray(both.faces), rig, [bone.placed for bone in bones])
+    both = trimesh.util.concatenate(
+        [bar, trimesh.creation.icosphere(4, 0.4).apply_translation([2, 0, 0])]
+    )
+    binding = bind(
+        np.asarray(both.vertices), np.asarray(both.faces), rig, [bone.placed for bone in bones]
+    )
     np.testing.assert_allclose(binding.weights.sum(axis=1), 1.0)
     assert (binding.weights >= 0.0).all()
     z = bar.vertices[:, 2]

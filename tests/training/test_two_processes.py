@@ -34,9 +34,15 @@ def module(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataModule:
     root = tmp_path_factory.mktemp("two_processes")
     ArticulatedShapes(n_classes=3, n_per_class=8, n_vertices=500).write(root / "meshes")
     data = SignatureDataModule(
-        root / "meshes", n_train=5, n_validation=3, classes_per_batch=3, shapes_per_class=2, config=CONFIG,
-        cache_dir=root / "cache", n_workers=1,
-    )  # fmt: skip
+        root / "meshes",
+        n_train=5,
+        n_validation=3,
+        classes_per_batch=3,
+        shapes_per_class=2,
+        config=CONFIG,
+        cache_dir=root / "cache",
+        n_workers=1,
+    )
     data.prepare_data()
     return data
 
@@ -44,10 +50,17 @@ def module(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataModule:
 def trainer(n_processes: int, root: Path) -> Trainer:
     # Processes of their own for two: those of the tests have no script that could be started again.
     return Trainer(
-        max_epochs=2, accelerator="cpu", devices=n_processes, strategy="ddp_spawn" if n_processes > 1 else "auto",
-        logger=False, enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
-        default_root_dir=root, num_sanity_val_steps=0,
-    )  # fmt: skip
+        max_epochs=2,
+        accelerator="cpu",
+        devices=n_processes,
+        strategy="ddp_spawn" if n_processes > 1 else "auto",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=root,
+        num_sanity_val_steps=0,
+    )
 
 
 def in_two_processes(work):  # type: ignore[no-untyped-def]
@@ -58,16 +71,24 @@ def in_two_processes(work):  # type: ignore[no-untyped-def]
         pytest.skip(f"no two processes here: {error}")
 
 
-def test_scores_on_two_processes_are_those_on_one(module: SignatureDataModule, tmp_path: Path) -> None:
+def test_scores_on_two_processes_are_those_on_one(
+    module: SignatureDataModule, tmp_path: Path
+) -> None:
     seed_everything(3, verbose=False)
-    bins = PairHistogram([Potential(2, learnable=True), InteriorDistance(16, learnable=True)], SpectralEmbedding())
-    model = RetrievalLearner(HistogramDescriptor(bins), BlendedDistance(ProjectionHead(width=8, n_hidden=16)))
+    bins = PairHistogram(
+        [Potential(2, learnable=True), InteriorDistance(16, learnable=True)], SpectralEmbedding()
+    )
+    model = RetrievalLearner(
+        HistogramDescriptor(bins), BlendedDistance(ProjectionHead(width=8, n_hidden=16))
+    )
     before = {name: value.clone() for name, value in model.state_dict().items()}
 
     two = trainer(2, tmp_path)
     in_two_processes(lambda: two.fit(model, module))
     trained = {name: float(value) for name, value in two.callback_metrics.items()}
-    moved = [name for name, value in model.state_dict().items() if not torch.equal(value, before[name])]
+    moved = [
+        name for name, value in model.state_dict().items() if not torch.equal(value, before[name])
+    ]
     assert any("head.layers" in name for name in moved)
     # Bins move by gradients alone, of which there are none where a process has one shape of each class.
     assert any("centres" in name for name in moved)
@@ -78,7 +99,9 @@ def test_scores_on_two_processes_are_those_on_one(module: SignatureDataModule, t
     assert {name: trained[name] for name in validated} == pytest.approx(validated, abs=1e-6)
 
     (tested,) = one.test(model, module, verbose=False)
-    (tested_by_two,) = in_two_processes(lambda: trainer(2, tmp_path).test(model, module, verbose=False))
+    (tested_by_two,) = in_two_processes(
+        lambda: trainer(2, tmp_path).test(model, module, verbose=False)
+    )
     assert tested_by_two == pytest.approx(tested, abs=1e-6)
 
     # The same without Lightning, over the nine shapes.
@@ -89,7 +112,9 @@ def test_scores_on_two_processes_are_those_on_one(module: SignatureDataModule, t
         distances = model.distances(found, found)
     assert len(part) == 9
     expected = retrieval_scores(distances, part.labels).mean()
-    assert tested == pytest.approx({f"test_{name}": value for name, value in expected.items()}, abs=1e-6)
+    assert tested == pytest.approx(
+        {f"test_{name}": value for name, value in expected.items()}, abs=1e-6
+    )
     # A shape that counted twice would have been told by the scores.
     dealt = [*range(9), 0]
     twice = retrieval_scores(distances[dealt][:, dealt], part.labels[dealt]).mean()

@@ -22,7 +22,9 @@ def grooved_ball() -> Mesh:
     """A wide ball with a narrow groove: places face each other, but none is far away along the surface."""
     body = trimesh.creation.icosphere(subdivisions=3)
     z = body.vertices[:, 2:]
-    body.vertices *= np.concatenate([2 - 0.5 * np.exp(-((z / 0.12) ** 2))] * 2 + [np.ones_like(z)], axis=1)
+    body.vertices *= np.concatenate(
+        [2 - 0.5 * np.exp(-((z / 0.12) ** 2))] * 2 + [np.ones_like(z)], axis=1
+    )
     body.vertices *= np.random.default_rng(0).uniform(0.99, 1.01, (len(body.vertices), 1))
     return Mesh(body.vertices, body.faces, name="grooved_ball")
 
@@ -31,7 +33,9 @@ def paths(mesh: Mesh) -> NDArray[np.float64]:
     """(V, V) shortest paths along edges."""
     surface = as_trimesh(mesh)
     i, j = surface.edges_unique.T
-    graph = sparse.coo_matrix((surface.edges_unique_length, (i, j)), shape=(len(mesh.vertices),) * 2)
+    graph = sparse.coo_matrix(
+        (surface.edges_unique_length, (i, j)), shape=(len(mesh.vertices),) * 2
+    )
     return shortest_path(graph.tocsr(), directed=False)
 
 
@@ -63,7 +67,10 @@ def test_weld_takes_the_shortest_tube() -> None:
     a, b = 3, len(mesh.vertices) - 10
     at = [[face for face in mesh.faces.tolist() if vertex in face] for vertex in (a, b)]
     lengths = [
-        sum(float(np.linalg.norm(mesh.vertices[p] - mesh.vertices[q])) for p, q in zip(one, turned, strict=True))
+        sum(
+            float(np.linalg.norm(mesh.vertices[p] - mesh.vertices[q]))
+            for p, q in zip(one, turned, strict=True)
+        )
         for one, other in itertools.product(*at)
         for turned in (other[::-1], other[1::-1] + other[:1:-1], [other[0], other[2], other[1]])
     ]
@@ -84,14 +91,22 @@ def test_weld_refuses_what_cannot_be_welded(sphere: Mesh) -> None:
 
 @pytest.mark.parametrize(
     ("mesh", "largest_gap", "least_path"),
-    [(horseshoe(0.008), 1 / 64, 1 / 4), (horseshoe(0.03), 1 / 32, 1 / 4), (grooved_ball(), 1 / 16, None)],
+    [
+        (horseshoe(0.008), 1 / 64, 1 / 4),
+        (horseshoe(0.03), 1 / 32, 1 / 4),
+        (grooved_ball(), 1 / 16, None),
+    ],
     ids=["narrow", "wide", "crease"],
 )
-def test_facing_vertices_are_the_best_of_all_pairs(mesh: Mesh, largest_gap: float, least_path: float | None) -> None:
+def test_facing_vertices_are_the_best_of_all_pairs(
+    mesh: Mesh, largest_gap: float, least_path: float | None
+) -> None:
     a, b = facing_vertices(mesh)
     normals = as_trimesh(mesh)
     areas = normals.face_normals * normals.area_faces[:, None]
-    sums = np.stack([areas[(mesh.faces == i).any(axis=1)].sum(axis=0) for i in range(len(mesh.vertices))])
+    sums = np.stack(
+        [areas[(mesh.faces == i).any(axis=1)].sum(axis=0) for i in range(len(mesh.vertices))]
+    )
     unit = sums / np.linalg.norm(sums, axis=1, keepdims=True)
     np.testing.assert_allclose(vertex_normals(mesh.vertices, mesh.faces), unit, atol=1e-12)
     way = mesh.vertices[None, :] - mesh.vertices[:, None]
@@ -118,7 +133,9 @@ def test_search_lists_every_facing_pair_once_and_best_first() -> None:
     gap = np.linalg.norm(way, axis=2) + np.eye(len(way))
     facing = np.einsum("ik,ijk->ij", unit, way / gap[..., None]) > 0.5
     allowed = np.triu(facing & facing.T & (gap <= largest_gap))
-    assert np.triu(facing & (gap <= largest_gap)).sum() > 2 * allowed.sum()  # many look at what does not look at them
+    assert (
+        np.triu(facing & (gap <= largest_gap)).sum() > 2 * allowed.sum()
+    )  # many look at what does not look at them
     along = paths(mesh)
     far = np.median(along[allowed])
     for least_path, value in ((None, along), (far, along / gap)):
@@ -134,7 +151,9 @@ def test_narrow_gaps_come_before_wide_ones(monkeypatch: pytest.MonkeyPatch) -> N
     mesh = horseshoe()
     asked = []
 
-    def none(self: object, largest_gap: float, least_path: float | None = None) -> list[tuple[int, int]]:
+    def none(
+        self: object, largest_gap: float, least_path: float | None = None
+    ) -> list[tuple[int, int]]:
         asked.append((largest_gap / mesh.diagonal, least_path and least_path / mesh.diagonal))
         return []
 

@@ -10,6 +10,13 @@ it in this order:
 - scans, shapes: remeshing, noise and motion of surfaces, and the benchmark
 """
 
-from training.graded.shapes import GradedShape, GradedShapes, body_of, family_of, individual_of, looks_alike
+from training.graded.shapes import (
+    GradedShape,
+    GradedShapes,
+    body_of,
+    family_of,
+    individual_of,
+    looks_alike,
+)
 
 __all__ = ["GradedShape", "GradedShapes", "body_of", "family_of", "individual_of", "looks_alike"]

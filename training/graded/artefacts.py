@@ -26,11 +26,17 @@ def vessel(g: np.random.Generator, body: str, handles: int, foot: str, extra: st
         return float(np.interp(z, heights[rising], radii[rising])), float(z)
 
     # Handles span a straight or concave part of the wall, because a bulge would fill their opening.
-    ends = {"bowl": (0.08, 0.93), "vase": (0.42, 0.98), "bottle": (0.35, 0.93)}.get(body, (0.18, 0.85))
+    ends = {"bowl": (0.08, 0.93), "vase": (0.42, 0.98), "bottle": (0.35, 0.93)}.get(
+        body, (0.18, 0.85)
+    )
     (r0, z0), (r1, z1) = (wall_at(share) for share in ends)
     rise = z1 - z0
-    ear = Part(Arc(0.5 * float(np.hypot(r1 - r0, rise)), np.pi, 0.1, 0.1), "handle", (0, 5, 0), blend=0.04)
-    parts = [ear.joined((r0 * c, r0 * s, z0), (c * rise, s * rise, r0 - r1)) for c, s in circle(handles)]
+    ear = Part(
+        Arc(0.5 * float(np.hypot(r1 - r0, rise)), np.pi, 0.1, 0.1), "handle", (0, 5, 0), blend=0.04
+    )
+    parts = [
+        ear.joined((r0 * c, r0 * s, z0), (c * rise, s * rise, r0 - r1)) for c, s in circle(handles)
+    ]
     match extra:
         case "spout":
             r, z = wall_at(0.4)
@@ -46,14 +52,19 @@ def vessel(g: np.random.Generator, body: str, handles: int, foot: str, extra: st
             reach = max(bottom, 0.3)
             z = 0.0 if bottom else float(np.interp(reach, radii[:3], heights[:3]))
             leg = limb("leg", [0.5], [0.12, 0.1], [(9, 9)])
-            parts += [leg.joined((reach * c, reach * s, z), (0.4 * c, 0.4 * s, -1)) for c, s in circle(3, 0.3)]
+            parts += [
+                leg.joined((reach * c, reach * s, z), (0.4 * c, 0.4 * s, -1))
+                for c, s in circle(3, 0.3)
+            ]
         case "stem":
             plate = Part(Prism(24, 0.42, 0.18, 0.07), "foot", at=(0, 0, 0.5))
             parts.append(limb("stem", [0.5], [0.13, 0.12], [(4, 4)], [plate]).joined(ORIGIN, DOWN))
     return Skeleton(Part(Shell(tuple(profile), wall), blend=0.05, children=tuple(parts)), handles)
 
 
-def _profile(g: np.random.Generator, body: str, wide: float, high: float) -> list[tuple[float, float]]:
+def _profile(
+    g: np.random.Generator, body: str, wide: float, high: float
+) -> list[tuple[float, float]]:
     """The wall of a vessel: points (radius, height) from the bottom up."""
     match body:
         case "bowl":
@@ -64,7 +75,13 @@ def _profile(g: np.random.Generator, body: str, wide: float, high: float) -> lis
             belly = (1.2 * wide, 0.4 * high)
             return [(0, 0), (0.75 * wide, 0), belly, (waist, 0.8 * high), (0.9 * wide, high)]
         case "bottle":
-            return [(0, 0), (0.9 * wide, 0), (0.9 * wide, 0.6 * high), (0.24, 0.8 * high), (0.24, 1.15 * high)]
+            return [
+                (0, 0),
+                (0.9 * wide, 0),
+                (0.9 * wide, 0.6 * high),
+                (0.24, 0.8 * high),
+                (0.24, 1.15 * high),
+            ]
         case "pipe":
             return [(wide * g.uniform(0.6, 1.0), 0), (wide, high)]
         case _:
@@ -85,7 +102,9 @@ def wheel(g: np.random.Generator, n: int, spokes: int, limbs: str, end: str) -> 
         case "rays":
             parts += [arm.joined((radius * c, radius * s, 0), (c, s, 0.3)) for c, s in corners]
         case "legs":
-            parts += [arm.joined((radius * c, radius * s, 0), (0.2 * c, 0.2 * s, -1)) for c, s in corners]
+            parts += [
+                arm.joined((radius * c, radius * s, 0), (0.2 * c, 0.2 * s, -1)) for c, s in corners
+            ]
         case "mast":
             mast = replace(style, length=1.5 * style.length).grow()
             parts.append(mast.joined((radius, 0, 0), (1, 0, 0)))
@@ -118,27 +137,40 @@ def table(g: np.random.Generator, top: str, legs: int, back: str) -> Skeleton:
         parts = [stem.joined((reach if hoop else 0.0, 0, 0), DOWN)]
     else:
         corners, stretch = circle(legs, np.pi / 4 if long else 0.0), 1.9 if long else 1.0
-        parts = [leg.joined((reach * c, stretch * reach * s, 0), (splay * c, splay * s, -1)) for c, s in corners]
+        parts = [
+            leg.joined((reach * c, stretch * reach * s, 0), (splay * c, splay * s, -1))
+            for c, s in corners
+        ]
     place = (0, rear, 0)
     match back:
         case "panel":
-            parts.append(Part(Box((1.2 * wide, 0.18, 0.9), 0.07), "back", (12, 0, 0), place, lift=0.42))
+            parts.append(
+                Part(Box((1.2 * wide, 0.18, 0.9), 0.07), "back", (12, 0, 0), place, lift=0.42)
+            )
         case "arch":
-            parts.append(Part(Ring(0.6 * wide, 0.11, 0.15), "back", (12, 0, 0), place, lift=0.6 * wide + 0.2))
+            parts.append(
+                Part(Ring(0.6 * wide, 0.11, 0.15), "back", (12, 0, 0), place, lift=0.6 * wide + 0.2)
+            )
         case "post":
             knob = ending("knob", 0.1, "back", (0, 0, 0.8))
             parts.append(limb("back", [0.8], [0.12, 0.11], [(12, 12)], knob).joined(place))
         case "horns":
             horn = limb("back", [0.5, 0.3], [0.12, 0.11, 0.1], [(12, 12)])
             for s in (-1, 1):  # on a hoop, in front and behind, where it has its tube
-                parts.append(horn.joined((0, rear * s, 0) if hoop else (0.5 * wide * s, rear, 0), (0.3 * s, 0.1, 1)))
+                parts.append(
+                    horn.joined(
+                        (0, rear * s, 0) if hoop else (0.5 * wide * s, rear, 0), (0.3 * s, 0.1, 1)
+                    )
+                )
     return Skeleton(Part(solid, children=tuple(parts)))
 
 
 def tool(g: np.random.Generator, shaft: str, head: str, pommel: str) -> Skeleton:
     """Build a shaft with a head and a pommel."""
     style = LimbStyle.draw(g, shaft, head, g.uniform(1.1, 1.9), 0.13, 12.0)
-    root = replace(style, end=style.start * g.uniform(0.8, 1.25), curl=0.6 * style.curl).grow("shaft")
+    root = replace(style, end=style.start * g.uniform(0.8, 1.25), curl=0.6 * style.curl).grow(
+        "shaft"
+    )
     butt = ending(pommel, 0.95 * style.start, "pommel", ORIGIN, aim(DOWN))
     return Skeleton(replace(root, children=root.children + butt))
 
@@ -169,7 +201,10 @@ def stack(g: np.random.Generator, layers: tuple[str, ...], side: str) -> Skeleto
             case "ball":
                 solid, high = Blob((size, size, size * g.uniform(0.7, 1.2))), 1.6 * size
             case "block":
-                solid, high = Box((1.7 * size, 1.7 * size * g.uniform(0.6, 1.0), 1.8 * size), 0.06), 1.7 * size
+                solid, high = (
+                    Box((1.7 * size, 1.7 * size * g.uniform(0.6, 1.0), 1.8 * size), 0.06),
+                    1.7 * size,
+                )
             case "plate":
                 solid, high = Prism(int(g.choice([3, 4, 6, 24])), 1.6 * size, 0.22, 0.08), 0.18
             case "post":
@@ -187,6 +222,9 @@ def stack(g: np.random.Generator, layers: tuple[str, ...], side: str) -> Skeleto
                 "hoops": (2, "stub", "ring", 0.5),
             }[side]
             arm = LimbStyle.draw(g, kind, end, length, 0.12).grow()
-            children += tuple(arm.joined((reach * c, reach * s, 0.5 * high), (c, s, 0.3)) for c, s in circle(count))
+            children += tuple(
+                arm.joined((reach * c, reach * s, 0.5 * high), (c, s, 0.3))
+                for c, s in circle(count)
+            )
         children = (Part(solid, f"layer{i}", (7, 7, 12), lift=0.5 * high, children=children),)
     return Skeleton(children[0])

@@ -44,8 +44,17 @@ class Warp:
     def draw(cls, rng: np.random.Generator, size: float, strength: float) -> Warp:
         """Draw a warp of a body of extent `size`: wavelengths of about `size`, gradients of about `strength`."""
         waves = rng.normal(size=(3, 3)) * (2.0 * np.pi / (1.3 * size) / np.sqrt(3.0))
-        steps = rng.normal(size=(3, 3)) * (strength / np.sqrt(3.0)) / np.linalg.norm(waves, axis=1, keepdims=True)
-        return cls(np.exp(strength * rng.uniform(-1.0, 1.0, 3)), waves, steps, rng.uniform(0.0, 2.0 * np.pi, 3))
+        steps = (
+            rng.normal(size=(3, 3))
+            * (strength / np.sqrt(3.0))
+            / np.linalg.norm(waves, axis=1, keepdims=True)
+        )
+        return cls(
+            np.exp(strength * rng.uniform(-1.0, 1.0, 3)),
+            waves,
+            steps,
+            rng.uniform(0.0, 2.0 * np.pi, 3),
+        )
 
     def __call__(self, points: Floats) -> Floats:
         moved = points * self.stretch
@@ -63,7 +72,9 @@ class Body:
     genus: int  # number of handles of the surface
     motion: Motion
     warp: Callable[[Floats], Floats]  # deformation of the surface at rest
-    relief: tuple[float, float, int]  # amplitude and wavelength of bumps, and the seed of their positions
+    relief: tuple[
+        float, float, int
+    ]  # amplitude and wavelength of bumps, and the seed of their positions
 
     @property
     def placed(self) -> list[Placed]:
@@ -72,7 +83,11 @@ class Body:
     def surface(self, target: int, rotation: Floats) -> tuple[Floats, Integers]:
         """Mesh the surface at rest, before the warp, with about `target` vertices, on a grid rotated by `rotation`."""
         turned = [
-            replace(solid, rotation=_product(rotation, solid.rotation), offset=(rotation * solid.offset).sum(axis=1))
+            replace(
+                solid,
+                rotation=_product(rotation, solid.rotation),
+                offset=(rotation * solid.offset).sum(axis=1),
+            )
             for solid in self.placed
         ]
         vertices, faces, _ = mesh(turned, target)
@@ -115,7 +130,9 @@ def draw_body(body_class: BodyClass, kin: Sequence[int], seed: Sequence[int]) ->
                 break
         else:
             return body
-    raise ValueError(f"no sound body of {body_class.name} in {_MAX_DRAWS} draws, the last had {fault}")
+    raise ValueError(
+        f"no sound body of {body_class.name} in {_MAX_DRAWS} draws, the last had {fault}"
+    )
 
 
 def draw_pose(body: Body, rng: np.random.Generator, target: int) -> Pose:
@@ -134,7 +151,9 @@ def draw_pose(body: Body, rng: np.random.Generator, target: int) -> Pose:
         angle = rng.uniform(0.0, np.pi)
         rig = _rig(body.bones, body.motion, np.array([np.cos(angle), np.sin(angle), 0.0]))
     binding = bind(vertices, faces, rig, body.placed)
-    rig = Rig(tuple(replace(rod, points=body.warp(rod.points)) for rod in rig.rods), rig.rod_of_solid)
+    rig = Rig(
+        tuple(replace(rod, points=body.warp(rod.points)) for rod in rig.rods), rig.rod_of_solid
+    )
     gaps = Gaps.of(rig)
     vigour = float(rng.uniform(0.25, 1.0))
     n_wanted = _N_CLOSE_DRAWS if rng.uniform() < _CLOSE_SHARE else 1
@@ -160,7 +179,9 @@ def draw_pose(body: Body, rng: np.random.Generator, target: int) -> Pose:
     return closest
 
 
-def _draw_candidate(body_class: BodyClass, kin: np.random.Generator, rng: np.random.Generator, spread: float) -> Body:
+def _draw_candidate(
+    body_class: BodyClass, kin: np.random.Generator, rng: np.random.Generator, spread: float
+) -> Body:
     skeleton, motion = body_class.draw(kin)
     groups = sorted({part.group for part in skeleton.root.walk()})
     thickness = rng.uniform(-0.1, 0.22)
@@ -175,11 +196,17 @@ def _draw_candidate(body_class: BodyClass, kin: np.random.Generator, rng: np.ran
     # A sheet must stay nearly flat, because only a flat sheet rolls without stretching.
     warp = Warp.draw(rng, longest_side(corners), 0.05 if motion == "sheet" else 0.14 * spread)
     thinnest = min(float(rod.radii.min()) for rod in rig.rods)
-    relief = (0.14 * spread * thinnest * rng.uniform(), rng.uniform(0.25, 0.6), int(rng.integers(2**31)))
+    relief = (
+        0.14 * spread * thinnest * rng.uniform(),
+        rng.uniform(0.25, 0.6),
+        int(rng.integers(2**31)),
+    )
     return Body(bones, rig, skeleton.genus, motion, warp, relief)
 
 
-def _mesh_body(body: Body, rng: np.random.Generator, target: int) -> tuple[Floats, Integers, Floats]:
+def _mesh_body(
+    body: Body, rng: np.random.Generator, target: int
+) -> tuple[Floats, Integers, Floats]:
     """Vertices before the warp, faces, and vertices after it, on the first grid that gives a sound surface."""
     fault: str | None = None
     for _ in range(_MAX_GRIDS):

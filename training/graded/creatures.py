@@ -34,7 +34,12 @@ def star(g: np.random.Generator, core: str, n: int, kind: str, end: str) -> Skel
             solid, seat = Prism(n, radius * 1.2, 0.35 * g.uniform(0.9, 2.0), 0.08), 0.95 * radius
     arm = style.grow()
     return Skeleton(
-        Part(solid, children=tuple(arm.joined((seat * c, seat * s, 0), (c, s, rise), roll) for c, s in circle(n)))
+        Part(
+            solid,
+            children=tuple(
+                arm.joined((seat * c, seat * s, 0), (c, s, rise), roll) for c, s in circle(n)
+            ),
+        )
     )
 
 
@@ -48,11 +53,15 @@ def tree(g: np.random.Generator, branches: int, twigs: int, end: str, base: str)
     top = (0, 0, length)
     twig = style.grow("twig")
     crown = tuple(twig.joined(top, (spread * a, spread * b, 0.9)) for a, b in circle(twigs, 0.5))
-    branch = limb("branch", [length], [0.14, 0.11], [(12, 9)], crown or ending(end, 0.11, "twig", top))
+    branch = limb(
+        "branch", [length], [0.14, 0.11], [(12, 9)], crown or ending(end, 0.11, "twig", top)
+    )
     parts = [branch.joined((0, 0, height), (c, s, rise)) for c, s in directions]
     match base:
         case "plate":
-            parts.append(Part(Prism(int(g.choice([3, 4, 6, 24])), g.uniform(0.4, 0.6), 0.22, 0.08), "base"))
+            parts.append(
+                Part(Prism(int(g.choice([3, 4, 6, 24])), g.uniform(0.4, 0.6), 0.22, 0.08), "base")
+            )
         case "bulb":
             parts.append(Part(Blob((0.38, 0.38, g.uniform(0.3, 0.5))), "base"))
         case "tripod":
@@ -65,7 +74,9 @@ def beast(g: np.random.Generator, pairs: int, stance: str, head: str, tail: str)
     """Build a body with bilateral symmetry: pairs of legs, a head and a tail."""
     half = 0.3 + 0.15 * pairs * g.uniform(0.9, 1.25)
     girth = g.uniform(0.22, 0.36)
-    kind, end, length = ("straight", "paddle", 0.4) if stance == "fins" else ("jointed", "plain", 0.85)
+    kind, end, length = (
+        ("straight", "paddle", 0.4) if stance == "fins" else ("jointed", "plain", 0.85)
+    )
     style = LimbStyle.draw(g, kind, end, length, 0.12, 10.0)
     leg = replace(style, curl=0.3 if stance == "stand" else -abs(style.curl) - 0.3).grow()
     parts = []
@@ -78,7 +89,9 @@ def beast(g: np.random.Generator, pairs: int, stance: str, head: str, tail: str)
                 parts.append(leg.joined((0.6 * s * room, y, 0), (s, 0.5 * y / half, 0.25)))
     long = head == "long"
     reach = g.uniform(0.7, 0.9) if long else g.uniform(0.2, 0.35)
-    kind = {"horned": "fork", "bill": "paddle", "looped": "ring", "round": "knob", "long": "knob"}[head]
+    kind = {"horned": "fork", "bill": "paddle", "looped": "ring", "round": "knob", "long": "knob"}[
+        head
+    ]
     tip = ending(kind, 0.1 if long else 0.13, "head", (0, 0, reach), aim((0, -0.3, 1)))
     neck = limb("neck", [reach], [0.16, 0.12], [(16, 14)], tip)
     parts.append(neck.joined((0, -0.85 * half, 0.1 * girth), (0, -1, g.uniform(0.2, 1.2))))
@@ -93,7 +106,11 @@ def beast(g: np.random.Generator, pairs: int, stance: str, head: str, tail: str)
 def chain(g: np.random.Generator, n: int, link: str, end: str) -> Skeleton:
     """Build a row of `n` links with joints between them."""
     radius = g.uniform(0.22, 0.3)
-    is_stiff = link in ("boxes", "plates", "tubes")  # their edges must not meet when the chain bends
+    is_stiff = link in (
+        "boxes",
+        "plates",
+        "tubes",
+    )  # their edges must not meet when the chain bends
     gap = g.uniform(0.08, 0.2) + {"boxes": 0.12, "plates": 0.16, "tubes": 0.14}.get(link, 0.0)
     bow = g.uniform(-8.0, 8.0) if is_stiff else g.uniform(-16.0, 16.0)
     side = g.uniform(0.0, 0.25)
@@ -107,9 +124,13 @@ def chain(g: np.random.Generator, n: int, link: str, end: str) -> Skeleton:
         children = tuple(replace(child, at=(0, 0, length + gap)) for child in children)
         if gap:
             children += (Part(Cone(gap + 0.2, 0.11, 0.11), "bridge", at=(0, 0, length - 0.1)),)
-        children = (Part(solid, "link", (limit, limit, 0), ORIGIN, turn, 0.05, 0.5 * length, children),)
+        children = (
+            Part(solid, "link", (limit, limit, 0), ORIGIN, turn, 0.05, 0.5 * length, children),
+        )
     root = children[0]
-    return Skeleton(replace(root, children=root.children + ending(end, 0.12, "end", ORIGIN, aim(DOWN))))
+    return Skeleton(
+        replace(root, children=root.children + ending(end, 0.12, "end", ORIGIN, aim(DOWN)))
+    )
 
 
 def _link(kind: str, radius: float, side: float, scale: float) -> tuple[Solid, float]:
@@ -137,8 +158,12 @@ def comb(g: np.random.Generator, n: int, sides: str, end: str) -> Skeleton:
         rail, across = Cone(step * (n - 1), 0.12, 0.12), turned("y", 90.0)
         second = Part(rail, at=(0, 0, reach), turn=across.T)
         rung = Part(Cone(reach, 0.1, 0.1), turn=across)
-        rungs = [replace(rung, at=(0, 0, i * step), children=() if i else (second,)) for i in range(n)]
-        return Skeleton(Part(rail, children=(*rungs, *ending(end, 0.12, "end", (0, 0, rail.length)))), n - 1)
+        rungs = [
+            replace(rung, at=(0, 0, i * step), children=() if i else (second,)) for i in range(n)
+        ]
+        return Skeleton(
+            Part(rail, children=(*rungs, *ending(end, 0.12, "end", (0, 0, rail.length)))), n - 1
+        )
     tooth = LimbStyle.draw(g, "straight", end, reach, 0.1, 8.0).grow("tooth")
     roll = 0.5 * np.pi if end == "hook" else 0.0  # hooks stand across the spine
     segments: tuple[Part, ...] = ()
@@ -146,7 +171,9 @@ def comb(g: np.random.Generator, n: int, sides: str, end: str) -> Skeleton:
         headings = {"one": [1], "both": [-1, 1], "zigzag": [1 if i % 2 else -1]}[sides]
         teeth = tuple(tooth.joined((0, 0, 0.5 * step), (s, 0, 0.2), roll) for s in headings)
         place = (0, 0, step if i else 0.0)
-        segments = (Part(Cone(step, 0.14, 0.14), "body", (14, 5, 0), place, children=segments + teeth),)
+        segments = (
+            Part(Cone(step, 0.14, 0.14), "body", (14, 5, 0), place, children=segments + teeth),
+        )
     return Skeleton(segments[0])
 
 
@@ -169,5 +196,9 @@ def serpent(g: np.random.Generator, n: int, ornament: str, head: str) -> Skeleto
     for i in reversed(range(n)):
         cone = Cone(step, float(radii[i]), float(radii[i + 1]))
         children = (*parts, *extras) if i % 2 or n < 5 else parts
-        parts = (Part(cone, "body", (9, 24, 0), (0, 0, step if i else 0.0), blend=0.05, children=children),)
+        parts = (
+            Part(
+                cone, "body", (9, 24, 0), (0, 0, step if i else 0.0), blend=0.05, children=children
+            ),
+        )
     return Skeleton(parts[0])

@@ -35,7 +35,9 @@ def _candidates(corners: Floats) -> Integers:
     radii = np.sqrt(((corners - centres[:, None]) ** 2).sum(axis=2).max(axis=1))
     max_small = float(np.quantile(radii, 0.9))
     small, large = np.nonzero(radii <= max_small)[0], np.nonzero(radii > max_small)[0]
-    candidates = [small[cKDTree(centres[small]).query_pairs(2.0 * max_small, output_type="ndarray")]]
+    candidates = [
+        small[cKDTree(centres[small]).query_pairs(2.0 * max_small, output_type="ndarray")]
+    ]
     if len(large):
         # The few large faces are searched one by one, so that they do not enlarge the search radius of all faces.
         neighbours = cKDTree(centres).query_ball_point(centres[large], radii[large] + radii.max())

@@ -36,7 +36,13 @@ class Change:
     step: float  # factor of the whole change
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, vertices: Floats, faces: Integers, shares: tuple[float, float]) -> Change:
+    def draw(
+        cls,
+        rng: np.random.Generator,
+        vertices: Floats,
+        faces: Integers,
+        shares: tuple[float, float],
+    ) -> Change:
         """Draw a change of a surface, whose largest displacement in units of √area is within `shares`."""
         size = float(np.sqrt(face_areas(vertices, faces).sum()))
         low, high = np.log(_RADII)
@@ -52,7 +58,9 @@ class Change:
         change = cls(waves, centres, axes, radii, swells, grows, np.zeros(7), 1.0)
         basis = _similarity_basis(vertices)
         steps = change(vertices) - vertices
-        similarity = np.linalg.lstsq(basis.reshape(-1, 7), steps.reshape(-1), rcond=None)[0].astype(np.float64)
+        similarity = np.linalg.lstsq(basis.reshape(-1, 7), steps.reshape(-1), rcond=None)[0].astype(
+            np.float64
+        )
         change = replace(change, similarity=similarity)
         largest = float(np.linalg.norm(change(vertices) - vertices, axis=1).max())
         return replace(change, step=size * float(np.exp(rng.uniform(*np.log(shares)))) / largest)
@@ -67,8 +75,14 @@ class Change:
             across = positions - along[:, None] * axis
             distances = np.linalg.norm(across, axis=1)
             near = np.exp(-0.5 * (distances**2 + along**2) / radius**2)
-            beyond = radius * np.logaddexp(0.0, along / radius) * np.exp(-0.5 * (distances / radius) ** 2)
-            steps = steps + 0.3 * swell * near[:, None] * across + 0.15 * grow * beyond[:, None] * axis
+            beyond = (
+                radius
+                * np.logaddexp(0.0, along / radius)
+                * np.exp(-0.5 * (distances / radius) ** 2)
+            )
+            steps = (
+                steps + 0.3 * swell * near[:, None] * across + 0.15 * grow * beyond[:, None] * axis
+            )
         return points + self.step * (steps - _similarity_basis(points) @ self.similarity)
 
 
@@ -86,12 +100,18 @@ class ChangedWarp:
 def individual(body: Body, rng: np.random.Generator, shares: tuple[float, float] = SHARES) -> Body:
     """Draw an individual of a body: the body with a `Change` of its surface at rest."""
     vertices, faces = body.surface(_TRIAL_VERTICES, np.eye(3))
-    return replace(body, warp=ChangedWarp(body.warp, Change.draw(rng, body.warp(vertices), faces, shares)))
+    return replace(
+        body, warp=ChangedWarp(body.warp, Change.draw(rng, body.warp(vertices), faces, shares))
+    )
 
 
 def _similarity_basis(points: Floats) -> Floats:
     """(P,3,7) displacements of points (P,3) by translations, infinitesimal rotations, and scaling."""
     x, y, z = points.T
     zero = np.zeros(len(points))
-    turns = np.stack([np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], axis=2)
-    return np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), turns, points[:, :, None]], axis=2)
+    turns = np.stack(
+        [np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], axis=2
+    )
+    return np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(points), 3, 3)), turns, points[:, :, None]], axis=2
+    )

@@ -50,7 +50,9 @@ LOOK_ALIKE_FAMILIES = {
 class Kind(NamedTuple):
     """A family of classes with the same builder."""
 
-    build: Callable[..., Skeleton]  # builder, called with a random generator and the choices of a structure
+    build: Callable[
+        ..., Skeleton
+    ]  # builder, called with a random generator and the choices of a structure
     structures: Sequence[tuple[Any, ...]]  # valid combinations of structural choices
     loose: int | None  # position of the choice that varies within a class; None if there is none
     motion: Callable[[tuple[Any, ...]], Motion]  # motion of the bodies of a structure
@@ -85,14 +87,22 @@ def body_classes(seed: int, look_alikes: bool = True) -> list[BodyClass]:
             continue
         groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
         for structure in kind.structures:
-            groups.setdefault(tuple(c for i, c in enumerate(structure) if i != kind.loose), []).append(structure)
+            groups.setdefault(
+                tuple(c for i, c in enumerate(structure) if i != kind.loose), []
+            ).append(structure)
         order = np.random.default_rng([seed, number]).permutation(len(groups))
         keys = list(groups)
         queues.append([(name, kind, keys[i], groups[keys[i]]) for i in order])
     for turn in itertools.zip_longest(*queues):
         for name, kind, key, structures in filter(None, turn):
-            words = [str(word) for choice in key for word in (choice if isinstance(choice, tuple) else (choice,))]
-            classes.append(BodyClass("-".join([name, *words, f"{len(classes):03d}"]), kind, structures))
+            words = [
+                str(word)
+                for choice in key
+                for word in (choice if isinstance(choice, tuple) else (choice,))
+            ]
+            classes.append(
+                BodyClass("-".join([name, *words, f"{len(classes):03d}"]), kind, structures)
+            )
     return classes
 
 

@@ -18,17 +18,28 @@ class Prism(Solid):
     rounding: float
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        across, past_corner = _to_polygon(self.sides, self.radius - self.rounding / np.cos(np.pi / self.sides), x, y)
+        across, past_corner = _to_polygon(
+            self.sides, self.radius - self.rounding / np.cos(np.pi / self.sides), x, y
+        )
         a = np.where(across > 0.0, np.hypot(across, past_corner), across)
         b = np.abs(z) - (0.5 * self.height - self.rounding)
-        return np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0)) + np.minimum(np.maximum(a, b), 0.0) - self.rounding
+        return (
+            np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0))
+            + np.minimum(np.maximum(a, b), 0.0)
+            - self.rounding
+        )
 
     def box(self) -> tuple[Floats, Floats]:
         upper = np.array([self.radius, self.radius, 0.5 * self.height])
         return -upper, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Prism(self.sides, self.radius * thick, self.height * length, self.rounding * min(thick, length))
+        return Prism(
+            self.sides,
+            self.radius * thick,
+            self.height * length,
+            self.rounding * min(thick, length),
+        )
 
 
 @dataclass(frozen=True)

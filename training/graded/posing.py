@@ -7,7 +7,9 @@ from igps.mesh import surface
 from training.graded.rods import MAX_CURVATURE, Joint, Rig, Rod
 
 
-def draw_turns(rig: Rig, rng: np.random.Generator, vigour: float, planar: bool = False) -> list[Floats]:
+def draw_turns(
+    rig: Rig, rng: np.random.Generator, vigour: float, planar: bool = False
+) -> list[Floats]:
     """Draw a pose: rotation vectors (n,3), radians, at the points of each rod.
 
     Args:
@@ -73,7 +75,9 @@ def _curled(rod: Rod, waves: Floats, planar: bool) -> Floats:
         return np.zeros((len(rod.arc_lengths), 3))
     t = rod.arc_lengths / rod.length
     shapes = np.stack([np.ones_like(t), 0.8 * np.cos(np.pi * t), 0.6 * np.cos(2.0 * np.pi * t)])
-    curvature = (waves[:, :, None] * shapes[None]).sum(axis=1) * np.array([1.0, 0.0 if planar else 0.6])[:, None]
+    curvature = (waves[:, :, None] * shapes[None]).sum(axis=1) * np.array(
+        [1.0, 0.0 if planar else 0.6]
+    )[:, None]
     max_angle = MAX_CURVATURE * rod.arc_lengths[1] / rod.bending_radii
     angles = np.clip(curvature * rod.curl / len(t), -max_angle, max_angle)
     angles[:, 0] = 0.0

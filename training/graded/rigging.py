@@ -113,17 +113,24 @@ def limb_rig(bones: Sequence[Bone], hinged: bool = False) -> Rig:
         solid = bones[int(np.argmax(rod_of_bone == number))].solid
         if len(rod.arc_lengths) == 1 and rod.parent >= 0 and not isinstance(solid, Cone):
             low, high = solid.box()
-            rods[rod.parent] = _stiffened(rods[rod.parent], rod.attachment, 0.5 * float((high - low).max()))
+            rods[rod.parent] = _stiffened(
+                rods[rod.parent], rod.attachment, 0.5 * float((high - low).max())
+            )
     return Rig(tuple(rods), rod_of_bone)
 
 
 def _stiffened(rod: Rod, attachment: float, half: float) -> Rod:
     """Reduce the bending of a rod near the attachment of a rigid solid of half extent `half`."""
     near = np.abs(rod.arc_lengths - attachment) < half
-    return replace(rod, bending_radii=np.where(near, np.maximum(rod.bending_radii, 1.5 * half), rod.bending_radii))
+    return replace(
+        rod,
+        bending_radii=np.where(near, np.maximum(rod.bending_radii, 1.5 * half), rod.bending_radii),
+    )
 
 
-def strip_rig(bones: Sequence[Bone], direction: Floats, axis: Floats, thickness: float, curl: float) -> Rig:
+def strip_rig(
+    bones: Sequence[Bone], direction: Floats, axis: Floats, thickness: float, curl: float
+) -> Rig:
     """Return a single rod along `direction` for a whole body, such as a sheet, which bends about `axis`.
 
     Args:
@@ -156,7 +163,9 @@ def _successors(bones: Sequence[Bone]) -> list[int | None]:
             reach = np.asarray(child.tip) - child.origin
             beyond = float(((child.origin - bone.origin) * ahead).sum()) / length**2
             aside = float(np.linalg.norm(np.cross(child.origin - bone.origin, ahead))) / length
-            cosine = float((reach * ahead).sum()) / (length * max(float(np.linalg.norm(reach)), 1e-9))
+            cosine = float((reach * ahead).sum()) / (
+                length * max(float(np.linalg.norm(reach)), 1e-9)
+            )
             if beyond > 0.85 and aside < 0.05 * length:
                 candidates.append((cosine, float(np.linalg.norm(reach)), other))
         if len(candidates) > 1:
@@ -165,33 +174,45 @@ def _successors(bones: Sequence[Bone]) -> list[int | None]:
     return successors
 
 
-def _rod(chain: Sequence[Bone], bones: Sequence[Bone], parent: int, attachment: float, hinged: bool) -> Rod:
+def _rod(
+    chain: Sequence[Bone], bones: Sequence[Bone], parent: int, attachment: float, hinged: bool
+) -> Rod:
     """The rod of a chain of bones, with a single element if no bone can bend."""
     line, radii, frames, starts = _centre_line(chain, parent < 0)
     if len(line) == 1 or (parent >= 0 and not any(any(bone.part.bend) for bone in chain)):
-        return Rod(parent, attachment, line[:1], np.zeros(1), radii[:1], radii[:1], frames[:1, :, :2])
+        return Rod(
+            parent, attachment, line[:1], np.zeros(1), radii[:1], radii[:1], frames[:1, :, :2]
+        )
     line_lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     length, radius = float(line_lengths[-1]), float(radii.mean())
     n = int(np.clip(np.ceil(length / (0.3 * radius)), 8, MAX_ELEMENTS))
     arc_lengths = np.linspace(0.0, length, n)
     points = np.stack([np.interp(arc_lengths, line_lengths, line[:, i]) for i in range(3)], axis=1)
-    segment = np.clip(np.searchsorted(line_lengths, arc_lengths, side="right") - 1, 0, len(frames) - 1)
+    segment = np.clip(
+        np.searchsorted(line_lengths, arc_lengths, side="right") - 1, 0, len(frames) - 1
+    )
     sides = frames[segment][:, :, :2]
     radii = np.interp(arc_lengths, line_lengths, radii)
     rod = Rod(parent, attachment, points, arc_lengths, radii, radii, sides, is_hinge=hinged)
     spring = chain[0].solid
     if isinstance(spring, Helix):
         return replace(rod, curl=_OPENING_PER_TURN * spring.turns)
-    rod = replace(rod, joints=_joints(chain, [float(line_lengths[start]) for start in starts], rod, bones))
+    rod = replace(
+        rod, joints=_joints(chain, [float(line_lengths[start]) for start in starts], rod, bones)
+    )
     if hinged:
         return rod
     slenderness = length / radius
     is_curling = len(chain) >= 3 and slenderness > _MIN_CURL_SLENDERNESS
     curl = min(np.radians(_CURL_LIMIT), 0.5 * slenderness) if is_curling else 0.06 * slenderness
-    return replace(rod, curl=float(curl), twist=float(min(np.radians(_TWIST_LIMIT), _MAX_SHEAR * slenderness)))
+    return replace(
+        rod, curl=float(curl), twist=float(min(np.radians(_TWIST_LIMIT), _MAX_SHEAR * slenderness))
+    )
 
 
-def _joints(chain: Sequence[Bone], starts: Sequence[float], rod: Rod, bones: Sequence[Bone]) -> tuple[Joint, ...]:
+def _joints(
+    chain: Sequence[Bone], starts: Sequence[float], rod: Rod, bones: Sequence[Bone]
+) -> tuple[Joint, ...]:
     """The joints of a rod; its bones start at the arc lengths `starts`."""
     joints = []
     radius = float(rod.radii.mean())
@@ -222,7 +243,9 @@ def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Floats, Floats, 
         local = np.array([root.solid.at(float(t)) for t in share])
         outward = surface.unit(local * np.array([1.0, 1.0, 0.0]))
         # A spring opens and closes about its axis.
-        axes = np.stack([np.tile([0.0, 0.0, 1.0], (len(share), 1)), outward, np.zeros_like(local)], axis=2)
+        axes = np.stack(
+            [np.tile([0.0, 0.0, 1.0], (len(share), 1)), outward, np.zeros_like(local)], axis=2
+        )
         return root.placed.offset + local, np.full(len(share), root.solid.tube), axes, [0]
     if is_root and len(chain) == 1 and not isinstance(root.solid, Cone | Arc):
         # A trunk bends about its middle, along its longest side. A body without a long side is a rigid hub.
@@ -245,7 +268,9 @@ def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Floats, Floats, 
         match bone.solid:
             case Arc(bow, angle, start, end):
                 t = np.linspace(0.0, 1.0, 12)[:-1]
-                local = np.stack([0.0 * t, bow * (1.0 - np.cos(t * angle)), bow * np.sin(t * angle)], axis=1)
+                local = np.stack(
+                    [0.0 * t, bow * (1.0 - np.cos(t * angle)), bow * np.sin(t * angle)], axis=1
+                )
                 points += list(bone.origin + (bone.frame[None] * local[:, None]).sum(axis=2))
                 radii += list(start + t * (end - start))
                 frames += [bone.frame] * len(t)
@@ -262,7 +287,9 @@ def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Floats, Floats, 
 
 def _limits(bone: Bone, previous: Bone | None, hinged: bool) -> tuple[Floats, Floats]:
     """Limits of raise and swing, radians. A knee that is bent at rest bends further to the same side."""
-    factor, limit = (_ROOT_FACTOR, _ROOT_LIMIT) if previous is None else (_INNER_FACTOR, _INNER_LIMIT)
+    factor, limit = (
+        (_ROOT_FACTOR, _ROOT_LIMIT) if previous is None else (_INNER_FACTOR, _INNER_LIMIT)
+    )
     high = np.radians(np.minimum(factor * np.array(bone.part.bend[:2], dtype=float), limit))
     if hinged:
         high = np.radians(1.4 * np.array(bone.part.bend[:2], dtype=float))

@@ -22,7 +22,14 @@ from scipy.spatial import cKDTree
 from igps._arrays import Floats, Integers
 from igps.mesh import surface
 from igps.shapes.skeleton import Placed
-from training.graded.skinning import IDENTITY, Motions, compose, normalized, rotations_about, transform
+from training.graded.skinning import (
+    IDENTITY,
+    Motions,
+    compose,
+    normalized,
+    rotations_about,
+    transform,
+)
 
 MAX_ELEMENTS = 48
 """Largest number of elements of a rod."""
@@ -57,7 +64,9 @@ class Rod:
     points: Floats  # (n,3) of the centre line
     arc_lengths: Floats  # (n,)
     radii: Floats  # (n,)
-    bending_radii: Floats  # (n,) radii that limit bending: larger where a rigid solid sits on the rod
+    bending_radii: (
+        Floats  # (n,) radii that limit bending: larger where a rigid solid sits on the rod
+    )
     sides: Floats  # (n,3,2) two directions across the rod
     joints: tuple[Joint, ...] = ()
     curl: float = 0.0  # largest curl over the whole length, radians
@@ -91,7 +100,9 @@ def rod_motions(rig: Rig, turns: Sequence[Floats]) -> list[Motions]:
     for rod, turn in zip(rig.rods, turns, strict=True):
         motion = IDENTITY
         if rod.parent >= 0:
-            motion = _interpolated(rig.rods[rod.parent], motions_of_rods[rod.parent], np.array(rod.attachment))
+            motion = _interpolated(
+                rig.rods[rod.parent], motions_of_rods[rod.parent], np.array(rod.attachment)
+            )
         steps = rotations_about(rod.points, turn)
         real, dual = np.empty((len(turn), 4)), np.empty((len(turn), 4))
         for j in range(len(turn)):
@@ -128,7 +139,9 @@ def bind(vertices: Floats, faces: Integers, rig: Rig, placed: Sequence[Placed]) 
     return Binding(weights / weights.sum(axis=1, keepdims=True), arc_lengths)
 
 
-def bend(vertices: Floats, rig: Rig, binding: Binding, motions_of_rods: Sequence[Motions]) -> Floats:
+def bend(
+    vertices: Floats, rig: Rig, binding: Binding, motions_of_rods: Sequence[Motions]
+) -> Floats:
     """Return the vertices (V,3) after the motions of the rods."""
     real, dual = np.zeros((len(vertices), 4)), np.zeros((len(vertices), 4))
     for number, rod in enumerate(rig.rods):
@@ -154,14 +167,19 @@ class Gaps:
         points = np.concatenate([rod.points for rod in rig.rods])
         radii = np.concatenate([rod.radii for rod in rig.rods])
         distance = np.sqrt(((points[:, None] - points[None]) ** 2).sum(axis=2))
-        first, second = np.nonzero(np.triu(distance > _MIN_SEPARATION * (radii[:, None] + radii[None])))
+        first, second = np.nonzero(
+            np.triu(distance > _MIN_SEPARATION * (radii[:, None] + radii[None]))
+        )
         return cls(first, second, radii[first] + radii[second])
 
     def smallest(self, rig: Rig, motions_of_rods: Sequence[Motions]) -> float:
         """Return the smallest gap in a pose: negative if elements overlap, infinite if there are no pairs."""
         pairs = zip(rig.rods, motions_of_rods, strict=True)
         points = np.concatenate([transform(motions, rod.points) for rod, motions in pairs])
-        gap = np.sqrt(((points[self.first] - points[self.second]) ** 2).sum(axis=1)) - self.radius_sums
+        gap = (
+            np.sqrt(((points[self.first] - points[self.second]) ** 2).sum(axis=1))
+            - self.radius_sums
+        )
         return float(gap.min(initial=np.inf))
 
 
@@ -181,7 +199,9 @@ def _interpolated(rod: Rod, motions: Motions, arc_lengths: Floats) -> Motions:
     n_elements = len(rod.arc_lengths)
     if n_elements == 1:
         shape = (*arc_lengths.shape, 4)
-        return Motions(np.broadcast_to(motions.real[0], shape), np.broadcast_to(motions.dual[0], shape))
+        return Motions(
+            np.broadcast_to(motions.real[0], shape), np.broadcast_to(motions.dual[0], shape)
+        )
     position = np.clip(arc_lengths / rod.arc_lengths[1] - 0.5, 0.0, n_elements - 1.0)
     lower = np.minimum(position.astype(np.int64), n_elements - 2)
     share = (position - lower)[..., None]
@@ -195,7 +215,9 @@ def _diffused(vertices: Floats, faces: Integers, values: Floats, width: Floats) 
     edges = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
     squared = np.einsum("fij,fij->fi", edges, edges)
     double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)[:, None]
-    cotangents = (squared.sum(axis=1, keepdims=True) - 2.0 * squared) / (2.0 * np.maximum(double_area, 1e-12))
+    cotangents = (squared.sum(axis=1, keepdims=True) - 2.0 * squared) / (
+        2.0 * np.maximum(double_area, 1e-12)
+    )
     # Weights of edges must be positive, so that no weight of a vertex becomes negative.
     conductance = np.maximum(cotangents, 0.02) * 0.25 * (width[faces] ** 2).mean(axis=1)[:, None]
     i, j = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel()
@@ -203,8 +225,12 @@ def _diffused(vertices: Floats, faces: Integers, values: Floats, width: Floats) 
     off_diagonal = coo_array((conductance.ravel(), (i, j)), shape=(n, n)).tocsc()
     off_diagonal = off_diagonal + off_diagonal.T
     mass = surface.vertex_areas(vertices, faces)
-    matrix = (diags_array(mass + np.asarray(off_diagonal.sum(axis=1)).ravel()) - off_diagonal).tocsc()
-    solver = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+    matrix = (
+        diags_array(mass + np.asarray(off_diagonal.sum(axis=1)).ravel()) - off_diagonal
+    ).tocsc()
+    solver = splu(
+        matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
+    )
     for _ in range(2):
         values = solver.solve(mass[:, None] * values)
     return values

@@ -70,14 +70,22 @@ class Scan:
             edge = np.sqrt(mesh.area / len(mesh.faces))
             steps = self.noise * edge * rng.normal(size=(len(mesh.vertices), 1))
             vertices = mesh.vertices + steps * surface.vertex_normals(mesh.vertices, mesh.faces)
-            mesh = Mesh(vertices, mesh.faces, mesh.name, notes=(*mesh.notes, "noise along the normals"))
+            mesh = Mesh(
+                vertices, mesh.faces, mesh.name, notes=(*mesh.notes, "noise along the normals")
+            )
         if self.is_watertight:
             # Limbs that nearly touch may merge on a coarse grid. In this case the surface is left unchanged.
             closed = watertight(
-                mesh.vertices, mesh.faces, resolution=_RESOLUTION, max_vertices=self.n_vertices, name=mesh.name
+                mesh.vertices,
+                mesh.faces,
+                resolution=_RESOLUTION,
+                max_vertices=self.n_vertices,
+                name=mesh.name,
             )
             if closed.genus == genus:
-                mesh = Mesh(closed.vertices, closed.faces, mesh.name, notes=(*mesh.notes, *closed.notes))
+                mesh = Mesh(
+                    closed.vertices, closed.faces, mesh.name, notes=(*mesh.notes, *closed.notes)
+                )
         if mesh.genus != genus:
             raise MeshError(f"{mesh.name}: expected genus {genus}, got {mesh.genus}.")
         centred = mesh.vertices - mesh.vertices.mean(axis=0)

@@ -24,7 +24,9 @@ from training.graded.scans import Scan
 
 _VERSION = 2  # raised when the same arguments give other meshes
 _MAX_ATTEMPTS = 6
-_KIN, _BODY, _POSE, _INDIVIDUAL, _SIDE = range(10, 15)  # parts of seeds that make random streams independent
+_KIN, _BODY, _POSE, _INDIVIDUAL, _SIDE = range(
+    10, 15
+)  # parts of seeds that make random streams independent
 _N_SIBLINGS = 2  # successive bodies with the same skeleton, which are hard to tell apart
 
 _log = logging.getLogger(__name__)
@@ -89,16 +91,22 @@ class GradedShapes:
         check_at_least(1, n_classes=n_classes, n_bodies=n_bodies, n_poses=n_poses)
         check_at_least(0, seed=seed, n_individuals=n_individuals)
         if not 1500 <= n_vertices[0] <= n_vertices[1]:
-            raise ValueError(f"n_vertices: expected two numbers, the first at least 1500 and no more than the second, "
-                             f"got {n_vertices}.")  # fmt: skip
+            raise ValueError(
+                f"n_vertices: expected two numbers, the first at least 1500 and no more than the second, "
+                f"got {n_vertices}."
+            )
         if asymmetry is not None and not 0 < asymmetry[0] <= asymmetry[1]:
-            raise ValueError(f"asymmetry: expected two positive numbers, the first not larger, got {asymmetry}.")
+            raise ValueError(
+                f"asymmetry: expected two positive numbers, the first not larger, got {asymmetry}."
+            )
         self.n_classes, self.n_bodies, self.n_poses = n_classes, n_bodies, n_poses
         self.seed, self.n_vertices, self.look_alikes = seed, n_vertices, look_alikes
         self.n_individuals, self.asymmetry, self.rigid = n_individuals, asymmetry, rigid
         classes = body_classes(seed, look_alikes)
         if n_classes > len(classes):
-            raise ValueError(f"n_classes: expected at most {len(classes)}, the number of all classes, got {n_classes}.")
+            raise ValueError(
+                f"n_classes: expected at most {len(classes)}, the number of all classes, got {n_classes}."
+            )
         self._classes: list[BodyClass] = classes[:n_classes]
         self._last: tuple[tuple[int, int], Body | ValueError] | None = None
         self._last_individual: tuple[tuple[int, int, int], Body] | None = None
@@ -156,7 +164,9 @@ class GradedShapes:
                 continue
             label = self._classes[body_class].name
             vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-            return GradedShape(vertices, faces, label, body_of(name), name, mesh.genus, scan.motion, mesh.notes)
+            return GradedShape(
+                vertices, faces, label, body_of(name), name, mesh.genus, scan.motion, mesh.notes
+            )
         raise self._failure(name, f"{_MAX_ATTEMPTS} attempts failed, the last with: {reason}")
 
     def pose(self, index: int) -> Pose:
@@ -169,7 +179,9 @@ class GradedShapes:
         scan = Scan.draw(rng, self.n_vertices)
         return draw_pose(self._side(body_class, number, individual_number, pose), rng, scan.target)
 
-    def write(self, root: str | os.PathLike[str], progress: bool = False, n_workers: int | None = 1) -> None:
+    def write(
+        self, root: str | os.PathLike[str], progress: bool = False, n_workers: int | None = 1
+    ) -> None:
         """Write every shape to `root/<class>/<body>/<pose>.off`, except shapes that are already there.
 
         If `igps.SignatureDataset` reads the folder, the labels are the classes, and `body_of` returns the body of a
@@ -203,10 +215,17 @@ class GradedShapes:
             jobs.setdefault(i // (self.n_poses * max(self.n_individuals, 1)), []).append(i)
         failed = []
         with (
-            tqdm(total=len(names), initial=len(names) - len(missing), desc="shapes", unit="shape",
-                 disable=not progress) as bar,
-            contextlib.closing(run(partial(_write, self, folder), list(jobs.values()), n_workers=n_workers)) as results,
-        ):  # fmt: skip
+            tqdm(
+                total=len(names),
+                initial=len(names) - len(missing),
+                desc="shapes",
+                unit="shape",
+                disable=not progress,
+            ) as bar,
+            contextlib.closing(
+                run(partial(_write, self, folder), list(jobs.values()), n_workers=n_workers)
+            ) as results,
+        ):
             for number, outcome in results:
                 bar.update(len(list(jobs.values())[number]))
                 if isinstance(outcome, Failed):
@@ -224,7 +243,9 @@ class GradedShapes:
         """The numbers of the class, body, individual and pose of a shape."""
         position = operator.index(index)
         if not -len(self) <= position < len(self):
-            raise IndexError(f"index: expected an index in [{-len(self)}, {len(self)}), got {index}.")
+            raise IndexError(
+                f"index: expected an index in [{-len(self)}, {len(self)}), got {index}."
+            )
         remainder, pose = divmod(position % len(self), self.n_poses)
         remainder, individual_number = divmod(remainder, max(self.n_individuals, 1))
         body_class, body = divmod(remainder, self.n_bodies)
@@ -236,7 +257,10 @@ class GradedShapes:
             return body
         key = (body_class, number, individual_number)
         if self._last_individual is None or self._last_individual[0] != key:
-            self._last_individual = key, individual(body, np.random.default_rng([self.seed, _INDIVIDUAL, *key]))
+            self._last_individual = (
+                key,
+                individual(body, np.random.default_rng([self.seed, _INDIVIDUAL, *key])),
+            )
         return self._last_individual[1]
 
     def _side(self, body_class: int, number: int, individual_number: int, pose: int) -> Body:
@@ -252,8 +276,12 @@ class GradedShapes:
             kin = [self.seed, _KIN, body_class, number // _N_SIBLINGS]
             drawn: Body | ValueError
             try:
-                drawn = draw_body(self._classes[body_class], kin, [self.seed, _BODY, body_class, number])
-            except ValueError as error:  # also stored, because no other pose of the body can be made either
+                drawn = draw_body(
+                    self._classes[body_class], kin, [self.seed, _BODY, body_class, number]
+                )
+            except (
+                ValueError
+            ) as error:  # also stored, because no other pose of the body can be made either
                 drawn = error
             self._last = (body_class, number), drawn
         if isinstance(self._last[1], ValueError):
@@ -273,8 +301,17 @@ class GradedShapes:
         self.__init__(**state)  # type: ignore[misc]
 
 
-_ARGUMENTS = ("n_classes", "n_bodies", "n_poses", "seed", "n_vertices", "look_alikes", "n_individuals", "asymmetry",
-              "rigid")  # fmt: skip
+_ARGUMENTS = (
+    "n_classes",
+    "n_bodies",
+    "n_poses",
+    "seed",
+    "n_vertices",
+    "look_alikes",
+    "n_individuals",
+    "asymmetry",
+    "rigid",
+)
 
 
 def body_of(name: str) -> str:

@@ -26,7 +26,9 @@ IDENTITY = Motions(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4))
 def rotations_about(centre: Floats, rotation: Floats) -> Motions:
     """Return the rotations by vectors (..., 3), radians, about points (..., 3)."""
     angle = np.sqrt((rotation * rotation).sum(axis=-1, keepdims=True))
-    real = np.concatenate([np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * rotation], axis=-1)
+    real = np.concatenate(
+        [np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * rotation], axis=-1
+    )
     # x ↦ R x + (c − R c).
     return motion(real, centre - _rotated(real, centre))
 
@@ -40,7 +42,8 @@ def motion(real: Floats, translation: Floats) -> Motions:
 def compose(first: Motions, second: Motions) -> Motions:
     """Return the motions that apply `second`, then `first`."""
     return Motions(
-        product(first.real, second.real), product(first.real, second.dual) + product(first.dual, second.real)
+        product(first.real, second.real),
+        product(first.real, second.dual) + product(first.dual, second.real),
     )
 
 

@@ -23,8 +23,10 @@ class Helix(Solid):
         """Return the point of the centre line at a share of its length."""
         angle = 2.0 * np.pi * self.turns * share
         return (
-            self.radius * float(np.cos(angle)), self.radius * float(np.sin(angle)), self.pitch * self.turns * share
-        )  # fmt: skip
+            self.radius * float(np.cos(angle)),
+            self.radius * float(np.sin(angle)),
+            self.pitch * self.turns * share,
+        )
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         slope = self.pitch / (2.0 * np.pi * self.radius)
@@ -34,7 +36,9 @@ class Helix(Solid):
         for step in (-1.0, 0.0, 1.0):  # the nearest turn, and the turns below and above
             turn = here + base + step
             # The nearest point of the helix is shifted along the wire from the point at the same angle.
-            turn = turn + (z - turn * self.pitch) * slope / (1.0 + slope**2) / (2.0 * np.pi * self.radius)
+            turn = turn + (z - turn * self.pitch) * slope / (1.0 + slope**2) / (
+                2.0 * np.pi * self.radius
+            )
             turn = np.clip(turn, 0.0, self.turns)
             angle = 2.0 * np.pi * turn
             gap = (x - self.radius * np.cos(angle)) ** 2 + (y - self.radius * np.sin(angle)) ** 2
@@ -46,10 +50,17 @@ class Helix(Solid):
 
     def box(self) -> tuple[Floats, Floats]:
         wide = self.radius + self.tube
-        return np.array([-wide, -wide, -self.tube]), np.array([wide, wide, self.pitch * self.turns + self.tube])
+        return np.array([-wide, -wide, -self.tube]), np.array(
+            [wide, wide, self.pitch * self.turns + self.tube]
+        )
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Helix(self.radius * length, self.pitch * length, self.turns, min(self.tube * thick, 0.4 * self.pitch))
+        return Helix(
+            self.radius * length,
+            self.pitch * length,
+            self.turns,
+            min(self.tube * thick, 0.4 * self.pitch),
+        )
 
     def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)

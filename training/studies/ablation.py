@@ -57,7 +57,9 @@ def ablate(
         dimensions: rows of the table, by their first word.
     """
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
-    config = layout("oriented", False, False, n_training_samples).requirements.apply_to(igps.SignatureConfig())
+    config = layout("oriented", False, False, n_training_samples).requirements.apply_to(
+        igps.SignatureConfig()
+    )
     print(f"{'dimensions':<14}{'learned':<16}" + "".join(f"{head:>14}" for head in HEADS))
     for name, bins, spectrum in ROWS:
         if name not in dimensions:
@@ -65,23 +67,34 @@ def ablate(
         ft: dict[str, list[float]] = {head: [] for head in HEADS}
         for seed in range(first_seed, first_seed + n_splits):
             seed_everything(seed, verbose=False)
-            data = SignatureDataModule(root, "seen", n_train, 0, split_seed=seed, config=config, cache_dir=cache_dir)
+            data = SignatureDataModule(
+                root, "seen", n_train, 0, split_seed=seed, config=config, cache_dir=cache_dir
+            )
             data.prepare_data()
             descriptor = layout(name, bins, spectrum, n_training_samples)
             if bins or spectrum:
                 train(descriptor, data, n_epochs)
             histograms = describe(data.dataset, descriptor.eval()).flatten(1)
             for head in HEADS:
-                scores = score(histograms, data.dataset.labels, data.split, head, descriptor.part_cells)
+                scores = score(
+                    histograms, data.dataset.labels, data.split, head, descriptor.part_cells
+                )
                 ft[head].append(100 * scores["ft"])
         learned = (
-            " + ".join(part for part, is_learned in (("bins", bins), ("spectrum", spectrum)) if is_learned) or "nothing"
+            " + ".join(
+                part for part, is_learned in (("bins", bins), ("spectrum", spectrum)) if is_learned
+            )
+            or "nothing"
         )
-        cells = "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in ft.values())
+        cells = "".join(
+            f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in ft.values()
+        )
         print(f"{name:<14}{learned:<16}{cells}", flush=True)
 
 
-def layout(dimensions: str, bins: bool, spectrum: bool, n_training_samples: int) -> HistogramDescriptor:
+def layout(
+    dimensions: str, bins: bool, spectrum: bool, n_training_samples: int
+) -> HistogramDescriptor:
     """Return the descriptor of a row.
 
     "interior" has interior distance and potential, "euclidean" adds Euclidean distance, and "oriented" adds angles to
@@ -99,7 +112,9 @@ def layout(dimensions: str, bins: bool, spectrum: bool, n_training_samples: int)
         distances = InteriorDistance(32, learnable=bins), EuclideanDistance(16, learnable=bins)
         parts = [histogram(potential, *distances)]
     if dimensions == "oriented":
-        parts.append(histogram(InteriorDistance(6, 3.0, learnable=bins), PairCosines(5, learnable=bins)))
+        parts.append(
+            histogram(InteriorDistance(6, 3.0, learnable=bins), PairCosines(5, learnable=bins))
+        )
     return HistogramDescriptor(parts)
 
 
@@ -107,7 +122,10 @@ def train(descriptor: HistogramDescriptor, data: SignatureDataModule, n_epochs: 
     """Train bins and filters on the training part, in place."""
     learner = RetrievalLearner(descriptor, BlendedDistance(WhitenedHead(), share=1.0))
     trainer = Trainer(
-        max_epochs=n_epochs, logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        max_epochs=n_epochs,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
         enable_model_summary=False,
-    )  # fmt: skip
+    )
     trainer.fit(learner, data)

@@ -9,7 +9,10 @@ from igps.retrieval import retrieval_scores
 from training.graded import GradedShapes, body_of, individual_of
 from training.studies.generated import N_VERTICES, generated, number_names
 
-_ASYMMETRY = (0.003, 0.012)  # displacements between the two sides of an individual, in units of √area
+_ASYMMETRY = (
+    0.003,
+    0.012,
+)  # displacements between the two sides of an individual, in units of √area
 
 
 def alike(
@@ -36,12 +39,21 @@ def alike(
     """
     for folder, rigid in (("rigid", True), ("posed", False)):
         shapes = GradedShapes(
-            n_bodies, 1, 2, seed, n_vertices=N_VERTICES, n_individuals=n_individuals, asymmetry=_ASYMMETRY, rigid=rigid
+            n_bodies,
+            1,
+            2,
+            seed,
+            n_vertices=N_VERTICES,
+            n_individuals=n_individuals,
+            asymmetry=_ASYMMETRY,
+            rigid=rigid,
         )
         for name in descriptors:
             descriptor = igps.descriptor(name)
             data = generated(shapes, root / folder, descriptor, cache_dir, n_workers)
-            bodies, individuals = (number_names([of(x) for x in data.bodies.names]) for of in (body_of, individual_of))
+            bodies, individuals = (
+                number_names([of(x) for x in data.bodies.names]) for of in (body_of, individual_of)
+            )
             descriptions = describe(data, descriptor, n_workers=n_workers)
             distances = descriptor.distances(descriptions, descriptions)
             distances[bodies[:, None] != bodies] = float("inf")

@@ -56,7 +56,9 @@ def describe_altered(
     return answers
 
 
-def _describe(job: tuple[SignatureDataset, Alteration | None, Sequence[Descriptor]]) -> dict[str, Answer]:
+def _describe(
+    job: tuple[SignatureDataset, Alteration | None, Sequence[Descriptor]],
+) -> dict[str, Answer]:
     """Describe the only mesh of a dataset after an alteration."""
     dataset, alteration, descriptors = job
     if alteration is None:
@@ -70,7 +72,9 @@ def _describe(job: tuple[SignatureDataset, Alteration | None, Sequence[Descripto
             with one_thread(), torch.inference_mode():
                 description = descriptor(batch)[0].numpy()
             is_finite = bool(np.isfinite(description).all())
-            answers[descriptor.name] = description if is_finite else "the description has entries that are not finite."
+            answers[descriptor.name] = (
+                description if is_finite else "the description has entries that are not finite."
+            )
         except ValueError as error:
             answers[descriptor.name] = str(error)
         except Exception as error:  # one descriptor must not stop the others

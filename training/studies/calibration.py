@@ -28,7 +28,14 @@ from training.studies.disturbances import move, remesh, scale, simplified
 from training.studies.generated import generated
 from training.studies.thresholds import quantiles, threshold_at, threshold_between
 
-SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj", "longer": ".off"}
+SUFFIXES = {
+    "triangles": ".off",
+    "half": ".off",
+    "motion": ".ply",
+    "format": ".stl",
+    "all": ".obj",
+    "longer": ".off",
+}
 """Suffixes of the files by alteration. Lengthened bodies are not copies."""
 
 LENGTHENED = 0.02
@@ -80,10 +87,14 @@ def calibrate(
     alterations = [alteration for _, alteration, _ in made]
     is_copy = np.array([x != "longer" for x in alterations])
 
-    described, of_copies = (describe(data, descriptor, n_workers=n_workers) for data in (shapes, copied))
+    described, of_copies = (
+        describe(data, descriptor, n_workers=n_workers) for data in (shapes, copied)
+    )
     with torch.inference_mode():
         distances = descriptor.distances(described, described).numpy()
-        to_copies = descriptor.distances(described[originals], of_copies).diagonal().numpy()[is_copy]
+        to_copies = (
+            descriptor.distances(described[originals], of_copies).diagonal().numpy()[is_copy]
+        )
     i, j = np.triu_indices(len(shapes), 1)
     distances = distances[i, j]
     of_body, of_class = bodies[i] == bodies[j], classes[i] == classes[j]
@@ -99,13 +110,17 @@ def calibrate(
         return [(surfaces, i[k], surfaces, j[k]) for k in np.flatnonzero(chosen)]
 
     def pairs_with_copies(chosen: Booleans) -> list[_Pair]:
-        return [(surfaces, originals[n], surfaces_of_copies, n) for n in np.flatnonzero(chosen).tolist()]
+        return [
+            (surfaces, originals[n], surfaces_of_copies, n) for n in np.flatnonzero(chosen).tolist()
+        ]
 
     # The rate of false pairs is that of the hard ones: other poses of bending bodies, and other bodies of the class
     same = pairs_with_copies(is_copy) + pairs_of_shapes(rigid_poses)
     others = pairs_of_shapes(of_kind["poses"] | of_kind["bodies"])
     longer = pairs_with_copies(~is_copy)
-    of_same, of_others, of_longer = (_surface_distances(pairs, n_workers) for pairs in (same, others, longer))
+    of_same, of_others, of_longer = (
+        _surface_distances(pairs, n_workers) for pairs in (same, others, longer)
+    )
     of_different = np.concatenate([of_others, of_longer])
 
     calibration = Calibration(
@@ -119,10 +134,19 @@ def calibrate(
         near,
         threshold_between(of_same[:, 0], of_different[:, 0], rate),
         threshold_at(of_same[:, 1], of_different[:, 1], rate),
-        threshold_between(np.concatenate([by_kind["copies"], by_kind["poses"]]), by_kind["bodies"], pose_rate),
+        threshold_between(
+            np.concatenate([by_kind["copies"], by_kind["poses"]]), by_kind["bodies"], pose_rate
+        ),
     )
     calibration.save(out)
-    _print(calibration, of_same, of_others, of_longer, [x for x in alterations if x != "longer"], to_copies)
+    _print(
+        calibration,
+        of_same,
+        of_others,
+        of_longer,
+        [x for x in alterations if x != "longer"],
+        to_copies,
+    )
 
 
 def _rigid_classes(shapes: GradedShapes) -> list[str]:
@@ -135,7 +159,9 @@ def _rigid_classes(shapes: GradedShapes) -> list[str]:
     return rigid
 
 
-def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: int) -> list[tuple[int, str, Path]]:
+def _copies(
+    shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: int
+) -> list[tuple[int, str, Path]]:
     """Copy the first pose of bodies: by all alterations at once, by one of them, and lengthened.
 
     Returns:
@@ -144,7 +170,9 @@ def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: in
     first: dict[str, int] = {}
     for i, name in enumerate(shapes.bodies.names):
         first.setdefault(body_of(name), i)
-    chosen = [(body, i) for body, i in sorted(first.items()) if int(body.rsplit("/", 1)[1]) < n_bodies]
+    chosen = [
+        (body, i) for body, i in sorted(first.items()) if int(body.rsplit("/", 1)[1]) < n_bodies
+    ]
     made = []
     for number, (body, i) in enumerate(chosen):
         for alteration in ("all", tuple(SUFFIXES)[number % 4], "longer"):
@@ -165,7 +193,9 @@ def _copy(mesh: Mesh, alteration: str, seed: int) -> Mesh:
     if alteration in ("half", "all"):
         mesh = simplified(mesh, 0.5)
     if alteration in ("motion", "all"):
-        mirrored = replace(mesh, vertices=mesh.vertices * [-1.0, 1.0, 1.0], faces=mesh.faces[:, ::-1])
+        mirrored = replace(
+            mesh, vertices=mesh.vertices * [-1.0, 1.0, 1.0], faces=mesh.faces[:, ::-1]
+        )
         mesh = move(scale(mirrored, math.exp(np.random.default_rng(seed).uniform(-3, 3))), seed)
     return mesh
 
@@ -177,7 +207,9 @@ def _lengthened(mesh: Mesh, seed: int) -> Mesh:
     normal /= np.linalg.norm(normal)
     height = mesh.vertices @ normal
     beyond = height > np.quantile(height, random.uniform(0.3, 0.7))
-    return replace(mesh, vertices=mesh.vertices + np.outer(beyond * LENGTHENED * math.sqrt(mesh.area), normal))
+    return replace(
+        mesh, vertices=mesh.vertices + np.outer(beyond * LENGTHENED * math.sqrt(mesh.area), normal)
+    )
 
 
 class _Measured:
@@ -213,19 +245,32 @@ def _print(
 ) -> None:
     print(calibration.made_of)
     for alteration in SUFFIXES:
-        rows = np.array([k for k, name in enumerate(alterations) if name == alteration], dtype=np.int64)
+        rows = np.array(
+            [k for k, name in enumerate(alterations) if name == alteration], dtype=np.int64
+        )
         if len(rows):
             surfaces, detail = same[rows].max(axis=0)
-            largest = (
-                f"distance ≤ {to_copies[rows].max():.4f}, surfaces ≤ {surfaces:.2%}, {detail:.1f} times coarseness"
-            )
-            print(f"{alteration:>10}: {len(rows)} copies, {largest}")
+            nearest = f"distance ≤ {to_copies[rows].max():.4f}"
+            finest = f"surfaces ≤ {surfaces:.2%}, {detail:.1f} times coarseness"
+            print(f"{alteration:>10}: {len(rows)} copies, {nearest}, {finest}")
     rigid = same[len(alterations) :]
-    for name, distances in (("poses of rigid bodies", rigid), ("others", others), ("longer", longer)):
+    for name, distances in (
+        ("poses of rigid bodies", rigid),
+        ("others", others),
+        ("longer", longer),
+    ):
         for column, unit in enumerate(("of √area", "times coarseness")):
             levels = 0, 0.001, 0.01, 0.1, 0.5, 0.99, 1
-            row = ", ".join(f"{x:.4g}" for x in np.quantile(distances[:, column], levels, method="higher"))
-            print(f"{name}: {len(distances)}, {unit}: smallest, 0.1 %, 1 %, 10 %, 50 %, 99 %, largest: {row}")
+            row = ", ".join(
+                f"{x:.4g}" for x in np.quantile(distances[:, column], levels, method="higher")
+            )
+            print(
+                f"{name}: {len(distances)}, {unit}: smallest, 0.1 %, 1 %, 10 %, 50 %, 99 %, largest: {row}"
+            )
     for kind in KINDS:
-        print(f"{kind:>10}: {calibration.n_pairs[kind]} pairs, median {calibration.distances[kind][11]:.4f}")
-    print(f"near {calibration.near:.4f}\nsame {calibration.same}\ndetail {calibration.detail}\npose {calibration.pose}")
+        print(
+            f"{kind:>10}: {calibration.n_pairs[kind]} pairs, median {calibration.distances[kind][11]:.4f}"
+        )
+    print(
+        f"near {calibration.near:.4f}\nsame {calibration.same}\ndetail {calibration.detail}\npose {calibration.pose}"
+    )

@@ -53,18 +53,31 @@ def classify(
         learner = RetrievalLearner.load_from_checkpoint(checkpoint)
         data = SignatureDataModule.load_from_checkpoint(checkpoint)
         data.prepare_data()
-        histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
+        histograms, labels = (
+            describe(data.dataset, learner.descriptor, progress=True),
+            data.dataset.labels,
+        )
         part_cells = learner.part_cells
         # The validation part was not used to choose anything here
         splits = [Split(data.split.train + data.split.validation, (), data.split.test)]
-    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split, part_cells, prior) for split in splits]
+    accuracy = [
+        100 * _accuracy(histograms.flatten(1), labels, split, part_cells, prior) for split in splits
+    ]
     spread = stdev(accuracy) if len(accuracy) > 1 else 0.0
     print(f"accuracy {mean(accuracy):.1f} ± {spread:.1f} percent over {len(accuracy)} splits")
 
 
 def _accuracy(
-    histograms: Tensor, labels: Tensor, split: Split, part_cells: Sequence[int] | None, prior: Head | None
+    histograms: Tensor,
+    labels: Tensor,
+    split: Split,
+    part_cells: Sequence[int] | None,
+    prior: Head | None,
 ) -> float:
     train, test = torch.tensor(split.train), torch.tensor(split.test)
-    predicted = KernelHead(prior).fit(histograms[train], labels[train], part_cells).predict(histograms[test])
+    predicted = (
+        KernelHead(prior)
+        .fit(histograms[train], labels[train], part_cells)
+        .predict(histograms[test])
+    )
     return float((predicted == labels[test]).float().mean())

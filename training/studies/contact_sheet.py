@@ -11,7 +11,9 @@ from igps.shapes import ArticulatedShapes
 from training.graded import GradedShape, GradedShapes
 
 
-def contact_sheet(shapes: ArticulatedShapes | GradedShapes, path: str | Path, n_shown: int = 1) -> None:
+def contact_sheet(
+    shapes: ArticulatedShapes | GradedShapes, path: str | Path, n_shown: int = 1
+) -> None:
     """Save a picture of the first shapes of every class, all in the same orientation.
 
     Args:
@@ -31,7 +33,9 @@ def contact_sheet(shapes: ArticulatedShapes | GradedShapes, path: str | Path, n_
     columns = min(len(chosen), max(4, math.ceil(math.sqrt(1.6 * len(chosen)))))
     rows = math.ceil(len(chosen) / columns)
     figure = new_figure(1.7 * columns, 1.85 * rows)
-    view = Rotation.from_euler("zx", (-35, -70), degrees=True).as_matrix()  # from the left, in front and above
+    view = Rotation.from_euler(
+        "zx", (-35, -70), degrees=True
+    ).as_matrix()  # from the left, in front and above
     for place, index in enumerate(chosen, 1):
         shape = shapes[index]
         motion = shape.motion if isinstance(shape, GradedShape) else shape.rotation

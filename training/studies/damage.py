@@ -82,7 +82,9 @@ def damage(
         ValueError: the dataset has no classes, or a damage is unknown.
     """
     if dataset.bodies.labels is None:
-        raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
+        raise ValueError(
+            "dataset: expected meshes with classes, got none. Give labels, or a folder per class."
+        )
     names = list(damages or DAMAGES)
     if unknown := [name for name in names if name not in DAMAGES]:
         raise ValueError(f"damages: expected some of {', '.join(DAMAGES)}, got {unknown[0]!r}.")
@@ -90,10 +92,15 @@ def damage(
     alterations: dict[str, Alteration | None] = {
         name: partial(damaged, name, seed, mending, least_vertices) for name in names
     }
-    answers = describe_altered(dataset, {_CLEAN: None, **alterations}, descriptors, n_workers=n_workers)
+    answers = describe_altered(
+        dataset, {_CLEAN: None, **alterations}, descriptors, n_workers=n_workers
+    )
     clean = [row[_CLEAN] for row in answers]
     return {
-        descriptor.name: {name: _result(descriptor, dataset, clean, [row[name] for row in answers]) for name in names}
+        descriptor.name: {
+            name: _result(descriptor, dataset, clean, [row[name] for row in answers])
+            for name in names
+        }
         for descriptor in descriptors
     }
 
@@ -105,7 +112,9 @@ def damaged(name: str, seed: int, mending: Mending, least_vertices: int, mesh: M
         MeshError: the damaged mesh cannot be mended.
     """
     vertices, faces = DAMAGES[name].apply(mesh, seed)
-    return mend(vertices, faces, how=mending, least_vertices=least_vertices, name=f"{mesh.name} ({name})")
+    return mend(
+        vertices, faces, how=mending, least_vertices=least_vertices, name=f"{mesh.name} ({name})"
+    )
 
 
 def _result(
@@ -124,11 +133,15 @@ def _result(
     usable = [i for i, name in enumerate(dataset.bodies.names) if name not in notes]
     if len({labels[i] for i in usable}) == len(usable):  # no query has a relevant mesh
         return DamageResult(len(dataset), {}, {}, notes)
-    gallery, queries = (torch.from_numpy(np.stack([answers[i] for i in usable])) for answers in (before, after))
+    gallery, queries = (
+        torch.from_numpy(np.stack([answers[i] for i in usable])) for answers in (before, after)
+    )
     scores = []
     for descriptions in (queries, gallery):
         with torch.inference_mode(), one_thread():
-            distances = torch.cat([descriptor.distances(row[None], gallery) for row in descriptions])
+            distances = torch.cat(
+                [descriptor.distances(row[None], gallery) for row in descriptions]
+            )
         # A square matrix: each query leaves out the mesh of its own index
         scores.append(retrieval_scores(distances, [labels[i] for i in usable]).mean())
     return DamageResult(len(dataset), scores[0], scores[1], notes)
@@ -144,12 +157,17 @@ def damage_table(results: Mapping[str, Mapping[str, DamageResult]]) -> str:
     notes = []
     for damage_name in damages:
         row = [results[name][damage_name] for name in names]
-        cells = [f"{100 * x.usable:>9.0f}%{100 * x.loss('nn'):>7.1f}{100 * x.loss('ft'):>7.1f}" for x in row]
+        cells = [
+            f"{100 * x.usable:>9.0f}%{100 * x.loss('nn'):>7.1f}{100 * x.loss('ft'):>7.1f}"
+            for x in row
+        ]
         lines.append(f"{damage_name:<{width}}" + "".join(cells))
         for name, result in zip(names, row, strict=True):
             if result.notes:
                 first = next(iter(result.notes.values()))
-                notes.append(f"{name}, {damage_name}: {len(result.notes)} of {result.n_given} missing; {first}")
+                notes.append(
+                    f"{name}, {damage_name}: {len(result.notes)} of {result.n_given} missing; {first}"
+                )
     lines.append(
         "used: share of the damaged meshes that could be described; NN, FT: points lost against the clean meshes"
     )
@@ -189,13 +207,17 @@ def damage_command(
     files = find_bodies(root, labelled=True)
     files = files.subset(range(0, len(files), every))
     dataset, failures = signatures(files, chosen, n_workers=n_workers, **reading)
-    results = damage(dataset, chosen, damages=damages, mending=mend_by, seed=seed, n_workers=n_workers)
+    results = damage(
+        dataset, chosen, damages=damages, mending=mend_by, seed=seed, n_workers=n_workers
+    )
     print(damage_table(results))
     for failure in failures:
         print(f"not used: {failure.error}")
     summary = {
         "damages": {name: kind.description for name, kind in DAMAGES.items()},
-        "results": {name: {key: x.as_dict() for key, x in row.items()} for name, row in results.items()},
+        "results": {
+            name: {key: x.as_dict() for key, x in row.items()} for name, row in results.items()
+        },
         "config": dataset.config.as_dict(),
     }
     if out is not None:

@@ -71,9 +71,13 @@ def halves(mesh: Mesh, seed: int = 0) -> Surface:
     centre = mesh.vertices.mean(axis=0)
     points = mesh.vertices - centre
     axis = np.linalg.eigh(points.T @ points)[1][:, -1]
-    body = manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(points), mesh.faces.astype(np.uint64)))
+    body = manifold3d.Manifold(
+        manifold3d.Mesh64(np.ascontiguousarray(points), mesh.faces.astype(np.uint64))
+    )
     if body.status() != manifold3d.Error.NoError:
-        raise MeshError(f"{mesh.name}: manifold3d does not accept the surface ({body.status()}), so it was not cut.")
+        raise MeshError(
+            f"{mesh.name}: manifold3d does not accept the surface ({body.status()}), so it was not cut."
+        )
     reach = _OVERLAP / 2 * diagonal(mesh.vertices)
     pieces = [body.trim_by_plane(sign * axis, -reach).to_mesh64() for sign in (1, -1)]
     vertices = [np.asarray(piece.vert_properties)[:, :3] + centre for piece in pieces]
@@ -99,12 +103,18 @@ def everything(mesh: Mesh, seed: int = 0) -> Surface:
 
 DAMAGES: Mapping[str, Damage] = {
     "holes": Damage("2 % of the surface missing, in three patches", holes),
-    "soup": Damage("every triangle with its own corners, in single precision, in random order", soup),
+    "soup": Damage(
+        "every triangle with its own corners, in single precision, in random order", soup
+    ),
     "turned": Damage("a third of the faces inside out", turned),
     "fins": Damage("30 triangles that stand on edges, and 1 % of the faces twice", fins),
     "parts": Damage("a ball that floats inside, and a speck outside", parts),
-    "halves": Damage("two closed halves that overlap by 2 % of the diagonal, by manifold3d", halves),
-    "noise": Damage("vertices moved along their normals, standard deviation 0.2 % of the diagonal", noise),
+    "halves": Damage(
+        "two closed halves that overlap by 2 % of the diagonal, by manifold3d", halves
+    ),
+    "noise": Damage(
+        "vertices moved along their normals, standard deviation 0.2 % of the diagonal", noise
+    ),
     "everything": Damage("all of these at once", everything),
 }
 """The damages by name."""
@@ -115,11 +125,15 @@ def _with_holes(vertices: Floats, faces: Integers, generator: np.random.Generato
     per_patch = _MISSING / _N_PATCHES * area.sum()
     pairs, _ = undirected_edges(faces, len(vertices))
     length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
-    graph = sparse.csr_array((np.maximum(length, 1e-300), tuple(pairs.T.astype(np.int32))), shape=(len(vertices),) * 2)
+    graph = sparse.csr_array(
+        (np.maximum(length, 1e-300), tuple(pairs.T.astype(np.int32))), shape=(len(vertices),) * 2
+    )
     is_kept = np.ones(len(faces), dtype=bool)
     for _ in range(_N_PATCHES):
         middle = generator.choice(len(area), p=area * is_kept / (area * is_kept).sum())
-        away = dijkstra(graph, directed=False, indices=faces[middle]).mean(axis=0)[faces].mean(axis=1)
+        away = (
+            dijkstra(graph, directed=False, indices=faces[middle]).mean(axis=0)[faces].mean(axis=1)
+        )
         order = np.argsort(np.where(is_kept, away, np.inf), kind="stable")
         is_kept[order[: max(int((np.cumsum(area[order]) <= per_patch).sum()), 1)]] = False
     return compact(vertices, faces[is_kept])
@@ -148,7 +162,9 @@ def _with_fins(vertices: Floats, faces: Integers, generator: np.random.Generator
     return np.vstack([vertices, tips]), np.vstack([faces, stands, twice])
 
 
-def _with_parts(vertices: Floats, faces: Integers, generator: np.random.Generator, mesh: Mesh) -> Surface:
+def _with_parts(
+    vertices: Floats, faces: Integers, generator: np.random.Generator, mesh: Mesh
+) -> Surface:
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=2)

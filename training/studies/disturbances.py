@@ -69,7 +69,9 @@ def remesh(mesh: Mesh) -> Mesh:
     """
     import igl
 
-    vertices, faces = igl.upsample(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces.astype(np.int32)))
+    vertices, faces = igl.upsample(
+        np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces.astype(np.int32))
+    )
     vertices, faces, *_ = igl.decimate(
         np.asfortranarray(vertices), np.asfortranarray(faces.astype(np.int32)), len(mesh.faces)
     )
@@ -81,7 +83,12 @@ def remesh(mesh: Mesh) -> Mesh:
     _, _, vertices = igl.point_mesh_squared_distance(
         np.asfortranarray(vertices), np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces)
     )
-    return _changed(mesh, vertices, faces, "remeshed: every face cut into four, then the shortest edges collapsed")
+    return _changed(
+        mesh,
+        vertices,
+        faces,
+        "remeshed: every face cut into four, then the shortest edges collapsed",
+    )
 
 
 def hole(mesh: Mesh, share: float = 0.01, seed: int = 0) -> Mesh:
@@ -113,7 +120,9 @@ def hole(mesh: Mesh, share: float = 0.01, seed: int = 0) -> Mesh:
         n_removed //= 2
     lost = 1 - face_areas(mesh.vertices, kept).sum() / area.sum()
     note = f"a hole of {len(mesh.faces) - len(kept)} faces, {lost:.2%} of the area"
-    return replace(mesh, vertices=mesh.vertices[used], faces=faces, allow_open=True, notes=(*mesh.notes, note))
+    return replace(
+        mesh, vertices=mesh.vertices[used], faces=faces, allow_open=True, notes=(*mesh.notes, note)
+    )
 
 
 def clip(mesh: Mesh, share: float = 0.1) -> Mesh:
@@ -140,9 +149,13 @@ def clip(mesh: Mesh, share: float = 0.1) -> Mesh:
     direction = points[np.argmax(distance)] / distance.max()
     along = points @ direction
     cut = along.max() - share * np.ptp(along)
-    body = manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(points), mesh.faces.astype(np.uint64)))
+    body = manifold3d.Manifold(
+        manifold3d.Mesh64(np.ascontiguousarray(points), mesh.faces.astype(np.uint64))
+    )
     if body.status() != manifold3d.Error.NoError:
-        raise MeshError(f"{mesh.name}: manifold3d does not accept the surface ({body.status()}), so it was not cut.")
+        raise MeshError(
+            f"{mesh.name}: manifold3d does not accept the surface ({body.status()}), so it was not cut."
+        )
     pieces = body.trim_by_plane(-direction, -float(cut)).decompose()
     if not pieces:
         raise MeshError(f"{mesh.name}: nothing remains when the farthest {share:.0%} are cut off.")
@@ -171,14 +184,23 @@ def move(mesh: Mesh, seed: int = 0) -> Mesh:
     direction = generator.standard_normal(3)
     centre = mesh.vertices.mean(axis=0)
     offset = 2 * mesh.diagonal * direction / np.linalg.norm(direction)
-    return _changed(mesh, rotation.apply(mesh.vertices - centre) + centre + offset, mesh.faces, "turned and moved")
+    return _changed(
+        mesh,
+        rotation.apply(mesh.vertices - centre) + centre + offset,
+        mesh.faces,
+        "turned and moved",
+    )
 
 
 DISTURBANCES: Mapping[str, Disturbance] = {
-    "noise": Disturbance("vertices moved along their normals, standard deviation 0.5 % of the diagonal", noise),
+    "noise": Disturbance(
+        "vertices moved along their normals, standard deviation 0.5 % of the diagonal", noise
+    ),
     "half": Disturbance("simplified to 50 % of the vertices", partial(simplified, share=0.5)),
     "tenth": Disturbance("simplified to 10 % of the vertices", partial(simplified, share=0.1)),
-    "remesh": Disturbance("each face cut into four, then the shortest edges collapsed to the old number", remesh),
+    "remesh": Disturbance(
+        "each face cut into four, then the shortest edges collapsed to the old number", remesh
+    ),
     "weld": Disturbance("two places that face each other joined by a triangular tube", weld_gap),
     "hole": Disturbance("a patch of 1 % of the area removed", hole),
     "limb": Disturbance("the farthest 10 % of the extent cut off and capped, by manifold3d", clip),

@@ -67,21 +67,36 @@ def explaining(
                 float(roc_auc_score(true, share_density(shares[1], samples, points)))
                 for shares in (explanation.samples, explanation.places or explanation.samples)
             )
-            rows.append({
-                "body": drawn[1].name, "alteration": how, "size": round(size, 4), "descriptor": name,
-                "distance": explanation.distance, "auc": by_place, "auc_of_pairs": by_samples,
-                "told": explanation.summary(),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "body": drawn[1].name,
+                    "alteration": how,
+                    "size": round(size, 4),
+                    "descriptor": name,
+                    "distance": explanation.distance,
+                    "auc": by_place,
+                    "auc_of_pairs": by_samples,
+                    "told": explanation.summary(),
+                }
+            )
             print(rows[-1], flush=True)
         write_analysis(out, "explaining", rows)
     for name in descriptors:
         for how in ("all", *ALTERATIONS):
-            own = [row for row in rows if row["descriptor"] == name and how in ("all", row["alteration"])]
+            own = [
+                row
+                for row in rows
+                if row["descriptor"] == name and how in ("all", row["alteration"])
+            ]
             auc, auc_of_pairs = ([row[column] for row in own] for column in ("auc", "auc_of_pairs"))
-            print(f"{name} {how}: {np.mean(auc):.3f} of {len(auc)}, by pairs alone {np.mean(auc_of_pairs):.3f}")
+            print(
+                f"{name} {how}: {np.mean(auc):.3f} of {len(auc)}, by pairs alone {np.mean(auc_of_pairs):.3f}"
+            )
 
 
-def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tuple[Mesh, Floats, float]:
+def alter(
+    mesh: Mesh, how: str, size: float, random: np.random.Generator
+) -> tuple[Mesh, Floats, float]:
     """Alter a mesh in one place; return it with the centre and the radius of the place.
 
     Args:
@@ -96,14 +111,20 @@ def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tup
     centre, reach = vertices[tip], _REACH * unit
     vectors = area_vectors(vertices, mesh.faces)
     near = np.linalg.norm(vertices[mesh.faces].mean(axis=1) - centre, axis=1) < 0.5 * reach
-    outward = vectors[near].sum(axis=0) if near.any() else vectors[(mesh.faces == tip).any(axis=1)].sum(axis=0)
+    outward = (
+        vectors[near].sum(axis=0)
+        if near.any()
+        else vectors[(mesh.faces == tip).any(axis=1)].sum(axis=0)
+    )
     outward = outward / np.linalg.norm(outward)
     if how == "hole":
         import trimesh
 
         radius = size * unit
         rod = trimesh.creation.cylinder(radius, 2 * unit, transform=_along(outward, centre))
-        cut = trimesh.boolean.difference([trimesh.Trimesh(vertices, mesh.faces, process=False), rod], engine="manifold")
+        cut = trimesh.boolean.difference(
+            [trimesh.Trimesh(vertices, mesh.faces, process=False), rod], engine="manifold"
+        )
         return Mesh(cut.vertices, cut.faces), centre, max(reach, 2 * radius)
     profile = np.clip(1 - (np.linalg.norm(vertices - centre, axis=1) / reach) ** 2, 0, 1) ** 2
     step = (-size if how == "dent" else size) * unit

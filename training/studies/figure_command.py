@@ -15,7 +15,9 @@ from igps.mesh.options import LoadOptions
 from training.studies.paper import pose_curves, potential_slice, weld_change
 
 
-def pose(root: Path, classes: list[str] | None = None, out: Path = Path("pose.png"), **reading: Any) -> dict[str, Any]:
+def pose(
+    root: Path, classes: list[str] | None = None, out: Path = Path("pose.png"), **reading: Any
+) -> dict[str, Any]:
     """Draw the distribution of interior distances of every mesh of some classes (Rustamov 2010, figure 1).
 
     Histograms have one potential class and 64 bins. There is one curve for each mesh, and one colour for each class.
@@ -42,7 +44,9 @@ def pose(root: Path, classes: list[str] | None = None, out: Path = Path("pose.pn
 
     draw_pose_curves(result.curves, result.centres, out)
     width = max(len(name) for name in result.curves)
-    print(f"{'class':<{width}}  meshes  within  to others   median chi-square distance of the curves")
+    print(
+        f"{'class':<{width}}  meshes  within  to others   median chi-square distance of the curves"
+    )
     for name, curves in result.curves.items():
         within, to_others = _median(result.within[name]), _median(result.to_others[name])
         print(f"{name:<{width}}  {len(curves):>6}  {within}  {to_others:>9}")
@@ -53,7 +57,9 @@ def pose(root: Path, classes: list[str] | None = None, out: Path = Path("pose.pn
         name: {
             "n_meshes": len(curves),
             "within": float(np.median(result.within[name])) if result.within[name].size else None,
-            "to_others": float(np.median(result.to_others[name])) if result.to_others[name].size else None,
+            "to_others": float(np.median(result.to_others[name]))
+            if result.to_others[name].size
+            else None,
         }
         for name, curves in result.curves.items()
     }
@@ -85,26 +91,34 @@ def topology(
     if weld is not None and len(weld) != 2:
         raise ValueError(f"weld: expected the indices of two vertices, got {len(weld)}.")
     ends = None if weld is None else (weld[0], weld[1])
-    result = weld_change(load_mesh(mesh, LoadOptions(mend)), ends, n_eigenpairs, resolution, progress=True)
+    result = weld_change(
+        load_mesh(mesh, LoadOptions(mend)), ends, n_eigenpairs, resolution, progress=True
+    )
 
     from training.studies.paper_figures import draw_weld_change
 
     draw_weld_change(result.before, result.after, result.change, out)
     print(result.after.notes[-1])
     print(f"genus {result.before.genus} before, {result.after.genus} after")
-    print(f"{result.n_samples} interior samples, {len(result.change)} pairs, {n_eigenpairs} eigenpairs")
+    print(
+        f"{result.n_samples} interior samples, {len(result.change)} pairs, {n_eigenpairs} eigenpairs"
+    )
     for limit, reported in ((3, "99.6 %"), (10, None), (14, "all")):
         beside = f" (Rustamov 2010, for Homer: {reported})" if reported else ""
         share = 100 * np.mean(result.change < limit / 100)
         print(f"changed by less than {limit:>2} %: {share:.1f} % of the pairs{beside}")
-    print(f"largest change: {100 * result.change.max():.1f} % (Rustamov 2010, for Homer: at most 14 %)")
+    print(
+        f"largest change: {100 * result.change.max():.1f} % (Rustamov 2010, for Homer: at most 14 %)"
+    )
     for when, values in zip(("before", "after"), result.eigenvalues, strict=True):
         print(f"first eigenvalues {when}: " + ", ".join(f"{value:.4g}" for value in values[:3]))
     print(f"written to {out}")
     return {
         "genus": [result.before.genus, result.after.genus],
         "n_samples": result.n_samples,
-        "changed_below": {str(limit / 100): float(np.mean(result.change < limit / 100)) for limit in (3, 10, 14)},
+        "changed_below": {
+            str(limit / 100): float(np.mean(result.change < limit / 100)) for limit in (3, 10, 14)
+        },
         "largest_change": float(result.change.max()),
         "first_eigenvalues": [values[:3].tolist() for values in result.eigenvalues],
     }
@@ -136,7 +150,9 @@ def potential(
     result = potential_slice(body, n_eigenpairs, resolution, progress=True)
     draw_potential_slice(result.axes, result.values, result.section, result.barycentroid, out)
     print(f"{result.n_samples} interior samples, {n_eigenpairs} eigenpairs")
-    print(f"potential {result.least:.4f} at the barycentroid, up to {result.largest:.4f} at the samples")
+    print(
+        f"potential {result.least:.4f} at the barycentroid, up to {result.largest:.4f} at the samples"
+    )
     print(f"written to {out}")
     return {"n_samples": result.n_samples, "least": result.least, "largest": result.largest}
 

@@ -16,18 +16,28 @@ N_VERTICES = (2000, 3600)
 
 
 def generated(
-    shapes: GradedShapes, root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None
+    shapes: GradedShapes,
+    root: Path,
+    descriptor: Descriptor,
+    cache_dir: Path | None,
+    n_workers: int | None,
 ) -> igps.SignatureDataset:
     """Write generated shapes to a folder, unless they exist, and return their dataset; see `usable_shapes`."""
     try:
         shapes.write(root, progress=True, n_workers=n_workers)
-    except ValueError as error:  # no grid resolves the thin parts of a body; the other shapes were written
+    except (
+        ValueError
+    ) as error:  # no grid resolves the thin parts of a body; the other shapes were written
         print(error)
     return usable_shapes(root, descriptor, cache_dir, n_workers)
 
 
 def usable_shapes(
-    root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, names: list[str] | None = None
+    root: Path,
+    descriptor: Descriptor,
+    cache_dir: Path | None,
+    n_workers: int | None,
+    names: list[str] | None = None,
 ) -> igps.SignatureDataset:
     """Return the dataset of the meshes (of `names`, if given) whose signatures can be computed; print failures."""
     data = igps.SignatureDataset(root, descriptor=descriptor, cache_dir=cache_dir)

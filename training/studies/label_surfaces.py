@@ -45,26 +45,46 @@ def solid(kind: str, thickness: float) -> Solid:
         axes = r * (AXES if kind == "ellipsoid" else np.ones(3))
         a, b, c = axes
         area = 4 * np.pi * float(elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2))
-        return Solid(lambda p: np.asarray(((p / axes) ** 2).sum(-1) < 1), axes, 4 / 3 * np.pi * axes.prod(), area)
+        return Solid(
+            lambda p: np.asarray(((p / axes) ** 2).sum(-1) < 1),
+            axes,
+            4 / 3 * np.pi * axes.prod(),
+            area,
+        )
     if kind == "torus":
         ring = RING * r
         return Solid(
             lambda p: (np.hypot(p[..., 0], p[..., 1]) - ring) ** 2 + p[..., 2] ** 2 < r**2,
-            np.array([ring + r, ring + r, r]), 2 * np.pi**2 * ring * r**2, 4 * np.pi**2 * ring * r, 1,
-        )  # fmt: skip
+            np.array([ring + r, ring + r, r]),
+            2 * np.pi**2 * ring * r**2,
+            4 * np.pi**2 * ring * r,
+            1,
+        )
     if kind == "capsule":
         return Solid(
-            lambda p: np.hypot(p[..., 0], p[..., 1]) ** 2 + np.maximum(abs(p[..., 2]) - 2 * r, 0) ** 2 < r**2,
-            np.array([r, r, 3 * r]), (4 + 4 / 3) * np.pi * r**3, (8 + 4) * np.pi * r**2,
-        )  # fmt: skip
+            lambda p: (
+                np.hypot(p[..., 0], p[..., 1]) ** 2 + np.maximum(abs(p[..., 2]) - 2 * r, 0) ** 2
+                < r**2
+            ),
+            np.array([r, r, 3 * r]),
+            (4 + 4 / 3) * np.pi * r**3,
+            (8 + 4) * np.pi * r**2,
+        )
     if kind == "rod":
         return Solid(
             lambda p: (np.hypot(p[..., 0], p[..., 1]) < r) & (abs(p[..., 2]) < 4 * r),
-            np.array([r, r, 4 * r]), 8 * np.pi * r**3, 18 * np.pi * r**2,
-        )  # fmt: skip
+            np.array([r, r, 4 * r]),
+            8 * np.pi * r**3,
+            18 * np.pi * r**2,
+        )
     half = r * SIDES
     a, b, c = half
-    return Solid(lambda p: np.asarray((abs(p) < half).all(-1)), half, 8 * a * b * c, 8 * (a * b + b * c + a * c))
+    return Solid(
+        lambda p: np.asarray((abs(p) < half).all(-1)),
+        half,
+        8 * a * b * c,
+        8 * (a * b + b * c + a * c),
+    )
 
 
 def exact_mesh(kind: str, thickness: float) -> Mesh:
@@ -82,7 +102,9 @@ def exact_mesh(kind: str, thickness: float) -> Mesh:
         if kind == "rod":
             end = np.concatenate([np.stack([np.linspace(0, r, 12), np.full(12, 4 * r)], 1)])
         side = np.stack([np.full(58, r), np.linspace(end[-1, 1], -end[-1, 1], 60)[1:-1]], 1)
-        surface = trimesh.creation.revolve(np.concatenate([end, side, end[::-1] * [1, -1]]), sections=48)
+        surface = trimesh.creation.revolve(
+            np.concatenate([end, side, end[::-1] * [1, -1]]), sections=48
+        )
     else:
         surface = trimesh.creation.icosphere(subdivisions=4)
         surface.vertices *= r * (AXES if kind == "ellipsoid" else np.ones(3))
@@ -112,7 +134,9 @@ class Measured:
     length: float  # longest side of the voxels
     volume: float  # relative error, signed
     area: float  # relative error, signed
-    distances: dict[str, float]  # to the description of the exact mesh, over the median distance between two kinds
+    distances: dict[
+        str, float
+    ]  # to the description of the exact mesh, over the median distance between two kinds
 
 
 def measure(
@@ -132,7 +156,9 @@ def measure(
         seed: seed of rotations and positions.
     """
     modules = {name: descriptor(name) for name in descriptors}
-    config = reduce(or_, (x.requirements for x in modules.values()), Requirements()).apply_to(SignatureConfig())
+    config = reduce(or_, (x.requirements for x in modules.values()), Requirements()).apply_to(
+        SignatureConfig()
+    )
 
     def described(mesh: Mesh) -> dict[str, torch.Tensor]:
         batch = collate([compute_signature(mesh, config)])
@@ -142,7 +168,12 @@ def measure(
     exact = {kind: described(exact_mesh(kind, 1.0)) for kind in KINDS} if modules else {}
     between = {
         name: float(
-            np.median([float(module.distances(exact[a][name], exact[b][name])) for a, b in combinations(KINDS, 2)])
+            np.median(
+                [
+                    float(module.distances(exact[a][name], exact[b][name]))
+                    for a, b in combinations(KINDS, 2)
+                ]
+            )
         )
         for name, module in modules.items()
     }
@@ -152,11 +183,14 @@ def measure(
             for length in lengths:
                 for _ in range(n_turns):
                     body = solid(kind, size * length)
-                    mask, affine = voxels(body, np.diag(rng.permutation([1, 1, length])).astype(float), rng)
+                    mask, affine = voxels(
+                        body, np.diag(rng.permutation([1, 1, length])).astype(float), rng
+                    )
                     mesh = Mesh(*voxel_surface(mask, affine)[:2], name=kind)
                     descriptions = described(mesh) if modules else {}
                     distances = {
-                        name: float(module.distances(descriptions[name], exact[kind][name])) / between[name]
+                        name: float(module.distances(descriptions[name], exact[kind][name]))
+                        / between[name]
                         for name, module in modules.items()
                     }
                     volume, area = mesh.volume / body.volume - 1, mesh.area / body.area - 1
@@ -182,6 +216,7 @@ def surfaces(n_turns: int = 1, descriptors: list[str] | None = None) -> None:
                 for name in ("volume", "area")
             ]
             columns += [
-                f"{name} {100 * np.median([row.distances[name] for row in rows]):.1f}" for name in rows[0].distances
+                f"{name} {100 * np.median([row.distances[name] for row in rows]):.1f}"
+                for name in rows[0].distances
             ]
             print(f"{sizes} voxels, {kind}: {', '.join(columns)}", flush=True)

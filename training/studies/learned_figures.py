@@ -31,7 +31,14 @@ def learned_layout(descriptor: HistogramDescriptor, path: str | Path) -> None:
             panels[0].set_axis_off()
         for panel, (title, bins) in zip(panels[1:], centres.items(), strict=False):
             panel.plot(bins.start, bins.start, color="#888888", linestyle="--", label="start")
-            panel.plot(bins.start, bins().detach(), color="#D55E00", marker=".", markersize=3, label="learned")
+            panel.plot(
+                bins.start,
+                bins().detach(),
+                color="#D55E00",
+                marker=".",
+                markersize=3,
+                label="learned",
+            )
             panel.set(xlabel="centre at the start", ylabel="centre", title=title)
             panel.legend(frameon=False)
         for panel in panels[1 + len(centres) :]:
@@ -45,7 +52,9 @@ def _filter(panel: Any, embedding: SpectralEmbedding) -> None:
     start = spectral_weights(x, area, embedding.kind, embedding.time)
     panel.loglog(x, start, color="#888888", linestyle="--", label="start")
     panel.loglog(x, embedding.weights(x, area).detach(), color="#0072B2", label="learned")
-    panel.set(xlabel="eigenvalue × area", ylabel="weight of the eigenfunction g", title="spectral filter")
+    panel.set(
+        xlabel="eigenvalue × area", ylabel="weight of the eigenfunction g", title="spectral filter"
+    )
     panel.legend(frameon=False)
 
 

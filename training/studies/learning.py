@@ -25,7 +25,10 @@ from igps.retrieval import chi_square, retrieval_scores
 from training.studies.learned_figures import learned_layout
 
 Row = Literal["none", "prior", "whitened", "kernel"]
-FITTED: dict[str, type[WhitenedHead | KernelHead]] = {"whitened": WhitenedHead, "kernel": KernelHead}
+FITTED: dict[str, type[WhitenedHead | KernelHead]] = {
+    "whitened": WhitenedHead,
+    "kernel": KernelHead,
+}
 COLUMNS = {"ft": "FT", "nn": "NN", "dcg": "DCG", "st": "ST", "adr": "ADR", "map": "mAP"}
 
 
@@ -56,7 +59,9 @@ def splits(
     dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=module)
     dataset.precompute(strict=True)
     histograms, labels = describe(dataset, module, progress=True).flatten(1), dataset.labels
-    print(f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent")
+    print(
+        f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent"
+    )
     print(f"{'head':<10}" + "".join(f"{title:>14}" for title in COLUMNS.values()))
     rows: list[dict[str, Any]] = []
     for head in ("none", "prior", "whitened", "kernel"):
@@ -67,8 +72,16 @@ def splits(
             split = (split_seen if protocol == "seen" else split_unseen)(labels, n_train, seed=seed)
             results.append(score(histograms, labels, split, head, cells, prior))
         values = {name: [result[name] for result in results] for name in COLUMNS}
-        columns = {name: {"mean": mean(v), "stdev": stdev(v) if n_splits > 1 else 0.0} for name, v in values.items()}
-        print(f"{head:<10}" + "".join(f"{100 * v['mean']:>8.1f} ± {100 * v['stdev']:>3.1f}" for v in columns.values()))
+        columns = {
+            name: {"mean": mean(v), "stdev": stdev(v) if n_splits > 1 else 0.0}
+            for name, v in values.items()
+        }
+        print(
+            f"{head:<10}"
+            + "".join(
+                f"{100 * v['mean']:>8.1f} ± {100 * v['stdev']:>3.1f}" for v in columns.values()
+            )
+        )
         rows.append({"descriptor": descriptor, "protocol": protocol, "head": head, **columns})
     if out is not None:
         earlier = json.loads(out.read_text()) if out.exists() else []
@@ -119,13 +132,19 @@ def fitted(
     dataset.precompute(strict=True)
     goals: tuple[Goal, ...] = ("known", "new")
     for goal in goals:
-        rows = [_fitted(dataset, descriptor, goal, n_train, first_seed + i) for i in range(n_splits)]
+        rows = [
+            _fitted(dataset, descriptor, goal, n_train, first_seed + i) for i in range(n_splits)
+        ]
         for name in rows[0]:
             values = [100 * row[name] for row in rows]
-            print(f"{goal:<6}{name:<18}{mean(values):>6.1f} ± {stdev(values) if n_splits > 1 else 0:.1f}")
+            print(
+                f"{goal:<6}{name:<18}{mean(values):>6.1f} ± {stdev(values) if n_splits > 1 else 0:.1f}"
+            )
 
 
-def _fitted(dataset: igps.SignatureDataset, descriptor: str, goal: Goal, n_train: int, seed: int) -> dict[str, float]:
+def _fitted(
+    dataset: igps.SignatureDataset, descriptor: str, goal: Goal, n_train: int, seed: int
+) -> dict[str, float]:
     split = (split_seen if goal == "known" else split_unseen)(dataset.labels, n_train, seed=seed)
     train, test = dataset.subset(split.train), dataset.subset(split.test)
     model = fit(train, descriptor, goal=goal)
@@ -137,7 +156,9 @@ def _fitted(dataset: igps.SignatureDataset, descriptor: str, goal: Goal, n_train
     probabilities, labels = classify(test, model).probabilities, test.labels
     result["accuracy"] = float((probabilities.argmax(dim=1) == labels).float().mean())
     n_classes = probabilities.shape[1]
-    result["calibration_error"] = float(multiclass_calibration_error(probabilities, labels, n_classes, 10))
+    result["calibration_error"] = float(
+        multiclass_calibration_error(probabilities, labels, n_classes, 10)
+    )
     areas = []
     for label in labels.unique():
         others = train.subset(torch.nonzero(train.labels != label).flatten().tolist())
@@ -149,7 +170,9 @@ def _fitted(dataset: igps.SignatureDataset, descriptor: str, goal: Goal, n_train
 def _classifier(dataset: igps.SignatureDataset, descriptor: str) -> EmbeddedDescriptor:
     base, prior = split_head(descriptor)
     histograms = describe(dataset, base, cache_tag=cache_tag(base)).flatten(1)
-    head = ClassifierHead(prior).fit(histograms, dataset.labels, part_cells_of(base), calibrate=False)
+    head = ClassifierHead(prior).fit(
+        histograms, dataset.labels, part_cells_of(base), calibrate=False
+    )
     return EmbeddedDescriptor(base, head)
 
 
@@ -171,7 +194,10 @@ def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:
     learner = RetrievalLearner.load_from_checkpoint(path).eval()
     data = SignatureDataModule.load_from_checkpoint(path)
     data.prepare_data()
-    histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
+    histograms, labels = (
+        describe(data.dataset, learner.descriptor, progress=True),
+        data.dataset.labels,
+    )
     test = torch.tensor(data.split.test)
     part = histograms[test]
     results = {"plain": retrieval_scores(learner.distance.plain(part, part), labels[test]).mean()}

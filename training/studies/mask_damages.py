@@ -27,8 +27,13 @@ def damaged(
         lowest, highest = positions[:, 2].min(), positions[:, 2].max()
         mask = mask & (grid[..., 2] <= highest - 0.25 * (highest - lowest))
     if how == "hole":
-        deepest = np.argwhere((depth := distance_transform_edt(mask, spacing)) == depth.max())[0] * spacing
-        across = ((grid - deepest)[..., :2] ** 2).sum(axis=-1) <= max(0.25 * radius, 1.01 * spacing.max()) ** 2
+        deepest = (
+            np.argwhere((depth := distance_transform_edt(mask, spacing)) == depth.max())[0]
+            * spacing
+        )
+        across = ((grid - deepest)[..., :2] ** 2).sum(axis=-1) <= max(
+            0.25 * radius, 1.01 * spacing.max()
+        ) ** 2
         mask = mask & ~across
     if how == "leak":
         mask = mask | ball(_on_skin(mask, spacing, random, others[box]), 0.6)
@@ -49,7 +54,10 @@ def varied(
     if how == "label":
         return whole, spacing
     if how == "blocks":  # resampled to a grid twice as coarse and back
-        first = [(np.arange(n) + k) // 2 * 2 - k for n, k in zip(whole.shape, random.integers(0, 2, 3), strict=True)]
+        first = [
+            (np.arange(n) + k) // 2 * 2 - k
+            for n, k in zip(whole.shape, random.integers(0, 2, 3), strict=True)
+        ]
         return whole[np.ix_(*(np.maximum(index, 0) for index in first))], spacing
     box, mask, grid, ball = _surroundings(whole, spacing)
     depth = distance_transform_edt(mask, spacing)
@@ -61,7 +69,9 @@ def varied(
         mask = mask & (along <= highest - size * (highest - lowest))
     if how == "tunnel":
         direction = random.normal(size=3)
-        across = np.linalg.norm(np.cross(grid - middle, direction / np.linalg.norm(direction)), axis=-1)
+        across = np.linalg.norm(
+            np.cross(grid - middle, direction / np.linalg.norm(direction)), axis=-1
+        )
         mask = mask & (across > max(size * _radius(mask, spacing), 1.01 * spacing.max()))
     if how == "cavity":
         mask = mask & ~(ball(middle, size) & (depth > 1.01 * spacing.min()))
@@ -69,7 +79,10 @@ def varied(
         nearby = others[box] if random.random() < 0.5 else np.zeros_like(mask)
         middle, radius = _on_skin(mask, spacing, random, nearby), _radius(mask, spacing)
         for _ in range(3):
-            mask, middle = mask | ball(middle, random.uniform(0.3, 0.5)), middle + random.normal(size=3) * 0.2 * radius
+            mask, middle = (
+                mask | ball(middle, random.uniform(0.3, 0.5)),
+                middle + random.normal(size=3) * 0.2 * radius,
+            )
     if how == "island":
         outside = grid[~binary_dilation(mask, iterations=2)]
         mask = mask | ball(outside[random.integers(len(outside))], size)
@@ -98,13 +111,17 @@ def _surroundings(
     grid = np.stack(np.meshgrid(*map(np.arange, mask.shape), indexing="ij"), axis=-1) * spacing
 
     def ball(middle: Floats, size: float) -> Booleans:
-        inside: Booleans = ((grid - middle) ** 2).sum(axis=-1) <= max(size * radius, 1.01 * spacing.max()) ** 2
+        inside: Booleans = ((grid - middle) ** 2).sum(axis=-1) <= max(
+            size * radius, 1.01 * spacing.max()
+        ) ** 2
         return inside
 
     return box, mask, grid, ball
 
 
-def _on_skin(mask: Booleans, spacing: Floats, random: np.random.Generator, others: Booleans) -> Floats:
+def _on_skin(
+    mask: Booleans, spacing: Floats, random: np.random.Generator, others: Booleans
+) -> Floats:
     """Return the position of a random border voxel, if possible near another body."""
     from scipy.ndimage import binary_erosion, distance_transform_edt
 

@@ -49,13 +49,17 @@ def outlying(
         for other, (near, _) in masks.items():
             if other != name and near.shape == mask.shape:
                 others |= near
-        paths.append(_write(out / f"{i}_damaged.nii.gz", *damage_of(mask, spacing, damage, random, others)))
+        paths.append(
+            _write(out / f"{i}_damaged.nii.gz", *damage_of(mask, spacing, damage, random, others))
+        )
     chosen = descriptor_of("pretrained")
     all_masks = SignatureDataset(paths, descriptor=chosen, cache_dir=cache_dir, labels=2 * labels)
     failures = all_masks.precompute()
     failed = {failure.id for failure in failures}
     dataset = all_masks.usable(failures)
-    usable = [path for path, name in zip(paths, all_masks.bodies.names, strict=True) if name not in failed]
+    usable = [
+        path for path, name in zip(paths, all_masks.bodies.names, strict=True) if name not in failed
+    ]
     index = {path: i for i, path in enumerate(usable)}
     described = describe(dataset, chosen, progress=True)
     distances = squared_distances(chosen.coordinates(described).double().numpy()) ** 0.5
@@ -76,13 +80,33 @@ def outlying(
     for n, i in enumerate(undamaged):
         path = paths[len(names) + i]
         if path not in index:
-            rows.append({"mask": names[i], "damage": damages[i], "score": 99.0, "reason": "refused by the reader"})
+            rows.append(
+                {
+                    "mask": names[i],
+                    "damage": damages[i],
+                    "score": 99.0,
+                    "reason": "refused by the reader",
+                }
+            )
             continue
         label = classes[n]
         if damages[i] == "label":
-            label = str(random.choice([x for x in sorted(set(classes)) if x != label and classes.count(x) > 1]))
-        outlier = scored([*files[:n], path, *files[n + 1 :]], [*classes[:n], label, *classes[n + 1 :]])[n]
-        rows.append({"mask": names[i], "damage": damages[i], "score": outlier.score, "reason": outlier.reason})
+            label = str(
+                random.choice(
+                    [x for x in sorted(set(classes)) if x != label and classes.count(x) > 1]
+                )
+            )
+        outlier = scored(
+            [*files[:n], path, *files[n + 1 :]], [*classes[:n], label, *classes[n + 1 :]]
+        )[n]
+        rows.append(
+            {
+                "mask": names[i],
+                "damage": damages[i],
+                "score": outlier.score,
+                "reason": outlier.reason,
+            }
+        )
     write_analysis(out, "outlying", rows)
     print(json.dumps(areas(rows), indent=2))
 
@@ -94,7 +118,9 @@ def areas(rows: Sequence[dict[str, object]]) -> dict[str, float]:
     result = {}
     for damage in ("all", *sorted({str(row["damage"]) for row in rows} - {"none"})):
         own = [row for row in rows if damage == "all" or row["damage"] in ("none", damage)]
-        result[damage] = float(roc_auc_score([row["damage"] != "none" for row in own], [row["score"] for row in own]))
+        result[damage] = float(
+            roc_auc_score([row["damage"] != "none" for row in own], [row["score"] for row in own])
+        )
     return result
 
 
@@ -118,7 +144,10 @@ def _read_masks(volumes: Path) -> dict[str, tuple[Booleans, Floats]]:
             continue
         name = path.name.removesuffix(".nii.gz")
         kind = re.sub(r"_(left|right)|_?[CTL]?\d+$", "", name)
-        masks[f"{kind}/{name}"] = (mask.squeeze(), np.array(image.header.get_zooms()[:3], dtype=float))
+        masks[f"{kind}/{name}"] = (
+            mask.squeeze(),
+            np.array(image.header.get_zooms()[:3], dtype=float),
+        )
     return masks
 
 
@@ -157,7 +186,9 @@ def generated(seed: int = 0) -> dict[str, tuple[Booleans, Floats]]:
                 own = own if sign == 1 else own * [-1, 1, 1] + [room[0], 0, 0]
                 drawn.append((f"pair{number}/{name}", own, radii * random.normal(1, 0.05)))
         else:
-            drawn.append((f"single{number}/single", curve + random.uniform(0.15, 0.85, 3) * room, radii))
+            drawn.append(
+                (f"single{number}/single", curve + random.uniform(0.15, 0.85, 3) * room, radii)
+            )
     for name, curve, radii in drawn:
         mask = _tube(curve, radii, spacing, random, ~taken)
         taken |= mask
@@ -169,15 +200,25 @@ def generated(seed: int = 0) -> dict[str, tuple[Booleans, Floats]]:
         own = _jittered(curve * random.normal(1, 0.2, 3), random) + 36
         flat = np.array([1.2, 1.2, 4.0])
         free = np.ones((60, 60, 18), dtype=bool)
-        masks[f"many/many{number}"] = (_tube(own, radii * random.normal(1, 0.12), flat, random, free), flat)
+        masks[f"many/many{number}"] = (
+            _tube(own, radii * random.normal(1, 0.12), flat, random, free),
+            flat,
+        )
     return masks
 
 
 def _curve(random: np.random.Generator) -> tuple[Floats, Floats]:
     """Draw a smooth curve of random length around the origin, and the radii of balls along it."""
     t, size = np.linspace(0, 1, 60), np.exp(random.uniform(np.log(25), np.log(170)))
-    waves = sum(random.normal(0, 0.5 / k**2, (3, 1)) * np.cos(np.pi * k * t + random.uniform(0, 6)) for k in (1, 2, 3))
-    radius = size * np.exp(random.uniform(np.log(0.08), np.log(0.4))) * (1 + 0.3 * np.sin(6 * t + random.uniform(0, 6)))
+    waves = sum(
+        random.normal(0, 0.5 / k**2, (3, 1)) * np.cos(np.pi * k * t + random.uniform(0, 6))
+        for k in (1, 2, 3)
+    )
+    radius = (
+        size
+        * np.exp(random.uniform(np.log(0.08), np.log(0.4)))
+        * (1 + 0.3 * np.sin(6 * t + random.uniform(0, 6)))
+    )
     return size * np.asarray(waves).T, np.maximum(radius * (1 - np.abs(2 * t - 1) ** 6) ** 0.5, 4.0)
 
 
@@ -187,7 +228,9 @@ def _jittered(points: Floats, random: np.random.Generator) -> Floats:
     return moved
 
 
-def _tube(curve: Floats, radii: Floats, spacing: Floats, random: np.random.Generator, free: Booleans) -> Booleans:
+def _tube(
+    curve: Floats, radii: Floats, spacing: Floats, random: np.random.Generator, free: Booleans
+) -> Booleans:
     """Return the largest piece of free voxels in balls along a curve, with a border as rough as in segmentations."""
     from scipy.ndimage import gaussian_filter, label
 
@@ -199,7 +242,10 @@ def _tube(curve: Floats, radii: Floats, spacing: Floats, random: np.random.Gener
         return mask
     away = np.full(high - low, np.inf)
     for centre, radius in zip(curve, radii, strict=True):
-        first, last = (np.clip((centre + sign * (radius + 6)) / spacing, low, high).astype(int) for sign in (-1, 1))
+        first, last = (
+            np.clip((centre + sign * (radius + 6)) / spacing, low, high).astype(int)
+            for sign in (-1, 1)
+        )
         near = tuple(map(slice, first - low, last - low + 1))
         grid = np.meshgrid(*map(np.arange, first, np.minimum(last + 1, high)), indexing="ij")
         ball = np.linalg.norm(np.stack(grid, axis=-1) * spacing - centre, axis=-1) - radius

@@ -26,7 +26,11 @@ def scores(source: Path) -> Table:
     """Read the results of `igps compare --out`: a row for each descriptor, scores in percent."""
     columns = ("nn", "ft", "st", "dcg", "adr_self", "map")
     rows = [
-        [f"`{row['descriptor']}`", *(_percent(row[name]) for name in columns), f"{row['seconds_per_mesh']:.2f}"]
+        [
+            f"`{row['descriptor']}`",
+            *(_percent(row[name]) for name in columns),
+            f"{row['seconds_per_mesh']:.2f}",
+        ]
         for row in _read(source, "compare.json")
     ]
     return ["descriptor", *(TITLES[name] for name in columns), "s/body"], rows
@@ -36,7 +40,11 @@ def splits(source: Path) -> Table:
     """Read the results of `python -m training.evaluate splits --out`: a row for each head, mean and deviation."""
     results = _read(source, "splits.json")
     rows = [
-        [f"{row['descriptor']}, {row['protocol']}", row["head"], *(_spread(row[name]) for name in ("ft", "nn", "dcg"))]
+        [
+            f"{row['descriptor']}, {row['protocol']}",
+            row["head"],
+            *(_spread(row[name]) for name in ("ft", "nn", "dcg")),
+        ]
         for row in results
     ]
     return ["descriptor, classes", "head", "FT", "NN", "DCG"], rows
@@ -71,7 +79,9 @@ def record(name: str, kind: str, source: Path, command: str) -> None:
         "rows": rows,
     }
     RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / f"{name}.json").write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (RESULTS / f"{name}.json").write_text(
+        json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
     write_pages()
 
 
@@ -103,10 +113,13 @@ def load_results(name: str) -> dict[str, Any]:
 def markdown(name: str) -> str:
     """Format the table of a name, followed by a line about its origin."""
     results = load_results(name)
-    lines = [_row(results["columns"]), _row(["---"] * len(results["columns"])), *map(_row, results["rows"])]
-    origin = (
-        f"version {results['version']}, signatures {results['signatures']}, {results['date']}, {results['processor']}"
-    )
+    lines = [
+        _row(results["columns"]),
+        _row(["---"] * len(results["columns"])),
+        *map(_row, results["rows"]),
+    ]
+    code = f"version {results['version']}, signatures {results['signatures']}"
+    origin = f"{code}, {results['date']}, {results['processor']}"
     return "\n".join([*lines, "", *wrap(f"`{results['command']}`: {origin}.", _WIDTH)]) + "\n"
 
 
@@ -128,7 +141,11 @@ def _read(source: Path, name: str) -> Any:
 
 def _processor() -> str:
     try:
-        names = re.findall(r"^model name\s*:\s*(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        names = re.findall(
+            r"^model name\s*:\s*(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE
+        )
     except OSError:
         names = []
-    return f"{len(names)} cores of {names[0]}" if names else platform.processor() or platform.machine()
+    return (
+        f"{len(names)} cores of {names[0]}" if names else platform.processor() or platform.machine()
+    )

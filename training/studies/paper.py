@@ -37,7 +37,9 @@ class PoseCurves:
     curves: dict[str, Singles]  # by class, (N, B) histograms of one potential class
     centres: Singles  # (B,) centres of the bins
     within: dict[str, Singles]  # by class, χ² distances between its meshes
-    to_others: dict[str, Singles]  # by class, χ² distances from its meshes to those of other classes
+    to_others: dict[
+        str, Singles
+    ]  # by class, χ² distances from its meshes to those of other classes
 
 
 def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int = 64) -> PoseCurves:
@@ -57,7 +59,10 @@ def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int =
     return PoseCurves(
         curves={name: histograms[torch.from_numpy(own)].numpy() for name, own in members.items()},
         centres=axis.centres.start.numpy(),
-        within={name: distances[np.ix_(own, own)][~np.eye(own.sum(), dtype=bool)] for name, own in members.items()},
+        within={
+            name: distances[np.ix_(own, own)][~np.eye(own.sum(), dtype=bool)]
+            for name, own in members.items()
+        },
         to_others={name: distances[np.ix_(own, ~own)].ravel() for name, own in members.items()},
     )
 
@@ -100,7 +105,9 @@ def weld_change(
         points = interior_samples(body, resolution)
         bar.update()
         if len(points) < 2:
-            raise ValueError(f"resolution: expected two interior samples of {body.name}, got {len(points)}. Raise it.")
+            raise ValueError(
+                f"resolution: expected two interior samples of {body.name}, got {len(points)}. Raise it."
+            )
         eigenvalues, distances = [], []
         for mesh in (body, after):
             spectrum = _spectrum(mesh, n_eigenpairs)
@@ -174,7 +181,9 @@ def _spectrum(mesh: Mesh, n_eigenpairs: int) -> Spectrum:
 def _embedding(mesh: Mesh, spectrum: Spectrum) -> Extension:
     """Return the commute-time embedding: a function from points (P, 3) in the body to (P, K)."""
     roots = np.sqrt(spectrum.eigenvalues)
-    return Extension(mesh.vertices, mesh.faces, spectrum.eigenfunctions, divisors=roots, accuracy=1e-3)
+    return Extension(
+        mesh.vertices, mesh.faces, spectrum.eigenfunctions, divisors=roots, accuracy=1e-3
+    )
 
 
 def _grid_around(mesh: Mesh, point: Floats, reach: float) -> Floats:
@@ -187,5 +196,7 @@ def _grid_around(mesh: Mesh, point: Floats, reach: float) -> Floats:
 def _section(mesh: Mesh, height: float) -> Floats:
     """Return the segments (S, 2, 2) in which the plane z = height cuts the surface."""
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    segments = trimesh.intersections.mesh_plane(surface, plane_normal=[0, 0, 1], plane_origin=[0, 0, height])
+    segments = trimesh.intersections.mesh_plane(
+        surface, plane_normal=[0, 0, 1], plane_origin=[0, 0, height]
+    )
     return np.asarray(segments)[:, :, :2]

@@ -26,7 +26,9 @@ _DPI = 100
 _REPORTED = ((3, "99.6 %"), (14, "all"))
 
 
-def draw_pose_curves(histograms: Mapping[str, NDArray[np.floating]], centres: NDArray[np.floating], out: Path) -> None:
+def draw_pose_curves(
+    histograms: Mapping[str, NDArray[np.floating]], centres: NDArray[np.floating], out: Path
+) -> None:
     """Draw the distributions of interior distances: a curve for each body, a colour for each class.
 
     Args:
@@ -38,7 +40,14 @@ def draw_pose_curves(histograms: Mapping[str, NDArray[np.floating]], centres: ND
     axes = figure.add_subplot()
     for i, (name, curves) in enumerate(histograms.items()):
         colour, style = PALETTE[i % len(PALETTE)], _STYLES[i % len(_STYLES)]
-        lines = axes.plot(centres, 100 * np.asarray(curves).T, color=colour, linestyle=style, linewidth=0.8, alpha=0.8)
+        lines = axes.plot(
+            centres,
+            100 * np.asarray(curves).T,
+            color=colour,
+            linestyle=style,
+            linewidth=0.8,
+            alpha=0.8,
+        )
         lines[0].set_label(f"{name} ({len(curves)} bodies)")
     axes.set(xlim=(0, float(2 * centres[-1] - centres[-2])))
     axes.set_ylim(bottom=0)
@@ -66,7 +75,10 @@ def draw_weld_change(mesh: Mesh, welded: Mesh, change: NDArray[np.floating], out
     percent = 100 * np.asarray(change)
     end = max(np.ceil(percent.max()), _REPORTED[-1][0] + 1)
     left.hist(
-        percent, bins=np.linspace(0, end, 61), weights=np.full(len(percent), 100 / len(percent)), color=PALETTE[1]
+        percent,
+        bins=np.linspace(0, end, 61),
+        weights=np.full(len(percent), 100 / len(percent)),
+        color=PALETTE[1],
     )
     for (value, reported), style in zip(_REPORTED, ("--", ":"), strict=True):
         share = 100 * np.mean(percent < value)
@@ -82,13 +94,24 @@ def draw_weld_change(mesh: Mesh, welded: Mesh, change: NDArray[np.floating], out
 
     vertices = upright(mesh.vertices)
     paint(middle, vertices, mesh.faces, GREY)
-    middle.plot(*vertices[ends, :2].mean(axis=0), "o", markersize=16, markerfacecolor="none", color=_ORANGE, mew=1.6)
+    middle.plot(
+        *vertices[ends, :2].mean(axis=0),
+        "o",
+        markersize=16,
+        markerfacecolor="none",
+        color=_ORANGE,
+        mew=1.6,
+    )
     middle.set_title("the body; circled: the weld", fontsize=9)
 
     _zoom(right, welded, tube)
-    first, last = (welded.vertices[tube[1::2, i]] for i in (0, 2))  # the ends of the three edges along the tube
+    first, last = (
+        welded.vertices[tube[1::2, i]] for i in (0, 2)
+    )  # the ends of the three edges along the tube
     length = float(np.linalg.norm(first - last, axis=1).mean() / longest_side(welded.vertices))
-    right.set_title(f"the tube (orange, {TUBE_FACES} triangles),\n{length:.1%} of the body's extent", fontsize=9)
+    right.set_title(
+        f"the tube (orange, {TUBE_FACES} triangles),\n{length:.1%} of the body's extent", fontsize=9
+    )
     _save(figure, out)
 
 
@@ -122,11 +145,22 @@ def draw_potential_slice(
     filled = panel.contourf(x, y, inside, levels=levels, cmap="cividis")
     panel.contour(x, y, inside, levels=levels, colors="white", linewidths=0.5)
     panel.add_collection(LineCollection(list(outline), colors="black", linewidths=1.2))
-    panel.plot(*barycentroid, "*", markersize=14, color="white", mec="black", linestyle="none", label="barycentroid")
+    panel.plot(
+        *barycentroid,
+        "*",
+        markersize=14,
+        color="white",
+        mec="black",
+        linestyle="none",
+        label="barycentroid",
+    )
     panel.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     panel.set_xlabel("length (unit of the mesh)")
     panel.set_ylabel("length (unit of the mesh)")
-    panel.set_title(f"Slice through the barycentroid;\na white line every {levels[1] - levels[0]:.2g}", fontsize=10)
+    panel.set_title(
+        f"Slice through the barycentroid;\na white line every {levels[1] - levels[0]:.2g}",
+        fontsize=10,
+    )
     figure.colorbar(filled, ax=panel, label="barycentroid potential U (no unit)")
     figure.legend(loc="outside lower center", frameon=False)
     _save(figure, out)

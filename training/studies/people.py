@@ -15,13 +15,23 @@ from igps.retrieval import retrieval_scores
 from training.graded.individuals import Change
 from training.studies.generated import usable_shapes
 
-_SHARES = (0.04, 0.1)  # largest displacements of an individual from the scanned body, in units of √area
+_SHARES = (
+    0.04,
+    0.1,
+)  # largest displacements of an individual from the scanned body, in units of √area
 
 
 def people(
     data: Path,
     root: Path = Path("build/people"),
-    descriptors: Sequence[str] = ("interior", "gps", "shape_dna", "multiscale", "rich", "pretrained"),
+    descriptors: Sequence[str] = (
+        "interior",
+        "gps",
+        "shape_dna",
+        "multiscale",
+        "rich",
+        "pretrained",
+    ),
     n_individuals: int = 10,
     seed: int = 0,
     cache_dir: Path | None = None,
@@ -50,23 +60,34 @@ def people(
         faces, random = np.asarray(poses[0].faces), np.random.default_rng([seed, number])
         for path, scan in zip(files, poses, strict=True):
             if not np.array_equal(scan.faces, faces):
-                raise ValueError(f"data: expected the faces of {files[0].name} in {path}, got others.")
+                raise ValueError(
+                    f"data: expected the faces of {files[0].name} in {path}, got others."
+                )
         vertices = [np.asarray(pose.vertices, dtype=np.float64) for pose in poses]
         for individual in range(n_individuals):
             change = Change.draw(random, vertices[0], faces, _SHARES)
             target = root / folder.name / str(individual)
             target.mkdir(parents=True, exist_ok=True)
-            for pose, moved in enumerate(transfer(vertices[0], vertices, change(vertices[0]), faces)):
+            for pose, moved in enumerate(
+                transfer(vertices[0], vertices, change(vertices[0]), faces)
+            ):
                 trimesh.Trimesh(moved, faces, process=False).export(target / f"{pose}.off")
         for name in descriptors:
             descriptor = igps.descriptor(name)
             shapes = usable_shapes(root / folder.name, descriptor, cache_dir, n_workers)
             described = describe(shapes, descriptor, n_workers=n_workers)
-            scores = retrieval_scores(descriptor.distances(described, described), shapes.labels).mean()
-            print(f"{folder.name} {name}: NN {100 * scores['nn']:.1f} FT {100 * scores['ft']:.1f}", flush=True)
+            scores = retrieval_scores(
+                descriptor.distances(described, described), shapes.labels
+            ).mean()
+            print(
+                f"{folder.name} {name}: NN {100 * scores['nn']:.1f} FT {100 * scores['ft']:.1f}",
+                flush=True,
+            )
 
 
-def transfer(rest: Floats, poses: Sequence[Floats], changed: Floats, faces: Integers) -> list[Floats]:
+def transfer(
+    rest: Floats, poses: Sequence[Floats], changed: Floats, faces: Integers
+) -> list[Floats]:
     """Return the changed surface in each of the poses, by deformation transfer (Sumner and Popović 2004).
 
     Each edge of a changed face follows the deformation of the face from rest to the pose. Vertices are fitted to these
@@ -81,12 +102,16 @@ def transfer(rest: Floats, poses: Sequence[Floats], changed: Floats, faces: Inte
     # Row 3 f + i subtracts the ends of the edge of face f that is opposite its corner i.
     corners = [np.roll(faces, shift, axis=1).ravel() for shift in (1, -1)]
     rows, signs = np.tile(np.arange(faces.size), 2), np.repeat([1.0, -1.0], faces.size)
-    differences = scipy.sparse.csr_array((signs, (rows, np.concatenate(corners))), (faces.size, len(rest)))
+    differences = scipy.sparse.csr_array(
+        (signs, (rows, np.concatenate(corners))), (faces.size, len(rest))
+    )
     edges = (differences @ changed).reshape(-1, 3, 3)
     nexts, lasts = np.roll(edges, -1, axis=1), np.roll(edges, 1, axis=1)
     cotangents = -(nexts * lasts).sum(axis=2) / np.linalg.norm(np.cross(nexts, lasts), axis=2)
     weighted = differences.T @ scipy.sparse.diags_array(cotangents.ravel())
-    fixed = scipy.sparse.csr_array(([1.0], ([0], [0])), (len(rest), len(rest)))  # edges leave a translation open
+    fixed = scipy.sparse.csr_array(
+        ([1.0], ([0], [0])), (len(rest), len(rest))
+    )  # edges leave a translation open
     solver = splu((weighted @ differences + fixed).tocsc())
     to_rest = np.linalg.inv(_frames(rest, faces))
     moved = []

@@ -51,7 +51,9 @@ def power(
     rows: list[dict[str, Any]] = []
     compared = [(PROPORTIONS[0], 0.0), *product(PROPORTIONS, differences)]
     for number, (proportion, difference) in enumerate(compared, start=1):
-        second = pool(proportion, difference, n_pool, descriptors, np.random.default_rng([seed, number]))
+        second = pool(
+            proportion, difference, n_pool, descriptors, np.random.default_rng([seed, number])
+        )
         setting = {"proportion": proportion if difference else "none", "difference": difference}
         print(setting, flush=True)
         rows += [{**setting, **row} for row in shares(first, second, n_each, n_draws, seed)]
@@ -68,16 +70,25 @@ def shares(
         while len(orders) < n_draws:
             shuffled = [random.permutation(len(side[name])) for side in (first, second)]
             n_groups = min(map(len, shuffled)) // n_each
-            orders += [[order[i * n_each : (i + 1) * n_each] for order in shuffled] for i in range(n_groups)]
+            orders += [
+                [order[i * n_each : (i + 1) * n_each] for order in shuffled]
+                for i in range(n_groups)
+            ]
         tests = [
             group_test(
-                np.vstack([first[name][a], second[name][b]]), ["a"] * n_each + ["b"] * n_each,
-                n_permutations=199, n_bootstraps=0, n_repeats=0, seed=draw,
+                np.vstack([first[name][a], second[name][b]]),
+                ["a"] * n_each + ["b"] * n_each,
+                n_permutations=199,
+                n_bootstraps=0,
+                n_repeats=0,
+                seed=draw,
             )
             for draw, (a, b) in enumerate(orders[:n_draws])
-        ]  # fmt: skip
+        ]
         rejected = {
-            name_of_test: float(np.mean([getattr(test, f"{name_of_test}_p") <= 0.05 for test in tests]))
+            name_of_test: float(
+                np.mean([getattr(test, f"{name_of_test}_p") <= 0.05 for test in tests])
+            )
             for name_of_test in ("permanova", "kernel")
         }
         rows.append({"descriptor": name, **rejected})
@@ -86,7 +97,11 @@ def shares(
 
 
 def pool(
-    proportion: str, difference: float, n_pool: int, descriptors: Sequence[str], random: np.random.Generator
+    proportion: str,
+    difference: float,
+    n_pool: int,
+    descriptors: Sequence[str],
+    random: np.random.Generator,
 ) -> dict[str, Floats]:
     """Draw subjects, and return their vectors (n_pool, D) by descriptor, including ShapeDNA of LaPy."""
     from lapy import TriaMesh, shapedna  # the extra `studies`
@@ -100,7 +115,9 @@ def pool(
         for name, descriptor in zip(descriptors, chosen, strict=True):
             coordinates = descriptor.coordinates(descriptor(batch).detach(), within_class=True)
             vectors[name].append(coordinates[0].double().numpy())
-        values = shapedna.compute_shapedna(TriaMesh(mesh.vertices, mesh.faces), k=_N_EIGENVALUES)["Eigenvalues"][1:]
+        values = shapedna.compute_shapedna(TriaMesh(mesh.vertices, mesh.faces), k=_N_EIGENVALUES)[
+            "Eigenvalues"
+        ][1:]
         vectors[_LAPY].append(np.log(values / values[0])[1:])
     return {name: np.array(rows) for name, rows in vectors.items()}
 
@@ -114,5 +131,7 @@ def subject(proportion: str, difference: float, random: np.random.Generator) -> 
     width, depth, height, waist = 1 + shift + _SCATTER * random.normal(size=len(PROPORTIONS))
     x, y, z = ball.vertices.T
     narrow = 1 - 0.35 * waist * np.exp(-8 * (z - 0.1) ** 2)
-    vertices = np.stack([0.8 * width * narrow * x, 0.6 * depth * narrow * y, 1.6 * height * z], axis=1)
+    vertices = np.stack(
+        [0.8 * width * narrow * x, 0.6 * depth * narrow * y, 1.6 * height * z], axis=1
+    )
     return Mesh(vertices, ball.faces)

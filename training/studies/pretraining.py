@@ -14,7 +14,13 @@ from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
 from training.graded import GradedShapes, body_of, family_of, individual_of, looks_alike
-from training.studies.generated import N_VERTICES, deal_families, generated, number_names, usable_shapes
+from training.studies.generated import (
+    N_VERTICES,
+    deal_families,
+    generated,
+    number_names,
+    usable_shapes,
+)
 from training.studies.transfer import few_labels, level_scores, report
 
 # With two classes, each part has a single direction, and its vectors are signs, which may cancel.
@@ -46,14 +52,21 @@ class _Collection:
         self.root, self.names, self.labels = root, data.bodies.names, data.labels
         self.histograms = describe(data, descriptor, progress=True, n_workers=n_workers)
         of_levels = (individual_of, body_of) if shapes.n_individuals else (body_of,)
-        self.levels = *(number_names([of(name) for name in self.names]) for of in of_levels), self.labels
+        self.levels = (
+            *(number_names([of(name) for name in self.names]) for of in of_levels),
+            self.labels,
+        )
         self.parts = torch.tensor([part_of[family_of(name)] for name in data.classes])[self.labels]
-        self.are_look_alikes = torch.tensor([looks_alike(name) for name in data.classes])[self.labels]
+        self.are_look_alikes = torch.tensor([looks_alike(name) for name in data.classes])[
+            self.labels
+        ]
 
     def draw_classes(self, part: int, n: int, seed: int) -> Tensor:
         """Return a mask of the shapes of at most n classes of a part, drawn by the seed."""
         classes = self.labels[self.parts == part].unique().tolist()
-        return torch.isin(self.labels, torch.tensor(random.Random(seed).sample(classes, min(n, len(classes)))))
+        return torch.isin(
+            self.labels, torch.tensor(random.Random(seed).sample(classes, min(n, len(classes))))
+        )
 
 
 def pretrain(
@@ -94,17 +107,29 @@ def pretrain(
     descriptor = pretrained_parts().eval()
     shapes = (
         GradedShapes(n_classes, n_bodies, n_poses, seed),
-        GradedShapes(*individuals[:2], individuals[3], seed, n_vertices=N_VERTICES, n_individuals=individuals[2]),
+        GradedShapes(
+            *individuals[:2],
+            individuals[3],
+            seed,
+            n_vertices=N_VERTICES,
+            n_individuals=individuals[2],
+        ),
     )
-    part_of = deal_families([family_of(name) for one in shapes for name in one.class_names], n_parts, seed)
+    part_of = deal_families(
+        [family_of(name) for one in shapes for name in one.class_names], n_parts, seed
+    )
     first, second = (
         _Collection(one, folder, part_of, cache_dir, n_workers)
-        for one, folder in zip(shapes, (root, root.with_name(f"{root.name}-individuals")), strict=True)
+        for one, folder in zip(
+            shapes, (root, root.with_name(f"{root.name}-individuals")), strict=True
+        )
     )
 
     def chosen(held_out: int, look_alikes: bool) -> tuple[Tensor, Tensor]:
         """Return masks of the shapes of both collections, without a part, and perhaps without look-alikes."""
-        masks = [(x.parts != held_out) & (look_alikes | ~x.are_look_alikes) for x in (first, second)]
+        masks = [
+            (x.parts != held_out) & (look_alikes | ~x.are_look_alikes) for x in (first, second)
+        ]
         return masks[0], masks[1]
 
     def suffice(of_first: Tensor, of_second: Tensor) -> bool:
@@ -130,13 +155,19 @@ def pretrain(
             level_scores(
                 name,
                 [
-                    (distances(collection, mask, part), *(level[mask] for level in collection.levels))
+                    (
+                        distances(collection, mask, part),
+                        *(level[mask] for level in collection.levels),
+                    )
                     for part, mask in enumerate(masks)
                 ],
             )
 
     def score_heads(name: str, heads: Sequence[TwoLevelHead]) -> None:
-        score(name, lambda collection, mask, part: _distances(heads[part], collection.histograms[mask]))
+        score(
+            name,
+            lambda collection, mask, part: _distances(heads[part], collection.histograms[mask]),
+        )
 
     def score_plain(other: Descriptor) -> None:
         def distances(collection: _Collection, mask: Tensor, part: int) -> Tensor:
@@ -147,7 +178,9 @@ def pretrain(
 
         score(other.name, distances)
 
-    print(f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:")
+    print(
+        f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:"
+    )
     for name, look_alikes in (("pretrained", True), ("without look-alikes", False)):
         masks = [chosen(part, look_alikes) for part in range(n_parts)]
         if all(suffice(*each) for each in masks):
@@ -162,7 +195,10 @@ def pretrain(
         return
 
     real = usable_shapes(data, descriptor, cache_dir, n_workers)
-    real_histograms, labels_of_real = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
+    real_histograms, labels_of_real = (
+        describe(real, descriptor, progress=True, n_workers=n_workers),
+        real.labels,
+    )
     report(str(data), real_histograms, labels_of_real, head)
     unlike = chosen(_NO_PART, False)
     if suffice(*unlike):
@@ -175,7 +211,9 @@ def pretrain(
 def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
     """Save `pretrained_parts` with a fitted `pretrained_head` as safetensors, the head in half precision."""
     state = {
-        name: (tensor.half() if name.startswith("head.") and tensor.is_floating_point() else tensor).contiguous()
+        name: (
+            tensor.half() if name.startswith("head.") and tensor.is_floating_point() else tensor
+        ).contiguous()
         for name, tensor in module.state_dict().items()
     }
     save_file(state, path)

@@ -54,11 +54,19 @@ class Robustness:
     def as_dict(self) -> dict[str, Any]:
         """Return a dict for a JSON file."""
         return {
-            "disturbances": {name: disturbance.description for name, disturbance in DISTURBANCES.items()},
-            "median_between_classes": {name: unit if unit > 0 else None for name, unit in self.units.items()},
+            "disturbances": {
+                name: disturbance.description for name, disturbance in DISTURBANCES.items()
+            },
+            "median_between_classes": {
+                name: unit if unit > 0 else None for name, unit in self.units.items()
+            },
             "movements": {
                 name: {
-                    column: {"mean": movement.mean, "each": dict(movement.distances), "notes": dict(movement.notes)}
+                    column: {
+                        "mean": movement.mean,
+                        "each": dict(movement.distances),
+                        "notes": dict(movement.notes),
+                    }
                     for column, movement in movements.items()
                 }
                 for name, movements in self.movements.items()
@@ -94,17 +102,24 @@ def robustness(
     """
     check_descriptors(descriptors, dataset)
     if gallery is None and len(dataset) < 2:
-        raise ValueError("dataset: expected at least two meshes, each its own class, or a gallery. Give one of them.")
+        raise ValueError(
+            "dataset: expected at least two meshes, each its own class, or a gallery. Give one of them."
+        )
     alterations: dict[str, Alteration | None] = {
         _UNCHANGED: None,
         **{name: kind.apply for name, kind in DISTURBANCES.items()},
     }
     answers = describe_altered(dataset, alterations, descriptors, n_workers=n_workers)
     if gallery is None:
-        units = {x.name: _between_meshes(x, [row[_UNCHANGED][x.name] for row in answers]) for x in descriptors}
+        units = {
+            x.name: _between_meshes(x, [row[_UNCHANGED][x.name] for row in answers])
+            for x in descriptors
+        }
     else:
         units = _between_classes(gallery, descriptors, n_workers)
-    table = {x.name: _movements(x, dataset.bodies.names, answers, units[x.name]) for x in descriptors}
+    table = {
+        x.name: _movements(x, dataset.bodies.names, answers, units[x.name]) for x in descriptors
+    }
     if poses is not None:
         for name, movement in _between_poses(poses, descriptors, units, n_workers).items():
             table[name][POSE] = movement
@@ -123,7 +138,10 @@ def _movements(
         distances: dict[str, float] = {}
         notes: dict[str, str] = {}
         for mesh, descriptions in zip(names, answers, strict=True):
-            before, after = descriptions[_UNCHANGED][descriptor.name], descriptions[disturbance][descriptor.name]
+            before, after = (
+                descriptions[_UNCHANGED][descriptor.name],
+                descriptions[disturbance][descriptor.name],
+            )
             if isinstance(before, str) or isinstance(after, str):
                 notes[mesh] = before if isinstance(before, str) else str(after)
             else:
@@ -134,13 +152,17 @@ def _movements(
 
 def _distance(descriptor: Descriptor, first: Singles, second: Singles) -> float:
     with torch.inference_mode():
-        return float(descriptor.distances(torch.from_numpy(first)[None], torch.from_numpy(second)[None]))
+        return float(
+            descriptor.distances(torch.from_numpy(first)[None], torch.from_numpy(second)[None])
+        )
 
 
 def _between_meshes(descriptor: Descriptor, descriptions: Sequence[Answer]) -> float:
     """Return the median distance between descriptions; NaN if fewer than two meshes could be described."""
     described = [description for description in descriptions if not isinstance(description, str)]
-    distances = [_distance(descriptor, first, second) for first, second in combinations(described, 2)]
+    distances = [
+        _distance(descriptor, first, second) for first, second in combinations(described, 2)
+    ]
     return float(np.median(distances)) if distances else np.nan
 
 
@@ -153,12 +175,17 @@ def _between_classes(
         labels = np.array(result.labels)
         differs = labels[:, None] != labels[None, :]
         is_known = result.distances is not None and differs.any()
-        units[result.descriptor.name] = float(np.median(np.asarray(result.distances)[differs])) if is_known else np.nan
+        units[result.descriptor.name] = (
+            float(np.median(np.asarray(result.distances)[differs])) if is_known else np.nan
+        )
     return units
 
 
 def _between_poses(
-    poses: SignatureDataset, descriptors: Sequence[Descriptor], units: Mapping[str, float], n_workers: int | None
+    poses: SignatureDataset,
+    descriptors: Sequence[Descriptor],
+    units: Mapping[str, float],
+    n_workers: int | None,
 ) -> dict[str, Movement]:
     """Return the movement of each descriptor between any two meshes of the same body."""
     movements = {}
@@ -170,7 +197,9 @@ def _between_poses(
                 if result.labels[j] == label:
                     pair = f"{result.names[j]} - {result.names[i]}"
                     distances[pair] = float(np.asarray(result.distances)[j, i])
-        movements[result.descriptor.name] = _movement(distances, notes, units[result.descriptor.name])
+        movements[result.descriptor.name] = _movement(
+            distances, notes, units[result.descriptor.name]
+        )
     return movements
 
 
@@ -190,7 +219,10 @@ def robustness_table(table: Mapping[str, Mapping[str, Movement]]) -> str:
     notes = []
     for name, movements in table.items():
         means = [movements[column].mean for column in columns]
-        lines.append(f"{name:<{width}}" + "".join(f"{'-' if x is None else f'{100 * x:.1f}':>9}" for x in means))
+        lines.append(
+            f"{name:<{width}}"
+            + "".join(f"{'-' if x is None else f'{100 * x:.1f}':>9}" for x in means)
+        )
         for column in columns:
             missing = movements[column].notes
             if missing:
@@ -198,7 +230,11 @@ def robustness_table(table: Mapping[str, Mapping[str, Movement]]) -> str:
                 n_all = len(movements[column].distances) + len(missing)
                 notes.append(f"{name}, {column}: {len(missing)} of {n_all} missing; {first}")
     lines.append("mean movement in percent of the median distance between classes")
-    lines += [f"  {column}: {DISTURBANCES[column].description}" for column in columns if column in DISTURBANCES]
+    lines += [
+        f"  {column}: {DISTURBANCES[column].description}"
+        for column in columns
+        if column in DISTURBANCES
+    ]
     if POSE in columns:
         lines.append(f"  {POSE}: from one pose of a body to another, over all pairs")
     return "\n".join(lines + notes)
@@ -251,7 +287,11 @@ def robustness_command(
         out.mkdir(parents=True, exist_ok=True)
         (out / "robustness.json").write_text(json.dumps(summary, indent=2) + "\n")
         write_mending_notes(out / "notes.csv", dataset)
-        write_rows(out / "failures.csv", ("name", "error"), [(failure.id, failure.error) for failure in failures])
+        write_rows(
+            out / "failures.csv",
+            ("name", "error"),
+            [(failure.id, failure.error) for failure in failures],
+        )
         write_sources(out, dataset)
         print(f"written to {out}")
         if report:

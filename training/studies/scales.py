@@ -14,7 +14,11 @@ from training.graded import GradedShapes
 
 
 def scales(
-    descriptors: list[str] | None = None, n_classes: int = 8, n_bodies: int = 4, seed: int = 77, n_individuals: int = 0
+    descriptors: list[str] | None = None,
+    n_classes: int = 8,
+    n_bodies: int = 4,
+    seed: int = 77,
+    n_individuals: int = 0,
 ) -> None:
     """Print the scales of descriptors, for `igps.descriptors.individual.SCALES`.
 
@@ -26,12 +30,16 @@ def scales(
         n_individuals: number of individuals of each body; if positive, distances are measured between individuals of
             the same body.
     """
-    generated = GradedShapes(n_classes, n_bodies, 1, seed=seed, n_vertices=(1800, 2600), n_individuals=n_individuals)
+    generated = GradedShapes(
+        n_classes, n_bodies, 1, seed=seed, n_vertices=(1800, 2600), n_individuals=n_individuals
+    )
     shapes = [generated[i] for i in range(len(generated))]
     labels = [shape.body if n_individuals else shape.label for shape in shapes]
     same = torch.tensor([[first == second for first in labels] for second in labels]).triu(1)
     modules = [descriptor_of(name) for name in descriptors or NAMES]
-    config = reduce(or_, (module.requirements for module in modules)).apply_to(SignatureConfig(n_eigenpairs=250))
+    config = reduce(or_, (module.requirements for module in modules)).apply_to(
+        SignatureConfig(n_eigenpairs=250)
+    )
     meshes = [Mesh(shape.vertices, shape.faces) for shape in shapes]
     batches = [collate([compute_signature(mesh, config)], [mesh]) for mesh in meshes]
     for module in modules:

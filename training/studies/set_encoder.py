@@ -36,10 +36,17 @@ class SetEncoder(nn.Module):
     def __init__(self, n_features: int, n_seeds: int = 8) -> None:
         super().__init__()
         self.each = nn.Sequential(
-            nn.Linear(n_features, 128), nn.GELU(), nn.Linear(128, 256), nn.GELU(), nn.Linear(256, 256), nn.GELU()
+            nn.Linear(n_features, 128),
+            nn.GELU(),
+            nn.Linear(128, 256),
+            nn.GELU(),
+            nn.Linear(256, 256),
+            nn.GELU(),
         )
         self.attention = nn.Linear(256, n_seeds)
-        self.whole = nn.Sequential(nn.LayerNorm(256 * n_seeds), nn.Dropout(0.2), nn.Linear(256 * n_seeds, 128))
+        self.whole = nn.Sequential(
+            nn.LayerNorm(256 * n_seeds), nn.Dropout(0.2), nn.Linear(256 * n_seeds, 128)
+        )
 
     def forward(self, samples: Tensor) -> Tensor:
         """Return the embeddings of samples."""
@@ -57,14 +64,18 @@ def features(batch: SignatureBatch) -> Tensor:
     for kind, samples in enumerate((batch.interior, surface)):
         potentials = [potential(samples, batch, n) for n in SCALES]
         own = radii if kind else torch.zeros(*samples.mask.shape, 2)
-        columns = torch.cat([torch.stack(potentials, dim=2), own, torch.full_like(own[..., :1], kind)], dim=2)
+        columns = torch.cat(
+            [torch.stack(potentials, dim=2), own, torch.full_like(own[..., :1], kind)], dim=2
+        )
         rows.append(columns[:, torch.linspace(0, columns.shape[1] - 1, N_SAMPLES).long()])
     return torch.cat(rows, dim=1)
 
 
 def potential(samples: SampleBatch, batch: SignatureBatch, n_eigenpairs: int) -> Tensor:
     """Return the logarithms (1, P) of the potential at samples."""
-    embedded = spectral_embedding(samples.eigenfunctions, batch.eigenvalues, batch.area, n_eigenpairs=n_eigenpairs)
+    embedded = spectral_embedding(
+        samples.eigenfunctions, batch.eigenvalues, batch.area, n_eigenpairs=n_eigenpairs
+    )
     return barycentroid_potential(embedded).clamp_min(1e-6).log()
 
 
@@ -78,7 +89,10 @@ def train_encoder(sets: Tensor, labels: Tensor, n_epochs: int, seed: int) -> Set
     for _ in range(n_steps):
         drawn = labels.unique()[torch.randperm(len(labels.unique()))[:8]]
         batch = torch.cat(
-            [(labels == c).nonzero().flatten()[torch.randperm(int((labels == c).sum()))[:8]] for c in drawn]
+            [
+                (labels == c).nonzero().flatten()[torch.randperm(int((labels == c).sum()))[:8]]
+                for c in drawn
+            ]
         )
         subset = torch.randperm(sets.shape[1])[:N_SAMPLES]  # half of the samples
         embedded = encoder(sets[batch][:, subset])
@@ -93,7 +107,11 @@ def train_encoder(sets: Tensor, labels: Tensor, n_epochs: int, seed: int) -> Set
 
 
 def study(
-    root: Path, cache_dir: Path | None = None, n_splits: int = 5, n_epochs: int = 40, first_seed: int = 0
+    root: Path,
+    cache_dir: Path | None = None,
+    n_splits: int = 5,
+    n_epochs: int = 40,
+    first_seed: int = 0,
 ) -> None:
     """Print FT on classes of held-out families, mean ± standard deviation over splits of the families.
 
@@ -113,7 +131,9 @@ def study(
     scores: dict[str, list[float]] = {}
     for seed in range(first_seed, first_seed + n_splits):
         order = sorted(set(families))
-        chosen = torch.randperm(len(order), generator=torch.Generator().manual_seed(seed))[: len(order) // 2].tolist()
+        chosen = torch.randperm(len(order), generator=torch.Generator().manual_seed(seed))[
+            : len(order) // 2
+        ].tolist()
         seen = torch.tensor([families[c] in {order[i] for i in chosen} for c in labels.tolist()])
         centre, spread = sets[seen].mean(dim=(0, 1)), sets[seen].std(dim=(0, 1)).clamp_min(1e-6)
         scaled = (sets - centre) / spread
@@ -124,12 +144,21 @@ def study(
         plain = descriptor.distances(histograms[~seen], histograms[~seen])
         by_set, by_head = ((1 - x @ x.T).clamp_min(0) for x in (embedded, whitened))
         both = by_set / by_set.median() + by_head / by_head.median()
-        rows = {"histograms": plain, "whitened": by_head, "set encoder": by_set, "whitened and set encoder": both}
+        rows = {
+            "histograms": plain,
+            "whitened": by_head,
+            "set encoder": by_set,
+            "whitened and set encoder": both,
+        }
         for name, distances in rows.items():
-            scores.setdefault(name, []).append(100 * retrieval_scores(distances, labels[~seen]).mean()["ft"])
+            scores.setdefault(name, []).append(
+                100 * retrieval_scores(distances, labels[~seen]).mean()["ft"]
+            )
         print(seed, {name: round(values[-1], 1) for name, values in scores.items()}, flush=True)
     n_weights = sum(parameter.numel() for parameter in encoder.parameters())
-    print(f"{len(dataset)} shapes of {len(dataset.classes)} classes, encoder of {n_weights} weights, FT:")
+    print(
+        f"{len(dataset)} shapes of {len(dataset.classes)} classes, encoder of {n_weights} weights, FT:"
+    )
     for name, values in scores.items():
         print(f"{name:<26}{mean(values):>6.1f} ± {stdev(values):.1f}")
 

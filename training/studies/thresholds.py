@@ -10,7 +10,10 @@ from igps.gallery.calibration import LEVELS, Threshold
 
 def quantiles(distances: ArrayLike) -> list[float]:
     """Return the quantiles of distances at `LEVELS`, with five digits."""
-    return [float(f"{value:.5g}") for value in np.quantile(np.asarray(distances, dtype=np.float64), LEVELS)]
+    return [
+        float(f"{value:.5g}")
+        for value in np.quantile(np.asarray(distances, dtype=np.float64), LEVELS)
+    ]
 
 
 def threshold_between(same: ArrayLike, other: ArrayLike, rate: float) -> Threshold:
@@ -41,4 +44,10 @@ def _smallest_rejected(other: ArrayLike, rate: float) -> float:
 
 def _with_counts(distance: float, same: ArrayLike, other: ArrayLike) -> Threshold:
     same, other = np.asarray(same), np.asarray(other)
-    return Threshold(distance, len(other), int((other <= distance).sum()), len(same), int((same <= distance).sum()))
+    return Threshold(
+        distance,
+        len(other),
+        int((other <= distance).sum()),
+        len(same),
+        int((same <= distance).sum()),
+    )

@@ -28,9 +28,15 @@ def scores(head: Head, histograms: Tensor, labels: Tensor) -> dict[str, float]:
     return retrieval_scores(head.distances(vectors, vectors), labels).mean()
 
 
-def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: Head, part_cells: Sequence[int]) -> None:
+def few_labels(
+    n: int, histograms: Tensor, labels: Tensor, pretrained: Head, part_cells: Sequence[int]
+) -> None:
     """Print FT of heads fitted to n shapes of each class, on the pretrained metric and from scratch."""
-    ft: dict[str, list[float]] = {"pretrained, no labels": [], "from pretrained": [], "from scratch": []}
+    ft: dict[str, list[float]] = {
+        "pretrained, no labels": [],
+        "from pretrained": [],
+        "from scratch": [],
+    }
     for seed in range(100, 105):
         split = split_seen(labels, n, seed=seed)
         train, test = torch.tensor(split.train), torch.tensor(split.test)
@@ -42,7 +48,9 @@ def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: Head, par
             head.fit(histograms[train], labels[train], part_cells)
         for name, other in {"pretrained, no labels": pretrained, **fitted}.items():
             ft[name].append(100 * scores(other, histograms[test], labels[test])["ft"])
-    rows = ", ".join(f"{name} FT {mean(values):.1f} ± {stdev(values):.1f}" for name, values in ft.items())
+    rows = ", ".join(
+        f"{name} FT {mean(values):.1f} ± {stdev(values):.1f}" for name, values in ft.items()
+    )
     print(f"{n} labels a class: {rows}")
 
 
@@ -58,7 +66,10 @@ def level_scores(name: str, parts: Sequence[tuple[Tensor, ...]]) -> None:
     names = ("individual", "body", "class")[4 - len(parts[0]) :]
     for place, level in enumerate(names, 1):
         results = [retrieval_scores(part[0], part[place]).mean() for part in parts]
-        words = [f"{key.upper()} {100 * mean(row[key] for row in results):.1f}" for key in ("nn", "ft", "dcg")]
+        words = [
+            f"{key.upper()} {100 * mean(row[key] for row in results):.1f}"
+            for key in ("nn", "ft", "dcg")
+        ]
         words[1] += f" ± {100 * stdev(row['ft'] for row in results):.1f}"
         rows.append(f"{level} " + " ".join(words))
     print(f"{name:<28}" + " | ".join(rows), flush=True)

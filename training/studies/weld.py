@@ -44,7 +44,9 @@ def weld(mesh: Mesh, a: int, b: int) -> Mesh:
     """
     for name, vertex in (("a", a), ("b", b)):
         if not 0 <= vertex < len(mesh.vertices):
-            raise ValueError(f"{name}: expected a vertex index from 0 to {len(mesh.vertices) - 1}, got {vertex}.")
+            raise ValueError(
+                f"{name}: expected a vertex index from 0 to {len(mesh.vertices) - 1}, got {vertex}."
+            )
     neighbours = edge_graph(mesh)
     best: tuple[float, int, int, Integers] | None = None
     faces_b = np.nonzero((mesh.faces == b).any(axis=1))[0]
@@ -55,8 +57,12 @@ def weld(mesh: Mesh, a: int, b: int) -> Mesh:
             if np.isin(mesh.faces[j], beside).any():
                 continue  # the tube would join an edge that already has two faces
             for turn in range(3):
-                other = mesh.faces[j][[turn, turn - 1, turn - 2]]  # reversed, as the rims face each other
-                length = float(np.linalg.norm(mesh.vertices[rim] - mesh.vertices[other], axis=1).sum())
+                other = mesh.faces[j][
+                    [turn, turn - 1, turn - 2]
+                ]  # reversed, as the rims face each other
+                length = float(
+                    np.linalg.norm(mesh.vertices[rim] - mesh.vertices[other], axis=1).sum()
+                )
                 if best is None or length < best[0]:
                     best = length, int(i), int(j), other
     if best is None:
@@ -114,9 +120,13 @@ class _GapSearch:
         self._graph = edge_graph(mesh)
         self._tree = cKDTree(mesh.vertices)
         self._normals = vertex_normals(mesh.vertices, mesh.faces)
-        self._landmarks = farthest_points(mesh, min(_N_LANDMARKS, len(mesh.vertices)), points_per_edge=0).distances
+        self._landmarks = farthest_points(
+            mesh, min(_N_LANDMARKS, len(mesh.vertices)), points_per_edge=0
+        ).distances
 
-    def pairs(self, largest_gap: float, least_path: float | None = None) -> Iterator[tuple[int, int]]:
+    def pairs(
+        self, largest_gap: float, least_path: float | None = None
+    ) -> Iterator[tuple[int, int]]:
         """Yield the pairs at most `largest_gap` apart, in descending order of the shortest path along edges.
 
         With `least_path`, yield only pairs whose path is at least as long, in descending order of path over gap.
@@ -137,7 +147,9 @@ class _GapSearch:
             a, b = pair[i].tolist()
             if is_exact:
                 yield a, b
-            elif a in of_source:  # otherwise the queue holds the pairs of this vertex with their exact paths
+            elif (
+                a in of_source
+            ):  # otherwise the queue holds the pairs of this vertex with their exact paths
                 path = dijkstra(self._graph, indices=a)
                 for k in of_source.pop(a):
                     length = float(path[pair[k, 1]])
@@ -151,10 +163,17 @@ class _GapSearch:
         return bool((winding_number(self._mesh.vertices, self._mesh.faces, points) < 0.5).all())
 
     def _facing(self, largest_gap: float) -> tuple[Integers, Floats]:
-        pair = self._tree.query_pairs(largest_gap, output_type="ndarray").astype(np.int64).reshape(-1, 2)
+        pair = (
+            self._tree.query_pairs(largest_gap, output_type="ndarray")
+            .astype(np.int64)
+            .reshape(-1, 2)
+        )
         step = self._mesh.vertices[pair[:, 1]] - self._mesh.vertices[pair[:, 0]]
         gap = np.linalg.norm(step, axis=1)
-        cosines = [np.einsum("ij,ij->i", sign * self._normals[pair[:, k]], step) for k, sign in ((0, 1), (1, -1))]
+        cosines = [
+            np.einsum("ij,ij->i", sign * self._normals[pair[:, k]], step)
+            for k, sign in ((0, 1), (1, -1))
+        ]
         # A gap of zero width is a defect of the mesh, which no tube can bridge
         is_facing = (np.minimum(*cosines) > _MIN_COSINE * gap) & (gap > 1e-6 * largest_gap)
         return pair[is_facing], gap[is_facing]

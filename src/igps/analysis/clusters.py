@@ -22,7 +22,9 @@ class Clusters:
     """Clusters of N bodies, cut from a hierarchical clustering."""
 
     labels: Integers  # (N,) cluster of each body, 0 for the largest cluster
-    medoids: tuple[int, ...]  # body of each cluster with the smallest sum of distances to the others
+    medoids: tuple[
+        int, ...
+    ]  # body of each cluster with the smallest sum of distances to the others
     # Largest Jaccard index of each cluster with the clusters of a random half of the bodies, averaged over the halves
     # with at least two bodies of the cluster; NaN if there is no such half
     stability: tuple[float, ...]
@@ -60,18 +62,30 @@ def clusters_of(
     tree = _tree(square, linkage)
     if n_clusters is None:
         cuts = {k: _cut(tree, k) for k in range(2, min(_MAX_CLUSTERS, n - 1) + 1)}
-        scores = {k: silhouette_score(square, cut, metric="precomputed") for k, cut in cuts.items() if cut.max()}
-        n_clusters = max((k for k, score in scores.items() if score > 0), key=lambda k: scores[k], default=1)
+        scores = {
+            k: silhouette_score(square, cut, metric="precomputed")
+            for k, cut in cuts.items()
+            if cut.max()
+        }
+        n_clusters = max(
+            (k for k, score in scores.items() if score > 0), key=lambda k: scores[k], default=1
+        )
     if not 1 <= n_clusters <= n:
         raise ValueError(f"n_clusters: expected 1 to {n}, got {n_clusters}.")
     labels = _cut(tree, n_clusters)
-    _, labels = np.unique(np.argsort(np.argsort(-np.bincount(labels), kind="stable"))[labels], return_inverse=True)
+    _, labels = np.unique(
+        np.argsort(np.argsort(-np.bincount(labels), kind="stable"))[labels], return_inverse=True
+    )
     members = [np.flatnonzero(labels == number) for number in range(labels.max() + 1)]
     medoids = tuple(int(own[square[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members)
     random, jaccard = np.random.default_rng(seed), np.full((n_resamples, len(members)), np.nan)
-    for row in jaccard if n > max(3, 2 * len(members)) else ():  # half of three bodies cannot be clustered
+    for row in (
+        jaccard if n > max(3, 2 * len(members)) else ()
+    ):  # half of three bodies cannot be clustered
         half = np.sort(random.choice(n, n // 2, replace=False))
-        resampled = np.eye(n, dtype=np.int64)[_cut(_tree(square[np.ix_(half, half)], linkage), len(members))]
+        resampled = np.eye(n, dtype=np.int64)[
+            _cut(_tree(square[np.ix_(half, half)], linkage), len(members))
+        ]
         original = np.eye(len(members), dtype=np.int64)[labels[half]]
         n_drawn = original.sum(axis=0)
         intersection = original.T @ resampled

@@ -24,7 +24,9 @@ from igps.retrieval.scores import SCORE_NAMES, RetrievalScores, retrieval_scores
 logger = logging.getLogger(__name__)
 
 _Description = tuple[Singles, float]  # a description (1, ...), and the seconds that it took
-_BLOCK_ENTRIES = 2**26  # queries × bodies × entries of a description, which some descriptors hold in memory at once
+_BLOCK_ENTRIES = (
+    2**26
+)  # queries × bodies × entries of a description, which some descriptors hold in memory at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,17 +34,25 @@ class Result:
     """Results of one descriptor on a collection."""
 
     descriptor: Descriptor
-    names: tuple[str, ...]  # the N meshes that the descriptor could describe, in the order of the collection
+    names: tuple[
+        str, ...
+    ]  # the N meshes that the descriptor could describe, in the order of the collection
     labels: tuple[str, ...]  # classes of these meshes
     distances: Tensor | None  # (N, N), rows are queries; None if they could not be computed
-    scores: RetrievalScores | None  # leave-one-out; None without distances, or if no two meshes share a class
-    seconds_per_mesh: float | None  # mean processor time without that of the signature; None if N is 0
+    scores: (
+        RetrievalScores | None
+    )  # leave-one-out; None without distances, or if no two meshes share a class
+    seconds_per_mesh: (
+        float | None
+    )  # mean processor time without that of the signature; None if N is 0
     failures: tuple[Failure, ...]  # meshes that the descriptor could not describe
     error: str | None  # reason for missing scores
 
     def row(self) -> dict[str, Any]:
         """Return a row of the comparison table: mean scores as fractions, None if missing, time, and counts."""
-        scores: dict[str, Any] = dict.fromkeys(SCORE_NAMES) if self.scores is None else self.scores.mean()
+        scores: dict[str, Any] = (
+            dict.fromkeys(SCORE_NAMES) if self.scores is None else self.scores.mean()
+        )
         return {
             "descriptor": self.descriptor.name,
             **{name: scores[name] for name in SCORE_NAMES},
@@ -79,11 +89,15 @@ def compare(
         MeshError: a mesh cannot be described, if `strict`.
     """
     if dataset.bodies.labels is None:
-        raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
+        raise ValueError(
+            "dataset: expected meshes with classes, got none. Give labels, or a folder per class."
+        )
     check_descriptors(descriptors, dataset)
     n, cpu = len(dataset), torch.device("cpu")
     jobs = [(descriptor, dataset.subset([i]), cpu) for descriptor in descriptors for i in range(n)]
-    pending: dict[int, _Description | Failure] = {}  # outcomes of descriptors that are not complete, by job
+    pending: dict[
+        int, _Description | Failure
+    ] = {}  # outcomes of descriptors that are not complete, by job
     n_done = 0
     with (
         tqdm(total=len(jobs), desc="descriptions", disable=not progress) as bar,
@@ -122,7 +136,10 @@ def check_names(names: Sequence[str]) -> None:
 
 
 def _result(
-    descriptor: Descriptor, dataset: SignatureDataset, outcomes: Sequence[_Description | Failure], progress: bool
+    descriptor: Descriptor,
+    dataset: SignatureDataset,
+    outcomes: Sequence[_Description | Failure],
+    progress: bool,
 ) -> Result:
     failures = tuple(outcome for outcome in outcomes if isinstance(outcome, Failure))
     bodies = dataset.usable(failures).bodies
@@ -142,10 +159,14 @@ def _result(
     return Result(descriptor, bodies.names, labels, distances, scores, seconds, failures, error)
 
 
-def pair_distances(descriptor: Descriptor, descriptions: Tensor, *, progress: bool = False) -> Tensor:
+def pair_distances(
+    descriptor: Descriptor, descriptions: Tensor, *, progress: bool = False
+) -> Tensor:
     """Return the distances (N, N) of descriptions (N, ...), computed in blocks of queries to limit memory."""
     n_queries, blocks = max(1, _BLOCK_ENTRIES // max(1, descriptions.numel())), []
-    bar = tqdm(total=len(descriptions), desc=f"distances by {descriptor.name}", disable=not progress)
+    bar = tqdm(
+        total=len(descriptions), desc=f"distances by {descriptor.name}", disable=not progress
+    )
     with torch.inference_mode(), one_thread(), bar:
         for block in descriptions.split(n_queries):
             blocks.append(descriptor.distances(block, descriptions).cpu())

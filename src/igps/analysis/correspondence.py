@@ -14,12 +14,20 @@ from igps.mesh.surface import unit
 # small times depends on the surface around it
 _LARGE_TIMES, _SMALL_TIMES = 0.01 * 2.0 ** np.arange(6), 0.0008 * 2.0 ** np.arange(5)
 _N_CORRESPONDING = 10  # samples of the other body that correspond to a sample
-_MIN_DEVIATION = 0.1  # smallest standard deviation at a place, as a fraction of that of the whole body
+_MIN_DEVIATION = (
+    0.1  # smallest standard deviation at a place, as a fraction of that of the whole body
+)
 _SMOOTHING = 0.06  # standard deviation of the smoothing kernel, over the square root of the area
 _PATCH = 0.04  # radius of the patches of surface whose curvature is measured, over the square root of the area
-_N_PLANE, _N_INSIDE = 12, 6  # nearest surface samples that determine a tangent plane, and interior ones its side
+_N_PLANE, _N_INSIDE = (
+    12,
+    6,
+)  # nearest surface samples that determine a tangent plane, and interior ones its side
 _MAX_BALL = 0.5  # largest radius of a ball, over the square root of the area
-_NEAR, _MIN_SINE = 0.03, 0.2  # a ball may contain samples nearer than this (over √area), or nearer the tangent plane
+_NEAR, _MIN_SINE = (
+    0.03,
+    0.2,
+)  # a ball may contain samples nearer than this (over √area), or nearer the tangent plane
 
 
 def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
@@ -56,7 +64,10 @@ def _heat_kernels(body: SignatureBatch) -> tuple[Floats, Floats]:
     area, is_sample = float(body.area[0]), body.surface.mask[0]
     squares = body.surface.eigenfunctions[0][is_sample].double().square().numpy() * area
     values = body.eigenvalues[0].double().numpy() * area
-    large, small = (np.log1p(squares @ np.exp(-np.outer(values, times))) for times in (_LARGE_TIMES, _SMALL_TIMES))
+    large, small = (
+        np.log1p(squares @ np.exp(-np.outer(values, times)))
+        for times in (_LARGE_TIMES, _SMALL_TIMES)
+    )
     return large, small
 
 
@@ -79,7 +90,9 @@ def squared_deviations(own: Floats, others: Floats, nearest: Integers) -> Floats
     corresponding = others[nearest]
     means = corresponding.mean(axis=1)
     offsets, steps = corresponding - means[:, None], (own - means)[:, :, None]
-    least = np.square(_MIN_DEVIATION) * np.cov(others.T, bias=True) + 1e-12 * np.eye(others.shape[1])
+    least = np.square(_MIN_DEVIATION) * np.cov(others.T, bias=True) + 1e-12 * np.eye(
+        others.shape[1]
+    )
     covariances = offsets.transpose(0, 2, 1) @ offsets / nearest.shape[1] + least
     return (steps * np.linalg.solve(covariances, steps)).sum(axis=(1, 2))
 
@@ -90,7 +103,10 @@ def local_shape(body: SignatureBatch) -> Floats:
     The curvatures, ascending and over the radius of a patch, are those of the linear function of the position that fits
     the normals of the patch (least squares). Normals are outward, and estimated if the samples have none.
     """
-    points, directions = _points(body.surface, body), body.surface.attributes.get("surface_direction")
+    points, directions = (
+        _points(body.surface, body),
+        body.surface.attributes.get("surface_direction"),
+    )
     if directions is None:
         normals = _estimated_normals(points, _points(body.interior, body))
     else:
@@ -101,7 +117,9 @@ def local_shape(body: SignatureBatch) -> Floats:
     n = max(_N_PLANE, math.ceil(1.5 * math.pi * _PATCH**2 * len(points)))
     distances, patch = tree.query(points, list(range(1, min(n, len(points)) + 1)))
     weights = np.clip(1 - np.square(distances / _PATCH), 0, 1)
-    weights *= np.einsum("pkc,pc->pk", normals[patch], normals) > 0.2  # not the other side of a thin part
+    weights *= (
+        np.einsum("pkc,pc->pk", normals[patch], normals) > 0.2
+    )  # not the other side of a thin part
     steps = (points[patch] - points[:, None]) @ axes / _PATCH
     terms = np.concatenate([np.ones_like(steps[:, :, :1]), steps], axis=2)
     weighted = (terms * weights[:, :, None]).transpose(0, 2, 1)
@@ -130,7 +148,9 @@ def _inner_balls(points: Floats, normals: Floats) -> Floats:
     radii = np.empty(len(points))
     for rows in np.array_split(np.arange(len(points)), math.ceil(len(points) / 256)):
         squares = cdist(points[rows], points, "sqeuclidean")
-        depths = (normals[rows] * points[rows]).sum(axis=1, keepdims=True) - normals[rows] @ points.T
+        depths = (normals[rows] * points[rows]).sum(axis=1, keepdims=True) - normals[
+            rows
+        ] @ points.T
         counts = (squares > _NEAR**2) & (depths > _MIN_SINE * np.sqrt(squares))
         through = np.where(counts, squares / np.where(counts, 2 * depths, 1), _MAX_BALL)
         radii[rows] = np.partition(through, 2, axis=1)[:, 2]

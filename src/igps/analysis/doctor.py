@@ -35,12 +35,16 @@ class Finding:
     fault: str | None = None  # why the surface in the file does not bound a body; None if it does
     steps: tuple[Step, ...] = ()  # steps that mend it
     notes: tuple[str, ...] = ()  # the same steps as sentences
-    n_vertices: int | None = None  # of the surface in the file, or made from it; None if it cannot be read
+    n_vertices: int | None = (
+        None  # of the surface in the file, or made from it; None if it cannot be read
+    )
     n_vertices_after: int | None = None  # of the mended body; None if it cannot be used
     seconds: float | None = None  # expected processor time from file to signature
     memory: float | None = None  # expected peak memory, bytes
     error: str | None = None  # why the body cannot be used; None if it can
-    voxels: VoxelMeasures | None = None  # measures of a label of a volume; None for every other kind of body
+    voxels: VoxelMeasures | None = (
+        None  # measures of a label of a volume; None for every other kind of body
+    )
 
 
 def examine(
@@ -55,13 +59,20 @@ def examine(
     """Read and mend every body as for its signature, and return the findings in order; `limits` apply to each file."""
     jobs = group_by_file(files, range(len(files)))
     examine_file = partial(_examine_file, reading or LoadOptions(), config or SignatureConfig())
-    outcomes = run(examine_file, [[files[i] for i in job] for job in jobs], n_workers=n_workers, limits=limits)
+    outcomes = run(
+        examine_file, [[files[i] for i in job] for job in jobs], n_workers=n_workers, limits=limits
+    )
     findings: dict[int, Finding] = {}
-    with tqdm(total=len(files), desc="bodies", disable=not progress) as bar, contextlib.closing(outcomes):
+    with (
+        tqdm(total=len(files), desc="bodies", disable=not progress) as bar,
+        contextlib.closing(outcomes),
+    ):
         for number, outcome in outcomes:
             bar.update(len(jobs[number]))
             for k, i in enumerate(jobs[number]):
-                finding = Finding("", error=outcome.reason) if isinstance(outcome, Failed) else outcome[k]
+                finding = (
+                    Finding("", error=outcome.reason) if isinstance(outcome, Failed) else outcome[k]
+                )
                 findings[i] = replace(finding, id=files.names[i])
     return [findings[i] for i in range(len(files))]
 
@@ -73,10 +84,15 @@ def expected_cost(n_vertices: int, n_eigenpairs: int) -> tuple[float, float]:
     return seconds, _BYTES + _BYTES_PER_VERTEX * n_vertices + _BYTES_PER_ENTRY * entries
 
 
-def _examine_file(reading: LoadOptions, config: SignatureConfig, bodies: Sequence[BodyRef]) -> list[Finding]:
+def _examine_file(
+    reading: LoadOptions, config: SignatureConfig, bodies: Sequence[BodyRef]
+) -> list[Finding]:
     """Examine bodies of the same file, which is read once."""
     path, findings = bodies[0].path, {}
-    start, fault = time.process_time(), f"{path}: the file has no such body. Choose a body of the file."
+    start, fault = (
+        time.process_time(),
+        f"{path}: the file has no such body. Choose a body of the file.",
+    )
     try:
         for ref, raw in each_surface(path, reading, parts=[body.part for body in bodies]):
             findings[ref] = _finding(ref, raw, reading, config, start)
@@ -86,7 +102,9 @@ def _examine_file(reading: LoadOptions, config: SignatureConfig, bodies: Sequenc
     return [findings.get(body, Finding(str(body), fault=fault, error=fault)) for body in bodies]
 
 
-def _finding(ref: BodyRef, raw: RawBody, reading: LoadOptions, config: SignatureConfig, start: float) -> Finding:
+def _finding(
+    ref: BodyRef, raw: RawBody, reading: LoadOptions, config: SignatureConfig, start: float
+) -> Finding:
     voxels = None if raw.voxels is None else raw.voxels().measures()
     finding = Finding(str(ref), n_vertices=len(raw.vertices), voxels=voxels)
     if raw.fault is not None:
@@ -103,6 +121,10 @@ def _finding(ref: BodyRef, raw: RawBody, reading: LoadOptions, config: Signature
     seconds, memory = expected_cost(n_simplified, config.n_kept)
     seconds += time.process_time() - start
     return replace(
-        finding, steps=repair_steps(mesh.notes), notes=mesh.notes, n_vertices_after=len(mesh.vertices), seconds=seconds,
+        finding,
+        steps=repair_steps(mesh.notes),
+        notes=mesh.notes,
+        n_vertices_after=len(mesh.vertices),
+        seconds=seconds,
         memory=memory,
-    )  # fmt: skip
+    )

@@ -33,7 +33,9 @@ class Explanation:
     """Shares of a distance. A negative share comes from a property that makes the bodies more similar."""
 
     distance: float  # by the descriptor
-    parts: Mapping[str, float]  # share of each histogram, by the quantity that it counts; they sum to the distance
+    parts: Mapping[
+        str, float
+    ]  # share of each histogram, by the quantity that it counts; they sum to the distance
     # Shares (P,) of the samples of each kind in the first and in the second body; all together sum to the distance
     samples: tuple[Shares, Shares]
     # As `samples`, but non-negative and by local dissimilarity, see `igps.analysis.correspondence`; None for groups
@@ -73,27 +75,39 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
         ValueError: another kind of descriptor, or a batch of several bodies.
     """
     if len(one) != 1 or len(other) != 1:
-        raise ValueError(f"one, other: expected batches of one body, got {len(one)} and {len(other)} bodies.")
+        raise ValueError(
+            f"one, other: expected batches of one body, got {len(one)} and {len(other)} bodies."
+        )
     descriptor = copy.deepcopy(descriptor).double().eval()
     headless, pair = without_head(descriptor), (_with_weights(one), _with_weights(other))
     first, second = torch.cat([headless(batch).detach().flatten(1) for batch in pair])
     units, distance = unit_shares(descriptor, first, second)
     shares = units * (first - second)
     samples = _sample_shares(descriptor, pair, units, shares)
-    places = _place_shares(one, other, samples[0], distance), _place_shares(other, one, samples[1], distance)
+    places = (
+        _place_shares(one, other, samples[0], distance),
+        _place_shares(other, one, samples[1], distance),
+    )
     return Explanation(distance, _part_shares(descriptor, shares), samples, places)
 
 
-def _place_shares(body: SignatureBatch, other: SignatureBatch, samples: Shares, distance: float) -> Shares:
+def _place_shares(
+    body: SignatureBatch, other: SignatureBatch, samples: Shares, distance: float
+) -> Shares:
     """Divide half of the distance among the surface samples of a body, by their dissimilarity to the other body."""
     weights = dissimilarity(body, other)
-    return {"interior": np.zeros(len(samples["interior"])), "surface": distance / 2 * weights / weights.sum()}
+    return {
+        "interior": np.zeros(len(samples["interior"])),
+        "surface": distance / 2 * weights / weights.sum(),
+    }
 
 
 def without_head(descriptor: Descriptor) -> Descriptor:
     """Return the descriptor without its head: it describes the histogram cells, followed by side and size, if any."""
     histograms = _histograms(descriptor)
-    return descriptor.wrap(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
+    return (
+        descriptor.wrap(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
+    )
 
 
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:
@@ -125,7 +139,9 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
     for n_nodes in _N_NODES if distance else ():
         gradient.zero_()
         nodes, weights = np.polynomial.legendre.leggauss(n_nodes)
-        for x, w in zip(torch.tensor(nodes).split(16), torch.tensor(weights).split(16), strict=True):
+        for x, w in zip(
+            torch.tensor(nodes).split(16), torch.tensor(weights).split(16), strict=True
+        ):
             step = (x[:, None] + 1) / 2 * half
             ends = torch.stack([midpoint + step, midpoint - step]).requires_grad_()
             (derivative,) = torch.autograd.grad(distances(ends) @ (w / 2), ends)
@@ -173,7 +189,10 @@ def _n_cells(descriptor: Descriptor) -> int:
 def _part_shares(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
     """Sum the shares of cells for each histogram, and those of side and of size if the descriptor keeps these."""
     parts = [part for group in _histograms(descriptor).parts for part in group]
-    cells, sums = shares[: _n_cells(descriptor)].split([part.n_cells for part in parts]), dict[str, float]()
+    cells, sums = (
+        shares[: _n_cells(descriptor)].split([part.n_cells for part in parts]),
+        dict[str, float](),
+    )
     for part, values in zip(parts, cells, strict=True):
         sums[part_name(part)] = sums.get(part_name(part), 0.0) + float(values.sum())
     form, side, size = (shares[None], *shares.new_empty(2, 1, 0))
@@ -211,7 +230,9 @@ def _sample_shares(
                 first += part.n_cells
                 if not value.requires_grad:
                     name = type(part).__name__
-                    raise ValueError(f"descriptor: {name} does not use the weights of samples, see DescriptionPart.")
+                    raise ValueError(
+                        f"descriptor: {name} does not use the weights of samples, see DescriptionPart."
+                    )
                 total = total + value / part.degree
         gradients = torch.autograd.grad(total, weights, allow_unused=True, materialize_grads=True)
         by_kind = zip(SAMPLE_KINDS, (gradient[0].numpy() for gradient in gradients), strict=True)
@@ -220,18 +241,28 @@ def _sample_shares(
 
 
 _AXES = {
-    "InteriorDistance": "interior distances", "EuclideanDistance": "distances in space", "PairCosines": "directions",
-    "EmbeddedPairCosines": "directions to the surface", "BallRadius": "thickness", "Attribute": "attributes",
+    "InteriorDistance": "interior distances",
+    "EuclideanDistance": "distances in space",
+    "PairCosines": "directions",
+    "EmbeddedPairCosines": "directions to the surface",
+    "BallRadius": "thickness",
+    "Attribute": "attributes",
     "Shares": "kinds of residues",
-    "AxialHistogram": "place along the axes", "BranchHistogram": "lengths of limbs",
-    "PieceHistogram": "sizes of pieces", "SpectrumShares": "spectrum",
-}  # fmt: skip
+    "AxialHistogram": "place along the axes",
+    "BranchHistogram": "lengths of limbs",
+    "PieceHistogram": "sizes of pieces",
+    "SpectrumShares": "spectrum",
+}
 
 
 def part_name(part: DescriptionPart) -> str:
     """Return what a part of a description counts, as text."""
     axes = [type(axis).__name__ for axis in getattr(part, "axes", [part])]
-    words = list(dict.fromkeys(_AXES.get(name, name) for name in axes if name != "Potential" or len(axes) == 1))
+    words = list(
+        dict.fromkeys(
+            _AXES.get(name, name) for name in axes if name != "Potential" or len(axes) == 1
+        )
+    )
     samples = f" ({part.samples})" if isinstance(part, SampleHistogram) else ""
     return " and ".join(words) + samples
 
@@ -259,13 +290,19 @@ def significant_cells(
     contrasts = torch.full((n_permutations + 1, len(rows)), -1 / len(other), dtype=torch.float64)
     random = torch.Generator().manual_seed(seed)
     for i in range(n_permutations + 1):
-        contrasts[i, torch.arange(n) if i == 0 else torch.randperm(len(rows), generator=random)[:n]] = 1 / n
+        contrasts[
+            i, torch.arange(n) if i == 0 else torch.randperm(len(rows), generator=random)[:n]
+        ] = 1 / n
     differences = (contrasts @ rows).abs()
     return differences[0] > differences.max(dim=1).values.quantile(1 - level)
 
 
 def explain_groups(
-    descriptor: Descriptor, one: Tensor, other: Tensor, batches: Sequence[SignatureBatch], **test: Any
+    descriptor: Descriptor,
+    one: Tensor,
+    other: Tensor,
+    batches: Sequence[SignatureBatch],
+    **test: Any,
 ) -> tuple[Explanation, Tensor]:
     """Divide the distance of the mean descriptions of two groups among histograms, and among samples of two bodies.
 
@@ -285,7 +322,9 @@ def explain_groups(
         ValueError: too few bodies for a test.
     """
     level, (n, m) = test.get("level", 0.05), (len(one), len(other))
-    n_ways = math.comb(n + m, n) // (1 + (n == m))  # exchanging groups of equal size changes no difference
+    n_ways = math.comb(n + m, n) // (
+        1 + (n == m)
+    )  # exchanging groups of equal size changes no difference
     if n_ways * level <= 1:
         raise ValueError(
             f"one, other: {n} and {m} bodies can be arranged in only {n_ways} ways, too few for a test at the level "
@@ -293,7 +332,9 @@ def explain_groups(
         )
     descriptor = copy.deepcopy(descriptor).double().eval()
     rows, n = [group.double().flatten(1) for group in (one, other)], _n_cells(descriptor)
-    is_significant = significant_cells(*(torch.cat([x[:, :n].sqrt(), x[:, n:]], dim=1) for x in rows), **test)
+    is_significant = significant_cells(
+        *(torch.cat([x[:, :n].sqrt(), x[:, n:]], dim=1) for x in rows), **test
+    )
     means = [group.mean(dim=0) for group in rows]
     units = torch.where(is_significant, unit_shares(descriptor, *means)[0], 0)
     shares = units * (means[0] - means[1])

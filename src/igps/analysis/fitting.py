@@ -27,10 +27,16 @@ from igps.retrieval import chi_square, retrieval_scores
 Goal = Literal["known", "new"]
 HeadName = Literal["auto", "classifier", "whitened", "as_is"]
 # Heads that "auto" chooses from, by the goal
-_CANDIDATES: Mapping[Goal, tuple[HeadName, ...]] = {"known": ("classifier", "whitened"), "new": ("whitened", "as_is")}
+_CANDIDATES: Mapping[Goal, tuple[HeadName, ...]] = {
+    "known": ("classifier", "whitened"),
+    "new": ("whitened", "as_is"),
+}
 # Weights of the prior beside a WhitenedHead: equal for new classes, smaller for classes that the head is fitted to
 _PRIOR_SHARES: Mapping[Goal, float] = {"new": 0.5, "known": 1 / 3}
-_N_FOLDS, _N_INNER_FOLDS = 5, 3  # for the held-out scores, and within them for the choice of the head
+_N_FOLDS, _N_INNER_FOLDS = (
+    5,
+    3,
+)  # for the held-out scores, and within them for the choice of the head
 _N_BINS = 10  # of the expected calibration error
 _MAX_SCALE_BODIES = 1000  # bodies whose distances determine the scale
 
@@ -56,7 +62,11 @@ def split_head(which: str | Descriptor) -> tuple[Descriptor, Head | None]:
     """Return the histograms of a descriptor, to which heads are fitted, and its own head, if any."""
     module = descriptor_of(which)
     module = module.without_size() if isinstance(module, SizedHistograms) else module
-    return (module.descriptor, module.head) if isinstance(module, EmbeddedDescriptor) else (module, None)
+    return (
+        (module.descriptor, module.head)
+        if isinstance(module, EmbeddedDescriptor)
+        else (module, None)
+    )
 
 
 def fit(
@@ -103,14 +113,20 @@ def fit(
     check_one_of(get_args(Goal), goal=goal)
     check_one_of(get_args(HeadName), head=head)
     module = descriptor_of(descriptor)
-    individual = {"size": isinstance(module, SizedHistograms), "side": False}  # numbers that bypass the head
+    individual = {
+        "size": isinstance(module, SizedHistograms),
+        "side": False,
+    }  # numbers that bypass the head
     if isinstance(module, IndividualDescriptor):
         individual = {"size": module.keeps_size, "side": module.twists is not None}
         module = module.descriptor
     base, metric = split_head(module)
     check_centres(base)
     check_classes(dataset.bodies, goal)
-    base, metric = copy.deepcopy(base), metric if prior else None  # the caller's descriptor stays unchanged
+    base, metric = (
+        copy.deepcopy(base),
+        metric if prior else None,
+    )  # the caller's descriptor stays unchanged
     histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
     check_classes(dataset.bodies, goal)  # without the bodies that could not be described
     labels, counts = dataset.labels, Counter(dataset.bodies.labels)
@@ -127,7 +143,11 @@ def fit(
     def choose_head(x: Tensor, y: Tensor) -> HeadName:
         if head != "auto":
             return head
-        masks = [out for out in _held_out(y, goal, _N_INNER_FOLDS) if _has_pair(y[out]) and _has_pair(y[~out])]
+        masks = [
+            out
+            for out in _held_out(y, goal, _N_INNER_FOLDS)
+            if _has_pair(y[out]) and _has_pair(y[~out])
+        ]
 
         def mean_ft(name: HeadName) -> float:
             heads = ((fit_head(name, x[~out], y[~out], False), out) for out in masks)
@@ -168,7 +188,9 @@ def check_classes(bodies: Bodies, goal: Goal) -> None:
     """Raise a ValueError if there are too few classes, or no class of two bodies."""
     counts, min_classes = Counter(bodies.labels), 2 if goal == "known" else 4
     if len(counts) < min_classes or max(counts.values()) < 2:
-        raise ValueError(f"classes: expected at least {min_classes}, one of them of two bodies, got {dict(counts)}.")
+        raise ValueError(
+            f"classes: expected at least {min_classes}, one of them of two bodies, got {dict(counts)}."
+        )
 
 
 def classify(
@@ -192,11 +214,17 @@ def classify(
     base, head = classifier_of(model)
     names = head.names or tuple(map(str, head.classes.tolist()))
     if len(names) != len(head.classes):
-        raise ValueError(f"model: expected names of {len(head.classes)} classes, got {len(names)}. Fit it again.")
+        raise ValueError(
+            f"model: expected names of {len(head.classes)} classes, got {len(names)}. Fit it again."
+        )
     histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
     strangeness = head.strangeness(histograms)
     return Classification(
-        dataset.bodies.names, names, head.probabilities(histograms), strangeness, strangeness > head.strange_from
+        dataset.bodies.names,
+        names,
+        head.probabilities(histograms),
+        strangeness,
+        strangeness > head.strange_from,
     )
 
 
@@ -205,22 +233,32 @@ def classifier_of(model: str | Descriptor) -> tuple[Descriptor, ClassifierHead]:
     module = descriptor_of(model)
     module = module.descriptor if isinstance(module, IndividualDescriptor) else module
     if not isinstance(module, EmbeddedDescriptor) or not isinstance(module.head, ClassifierHead):
-        raise ValueError(f"model: expected a classifier, got {module.name}. Fit one with head='classifier'.")
+        raise ValueError(
+            f"model: expected a classifier, got {module.name}. Fit one with head='classifier'."
+        )
     return module.descriptor, module.head
 
 
 def _histograms(
-    dataset: SignatureDataset, base: Descriptor, failures: list[Failure] | None, n_workers: int | None, progress: bool
+    dataset: SignatureDataset,
+    base: Descriptor,
+    failures: list[Failure] | None,
+    n_workers: int | None,
+    progress: bool,
 ) -> tuple[Tensor, SignatureDataset]:
     """Return the histograms (M, cells) of the M bodies that can be described, and a dataset of these bodies."""
     tag, n_earlier = cache_tag(base), len(failures or ())
-    histograms = describe(dataset, base, failures=failures, cache_tag=tag, n_workers=n_workers, progress=progress)
+    histograms = describe(
+        dataset, base, failures=failures, cache_tag=tag, n_workers=n_workers, progress=progress
+    )
     return histograms.flatten(1), dataset.usable((failures or [])[n_earlier:])
 
 
 def _held_out(labels: Tensor, goal: Goal, n_folds: int) -> Iterator[Tensor]:
     """Yield masks (N,) of held-out bodies: folds for known classes, random halves of the classes for new classes."""
-    if goal == "known":  # at least two bodies of the largest class are held out together, as needed for retrieval
+    if (
+        goal == "known"
+    ):  # at least two bodies of the largest class are held out together, as needed for retrieval
         largest = int(labels.unique(return_counts=True)[1].max())
         yield from folds(labels, max(2, min(n_folds, largest // 2)))
         return
@@ -257,7 +295,9 @@ def _held_out_scores(
     for number, out in enumerate(_held_out(labels, goal, _N_FOLDS)):
         x, y = histograms[~out], labels[~out]
         name = choose_head(x, y)
-        if name == "whitened" and not _has_pair(y):  # a WhitenedHead is fitted to pairs of one class
+        if name == "whitened" and not _has_pair(
+            y
+        ):  # a WhitenedHead is fitted to pairs of one class
             continue
         head = fit_head(name, x, y)
         if _has_pair(labels[out]):
@@ -266,20 +306,29 @@ def _held_out_scores(
         if isinstance(head, ClassifierHead):
             probabilities_of_folds.append(head.probabilities(histograms[out]))
             targets_of_folds.append(torch.searchsorted(head.classes, labels[out]))
-            is_new = torch.isin(labels, classes[number::_N_FOLDS])  # left out of the fit of a second classifier
+            is_new = torch.isin(
+                labels, classes[number::_N_FOLDS]
+            )  # left out of the fit of a second classifier
             unknown, known, fit_to = out & is_new, out & ~is_new, ~out & ~is_new
             if bool(unknown.any() and known.any()) and len(labels[fit_to].unique()) > 1:
                 partial = fit_head(name, histograms[fit_to], labels[fit_to], False)
                 assert isinstance(partial, ClassifierHead)
                 strangeness = [partial.strangeness(histograms[mask]) for mask in (unknown, known)]
-                targets = torch.cat([torch.ones(len(strangeness[0])), torch.zeros(len(strangeness[1]))]).long()
+                targets = torch.cat(
+                    [torch.ones(len(strangeness[0])), torch.zeros(len(strangeness[1]))]
+                ).long()
                 unknown_aucs.append(float(binary_auroc(torch.cat(strangeness), targets)))
-    means = {score: fmean(scores[score] for scores in retrieval) for score in (retrieval[0] if retrieval else ())}
+    means = {
+        score: fmean(scores[score] for scores in retrieval)
+        for score in (retrieval[0] if retrieval else ())
+    }
     if probabilities_of_folds:
         probabilities, targets = torch.cat(probabilities_of_folds), torch.cat(targets_of_folds)
         means["accuracy"] = float((probabilities.argmax(dim=1) == targets).float().mean())
         n_classes = probabilities.shape[1]
-        means["calibration_error"] = float(multiclass_calibration_error(probabilities, targets, n_classes, _N_BINS))
+        means["calibration_error"] = float(
+            multiclass_calibration_error(probabilities, targets, n_classes, _N_BINS)
+        )
     if unknown_aucs:
         means["unknown_auc"] = fmean(unknown_aucs)
     return means

@@ -29,7 +29,9 @@ class GroupTest:
     sizes: Mapping[str, int]  # sizes of the groups by name
     permanova_f: float | None = None  # pseudo-F (Anderson 2001)
     permanova_p: float | None = None  # p-value of the pseudo-F, by permutation
-    permanova_q: float | None = None  # q-value: smallest false discovery rate at which it is significant
+    permanova_q: float | None = (
+        None  # q-value: smallest false discovery rate at which it is significant
+    )
     # Kernel two-sample statistic (Gretton et al. 2012) of the whitened vectors: the squared distance between the kernel
     # means of two groups; for more groups, the weighted mean squared distance of their means from the overall mean
     kernel: float | None = None
@@ -40,7 +42,9 @@ class GroupTest:
     effect: float | None = None
     effect_low: float | None = None
     effect_high: float | None = None
-    auc: float | None = None  # area under the curve of a ridge classifier, cross-validated, group mean; 0.5 for chance
+    auc: float | None = (
+        None  # area under the curve of a ridge classifier, cross-validated, group mean; 0.5 for chance
+    )
     refused: str | None = None  # reason for no test
 
 
@@ -90,9 +94,19 @@ def group_test(
     check_at_least(1, n_permutations=n_permutations)
     n = len(vectors)
     strata = ["all"] * n if strata is None else strata
-    group, stratum = (np.unique(np.asarray(names), return_inverse=True)[1] for names in (groups, strata))
-    design = np.ones((n, 0)) if covariates is None else np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
-    for name, count in (("groups", len(groups)), ("strata", len(stratum)), ("covariates", len(design))):
+    group, stratum = (
+        np.unique(np.asarray(names), return_inverse=True)[1] for names in (groups, strata)
+    )
+    design = (
+        np.ones((n, 0))
+        if covariates is None
+        else np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
+    )
+    for name, count in (
+        ("groups", len(groups)),
+        ("strata", len(stratum)),
+        ("covariates", len(design)),
+    ):
         if count != n:
             raise ValueError(f"{name}: expected one for each of {n} bodies, got {count}.")
     for name, numbers in (("vectors", vectors), ("covariates", design)):
@@ -104,7 +118,9 @@ def group_test(
     # Orthonormal bases of the means of strata, of what covariates add to these, and of what groups add to both. A
     # permutation within strata changes the covariates, but not the means of strata
     stratum_basis = _orthonormal(_indicators(stratum), _ROUNDING)
-    design = design / np.maximum(np.abs(design).max(axis=0, initial=0), np.finfo(float).tiny)  # whatever the units
+    design = design / np.maximum(
+        np.abs(design).max(axis=0, initial=0), np.finfo(float).tiny
+    )  # whatever the units
     design = _orthonormal(design - design.mean(axis=0), _ROUNDING)
     covariate_basis = _orthonormal(design - stratum_basis @ (stratum_basis.T @ design), _ROUNDING)
     nuisance = np.column_stack([stratum_basis, covariate_basis])
@@ -114,13 +130,17 @@ def group_test(
         return replace(untested, refused="covariates or strata determine the groups.")
     freedom = n - nuisance.shape[1] - added.shape[1]
     if freedom < 3:
-        return replace(untested, refused=f"{n} bodies are too few for so many strata and covariates.")
+        return replace(
+            untested, refused=f"{n} bodies are too few for so many strata and covariates."
+        )
     residual = np.eye(n) - nuisance @ nuisance.T  # projection
     centred = vectors - vectors.mean(axis=0)
     total = centred @ centred.T
     gram = residual @ total @ residual
     if np.trace(gram) <= _ROUNDING * np.square(vectors).sum():
-        return replace(untested, refused="the vectors do not differ beyond what covariates and strata explain.")
+        return replace(
+            untested, refused="the vectors do not differ beyond what covariates and strata explain."
+        )
     whitened = _squares(_whitened(gram))
     pairs = whitened[np.triu_indices(n, 1)]
     width = np.median(pairs[pairs > _ROUNDING * pairs.max()])  # most of the pairs may be duplicates
@@ -138,7 +158,9 @@ def group_test(
         covariate_traces[part] = _traces(gram, covariate_basis, orders)
         kernel_traces[part] = _traces(kernel, added, orders)
         overlap[part] = _traces(covariate_basis @ covariate_basis.T, added, orders)
-    share = group_traces / np.maximum(np.trace(gram) - covariate_traces, np.finfo(float).tiny)  # grows with pseudo-F
+    share = group_traces / np.maximum(
+        np.trace(gram) - covariate_traces, np.finfo(float).tiny
+    )  # grows with pseudo-F
     # Covariates explain a share of the permuted groups, which the kernel of the residuals cannot contain
     unexplained = np.maximum(1 - overlap / added.shape[1], _ROUNDING)
     # For the effect, the part that groups add is rotated to the group means, and the remainder is scaled up to the
@@ -147,15 +169,21 @@ def group_test(
     at_means = _orthonormal(indicators - indicators.mean(axis=0), 1e-6)
     left, _, right = np.linalg.svd(at_means.T @ added)
     inflation = (n - len(sizes)) / freedom
-    adjustment = at_means @ left @ right @ added.T + np.sqrt(inflation) * (residual - added @ added.T)
+    adjustment = at_means @ left @ right @ added.T + np.sqrt(inflation) * (
+        residual - added @ added.T
+    )
     squares = _squares(adjustment @ gram @ adjustment.T)
     weights = [random.multinomial(k, np.full(k, 1 / k), n_bootstraps) for k in sizes]
-    with np.errstate(invalid="ignore"):  # NaN if a group is drawn as copies of one body, which have no variance
+    with np.errstate(
+        invalid="ignore"
+    ):  # NaN if a group is drawn as copies of one body, which have no variance
         effects = _effects(squares, group, weights)
     low, high = np.nanquantile(effects, (0.025, 0.975)) if n_bootstraps else (None, None)
     return replace(
         untested,
-        permanova_f=float(share[0] / max(1 - share[0], np.finfo(float).eps) * freedom / added.shape[1]),
+        permanova_f=float(
+            share[0] / max(1 - share[0], np.finfo(float).eps) * freedom / added.shape[1]
+        ),
         permanova_p=_p_value(share),
         kernel=float(kernel_traces[0] * (n / np.prod(sizes) if len(sizes) == 2 else 1 / n)),
         kernel_p=_p_value(kernel_traces / unexplained),
@@ -188,7 +216,9 @@ def _obstacle(sizes: Mapping[str, int], group: Integers, stratum: Integers) -> s
         return f"{smallest} has {sizes[smallest]} bodies, a test needs at least {_MIN_GROUP_SIZE} in each group."
     counts = np.zeros((stratum.max() + 1, group.max() + 1), dtype=int)
     np.add.at(counts, (stratum, group), 1)
-    log_ways = sum(math.lgamma(row.sum() + 1) - sum(math.lgamma(k + 1) for k in row) for row in counts)
+    log_ways = sum(
+        math.lgamma(row.sum() + 1) - sum(math.lgamma(k + 1) for k in row) for row in counts
+    )
     if log_ways < math.log(_MIN_ARRANGEMENTS):
         return f"within strata the groups can be arranged in only {math.exp(log_ways):.0f} ways, too few for a test."
     return None
@@ -257,13 +287,23 @@ def _effects(squares: Floats, group: Integers, weights: Sequence[Any]) -> Floats
     shares = [len(own) / len(group) for own in members]
 
     def mean(a: int, b: int) -> Floats:
-        total = np.einsum("ni,ij,nj->n", weights[a], squares[np.ix_(members[a], members[b])], weights[b], optimize=True)
+        total = np.einsum(
+            "ni,ij,nj->n",
+            weights[a],
+            squares[np.ix_(members[a], members[b])],
+            weights[b],
+            optimize=True,
+        )
         n_pairs = weights[a].sum(axis=1) * weights[b].sum(axis=1)
-        return np.asarray(total / (n_pairs - np.square(weights[a]).sum(axis=1) if a == b else n_pairs))
+        return np.asarray(
+            total / (n_pairs - np.square(weights[a]).sum(axis=1) if a == b else n_pairs)
+        )
 
     variances = [mean(a, a) / 2 for a in range(len(members))]
     pairs = combinations(range(len(members)), 2)
-    between: Any = sum(shares[a] * shares[b] * (mean(a, b) - variances[a] - variances[b]) for a, b in pairs)
+    between: Any = sum(
+        shares[a] * shares[b] * (mean(a, b) - variances[a] - variances[b]) for a, b in pairs
+    )
     within: Any = sum(share * variance for share, variance in zip(shares, variances, strict=True))
     return np.asarray(between / (between + within))
 
@@ -285,9 +325,20 @@ def _auc(gram: Floats, nuisance: Floats, group: Integers, n_repeats: int, seed: 
     areas = []
     folds = RepeatedStratifiedKFold(n_splits=5, n_repeats=n_repeats, random_state=seed)
     for training, test in folds.split(gram, group):
-        residuals = coordinates - nuisance @ np.linalg.lstsq(nuisance[training], coordinates[training], rcond=1e-9)[0]
-        scores = RidgeClassifierCV(alphas).fit(residuals[training], group[training]).decision_function(residuals[test])
+        residuals = (
+            coordinates
+            - nuisance @ np.linalg.lstsq(nuisance[training], coordinates[training], rcond=1e-9)[0]
+        )
+        scores = (
+            RidgeClassifierCV(alphas)
+            .fit(residuals[training], group[training])
+            .decision_function(residuals[test])
+        )
         if scores.ndim == 1:  # for two groups, scikit-learn returns the score of the second
             scores = np.stack([-scores, scores], axis=1)
-        areas.append(np.mean([roc_auc_score(group[test] == code, column) for code, column in enumerate(scores.T)]))
+        areas.append(
+            np.mean(
+                [roc_auc_score(group[test] == code, column) for code, column in enumerate(scores.T)]
+            )
+        )
     return float(np.mean(areas))

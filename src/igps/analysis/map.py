@@ -15,7 +15,9 @@ from igps._parameters import check_one_of
 Layout = Literal["mds", "umap"]
 
 _MAX_ITERATIONS = 300  # of SMACOF
-_MAX_ENTRIES = 10**9  # of the distance matrix times the iterations of SMACOF, which then take seconds
+_MAX_ENTRIES = (
+    10**9
+)  # of the distance matrix times the iterations of SMACOF, which then take seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +34,13 @@ def checked_distances(distances: Floats) -> Floats:
     """Return symmetric distances (N, N) with a zero diagonal; raise a ValueError for another shape, N < 3, or NaN."""
     square = np.asarray(distances, dtype=float)
     if square.ndim != 2 or len(square) != square.shape[-1] or len(square) < 3:
-        raise ValueError(f"distances: expected (N, N) between three bodies or more, got {square.shape}.")
+        raise ValueError(
+            f"distances: expected (N, N) between three bodies or more, got {square.shape}."
+        )
     if not np.isfinite(square).all():
-        raise ValueError("distances: expected finite numbers. Leave out bodies that cannot be compared.")
+        raise ValueError(
+            "distances: expected finite numbers. Leave out bodies that cannot be compared."
+        )
     square = np.maximum((square + square.T) / 2, 0)
     np.fill_diagonal(square, 0)
     return square
@@ -60,10 +66,16 @@ def body_map(distances: Floats, layout: Layout = "mds", *, seed: int = 0) -> Bod
     check_one_of(get_args(Layout), layout=layout)
     square = checked_distances(distances)
     points = _classical_mds(square) if layout == "mds" else _umap(square, seed)
-    if layout == "mds" and (n_iterations := min(_MAX_ITERATIONS, _MAX_ENTRIES // square.size)) and square.any():
+    if (
+        layout == "mds"
+        and (n_iterations := min(_MAX_ITERATIONS, _MAX_ENTRIES // square.size))
+        and square.any()
+    ):
         from sklearn.manifold import smacof
 
-        points = smacof(square, init=points, n_init=1, max_iter=n_iterations, eps=1e-6, normalized_stress=False)[0]
+        points = smacof(
+            square, init=points, n_init=1, max_iter=n_iterations, eps=1e-6, normalized_stress=False
+        )[0]
     centred = points - points.mean(axis=0)
     rotated = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
     rotated *= np.where((rotated**3).sum(axis=0) < 0, -1, 1)
@@ -93,9 +105,16 @@ def import_umap() -> Any:
 
 def _umap(distances: Floats, seed: int) -> Floats:
     UMAP = import_umap()
-    with warnings.catch_warnings():  # UMAP warns that a fit to precomputed distances cannot transform new points
+    with (
+        warnings.catch_warnings()
+    ):  # UMAP warns that a fit to precomputed distances cannot transform new points
         warnings.simplefilter("ignore", UserWarning)
-        umap = UMAP(n_neighbors=min(15, len(distances) - 1), metric="precomputed", random_state=seed, n_jobs=1)
+        umap = UMAP(
+            n_neighbors=min(15, len(distances) - 1),
+            metric="precomputed",
+            random_state=seed,
+            n_jobs=1,
+        )
         return umap.fit_transform(distances).astype(float)
 
 

@@ -13,7 +13,15 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps._parallel import Failed, run
 from igps._threads import n_cores
-from igps.analysis.segmentation import Place, cavity_root, cut_end, gap_root, hole_root, overlaps, stray_root
+from igps.analysis.segmentation import (
+    Place,
+    cavity_root,
+    cut_end,
+    gap_root,
+    hole_root,
+    overlaps,
+    stray_root,
+)
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import group_by_file
 from igps.data.pipeline import SignaturePipeline
@@ -34,9 +42,19 @@ _MIN_SUBJECTS = 5  # with fewer subjects, none can be identified as unusual
 _TWO_SIDED = ("volume", "spacing")  # measures whose small values are as unusual as large ones
 # Smallest scatter that is assumed, so that small differences do not count; in units of the measures
 _MIN_SCATTER = {
-    "shape": 0.1, "volume": 0.05, "spacing": 0.05, "handles": 0.35, "repairs": 0.35, "flat": 0.02,
-    "stray": 0.01, "cavity": 0.01, "hole": 0.01, "gap": 0.01, "cut": 0.5, "overlap": 0.01,
-}  # fmt: skip
+    "shape": 0.1,
+    "volume": 0.05,
+    "spacing": 0.05,
+    "handles": 0.35,
+    "repairs": 0.35,
+    "flat": 0.02,
+    "stray": 0.01,
+    "cavity": 0.01,
+    "hole": 0.01,
+    "gap": 0.01,
+    "cut": 0.5,
+    "overlap": 0.01,
+}
 LIMIT = 3.5
 """Bodies with a larger score are outliers; for a normal distribution, one body in 2,000."""
 _REASONS = {
@@ -62,8 +80,12 @@ class Outlier:
     body: int  # index of the body
     label: str  # class of the body
     score: float  # root of the sum of squares of the positive `scores`
-    scores: Mapping[str, float]  # robust standard deviations from the other bodies of the class, by measure
-    nearer_class: str | None  # another class whose members are nearer than those of the own class, if any
+    scores: Mapping[
+        str, float
+    ]  # robust standard deviations from the other bodies of the class, by measure
+    nearer_class: (
+        str | None
+    )  # another class whose members are nearer than those of the own class, if any
     reason: str  # explanation as text
 
     @property
@@ -97,7 +119,11 @@ def outliers(
     names, codes = np.unique(np.asarray(labels), return_inverse=True)
     own, other, nearest = _class_distances(np.asarray(distances, dtype=float), codes)
     n_per_subject = _max_bodies_of_subject(subjects or range(len(codes)), codes)
-    scores = {"shape": np.fmax(*(_deviations(shape, codes, "shape", n_per_subject)[0] for shape in (own, own - other)))}
+    scores = {
+        "shape": np.fmax(
+            *(_deviations(shape, codes, "shape", n_per_subject)[0] for shape in (own, own - other))
+        )
+    }
     values = dict(measures or {})
     if "overlap" in values:
         values["overlap"] = np.sqrt(values["overlap"].max(axis=1))
@@ -110,22 +136,34 @@ def outliers(
         scores[name], usual[name] = _deviations(measure, codes, name, n_per_subject)
     result = []
     for i, label in enumerate(labels):
-        deviations = {name: float(np.nan_to_num(column[i], nan=0.0)) for name, column in scores.items()}
+        deviations = {
+            name: float(np.nan_to_num(column[i], nan=0.0)) for name, column in scores.items()
+        }
         score = float(np.linalg.norm(np.maximum(list(deviations.values()), 0)))
         among = str(names[nearest[i]]) if own[i] > other[i] else None
         reasons = []
         ordered = sorted(deviations, key=lambda name: -deviations[name])
         for name in [name for k, name in enumerate(ordered) if k == 0 or deviations[name] > LIMIT]:
-            value, centre = (float(table[name][i]) if name in table else 0.0 for table in (values, usual))
+            value, centre = (
+                float(table[name][i]) if name in table else 0.0 for table in (values, usual)
+            )
             notes_text = "; ".join(rare_notes[i]) if name == "repairs" else ""
             numbers = {"value": value, "usual": centre, "square": value**2, "common": centre**2}
-            reasons.append(_REASONS[name].format(**numbers, ratio=np.exp(min(value - centre, 50)), notes=notes_text))
+            reasons.append(
+                _REASONS[name].format(
+                    **numbers, ratio=np.exp(min(value - centre, 50)), notes=notes_text
+                )
+            )
         if score <= LIMIT:
             reasons = []
         if among is not None:
             reasons.append(f"labelled {label}, but nearer to {among}")
         if not reasons:
-            reasons = ["shape not assessed: the only body of its class" if np.isnan(own[i]) else "nothing unusual"]
+            reasons = [
+                "shape not assessed: the only body of its class"
+                if np.isnan(own[i])
+                else "nothing unusual"
+            ]
         result.append(Outlier(i, label, score, deviations, among, "; ".join(reasons)))
     return sorted(result, key=lambda outlier: -outlier.score)
 
@@ -147,9 +185,13 @@ def measure_bodies(dataset: SignatureDataset, *, n_workers: int | None = None) -
     """
     values = np.full((len(dataset), len(_MEASURED)), np.nan)
     places = list[Place | None]([None] * len(dataset))
-    jobs = group_by_file(dataset.bodies, range(len(dataset)), -(-len(dataset) // (n_workers or n_cores())))
+    jobs = group_by_file(
+        dataset.bodies, range(len(dataset)), -(-len(dataset) // (n_workers or n_cores()))
+    )
     bodies = [[dataset.bodies[i] for i in job] for job in jobs]
-    with contextlib.closing(run(partial(_measure_file, dataset.pipeline), bodies, n_workers=n_workers)) as outcomes:
+    with contextlib.closing(
+        run(partial(_measure_file, dataset.pipeline), bodies, n_workers=n_workers)
+    ) as outcomes:
         for number, outcome in outcomes:
             for i, body in zip(jobs[number], bodies[number], strict=True):
                 if not isinstance(outcome, Failed) and body in outcome:
@@ -159,7 +201,10 @@ def measure_bodies(dataset: SignatureDataset, *, n_workers: int | None = None) -
     for i, (path, place) in enumerate(zip(dataset.bodies.paths, places, strict=True)):
         if place is not None and counts[path] > 1:
             places[i] = replace(place, grid=(path, *place.grid))
-    return {**dict(zip(_MEASURED, values.T, strict=True)), "overlap": overlaps(places, dataset.bodies.labels)}
+    return {
+        **dict(zip(_MEASURED, values.T, strict=True)),
+        "overlap": overlaps(places, dataset.bodies.labels),
+    }
 
 
 def flat_share(mesh: Mesh) -> float:
@@ -176,7 +221,10 @@ def flat_share(mesh: Mesh) -> float:
         heights, weights = centres[is_parallel] @ normal, areas[is_parallel]
         order = np.argsort(heights)
         heights, sums = heights[order], np.append(0, np.cumsum(weights[order]))
-        largest = max(largest, float((sums[np.searchsorted(heights, heights + thickness, "right")] - sums[:-1]).max()))
+        largest = max(
+            largest,
+            float((sums[np.searchsorted(heights, heights + thickness, "right")] - sums[:-1]).max()),
+        )
     return largest / float(areas.sum())
 
 
@@ -185,13 +233,17 @@ def _measure_file(
 ) -> dict[BodyRef, tuple[list[float], Place | None]]:
     """Measure bodies of the same file, which is read once; bodies without a surface are left out."""
     result = {}
-    for body, raw in each_surface(bodies[0].path, pipeline.reading, parts=[body.part for body in bodies]):
+    for body, raw in each_surface(
+        bodies[0].path, pipeline.reading, parts=[body.part for body in bodies]
+    ):
         with contextlib.suppress(MeshError):
             result[body] = _measure(pipeline, body, raw)
     return result
 
 
-def _measure(pipeline: SignaturePipeline, body: BodyRef, raw: RawBody) -> tuple[list[float], Place | None]:
+def _measure(
+    pipeline: SignaturePipeline, body: BodyRef, raw: RawBody
+) -> tuple[list[float], Place | None]:
     """Return the measures `_MEASURED` of a body, and the place of a label."""
     mesh = surface_body(raw, body, pipeline.reading, least_vertices=pipeline.config.n_vertices_read)
     values = dict.fromkeys(_MEASURED, np.nan)
@@ -204,8 +256,14 @@ def _measure(pipeline: SignaturePipeline, body: BodyRef, raw: RawBody) -> tuple[
     voxels = raw.voxels()
     mask, low, grid = voxels.mask, voxels.low, voxels.grid
     sides = np.linalg.norm(voxels.affine[:3, :3], axis=0)
-    values["spacing"] = np.log(sides.prod()) / 3  # faces do not tell: the surface of a label adapts them to the shape
-    values["stray"], values["cavity"], values["hole"] = stray_root(mask), cavity_root(mask), hole_root(mask)
+    values["spacing"] = (
+        np.log(sides.prod()) / 3
+    )  # faces do not tell: the surface of a label adapts them to the shape
+    values["stray"], values["cavity"], values["hole"] = (
+        stray_root(mask),
+        cavity_root(mask),
+        hole_root(mask),
+    )
     values["gap"] = gap_root(mask, sides)
     values["cut"] = cut_end(mask, np.stack([low == 0, low + mask.shape == grid], axis=1))
     key = body.path.parent, grid, voxels.affine.tobytes()
@@ -235,11 +293,16 @@ def _class_distances(distances: Floats, codes: Integers) -> tuple[Floats, Floats
 def _max_bodies_of_subject(subjects: Sequence[object], codes: Integers) -> int:
     """Return the largest number of bodies of a subject; 1 if subjects are few or have several bodies of a class."""
     counts = Counter(subjects)
-    is_usable = len(set(zip(subjects, codes.tolist(), strict=True))) == len(codes) and len(counts) >= _MIN_SUBJECTS
+    is_usable = (
+        len(set(zip(subjects, codes.tolist(), strict=True))) == len(codes)
+        and len(counts) >= _MIN_SUBJECTS
+    )
     return max(counts.values()) if is_usable else 1
 
 
-def _deviations(values: Floats, codes: Integers, name: str, n_per_subject: int) -> tuple[Floats, Floats]:
+def _deviations(
+    values: Floats, codes: Integers, name: str, n_per_subject: int
+) -> tuple[Floats, Floats]:
     """Return how many robust standard deviations values (N,) exceed the usual value, and the usual value.
 
     The usual value is the median of the other bodies of the class; for a class of one, the median of the other classes.
@@ -253,13 +316,17 @@ def _deviations(values: Floats, codes: Integers, name: str, n_per_subject: int) 
     usual = np.array([np.median(values[own]) if len(own) else np.nan for own in members])
     differences = values - usual
     pooled = _scatter(differences[np.isfinite(differences)], min_scatter)
-    centres = {code: np.median(values[is_known & (codes == code)]) for code in np.unique(codes[is_known])}
+    centres = {
+        code: np.median(values[is_known & (codes == code)]) for code in np.unique(codes[is_known])
+    }
     result = np.full(n, np.nan)
     for i in np.flatnonzero(is_known).tolist():
         deviations, own = [], values[members[i]]
         if len(own):
             n_own, own_scatter = len(own), _scatter(own, 0, use_tail=False)
-            variance = (n_own * own_scatter**2 + _PRIOR_WEIGHT * pooled**2) / (n_own + _PRIOR_WEIGHT)
+            variance = (n_own * own_scatter**2 + _PRIOR_WEIGHT * pooled**2) / (
+                n_own + _PRIOR_WEIGHT
+            )
             deviations.append(differences[i] / max(min_scatter, np.sqrt(variance)))
         if name != "volume" and len(own) < (_MIN_CLASS_SIZE - 1 if name == "spacing" else 1):
             others = np.array([centre for code, centre in centres.items() if code != codes[i]])
@@ -279,7 +346,11 @@ def _scatter(values: Floats, minimum: float, use_tail: bool = True) -> float:
     if not len(values):
         return minimum
     deviations = np.abs(values - np.median(values))
-    tail = np.quantile(deviations, 0.9) / 1.645 if use_tail and len(values) > _MAX_WITHOUT_TAIL else 0.0
+    tail = (
+        np.quantile(deviations, 0.9) / 1.645
+        if use_tail and len(values) > _MAX_WITHOUT_TAIL
+        else 0.0
+    )
     return max(minimum, _NORMAL_RATIO * float(np.median(deviations)), float(tail))
 
 
@@ -291,7 +362,11 @@ def _rare_repairs(notes: Sequence[Sequence[str]]) -> tuple[Floats, list[list[str
     kinds = [[re.sub(r"[\d.,]+", "n", note) for note in notes_of_body] for notes_of_body in notes]
     counts = Counter(kind for kinds_of_body in kinds for kind in set(kinds_of_body))
     rare = [
-        [note for note, kind in zip(notes_of_body, kinds_of_body, strict=True) if counts[kind] < len(notes) / 4]
+        [
+            note
+            for note, kind in zip(notes_of_body, kinds_of_body, strict=True)
+            if counts[kind] < len(notes) / 4
+        ]
         for notes_of_body, kinds_of_body in zip(notes, kinds, strict=True)
     ]
     return np.array([2.0 * len(rare_of_body) for rare_of_body in rare]), rare

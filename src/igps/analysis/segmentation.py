@@ -41,7 +41,9 @@ def hole_root(mask: Booleans) -> float:
         np.moveaxis(neighbours, axis, 0)[[0, 2]] = False
         pieces, n_pieces = ndimage.label(~padded, neighbours)
         is_hole = np.arange(n_pieces + 1) > 0
-        is_hole[np.take(pieces, 0, axis=axis - 1)] = False  # the outside, which contains the padding of the slice
+        is_hole[np.take(pieces, 0, axis=axis - 1)] = (
+            False  # the outside, which contains the padding of the slice
+        )
         holes |= is_hole[pieces][1:-1, 1:-1, 1:-1]
     return float(np.sqrt(np.count_nonzero(holes) / np.count_nonzero(mask)))
 

@@ -51,7 +51,9 @@ def completion(shell: Literal["bash", "zsh", "tcsh"]) -> None:
     try:
         import shtab  # noqa: F401
     except ImportError as error:
-        raise ImportError('igps completion needs shtab: pip install "interior-gps[completion]".') from error
+        raise ImportError(
+            'igps completion needs shtab: pip install "interior-gps[completion]".'
+        ) from error
     print(command_parser().get_completion_script(f"shtab-{shell}"))
 
 
@@ -63,22 +65,35 @@ COMMANDS: Commands = {
     **_by_name(retrieve, extract, query, fit, classify, precompute),
     "cache": {"export": cache_export},
     "gallery": _by_name(
-        gallery.build, gallery.add, gallery.sync, gallery.remove, gallery.update, gallery.merge, query, gallery.info,
-        gallery.versions, gallery.restore,
+        gallery.build,
+        gallery.add,
+        gallery.sync,
+        gallery.remove,
+        gallery.update,
+        gallery.merge,
+        query,
+        gallery.info,
+        gallery.versions,
+        gallery.restore,
     ),
     **_by_name(duplicates, distance, demo, compare, doctor, groups, explain, outliers, clusters),
     "figure": {"map": map_bodies, **_by_name(clusters, groups, explain, outliers)},
     **_by_name(report, completion),
-}  # fmt: skip
+}
 """The commands by name: a function, or a mapping for a group of commands.
 
 A command that prints a table returns the same data, for `--json`. Commands of `figure` write to `figures` by default.
 """
 
 ENDINGS: Mapping[Command, Sequence[str]] = {
-    extract: (*SUFFIXES, ".npz"), fit: (".safetensors", ""), cache_export: (".igps",), classify: (".csv",),
-    duplicates: (".csv",), doctor: (), report: (),
-}  # fmt: skip
+    extract: (*SUFFIXES, ".npz"),
+    fit: (".safetensors", ""),
+    cache_export: (".igps",),
+    classify: (".csv",),
+    duplicates: (".csv",),
+    doctor: (),
+    report: (),
+}
 """Suffixes that `out` of a command may have: () allows any file, and "" a folder. Elsewhere `out` is a folder."""
 
 
@@ -88,19 +103,26 @@ def errors_as_messages() -> Iterator[None]:
     try:
         yield
     except MemoryError as error:
-        print(f"igps: out of memory ({error}). Reduce the input, or set a memory limit for each body.", file=sys.stderr)
+        print(
+            f"igps: out of memory ({error}). Reduce the input, or set a memory limit for each body.",
+            file=sys.stderr,
+        )
         sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         is_system = isinstance(error, OSError) and is_machine_error(error)
         print(f"igps: {machine_error_text(error) if is_system else error}", file=sys.stderr)  # type: ignore[arg-type]
         sys.exit(2 if is_system or isinstance(error, MachineError) else 1)
     except KeyboardInterrupt:
-        print("igps: interrupted. Run again to continue: finished results are kept.", file=sys.stderr)
+        print(
+            "igps: interrupted. Run again to continue: finished results are kept.", file=sys.stderr
+        )
         sys.exit(130)  # the convention of shells: 128 + SIGINT
 
 
 def main(
-    commands: Commands | None = None, program: str = "igps", endings: Mapping[Command, Sequence[str]] = ENDINGS
+    commands: Commands | None = None,
+    program: str = "igps",
+    endings: Mapping[Command, Sequence[str]] = ENDINGS,
 ) -> None:
     """Run the command of the command line; exit with status 1 for wrong input, or 2 for a fault of the system.
 
@@ -127,7 +149,10 @@ def main(
         check_place("out", options.get("out"), endings.get(command))
         check_place("failures", options.get("failures"), ())
         # With --json, standard output holds the JSON alone
-        with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+        with (
+            one_thread(),
+            contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext(),
+        ):
             result = command(**options)
     verdict = result if isinstance(result, Verdict) else Verdict(result, True)
     if as_json:
@@ -148,9 +173,13 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
     existing = next(path for path in (place, *place.parents) if path.exists())
     if existing.is_dir() == (existing == place and is_file):
         kind, other = ("file", "folder") if existing.is_dir() else ("folder", "file")
-        raise ValueError(f"{name}: expected a {kind}, {existing} is a {other}. Choose another path.")
+        raise ValueError(
+            f"{name}: expected a {kind}, {existing} is a {other}. Choose another path."
+        )
     if not os.access(existing, os.W_OK):
-        raise ValueError(f"{name}: no permission to write to {existing}. Choose another path, or grant the permission.")
+        raise ValueError(
+            f"{name}: no permission to write to {existing}. Choose another path, or grant the permission."
+        )
 
 
 def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:
@@ -158,7 +187,9 @@ def command_parser(commands: Commands | None = None, program: str = "igps") -> A
     summary = "Volumetric shape retrieval by interior Global Point Signatures."
     parser = ArgumentParser(prog=program, description=summary, formatter_class=HelpFormatter)
     text = f"%(prog)s {version()}"
-    parser.add_argument("--version", action="version", version=text, help="show the version and exit")
+    parser.add_argument(
+        "--version", action="version", version=text, help="show the version and exit"
+    )
     _add_commands(parser, COMMANDS if commands is None else commands, program)
     return parser
 
@@ -182,7 +213,9 @@ def _add_commands(parser: ArgumentParser, commands: Commands, program: str) -> N
             subcommands.add_subcommand(name, subparser, help=summary)
         else:
             listed = f"commands: {', '.join(command)}"
-            group = ArgumentParser(description=f"One of several {listed}.", formatter_class=HelpFormatter)
+            group = ArgumentParser(
+                description=f"One of several {listed}.", formatter_class=HelpFormatter
+            )
             subcommands.add_subcommand(name, group, help=listed)
             # jsonargparse accepts subcommands of a group only after adding the group
             _add_commands(group, command, f"{program} {name}")
@@ -194,7 +227,10 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
     A first parameter without default is positional. A list takes several values, and a boolean is a switch.
     """
     types = get_type_hints(command)
-    documented = {parameter.arg_name: parameter.description for parameter in parse(command.__doc__ or "").params}
+    documented = {
+        parameter.arg_name: parameter.description
+        for parameter in parse(command.__doc__ or "").params
+    }
     meanings = {**MEANINGS, **documented}
     parameters = inspect.signature(command).parameters
     switches = {name: meanings.get(name) for name in parameters if types[name] is bool}
@@ -202,7 +238,9 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
     if "reading" in parameters:
         switches = {**FLAGS, **switches}
         has_descriptor = {"descriptor", "descriptors"} & set(parameters)
-        lists = {name: meaning for name, meaning in LISTS.items() if name != "with" or has_descriptor}
+        lists = {
+            name: meaning for name, meaning in LISTS.items() if name != "with" or has_descriptor
+        }
     if types["return"] is not type(None):
         switches[JSON] = "print the table as JSON, and everything else to standard error"
     custom: set[str | int] = {*switches, *LISTS}  # their syntax differs from jsonargparse's
@@ -215,7 +253,13 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
                 settings["default"] = parameter.default
             if not is_positional:
                 settings |= {"action": _Collect, "required": not settings}
-            parser.add_argument(option, nargs=item and "+", type=item or types[name], help=meanings[name], **settings)
+            parser.add_argument(
+                option,
+                nargs=item and "+",
+                type=item or types[name],
+                help=meanings[name],
+                **settings,
+            )
             custom.add(name)
     parser.add_function_arguments(command, as_group=False, skip=custom)
     for action in parser._actions:
@@ -231,7 +275,9 @@ class _Collect(argparse.Action):
 
     _collected: Any = None  # the last value that this action set, which is never the default
 
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+    def __call__(
+        self, parser: Any, namespace: Any, values: Any, option_string: str | None = None
+    ) -> None:
         given = getattr(namespace, self.dest, None)
         self._collected = [*given, *values] if given is self._collected and given else values
         setattr(namespace, self.dest, self._collected)

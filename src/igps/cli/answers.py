@@ -14,7 +14,14 @@ from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, with_q_values
 from igps.analysis.outliers import LIMIT, measure_bodies
 from igps.analysis.outliers import outliers as find_outliers
-from igps.cli.reading import Folder, check_files, described, files_or_folder, is_named_after_file, print_failures
+from igps.cli.reading import (
+    Folder,
+    check_files,
+    described,
+    files_or_folder,
+    is_named_after_file,
+    print_failures,
+)
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
@@ -61,7 +68,11 @@ def groups(
     def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
         labels = np.array(bodies.labels if group is None else bodies.column(group))
         stratum = None if strata is None else np.array(bodies.column(strata))
-        return labels, stratum, np.hstack([_design(bodies, name) for name in covariate]) if covariate else None
+        return (
+            labels,
+            stratum,
+            np.hstack([_design(bodies, name) for name in covariate]) if covariate else None,
+        )
 
     folder = Folder(root, labelled=group is None, check=columns)
     # Size counts only where the descriptor's name says so
@@ -73,25 +84,39 @@ def groups(
     if test_size:
         if warning := keeps_size("keep", result.dataset.units())[1]:
             print(warning)
-        vectors[", size"] = np.log([[s.volume * millimetres(s.unit) ** 3] for s in result.dataset.signatures()])
+        vectors[", size"] = np.log(
+            [[s.volume * millimetres(s.unit) ** 3] for s in result.dataset.signatures()]
+        )
     members: dict[str, list[int]] = {}
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
     n_pairs = len(set(zip(bodies.parts, labels, strict=True)))
-    is_named_by_file = n_pairs == len(bodies) and all(map(is_named_after_file, bodies.names, bodies.parts))
+    is_named_by_file = n_pairs == len(bodies) and all(
+        map(is_named_after_file, bodies.names, bodies.parts)
+    )
     if is_named_by_file or n_pairs == len(members) in (len(set(labels)), len(bodies)):
         # The parts are not organs: they are the groups, or the names of files with one mask each, which may repeat in
         # each group
         members = {"all": list(range(len(bodies)))}
-    jobs = [(body + suffix, i, rows[i]) for body, i in members.items() for suffix, rows in vectors.items()]
-    tests = with_q_values([
-        group_test(
-            rows, labels[i].tolist(), body=body, n_permutations=n_permutations, seed=seed,
-            strata=None if stratum is None else stratum[i].tolist(),
-            covariates=None if covariates is None else covariates[i],
-        )
-        for body, i, rows in tqdm(jobs, desc="tests")
-    ])  # fmt: skip
+    jobs = [
+        (body + suffix, i, rows[i])
+        for body, i in members.items()
+        for suffix, rows in vectors.items()
+    ]
+    tests = with_q_values(
+        [
+            group_test(
+                rows,
+                labels[i].tolist(),
+                body=body,
+                n_permutations=n_permutations,
+                seed=seed,
+                strata=None if stratum is None else stratum[i].tolist(),
+                covariates=None if covariates is None else covariates[i],
+            )
+            for body, i, rows in tqdm(jobs, desc="tests")
+        ]
+    )
     print(groups_table(tests))
     print_failures(result.failures, len(bodies))
     if out is not None:
@@ -108,11 +133,17 @@ def _design(bodies: Bodies, name: str) -> Any:
     words = bodies.column(name)
     if any(re.match(r"[-+.\d]|inf(inity)?$", word, re.IGNORECASE) for word in words):
         return np.array(bodies.numbers(name))[:, None]
-    return np.array([[word == category for category in sorted(set(words))] for word in words], dtype=float)
+    return np.array(
+        [[word == category for category in sorted(set(words))] for word in words], dtype=float
+    )
 
 
 def outliers(
-    root: Path, descriptor: str = "pretrained", top: int = 20, out: Path | None = None, **reading: Any
+    root: Path,
+    descriptor: str = "pretrained",
+    top: int = 20,
+    out: Path | None = None,
+    **reading: Any,
 ) -> list[dict[str, Any]]:
     """List the bodies that are most unlike their class, to review before the collection is used.
 
@@ -135,27 +166,42 @@ def outliers(
     files = dataset.bodies.paths
     # Where each file holds one mask, a folder holds the organs of one subject
     subjects = files if len(set(files)) < len(files) else [file.parent for file in files]
-    ranked = find_outliers(distances, dataset.bodies.labels or (), measures, dataset.all_notes(), subjects)
+    ranked = find_outliers(
+        distances, dataset.bodies.labels or (), measures, dataset.all_notes(), subjects
+    )
     rows: list[dict[str, Any]] = [
-        {"name": dataset.bodies.names[o.body], "class": o.label, "score": round(o.score, 3), "reason": o.reason,
-         **{f"score_{name}": round(value, 3) for name, value in o.scores.items()}}
+        {
+            "name": dataset.bodies.names[o.body],
+            "class": o.label,
+            "score": round(o.score, 3),
+            "reason": o.reason,
+            **{f"score_{name}": round(value, 3) for name, value in o.scores.items()},
+        }
         for o in ranked
-    ]  # fmt: skip
+    ]
     width = max((len(row["name"]) for row in rows[:top]), default=4)
     print(f"{'score':>7}  {'body':<{width}}  class: reason")
     for row in rows[:top]:
         print(f"{row['score']:>7.1f}  {row['name']:<{width}}  {row['class']}: {row['reason']}")
-    print(f"{sum(o.is_outlier for o in ranked)} of {len(rows)} bodies are outliers, with a score above {LIMIT}")
+    print(
+        f"{sum(o.is_outlier for o in ranked)} of {len(rows)} bodies are outliers, with a score above {LIMIT}"
+    )
     print_failures(result.failures, len(dataset))
     if out is not None:
-        pictured = [(o, dataset.bodies.names[o.body], dataset.mesh(o.body)) for o in ranked[: min(top, 12)]]
+        pictured = [
+            (o, dataset.bodies.names[o.body], dataset.mesh(o.body)) for o in ranked[: min(top, 12)]
+        ]
         write_analysis(out, "outliers", rows, outliers_figure(pictured) if pictured else None)
         print(f"written to {out}")
     return rows
 
 
 def explain(
-    meshes: list[Path], descriptor: str = "pretrained", level: float = 0.05, out: Path | None = None, **reading: Any
+    meshes: list[Path],
+    descriptor: str = "pretrained",
+    level: float = 0.05,
+    out: Path | None = None,
+    **reading: Any,
 ) -> dict[str, Any]:
     """Show where two bodies or two groups of bodies differ, by the share of each part in their distance.
 
@@ -170,19 +216,31 @@ def explain(
     source = files_or_folder(meshes)
     if not isinstance(source, Folder):
         if len(source) != 2:
-            raise ValueError(f"meshes: expected two files, or a folder of two classes, got {len(source)} files.")
+            raise ValueError(
+                f"meshes: expected two files, or a folder of two classes, got {len(source)} files."
+            )
         check_files(source)
-    without_head(descriptor_of(descriptor))  # raises for other descriptors before anything is computed
+    without_head(
+        descriptor_of(descriptor)
+    )  # raises for other descriptors before anything is computed
     if isinstance(source, Folder):
         folder = Folder(source.root, labelled=True, needs_meshes=True, check=_check_two_classes)
         result = described(folder, descriptor, **reading)
         _check_two_classes(result.dataset.bodies)  # without the bodies that could not be used
-        dataset, module, labels = result.dataset, result.descriptor, np.array(result.dataset.bodies.labels)
+        dataset, module, labels = (
+            result.dataset,
+            result.descriptor,
+            np.array(result.dataset.bodies.labels),
+        )
         inner, n_workers = without_head(module), reading.get("n_workers")
-        descriptions = describe(dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True)
+        descriptions = describe(
+            dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True
+        )
         members = [np.flatnonzero(labels == name) for name in sorted(set(labels))]
         squares = squared_distances(inner.coordinates(descriptions).double().numpy())
-        pair = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]  # the medoids
+        pair = [
+            int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members
+        ]  # the medoids
         batches = [dataset.batch([i]) for i in pair]
         first, second = (descriptions[own] for own in members)
         explanation, is_significant = explain_groups(module, first, second, batches, level=level)
@@ -193,10 +251,14 @@ def explain(
         dataset, module = result.dataset, result.descriptor
         if len(dataset) != 2:
             listed = ", ".join(dataset.bodies.names[:4])
-            raise ValueError(f"meshes: expected two bodies, got {len(dataset)}: {listed}. Name each as FILE#PART.")
+            raise ValueError(
+                f"meshes: expected two bodies, got {len(dataset)}: {listed}. Name each as FILE#PART."
+            )
         explanation = explain_pair(module, *(dataset.batch([i]) for i in pair))
     names = [dataset.bodies.names[i] for i in pair]
-    print(f"{' and '.join(names)}: {explanation.distance:.4g} by {module.name}: {explanation.summary()}")
+    print(
+        f"{' and '.join(names)}: {explanation.distance:.4g} by {module.name}: {explanation.summary()}"
+    )
     painted = [_painted(dataset, i, explanation, side) for side, i in enumerate(pair)]
     for name, mesh, values in painted:
         print(f"{name}: {_extent(values, face_areas(mesh.vertices, mesh.faces))}")
@@ -213,7 +275,9 @@ def _check_two_classes(bodies: Bodies) -> None:
         raise ValueError(f"meshes: expected a folder of two classes, got {n}.")
 
 
-def _painted(dataset: SignatureDataset, i: int, explanation: Explanation, side: int) -> tuple[str, Mesh, Any]:
+def _painted(
+    dataset: SignatureDataset, i: int, explanation: Explanation, side: int
+) -> tuple[str, Mesh, Any]:
     """Return the name and mesh of a body, and the shares of its faces (F,) in the distance; `side` is 0 or 1."""
     mesh, signature = dataset.mesh(i), dataset[i].signature
     centres = mesh.vertices[mesh.faces].mean(axis=1)
@@ -232,14 +296,24 @@ def _extent(values: Any, areas: Any) -> str:
     return f"half of its share lies on {100 * half:.2g}% of its surface"
 
 
-def _sample_rows(dataset: SignatureDataset, pair: list[int], explanation: Explanation) -> list[dict[str, Any]]:
+def _sample_rows(
+    dataset: SignatureDataset, pair: list[int], explanation: Explanation
+) -> list[dict[str, Any]]:
     by_place = explanation.places or explanation.samples
     return [
-        {"name": dataset.bodies.names[i], "samples": kind, **dict(zip("xyz", point, strict=True)),
-         "share": float(share), "share_by_place": float(placed)}
+        {
+            "name": dataset.bodies.names[i],
+            "samples": kind,
+            **dict(zip("xyz", point, strict=True)),
+            "share": float(share),
+            "share_by_place": float(placed),
+        }
         for i, shares, places in zip(pair, explanation.samples, by_place, strict=True)
         for kind in SAMPLE_KINDS
         for point, share, placed in zip(
-            getattr(dataset[i].signature, kind).points.tolist(), shares[kind], places[kind], strict=True
+            getattr(dataset[i].signature, kind).points.tolist(),
+            shares[kind],
+            places[kind],
+            strict=True,
         )
-    ]  # fmt: skip
+    ]

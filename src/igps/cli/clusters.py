@@ -48,28 +48,48 @@ def clusters(
 
     def check_number(bodies: Bodies) -> None:
         if n_clusters is not None and not 1 <= n_clusters <= len(bodies):
-            raise ValueError(f"n_clusters: expected 1 to {len(bodies)}, the bodies of the folder, got {n_clusters}.")
+            raise ValueError(
+                f"n_clusters: expected 1 to {len(bodies)}, the bodies of the folder, got {n_clusters}."
+            )
 
     dataset, distances, labels = _distances(root, check_number, descriptor, **reading)
     result = clusters_of(distances, n_clusters, linkage=linkage, n_resamples=n_resamples, seed=seed)
     names, table = dataset.bodies.names, list[dict[str, Any]]()
     print(f"{'cluster':>7}{'bodies':>8}{'stability':>11}  medoid (classes)")
-    for number, (medoid, stability) in enumerate(zip(result.medoids, result.stability, strict=True)):
+    for number, (medoid, stability) in enumerate(
+        zip(result.medoids, result.stability, strict=True)
+    ):
         members = np.flatnonzero(result.labels == number)
         classes = Counter(labels[i] for i in members if labels[i])
         table.append(
-            {"cluster": number + 1, "n_bodies": len(members), "stability": stability, "middle": names[medoid],
-             "classes": dict(classes.most_common()), "bodies": [names[i] for i in members]}
-        )  # fmt: skip
-        shown = ", ".join(f"{count} {name}" for name, count in classes.most_common(3)) + ", …" * (len(classes) > 3)
+            {
+                "cluster": number + 1,
+                "n_bodies": len(members),
+                "stability": stability,
+                "middle": names[medoid],
+                "classes": dict(classes.most_common()),
+                "bodies": [names[i] for i in members],
+            }
+        )
+        shown = ", ".join(f"{count} {name}" for name, count in classes.most_common(3)) + ", …" * (
+            len(classes) > 3
+        )
         stability_text = "–" if np.isnan(stability) else f"{stability:.2f}"
-        print(f"{number + 1:>7}{len(members):>8}{stability_text:>11}  {names[medoid]}" + f" ({shown})" * bool(shown))
+        print(
+            f"{number + 1:>7}{len(members):>8}{stability_text:>11}  {names[medoid]}"
+            + f" ({shown})" * bool(shown)
+        )
     n_stable = sum(stability >= STABLE for stability in result.stability)
     unknown = f", {n} unknown" if (n := np.isnan(result.stability).sum()) else ""
     print(f"{n_stable} of {len(table)} clusters are stable (at least {STABLE}){unknown}")
     if out is not None:
         rows = [
-            {"name": name, "class": label, "cluster": int(number) + 1, "stability": result.stability[number]}
+            {
+                "name": name,
+                "class": label,
+                "cluster": int(number) + 1,
+                "stability": result.stability[number],
+            }
             for name, label, number in zip(names, labels, result.labels, strict=True)
         ]
         write_analysis(out, "clusters", rows, clusters_figure(result, names))
@@ -113,17 +133,26 @@ def map_bodies(
     if colour == "class":
         values = labels
     elif colour == "cluster":
-        values = [str(number + 1) for number in clusters_of(distances, n_resamples=0, seed=seed).labels]
+        values = [
+            str(number + 1) for number in clusters_of(distances, n_resamples=0, seed=seed).labels
+        ]
     elif colour == "volume":
-        values = [signature.volume * millimetres(signature.unit) ** 3 for signature in dataset.signatures()]
+        values = [
+            signature.volume * millimetres(signature.unit) ** 3
+            for signature in dataset.signatures()
+        ]
     else:
         values = column_values(bodies)
     column = colour if colour not in ("name", "x", "y") else f"{colour} of {LABELS_FILE}"
     rows = [
         {"name": name, "x": x, "y": y, "class": label, column: value}
-        for name, (x, y), label, value in zip(bodies.names, result.points.tolist(), labels, values, strict=True)
+        for name, (x, y), label, value in zip(
+            bodies.names, result.points.tolist(), labels, values, strict=True
+        )
     ]
-    print(f"{len(rows)} bodies; stress {result.stress:.2f} (0: exact distances; above 0.2: strong distortion)")
+    print(
+        f"{len(rows)} bodies; stress {result.stress:.2f} (0: exact distances; above 0.2: strong distortion)"
+    )
     if out is not None:
         write_analysis(out, "map", rows, map_figure(result, values, colour))
         print(f"written to {out}")
@@ -137,10 +166,18 @@ def _distances(
 
     def check_all(bodies: Bodies) -> None:
         if len(bodies) < 3:
-            raise ValueError(f"root: expected three bodies or more, {root} has {len(bodies)}. Choose a larger folder.")
+            raise ValueError(
+                f"root: expected three bodies or more, {root} has {len(bodies)}. Choose a larger folder."
+            )
         check(bodies)
 
     result = described(Folder(root, check=check_all), descriptor, **reading)
     print_failures(result.failures, len(result.dataset))
-    distances = pair_distances(result.descriptor, result.descriptions, progress=True).double().numpy()
-    return result.dataset, distances, list(result.dataset.bodies.labels or [""] * len(result.dataset))
+    distances = (
+        pair_distances(result.descriptor, result.descriptions, progress=True).double().numpy()
+    )
+    return (
+        result.dataset,
+        distances,
+        list(result.dataset.bodies.labels or [""] * len(result.dataset)),
+    )

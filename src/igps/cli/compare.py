@@ -9,7 +9,14 @@ import numpy as np
 
 from igps.analysis.comparison import Result, check_names
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import Folder, MirrorOption, signatures, with_side, with_size, write_mending_notes
+from igps.cli.reading import (
+    Folder,
+    MirrorOption,
+    signatures,
+    with_side,
+    with_size,
+    write_mending_notes,
+)
 from igps.cli.report import check_report_folder
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
@@ -52,15 +59,21 @@ def compare(
     modules = [descriptor_of(name) for name in names]
     if size == "auto" and any(SIZE in module.name for module in modules):
         size = "ignore"
-    check_names([module.name.replace(SIZE, "") if size == "keep" else module.name for module in modules])
-    dataset, failures = signatures(Folder(root, labelled=True), modules, n_workers=n_workers, strict=strict, **reading)
+    check_names(
+        [module.name.replace(SIZE, "") if size == "keep" else module.name for module in modules]
+    )
+    dataset, failures = signatures(
+        Folder(root, labelled=True), modules, n_workers=n_workers, strict=strict, **reading
+    )
     modules = [descriptor_of(with_size(name, size, dataset)) for name in names]
     for module in modules:
         fit_centres(module, dataset)
     results: list[Result] = []
     for result in compare_descriptors(dataset, modules, n_workers=n_workers, strict=strict):
         results.append(result)
-        if out is not None:  # after each descriptor, so that an interrupted run keeps its results so far
+        if (
+            out is not None
+        ):  # after each descriptor, so that an interrupted run keeps its results so far
             _write(out, results, failures)
     print(comparison_table(results))
     if n_failed := len(failures) + sum(len(result.failures) for result in results):
@@ -84,7 +97,9 @@ def compare(
 def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) -> None:
     """Write the rows and failures of all results, and the distances of the last one."""
     (out / "distances").mkdir(parents=True, exist_ok=True)
-    (out / "compare.json").write_text(json.dumps([result.row() for result in results], indent=2) + "\n")
+    (out / "compare.json").write_text(
+        json.dumps([result.row() for result in results], indent=2) + "\n"
+    )
     last = results[-1]
     if last.distances is not None:
         path = out / "distances" / f"{last.descriptor.name}.npz"

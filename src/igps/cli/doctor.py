@@ -34,15 +34,23 @@ def doctor(
         signature: parameters of the signatures, for the expected cost.
         attribute: values inside the bodies, such as ct=images/{stem}.nii.gz; these files do not count as bodies.
     """
-    reading, limits = LoadOptions(allow_open=allow_open, **options), limits_of(time_limit, memory_limit)
-    bodies = find_bodies(root, reading, attributes=attribute_sources(attribute or (), root).values())
+    reading, limits = (
+        LoadOptions(allow_open=allow_open, **options),
+        limits_of(time_limit, memory_limit),
+    )
+    bodies = find_bodies(
+        root, reading, attributes=attribute_sources(attribute or (), root).values()
+    )
     findings = examine(bodies, reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(findings))
     if out is not None:
         rows = [_row(finding) for finding in findings]
         write_rows(out, rows[0], [row.values() for row in rows])
         print(f"written to {out}")
-    return Verdict([asdict(finding) for finding in findings], all(finding.error is None for finding in findings))
+    return Verdict(
+        [asdict(finding) for finding in findings],
+        all(finding.error is None for finding in findings),
+    )
 
 
 def _row(finding: Finding) -> dict[str, Any]:

@@ -51,26 +51,44 @@ def duplicates(
         source = Gallery(root)
         gallery_options(source, reading)
     else:
-        source, unread = signatures(Folder(root, needs_meshes=True), [descriptor_of(DESCRIPTOR)], **reading)
-    units = [row["unit"] for row in source.rows("unit")] if isinstance(source, Gallery) else source.units()
+        source, unread = signatures(
+            Folder(root, needs_meshes=True), [descriptor_of(DESCRIPTOR)], **reading
+        )
+    units = (
+        [row["unit"] for row in source.rows("unit")]
+        if isinstance(source, Gallery)
+        else source.units()
+    )
     if warning := keeps_size(size, units)[1]:
         print(warning)
     shared = {name: reading.get(name) for name in ("cache_dir", "n_workers")}
-    result = find_duplicates(source, DESCRIPTOR, poses=poses, size=size, tolerance=tolerance, progress=True, **shared)
+    result = find_duplicates(
+        source, DESCRIPTOR, poses=poses, size=size, tolerance=tolerance, progress=True, **shared
+    )
     _print_groups(result, poses)
     if failures := [*result.failures, *unread]:
         print(f"{len(failures)} files could not be compared. The first: {failures[0].error}")
     if out is not None:
-        rows = [(n, name, result.paths[name]) for n, group in enumerate(result.groups, 1) for name in group]
+        rows = [
+            (n, name, result.paths[name])
+            for n, group in enumerate(result.groups, 1)
+            for name in group
+        ]
         write_rows(out, ("group", "name", "path"), rows)
     pairs: list[dict[str, Any]] = []
     for pair, apart in result.pairs.items():
-        largest = dict(zip(("largest", "largest_length", "unit"), result.largest.get(pair, ()), strict=False))
-        pairs.append({"files": list(pair), "distance": apart, "grade": result.grades.get(pair), **largest})
+        largest = dict(
+            zip(("largest", "largest_length", "unit"), result.largest.get(pair, ()), strict=False)
+        )
+        pairs.append(
+            {"files": list(pair), "distance": apart, "grade": result.grades.get(pair), **largest}
+        )
     return {
         "groups": [list(group) for group in result.groups],
         "pairs": pairs,
-        "nearly": [{"files": list(pair), "distance": apart} for pair, apart in result.nearly.items()],
+        "nearly": [
+            {"files": list(pair), "distance": apart} for pair, apart in result.nearly.items()
+        ],
         "n_files": result.n_files,
         "n_skipped": len(failures),
     }
@@ -85,16 +103,24 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     if len(meshes) != 2:
         raise ValueError(f"meshes: expected two files, got {len(meshes)}.")
     check_files(meshes)
-    reading["strict"] = True  # not in the call, where the parser looks for plain `**reading` to find the options
+    reading["strict"] = (
+        True  # not in the call, where the parser looks for plain `**reading` to find the options
+    )
     dataset, _ = signatures(meshes, [descriptor_of(DESCRIPTOR)], **reading)
     result = body_distance(dataset, DESCRIPTOR, progress=True)
     print(f"{result.distance:.4g} by {DESCRIPTOR}: {result.meaning}")
     verdict = "the same shape" if result.same else "not the same shape"
     reason = "their handles or vertices differ"
     if result.limit:
-        reason = f"at their level of detail, distances up to {result.limit:.3%} count as the same shape"
-    print(f"aligned surfaces: {result.surfaces:.3%} of the square root of the area apart, {verdict} ({reason})")
-    first, second = (signature.area**0.5 * millimetres(signature.unit) for signature in dataset.signatures())
+        reason = (
+            f"at their level of detail, distances up to {result.limit:.3%} count as the same shape"
+        )
+    print(
+        f"aligned surfaces: {result.surfaces:.3%} of the square root of the area apart, {verdict} ({reason})"
+    )
+    first, second = (
+        signature.area**0.5 * millimetres(signature.unit) for signature in dataset.signatures()
+    )
     print(f"lengths of the second are {second / first:.4g} times those of the first")
     return {"descriptor": DESCRIPTOR, **asdict(result), "lengths": second / first}
 
@@ -106,7 +132,9 @@ def _print_groups(result: Duplicates, poses: bool) -> None:
         print(f"nearly: {'  '.join(pair)}  {distance:.3%} of the square root of the area apart")
     calibration, n_grouped = Calibration.load(), sum(map(len, result.groups))
     threshold, kind = (calibration.pose, "poses") if poses else (calibration.detail, "copies")
-    grades = "".join(f"; {n} pairs {grade}" for grade, n in Counter(result.grades.values()).most_common())
+    grades = "".join(
+        f"; {n} pairs {grade}" for grade, n in Counter(result.grades.values()).most_common()
+    )
     print(
         f"{n_grouped} of {result.n_files} files in {len(result.groups)} groups; on generated bodies, this finds "
         f"{threshold.n_found} of {threshold.n_same} pairs of {kind} and mistakes {threshold.n_false} of "

@@ -30,13 +30,27 @@ def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Tabl
         The measured values: `volume`, `area`, and the description as `v0`, `v1` and so on.
     """
     bodies = dataset.bodies
-    units, volumes, areas = zip(*((s.unit, s.volume, s.area) for s in dataset.signatures()), strict=True)
+    units, volumes, areas = zip(
+        *((s.unit, s.volume, s.area) for s in dataset.signatures()), strict=True
+    )
     files = list(map(file_name_of, bodies.names, bodies.parts))
-    own = {"file": files, "part": bodies.parts, "name": bodies.names, "class": bodies.labels or [None] * len(bodies)}
+    own = {
+        "file": files,
+        "part": bodies.parts,
+        "name": bodies.names,
+        "class": bodies.labels or [None] * len(bodies),
+    }
     vectors = features.reshape(len(features), -1)
-    measured = {"volume": volumes, "area": areas, **{f"v{i}": list(column) for i, column in enumerate(vectors.T)}}
+    measured = {
+        "volume": volumes,
+        "area": areas,
+        **{f"v{i}": list(column) for i, column in enumerate(vectors.T)},
+    }
     reserved = {*own, "folder", "unit", *measured}
-    further = {f"{name} of {LABELS_FILE}" * (name in reserved) or name: bodies.columns[name] for name in bodies.columns}
+    further = {
+        f"{name} of {LABELS_FILE}" * (name in reserved) or name: bodies.columns[name]
+        for name in bodies.columns
+    }
     return {**own, **further, "unit": units}, measured
 
 
@@ -51,14 +65,21 @@ def wide_table(metadata: Table, measured: Table) -> Table:
     """
     folders = [PurePath(file).parent.as_posix() for file in metadata["file"]]
     n, parts = len(folders), set(metadata["part"])
-    has_one_body_per_file = len(set(metadata["file"])) == n == len(set(zip(folders, metadata["part"], strict=True)))
+    has_one_body_per_file = (
+        len(set(metadata["file"])) == n == len(set(zip(folders, metadata["part"], strict=True)))
+    )
     is_named_by_file = all(map(is_named_after_file, metadata["name"], metadata["part"]))
     if is_named_by_file and all(part and part.isdigit() for part in parts):
         metadata = {**metadata, "part": [None] * n}
     elif has_one_body_per_file and len(parts) > 1 and (n > len(parts) or is_named_by_file):
-        metadata = {"folder": folders, **{name: metadata[name] for name in metadata if name != "file"}}
+        metadata = {
+            "folder": folders,
+            **{name: metadata[name] for name in metadata if name != "file"},
+        }
     rows: dict[str, dict[str | None, int]] = {}
-    for i, (file, part) in enumerate(zip(next(iter(metadata.values())), metadata["part"], strict=True)):
+    for i, (file, part) in enumerate(
+        zip(next(iter(metadata.values())), metadata["part"], strict=True)
+    ):
         rows.setdefault(file, {})[part] = i
     table: dict[str, Sequence[Any]] = {}
     per_body: dict[str, Sequence[Any]] = {}
@@ -82,7 +103,9 @@ def write_table(path: Path, table: Table) -> None:
         try:
             import pyarrow.parquet
         except ImportError as error:
-            raise ImportError('out: Parquet needs pyarrow: pip install "interior-gps[table]". Or write CSV.') from error
+            raise ImportError(
+                'out: Parquet needs pyarrow: pip install "interior-gps[table]". Or write CSV.'
+            ) from error
         arrays = {name: pyarrow.array(_typed(name, values)) for name, values in table.items()}
         pyarrow.parquet.write_table(pyarrow.table(arrays), path)
     else:

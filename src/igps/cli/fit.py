@@ -52,7 +52,9 @@ def fit(
         no_prior: ignore the descriptor's own metric, and fit to its histograms alone
     """
     if out.is_dir() and not (out / IN_FOLDER).is_file() and (file := next(out.iterdir(), None)):
-        raise ValueError(f"out: expected a new or empty folder, or a model's, {out} holds {file.name}. Choose another.")
+        raise ValueError(
+            f"out: expected a new or empty folder, or a model's, {out} holds {file.name}. Choose another."
+        )
     base = descriptor_of(descriptor)
     specification(base)  # raises for a descriptor that cannot be saved, before anything is computed
     check_centres(base)
@@ -60,7 +62,14 @@ def fit(
     dataset, unread = signatures(folder, [base], n_workers=n_workers, strict=strict, **reading)
     failures: list[Failure] | None = None if strict else []
     model = fit_head(
-        dataset, base, goal=goal, head=head, prior=not no_prior, failures=failures, n_workers=n_workers, progress=True
+        dataset,
+        base,
+        goal=goal,
+        head=head,
+        prior=not no_prior,
+        failures=failures,
+        n_workers=n_workers,
+        progress=True,
     )
     model.save(out, {**model.card, "descriptor": descriptor})
     card = _card(model, out)
@@ -73,7 +82,9 @@ def fit(
     return {**model.card, "n_refused": len(skipped)}
 
 
-def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading: Any) -> list[dict[str, Any]]:
+def classify(
+    meshes: list[Path], model: Path, out: Path | None = None, **reading: Any
+) -> list[dict[str, Any]]:
     """Classify meshes: print the most probable class of each, its probability, and the meshes that fit no class.
 
     Args:
@@ -85,7 +96,10 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
     classifier_of(module)  # raises for other models before anything is computed
     dataset, failures = signatures(files_or_folder(meshes), [module], **reading)
     result = classify_bodies(
-        dataset, module, failures=None if reading.get("strict") else failures, n_workers=reading.get("n_workers")
+        dataset,
+        module,
+        failures=None if reading.get("strict") else failures,
+        n_workers=reading.get("n_workers"),
     )
     width = max(map(len, result.names))
     print(f"{'mesh':<{width}}  {'probability':>11}  class")
@@ -93,9 +107,20 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
     best = result.probabilities.max(dim=1)
     columns = (result.names, result.predicted, best.values.tolist(), best.indices.tolist())
     for name, predicted, value, likely in zip(*columns, strict=True):
-        shown = f"unlike every known class, most like {result.classes[likely]}" if predicted is None else predicted
+        shown = (
+            f"unlike every known class, most like {result.classes[likely]}"
+            if predicted is None
+            else predicted
+        )
         print(f"{name:<{width}}  {value:>11.1%}  {shown}")
-        rows.append({"name": name, "class": predicted, "most_like": result.classes[likely], "probability": value})
+        rows.append(
+            {
+                "name": name,
+                "class": predicted,
+                "most_like": result.classes[likely],
+                "probability": value,
+            }
+        )
     print_failures(failures, len(rows))
     if out is not None:
         table = [
@@ -108,10 +133,15 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
 
 def _card(model: Descriptor, path: Path) -> str:
     card = model.card
-    scores = "\n".join(f"| {_TITLES[name]} | {100 * value:.1f} |" for name, value in card["held_out_scores"].items())
+    scores = "\n".join(
+        f"| {_TITLES[name]} | {100 * value:.1f} |"
+        for name, value in card["held_out_scores"].items()
+    )
     scores = scores or "| none: no class is large enough to hold bodies out | |"
     classes = ", ".join(f"{name} ({n})" for name, n in card["classes"].items())
-    use = {"known": "bodies of its classes", "new": "bodies of classes that it was not fitted to"}[card["goal"]]
+    use = {"known": "bodies of its classes", "new": "bodies of classes that it was not fitted to"}[
+        card["goal"]
+    ]
     return f"""# {path.name}
 
 `{card["descriptor"]}` under the head `{card["head"]}`, {"with" if card["prior"] else "without"} a prior metric,

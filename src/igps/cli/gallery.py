@@ -27,9 +27,15 @@ from igps.signature.signature import SignatureConfig
 
 
 def build(
-    root: Path, out: Path, descriptor: str = "pretrained", size: Size = "auto", mirror: MirrorOption = "auto",
-    n_workers: int | None = None, strict: bool = False, **reading: Any,
-) -> None:  # fmt: skip
+    root: Path,
+    out: Path,
+    descriptor: str = "pretrained",
+    size: Size = "auto",
+    mirror: MirrorOption = "auto",
+    n_workers: int | None = None,
+    strict: bool = False,
+    **reading: Any,
+) -> None:
     """Describe the bodies of a folder and store them in a gallery, which igps query searches without their files.
 
     An existing gallery is replaced only when the new one is complete; its previous state remains as a version.
@@ -41,23 +47,33 @@ def build(
     module = descriptor_of(descriptor)
     check_centres(module)
     tables().check_place(out)
-    dataset, unread = signatures(Folder(root), [module], n_workers=n_workers, strict=strict, **reading)
+    dataset, unread = signatures(
+        Folder(root), [module], n_workers=n_workers, strict=strict, **reading
+    )
     descriptor = with_size(descriptor, size, dataset)
-    gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
+    gallery, undescribed = Gallery.build(
+        out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True
+    )
     _print_state(gallery, [*unread, *undescribed])
 
 
-def add(root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any) -> None:
+def add(
+    root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any
+) -> None:
     """Add the bodies of a folder to a gallery, with the gallery's descriptor; bodies already in it are skipped."""
     opened = Gallery(gallery)
     reading = gallery_options(opened, reading)
-    dataset, unread = signatures(Folder(root), [opened.descriptor], n_workers=n_workers, strict=strict, **reading)
+    dataset, unread = signatures(
+        Folder(root), [opened.descriptor], n_workers=n_workers, strict=strict, **reading
+    )
     print_unit_warning(opened.descriptor, dataset)
     undescribed = opened.add(dataset, n_workers=n_workers, strict=strict, progress=True)
     _print_state(opened, [*unread, *undescribed])
 
 
-def sync(root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any) -> None:
+def sync(
+    root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any
+) -> None:
     """Update a gallery from a folder: describe new and changed files, update labels, remove bodies of deleted files.
 
     Args:
@@ -66,7 +82,9 @@ def sync(root: Path, gallery: Path, n_workers: int | None = None, strict: bool =
     opened = Gallery(gallery)
     reading = gallery_options(opened, reading)
     dataset = dataset_from_options(Folder(root), opened.descriptor.requirements, **reading)
-    n_new, n_gone, failures = sync_folder(opened, dataset, root, n_workers=n_workers, strict=strict, progress=True)
+    n_new, n_gone, failures = sync_folder(
+        opened, dataset, root, n_workers=n_workers, strict=strict, progress=True
+    )
     print(f"{n_new} bodies described, {n_gone} removed")
     _print_state(opened, failures)
 
@@ -101,7 +119,9 @@ def update(gallery: Path, where: str, to: list[str]) -> None:
     """
     if wrong := [assignment for assignment in to if "=" not in assignment]:
         raise ValueError(f"to: expected COLUMN=VALUE, got {wrong[0]!r}.")
-    values = {name: value or None for name, _, value in (assignment.partition("=") for assignment in to)}
+    values = {
+        name: value or None for name, _, value in (assignment.partition("=") for assignment in to)
+    }
     print(f"{Gallery(gallery).update(where, values)} bodies updated")
 
 
@@ -112,8 +132,13 @@ def info(gallery: Path, version: int | None = None) -> dict[str, Any]:
         version: number of an earlier version, see igps gallery versions.
     """
     opened = Gallery(gallery, version=version)
-    contents = {"bodies": len(opened), "columns": {name: kind.__name__ for name, kind in opened.columns.items()}}
-    print(f"{opened.path}: {len(opened)} bodies by {opened.about['descriptor']}; columns: {', '.join(opened.columns)}")
+    contents = {
+        "bodies": len(opened),
+        "columns": {name: kind.__name__ for name, kind in opened.columns.items()},
+    }
+    print(
+        f"{opened.path}: {len(opened)} bodies by {opened.about['descriptor']}; columns: {', '.join(opened.columns)}"
+    )
     return {**contents, **opened.about}
 
 
@@ -139,7 +164,11 @@ def restore(gallery: Path, version: int) -> None:
 def gallery_options(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
     """Return reading options with those of the gallery filled in; raise a ValueError if an option contradicts them."""
     options, check = dict(reading), partial(check_alike, gallery.path, gallery.about)
-    size, mirror, name = options.pop("size", "auto"), options.pop("mirror", "auto"), gallery.about["descriptor"]
+    size, mirror, name = (
+        options.pop("size", "auto"),
+        options.pop("mirror", "auto"),
+        gallery.about["descriptor"],
+    )
     if size != "auto":
         check({"descriptor": name.replace(SIZE, "") + SIZE * (size == "keep")})
     if mirror == "distinct":
@@ -149,14 +178,18 @@ def gallery_options(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, A
     config = options.pop("signature", SignatureConfig())
     if options.pop("paper", False):
         config = SignatureConfig.paper()
-    load = LoadOptions(**{field.name: options.pop(field.name, field.default) for field in fields(LoadOptions)})
+    load = LoadOptions(
+        **{field.name: options.pop(field.name, field.default) for field in fields(LoadOptions)}
+    )
     if config != SignatureConfig():
         resolved = gallery.descriptor.requirements.apply_to(config).resolved()
         check({"signature": about_of(resolved, load, gallery.descriptor)["signature"]})
     if load.as_dict() != LoadOptions().as_dict():
         check({"reading": load.as_dict()})
     # Names of labels and the size limit do not change a description
-    load = replace(gallery.reading, names=load.names or gallery.reading.names, max_unpacked=load.max_unpacked)
+    load = replace(
+        gallery.reading, names=load.names or gallery.reading.names, max_unpacked=load.max_unpacked
+    )
     return {**options, "signature": gallery.config, **asdict(load)}
 
 

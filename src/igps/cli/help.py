@@ -19,13 +19,20 @@ class HelpFormatter(DefaultHelpFormatter):
         text = as_typed(action.help or "").removesuffix(".")
         if isinstance(action.default, list):
             return f"{text} (default: {' '.join(action.default)})"
-        is_unset = any(action.default is unset for unset in (None, False, ())) or action.default == argparse.SUPPRESS
+        is_unset = (
+            any(action.default is unset for unset in (None, False, ()))
+            or action.default == argparse.SUPPRESS
+        )
         has_default = action.option_strings and not is_unset
         return f"{text} (default: %(default)s)" if has_default else text
 
     def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
         choices = _choices(getattr(action, "_typehint", None))
-        return f"{{{','.join(choices)}}}" if choices else super()._get_default_metavar_for_optional(action)
+        return (
+            f"{{{','.join(choices)}}}"
+            if choices
+            else super()._get_default_metavar_for_optional(action)
+        )
 
 
 def as_typed(text: str) -> str:
@@ -47,4 +54,6 @@ def usage_of(parser: ArgumentParser, command: str) -> str:
 
 def _choices(hint: Any) -> tuple[str, ...]:
     """Return the strings that an optional choice allows."""
-    return tuple(choice for kind in get_args(hint) for choice in get_args(kind) if isinstance(choice, str))
+    return tuple(
+        choice for kind in get_args(hint) for choice in get_args(kind) if isinstance(choice, str)
+    )

@@ -43,7 +43,9 @@ def precompute(
         shard: part of the meshes for one job of a batch system, such as 3/64, the third of 64 parts.
         failures: CSV file for the meshes that cannot be used.
     """
-    requirements = reduce(or_, (descriptor_of(name).requirements for name in descriptors), Requirements())
+    requirements = reduce(
+        or_, (descriptor_of(name).requirements for name in descriptors), Requirements()
+    )
     dataset = dataset_from_options(Folder(root), requirements, **reading)
     dataset = dataset.subset(of_shard(len(dataset), shard))
     if not len(dataset):
@@ -58,10 +60,17 @@ def precompute(
     if failures is not None:
         write_rows(failures, ("name", "error"), [(failure.id, failure.error) for failure in failed])
     part = "" if shard is None else f" in shard {shard}"
-    print(f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed")
+    print(
+        f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed"
+    )
 
 
-def cache_export(root: Path, out: Path, descriptors: list[str] = ["pretrained"], **reading: Any) -> None:  # noqa: B006
+def cache_export(
+    root: Path,
+    out: Path,
+    descriptors: list[str] = ["pretrained"],  # noqa: B006 (only read)
+    **reading: Any,
+) -> None:
     """Write the signatures of a folder to a single file, which other commands accept in place of the folder.
 
     The file is memory-mapped when read, contains no code and no paths, and leaves out meshes that cannot be used. The
@@ -113,7 +122,11 @@ def dask_executor(address: str) -> Iterator[Executor]:
     with client:
         for worker, answer in client.run(version, on_error="return").items():
             if answer != version():
-                shown = answer if isinstance(answer, str) else f"of another version ({type(answer).__name__})"
+                shown = (
+                    answer
+                    if isinstance(answer, str)
+                    else f"of another version ({type(answer).__name__})"
+                )
                 raise MachineError(
                     f"cluster: expected igps {version()} on every worker, the one at {worker} has igps {shown}. "
                     "Install one version everywhere and run again."

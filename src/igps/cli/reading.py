@@ -68,7 +68,9 @@ class Folder:
     root: Path
     labelled: bool = False  # whether classes are required
     needs_meshes: bool = False  # whether the meshes are required, besides their signatures
-    check: Callable[[Bodies], object] | None = None  # called before any computation; raises for unsuitable bodies
+    check: Callable[[Bodies], object] | None = (
+        None  # called before any computation; raises for unsuitable bodies
+    )
 
 
 @dataclass(frozen=True)
@@ -87,11 +89,17 @@ class Described:
     descriptions: Tensor  # (N, ...)
     failures: list[Failure]  # the other bodies
     descriptor: Descriptor
-    name: str | None  # name that loads the descriptor; None where its centres were fitted to the collection
+    name: (
+        str | None
+    )  # name that loads the descriptor; None where its centres were fitted to the collection
 
     def coordinates(self, *, within_class: bool = False) -> Floats:
         """Return vectors (N, D) for statistics, see `Descriptor.coordinates`."""
-        return self.descriptor.coordinates(self.descriptions, within_class=within_class).double().numpy()
+        return (
+            self.descriptor.coordinates(self.descriptions, within_class=within_class)
+            .double()
+            .numpy()
+        )
 
 
 def signatures(
@@ -117,14 +125,22 @@ def signatures(
     Raises:
         ValueError: no body could be used.
     """
-    requirements = reduce(or_, (d.requirements for d in descriptors), Requirements()) if descriptors else None
+    requirements = (
+        reduce(or_, (d.requirements for d in descriptors), Requirements()) if descriptors else None
+    )
     dataset = dataset_from_options(source, requirements, **reading)
-    is_file = isinstance(source, Folder) and not source.root.is_dir()  # `from_file` has checked its attributes
+    is_file = (
+        isinstance(source, Folder) and not source.root.is_dir()
+    )  # `from_file` has checked its attributes
     for descriptor in () if is_file else descriptors:
         check_attributes(descriptor, {*dataset.config.attributes, *dataset.pipeline.attributes})
-    failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits_of(time_limit, memory_limit))
+    failures = dataset.precompute(
+        n_workers=n_workers, strict=strict, limits=limits_of(time_limit, memory_limit)
+    )
     if len(failures) == len(dataset):
-        raise ValueError(f"none of {len(dataset)} meshes could be used; the first: {failures[0].error}")
+        raise ValueError(
+            f"none of {len(dataset)} meshes could be used; the first: {failures[0].error}"
+        )
     usable = dataset.usable(failures)
     if summary := mending_summary(usable, len(dataset)):
         print(summary)
@@ -148,16 +164,29 @@ def described(
     """
     if isinstance(descriptor, str):
         descriptor = with_side(descriptor, mirror, size)
-    dataset, failures = signatures(source, [descriptor_of(descriptor)], strict, n_workers, **reading)
+    dataset, failures = signatures(
+        source, [descriptor_of(descriptor)], strict, n_workers, **reading
+    )
     if isinstance(descriptor, str):
         descriptor = with_size(descriptor, size, dataset)
     module = descriptor_of(descriptor)
     name = None if fit_centres(module, dataset) else name_of(descriptor)
     undescribed: list[Failure] | None = None if strict else []
     descriptions = describe(
-        dataset, module, failures=undescribed, cache_tag=cache_tag(module), n_workers=n_workers, progress=True
+        dataset,
+        module,
+        failures=undescribed,
+        cache_tag=cache_tag(module),
+        n_workers=n_workers,
+        progress=True,
     )
-    return Described(dataset.usable(undescribed or ()), descriptions, [*failures, *(undescribed or ())], module, name)
+    return Described(
+        dataset.usable(undescribed or ()),
+        descriptions,
+        [*failures, *(undescribed or ())],
+        module,
+        name,
+    )
 
 
 def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:
@@ -170,7 +199,9 @@ def check_files(paths: Sequence[Path]) -> None:
     """Raise a FileNotFoundError for the first path that is no file, before anything is computed."""
     for path in paths:
         if not file_and_part(path)[0].is_file():
-            reason = "expected a file, got a folder" if path.is_dir() else "no such file. Check the path"
+            reason = (
+                "expected a file, got a folder" if path.is_dir() else "no such file. Check the path"
+            )
             raise FileNotFoundError(f"{path}: {reason}.")
 
 
@@ -194,9 +225,14 @@ def print_failures(failures: Sequence[Failure], n_used: int) -> None:
 
 def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
     """Return the name, with +side if `mirror` is "distinct"; raise a ValueError if an option contradicts the name."""
-    for option, value, excluded, suffix in (("size", size, "ignore", SIZE), ("mirror", mirror, "same", SIDE)):
+    for option, value, excluded, suffix in (
+        ("size", size, "ignore", SIZE),
+        ("mirror", mirror, "same", SIDE),
+    ):
         if value == excluded and suffix in (name := descriptor_of(descriptor).name):
-            raise ValueError(f"{option}: expected no {value!r} with {name}, which has {suffix}. Leave one of them out.")
+            raise ValueError(
+                f"{option}: expected no {value!r} with {name}, which has {suffix}. Leave one of them out."
+            )
     if mirror != "distinct" or SIDE in descriptor:
         return descriptor
     return descriptor.replace(SIZE, "") + SIDE + SIZE * (SIZE in descriptor)
@@ -207,11 +243,16 @@ def with_size(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
     module = descriptor_of(descriptor)
     if SIZE in module.name or "scale" not in module.invariant_to:
         if size != "auto" and SIZE not in module.name:
-            print(f"--size {size} has no effect: {descriptor} does not declare that it ignores size (invariant_to)")
+            print(
+                f"--size {size} has no effect: {descriptor} does not declare that it ignores size (invariant_to)"
+            )
         return descriptor
     is_kept, warning = keeps_size(size, () if size == "ignore" else dataset.units())
     if is_kept and size == "auto" and scale_of(module) is None:
-        is_kept, warning = False, f"size is ignored: set the attribute `scale` of {descriptor} to keep it"
+        is_kept, warning = (
+            False,
+            f"size is ignored: set the attribute `scale` of {descriptor} to keep it",
+        )
     if warning:
         print(warning)
     return descriptor + SIZE * is_kept
@@ -219,7 +260,9 @@ def with_size(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
 
 def print_unit_warning(descriptor: Descriptor, dataset: SignatureDataset) -> None:
     """Print how many bodies have no unit and are read as millimetres, if the descriptor keeps size."""
-    n_unknown = sum(unit not in MILLIMETRES for unit in dataset.units()) if SIZE in descriptor.name else 0
+    n_unknown = (
+        sum(unit not in MILLIMETRES for unit in dataset.units()) if SIZE in descriptor.name else 0
+    )
     if n_unknown:
         reason = f"{n_unknown} of {len(dataset)} bodies have no unit"
         print(f"size is kept: {reason}; their coordinates are taken as millimetres")
@@ -230,10 +273,16 @@ def print_reading_warning(descriptor: Descriptor, dataset: SignatureDataset) -> 
     fitted = descriptor.card.get("reading")
     if not isinstance(fitted, Mapping):  # not a fitted model, or its card is of an earlier version
         return
-    then, now = ({**asdict(LoadOptions()), **options} for options in (fitted, dataset.reading.as_dict()))
+    then, now = (
+        {**asdict(LoadOptions()), **options} for options in (fitted, dataset.reading.as_dict())
+    )
     names = ("mend", "component", "allow_open", "cavities")
-    if changed := [f"--{name} {then[name]}, not {now[name]}" for name in names if then[name] != now[name]]:
-        print(f"{descriptor.name} was fitted to bodies read with {', '.join(changed)}: its results may be wrong")
+    if changed := [
+        f"--{name} {then[name]}, not {now[name]}" for name in names if then[name] != now[name]
+    ]:
+        print(
+            f"{descriptor.name} was fitted to bodies read with {', '.join(changed)}: its results may be wrong"
+        )
 
 
 def dataset_from_options(
@@ -257,29 +306,56 @@ def dataset_from_options(
         ValueError: options that contradict each other or the source, or no classes where they are required.
     """
     if paper and signature != SignatureConfig():
-        raise ValueError("paper: expected no other parameters of the signatures with it. Leave one of them out.")
+        raise ValueError(
+            "paper: expected no other parameters of the signatures with it. Leave one of them out."
+        )
     config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**options)
     if isinstance(source, Folder) and source.root.is_file() and not is_searched(source.root.name):
-        if config != SignatureConfig() or reading != LoadOptions() or classes is not None or attribute:
-            raise ValueError(f"{source.root}: expected no reading options with a file of signatures. Leave them out.")
+        if (
+            config != SignatureConfig()
+            or reading != LoadOptions()
+            or classes is not None
+            or attribute
+        ):
+            raise ValueError(
+                f"{source.root}: expected no reading options with a file of signatures. Leave them out."
+            )
         if source.needs_meshes:
-            raise ValueError(f"{source.root}: expected meshes, got a file of signatures. Give the folder of meshes.")
-        dataset = SignatureDataset.from_file(source.root, descriptor=requirements, cache_dir=cache_dir)
+            raise ValueError(
+                f"{source.root}: expected meshes, got a file of signatures. Give the folder of meshes."
+            )
+        dataset = SignatureDataset.from_file(
+            source.root, descriptor=requirements, cache_dir=cache_dir
+        )
         if source.labelled and dataset.bodies.labels is None:
-            raise ValueError(f"{source.root}: expected signatures with classes. Export those of a labelled folder.")
+            raise ValueError(
+                f"{source.root}: expected signatures with classes. Export those of a labelled folder."
+            )
         if source.check is not None:
             source.check(dataset.bodies)
         return dataset
-    attributes = attribute_sources(attribute or (), source.root if isinstance(source, Folder) else None)
+    attributes = attribute_sources(
+        attribute or (), source.root if isinstance(source, Folder) else None
+    )
     if isinstance(source, Folder):
         bodies = find_bodies(
-            source.root, reading, labelled=source.labelled, classes=classes or "folder", attributes=attributes.values()
+            source.root,
+            reading,
+            labelled=source.labelled,
+            classes=classes or "folder",
+            attributes=attributes.values(),
         )
         if source.check is not None:
             source.check(bodies)
         source = bodies
     return SignatureDataset(
-        source, config, cache_dir, descriptor=requirements, classes=classes, reading=reading, attributes=attributes
+        source,
+        config,
+        cache_dir,
+        descriptor=requirements,
+        classes=classes,
+        reading=reading,
+        attributes=attributes,
     )
 
 

@@ -33,16 +33,24 @@ def report(
         raise FileNotFoundError(f"meshes: {meshes}: no such folder. Check the path.")
     dataset, contents = read_sources(results, meshes), read_results(results)
     stored = results / "surfaces.npz"
-    surfaces = read_surfaces(stored) if dataset is None else keep_surfaces(stored, dataset, n_workers=n_workers)
+    surfaces = (
+        read_surfaces(stored)
+        if dataset is None
+        else keep_surfaces(stored, dataset, n_workers=n_workers)
+    )
     stored = results / "explanations.npz"
     if not explain:
         explanations = read_explanations(stored, surfaces)
     elif dataset is None or len(contents.systems) != 1:
-        raise ValueError("explain: expected a folder that `igps retrieve` wrote, with its descriptor and meshes.")
+        raise ValueError(
+            "explain: expected a folder that `igps retrieve` wrote, with its descriptor and meshes."
+        )
     else:
         (system,), fitted = contents.systems, results / "descriptor.safetensors"
         module = descriptor_of(str(fitted) if fitted.is_file() else system.name)
-        explanations = keep_explanations(stored, system, dataset, module, surfaces, n_workers=n_workers)
+        explanations = keep_explanations(
+            stored, system, dataset, module, surfaces, n_workers=n_workers
+        )
     page = out or results / "report.html"
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(render_page(contents, surfaces, explanations), encoding="utf-8")

@@ -34,7 +34,14 @@ from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.report.results import write_sources
 from igps.report.tables import scores_table, write_rows
-from igps.retrieval import N_RERANKED, RetrievalScores, rank, rerank_candidates, retrieval_scores, search
+from igps.retrieval import (
+    N_RERANKED,
+    RetrievalScores,
+    rank,
+    rerank_candidates,
+    retrieval_scores,
+    search,
+)
 from igps.retrieval import rerank as reranked_distances
 
 
@@ -107,17 +114,25 @@ def extract(
     """
     suffix = out.suffix.lower()
     if wide and suffix == ".npz":
-        raise ValueError(f"out: expected a file of a wide table ending in {' or '.join(SUFFIXES)}, got {out}.")
+        raise ValueError(
+            f"out: expected a file of a wide table ending in {' or '.join(SUFFIXES)}, got {out}."
+        )
     module = descriptor_of(descriptor)
     inner = module.descriptor if isinstance(module, IndividualDescriptor) else module
     if short and not isinstance(inner, EmbeddedDescriptor):
-        raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
+        raise ValueError(
+            f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}."
+        )
     result = described(files_or_folder(meshes), descriptor, **reading)
-    features = (result.descriptor.shorten(result.descriptions) if short else result.descriptions).numpy()
+    features = (
+        result.descriptor.shorten(result.descriptions) if short else result.descriptions
+    ).numpy()
     out.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".npz":
         bodies = result.dataset.bodies
-        labels: dict[str, Any] = {} if bodies.labels is None else {"labels": np.array(bodies.labels)}
+        labels: dict[str, Any] = (
+            {} if bodies.labels is None else {"labels": np.array(bodies.labels)}
+        )
         np.savez_compressed(out, features=features, names=np.array(bodies.names), **labels)
     else:
         metadata, measured = feature_table(result.dataset, features)
@@ -162,18 +177,26 @@ def query(
         n_missing = sum(not match.path.exists() for match in matches)
         nearest = [(match.name, match.label, match.distance) for match in matches]
     elif where is not None:
-        raise ValueError(f"where: expected a gallery, {gallery} is a folder of meshes. See igps gallery build.")
+        raise ValueError(
+            f"where: expected a gallery, {gallery} is a folder of meshes. See igps gallery build."
+        )
     else:
         known, n_missing = described(Folder(gallery), descriptor or "pretrained", **reading), 0
         # The query is described with the options of the folder, which may be a file of signatures
-        options = {"paper": False, "signature": known.dataset.config, **asdict(known.dataset.reading)}
+        options = {
+            "paper": False,
+            "signature": known.dataset.config,
+            **asdict(known.dataset.reading),
+        }
         description = _describe_body(mesh, known.descriptor, **{**reading, **options})
         bodies, distance = known.dataset.bodies, known.descriptor.distances
         n_listed = min(top, len(bodies))
         n_candidates = min(max(top, N_RERANKED), len(bodies)) if rerank else n_listed
         ranking = search(description, known.descriptions, top=n_candidates, distance=distance)
         if rerank:
-            ranking = rerank_candidates(description, ranking, lambda i: known.descriptions[i], distance, top=n_listed)
+            ranking = rerank_candidates(
+                description, ranking, lambda i: known.descriptions[i], distance, top=n_listed
+            )
         pairs = zip(ranking.indices[0].tolist(), ranking.distances[0].tolist(), strict=True)
         labels = bodies.labels or [None] * len(bodies)
         nearest = [(bodies.names[i], labels[i], value) for i, value in pairs]
@@ -184,9 +207,13 @@ def query(
     width = max((len(row["name"]) for row in rows), default=4)
     print(f"{'rank':>4}  {'distance':>9}  {'mesh':<{width}}  class")
     for row in rows:
-        print(f"{row['rank']:>4}  {row['distance']:>9.3g}  {row['name']:<{width}}  {row['class'] or '-'}")
+        print(
+            f"{row['rank']:>4}  {row['distance']:>9.3g}  {row['name']:<{width}}  {row['class'] or '-'}"
+        )
     if n_missing:
-        print(f"{n_missing} of these {len(rows)} files were moved or deleted since they were described.")
+        print(
+            f"{n_missing} of these {len(rows)} files were moved or deleted since they were described."
+        )
     return rows
 
 
@@ -219,25 +246,38 @@ def _summary(result: Described, scores: RetrievalScores) -> dict[str, Any]:
         "n_used": n_used,
         "n_refused": n_refused,
         "per_class": {str(label): values for label, values in scores.per_class().items()},
-        "config": {"descriptor": result.name or result.descriptor.name, **result.dataset.config.as_dict()},
+        "config": {
+            "descriptor": result.name or result.descriptor.name,
+            **result.dataset.config.as_dict(),
+        },
     }
 
 
-def _write_retrieval(out: Path, result: Described, summary: dict[str, Any], distances: dict[str, Tensor]) -> None:
+def _write_retrieval(
+    out: Path, result: Described, summary: dict[str, Any], distances: dict[str, Tensor]
+) -> None:
     out.mkdir(parents=True, exist_ok=True)
     names, labels = result.dataset.bodies.names, result.dataset.bodies.labels or ()
     (out / "scores.json").write_text(json.dumps(summary, indent=2) + "\n")
     arrays: dict[str, Any] = {name: values.numpy() for name, values in distances.items()}
-    np.savez_compressed(out / "distances.npz", names=np.array(names), labels=np.array(labels), **arrays)
+    np.savez_compressed(
+        out / "distances.npz", names=np.array(names), labels=np.array(labels), **arrays
+    )
 
     def ranking() -> Iterator[tuple[Any, ...]]:
         for i, order in enumerate(tqdm(rank(distances["distances"]), desc="rankings")):
-            row = distances["distances"][i].tolist()  # much faster than access to single entries of a tensor
+            row = distances["distances"][
+                i
+            ].tolist()  # much faster than access to single entries of a tensor
             for place, j in enumerate(order[order != i].tolist(), 1):
                 yield names[i], place, names[j], f"{row[j]:.6g}", int(labels[i] == labels[j])
 
     write_rows(out / "ranking.csv", ("query", "rank", "model", "distance", "relevant"), ranking())
-    write_rows(out / "failures.csv", ("name", "error"), [(failure.id, failure.error) for failure in result.failures])
+    write_rows(
+        out / "failures.csv",
+        ("name", "error"),
+        [(failure.id, failure.error) for failure in result.failures],
+    )
     write_mending_notes(out / "notes.csv", result.dataset)
     write_sources(out, result.dataset)
     if result.name is None:  # a descriptor whose centres were fitted to the collection has no name

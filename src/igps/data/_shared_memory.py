@@ -52,7 +52,9 @@ class _Block:
 _blocks: list[_Block] = []
 
 
-def empty_arrays(shapes: Sequence[tuple[int, ...]], dtypes: Sequence[np.dtype[Any]]) -> list[NDArray[Any]]:
+def empty_arrays(
+    shapes: Sequence[tuple[int, ...]], dtypes: Sequence[np.dtype[Any]]
+) -> list[NDArray[Any]]:
     """Return empty arrays. In a worker process on Linux, they lie in one shared block."""
     if get_worker_info() is None or not hasattr(os, "memfd_create"):
         # NumPy requests huge pages, which the system provides many times faster
@@ -68,7 +70,9 @@ def empty_arrays(shapes: Sequence[tuple[int, ...]], dtypes: Sequence[np.dtype[An
 
 def _free_block(min_bytes: int) -> _Block:
     """Return a free block, reused or new, and close free blocks that are too small or too many."""
-    free = sorted((block for block in _blocks if block.is_free), key=lambda block: block.n_bytes, reverse=True)
+    free = sorted(
+        (block for block in _blocks if block.is_free), key=lambda block: block.n_bytes, reverse=True
+    )
     has_fitting = bool(free) and free[0].n_bytes >= min_bytes
     for block in free[_MAX_FREE_BLOCKS:] if has_fitting else free:
         _blocks.remove(block)
@@ -82,13 +86,19 @@ def _free_block(min_bytes: int) -> _Block:
 def _reduce(batch: SignatureBatch) -> Any:
     """Reduce a batch to its block and the places of its tensors, or as usual if it has no block or was sent before."""
     address = batch.labels.data_ptr()
-    block = next((b for b in _blocks if b.start <= address < b.start + b.n_bytes and not b.memory[0]), None)
+    block = next(
+        (b for b in _blocks if b.start <= address < b.start + b.n_bytes and not b.memory[0]), None
+    )
     if block is None:
         return batch.__reduce_ex__(2)
 
     def place(values: Tensor) -> Any:
         offset = values.data_ptr() - block.start  # bytes
-        return (offset, values.dtype, values.shape, values.stride()) if 0 <= offset < block.n_bytes else values
+        return (
+            (offset, values.dtype, values.shape, values.stride())
+            if 0 <= offset < block.n_bytes
+            else values
+        )
 
     block.memory[0] = 1
     return _rebuild, (DupFd(block.handle), _ALIGNMENT + block.n_bytes, vars(batch.map(place)))
@@ -113,7 +123,9 @@ def _rebuild(handle: Any, n_bytes: int, fields: dict[str, Any]) -> SignatureBatc
 
 
 def _release(memory: mmap.mmap, owner: int) -> None:
-    if os.getpid() == owner:  # a forked child has copies of the tensors, and must not release those of its parent
+    if (
+        os.getpid() == owner
+    ):  # a forked child has copies of the tensors, and must not release those of its parent
         memory[0] = 0
 
 

@@ -55,10 +55,14 @@ class ResidueAttribute:
     def __call__(self, body: BodyRef, points: Floats) -> Floats:
         """Return values (P,) or (P, C) at points (P, 3), Å; raise a MeshError if the body has no such values."""
         if not is_structure(body.path):
-            raise MeshError(f"{body}: expected a PDB, mmCIF or PQR file for {self.name!r}. Choose another descriptor.")
+            raise MeshError(
+                f"{body}: expected a PDB, mmCIF or PQR file for {self.name!r}. Choose another descriptor."
+            )
         values = residue_attribute(_molecule(body), points, self.name)
         if np.isnan(values).all():
-            raise MeshError(f"{body}: {self.name!r} is defined for none of its residues. Choose another descriptor.")
+            raise MeshError(
+                f"{body}: {self.name!r} is defined for none of its residues. Choose another descriptor."
+            )
         return fill_missing(values, points, f"{body}: {self.name}")
 
 
@@ -73,10 +77,16 @@ def _molecule(body: BodyRef) -> Molecule:
             return molecules[part]
     models = list(molecules.values())
     fields = ("positions", "radii", "charges", "residue_positions", "b_factors")
-    arrays: dict[str, Any] = {field: np.concatenate([getattr(model, field) for model in models]) for field in fields}
+    arrays: dict[str, Any] = {
+        field: np.concatenate([getattr(model, field) for model in models]) for field in fields
+    }
     starts = np.cumsum([0, *(len(model.residue_names) for model in models)])
-    arrays["residue_of"] = np.concatenate([model.residue_of + i for model, i in zip(models, starts, strict=False)])
-    return replace(models[0], residue_names=tuple(name for m in models for name in m.residue_names), **arrays)
+    arrays["residue_of"] = np.concatenate(
+        [model.residue_of + i for model, i in zip(models, starts, strict=False)]
+    )
+    return replace(
+        models[0], residue_names=tuple(name for m in models for name in m.residue_names), **arrays
+    )
 
 
 @dataclass(frozen=True)
@@ -109,7 +119,9 @@ class FileAttribute(ABC):
         except MeshError as error:
             if str(body) in str(error):
                 raise
-            raise MeshError(f"{body}: its attribute file {error}") from error  # the body may be one of thousands
+            raise MeshError(
+                f"{body}: its attribute file {error}"
+            ) from error  # the body may be one of thousands
         except Exception as error:  # the readers of the formats raise exceptions of many types
             raise MeshError(
                 f"{body}: its attribute file {file} is not readable ({type(error).__name__}: "
@@ -135,20 +147,34 @@ class FileAttribute(ABC):
         pattern, _, name = self.path.partition("#")
         root = body.path.parent if self.root is None else self.root
         # Links in the path of the folder are resolved only if needed. The file itself may be a link to any place
-        locations = ((Path(os.path.abspath(body.path)), Path(os.path.abspath(root))),
-                     (body.path.parent.resolve() / body.path.name, root.resolve()))  # fmt: skip
-        relative = (file.relative_to(folder) for file, folder in locations if file.is_relative_to(folder))
+        locations = (
+            (Path(os.path.abspath(body.path)), Path(os.path.abspath(root))),
+            (body.path.parent.resolve() / body.path.name, root.resolve()),
+        )
+        relative = (
+            file.relative_to(folder) for file, folder in locations if file.is_relative_to(folder)
+        )
         below_root = next(relative, Path(body.path.name)).as_posix()
         if Path(pattern).is_absolute():
-            root = Path(pattern.partition("{")[0]).parent if "{" in pattern else Path(pattern).parent
-        values = {"{stem}": body.path.name.partition(".")[0], "{file}": below_root, "{part}": body.part or ""}
+            root = (
+                Path(pattern.partition("{")[0]).parent if "{" in pattern else Path(pattern).parent
+            )
+        values = {
+            "{stem}": body.path.name.partition(".")[0],
+            "{file}": below_root,
+            "{part}": body.part or "",
+        }
         for placeholder, value in values.items():
             pattern = pattern.replace(placeholder, value)
         path = root / pattern
         if not path.resolve().is_relative_to(root.resolve()):
-            raise MeshError(f"{body}: its attribute file {path} lies outside of {root}. Put it into that folder.")
+            raise MeshError(
+                f"{body}: its attribute file {path} lies outside of {root}. Put it into that folder."
+            )
         if not path.is_file():
-            raise MeshError(f"{body}: its attribute file {path} does not exist. Check the pattern {self.path!r}.")
+            raise MeshError(
+                f"{body}: its attribute file {path} does not exist. Check the pattern {self.path!r}."
+            )
         return path, name
 
 
@@ -167,7 +193,9 @@ class ImageAttribute(FileAttribute):
 
     def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
         grid, affine = images.read(file, stat_key(*dependencies_of(file)))
-        indices = (brains.in_scanner(body.path, points) - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
+        indices = (brains.in_scanner(body.path, points) - affine[:3, 3]) @ np.linalg.inv(
+            affine[:3, :3]
+        ).T
         size = np.array(grid.shape)
         inside = ((indices > -0.5) & (indices < size - 0.5)).all(axis=1)
         values = np.full(len(points), np.nan)
@@ -178,8 +206,13 @@ class ImageAttribute(FileAttribute):
         high = np.clip(np.ceil(indices[inside].max(axis=0)).astype(int), 0, size - 1)
         block = grid[tuple(map(slice, low, high + 1))].astype(np.float64)
         known = _is_known(block)
-        interpolate = partial(map_coordinates, coordinates=(indices[inside] - low).T, order=1, mode="nearest")
-        weight, sums = interpolate(known.astype(np.float64)), interpolate(np.where(known, block, 0.0))
+        interpolate = partial(
+            map_coordinates, coordinates=(indices[inside] - low).T, order=1, mode="nearest"
+        )
+        weight, sums = (
+            interpolate(known.astype(np.float64)),
+            interpolate(np.where(known, block, 0.0)),
+        )
         values[inside] = np.where(weight > 0.5, sums / np.maximum(weight, 0.5), np.nan)
         return values
 
@@ -198,24 +231,37 @@ class VertexAttribute(FileAttribute):
     def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
         import igl
 
-        if file.name.lower().endswith(images.SUFFIXES):  # if the pattern ends in {file}, the suffix is known only here
+        if file.name.lower().endswith(
+            images.SUFFIXES
+        ):  # if the pattern ends in {file}, the suffix is known only here
             return ImageAttribute(self.path, self.root).values(body, file, name, points)
         raw = read_surface(body.path, self.reading, part=body.part)
         values = vertex_values.chosen(vertex_values.read(file), name, file)
-        if len(values) != (n_own := len(raw.vertices)) and self.reading.bodies in ("pieces", "objects"):
+        if len(values) != (n_own := len(raw.vertices)) and self.reading.bodies in (
+            "pieces",
+            "objects",
+        ):
             raw = read_surface(body.path, replace(self.reading, bodies="whole"))
         if len(values) != len(raw.vertices):
             whole = f" ({len(raw.vertices)} in the whole file)" * (len(raw.vertices) != n_own)
-            raise MeshError(f"{body}: {file} has {len(values)} values for {n_own} vertices{whole}. Give one for each.")
+            raise MeshError(
+                f"{body}: {file} has {len(values)} values for {n_own} vertices{whole}. Give one for each."
+            )
         columns = fill_missing(values.reshape(len(values), -1), raw.vertices, str(file))
         mesh = load_mesh(body.path, self.reading, part=body.part)
         if not np.array_equal(mesh.vertices, raw.vertices):
             faces = np.ascontiguousarray(raw.faces)
-            _, face, nearest = igl.point_mesh_squared_distance(mesh.vertices, np.ascontiguousarray(raw.vertices), faces)
+            _, face, nearest = igl.point_mesh_squared_distance(
+                mesh.vertices, np.ascontiguousarray(raw.vertices), faces
+            )
             corners = [np.ascontiguousarray(raw.vertices[faces[face, i]]) for i in range(3)]
-            weights = np.nan_to_num(igl.barycentric_coordinates(np.ascontiguousarray(nearest), *corners), nan=1 / 3)
+            weights = np.nan_to_num(
+                igl.barycentric_coordinates(np.ascontiguousarray(nearest), *corners), nan=1 / 3
+            )
             columns = np.einsum("vi,vid->vd", weights, columns[faces[face]])
-        return extend(mesh.vertices, mesh.faces, columns, points).reshape(len(points), *values.shape[1:])
+        return extend(mesh.vertices, mesh.faces, columns, points).reshape(
+            len(points), *values.shape[1:]
+        )
 
 
 @dataclass(frozen=True)
@@ -236,13 +282,21 @@ class TetAttribute(FileAttribute):
         # No point of a tetrahedron is farther from its centre than a corner
         centres = corners.mean(axis=1)
         radius = np.linalg.norm(corners - centres[:, None], axis=2).max()
-        for i, near in enumerate(cKDTree(centres).query_ball_point(points, radius * (1 + _TOLERANCE))):
+        for i, near in enumerate(
+            cKDTree(centres).query_ball_point(points, radius * (1 + _TOLERANCE))
+        ):
             if near:
                 last_three = np.einsum("td,tde->te", points[i] - corners[near, 0], inverse[near])
                 barycentric = np.column_stack([1 - last_three.sum(axis=1), last_three])
                 best = int(np.argmax(barycentric.min(axis=1)))
-                smallest[i], weights[i], owner[i] = barycentric[best].min(), barycentric[best], near[best]
-        values = np.einsum("pi,pi...->p...", weights, at_vertices[tetrahedra[owner]].astype(np.float64))
+                smallest[i], weights[i], owner[i] = (
+                    barycentric[best].min(),
+                    barycentric[best],
+                    near[best],
+                )
+        values = np.einsum(
+            "pi,pi...->p...", weights, at_vertices[tetrahedra[owner]].astype(np.float64)
+        )
         values[smallest < -_TOLERANCE] = np.nan
         return values
 
@@ -269,7 +323,9 @@ def attribute_sources(definitions: Sequence[str], root: Path | None) -> dict[str
     for text in definitions:
         name, _, path = text.partition("=")
         if not name.isidentifier() or not path or name in sources:
-            raise ValueError(f"attribute: expected a new name and a path, as in ct={{stem}}.nii.gz, got {text!r}.")
+            raise ValueError(
+                f"attribute: expected a new name and a path, as in ct={{stem}}.nii.gz, got {text!r}."
+            )
         sources[name] = attribute_source(path, root)
     return sources
 
@@ -282,14 +338,18 @@ def fill_missing(values: Floats, points: Floats, label: str) -> Floats:
     known = np.asarray(_is_known(values.reshape(len(points), -1)).all(axis=1))
     n_missing = int((~known).sum())
     if n_missing > _MAX_MISSING_SHARE * len(known):
-        low, high = (", ".join(f"{x:.4g}" for x in end) for end in (points.min(axis=0), points.max(axis=0)))
+        low, high = (
+            ", ".join(f"{x:.4g}" for x in end) for end in (points.min(axis=0), points.max(axis=0))
+        )
         raise MeshError(
             f"{label}: has no value at {n_missing} of {len(known)} points of the body, which extends from ({low}) to "
             f"({high}); at most {_MAX_MISSING_SHARE:.0%} of the points may lack a value. Give values of this body, in "
             "the coordinates of its file."
         )
     if n_missing:
-        logger.warning("%s: %d of %d values were taken from the nearest point", label, n_missing, len(known))
+        logger.warning(
+            "%s: %d of %d values were taken from the nearest point", label, n_missing, len(known)
+        )
         nearest = cKDTree(points[known]).query(points[~known])[1]
         values = values.copy()
         values[~known] = values[known][nearest]

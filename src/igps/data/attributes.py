@@ -89,10 +89,14 @@ def split_attributes(
     return sources, functions
 
 
-def with_attribute(signature: Signature, name: str, values: Mapping[SampleKind, ArrayLike]) -> Signature:
+def with_attribute(
+    signature: Signature, name: str, values: Mapping[SampleKind, ArrayLike]
+) -> Signature:
     """Return a Signature with an additional attribute; raise a ValueError if a sample lacks a finite row of values."""
     try:
-        interior, surface = (getattr(signature, kind).with_attributes({name: values[kind]}) for kind in SAMPLE_KINDS)
+        interior, surface = (
+            getattr(signature, kind).with_attributes({name: values[kind]}) for kind in SAMPLE_KINDS
+        )
     except ValueError as error:
         raise ValueError(f"{signature.name}: attributes: {error}") from error
     return replace(signature, interior=interior, surface=surface)

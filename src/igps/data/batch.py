@@ -34,17 +34,25 @@ class SampleBatch:
     points: Tensor  # (N, P, 3) float32, unit of length, relative to the mean of the samples of each shape
     eigenfunctions: Tensor  # (N, P, K) float32, 1/length; zero where padded
     mask: Tensor  # (N, P) bool, false where padded
-    attributes: Mapping[str, Tensor]  # by name, each (N, P) or (N, P, C) float32; a direction has C = 3
+    attributes: Mapping[
+        str, Tensor
+    ]  # by name, each (N, P) or (N, P, C) float32; a direction has C = 3
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SampleBatch:
         """Return the batch with a function applied to each of its tensors."""
         attributes = {name: function(values) for name, values in self.attributes.items()}
-        return SampleBatch(function(self.points), function(self.eigenfunctions), function(self.mask), attributes)
+        return SampleBatch(
+            function(self.points), function(self.eigenfunctions), function(self.mask), attributes
+        )
 
-    def to(self, device: torch.device | str | torch.dtype, non_blocking: bool = False) -> SampleBatch:
+    def to(
+        self, device: torch.device | str | torch.dtype, non_blocking: bool = False
+    ) -> SampleBatch:
         """Return the batch on another device or with another floating type, see `torch.Tensor.to`."""
         if isinstance(device, torch.dtype):
-            return self.map(lambda values: values.to(device) if values.is_floating_point() else values)
+            return self.map(
+                lambda values: values.to(device) if values.is_floating_point() else values
+            )
         return self.map(lambda values: values.to(device, non_blocking=non_blocking))
 
     def subset(self, n_samples: int, seed: int | None = None) -> SampleBatch:
@@ -60,19 +68,27 @@ class SampleBatch:
         numbers = torch.arange(n_chosen, dtype=torch.float64, device=self.mask.device)
         mask = numbers < n_present
         if seed is None:
-            priority = torch.rand(self.mask.shape, device=self.mask.device).masked_fill(~self.mask, -1)
+            priority = torch.rand(self.mask.shape, device=self.mask.device).masked_fill(
+                ~self.mask, -1
+            )
             index = priority.topk(n_chosen).indices
         else:
             start = _START_OF_SEED_0 if seed == 0 else _random_start(seed)
             steps = (n_present.double() / n_samples).clamp(min=1) * (numbers + start)
-            index = torch.searchsorted(self.mask.cumsum(dim=1), steps.long().clamp(max=n_present - 1) + 1)
+            index = torch.searchsorted(
+                self.mask.cumsum(dim=1), steps.long().clamp(max=n_present - 1) + 1
+            )
         index = index.masked_fill(~mask, 0)
         rows = (index + n_padded * torch.arange(n_shapes, device=index.device)[:, None]).flatten()
         padding = None if not torch.compiler.is_compiling() and bool(mask.all()) else ~mask
 
         def take(values: Tensor) -> Tensor:
             taken = values.flatten(0, 1).index_select(0, rows).unflatten(0, (n_shapes, n_chosen))
-            return taken if padding is None else taken.masked_fill_(padding[(..., *[None] * (values.ndim - 2))], 0)
+            return (
+                taken
+                if padding is None
+                else taken.masked_fill_(padding[(..., *[None] * (values.ndim - 2))], 0)
+            )
 
         attributes = {name: take(values) for name, values in self.attributes.items()}
         return SampleBatch(take(self.points), take(self.eigenfunctions), mask, attributes)
@@ -83,7 +99,9 @@ def _random_start(seed: int) -> float:
     return torch.rand(1, generator=generator, dtype=torch.float64, device="cpu").item()
 
 
-_START_OF_SEED_0 = _random_start(0)  # the seed of all descriptors; `torch.compile` cannot trace a generator
+_START_OF_SEED_0 = _random_start(
+    0
+)  # the seed of all descriptors; `torch.compile` cannot trace a generator
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +120,9 @@ class Body:
     def mesh(self) -> Mesh:
         """The surface; raises a ValueError if the batch has no meshes."""
         if self.surface_mesh is None:
-            raise ValueError(f"{self.id}: expected a batch with meshes, got one without. See SignatureDataset.batch.")
+            raise ValueError(
+                f"{self.id}: expected a batch with meshes, got one without. See SignatureDataset.batch."
+            )
         return self.surface_mesh
 
 
@@ -156,7 +176,9 @@ class SignatureBatch:
             return self[i : i + 1].to("cpu")._body(0)
         indices = resolve_indices(index, len(self))
         rows: slice | Tensor = torch.tensor(indices, dtype=torch.int64, device=self.labels.device)
-        if isinstance(index, slice) and (index.step or 1) > 0:  # slices give views, but tensors allow no negative step
+        if (
+            isinstance(index, slice) and (index.step or 1) > 0
+        ):  # slices give views, but tensors allow no negative step
             rows = index
         return replace(
             self.map(lambda values: values[rows]),
@@ -182,7 +204,9 @@ class SignatureBatch:
             labels=function(self.labels),
         )
 
-    def to(self, device: torch.device | str | torch.dtype, non_blocking: bool = False) -> SignatureBatch:
+    def to(
+        self, device: torch.device | str | torch.dtype, non_blocking: bool = False
+    ) -> SignatureBatch:
         """Return the batch on another device, or with samples of another floating type, see `torch.Tensor.to`.
 
         Meshes stay on the CPU, and eigenvalues, area and volume in double precision.
@@ -202,7 +226,9 @@ class SignatureBatch:
             raise ValueError("batches: expected at least one, got none.")
         meshes = [batch.meshes for batch in batches if batch.meshes is not None]
         if meshes and len(meshes) < len(batches):
-            raise ValueError("batches: expected meshes in all batches or in none, got some of each.")
+            raise ValueError(
+                "batches: expected meshes in all batches or in none, got some of each."
+            )
         return SignatureBatch(
             eigenvalues=_joined([batch.eigenvalues for batch in batches], math.inf),
             interior=_joined_samples([batch.interior for batch in batches]),
@@ -221,9 +247,19 @@ class SignatureBatch:
 
     def _body(self, i: int) -> Body:
         eigenvalues = self.eigenvalues[i][torch.isfinite(self.eigenvalues[i])].numpy()
-        interior, surface = (_samples_of(batch, i, len(eigenvalues)) for batch in (self.interior, self.surface))
+        interior, surface = (
+            _samples_of(batch, i, len(eigenvalues)) for batch in (self.interior, self.surface)
+        )
         mesh = None if self.meshes is None else self.meshes[i]
-        return Body(eigenvalues, interior, surface, float(self.area[i]), float(self.volume[i]), self.ids[i], mesh)
+        return Body(
+            eigenvalues,
+            interior,
+            surface,
+            float(self.area[i]),
+            float(self.volume[i]),
+            self.ids[i],
+            mesh,
+        )
 
 
 def _refuse(batch: Any, name: str, value: Any) -> None:
@@ -256,14 +292,17 @@ def attribute_names(samples: Sequence[Samples | SampleBatch], argument: str) -> 
     """Return the sorted attribute names of samples; raise a ValueError that names the argument if they differ."""
     first, *others = (sorted(sample.attributes) for sample in samples)
     if differing := [names for names in others if names != first]:
-        raise ValueError(f"{argument}: all must carry the same sample attributes, got {first} and {differing[0]}.")
+        raise ValueError(
+            f"{argument}: all must carry the same sample attributes, got {first} and {differing[0]}."
+        )
     return first
 
 
 def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
     names = attribute_names(parts, "batches")
     points, eigenfunctions, mask = (
-        _joined([getattr(part, name) for part in parts]) for name in ("points", "eigenfunctions", "mask")
+        _joined([getattr(part, name) for part in parts])
+        for name in ("points", "eigenfunctions", "mask")
     )
     attributes = {name: _joined([part.attributes[name] for part in parts]) for name in names}
     return SampleBatch(points, eigenfunctions, mask, attributes)

@@ -22,7 +22,9 @@ logger = logging.getLogger(__name__)
 
 # Fields of a Signature besides arrays and configuration
 _SCALAR_FIELDS = ("area", "volume", "name", "notes", "residual", "unit")
-_ABANDONED_AGE = 24 * 3600  # seconds until a partial file is removed; writing a file takes well below one second
+_ABANDONED_AGE = (
+    24 * 3600
+)  # seconds until a partial file is removed; writing a file takes well below one second
 _CHECKSUM_ROW = 4096  # bytes
 T = TypeVar("T")
 Result = TypeVar("Result")
@@ -43,7 +45,11 @@ def content_digest(path: Path, *companions: Path) -> bytes:
     """Return a digest of the content of a file and of the companion files that are read with it."""
     with open(path, "rb") as file:
         digest = hashlib.file_digest(file, "sha256").digest()
-    return hashlib.sha256(digest + b"".join(map(content_digest, companions))).digest() if companions else digest
+    return (
+        hashlib.sha256(digest + b"".join(map(content_digest, companions))).digest()
+        if companions
+        else digest
+    )
 
 
 class FileCache(Generic[T]):
@@ -84,7 +90,9 @@ class FileCache(Generic[T]):
     def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], Result]) -> Result | None:
         path = self.path(key)
         try:
-            with safe_open(path, framework="pt") as file:  # framework="numpy" would copy every array
+            with safe_open(
+                path, framework="pt"
+            ) as file:  # framework="numpy" would copy every array
                 metadata = file.metadata() or {}
                 if metadata.get("format") != self._format or metadata.get("key") != key:
                     raise ValueError(f"not a {self._format} file of this key")
@@ -92,7 +100,12 @@ class FileCache(Generic[T]):
         except FileNotFoundError:
             return None
         except (SafetensorError, ValueError, KeyError, TypeError, OSError) as error:
-            logger.warning("%s: cached %s is not usable (%s), and is computed again", path, self.value_name, error)
+            logger.warning(
+                "%s: cached %s is not usable (%s), and is computed again",
+                path,
+                self.value_name,
+                error,
+            )
             return None
 
     def put(self, key: str, value: T) -> None:
@@ -123,14 +136,19 @@ class FileCache(Generic[T]):
 def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return the arrays of a Signature by name, and its other fields as JSON."""
     # safetensors writes the memory of arrays, so they must be contiguous
-    tensors: dict[str, np.ndarray] = {"eigenvalues": np.ascontiguousarray(signature.eigenvalues, np.float64)}
+    tensors: dict[str, np.ndarray] = {
+        "eigenvalues": np.ascontiguousarray(signature.eigenvalues, np.float64)
+    }
     for kind in SAMPLE_KINDS:
         samples: Samples = getattr(signature, kind)
         tensors[f"{kind}.points"] = np.ascontiguousarray(samples.points, np.float64)
         tensors[f"{kind}.eigenfunctions"] = np.ascontiguousarray(samples.eigenfunctions, np.float32)
         for name, values in samples.attributes.items():
             tensors[f"{kind}.attributes.{name}"] = np.ascontiguousarray(values, np.float32)
-    fields = {**{name: getattr(signature, name) for name in _SCALAR_FIELDS}, "config": signature.config.as_dict()}
+    fields = {
+        **{name: getattr(signature, name) for name in _SCALAR_FIELDS},
+        "config": signature.config.as_dict(),
+    }
     return tensors, {name: json.dumps(value) for name, value in fields.items()}
 
 
@@ -143,21 +161,33 @@ def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Si
     _check_array("eigenvalues", eigenvalues, np.float64, (len(eigenvalues),))
     for kind in SAMPLE_KINDS:
         prefix = f"{kind}.attributes."
-        attributes = {name.removeprefix(prefix): values for name, values in tensors.items() if name.startswith(prefix)}
+        attributes = {
+            name.removeprefix(prefix): values
+            for name, values in tensors.items()
+            if name.startswith(prefix)
+        }
         points, eigenfunctions = tensors[f"{kind}.points"], tensors[f"{kind}.eigenfunctions"]
         _check_array(f"{kind}.points", points, np.float64, (len(points), 3))
-        _check_array(f"{kind}.eigenfunctions", eigenfunctions, np.float32, (len(points), len(eigenvalues)))
+        _check_array(
+            f"{kind}.eigenfunctions", eigenfunctions, np.float32, (len(points), len(eigenvalues))
+        )
         for name, values in attributes.items():
-            _check_array(f"{kind}.attributes.{name}", values, np.float32, (len(points), *values.shape[1:]))
+            _check_array(
+                f"{kind}.attributes.{name}", values, np.float32, (len(points), *values.shape[1:])
+            )
         samples_of[kind] = Samples(points, eigenfunctions, attributes)
     fields: dict[str, Any] = {name: json.loads(metadata[name]) for name in _SCALAR_FIELDS}
     fields["notes"] = tuple(fields["notes"])
     return Signature(eigenvalues, **samples_of, config=SignatureConfig(**config), **fields)
 
 
-def _check_array(name: str, values: np.ndarray, dtype: type[np.floating[Any]], shape: tuple[int, ...]) -> None:
+def _check_array(
+    name: str, values: np.ndarray, dtype: type[np.floating[Any]], shape: tuple[int, ...]
+) -> None:
     if values.dtype != dtype or values.shape != shape:
-        raise ValueError(f"{name}: expected {dtype.__name__} {shape}, got {values.dtype} {values.shape}")
+        raise ValueError(
+            f"{name}: expected {dtype.__name__} {shape}, got {values.dtype} {values.shape}"
+        )
 
 
 class SignatureCache(FileCache[Signature]):
@@ -175,7 +205,9 @@ class SignatureCache(FileCache[Signature]):
         return self._read(key, lambda file, metadata: json.loads(metadata["unit"]))
 
 
-def _without_metadata(arrays: Mapping[Any, Singles]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def _without_metadata(
+    arrays: Mapping[Any, Singles],
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     return {name: np.ascontiguousarray(values) for name, values in arrays.items()}, {}
 
 
@@ -217,7 +249,9 @@ def checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> 
         crc = zlib.crc32(f"{name} {tensor.dtype.str} {tensor.shape}\0".encode(), crc)
         raw = tensor.reshape(-1).view(np.uint8)
         end = raw.size // _CHECKSUM_ROW * _CHECKSUM_ROW
-        crc = zlib.crc32(raw[:end].view(np.uint64).reshape(-1, _CHECKSUM_ROW // 8).sum(axis=0).data, crc)
+        crc = zlib.crc32(
+            raw[:end].view(np.uint64).reshape(-1, _CHECKSUM_ROW // 8).sum(axis=0).data, crc
+        )
         crc = zlib.crc32(raw[end:].data, crc)
     return f"{crc:08x}"
 
@@ -225,4 +259,6 @@ def checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> 
 def check_checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
     """Raise a ValueError if tensors and metadata do not match the checksum in the metadata."""
     if metadata.get("checksum") != checksum(tensors, metadata):
-        raise ValueError("its content is damaged: the checksum differs from the one that was written")
+        raise ValueError(
+            "its content is damaged: the checksum differs from the one that was written"
+        )

@@ -15,7 +15,9 @@ from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
 
 
-def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mesh] | None = None) -> SignatureBatch:
+def collate(
+    items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mesh] | None = None
+) -> SignatureBatch:
     """Pad Signatures and collate them to a batch.
 
     The default `collate_fn` of a `DataLoader` does the same, also for Signatures inside tuples or dictionaries. In a
@@ -40,13 +42,20 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     if not items:
         raise ValueError("items: expected at least one signature, got none.")
     if meshes is not None and len(meshes) != len(items):
-        raise ValueError(f"meshes: expected one for each of {len(items)} signatures, got {len(meshes)}.")
-    labelled = [x if isinstance(x, LabelledSignature) else LabelledSignature(x, -1, x.name) for x in items]
+        raise ValueError(
+            f"meshes: expected one for each of {len(items)} signatures, got {len(meshes)}."
+        )
+    labelled = [
+        x if isinstance(x, LabelledSignature) else LabelledSignature(x, -1, x.name) for x in items
+    ]
     signatures = [item.signature for item in labelled]
     n_eigenpairs = max(len(s.eigenvalues) for s in signatures)
     columns: list[list[Any]] = [
         # Padded by infinity, so that every spectral weight of the padding is zero
-        [np.pad(s.eigenvalues, (0, n_eigenpairs - len(s.eigenvalues)), constant_values=np.inf) for s in signatures],
+        [
+            np.pad(s.eigenvalues, (0, n_eigenpairs - len(s.eigenvalues)), constant_values=np.inf)
+            for s in signatures
+        ],
         [np.float64(s.area) for s in signatures],
         [np.float64(s.volume) for s in signatures],
         [np.int64(item.label) for item in labelled],
@@ -57,12 +66,19 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     eigenvalues, area, volume, labels, *sample_tensors = _padded(columns)
     data = iter(sample_tensors)
     interior, surface = (
-        SampleBatch(next(data), next(data), next(data), {name: next(data) for name in sorted(samples[0].attributes)})
+        SampleBatch(
+            next(data),
+            next(data),
+            next(data),
+            {name: next(data) for name in sorted(samples[0].attributes)},
+        )
         for samples in samples_by_kind
     )
     ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
     surfaces = None if meshes is None else tuple(meshes)
-    return SignatureBatch(eigenvalues, interior, surface, area, volume, labels, ids, surfaces, units)
+    return SignatureBatch(
+        eigenvalues, interior, surface, area, volume, labels, ids, surfaces, units
+    )
 
 
 for _kind in (LabelledSignature, Signature):
@@ -83,7 +99,9 @@ def _sample_columns(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
 
 def _padded(columns: Sequence[Sequence[Any]]) -> list[Tensor]:
     """Stack each list of N arrays to an (N, ...) tensor, padded by zeros to the largest size of each dimension."""
-    shapes = [(len(arrays), *map(max, zip(*(a.shape for a in arrays), strict=True))) for arrays in columns]
+    shapes = [
+        (len(arrays), *map(max, zip(*(a.shape for a in arrays), strict=True))) for arrays in columns
+    ]
     stacks = empty_arrays(shapes, [arrays[0].dtype for arrays in columns])
     for arrays, stack in zip(columns, stacks, strict=True):
         for i, array in enumerate(arrays):

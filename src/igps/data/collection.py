@@ -37,27 +37,47 @@ class Contents:
     def to_json(self) -> str:
         """Return the contents as JSON, without paths."""
         bodies = {name: value for name, value in vars(self.bodies).items() if name != "paths"}
-        labels = None if self.bodies.labels is None else list(map(str, self.bodies.labels))  # users may give numbers
+        labels = (
+            None if self.bodies.labels is None else list(map(str, self.bodies.labels))
+        )  # users may give numbers
         names = {"labels": labels, "classes": list(map(str, self.classes)), "keys": self.keys}
-        return json.dumps({**bodies, **names, "reading": asdict(self.reading), "config": asdict(self.config)})
+        return json.dumps(
+            {**bodies, **names, "reading": asdict(self.reading), "config": asdict(self.config)}
+        )
 
     @staticmethod
     def from_json(text: str) -> Contents:
         """Parse the text of `to_json`; raise a ValueError, KeyError or TypeError if it is invalid."""
         data: dict[str, Any] = json.loads(text)
-        names, parts, columns = _strings(data["names"]), tuple(data["parts"]), dict(data.get("columns", {}))
+        names, parts, columns = (
+            _strings(data["names"]),
+            tuple(data["parts"]),
+            dict(data.get("columns", {})),
+        )
         labels = None if data["labels"] is None else _strings(data["labels"])
         columns = {name: tuple(values) for name, values in columns.items()}
-        paths = tuple(Path(file_name_of(name, part)) for name, part in zip(names, parts, strict=True))
+        paths = tuple(
+            Path(file_name_of(name, part)) for name, part in zip(names, parts, strict=True)
+        )
         bodies = Bodies(paths, names, labels, parts, columns)
         classes, keys = _strings(data["classes"]), _strings(data["keys"])
         if len(keys) != len(names) or len(parts) != len(names) or len(set(names)) < len(names):
             raise ValueError("its names are not unique, or differ in number from its parts or keys")
         optional_strings = [*parts, *(value for values in columns.values() for value in values)]
-        if not set(labels or ()) <= set(classes) or not all(s is None or isinstance(s, str) for s in optional_strings):
-            raise ValueError("a label is not one of its classes, or a part or a value of a column is not a string")
+        if not set(labels or ()) <= set(classes) or not all(
+            s is None or isinstance(s, str) for s in optional_strings
+        ):
+            raise ValueError(
+                "a label is not one of its classes, or a part or a value of a column is not a string"
+            )
         try:
-            return Contents(bodies, classes, keys, LoadOptions(**data["reading"]), SignatureConfig(**data["config"]))
+            return Contents(
+                bodies,
+                classes,
+                keys,
+                LoadOptions(**data["reading"]),
+                SignatureConfig(**data["config"]),
+            )
         except (TypeError, KeyError, ValueError) as error:
             raise ValueError(f"parameters of another version: {error}") from error
 
@@ -71,27 +91,52 @@ def write_collection(path: Path, about: Contents, signature: Callable[[int], Sig
     n = len(about.bodies)
     if len(set(about.bodies.names)) < n:
         duplicate = next(name for name, count in Counter(about.bodies.names).items() if count > 1)
-        raise ValueError(f"{path}: expected unique names, got {duplicate} twice. Give each body once.")
-    arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []  # dtype, shape, bytes of each Signature's arrays
+        raise ValueError(
+            f"{path}: expected unique names, got {duplicate} twice. Give each body once."
+        )
+    arrays: list[
+        dict[str, tuple[str, tuple[int, ...], int]]
+    ] = []  # dtype, shape, bytes of each Signature's arrays
     all_metadata = []
     for i in range(n):
         tensors, metadata = encode(signature(i))
         all_metadata.append({**metadata, "checksum": checksum(tensors, metadata)})
-        arrays.append({name: (values.dtype.name, values.shape, values.nbytes) for name, values in tensors.items()})
+        arrays.append(
+            {
+                name: (values.dtype.name, values.shape, values.nbytes)
+                for name, values in tensors.items()
+            }
+        )
     # Doubles come before singles, so that all arrays are aligned: the format allows no gaps
-    order = [(i, name) for d in _DTYPES for i in range(n) for name, (dtype, *_) in arrays[i].items() if dtype == d]
+    order = [
+        (i, name)
+        for d in _DTYPES
+        for i in range(n)
+        for name, (dtype, *_) in arrays[i].items()
+        if dtype == d
+    ]
     header: dict[str, Any] = {}
     end = 0
     for i, name in order:
         dtype, shape, n_bytes = arrays[i][name]
-        header[f"{i}.{name}"] = {"dtype": _DTYPES[dtype], "shape": shape, "data_offsets": (end, end + n_bytes)}
+        header[f"{i}.{name}"] = {
+            "dtype": _DTYPES[dtype],
+            "shape": shape,
+            "data_offsets": (end, end + n_bytes),
+        }
         end += n_bytes
-    file_metadata = {"format": _FORMAT, "about": about.to_json(), "signatures": json.dumps(all_metadata)}
+    file_metadata = {
+        "format": _FORMAT,
+        "about": about.to_json(),
+        "signatures": json.dumps(all_metadata),
+    }
     file_metadata["checksum"] = checksum({}, {"about": file_metadata["about"]})
     text = json.dumps({"__metadata__": file_metadata, **header}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > _MAX_HEADER_BYTES:
-        raise ValueError(f"{path}: {n} bodies are too many for one file. Export parts of the dataset.")
+        raise ValueError(
+            f"{path}: {n} bodies are too many for one file. Export parts of the dataset."
+        )
     with atomic_write(path) as file:
         file.write(len(text).to_bytes(8, "little") + text)
         for (i, _), group in groupby(order, key=lambda key: (key[0], arrays[key[0]][key[1]][0])):
@@ -128,7 +173,9 @@ class CollectionFile:
             self.about = Contents.from_json(metadata["about"])
             self._metadata: list[dict[str, str]] = json.loads(metadata["signatures"])
             if len(self._metadata) != len(self.about.bodies):
-                raise ValueError(f"it has {len(self.about.bodies)} names for {len(self._metadata)} signatures")
+                raise ValueError(
+                    f"it has {len(self.about.bodies)} names for {len(self._metadata)} signatures"
+                )
             names = set(self._file.keys())
         except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(
@@ -147,19 +194,26 @@ class CollectionFile:
         """Return a Signature with views of the file; raise a ValueError if it is damaged or of another version."""
         metadata = self._metadata[index]
         try:
-            tensors = {name: self._file.get_tensor(f"{index}.{name}").numpy() for name in self._arrays[index]}
+            tensors = {
+                name: self._file.get_tensor(f"{index}.{name}").numpy()
+                for name in self._arrays[index]
+            }
             check_checksum(tensors, metadata)
             return decode(tensors, metadata)
         except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
             name = self.about.bodies.names[index]
-            raise ValueError(f"{self.path}: {name} is not usable ({error}). Export the collection again.") from error
+            raise ValueError(
+                f"{self.path}: {name} is not usable ({error}). Export the collection again."
+            ) from error
 
     def check_requirements(self, requirements: Requirements) -> None:
         """Raise a ValueError that names the file if its Signatures do not meet the requirements."""
         try:
             requirements.check_config(self.about.config)
         except ValueError as error:
-            raise ValueError(f"{self.path}: {error} Or export the collection again for this descriptor.") from error
+            raise ValueError(
+                f"{self.path}: {error} Or export the collection again for this descriptor."
+            ) from error
 
     def notes(self, index: int) -> tuple[str, ...]:
         """Return the notes on how the mesh of a Signature was changed."""

@@ -82,21 +82,30 @@ class SignatureDataModule(LightningDataModule):
         super().__init__()
         check_one_of(get_args(SplitProtocol), protocol=protocol)
         if protocol == "seen" and n_test is not None:
-            raise ValueError("n_test: expected None with protocol 'seen', which tests all shapes not trained on.")
+            raise ValueError(
+                "n_test: expected None with protocol 'seen', which tests all shapes not trained on."
+            )
         check_at_least(2, n_samples_in_memory=n_samples_in_memory)
         check_at_least(1, evaluation_batch_size=evaluation_batch_size)
         if has_configuration():
             self.save_hyperparameters()
-        self.dataset = SignatureDataset(find_bodies(root, labelled=True), config, cache_dir, reading=reading)
+        self.dataset = SignatureDataset(
+            find_bodies(root, labelled=True), config, cache_dir, reading=reading
+        )
         self.classes_per_batch, self.shapes_per_class = classes_per_batch, shapes_per_class
-        self.n_samples_in_memory, self.evaluation_batch_size = n_samples_in_memory, evaluation_batch_size
+        self.n_samples_in_memory, self.evaluation_batch_size = (
+            n_samples_in_memory,
+            evaluation_batch_size,
+        )
         self.n_workers, self.n_loading_workers = n_workers, n_loading_workers
         self._in_memory: SignatureDataset | None = None
         labels = self.dataset.labels
         if protocol == "seen":
             self.split = split_seen(labels, n_train, n_validation=n_validation, seed=split_seed)
         else:
-            self.split = split_unseen(labels, n_train, n_validation=n_validation, n_test=n_test, seed=split_seed)
+            self.split = split_unseen(
+                labels, n_train, n_validation=n_validation, n_test=n_test, seed=split_seed
+            )
 
     def prepare_data(self) -> None:
         """Fill the cache. A mesh that cannot be used stops training, because the split must be complete."""
@@ -107,7 +116,9 @@ class SignatureDataModule(LightningDataModule):
         try:
             from pytorch_metric_learning.samplers import MPerClassSampler
         except ImportError as error:
-            raise ImportError('training needs pytorch-metric-learning: pip install "interior-gps[metric]".') from error
+            raise ImportError(
+                'training needs pytorch-metric-learning: pip install "interior-gps[metric]".'
+            ) from error
         part = self.dataset.subset(self.split.train)
         n_batch = min(self.classes_per_batch, len(part.labels.unique())) * self.shapes_per_class
         # Lightning distributes the drawn shapes to its processes in turn, and each gets `shapes_per_class` of a class
@@ -123,7 +134,9 @@ class SignatureDataModule(LightningDataModule):
         if self._in_memory is None:
             n = self.n_samples_in_memory
             self._in_memory = part.to_memory(FewerSamples(n_interior=n, n_surface=n, seed=0))
-        return self._loader(self._in_memory, n_batch, sampler, 0)  # no workers, because there is nothing to read
+        return self._loader(
+            self._in_memory, n_batch, sampler, 0
+        )  # no workers, because there is nothing to read
 
     def val_dataloader(self) -> DataLoader[LabelledSignature] | list[DataLoader[LabelledSignature]]:
         """Return a loader of the validation part in order; an empty list if the part is empty."""
@@ -140,7 +153,9 @@ class SignatureDataModule(LightningDataModule):
         return batch.to(device, non_blocking=True)
 
     def _evaluation_loader(self, indices: Sequence[int]) -> DataLoader[LabelledSignature]:
-        return self._loader(self.dataset.subset(indices), self.evaluation_batch_size, None, self.n_loading_workers)
+        return self._loader(
+            self.dataset.subset(indices), self.evaluation_batch_size, None, self.n_loading_workers
+        )
 
     def _loader(
         self, part: SignatureDataset, batch_size: int, sampler: Sampler[int] | None, n_workers: int

@@ -84,21 +84,37 @@ class SignatureDataset(Dataset[LabelledSignature]):
         pre_transform: PreTransform | None = None,
         transform: Callable[[Signature], Signature] | None = None,
     ) -> None:
-        config, reading, attributes = config or SignatureConfig(), reading or LoadOptions(), attributes or {}
+        config, reading, attributes = (
+            config or SignatureConfig(),
+            reading or LoadOptions(),
+            attributes or {},
+        )
         if descriptor is not None:
             requirements = requirements_of(descriptor)
-            config, attributes = requirements.apply_to(config), {**requirements.sources, **attributes}
+            config, attributes = (
+                requirements.apply_to(config),
+                {**requirements.sources, **attributes},
+            )
         sources, self._functions = split_attributes(attributes)
         meshes: Mapping[BodyRef, Mesh | MeshError] = {}
         if isinstance(root_or_paths, Mapping):
-            (root_or_paths, meshes), labels = bodies_in_memory(root_or_paths, labels, reading, config), None
-        self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).with_classes(classes or "folder")
+            (root_or_paths, meshes), labels = (
+                bodies_in_memory(root_or_paths, labels, reading, config),
+                None,
+            )
+        self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).with_classes(
+            classes or "folder"
+        )
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and self._functions:
-            raise ValueError("pre_transform: expected attributes with a cache_tag, got a function of points.")
+            raise ValueError(
+                "pre_transform: expected attributes with a cache_tag, got a function of points."
+            )
         directory = Path(cache_dir or default_cache_dir())
         self.config, self.reading = config.resolved(), reading
-        self.pipeline = SignaturePipeline(self.config, reading, directory, sources, pre_transform, meshes)
+        self.pipeline = SignaturePipeline(
+            self.config, reading, directory, sources, pre_transform, meshes
+        )
         self.transform = transform
         self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)  # known cache entries
         # Signatures that are used instead of the cache, and the index of each body in them
@@ -109,13 +125,17 @@ class SignatureDataset(Dataset[LabelledSignature]):
     def labels(self) -> Tensor:
         """(N,) int64 index of the class of each body in `classes`, −1 if unknown."""
         index = {name: i for i, name in enumerate(self.classes)}
-        labels = None if self.bodies.labels is None else [index[name] for name in self.bodies.labels]
+        labels = (
+            None if self.bodies.labels is None else [index[name] for name in self.bodies.labels]
+        )
         return torch.tensor(labels or [-1] * len(self), dtype=torch.int64, device="cpu")
 
     @property
     def sizes(self) -> Tensor:
         """(N,) int64 number of interior samples of each body, for `BucketBatchSampler`; reads all Signatures."""
-        return torch.tensor([len(s.interior) for s in self.signatures()], dtype=torch.int64, device="cpu")
+        return torch.tensor(
+            [len(s.interior) for s in self.signatures()], dtype=torch.int64, device="cpu"
+        )
 
     def __len__(self) -> int:
         return len(self.bodies)
@@ -164,7 +184,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """Return a mesh, read and checked as for its Signature; raise a MeshError if it cannot be used."""
         if isinstance(self._loaded, CollectionFile):
             name, file = self.bodies.names[index], self._loaded.path
-            raise MeshError(f"{name}: {file} holds signatures and no meshes. Use a dataset of the folder of meshes.")
+            raise MeshError(
+                f"{name}: {file} holds signatures and no meshes. Use a dataset of the folder of meshes."
+            )
         return self.pipeline.mesh(self.bodies[index])
 
     def key(self, index: int) -> str:
@@ -195,7 +217,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Return a batch of some of the items, optionally with their meshes."""
-        return collate([self[i] for i in indices], [self.mesh(i) for i in indices] if meshes else None)
+        return collate(
+            [self[i] for i in indices], [self.mesh(i) for i in indices] if meshes else None
+        )
 
     def subset(self, indices: Sequence[int]) -> Self:
         """Return a dataset of some of the bodies, with the same `classes`, so that labels are unchanged."""
@@ -219,7 +243,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         Signatures that are not cached are computed. If given, `change` is applied to each; `FewerSamples` saves memory.
         """
         dataset = copy.copy(self)
-        dataset._loaded = [copy.deepcopy(s if change is None else change(s)) for s in self.signatures()]
+        dataset._loaded = [
+            copy.deepcopy(s if change is None else change(s)) for s in self.signatures()
+        ]
         if change is not None:  # the cache entries no longer belong to the Signatures
             dataset._hits = (None,) * len(self)
         dataset._loaded_indices = tuple(range(len(self)))
@@ -232,14 +258,27 @@ class SignatureDataset(Dataset[LabelledSignature]):
         body that cannot be used raises a MeshError, see `usable`.
         """
         dataset = copy.copy(self)
-        hits = [hit or self.pipeline.hit(body) for hit, body in zip(self._hits, self.bodies, strict=True)]
+        hits = [
+            hit or self.pipeline.hit(body)
+            for hit, body in zip(self._hits, self.bodies, strict=True)
+        ]
         dataset._hits = tuple(hits)
-        about = Contents(self.bodies, self.classes, tuple(hit.whole_key for hit in hits), self.reading, self.config)
+        about = Contents(
+            self.bodies,
+            self.classes,
+            tuple(hit.whole_key for hit in hits),
+            self.reading,
+            self.config,
+        )
         write_collection(Path(path), about, dataset._signature)
 
     @classmethod
     def from_file(
-        cls, path: str | Path, *, descriptor: AnyDescriptor | None = None, cache_dir: Path | None = None
+        cls,
+        path: str | Path,
+        *,
+        descriptor: AnyDescriptor | None = None,
+        cache_dir: Path | None = None,
     ) -> Self:
         """Open a file that `to_file` wrote. It is memory-mapped, and reading it runs no code.
 
@@ -256,9 +295,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
         if descriptor is not None:
             file.check_requirements(requirements_of(descriptor))
         dataset = cls.__new__(cls)
-        SignatureDataset.__init__(dataset, about.bodies, about.config, cache_dir, reading=about.reading)
+        SignatureDataset.__init__(
+            dataset, about.bodies, about.config, cache_dir, reading=about.reading
+        )
         dataset.classes, dataset._loaded = about.classes, file
-        dataset._hits = tuple(CacheHit(key, 0, file.notes(i), (0, 0, 0)) for i, key in enumerate(about.keys))
+        dataset._hits = tuple(
+            CacheHit(key, 0, file.notes(i), (0, 0, 0)) for i, key in enumerate(about.keys)
+        )
         return dataset
 
     def precompute(
@@ -288,7 +331,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         if self._loaded is not None:
             return []
-        hits, failures = fill(self.pipeline, self.bodies, executor, n_workers, strict, progress, limits)
+        hits, failures = fill(
+            self.pipeline, self.bodies, executor, n_workers, strict, progress, limits
+        )
         self._hits = tuple(hits)
         return failures
 

@@ -21,7 +21,9 @@ logger = logging.getLogger(__name__)
 
 _FILE = "known_files.sqlite"
 _LOCK_TIMEOUT = 30.0  # seconds; a writer holds the lock of the database for milliseconds
-MIN_AGE = 2 * 10**9  # nanoseconds; a file that was changed more recently may change again without a new time stamp
+MIN_AGE = (
+    2 * 10**9
+)  # nanoseconds; a file that was changed more recently may change again without a new time stamp
 _TABLE = (
     "CREATE TABLE IF NOT EXISTS body (pipeline TEXT, path TEXT, part TEXT, size INTEGER, mtime INTEGER, ctime INTEGER, "
     "key TEXT, bytes INTEGER, notes TEXT, PRIMARY KEY (pipeline, path, part)) WITHOUT ROWID"
@@ -40,8 +42,12 @@ class FileStatCache:
         self._path = pipeline.cache_dir / _FILE
         tag = pipeline.pre_transform.cache_tag if pipeline.pre_transform else None
         fields = [pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION, tag]
-        fields += [pipeline.reading.names] if pipeline.reading.names else []  # tables of names may have equal stamps
-        self._pipeline_id = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:32]
+        fields += (
+            [pipeline.reading.names] if pipeline.reading.names else []
+        )  # tables of names may have equal stamps
+        self._pipeline_id = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[
+            :32
+        ]
         # A transform may depend on attributes, whose sources can change while the file of the body does not
         self._is_enabled = not (pipeline.attributes and pipeline.pre_transform)
 
@@ -51,7 +57,9 @@ class FileStatCache:
         if not self._path.exists() or not self._is_enabled:
             return hits
         cache = SignatureCache(self._pipeline.cache_dir)
-        current_stamp = lru_cache(maxsize=1)(lambda path: stat_key(*dependencies_of(path, self._pipeline.reading)))
+        current_stamp = lru_cache(maxsize=1)(
+            lambda path: stat_key(*dependencies_of(path, self._pipeline.reading))
+        )
         with self._tolerate_database_errors(), contextlib.closing(self._database()) as database:
             for body in bodies:
                 row = database.execute(_QUERY, (self._pipeline_id, *_row_key(body))).fetchone()
@@ -70,13 +78,26 @@ class FileStatCache:
         """Record the cache entries of bodies, except for files that were changed just now."""
         now = time.time_ns()
         rows = [
-            (self._pipeline_id, *_row_key(body), *hit.stamp, hit.key, hit.n_bytes, json.dumps(hit.notes))
+            (
+                self._pipeline_id,
+                *_row_key(body),
+                *hit.stamp,
+                hit.key,
+                hit.n_bytes,
+                json.dumps(hit.notes),
+            )
             for body, hit in hits.items()
             if now - max(hit.stamp[1:]) > MIN_AGE
         ]
         if rows and self._is_enabled:
-            with self._tolerate_database_errors(), contextlib.closing(self._database()) as database, database:
-                database.executemany("INSERT OR REPLACE INTO body VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            with (
+                self._tolerate_database_errors(),
+                contextlib.closing(self._database()) as database,
+                database,
+            ):
+                database.executemany(
+                    "INSERT OR REPLACE INTO body VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows
+                )
 
     def _database(self) -> sqlite3.Connection:
         self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -90,8 +111,12 @@ class FileStatCache:
         try:
             yield
         except (sqlite3.Error, OSError) as error:
-            logger.warning("%s: not usable (%s); unchanged files may be read again", self._path, error)
-            if isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.OperationalError):
+            logger.warning(
+                "%s: not usable (%s); unchanged files may be read again", self._path, error
+            )
+            if isinstance(error, sqlite3.DatabaseError) and not isinstance(
+                error, sqlite3.OperationalError
+            ):
                 with contextlib.suppress(OSError):
                     self._path.unlink()
 

@@ -41,13 +41,22 @@ class Failure:
     def of(bodies: Bodies, i: int, reason: str) -> Failure:
         """Return the failure of a body by its index, with its file named in the error."""
         path = bodies.paths[i]
-        return Failure(bodies.names[i], path, reason if reason.startswith(str(path)) else f"{bodies[i]}: {reason}")
+        return Failure(
+            bodies.names[i],
+            path,
+            reason if reason.startswith(str(path)) else f"{bodies[i]}: {reason}",
+        )
 
 
 def fill(
-    pipeline: SignaturePipeline, bodies: Bodies, executor: Executor | None, n_workers: int | None, strict: bool,
-    progress: bool, limits: Limits | None,
-) -> tuple[list[CacheHit | None], list[Failure]]:  # fmt: skip
+    pipeline: SignaturePipeline,
+    bodies: Bodies,
+    executor: Executor | None,
+    n_workers: int | None,
+    strict: bool,
+    progress: bool,
+    limits: Limits | None,
+) -> tuple[list[CacheHit | None], list[Failure]]:
     """Compute missing Signatures; return all cache entries, and failures. See `SignatureDataset.precompute`."""
     try:  # here, so that it is reported once and not for every body
         pipeline.cache_dir.mkdir(parents=True, exist_ok=True)
@@ -60,8 +69,15 @@ def fill(
     failures: dict[int, Failure] = {}
     new: dict[BodyRef, CacheHit] = {}
     missing = [i for i, hit in enumerate(hits) if hit is None]
-    outcomes = compute(pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits())
-    bar = tqdm(total=len(bodies), initial=len(bodies) - len(missing), desc="signatures", disable=not progress)
+    outcomes = compute(
+        pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits()
+    )
+    bar = tqdm(
+        total=len(bodies),
+        initial=len(bodies) - len(missing),
+        desc="signatures",
+        disable=not progress,
+    )
     with bar, contextlib.closing(outcomes):
         try:
             for i, outcome in outcomes:
@@ -83,12 +99,16 @@ def fill(
     return hits, [failures[i] for i in sorted(failures)]
 
 
-def find_cached(pipeline: SignaturePipeline, bodies: Bodies, read_files: bool = True) -> list[CacheHit | None]:
+def find_cached(
+    pipeline: SignaturePipeline, bodies: Bodies, read_files: bool = True
+) -> list[CacheHit | None]:
     """Return the cache entry of each body, or None. Files that are new or changed are read only if `read_files`."""
     records = FileStatCache(pipeline)
     hits = list(map(records.ready(bodies).get, bodies))
     new: dict[BodyRef, CacheHit] = {}
-    for group in group_by_file(bodies, (i for i, hit in enumerate(hits) if hit is None and read_files)):
+    for group in group_by_file(
+        bodies, (i for i, hit in enumerate(hits) if hit is None and read_files)
+    ):
         with contextlib.suppress(MeshError):  # which the computation reports
             for i, hit in zip(group, pipeline.lookup([bodies[i] for i in group]), strict=True):
                 if hit is not None:
@@ -98,9 +118,15 @@ def find_cached(pipeline: SignaturePipeline, bodies: Bodies, read_files: bool = 
 
 
 def compute(
-    pipeline: SignaturePipeline, bodies: Bodies, indices: Sequence[int], *, n_workers: int | None,
-    executor: Executor | None, limits: Limits, max_per_job: int | None = None,
-) -> Generator[tuple[int, CacheHit | Failed], None, None]:  # fmt: skip
+    pipeline: SignaturePipeline,
+    bodies: Bodies,
+    indices: Sequence[int],
+    *,
+    n_workers: int | None,
+    executor: Executor | None,
+    limits: Limits,
+    max_per_job: int | None = None,
+) -> Generator[tuple[int, CacheHit | Failed], None, None]:
     """Compute Signatures into the cache, and yield the index and the cache entry or failure of each body.
 
     A job computes several bodies of one file, which it reads once. If the process of a job dies, each of its bodies is
@@ -108,13 +134,22 @@ def compute(
     64 if None, or less so that all workers have a job. See `igps._parallel.run` for the other arguments.
     """
     per_worker = -(-len(indices) // (n_workers or n_cores()))
-    max_per_job = 1 if limits != Limits() else max_per_job or max(1, min(per_worker, _MAX_BODIES_PER_JOB))
+    max_per_job = (
+        1 if limits != Limits() else max_per_job or max(1, min(per_worker, _MAX_BODIES_PER_JOB))
+    )
     groups = group_by_file(bodies, indices, max_per_job)
     jobs = [[bodies[i] for i in group] for group in groups]
     function: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     if executor is not None:  # its workers may run in another folder, so all paths must be absolute
-        function = partial(fill_elsewhere, replace(pipeline, cache_dir=pipeline.cache_dir.absolute()).fill, version())
-        jobs = [[b if b in pipeline.meshes else replace(b, path=b.path.absolute()) for b in job] for job in jobs]
+        function = partial(
+            fill_elsewhere,
+            replace(pipeline, cache_dir=pipeline.cache_dir.absolute()).fill,
+            version(),
+        )
+        jobs = [
+            [b if b in pipeline.meshes else replace(b, path=b.path.absolute()) for b in job]
+            for job in jobs
+        ]
     lost: list[int] = []
     results = run(function, jobs, n_workers=n_workers, executor=executor, limits=limits)
     with contextlib.closing(results):
@@ -127,7 +162,15 @@ def compute(
             else:
                 yield group[0], outcome
     if lost:
-        yield from compute(pipeline, bodies, lost, n_workers=n_workers, executor=executor, limits=limits, max_per_job=1)
+        yield from compute(
+            pipeline,
+            bodies,
+            lost,
+            n_workers=n_workers,
+            executor=executor,
+            limits=limits,
+            max_per_job=1,
+        )
 
 
 def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
@@ -137,14 +180,22 @@ def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
     while not path.exists():
         if time.monotonic() > deadline:
             cause = f"{pipeline.cache_dir}: the workers' signatures do not appear there"
-            raise MachineError(f"{cause}. Choose a cache_dir that this machine and all workers share by the same path.")
+            raise MachineError(
+                f"{cause}. Choose a cache_dir that this machine and all workers share by the same path."
+            )
         time.sleep(0.1)
 
 
-def group_by_file(bodies: Bodies, indices: Iterable[int], max_size: int | None = None) -> list[list[int]]:
+def group_by_file(
+    bodies: Bodies, indices: Iterable[int], max_size: int | None = None
+) -> list[list[int]]:
     """Group the indices of bodies by file, with at most `max_size` indices in a group."""
     groups: dict[Path, list[int]] = {}
     for i in indices:
         groups.setdefault(bodies.paths[i], []).append(i)
     step = max_size or len(bodies)
-    return [group[start : start + step] for group in groups.values() for start in range(0, len(group), step)]
+    return [
+        group[start : start + step]
+        for group in groups.values()
+        for start in range(0, len(group), step)
+    ]

@@ -28,7 +28,9 @@ def to_pyg(signature: Signature, samples: SampleKind = "surface", label: int = -
     try:
         from torch_geometric.data import Data
     except ImportError as error:
-        raise ImportError('to_pyg: needs PyTorch Geometric: pip install "interior-gps[geometric]".') from error
+        raise ImportError(
+            'to_pyg: needs PyTorch Geometric: pip install "interior-gps[geometric]".'
+        ) from error
     chosen = getattr(signature, samples)
     measure = signature.area if samples == "surface" else signature.volume
     return Data(

@@ -13,11 +13,16 @@ from igps.signature.signature import SignatureConfig
 
 
 def bodies_in_memory(
-    objects: Mapping[str, Any], labels: Sequence[str] | None, options: LoadOptions, config: SignatureConfig
+    objects: Mapping[str, Any],
+    labels: Sequence[str] | None,
+    options: LoadOptions,
+    config: SignatureConfig,
 ) -> tuple[Bodies, dict[BodyRef, Mesh | MeshError]]:
     """Return the bodies of objects by name, see `object_bodies`, and the mesh or the error of each body."""
     if labels is not None and len(labels) != len(objects):
-        raise ValueError(f"labels: expected one for each of {len(objects)} bodies, got {len(labels)}.")
+        raise ValueError(
+            f"labels: expected one for each of {len(objects)} bodies, got {len(labels)}."
+        )
     if not objects:
         raise ValueError("bodies: expected at least one, got none.")
     min_vertices = config.resolved().n_vertices_read
@@ -29,11 +34,15 @@ def bodies_in_memory(
             for raw in object_bodies(value, name, options):
                 ref = BodyRef(Path(name), raw.part)
                 try:
-                    meshes[ref] = surface_body(raw.made(), ref, options, least_vertices=min_vertices)
+                    meshes[ref] = surface_body(
+                        raw.made(), ref, options, least_vertices=min_vertices
+                    )
                 except MeshError as error:
                     meshes[ref] = error
         except MeshError as error:
             meshes[BodyRef(Path(name))] = error
         classes += [] if labels is None else [labels[i]] * (len(meshes) - n_before)
     paths, parts = zip(*((ref.path, ref.part) for ref in meshes), strict=True)
-    return Bodies(paths, tuple(map(str, meshes)), None if labels is None else tuple(classes), parts), meshes
+    return Bodies(
+        paths, tuple(map(str, meshes)), None if labels is None else tuple(classes), parts
+    ), meshes

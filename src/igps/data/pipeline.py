@@ -52,7 +52,9 @@ class CacheHit:
     n_bytes: int  # size of the cached file
     notes: tuple[str, ...]  # on how the mesh was changed
     stamp: tuple[int, int, int]  # of the body's file when it was read, see `stat_key`
-    attributes: Mapping[str, str] = field(default_factory=dict)  # cache keys of added attributes, by name
+    attributes: Mapping[str, str] = field(
+        default_factory=dict
+    )  # cache keys of added attributes, by name
 
     @property
     def whole_key(self) -> str:
@@ -67,9 +69,13 @@ class SignaturePipeline:
     config: SignatureConfig
     reading: LoadOptions
     cache_dir: Path
-    attributes: Mapping[str, AttributeSource] = field(default_factory=dict)  # additional attributes by name
+    attributes: Mapping[str, AttributeSource] = field(
+        default_factory=dict
+    )  # additional attributes by name
     pre_transform: PreTransform | None = None  # applied after the attributes are added, and cached
-    meshes: Mapping[BodyRef, Mesh | MeshError] = field(default_factory=dict)  # bodies in memory, or their errors
+    meshes: Mapping[BodyRef, Mesh | MeshError] = field(
+        default_factory=dict
+    )  # bodies in memory, or their errors
 
     def __post_init__(self) -> None:
         if self.pre_transform is not None and not getattr(self.pre_transform, "cache_tag", None):
@@ -81,7 +87,9 @@ class SignaturePipeline:
     def mesh(self, body: BodyRef) -> Mesh:
         """Return the checked mesh of a body; raise a MeshError if it cannot be used."""
         if body not in self.meshes:
-            return load_mesh(body.path, self.reading, part=body.part, least_vertices=self.config.n_vertices_read)
+            return load_mesh(
+                body.path, self.reading, part=body.part, least_vertices=self.config.n_vertices_read
+            )
         if isinstance(mesh := self.meshes[body], MeshError):
             raise mesh
         return mesh
@@ -90,13 +98,19 @@ class SignaturePipeline:
         """Return stamp and digest of the file of a body, or of its mesh in memory; raise a MeshError if unreadable."""
         if body in self.meshes:
             mesh = self.mesh(body)
-            content = mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((mesh.unit, mesh.notes)).encode()
+            content = (
+                mesh.vertices.tobytes(),
+                mesh.faces.tobytes(),
+                repr((mesh.unit, mesh.notes)).encode(),
+            )
             return BodyFile((0, 0, 0), b"".join(hashlib.sha256(data).digest() for data in content))
         try:
             files = dependencies_of(body.path, self.reading)
             return BodyFile(stat_key(*files), content_digest(*files))
         except OSError as error:
-            raise MeshError(f"{body.path}: cannot be read ({error.strerror}). Check the path.") from error
+            raise MeshError(
+                f"{body.path}: cannot be read ({error.strerror}). Check the path."
+            ) from error
 
     def signature(self, body: BodyRef) -> Signature:
         """Return the Signature of a body from the cache, where it is stored if it was missing."""
@@ -117,11 +131,15 @@ class SignaturePipeline:
             return [attempt(partial(self.hit, body)) for body in bodies]
         file = self._file(bodies[0])
         cached = {body: self._lookup(body, file) for body in bodies}
-        outcomes: dict[BodyRef, CacheHit | Failed] = {body: hit for body, hit in cached.items() if hit is not None}
+        outcomes: dict[BodyRef, CacheHit | Failed] = {
+            body: hit for body, hit in cached.items() if hit is not None
+        }
         missing = {body.part: body for body in bodies if body not in outcomes}
         min_vertices = self.config.n_vertices_read
         try:
-            for ref, mesh in each_body(bodies[0].path, self.reading, parts=[*missing], least_vertices=min_vertices):
+            for ref, mesh in each_body(
+                bodies[0].path, self.reading, parts=[*missing], least_vertices=min_vertices
+            ):
                 body = missing[ref.part]
                 if isinstance(mesh, MeshError):
                     outcomes[body] = Failed(str(mesh))
@@ -130,9 +148,14 @@ class SignaturePipeline:
         except MeshError as error:  # in the file, and thus in all bodies that were not read before
             outcomes = {**dict.fromkeys(missing.values(), Failed(str(error))), **outcomes}
         # The error of a body that is not in the file is raised by `hit`
-        return [outcomes[body] if body in outcomes else attempt(partial(self.hit, body, file)) for body in bodies]
+        return [
+            outcomes[body] if body in outcomes else attempt(partial(self.hit, body, file))
+            for body in bodies
+        ]
 
-    def hit(self, body: BodyRef, file: BodyFile | None = None, mesh: Mesh | None = None) -> CacheHit:
+    def hit(
+        self, body: BodyRef, file: BodyFile | None = None, mesh: Mesh | None = None
+    ) -> CacheHit:
         """Return the cache entry of a body, computed if missing; raise a MeshError if the body cannot be used."""
         file = file or self._file(body)
         return self._lookup(body, file) or self._compute(body, file, mesh)[0]
@@ -140,7 +163,9 @@ class SignaturePipeline:
     def lookup(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
         """Return the cache entries of bodies of one file, None if missing; raise a MeshError if it is unreadable."""
         file = self._file(bodies[0])
-        return [self._lookup(body, self._file(body) if body in self.meshes else file) for body in bodies]
+        return [
+            self._lookup(body, self._file(body) if body in self.meshes else file) for body in bodies
+        ]
 
     def with_attributes(self, body: BodyRef, hit: CacheHit) -> CacheHit | None:
         """Return the cache entry of a body with the keys of its attributes; None if one is not cached."""
@@ -176,14 +201,19 @@ class SignaturePipeline:
         if self.pre_transform is None:
             key = next(self._cached_keys(body, file), None)
         else:
-            keys = (self._transformed_key(body, self._key(body, file, self.config, mended)) for mended in (False, True))
+            keys = (
+                self._transformed_key(body, self._key(body, file, self.config, mended))
+                for mended in (False, True)
+            )
             key = next((key for key in keys if key in cache), None)
         if key is None:
             return None
         hit = CacheHit(key, cache.path(key).stat().st_size, cache.notes(key), file.stamp)
         return self.with_attributes(body, hit)
 
-    def _compute(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> tuple[CacheHit, Signature]:
+    def _compute(
+        self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None
+    ) -> tuple[CacheHit, Signature]:
         """Compute the Signature of a body into the cache, and return its cache entry and the Signature."""
         cache = SignatureCache(self.cache_dir)
         key, signature = self._compute_without_attributes(body, file, mesh)
@@ -194,13 +224,17 @@ class SignaturePipeline:
         if self.pre_transform is not None:
             key = self._key(body, file, self.config, bool(repair_steps(signature.notes)))
             # Transforms seed random numbers by the name, so copies of a file get the same numbers only by its key
-            signature = replace(self.pre_transform(replace(signature, name=key)), name=signature.name)
+            signature = replace(
+                self.pre_transform(replace(signature, name=key)), name=signature.name
+            )
             key, attribute_keys = self._transformed_key(body, key), {}
             cache.put(key, signature)
         n_bytes = cache.path(key).stat().st_size
         return CacheHit(key, n_bytes, tuple(signature.notes), file.stamp, attribute_keys), signature
 
-    def _compute_without_attributes(self, body: BodyRef, file: BodyFile, mesh: Mesh | None) -> tuple[str, Signature]:
+    def _compute_without_attributes(
+        self, body: BodyRef, file: BodyFile, mesh: Mesh | None
+    ) -> tuple[str, Signature]:
         """Return the key and the Signature of a body before attributes and transform, computed if missing."""
         cache = SignatureCache(self.cache_dir)
         for key in self._cached_keys(body, file):
@@ -212,7 +246,9 @@ class SignaturePipeline:
         cache.put(key, signature)
         return key, signature
 
-    def _with_attribute(self, body: BodyRef, signature: Signature, name: str, key: str) -> Signature:
+    def _with_attribute(
+        self, body: BodyRef, signature: Signature, name: str, key: str
+    ) -> Signature:
         cache = AttributeCache(self.cache_dir)
         values = cache.get(key)
         if values is not None:
@@ -234,7 +270,10 @@ class SignaturePipeline:
                 # Not a body that an earlier version mended, whose key lacks the version
                 has_current_mending = mended or not steps
                 # Not a mesh that was subdivided for another number of vertices
-                has_same_mesh = config.n_vertices_read == self.config.n_vertices_read or "subdivided" not in steps
+                has_same_mesh = (
+                    config.n_vertices_read == self.config.n_vertices_read
+                    or "subdivided" not in steps
+                )
                 if has_current_mending and has_same_mesh:
                     yield key
 
@@ -263,12 +302,23 @@ def _digest(values: Sequence[object]) -> str:
 
 @lru_cache
 def _key_parameters(
-    suffix: str, part: str | None, reading: LoadOptions, config: SignatureConfig, versions: tuple[int, int | None]
+    suffix: str,
+    part: str | None,
+    reading: LoadOptions,
+    config: SignatureConfig,
+    versions: tuple[int, int | None],
 ) -> bytes:
     """Return the part of a key that is not the content of the file; cached, because thousands of files share it."""
     algorithm, mending = versions
-    loading = {"suffix": suffix, "part": part, "reading": reading.as_dict(), "mending_version": mending}
-    return json.dumps([loading, {**config.as_dict(), "algorithm_version": algorithm}], sort_keys=True).encode()
+    loading = {
+        "suffix": suffix,
+        "part": part,
+        "reading": reading.as_dict(),
+        "mending_version": mending,
+    }
+    return json.dumps(
+        [loading, {**config.as_dict(), "algorithm_version": algorithm}], sort_keys=True
+    ).encode()
 
 
 @lru_cache
@@ -283,7 +333,9 @@ def version() -> str:
 
 
 def fill_elsewhere(
-    fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]], expected: str, bodies: Sequence[BodyRef]
+    fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]],
+    expected: str,
+    bodies: Sequence[BodyRef],
 ) -> list[CacheHit | Failed]:
     """Call `SignaturePipeline.fill` on a worker of a cluster; raise a MachineError if it has another version."""
     if version() != expected:

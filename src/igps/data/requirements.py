@@ -22,7 +22,9 @@ class Requirements:
     n_eigenpairs: int = 0  # minimum number; fewer would give another descriptor
     attributes: tuple[AttributeName, ...] = ()  # of the samples, see `SignatureConfig`
     mesh: bool = False  # whether the mesh is needed
-    whole_spectrum: bool = False  # whether all eigenpairs are used, so that more would give another descriptor
+    whole_spectrum: bool = (
+        False  # whether all eigenpairs are used, so that more would give another descriptor
+    )
     # Sources of additional attributes by name, which the `attributes` of a SignatureDataset override
     sources: Mapping[str, AttributeSource] = field(default_factory=dict, hash=False)
 
@@ -44,7 +46,9 @@ class Requirements:
         default = SignatureConfig.DEFAULT_EIGENPAIRS if self.whole_spectrum else 0
         config = config.with_eigenpairs(max(default, self.n_eigenpairs))
         self._check_eigenpairs(config.n_kept)
-        return replace(config, attributes=tuple(dict.fromkeys((*config.attributes, *self.attributes))))
+        return replace(
+            config, attributes=tuple(dict.fromkeys((*config.attributes, *self.attributes)))
+        )
 
     def check_config(self, config: SignatureConfig) -> None:
         """Raise a ValueError if Signatures of a configuration do not meet the requirements."""
@@ -55,7 +59,9 @@ class Requirements:
         """Raise a ValueError if a batch does not meet the requirements."""
         if not batch.area.shape[0]:
             raise ValueError("batch: expected at least one shape, got none.")
-        if self.n_eigenpairs and not torch.compiler.is_compiling():  # tracing cannot read values of tensors
+        if (
+            self.n_eigenpairs and not torch.compiler.is_compiling()
+        ):  # tracing cannot read values of tensors
             self._check_eigenpairs(int(torch.isfinite(batch.eigenvalues).sum(dim=1).min()))
         self._check_attributes({*batch.interior.attributes, *batch.surface.attributes})
         if self.mesh and batch.meshes is None:
@@ -82,7 +88,11 @@ class Requirements:
 def embedding_requirements(embedding: nn.Module) -> Requirements:
     """Return the requirements of an embedding: its `n_eigenpairs`, or the whole spectrum if it has none."""
     n_eigenpairs = getattr(embedding, "n_eigenpairs", None)
-    return Requirements(n_eigenpairs) if isinstance(n_eigenpairs, int) else Requirements(whole_spectrum=True)
+    return (
+        Requirements(n_eigenpairs)
+        if isinstance(n_eigenpairs, int)
+        else Requirements(whole_spectrum=True)
+    )
 
 
 class HasRequirements(Protocol):
@@ -108,4 +118,6 @@ def requirements_of(descriptor: AnyDescriptor) -> Requirements:
     """Return the requirements of a descriptor."""
     if isinstance(descriptor, Requirements):
         return descriptor
-    return (_find_by_name[0](descriptor) if isinstance(descriptor, str) else descriptor).requirements
+    return (
+        _find_by_name[0](descriptor) if isinstance(descriptor, str) else descriptor
+    ).requirements

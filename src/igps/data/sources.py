@@ -31,19 +31,30 @@ class Bodies:
     """Bodies in files, with names, classes and further columns."""
 
     paths: tuple[Path, ...]  # file of each body
-    names: tuple[str, ...]  # unique: path of the file relative to the searched folder, and `#part` if it has a part
+    names: tuple[
+        str, ...
+    ]  # unique: path of the file relative to the searched folder, and `#part` if it has a part
     labels: tuple[str, ...] | None = None  # class of each body; None if there are no classes
-    parts: tuple[str | None, ...] = ()  # name of each body in its file; None if the file is one body
+    parts: tuple[
+        str | None, ...
+    ] = ()  # name of each body in its file; None if the file is one body
     # Further columns of `labels.csv` by name, with one value for each body; None if a value is missing (empty, NA, ...)
     columns: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if not self.parts:
             object.__setattr__(self, "parts", (None,) * len(self.paths))
-        fields = (("names", self.names), ("labels", self.labels), ("parts", self.parts), *self.columns.items())
+        fields = (
+            ("names", self.names),
+            ("labels", self.labels),
+            ("parts", self.parts),
+            *self.columns.items(),
+        )
         for name, values in fields:
             if values is not None and len(values) != len(self.paths):
-                raise ValueError(f"{name}: expected one for each of {len(self.paths)} files, got {len(values)}.")
+                raise ValueError(
+                    f"{name}: expected one for each of {len(self.paths)} files, got {len(values)}."
+                )
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -74,12 +85,18 @@ class Bodies:
         """Return the values of a column such as "scanner"; raise a ValueError if a body has no value."""
         if name not in self.columns:
             names = ", ".join(self.columns) or "none"
-            raise ValueError(f"{name}: no such column of {LABELS_FILE}; further columns: {names}. Choose one of them.")
+            raise ValueError(
+                f"{name}: no such column of {LABELS_FILE}; further columns: {names}. Choose one of them."
+            )
         values = self.columns[name]
         missing = [body for body, value in zip(self.names, values, strict=True) if value is None]
         if missing:
-            cause = f"{name}: {len(missing)} of {len(self)} bodies have no value, such as {missing[0]}"
-            raise ValueError(f"{cause}. Fill the column of {LABELS_FILE}, or leave these bodies out.")
+            cause = (
+                f"{name}: {len(missing)} of {len(self)} bodies have no value, such as {missing[0]}"
+            )
+            raise ValueError(
+                f"{cause}. Fill the column of {LABELS_FILE}, or leave these bodies out."
+            )
         return tuple(str(value) for value in values)
 
     def numbers(self, name: str) -> list[float]:
@@ -87,7 +104,9 @@ class Bodies:
         values = self.column(name)
         for body, value in zip(self.names, values, strict=True):
             if not is_number(value):
-                raise ValueError(f"{name}: expected numbers, got {value!r} of {body}. Correct it in {LABELS_FILE}.")
+                raise ValueError(
+                    f"{name}: expected numbers, got {value!r} of {body}. Correct it in {LABELS_FILE}."
+                )
         return [float(value) for value in values]
 
     def with_classes(self, rule: ClassRule) -> Bodies:
@@ -99,10 +118,14 @@ class Bodies:
         if rule == "file":
             return replace(self, labels=tuple(map(file_name_of, self.names, self.parts)))
         if all(part is None for part in self.parts):
-            raise ValueError(f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body.")
+            raise ValueError(
+                f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body."
+            )
         # Files without parts, for example because they cannot be read, have classes by their own names
         stems = [path.name.partition(".")[0] for path in self.paths]
-        return replace(self, labels=tuple(part or stem for part, stem in zip(self.parts, stems, strict=True)))
+        return replace(
+            self, labels=tuple(part or stem for part, stem in zip(self.parts, stems, strict=True))
+        )
 
 
 def find_bodies(
@@ -133,48 +156,77 @@ def find_bodies(
     if not _is_utf8(root.absolute()):
         raise ValueError(f"{os.fsencode(root)!r}: expected a name in UTF-8. Rename the folder.")
     if not root.is_dir():
-        raise FileNotFoundError(f"{root}: {'expected a folder, got a file' if root.exists() else 'no such folder'}.")
+        raise FileNotFoundError(
+            f"{root}: {'expected a folder, got a file' if root.exists() else 'no such folder'}."
+        )
     has_table = (root / LABELS_FILE).is_file()
-    bodies = _from_labels_file(root, options) if has_table else _from_folder(root, options, attributes)
+    bodies = (
+        _from_labels_file(root, options) if has_table else _from_folder(root, options, attributes)
+    )
     bodies = bodies.with_classes(classes)
     if labelled and bodies.labels is None:
-        other = f" Or rename one of the columns {', '.join(bodies.columns)} to label." if bodies.columns else ""
-        raise ValueError(f"{root}: no classes found. Expected a folder per class or {LABELS_FILE} (file,label).{other}")
+        other = (
+            f" Or rename one of the columns {', '.join(bodies.columns)} to label."
+            if bodies.columns
+            else ""
+        )
+        raise ValueError(
+            f"{root}: no classes found. Expected a folder per class or {LABELS_FILE} (file,label).{other}"
+        )
     return bodies
 
 
 def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[AttributeSource]) -> Bodies:
-    links = [path for path in root.iterdir() if path.is_symlink() and path.is_dir() and not path.name.startswith(".")]
+    links = [
+        path
+        for path in root.iterdir()
+        if path.is_symlink() and path.is_dir() and not path.name.startswith(".")
+    ]
     files = sorted(path for folder in (root, *links) for path in _files_in(folder))
-    excluded = {file for source in attributes if isinstance(source, FileSource) for file in source.files(files)}
+    excluded = {
+        file
+        for source in attributes
+        if isinstance(source, FileSource)
+        for file in source.files(files)
+    }
     at_root = [path for path in files if path.parent == root and path not in excluded]
     nested = [path for path in files if path.parent != root and path not in excluded]
     if at_root and nested:
         ignored = f"{len(at_root)} files beside the folders of classes are ignored, such as {at_root[0].name}"
-        logger.warning("%s: %s. Put them into a folder, or list all in a %s.", root, ignored, LABELS_FILE)
+        logger.warning(
+            "%s: %s. Put them into a folder, or list all in a %s.", root, ignored, LABELS_FILE
+        )
     names = [(path, path.relative_to(root)) for path in nested or at_root]
     if not names:
         raise FileNotFoundError(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
             f"in one of the formats {', '.join(searched_suffixes())}."
         )
-    rows = [(path, name.as_posix(), name.parts[0] if nested else None, None) for path, name in names]
+    rows = [
+        (path, name.as_posix(), name.parts[0] if nested else None, None) for path, name in names
+    ]
     return _bodies_in_files(rows, options)
 
 
 def bodies_of_files(
-    paths: Sequence[str | Path], labels: Sequence[str] | None = None, options: LoadOptions | None = None
+    paths: Sequence[str | Path],
+    labels: Sequence[str] | None = None,
+    options: LoadOptions | None = None,
 ) -> Bodies:
     """Return the bodies of files in their order. ``FILE#PART`` selects one body of a file. Labels are given by file."""
     files = [file_and_part(Path(path)) for path in paths]
     if not files:
         raise ValueError("paths: expected at least one mesh file, got none.")
     if invalid := [file for file, _ in files if not _is_utf8(file.absolute())]:
-        raise ValueError(f"paths: expected names in UTF-8, got {os.fsencode(invalid[0])!r}. Rename the file.")
+        raise ValueError(
+            f"paths: expected names in UTF-8, got {os.fsencode(invalid[0])!r}. Rename the file."
+        )
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
     classes: Sequence[str | None] = [None] * len(files) if labels is None else list(labels)
-    rows = [(file, str(file), label, part) for (file, part), label in zip(files, classes, strict=True)]
+    rows = [
+        (file, str(file), label, part) for (file, part), label in zip(files, classes, strict=True)
+    ]
     return _bodies_in_files(rows, options or LoadOptions())
 
 
@@ -185,9 +237,13 @@ def bodies_of(
     attributes: Iterable[AttributeSource] = (),
 ) -> Bodies:
     """Return the bodies of a folder or of files, see `find_bodies` and `bodies_of_files`; return `Bodies` unchanged."""
-    has_labels = isinstance(source, Bodies) or (isinstance(source, str | Path) and Path(source).is_dir())
+    has_labels = isinstance(source, Bodies) or (
+        isinstance(source, str | Path) and Path(source).is_dir()
+    )
     if labels is not None and has_labels:
-        raise ValueError(f"labels: expected None with a folder or bodies, which have labels, got {len(labels)}.")
+        raise ValueError(
+            f"labels: expected None with a folder or bodies, which have labels, got {len(labels)}."
+        )
     if isinstance(source, Bodies):
         return source
     if not isinstance(source, str | Path):
@@ -236,31 +292,50 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
         reader = csv.DictReader(stream, skipinitialspace=True, restval="")
         try:
             reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
-            rows = [(reader.line_num, {name: "".join(value).strip() for name, value in row.items()}) for row in reader]
+            rows = [
+                (reader.line_num, {name: "".join(value).strip() for name, value in row.items()})
+                for row in reader
+            ]
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{file}: not readable as a table ({error}). Save it as CSV in UTF-8.") from error
+            raise ValueError(
+                f"{file}: not readable as a table ({error}). Save it as CSV in UTF-8."
+            ) from error
         header = [name for name in reader.fieldnames if name]
         further_columns = [name for name in header if name not in ("file", "body", "label")]
         if "file" not in header or not ("label" in header or further_columns):
             expected = "expected the columns file,label in the first line, separated by commas"
             raise ValueError(f"{file}: {expected}, got {reader.fieldnames}.")
         if len(set(header)) < len(header):
-            raise ValueError(f"{file}: a column is named twice in {header}. Give each column a name of its own.")
+            raise ValueError(
+                f"{file}: a column is named twice in {header}. Give each column a name of its own."
+            )
     if long := [line for line, row in rows if row.get(None)]:  # the key of values without a column
-        raise ValueError(f"{file}: line {long[0]} has more values than columns. Put a value with a comma in quotes.")
+        raise ValueError(
+            f"{file}: line {long[0]} has more values than columns. Put a value with a comma in quotes."
+        )
     required = {"file", "label"} & {*header}
-    invalid = [line for line, row in rows if any("\0" in (row.get(name) or "\0") for name in required)]
+    invalid = [
+        line for line, row in rows if any("\0" in (row.get(name) or "\0") for name in required)
+    ]
     if not rows or invalid:
         cause = f"line {invalid[0]} lacks the name of a file, or a label" if invalid else "no rows"
         raise ValueError(f"{file}: {cause}. Each line names a mesh file and its class.")
     missing = ("", "na", "n/a", "nan")  # as R and pandas write it
     columns = {
-        name: [None if row[name].lower() in missing else row[name] for _, row in rows] for name in further_columns
+        name: [None if row[name].lower() in missing else row[name] for _, row in rows]
+        for name in further_columns
     }
-    files = [(root / row["file"], row["file"], row.get("label"), row.get("body") or None) for _, row in rows]
+    files = [
+        (root / row["file"], row["file"], row.get("label"), row.get("body") or None)
+        for _, row in rows
+    ]
     bodies = _bodies_in_files(files, options, columns)
-    counts = Counter(keys := [(os.path.abspath(body.path), body.part) for body in bodies])  # ./1.off is 1.off
-    if duplicates := sorted(name for name, key in zip(bodies.names, keys, strict=True) if counts[key] > 1):
+    counts = Counter(
+        keys := [(os.path.abspath(body.path), body.part) for body in bodies]
+    )  # ./1.off is 1.off
+    if duplicates := sorted(
+        name for name, key in zip(bodies.names, keys, strict=True) if counts[key] > 1
+    ):
         raise ValueError(f"{file}: {duplicates[0]} is listed twice. List each body once.")
     return bodies
 
@@ -277,7 +352,9 @@ def _bodies_in_files(
         for part in (_parts(path, options) if chosen_part is None else [chosen_part])
     ]
     indices, paths, names, labels, parts = zip(*entries, strict=True)
-    body_columns = {name: tuple(values[i] for i in indices) for name, values in (columns or {}).items()}
+    body_columns = {
+        name: tuple(values[i] for i in indices) for name, values in (columns or {}).items()
+    }
     return Bodies(paths, names, None if None in labels else labels, parts, body_columns)
 
 
@@ -285,12 +362,18 @@ def _files_in(folder: Path) -> list[Path]:
     """Find files that may be bodies, except for hidden ones. Broken links are included, and fail when they are read."""
     message = "%s: this folder is left out (%s). Ask for the right to read it."
     files = []
-    for parent, folders, names in os.walk(folder, onerror=lambda e: logger.warning(message, e.filename, e.strerror)):
+    for parent, folders, names in os.walk(
+        folder, onerror=lambda e: logger.warning(message, e.filename, e.strerror)
+    ):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        for path in (Path(parent, name) for name in names if not name.startswith(".") and is_searched(name)):
+        for path in (
+            Path(parent, name) for name in names if not name.startswith(".") and is_searched(name)
+        ):
             if not _is_utf8(path):
                 logger.warning("%s: left out, its name is not UTF-8. Rename it.", os.fsencode(path))
-            elif os.path.isfile(path) or not os.path.exists(path):  # not a pipe, whose reading might never end
+            elif os.path.isfile(path) or not os.path.exists(
+                path
+            ):  # not a pipe, whose reading might never end
                 files.append(path)
     return files
 

@@ -38,9 +38,13 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
         members = torch.nonzero(labels == label).flatten()
         n_fit = _count(n_train, len(members), 3, 2)
         if 0 < n_train < 1 and len(members) < 5:
-            raise ValueError(f"n_train: a share expects at least 5 shapes of a class, got {len(members)} of {label}.")
+            raise ValueError(
+                f"n_train: a share expects at least 5 shapes of a class, got {len(members)} of {label}."
+            )
         if len(members) <= n_fit:
-            raise ValueError(f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}.")
+            raise ValueError(
+                f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}."
+            )
         n_held_out = _count(n_validation, n_fit, 2)
         shuffled = members[torch.randperm(len(members), generator=generator)].tolist()
         train += shuffled[n_held_out:n_fit]
@@ -50,7 +54,12 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
 
 
 def split_unseen(
-    labels: Tensor, n_train: float, *, n_validation: float = 0, n_test: int | None = None, seed: int = 0
+    labels: Tensor,
+    n_train: float,
+    *,
+    n_validation: float = 0,
+    n_test: int | None = None,
+    seed: int = 0,
 ) -> Split:
     """Split the classes, so that no class is in two parts.
 
@@ -72,7 +81,9 @@ def split_unseen(
     n_held_out = _count(n_validation, n_fit, 1)
     n_test = len(classes) - n_fit if n_test is None else n_test
     if n_test < 1 or n_fit + n_test > len(classes):
-        raise ValueError(f"n_train, n_test: expected at most {len(classes)} classes together, got {n_train}, {n_test}.")
+        raise ValueError(
+            f"n_train, n_test: expected at most {len(classes)} classes together, got {n_train}, {n_test}."
+        )
     shuffled = classes[torch.randperm(len(classes), generator=torch.Generator().manual_seed(seed))]
 
     def members(chosen: Tensor) -> tuple[int, ...]:
@@ -94,5 +105,9 @@ def _check(n_validation: float, n_train: float) -> None:
     if n_train <= 0:
         raise ValueError(f"n_train: expected a number above 0, got {n_train}.")
     if not 0 <= n_validation < max(n_train, 1):
-        expected = f"0 to n_train - 1 = {n_train - 1}" if n_train >= 1 else "a share below 1, as n_train is a share"
+        expected = (
+            f"0 to n_train - 1 = {n_train - 1}"
+            if n_train >= 1
+            else "a share below 1, as n_train is a share"
+        )
         raise ValueError(f"n_validation: expected {expected}, got {n_validation}.")

@@ -26,13 +26,17 @@ class Transform(ABC):
     def cache_tag(self) -> str:
         """Class and parameters as text; raises a ValueError without a seed."""
         if self.seed is None:
-            raise ValueError(f"pre_transform: expected a seed, got {self!r}. Cached results must be reproducible.")
+            raise ValueError(
+                f"pre_transform: expected a seed, got {self!r}. Cached results must be reproducible."
+            )
         return repr(self)
 
     def __call__(self, signature: Signature) -> Signature:
         """Return the transformed Signature, without changing the argument."""
         seed = int(torch.randint(2**31, ())) if self.seed is None else self.seed
-        return self._changed(signature, np.random.default_rng([seed, zlib.crc32(signature.name.encode())]))
+        return self._changed(
+            signature, np.random.default_rng([seed, zlib.crc32(signature.name.encode())])
+        )
 
     @abstractmethod
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature: ...
@@ -70,7 +74,10 @@ class FewerSamples(Transform):
             attributes = {name: values[chosen] for name, values in samples.attributes.items()}
             return Samples(samples.points[chosen], samples.eigenfunctions[chosen], attributes)
 
-        interior, surface = fewer(signature.interior, self.n_interior), fewer(signature.surface, self.n_surface)
+        interior, surface = (
+            fewer(signature.interior, self.n_interior),
+            fewer(signature.surface, self.n_surface),
+        )
         return replace(signature, interior=interior, surface=surface)
 
 
@@ -82,7 +89,9 @@ class FewerEigenpairs(Transform):
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         chosen = np.sort(generator.permutation(len(signature.eigenvalues))[: self.n_eigenpairs])
-        fewer = signature.map_samples(lambda s: replace(s, eigenfunctions=s.eigenfunctions[:, chosen]))
+        fewer = signature.map_samples(
+            lambda s: replace(s, eigenfunctions=s.eigenfunctions[:, chosen])
+        )
         return replace(fewer, eigenvalues=signature.eigenvalues[chosen])
 
 
@@ -91,7 +100,9 @@ class Noise(Transform):
     """Gaussian noise on positions and on eigenfunctions."""
 
     points: float = 0.0  # standard deviation of the noise, divided by √area
-    eigenfunctions: float = 0.0  # standard deviation times √area; the mean square of an eigenfunction is 1/area
+    eigenfunctions: float = (
+        0.0  # standard deviation times √area; the mean square of an eigenfunction is 1/area
+    )
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         length = np.sqrt(signature.area)
@@ -127,7 +138,9 @@ class Scale(Transform):
             return replace(samples, points=samples.points * factor, eigenfunctions=values)
 
         area, volume = signature.area * factor**2, signature.volume * factor**3
-        rescaled = replace(signature, eigenvalues=signature.eigenvalues / factor**2, area=area, volume=volume)
+        rescaled = replace(
+            signature, eigenvalues=signature.eigenvalues / factor**2, area=area, volume=volume
+        )
         return rescaled.map_samples(scaled)
 
 

@@ -116,5 +116,8 @@ def edge_graph(mesh: Mesh, points_per_edge: int = 0) -> sparse.csr_array:
     # SciPy's shortest paths accept no 64-bit indices up to version 1.14.
     tail, head = (np.concatenate(ends).astype(np.int32) for ends in (tails, heads))
     length = np.linalg.norm(positions[tail] - positions[head], axis=1)
-    entries = (np.concatenate([length, length]), (np.concatenate([tail, head]), np.concatenate([head, tail])))
+    entries = (
+        np.concatenate([length, length]),
+        (np.concatenate([tail, head]), np.concatenate([head, tail])),
+    )
     return sparse.csr_array(sparse.coo_array(entries, shape=(len(positions), len(positions))))

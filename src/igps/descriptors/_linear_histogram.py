@@ -15,11 +15,18 @@ def linear_histogram(values: Sequence[Floats], n_bins: Sequence[int]) -> Floats:
     weights that fall linearly with the distance from the centre. Values above 1 count for the last bin.
     """
     positions = [np.clip(x * n - 0.5, 0, n - 1) for x, n in zip(values, n_bins, strict=True)]
-    lower = [np.minimum(position.astype(int), n - 2) for position, n in zip(positions, n_bins, strict=True)]
+    lower = [
+        np.minimum(position.astype(int), n - 2)
+        for position, n in zip(positions, n_bins, strict=True)
+    ]
     shares = [position - bins for position, bins in zip(positions, lower, strict=True)]
     histogram = np.zeros(int(np.prod(n_bins)))
     for corner in product((0, 1), repeat=len(values)):
-        cells = np.ravel_multi_index([bins + step for bins, step in zip(lower, corner, strict=True)], tuple(n_bins))
-        weights = np.prod([x if step else 1 - x for x, step in zip(shares, corner, strict=True)], axis=0)
+        cells = np.ravel_multi_index(
+            [bins + step for bins, step in zip(lower, corner, strict=True)], tuple(n_bins)
+        )
+        weights = np.prod(
+            [x if step else 1 - x for x, step in zip(shares, corner, strict=True)], axis=0
+        )
         histogram += np.bincount(cells, weights, len(histogram))
     return (histogram / len(positions[0])).reshape(tuple(n_bins))

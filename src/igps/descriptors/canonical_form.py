@@ -42,7 +42,9 @@ class CanonicalForm(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        check_at_least(2, max_order=self.max_order)  # moments of lower order are the same for all bodies
+        check_at_least(
+            2, max_order=self.max_order
+        )  # moments of lower order are the same for all bodies
         if not _DIMENSION < self.n_samples <= self.max_vertices:
             raise ValueError(
                 f"n_samples: expected {_DIMENSION + 1} to max_vertices = {self.max_vertices}, got {self.n_samples}."
@@ -57,7 +59,9 @@ class CanonicalForm(BodyDescriptor):
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) Euclidean distances of the moments, each the least over the eight reflections of the query."""
-        odd = torch.as_tensor(exponents(self.max_order) % 2, dtype=queries.dtype, device=queries.device)
+        odd = torch.as_tensor(
+            exponents(self.max_order) % 2, dtype=queries.dtype, device=queries.device
+        )
         reflections = product((0.0, 1.0), repeat=_DIMENSION)
         signs = ((1 - 2 * odd * odd.new_tensor(axes)).prod(dim=1) for axes in reflections)
         return torch.stack([euclidean(queries * sign, gallery) for sign in signs]).amin(dim=0)

@@ -27,7 +27,9 @@ def name_of(descriptor: str | Path | Descriptor) -> str:
 def fingerprint(descriptor: nn.Module) -> str:
     """Return a checksum of a descriptor: of its saved tensors, and of classes and plain attributes of its modules."""
     checksum = hashlib.sha256()
-    common = vars(nn.Module())  # attributes of every module; they differ between versions of PyTorch
+    common = vars(
+        nn.Module()
+    )  # attributes of every module; they differ between versions of PyTorch
     for name, module in descriptor.named_modules():
         plain = {k: v for k, v in sorted(vars(module).items()) if k not in common and _is_plain(v)}
         checksum.update(f"{name} {type(module).__qualname__} {plain!r}\0".encode())
@@ -45,7 +47,9 @@ def cache_tag(module: nn.Module) -> str | None:
     of the versions of the numerical packages. It is None for a descriptor with code from outside the library, such as a
     forward hook or a module of another package.
     """
-    if any(submodule._forward_hooks or submodule._forward_pre_hooks for submodule in module.modules()):
+    if any(
+        submodule._forward_hooks or submodule._forward_pre_hooks for submodule in module.modules()
+    ):
         return None
     try:
         spec = json.dumps(specification(module))

@@ -28,7 +28,9 @@ HISTOGRAMS: Mapping[str, type[DescriptionPart]] = {
 """Classes of histograms by their names in YAML files."""
 
 _MAX_BYTES = 100_000  # of a file
-_MAX_INTEGER = 10_000  # of any number in a file: files are untrusted, and must not ask for huge histograms
+_MAX_INTEGER = (
+    10_000  # of any number in a file: files are untrusted, and must not ask for huge histograms
+)
 
 
 def load_yaml(path: str | Path) -> HistogramDescriptor:
@@ -59,13 +61,22 @@ def load_yaml(path: str | Path) -> HistogramDescriptor:
             raise ValueError("expected a list of `parts`, got none")
         embedding = cache(lambda n: SpectralEmbedding(n_eigenpairs=n))
         parts = [
-            [_histogram(item, embedding) for item in part] if isinstance(part, list) else _histogram(part, embedding)
+            [_histogram(item, embedding) for item in part]
+            if isinstance(part, list)
+            else _histogram(part, embedding)
             for part in spec["parts"]
         ]
         metadata = {key: spec[key] for key in ("source", "invariant_to") if key in spec}
         descriptor = HistogramDescriptor(parts, name=str(spec.get("name", path.stem)), **metadata)
         descriptor.scale = spec.get("scale")
-    except (ValueError, TypeError, AttributeError, KeyError, yaml.YAMLError, RecursionError) as error:
+    except (
+        ValueError,
+        TypeError,
+        AttributeError,
+        KeyError,
+        yaml.YAMLError,
+        RecursionError,
+    ) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: expected a descriptor ({reason}). Correct it.") from error
     return descriptor.eval()
@@ -82,7 +93,9 @@ def _histogram(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> Desc
 
 
 def _axis(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> Any:
-    name, options = next(iter(spec.items())) if isinstance(spec, Mapping) and len(spec) == 1 else (spec, {})
+    name, options = (
+        next(iter(spec.items())) if isinstance(spec, Mapping) and len(spec) == 1 else (spec, {})
+    )
     if not isinstance(name, str) or not isinstance(options, Mapping | None):
         raise ValueError(f"axes: expected a name, or a name with its options, got {spec!r}")
     options = dict(options or {})
@@ -95,10 +108,14 @@ def _axis(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> Any:
     return _build(Attribute, {"name": name, **options}, embedding, name)
 
 
-def _build(kind: type, options: dict[str, Any], embedding: Callable[[int], SpectralEmbedding], name: str) -> Any:
+def _build(
+    kind: type, options: dict[str, Any], embedding: Callable[[int], SpectralEmbedding], name: str
+) -> Any:
     """Check the options of a class, which messages call `name`, and make an instance of it."""
     parameters = inspect.signature(kind).parameters
-    keys = [key for key in parameters if key != "embedding"] + ["eigenpairs"] * ("embedding" in parameters)
+    keys = [key for key in parameters if key != "embedding"] + ["eigenpairs"] * (
+        "embedding" in parameters
+    )
     _check_keys(options, keys, name)
     for value in options.values():
         for number in value if isinstance(value, list) else [value]:

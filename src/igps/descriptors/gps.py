@@ -13,4 +13,6 @@ def gps(n_eigenpairs: int = 250) -> HistogramDescriptor:
     """
     embedding = SpectralEmbedding(n_eigenpairs=n_eigenpairs)
     histogram = PairHistogram([Potential(4), InteriorDistance(64)], embedding, samples="surface")
-    return HistogramDescriptor(histogram, name="gps", source="Rustamov 2007", invariant_to=("motion", "scale", "pose"))
+    return HistogramDescriptor(
+        histogram, name="gps", source="Rustamov 2007", invariant_to=("motion", "scale", "pose")
+    )

@@ -25,10 +25,20 @@ SIZE, SIDE = "+size", "+side"
 """Suffixes of the names of descriptors that keep size, and that distinguish a body from its mirror image."""
 
 SCALES: Mapping[str, float] = {
-    "interior": 0.017, "gps": 0.017, "multiscale": 0.03, "rich": 0.026, "pretrained": 0.083, "d2": 0.035,
-    "shape_dna": 17, "volume_shape_dna": 23, "local_diameter_centricity": 0.14, "inner_distance": 0.004,
-    "canonical_form": 0.066, "geodesic_spectral": 0.0014, "spectral_gw": 0.0014,
-}  # fmt: skip
+    "interior": 0.017,
+    "gps": 0.017,
+    "multiscale": 0.03,
+    "rich": 0.026,
+    "pretrained": 0.083,
+    "d2": 0.035,
+    "shape_dna": 17,
+    "volume_shape_dna": 23,
+    "local_diameter_centricity": 0.14,
+    "inner_distance": 0.004,
+    "canonical_form": 0.066,
+    "geodesic_spectral": 0.0014,
+    "spectral_gw": 0.0014,
+}
 """The median distance between generated bodies of one class, by descriptor, as `training.study scales` prints it."""
 
 # Typical distance between individuals of one body, over the scale of the descriptor; `training.study scales` measures
@@ -67,11 +77,18 @@ class IndividualDescriptor(Descriptor):
     """
 
     def __init__(
-        self, descriptor: Descriptor, *, size: bool = False, side: bool = False, scale: float | None = None
+        self,
+        descriptor: Descriptor,
+        *,
+        size: bool = False,
+        side: bool = False,
+        scale: float | None = None,
     ) -> None:
         super().__init__()
         if size and "scale" not in descriptor.invariant_to:
-            raise ValueError(f"size: expected a descriptor that ignores size by itself, got {descriptor.name!r}.")
+            raise ValueError(
+                f"size: expected a descriptor that ignores size by itself, got {descriptor.name!r}."
+            )
         scale = scale or scale_of(descriptor)
         if scale is None:
             raise ValueError(
@@ -80,7 +97,10 @@ class IndividualDescriptor(Descriptor):
             )
         self.descriptor, self.scale, self.keeps_size = descriptor, scale, size
         self._unit = _INDIVIDUAL_SHARE * scale
-        axes, embedding = [InteriorDistance(6, 3.0), PairTwist()], SpectralEmbedding(n_eigenpairs=16)
+        axes, embedding = (
+            [InteriorDistance(6, 3.0), PairTwist()],
+            SpectralEmbedding(n_eigenpairs=16),
+        )
         self.twists = PairHistogram(axes, embedding) if side else None
         self.name, self.source = descriptor.name + SIDE * side + SIZE * size, descriptor.source
         compared = ["scale"] * size + ["motion"] * side  # "motion" includes reflections
@@ -96,7 +116,10 @@ class IndividualDescriptor(Descriptor):
             counts = self.twists(BatchFeatures(batch, self.training))
             odd = (counts - counts.flip(-1))[..., counts.shape[-1] // 2 :] / 2
             volumes = signed_volumes(batch).to(odd)
-            parts += [self._unit / _TYPICAL_VOLUME * volumes, self._unit / _TYPICAL_TWIST * odd.flatten(1)]
+            parts += [
+                self._unit / _TYPICAL_VOLUME * volumes,
+                self._unit / _TYPICAL_TWIST * odd.flatten(1),
+            ]
         if self.keeps_size:
             factors = [millimetres(unit) for unit in batch.units or [None] * len(batch)]
             size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
@@ -118,7 +141,9 @@ class IndividualDescriptor(Descriptor):
     def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, D) descriptions to the coordinates of the descriptor, then the side and size blocks."""
         form, *others = self.split(descriptions)
-        return torch.cat([self.descriptor.coordinates(form, within_class=within_class), *others], dim=1)
+        return torch.cat(
+            [self.descriptor.coordinates(form, within_class=within_class), *others], dim=1
+        )
 
     def shorten(self, descriptions: Tensor) -> Tensor:
         """(N, D) descriptions to (N, ≤ 256 + 55): `shorten` of the descriptor (or its ValueError), then others."""
@@ -128,13 +153,17 @@ class IndividualDescriptor(Descriptor):
     def wrap(self, descriptor: Descriptor) -> "IndividualDescriptor":
         """Return an `IndividualDescriptor` of another descriptor with the same options and scales."""
         has_side = self.twists is not None
-        return IndividualDescriptor(descriptor, size=self.keeps_size, side=has_side, scale=self.scale)
+        return IndividualDescriptor(
+            descriptor, size=self.keeps_size, side=has_side, scale=self.scale
+        )
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Split descriptions (N, D) into the descriptor's own, in its shape, the side block and the size block."""
         n_side = 0 if self.twists is None else math.comb(_N_VECTORS, 3) + self.twists.n_cells // 2
         n_size = 2 * self.keeps_size
-        form, side, size = descriptions.split([descriptions.shape[1] - n_side - n_size, n_side, n_size], dim=1)
+        form, side, size = descriptions.split(
+            [descriptions.shape[1] - n_side - n_size, n_side, n_size], dim=1
+        )
         return form.unflatten(1, self.descriptor.description_shape), side, size
 
 
@@ -150,7 +179,10 @@ def signed_volumes(batch: SignatureBatch) -> Tensor:
     """
     root = batch.area.sqrt()[:, None, None]
     (interior, interior_weights), (surface, surface_weights) = (
-        (samples.points / root, (samples.mask / samples.mask.sum(dim=1, keepdim=True))[..., None].to(root))
+        (
+            samples.points / root,
+            (samples.mask / samples.mask.sum(dim=1, keepdim=True))[..., None].to(root),
+        )
         for samples in (batch.interior, batch.surface)
     )
     interior = interior - (interior * interior_weights).sum(dim=1)[:, None]
@@ -189,5 +221,13 @@ def keeps_size(size: Size, units: Sequence[str | None]) -> tuple[bool, str]:
         return size == "keep" or (size == "auto" and n_known > 0), ""
     reason = f"{len(units) - n_known} of {len(units)} bodies have no unit of length"
     if size == "keep":
-        return True, f"size is kept: {reason}; their coordinates are taken as millimetres" if n_known else ""
-    return False, f"size is ignored: {reason}; if their coordinates are millimetres, give --size keep"
+        return (
+            True,
+            f"size is kept: {reason}; their coordinates are taken as millimetres"
+            if n_known
+            else "",
+        )
+    return (
+        False,
+        f"size is ignored: {reason}; if their coordinates are millimetres, give --size keep",
+    )

@@ -43,7 +43,9 @@ class InnerDistance(BodyDescriptor):
     requirements = Requirements()
 
     n_bins: int = 64  # distance bins, with a linear kernel
-    max_distance: float = 3.0  # upper end of the last bin, in units of √area; larger distances go into this bin
+    max_distance: float = (
+        3.0  # upper end of the last bin, in units of √area; larger distances go into this bin
+    )
     n_sources: int = 200  # samples from which paths start; all samples if there are fewer
     seed: int = 0  # of the choice of the sources
 
@@ -85,7 +87,9 @@ def inner_distances(points: Floats, sources: Integers) -> Floats:
 def _grid_indices(points: Floats) -> tuple[Integers, float]:
     """Indices of the cells (P, 3), from 0 on, and the side of a cell."""
     if len(points) < 2:
-        raise ValueError(f"points: expected at least two interior samples, got {len(points)}. Raise the resolution.")
+        raise ValueError(
+            f"points: expected at least two interior samples, got {len(points)}. Raise the resolution."
+        )
     origin = points.min(axis=0)
     relative = points - origin
     gaps = np.concatenate([np.diff(np.sort(column)) for column in relative.T])
@@ -97,7 +101,9 @@ def _grid_indices(points: Floats) -> tuple[Integers, float]:
         cells = np.round(position).astype(np.int64)
         if np.abs(position - cells).max() < _GRID_TOLERANCE * divisor:
             return cells, cell
-    raise ValueError("points: expected cell centres of a cubic grid along the axes; take those of a Signature.")
+    raise ValueError(
+        "points: expected cell centres of a cubic grid along the axes; take those of a Signature."
+    )
 
 
 def _visible_links(cells: Integers) -> sparse.csr_array:
@@ -140,5 +146,7 @@ def _connect(graph: sparse.csr_array, cells: Integers) -> sparse.csr_array:
             links.append((own[nearest[closest]], others[closest], length[closest]))
         a, b, length = (np.array(column) for column in zip(*links, strict=True))
         # Two components that are nearest to each other give the same link twice, whose lengths must not add up.
-        bridge = sparse.coo_array((length, (a.astype(int), b.astype(int))), shape=graph.shape).tocsr()
+        bridge = sparse.coo_array(
+            (length, (a.astype(int), b.astype(int))), shape=graph.shape
+        ).tocsr()
         graph = graph.maximum(bridge).maximum(bridge.T).tocsr()

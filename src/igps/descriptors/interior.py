@@ -11,6 +11,10 @@ def interior(n_eigenpairs: int = 250) -> HistogramDescriptor:
 
     Source: Rustamov 2010, sections 3 and 4: 4 classes, 64 bins, 250 eigenpairs, χ².
     """
-    histogram = PairHistogram([Potential(4), InteriorDistance(64)], SpectralEmbedding(n_eigenpairs=n_eigenpairs))
+    histogram = PairHistogram(
+        [Potential(4), InteriorDistance(64)], SpectralEmbedding(n_eigenpairs=n_eigenpairs)
+    )
     invariant_to = ("motion", "scale", "pose")
-    return HistogramDescriptor(histogram, name="interior", source="Rustamov 2010", invariant_to=invariant_to)
+    return HistogramDescriptor(
+        histogram, name="interior", source="Rustamov 2010", invariant_to=invariant_to
+    )

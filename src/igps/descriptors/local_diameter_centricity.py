@@ -37,7 +37,9 @@ class LocalDiameterCentricity(BodyDescriptor):
 
     n_diameter_bins: int = 32  # with a linear kernel
     n_centricity_bins: int = 32  # with a linear kernel
-    max_diameter: float = 0.45  # upper end of the last bin, in units of √area; larger values go into this bin
+    max_diameter: float = (
+        0.45  # upper end of the last bin, in units of √area; larger values go into this bin
+    )
     max_centricity: float = 2.0  # the same for the centricity
     n_samples: int = 2000  # area-weighted random points of the surface
     n_rays: int = 30  # per sample
@@ -47,17 +49,23 @@ class LocalDiameterCentricity(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        check_at_least(2, n_diameter_bins=self.n_diameter_bins, n_centricity_bins=self.n_centricity_bins)
+        check_at_least(
+            2, n_diameter_bins=self.n_diameter_bins, n_centricity_bins=self.n_centricity_bins
+        )
         check_at_least(1, n_samples=self.n_samples, n_rays=self.n_rays, n_sources=self.n_sources)
         check_positive(max_diameter=self.max_diameter, max_centricity=self.max_centricity)
         if not 0 < self.opening_angle < 180:
-            raise ValueError(f"opening_angle: expected between 0 and 180 degrees, got {self.opening_angle}.")
+            raise ValueError(
+                f"opening_angle: expected between 0 and 180 degrees, got {self.opening_angle}."
+            )
 
     def describe_body(self, body: Body) -> Singles:
         """(n_diameter_bins, n_centricity_bins) histogram of sum 1; a MeshError if no ray meets the far side."""
         mesh = in_canonical_order(body.mesh)
         points = surface_points(mesh, self.n_samples, self.seed)
-        diameter = local_diameters(mesh, points.face, points.weights, self.n_rays, self.opening_angle)
+        diameter = local_diameters(
+            mesh, points.face, points.weights, self.n_rays, self.opening_angle
+        )
         central = points.interpolate(centricity(mesh, self.n_sources)[:, None])[:, 0]
         valid = np.isfinite(diameter)
         if not valid.any():
@@ -65,11 +73,18 @@ class LocalDiameterCentricity(BodyDescriptor):
                 f"{mesh.name}: no ray from the surface inwards meets its far side. Close the surface or repair it."
             )
         scale = np.sqrt(mesh.area)
-        ratios = [diameter[valid] / scale / self.max_diameter, central[valid] / scale / self.max_centricity]
-        return linear_histogram(ratios, [self.n_diameter_bins, self.n_centricity_bins]).astype(np.float32)
+        ratios = [
+            diameter[valid] / scale / self.max_diameter,
+            central[valid] / scale / self.max_centricity,
+        ]
+        return linear_histogram(ratios, [self.n_diameter_bins, self.n_centricity_bins]).astype(
+            np.float32
+        )
 
 
-def local_diameters(mesh: Mesh, face: Integers, weights: Floats, n_rays: int, opening_angle: float) -> Floats:
+def local_diameters(
+    mesh: Mesh, face: Integers, weights: Floats, n_rays: int, opening_angle: float
+) -> Floats:
     """Thickness (P,) of the body at points of its surface: the mean length of inward rays, without outliers.
 
     Points are given by their faces (P,) and barycentric weights (P, 3). From each point, rays fill a cone about the
@@ -93,7 +108,9 @@ def local_diameters(mesh: Mesh, face: Integers, weights: Floats, n_rays: int, op
     tree = igl.AABB()
     tree.init(vertices, faces)
     rays = directions.reshape(-1, 3)
-    hit, length, _ = tree.intersect_ray_first(vertices, faces, np.repeat(origins, n_rays, axis=0), rays)
+    hit, length, _ = tree.intersect_ray_first(
+        vertices, faces, np.repeat(origins, n_rays, axis=0), rays
+    )
     valid = (hit >= 0) & (np.einsum("ij,ij->i", normals[hit], rays) > 0)
     return size * _robust_mean(np.where(valid, length, np.nan).reshape(-1, n_rays))
 
@@ -103,7 +120,9 @@ def centricity(mesh: Mesh, n_sources: int) -> Floats:
 
     The mean is over at most `n_sources` vertices by farthest-point sampling, each weighted by the area nearest to it.
     """
-    distances = farthest_points(mesh, min(n_sources, len(mesh.vertices)), _POINTS_PER_EDGE).distances
+    distances = farthest_points(
+        mesh, min(n_sources, len(mesh.vertices)), _POINTS_PER_EDGE
+    ).distances
     area = vertex_areas(mesh.vertices, mesh.faces)
     weight = np.bincount(np.argmin(distances, axis=0), area, len(distances))
     return weight @ distances / weight.sum()
@@ -123,7 +142,10 @@ def _robust_mean(lengths: Floats) -> Floats:
     means = np.full(len(lengths), np.nan)
     rows = np.isfinite(lengths).any(axis=1)
     values = lengths[rows]
-    median, deviation = np.nanmedian(values, axis=1, keepdims=True), np.nanstd(values, axis=1, keepdims=True)
+    median, deviation = (
+        np.nanmedian(values, axis=1, keepdims=True),
+        np.nanstd(values, axis=1, keepdims=True),
+    )
     # The tolerance keeps lengths that differ from the median by rounding alone.
     outlier = np.abs(values - median) > deviation + 1e-9 * median
     trimmed = np.where(outlier, np.nan, values)

@@ -80,7 +80,9 @@ class SizedHistograms(HistogramDescriptor):
     def without_size(self) -> HistogramDescriptor:
         """Return a descriptor of the histograms alone."""
         invariant_to = (*self.invariant_to, "scale")
-        return HistogramDescriptor(self.parts, name=self.name, source=self.source, invariant_to=invariant_to)
+        return HistogramDescriptor(
+            self.parts, name=self.name, source=self.source, invariant_to=invariant_to
+        )
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, cells + 2) descriptions: histograms, log area, log volume."""
@@ -118,5 +120,8 @@ def molecular(*, size: bool = True) -> HistogramDescriptor:
     scalars = [histogram(Attribute(name, centres, soft=True)) for name, centres in _CENTRES.items()]
     kind = SizedHistograms if size else HistogramDescriptor
     return kind(
-        [kinds, scalars], name="molecular", source="Rustamov 2010; Kyte and Doolittle 1982", invariant_to=("motion",)
+        [kinds, scalars],
+        name="molecular",
+        source="Rustamov 2010; Kyte and Doolittle 1982",
+        invariant_to=("motion",),
     )

@@ -22,7 +22,11 @@ def multiscale() -> HistogramDescriptor:
     embeddings = {n: SpectralEmbedding(n_eigenpairs=n) for n in (250, 50, 16, 8, 4)}
 
     def scale(n_eigenpairs: int, reach: float) -> PairHistogram:
-        return PairHistogram([Potential(8), InteriorDistance(64, reach)], embeddings[n_eigenpairs], n_samples=N_SAMPLES)
+        return PairHistogram(
+            [Potential(8), InteriorDistance(64, reach)],
+            embeddings[n_eigenpairs],
+            n_samples=N_SAMPLES,
+        )
 
     def oriented(n_eigenpairs: int, samples: SampleKind) -> PairHistogram:
         axes = [InteriorDistance(6, 3.0), EmbeddedPairCosines(5)]

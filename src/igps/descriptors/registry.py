@@ -62,7 +62,9 @@ def is_file(which: str | Path) -> bool:
     """Return whether an argument for a descriptor is the path of a descriptor's file or folder."""
     if str(which) in _FACTORIES:
         return False
-    is_folder = bool(which) and os.path.isfile(os.path.join(which, IN_FOLDER))  # False if `which` is no valid path
+    is_folder = bool(which) and os.path.isfile(
+        os.path.join(which, IN_FOLDER)
+    )  # False if `which` is no valid path
     return str(which).lower().endswith((".safetensors", *_YAML_SUFFIXES)) or is_folder
 
 
@@ -90,7 +92,9 @@ def load(path: str | Path) -> Descriptor:
     if not isinstance(module, Descriptor):
         raise ValueError(f"{path}: expected a descriptor, got {type(module).__name__}.")
     if not NAME.fullmatch(module.name):
-        raise ValueError(f"{path}: expected a descriptor's name of letters, digits and _, got {module.name[:80]!r}.")
+        raise ValueError(
+            f"{path}: expected a descriptor's name of letters, digits and _, got {module.name[:80]!r}."
+        )
     _check_heads(module, path)
     module.card = card
     scale = card.get("scale")  # cards may come from users: this entry may be anything
@@ -102,7 +106,9 @@ def load(path: str | Path) -> Descriptor:
 def _check_heads(module: Descriptor, path: str | Path) -> None:
     """Raise a ValueError if the sizes of a head's tensors are inconsistent, before any body is described."""
     for submodule in module.modules():
-        if not isinstance(submodule, EmbeddedDescriptor) or not isinstance(submodule.descriptor, HistogramDescriptor):
+        if not isinstance(submodule, EmbeddedDescriptor) or not isinstance(
+            submodule.descriptor, HistogramDescriptor
+        ):
             continue
         head, cells = submodule.head, torch.ones(2, submodule.descriptor.n_features)
         try:
@@ -110,7 +116,9 @@ def _check_heads(module: Descriptor, path: str | Path) -> None:
             if isinstance(head, ClassifierHead):
                 head.strangeness(cells)
         except (ValueError, RuntimeError, TypeError, LookupError, ArithmeticError) as error:
-            raise ValueError(f"{path}: expected a head for {cells.shape[1]} cells ({error}). Save it again.") from error
+            raise ValueError(
+                f"{path}: expected a head for {cells.shape[1]} cells ({error}). Save it again."
+            ) from error
 
 
 def descriptor(
@@ -142,12 +150,19 @@ def descriptor(
     check_one_of(get_args(Size), size=size)
     check_one_of(get_args(Mirror), mirror=mirror)
     if size == "auto" and units is None:
-        raise ValueError('size: expected "keep" or "ignore", or "auto" with the units of the bodies, got no units.')
+        raise ValueError(
+            'size: expected "keep" or "ignore", or "auto" with the units of the bodies, got no units.'
+        )
     suffixes = ""
     if isinstance(which, str):
-        suffixes, which = "".join(_INDIVIDUAL_SUFFIX.findall(which)), _INDIVIDUAL_SUFFIX.sub("", which)
+        suffixes, which = (
+            "".join(_INDIVIDUAL_SUFFIX.findall(which)),
+            _INDIVIDUAL_SUFFIX.sub("", which),
+        )
     base = _base_descriptor(which)
-    with_size = SIZE in suffixes or (size == "keep" if units is None else keeps_size(size, units)[0])
+    with_size = SIZE in suffixes or (
+        size == "keep" if units is None else keeps_size(size, units)[0]
+    )
     with_side = SIDE in suffixes or mirror == "distinct"
     if not (with_size or with_side):
         return base
@@ -162,7 +177,9 @@ def attributes_suffix(attributes: Iterable[str]) -> str:
     """Return the suffix of a name that combines a descriptor with attributes NAME or NAME=WEIGHT."""
     suffixes = [f"+{attribute}" for attribute in attributes]
     if wrong := [suffix[1:] for suffix in suffixes if not _ATTRIBUTE_SUFFIX.fullmatch(suffix)]:
-        raise ValueError(f"with: expected NAME or NAME=WEIGHT with a weight above 0, such as ct=0.5, got {wrong[0]!r}.")
+        raise ValueError(
+            f"with: expected NAME or NAME=WEIGHT with a weight above 0, such as ct=0.5, got {wrong[0]!r}."
+        )
     return "".join(suffixes)
 
 
@@ -181,7 +198,9 @@ def _base_descriptor(which: str | Path | Descriptor) -> Descriptor:
                 "descriptor: expected +NAME or +NAME=WEIGHT after the name of a descriptor, such as +ct=0.5, with a "
                 f"weight above 0, got {which!r}."
             )
-        attributes, weights = zip(*((match[1], float(match[2] or 1)) for match in matches), strict=True)
+        attributes, weights = zip(
+            *((match[1], float(match[2] or 1)) for match in matches), strict=True
+        )
         return WithAttributes(_base_descriptor(base), attributes, weights).eval()
     if which in _FACTORIES:
         return _FACTORIES[which]().eval()
@@ -201,7 +220,9 @@ def _base_descriptor(which: str | Path | Descriptor) -> Descriptor:
     try:
         instance = own if isinstance(own, Descriptor) or not callable(own) else own()
     except TypeError as error:
-        raise ValueError(f"descriptor: expected {which} to make one without arguments ({error}).") from error
+        raise ValueError(
+            f"descriptor: expected {which} to make one without arguments ({error})."
+        ) from error
     if not isinstance(instance, Descriptor):
         raise ValueError(
             f"descriptor: expected {which} to be or to make an igps.Descriptor, got {type(instance).__name__}."

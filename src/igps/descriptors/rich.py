@@ -3,7 +3,15 @@
 from functools import partial
 
 from igps.descriptors.multiscale import N_ORIENTED_SAMPLES, N_SAMPLES
-from igps.nn.axes import Attribute, EuclideanDistance, InteriorDistance, PairAxis, PairCosines, PointAxis, Potential
+from igps.nn.axes import (
+    Attribute,
+    EuclideanDistance,
+    InteriorDistance,
+    PairAxis,
+    PairCosines,
+    PointAxis,
+    Potential,
+)
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
@@ -29,10 +37,16 @@ def rich(*, learnable: bool = False, n_training_samples: int | None = None) -> H
     # Histograms share fixed embeddings, which are computed once. Each histogram has a learned filter of its own.
     fixed = {n: SpectralEmbedding(n_eigenpairs=n) for n in (50, 16)}
 
-    def histogram(n_eigenpairs: int, *axes: PointAxis | PairAxis, n_samples: int = N_SAMPLES) -> PairHistogram:
-        learned = SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=_N_KNOTS) if learnable else None
+    def histogram(
+        n_eigenpairs: int, *axes: PointAxis | PairAxis, n_samples: int = N_SAMPLES
+    ) -> PairHistogram:
+        learned = (
+            SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=_N_KNOTS) if learnable else None
+        )
         embedding = learned or fixed[n_eigenpairs]
-        return PairHistogram(axes, embedding, n_samples=n_samples, n_training_samples=n_training_samples)
+        return PairHistogram(
+            axes, embedding, n_samples=n_samples, n_training_samples=n_training_samples
+        )
 
     potential = partial(Potential, learnable=learnable)
     distance = partial(InteriorDistance, learnable=learnable)
@@ -53,7 +67,11 @@ def rich(*, learnable: bool = False, n_training_samples: int | None = None) -> H
             ],
             histogram(50, distance(6, 3.0), cosines(), n_samples=n),
             PairHistogram(
-                [euclidean(6, 1.0), cosines()], fixed[50], "surface", n_samples=n, n_training_samples=n_training_samples
+                [euclidean(6, 1.0), cosines()],
+                fixed[50],
+                "surface",
+                n_samples=n,
+                n_training_samples=n_training_samples,
             ),
         ],
         name="rich",

@@ -52,7 +52,9 @@ class SpectralGromovWasserstein(BodyDescriptor):
     times: tuple[float, ...] = TIMES  # in units of A/8π
     n_samples: int = 500  # at most, at equal steps along the order of the samples
     n_quantiles: int = 200  # steps of the quantile functions
-    n_eigenpairs: int = 100  # of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
+    n_eigenpairs: int = (
+        100  # of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
+    )
     seed: int = 0  # of the offset of the steps along the order of the samples
 
     def __post_init__(self) -> None:
@@ -65,7 +67,9 @@ class SpectralGromovWasserstein(BodyDescriptor):
 
     def describe_body(self, body: Body) -> Singles:
         """(times, n_quantiles) quantile functions times c²(t); (times, 1) for the bound "trace"."""
-        kernels = heat_kernels(body, self.samples, self.times, self.n_samples, self.n_eigenpairs, self.seed)
+        kernels = heat_kernels(
+            body, self.samples, self.times, self.n_samples, self.n_eigenpairs, self.seed
+        )
         rows = []
         for time, kernel in zip(self.times, kernels, strict=True):
             if self.bound == "pairs":
@@ -144,7 +148,9 @@ def gromov_wasserstein(
     try:
         import ot
     except ImportError as error:
-        raise ImportError('gromov_wasserstein needs POT: pip install "interior-gps[transport]".') from error
+        raise ImportError(
+            'gromov_wasserstein needs POT: pip install "interior-gps[transport]".'
+        ) from error
     kernels = (heat_kernels(shape, samples, times, n_samples, seed=seed) for shape in (a, b))
     largest = 0.0
     for time, first, second in zip(times, *kernels, strict=True):
@@ -152,7 +158,8 @@ def gromov_wasserstein(
         norms = (np.sqrt(np.square(kernel).mean(axis=1)) for kernel in (first, second))
         starts = (np.outer(p, q), ot.emd_1d(*norms, p, q))
         squared = min(
-            ot.gromov.gromov_wasserstein2(first, second, p, q, loss_fun="square_loss", G0=start) for start in starts
+            ot.gromov.gromov_wasserstein2(first, second, p, q, loss_fun="square_loss", G0=start)
+            for start in starts
         )
         largest = max(largest, time_weight(time) * float(np.sqrt(max(squared, 0.0))))
     return largest

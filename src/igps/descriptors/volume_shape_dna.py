@@ -56,7 +56,9 @@ class VolumeShapeDNA(BodyDescriptor):
     invariant_to = ("motion", "scale")
     requirements = Requirements(mesh=True)
 
-    boundary: Boundary = "dirichlet"  # zero on the surface; or "neumann": no flux through the surface
+    boundary: Boundary = (
+        "dirichlet"  # zero on the surface; or "neumann": no flux through the surface
+    )
     n_eigenvalues: int = 12  # without the first zero under Neumann conditions
     n_voxels: int = 4000  # a cell has 1/`n_voxels` of the volume, but its side is at least 1/128 of the longest side
 
@@ -67,7 +69,9 @@ class VolumeShapeDNA(BodyDescriptor):
 
     def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) normalised eigenvalues, ascending, without unit; raises the errors of `volume_spectrum`."""
-        return volume_spectrum(body.mesh, self.n_eigenvalues, self.boundary, self.n_voxels).astype(np.float32)
+        return volume_spectrum(body.mesh, self.n_eigenvalues, self.boundary, self.n_voxels).astype(
+            np.float32
+        )
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) Euclidean distances."""
@@ -98,7 +102,9 @@ def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels
 def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[Booleans, float]:
     """Whether 3³ points per cell are inside, (X, 3, Y, 3, Z, 3), with a margin of empty cells; and the cell side."""
     longest = longest_side(mesh.vertices)
-    resolution = int(np.clip(np.ceil(longest * (n_voxels / abs(mesh.volume)) ** (1 / 3)), 1, _MAX_RESOLUTION))
+    resolution = int(
+        np.clip(np.ceil(longest * (n_voxels / abs(mesh.volume)) ** (1 / 3)), 1, _MAX_RESOLUTION)
+    )
     cell = longest / resolution
     axes = []
     for axis in grid_axes(mesh, resolution):
@@ -126,7 +132,9 @@ def _neumann(inside: Booleans) -> tuple[sparse.csr_array, Floats]:
         rows.append(cell[:-1][is_open])
         columns.append(cell[1:][is_open])
         weights.append(aperture[is_open])
-    graph = _symmetric(np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), len(mass))
+    graph = _symmetric(
+        np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), len(mass)
+    )
     n_components, component = connected_components(graph, directed=False)
     share = np.bincount(component, weights=mass, minlength=n_components) / mass.sum()
     cells = np.nonzero((share >= _MIN_COMPONENT_SHARE)[component])[0]
@@ -163,17 +171,24 @@ def _dirichlet(inside: Booleans) -> tuple[sparse.csr_array, Floats]:
 
 
 def _symmetric(rows: Integers, columns: Integers, weights: Floats, size: int) -> sparse.csr_array:
-    entries = (np.concatenate([weights, weights]), (np.concatenate([rows, columns]), np.concatenate([columns, rows])))
+    entries = (
+        np.concatenate([weights, weights]),
+        (np.concatenate([rows, columns]), np.concatenate([columns, rows])),
+    )
     return sparse.coo_array(entries, shape=(size, size)).tocsr()
 
 
-def _smallest_eigenvalues(stiffness: sparse.csr_array, mass: Floats, n_values: int, shift: float) -> Floats:
+def _smallest_eigenvalues(
+    stiffness: sparse.csr_array, mass: Floats, n_values: int, shift: float
+) -> Floats:
     """Smallest eigenvalues of K u = λ M u, ascending, by Lanczos iteration on (K − shift M)⁻¹."""
     scaling = sparse.diags_array(1 / np.sqrt(mass))
     matrix = (scaling @ stiffness @ scaling).tocsc()
     shifted = (matrix - shift * sparse.eye_array(len(mass))).tocsc()
     # The matrix is positive definite: factorize without pivoting, in an elimination order for symmetric matrices.
-    factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    factor = splu(
+        shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
     inverse = LinearOperator(matrix.shape, factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(len(mass))
     values, vectors = eigsh(matrix, n_values, sigma=shift, OPinv=inverse, v0=start, tol=_TOLERANCE)
@@ -181,9 +196,13 @@ def _smallest_eigenvalues(stiffness: sparse.csr_array, mass: Floats, n_values: i
         # An iteration from a single vector may find only one copy of a multiple eigenvalue. The missed copies lie in
         # the orthogonal complement of the eigenvectors found so far.
         complement = LinearOperator(
-            matrix.shape, lambda u, q=vectors: _project(factor.solve(_project(u, q)), q), dtype=np.float64
+            matrix.shape,
+            lambda u, q=vectors: _project(factor.solve(_project(u, q)), q),
+            dtype=np.float64,
         )
-        inverses, candidates = eigsh(complement, _N_RECHECKED, which="LA", v0=_project(start, vectors), tol=_TOLERANCE)
+        inverses, candidates = eigsh(
+            complement, _N_RECHECKED, which="LA", v0=_project(start, vectors), tol=_TOLERANCE
+        )
         missed = shift + 1 / inverses < values.max() - _TOLERANCE * (values.max() - shift)
         if not missed.any():
             return np.sort(values)

@@ -36,7 +36,9 @@ class WithAttributes(Descriptor):
         ValueError: the scale of the descriptor is not known, or a weight is not positive.
     """
 
-    def __init__(self, descriptor: Descriptor, attributes: Sequence[str], weights: Sequence[float]) -> None:
+    def __init__(
+        self, descriptor: Descriptor, attributes: Sequence[str], weights: Sequence[float]
+    ) -> None:
         super().__init__()
         scale = scale_of(descriptor)
         if scale is None or not all(0 < weight < float("inf") for weight in weights):
@@ -53,8 +55,13 @@ class WithAttributes(Descriptor):
             return PairHistogram(axes, embedding, n_samples=_N_SAMPLES)
 
         self.inside = HistogramDescriptor([histogram(name) for name in attributes])
-        suffixes = (f"+{name}" + f"={w:g}" * (w != 1) for name, w in zip(attributes, weights, strict=True))
-        self.name, self.source = descriptor.name + "".join(suffixes), f"{descriptor.source}; Rustamov 2010, section 4"
+        suffixes = (
+            f"+{name}" + f"={w:g}" * (w != 1) for name, w in zip(attributes, weights, strict=True)
+        )
+        self.name, self.source = (
+            descriptor.name + "".join(suffixes),
+            f"{descriptor.source}; Rustamov 2010, section 4",
+        )
         self.invariant_to = descriptor.invariant_to
         self.requirements = descriptor.requirements | self.inside.requirements
 
@@ -65,7 +72,10 @@ class WithAttributes(Descriptor):
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) distances."""
-        (form, *histograms), (forms, *gallery_histograms) = self._split(queries), self._split(gallery)
+        (form, *histograms), (forms, *gallery_histograms) = (
+            self._split(queries),
+            self._split(gallery),
+        )
         distances = self.descriptor.distances(form, forms)
         for weight, *pair in zip(self.weights, histograms, gallery_histograms, strict=True):
             for n_merged in _N_MERGED_BINS:
@@ -76,11 +86,17 @@ class WithAttributes(Descriptor):
     def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, ≤ D + cells) coordinates of the descriptor, then square roots of the weighted histograms."""
         form, *histograms = self._split(descriptions)
-        roots = [(weight * cells).sqrt() for weight, cells in zip(self.weights, histograms, strict=True)]
-        return torch.cat([self.descriptor.coordinates(form, within_class=within_class), *roots], dim=1)
+        roots = [
+            (weight * cells).sqrt() for weight, cells in zip(self.weights, histograms, strict=True)
+        ]
+        return torch.cat(
+            [self.descriptor.coordinates(form, within_class=within_class), *roots], dim=1
+        )
 
     def _split(self, descriptions: Tensor) -> list[Tensor]:
         """Split descriptions (N, D + cells) into the descriptor's own, in its shape, and each attribute's histogram."""
         sizes = list(self.inside.part_cells)
-        form, *histograms = torch.split(descriptions, [descriptions.shape[1] - sum(sizes), *sizes], dim=1)
+        form, *histograms = torch.split(
+            descriptions, [descriptions.shape[1] - sum(sizes), *sizes], dim=1
+        )
         return [form.unflatten(1, self.descriptor.description_shape), *histograms]

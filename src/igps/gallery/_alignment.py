@@ -50,15 +50,24 @@ class SurfaceSamples:
     @classmethod
     def of(cls, points: Floats, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
         """Normalise points (P, 3), a length, with outward normals (P, 3), by the area of the surface, a length²."""
-        if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
+        if (
+            points.shape != normals.shape
+            or points.ndim != 2
+            or points.shape[1] != 3
+            or len(points) < 4
+        ):
             shapes = f"{tuple(points.shape)} and {tuple(normals.shape)}"
             raise ValueError(f"points, normals: expected both (P, 3) with P ≥ 4, got {shapes}.")
-        return cls((points - points.mean(axis=0)) / math.sqrt(area), np.asarray(normals, dtype=np.float64))
+        return cls(
+            (points - points.mean(axis=0)) / math.sqrt(area), np.asarray(normals, dtype=np.float64)
+        )
 
     @cached_property
     def tree(self) -> KDTree:
         """Tree of the samples, with positions and weighted normals as six coordinates."""
-        return KDTree(_with_normals(self), leafsize=50)  # twice as fast as the default in six dimensions
+        return KDTree(
+            _with_normals(self), leafsize=50
+        )  # twice as fast as the default in six dimensions
 
     @cached_property
     def extents(self) -> Floats:
@@ -91,14 +100,21 @@ class TriangleSurface:
 
     def nearest(self, samples: SurfaceSamples) -> tuple[Floats, Floats]:
         """Return the nearest point of the surface to each of the samples (P), and the normal there."""
-        _, face, points = self._tree.squared_distance(*self._triangles, np.ascontiguousarray(samples.points))
+        _, face, points = self._tree.squared_distance(
+            *self._triangles, np.ascontiguousarray(samples.points)
+        )
         return np.asarray(points), self._normals[np.asarray(face).ravel()]
 
 
 def surface_distance(
-    one: SurfaceSamples, other: SurfaceSamples, *, stop_at: float = 0.0, hopeless: float = math.inf,
-    max_distance: float = math.inf, patch_size: int = _PATCH_SIZE,
-) -> float:  # fmt: skip
+    one: SurfaceSamples,
+    other: SurfaceSamples,
+    *,
+    stop_at: float = 0.0,
+    hopeless: float = math.inf,
+    max_distance: float = math.inf,
+    patch_size: int = _PATCH_SIZE,
+) -> float:
     """Return the distance of two surfaces after alignment, over √area: root mean square over patches, both ways.
 
     The first surface is moved, rotated, possibly reflected, and scaled by up to a tenth (areas are equal already) by
@@ -125,7 +141,9 @@ def surface_distance(
     is_ambiguous = min(_min_extent_ratio(one), _min_extent_ratio(other)) < _AMBIGUITY
     samples = _subset(one, _N_FITTED)
     for starts in (_principal_starts(one, other), _uniform_starts()):
-        order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")[:_N_STARTS]
+        order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")[
+            :_N_STARTS
+        ]
         coarse = [_fit(samples, other, _Alignment(starts[i]), _N_COARSE_STEPS) for i in order]
         distance = min(coarse, key=itemgetter(0))[0]
         if distance <= hopeless:
@@ -150,14 +168,21 @@ def offset_in_place(samples: SurfaceSamples, surface: TriangleSurface) -> float:
 
 
 def _two_way_distance(
-    one: SurfaceSamples, other: SurfaceSamples, alignment: _Alignment, patch_size: int, max_distance: float
+    one: SurfaceSamples,
+    other: SurfaceSamples,
+    alignment: _Alignment,
+    patch_size: int,
+    max_distance: float,
 ) -> float:
     """Return the root mean square over the patches of both surfaces, or a lower bound of it above `max_distance`."""
     squares = []
     for samples, target, initial in ((one, other, alignment), (other, one, alignment.inverse())):
         finest = target if target.surface is None else target.surface()
         if max_distance < math.inf:
-            bound = math.sqrt(_mean_square(initial(samples), finest, patch_size) / initial.scale) - _LAST_GAIN
+            bound = (
+                math.sqrt(_mean_square(initial(samples), finest, patch_size) / initial.scale)
+                - _LAST_GAIN
+            )
             if bound > max_distance:
                 return bound
         _, fitted = _fit(samples, finest, initial, _N_LAST_STEPS)
@@ -168,7 +193,9 @@ def _two_way_distance(
     return math.sqrt(sum(squares) / 2)
 
 
-def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch_size: int) -> float:
+def _mean_square(
+    samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch_size: int
+) -> float:
     """Return the mean square offset of patches, or the largest square offset if a patch is one sample."""
     ranks = np.arange(1, min(patch_size, len(samples.points)) + 1)
     neighbours = samples.tree.query(_with_normals(samples), k=ranks)[1]
@@ -189,9 +216,13 @@ def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) 
 
 def _scores(samples: SurfaceSamples, target: SurfaceSamples, starts: Floats) -> Floats:
     """Return the mean square distance (S,) of the samples from the target after each of the rotations (S, 3, 3)."""
-    points, normals = (np.einsum("sij,nj->sni", starts, array) for array in (samples.points, samples.normals))
+    points, normals = (
+        np.einsum("sij,nj->sni", starts, array) for array in (samples.points, samples.normals)
+    )
     rotated = SurfaceSamples(points.reshape(-1, 3), normals.reshape(-1, 3))
-    distances, _ = target.tree.query(_with_normals(rotated), eps=0.5)  # precise enough to order the starts
+    distances, _ = target.tree.query(
+        _with_normals(rotated), eps=0.5
+    )  # precise enough to order the starts
     return np.asarray(np.square(distances).reshape(len(starts), -1).mean(axis=1))
 
 
@@ -221,7 +252,10 @@ class _Alignment:
 
 
 def _fit(
-    samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, alignment: _Alignment, n_steps: int
+    samples: SurfaceSamples,
+    target: SurfaceSamples | TriangleSurface,
+    alignment: _Alignment,
+    n_steps: int,
 ) -> tuple[float, _Alignment]:
     """Improve an alignment, and return the root mean square of the offsets with the last alignment."""
     for _ in range(n_steps):
@@ -247,14 +281,20 @@ def _with_normals(samples: SurfaceSamples) -> Floats:
 
 def _subset(samples: SurfaceSamples, n: int) -> SurfaceSamples:
     """Return about n of the samples, at equal steps."""
-    chosen = np.linspace(0, len(samples.points) - 1, min(n, len(samples.points))).round().astype(np.int64)
+    chosen = (
+        np.linspace(0, len(samples.points) - 1, min(n, len(samples.points)))
+        .round()
+        .astype(np.int64)
+    )
     return SurfaceSamples(samples.points[chosen], samples.normals[chosen])
 
 
 def _principal_starts(one: SurfaceSamples, other: SurfaceSamples) -> Floats:
     """Return the maps (8, 3, 3) of principal axes onto principal axes, with every choice of signs."""
     axes, other_axes = (np.linalg.eigh(np.cov(samples.points.T))[1] for samples in (one, other))
-    return np.stack([other_axes @ np.diag(signs) @ axes.T for signs in product((1.0, -1.0), repeat=3)])
+    return np.stack(
+        [other_axes @ np.diag(signs) @ axes.T for signs in product((1.0, -1.0), repeat=3)]
+    )
 
 
 def _min_extent_ratio(samples: SurfaceSamples) -> float:
@@ -270,6 +310,8 @@ def _uniform_starts() -> Floats:
     phi, psi = math.sqrt(2), 1.533751168755204288118041
     r, big_r = np.sqrt(s / _N_ROTATIONS), np.sqrt(1 - s / _N_ROTATIONS)
     alpha, beta = 2 * math.pi * s / phi, 2 * math.pi * s / psi
-    quaternions = np.column_stack([r * np.sin(alpha), r * np.cos(alpha), big_r * np.sin(beta), big_r * np.cos(beta)])
+    quaternions = np.column_stack(
+        [r * np.sin(alpha), r * np.cos(alpha), big_r * np.sin(beta), big_r * np.cos(beta)]
+    )
     rotations = Rotation.from_quat(quaternions).as_matrix()
     return np.concatenate([rotations, -rotations])

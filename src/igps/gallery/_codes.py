@@ -34,7 +34,9 @@ _MIN_SHARE, _CODES_PER_RESULT = 0.25, 64
 _BLOCK_SIZE = 1024  # codes that are compared at once
 _TINY = np.finfo(np.float32).tiny
 
-CODE = np.dtype([("centre", "<u2"), ("square", "<f4"), ("scale", "<f4"), ("signs", "u1", (_N_BITS // 8,))])
+CODE = np.dtype(
+    [("centre", "<u2"), ("square", "<f4"), ("scale", "<f4"), ("signs", "u1", (_N_BITS // 8,))]
+)
 """The code of a vector: number of its centroid, |r|², |r|² / Σ |rᵢ| and signs of its difference r from the centroid."""
 
 
@@ -54,8 +56,12 @@ class Coder:
         gaussian = np.random.default_rng(0).standard_normal((_N_BITS, vectors.shape[1]))
         rotation = np.linalg.qr(gaussian)[0].astype(np.float32)
         n_centroids = min(_MAX_CENTROIDS, len(vectors))
-        kmeans = KMeans(n_centroids, init="random", n_init=1, max_iter=_KMEANS_ROUNDS, random_state=0)
-        with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # too few distinct vectors
+        kmeans = KMeans(
+            n_centroids, init="random", n_init=1, max_iter=_KMEANS_ROUNDS, random_state=0
+        )
+        with warnings.catch_warnings(
+            action="ignore", category=ConvergenceWarning
+        ):  # too few distinct vectors
             kmeans.fit(vectors @ rotation.T)
         return cls(short, rotation, kmeans.cluster_centers_.astype(np.float32))
 
@@ -68,7 +74,9 @@ class Coder:
         """Return the encoder that `arrays` defines."""
         coder = cls(VectorMap.of_arrays(arrays), arrays["turn"], arrays["centres"])
         if not len(coder.rotation) == coder.centroids.shape[1] == _N_BITS:
-            raise ValueError(f"rotation of shape {coder.rotation.shape}, centroids of {coder.centroids.shape}")
+            raise ValueError(
+                f"rotation of shape {coder.rotation.shape}, centroids of {coder.centroids.shape}"
+            )
         return coder
 
     def rotated(self, descriptions: Singles) -> Singles:
@@ -80,7 +88,9 @@ class Coder:
         """Return the codes (N,) of descriptions (N, F)."""
         vectors = self.rotated(descriptions)
         codes = np.zeros(len(vectors), CODE)
-        codes["centre"] = (np.square(self.centroids).sum(axis=1) - 2 * (vectors @ self.centroids.T)).argmin(axis=1)
+        codes["centre"] = (
+            np.square(self.centroids).sum(axis=1) - 2 * (vectors @ self.centroids.T)
+        ).argmin(axis=1)
         differences = vectors - self.centroids[codes["centre"]]
         codes["square"] = np.square(differences).sum(axis=1)
         codes["scale"] = codes["square"] / np.maximum(np.abs(differences).sum(axis=1), _TINY)
@@ -93,13 +103,17 @@ class CodeIndex:
 
     def __init__(self, coder: Coder, codes: NDArray[np.void], row_ids: Words) -> None:
         by_id = np.argsort(row_ids, kind="stable")
-        order = np.argsort(codes["centre"][by_id], kind="stable")  # codes of one centroid lie side by side
+        order = np.argsort(
+            codes["centre"][by_id], kind="stable"
+        )  # codes of one centroid lie side by side
         self._coder, self._row_ids, self._order = coder, row_ids[by_id], order
         self._positions = np.empty_like(order)  # of rows in the order of their ids
         self._positions[order] = np.arange(len(order))
         by_centroid = by_id[order]
         # One field after the other is copied in a tenth of the time of whole codes
-        signs, square, scale, centre = (np.ascontiguousarray(codes[x]) for x in ("signs", "square", "scale", "centre"))
+        signs, square, scale, centre = (
+            np.ascontiguousarray(codes[x]) for x in ("signs", "square", "scale", "centre")
+        )
         self._signs = np.ascontiguousarray(signs.view(np.uint64).T).take(by_centroid, axis=1)
         self._square, self._scale = square.take(by_centroid), scale.take(by_centroid)
         self._ends = np.searchsorted(centre.take(by_centroid), np.arange(len(coder.centroids) + 1))
@@ -109,11 +123,19 @@ class CodeIndex:
 
         Rows can be restricted to those with the ids `among`. All of them are returned if there are no more than n.
         """
-        positions = None if among is None else np.sort(self._positions[np.searchsorted(self._row_ids, among)])
+        positions = (
+            None
+            if among is None
+            else np.sort(self._positions[np.searchsorted(self._row_ids, among)])
+        )
         lowest = _lowest(self._distances(description, _CODES_PER_RESULT * n, positions), n)
-        return np.sort(self._row_ids[self._order[lowest if positions is None else positions[lowest]]])
+        return np.sort(
+            self._row_ids[self._order[lowest if positions is None else positions[lowest]]]
+        )
 
-    def _distances(self, description: Singles, n_compared: int, positions: Integers | None = None) -> Singles:
+    def _distances(
+        self, description: Singles, n_compared: int, positions: Integers | None = None
+    ) -> Singles:
         """Estimate squared distances from a description (F,) to codes, all or those at ascending positions.
 
         Only codes of the nearest centroids are compared: `n_compared` or a quarter of all codes, whichever is more. The
@@ -121,7 +143,9 @@ class CodeIndex:
         """
         signs, square, scale, ends = self._signs, self._square, self._scale, self._ends
         if positions is not None:
-            signs, square, scale = (field.take(positions, axis=-1) for field in (signs, square, scale))
+            signs, square, scale = (
+                field.take(positions, axis=-1) for field in (signs, square, scale)
+            )
             ends = np.searchsorted(positions, ends)
         differences = self._coder.rotated(description[None]) - self._coder.centroids
         to_centroid = np.square(differences).sum(axis=1)
@@ -133,10 +157,24 @@ class CodeIndex:
         # A component of the query is `step` times (u - 7.5), where u is an integer of four bits
         middle = np.float32((2**_N_QUERY_BITS - 1) / 2)
         step = np.maximum(np.abs(differences).max(axis=1), _TINY) / middle
-        u = np.clip(np.rint(differences / step[:, None] + middle), 0, 2 * middle).astype(np.uint8)[:, None]
-        planes = np.packbits(u >> np.arange(_N_QUERY_BITS, dtype=np.uint8)[:, None] & 1, axis=2).view(np.uint64)
+        u = np.clip(np.rint(differences / step[:, None] + middle), 0, 2 * middle).astype(np.uint8)[
+            :, None
+        ]
+        planes = np.packbits(
+            u >> np.arange(_N_QUERY_BITS, dtype=np.uint8)[:, None] & 1, axis=2
+        ).view(np.uint64)
         distances = np.full(len(square), np.inf, np.float32)
-        _estimate(signs, square, scale, ends[near], ends[near + 1], planes, step, to_centroid[near], distances)
+        _estimate(
+            signs,
+            square,
+            scale,
+            ends[near],
+            ends[near + 1],
+            planes,
+            step,
+            to_centroid[near],
+            distances,
+        )
         return distances
 
 
@@ -157,16 +195,25 @@ def _lowest(values: Singles, n: int) -> Integers:
 def _popcount(word: np.uint64) -> np.uint64:
     """Count the bits that are set. LLVM compiles this form to one instruction."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word & np.uint64(0x3333333333333333)) + (
+        (word >> np.uint64(2)) & np.uint64(0x3333333333333333)
+    )
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
     return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
 @compiled(fastmath=REASSOCIATE)
 def _estimate(
-    signs: Words, square: Singles, scale: Singles, starts: Integers, ends: Integers, planes: Words, step: Singles,
-    to_centroid: Singles, distances: Singles,
-) -> None:  # fmt: skip
+    signs: Words,
+    square: Singles,
+    scale: Singles,
+    starts: Integers,
+    ends: Integers,
+    planes: Words,
+    step: Singles,
+    to_centroid: Singles,
+    distances: Singles,
+) -> None:
     """Write the estimated squared distances between a query and the codes of C centroids into `distances` (N,).
 
     Args:
@@ -192,5 +239,7 @@ def _estimate(
                     )
             squares, scales, estimates = square[block], scale[block], distances[block]
             for i in range(len(n_different)):
-                product = step[centroid] * np.float32(1920 - np.int64(n_different[i]))  # 1920 is 256 times 7.5
+                product = step[centroid] * np.float32(
+                    1920 - np.int64(n_different[i])
+                )  # 1920 is 256 times 7.5
                 estimates[i] = to_centroid[centroid] + squares[i] - 2 * scales[i] * product

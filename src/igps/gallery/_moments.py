@@ -15,9 +15,13 @@ from igps.mesh.surface import area_vectors, directed_edges, face_areas
 
 # Quadrature with six nodes, exact for polynomials of degree four on a triangle (Dunavant 1985)
 _INNER, _OUTER = 0.445948490915965, 0.091576213509771
-_NODES = np.concatenate([np.full((3, 3), x) + np.eye(3) * (1 - 3 * x) for x in (_INNER, _OUTER)])  # barycentric
+_NODES = np.concatenate(
+    [np.full((3, 3), x) + np.eye(3) * (1 - 3 * x) for x in (_INNER, _OUTER)]
+)  # barycentric
 _WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
-_SECOND_ORDER = 0.03  # over first-order terms: a move of √area / 100 where the radius of curvature is √area / 3
+_SECOND_ORDER = (
+    0.03  # over first-order terms: a move of √area / 100 where the radius of curvature is √area / 3
+)
 
 
 def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
@@ -31,8 +35,12 @@ def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
     start, end = directed_edges(faces)
     is_open = ~np.isin(start * len(vertices) + end, end * len(vertices) + start)
     if is_open.any():
-        centroid = np.average(vertices[faces].mean(axis=1), axis=0, weights=face_areas(vertices, faces))
-        cones = np.column_stack([end[is_open], start[is_open], np.full(is_open.sum(), len(vertices))])
+        centroid = np.average(
+            vertices[faces].mean(axis=1), axis=0, weights=face_areas(vertices, faces)
+        )
+        cones = np.column_stack(
+            [end[is_open], start[is_open], np.full(is_open.sum(), len(vertices))]
+        )
         vertices, faces = np.vstack([vertices, centroid]), np.vstack([faces, cones])
     vectors = area_vectors(vertices, faces)
     x = np.einsum("qk,fkd->fqd", _NODES, vertices[faces])
@@ -49,10 +57,15 @@ def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
     if not even.min() > 0:
         return np.zeros((7, 6))
     # The functions h of the moments; the centroid moves with the surface, too
-    h_even = np.column_stack([np.ones(len(x)), (x @ axes) ** 2, square**2 - 4 * x @ third / volume]) / even
+    h_even = (
+        np.column_stack([np.ones(len(x)), (x @ axes) ** 2, square**2 - 4 * x @ third / volume])
+        / even
+    )
     h_third = x * square[:, None] - x @ (total * np.eye(3) + 2 * second) / volume
     length, scale = max(float(np.linalg.norm(third)), 1e-9), volume**0.5 / total**1.5
-    h_length = scale * (h_third @ third / length + length * (h_even[:, 0] / 2 - 1.5 * square / total))
+    h_length = scale * (
+        h_third @ third / length + length * (h_even[:, 0] / 2 - 1.5 * square / total)
+    )
     h = np.column_stack([h_even, h_length])
     weights = np.outer(np.linalg.norm(vectors, axis=1), _WEIGHTS).ravel()
     gram = (weights[:, None] * h).T @ h
@@ -68,7 +81,10 @@ def distance_bounds(one: Tensor, other: Tensor) -> Tensor:
     def bounds(own: Tensor, others: Tensor) -> Tensor:
         """Return the bounds by the maps of the first bodies."""
         own_moments, maps = own[:, 0], own[:, 1:].movedim(1, 0)
-        return sum(((row @ others[:, 0].T) - (row * own_moments).sum(1, keepdim=True)).square() for row in maps).sqrt()
+        return sum(
+            ((row @ others[:, 0].T) - (row * own_moments).sum(1, keepdim=True)).square()
+            for row in maps
+        ).sqrt()
 
     # The derivative of |∫ x |x|² dV| depends on the direction of the vector, which is uncertain for a short one
     return torch.minimum(bounds(one, other), bounds(other, one).T)

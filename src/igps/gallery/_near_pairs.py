@@ -14,7 +14,9 @@ from igps.mesh.mesh import millimetres
 from igps.retrieval.distances import Distance
 
 _ROWS = 256  # of the matrix of distances in memory at once
-_FIRST_TOP = 32  # neighbours in a gallery that are searched first; four times as many if all are near
+_FIRST_TOP = (
+    32  # neighbours in a gallery that are searched first; four times as many if all are near
+)
 # Bodies of one size differ by less in the logarithm of √area; levels of detail of a body differ by up to half of this
 _SIZE_TOLERANCE = 0.05
 
@@ -59,4 +61,6 @@ def of_one_size(near: NearPairs, dataset: SignatureDataset) -> NearPairs:
         signature = dataset[i].signature
         return math.log(signature.area) / 2 + math.log(millimetres(signature.unit))
 
-    return (pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _SIZE_TOLERANCE)
+    return (
+        pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _SIZE_TOLERANCE
+    )

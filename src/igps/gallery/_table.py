@@ -44,26 +44,36 @@ class BodyTable:
     def __init__(self, path: str | Path, version: int | None = None) -> None:
         self.path = Path(path)
         if not exists(self.path):
-            raise FileNotFoundError(f"{path}: no gallery there, or one whose build did not finish. Build it.")
+            raise FileNotFoundError(
+                f"{path}: no gallery there, or one whose build did not finish. Build it."
+            )
         with self._translated_errors(None):
             self.table = lancedb.connect(self.path).open_table(_BODIES)
-        with engine_errors_as(f"version: expected one that `igps gallery versions` lists, got {version}"):
+        with engine_errors_as(
+            f"version: expected one that `igps gallery versions` lists, got {version}"
+        ):
             self.table.checkout(self.table.version if version is None else version)
         self._read_head()
 
     def _read_head(self) -> None:
         with self._translated_errors(None):
             schema = self.table.schema
-            if b"embedding_functions" in schema.metadata:  # LanceDB would import and run the models that it names
+            if (
+                b"embedding_functions" in schema.metadata
+            ):  # LanceDB would import and run the models that it names
                 raise ValueError("it names models to load")
             self.head: dict[str, Any] = json.loads(schema.metadata[_ABOUT])
             self.about, self.shape = self.head["about"], tuple(self.head["shape"])
             self.coder: Coder | None = None
             self._codes: CodeIndex | None = None
             types = {arrow: python for python, arrow in _ARROW_TYPES.items()}
-            self.columns = {column.name: types[column.type] for column in schema if column.type in types}
+            self.columns = {
+                column.name: types[column.type] for column in schema if column.type in types
+            }
             if schema.field("vector").type.list_size != np.prod(self.shape) + 1:
-                raise ValueError(f"descriptions of {schema.field('vector').type}, not of shape {self.shape}")
+                raise ValueError(
+                    f"descriptions of {schema.field('vector').type}, not of shape {self.shape}"
+                )
             if name := self.head["map"]:
                 file = lancedb.connect(self.path).open_table(name).to_arrow()["arrays"][0].as_py()
                 with np.load(io.BytesIO(file), allow_pickle=False) as arrays:
@@ -76,7 +86,11 @@ class BodyTable:
         """Yield Arrow tables of rows in batches; without `columns`, with all columns that `decoded` needs."""
         with self._translated_errors(where):
             request = self._request(where, *(columns or (*self.columns, "vector")))
-            yield from (pa.Table.from_batches([batch]) for batch in request.to_batches(_BATCH_SIZE) if batch.num_rows)
+            yield from (
+                pa.Table.from_batches([batch])
+                for batch in request.to_batches(_BATCH_SIZE)
+                if batch.num_rows
+            )
 
     def _request(self, where: str | None, *columns: str) -> Any:
         request = self.table.search().select([*columns])
@@ -96,7 +110,11 @@ class BodyTable:
         return self.descriptions(rows), rows.select(list(self.columns)).to_pylist()
 
     def descriptions(self, rows: Any) -> Tensor:
-        values = torch.from_numpy(np.array(rows["vector"].combine_chunks().flatten())).float().reshape(len(rows), -1)
+        values = (
+            torch.from_numpy(np.array(rows["vector"].combine_chunks().flatten()))
+            .float()
+            .reshape(len(rows), -1)
+        )
         return torch.ldexp(values[:, :-1], values[:, -1:]).reshape(-1, *self.shape)
 
     def code_index(self) -> CodeIndex | None:
@@ -111,7 +129,12 @@ class BodyTable:
     def take(self, row_ids: Any, *columns: str) -> Any:
         """Return an Arrow table of the rows with some LanceDB row ids."""
         with self._translated_errors(None):
-            return self.table.take_row_ids(np.asarray(row_ids).tolist()).with_row_id().select([*columns]).to_arrow()
+            return (
+                self.table.take_row_ids(np.asarray(row_ids).tolist())
+                .with_row_id()
+                .select([*columns])
+                .to_arrow()
+            )
 
     def add(self, descriptions: Tensor, rows: Sequence[Row], further: Mapping[str, type]) -> None:
         """Add rows with distinct ids, in place of rows of these ids. `further` has types of columns beside `KNOWN`."""
@@ -120,16 +143,28 @@ class BodyTable:
             n_before = len(self)
             self.check_kinds(further)
             if new := further.keys() - self.columns.keys():
-                self.table.add_columns(pa.schema([(name, _ARROW_TYPES[further[name]]) for name in sorted(new)]))
+                self.table.add_columns(
+                    pa.schema([(name, _ARROW_TYPES[further[name]]) for name in sorted(new)])
+                )
                 self._read_head()
-            arrow = _encoded((descriptions, rows), self.columns, self.coder).select(self.table.schema.names)
-            merging = self.table.merge_insert("id").when_matched_update_all().when_not_matched_insert_all()
+            arrow = _encoded((descriptions, rows), self.columns, self.coder).select(
+                self.table.schema.names
+            )
+            merging = (
+                self.table.merge_insert("id")
+                .when_matched_update_all()
+                .when_not_matched_insert_all()
+            )
             merging.execute(arrow.cast(self.table.schema))
             steps = _MIN_ROWS_FOR_CODES * _REFIT_FACTOR ** np.arange(10)
             if self.head["searched_by"] and ((n_before < steps) & (steps <= len(self))).any():
                 offsets = np.linspace(0, len(self) - 1, _MIN_ROWS_FOR_CODES).astype(int).tolist()
-                sample = self.descriptions(self.table.take_offsets(offsets).select(["vector"]).to_arrow())
-                _overwrite(self.path, self.head, map(self.decoded, self.batches()), self.columns, sample)
+                sample = self.descriptions(
+                    self.table.take_offsets(offsets).select(["vector"]).to_arrow()
+                )
+                _overwrite(
+                    self.path, self.head, map(self.decoded, self.batches()), self.columns, sample
+                )
 
     @contextlib.contextmanager
     def changing(self, where: str | None = None) -> Iterator[Any]:
@@ -149,28 +184,49 @@ class BodyTable:
         """Raise a ValueError if a column of numbers would get text."""
         for name, kind in further.items():
             if self.columns.get(name, kind) not in (kind, str):
-                raise ValueError(f"{name}: expected numbers as in {self.path}, got text. Correct the labels.")
+                raise ValueError(
+                    f"{name}: expected numbers as in {self.path}, got text. Correct the labels."
+                )
 
     def check_shape(self, descriptions: Tensor) -> None:
         if (shape := tuple(descriptions.shape[1:])) != self.shape:
-            raise ValueError(f"descriptions: expected shape {self.shape} as in {self.path}, got {shape}.")
+            raise ValueError(
+                f"descriptions: expected shape {self.shape} as in {self.path}, got {shape}."
+            )
 
     def _translated_errors(self, where: str | None) -> contextlib.AbstractContextManager[None]:
         if where is None:
-            return engine_errors_as(f"{self.path}: the gallery is damaged. Restore a version of it, or build it again")
-        return engine_errors_as(f"where: expected a condition on the columns {', '.join(self.columns)}, got {where!r}")
+            return engine_errors_as(
+                f"{self.path}: the gallery is damaged. Restore a version of it, or build it again"
+            )
+        return engine_errors_as(
+            f"where: expected a condition on the columns {', '.join(self.columns)}, got {where!r}"
+        )
 
 
 def check_place(path: Path) -> None:
     """Raise a ValueError if no gallery can be built at a path."""
-    foreign = ["a file"] if path.is_file() else [f"a folder with {entry.name}" for entry in path.glob("*")
-                                                 if not entry.name.startswith((_BODIES, _MAP, "lock"))]  # fmt: skip
+    foreign = (
+        ["a file"]
+        if path.is_file()
+        else [
+            f"a folder with {entry.name}"
+            for entry in path.glob("*")
+            if not entry.name.startswith((_BODIES, _MAP, "lock"))
+        ]
+    )
     if foreign:
-        raise ValueError(f"{path}: expected a gallery or a new folder, got {min(foreign)}. Name another.")
+        raise ValueError(
+            f"{path}: expected a gallery or a new folder, got {min(foreign)}. Name another."
+        )
 
 
 def write(
-    path: Path, about: Row, searched_by: SearchDistance | None, batches: Iterable[Batch], further: Mapping[str, type]
+    path: Path,
+    about: Row,
+    searched_by: SearchDistance | None,
+    batches: Iterable[Batch],
+    further: Mapping[str, type],
 ) -> None:
     """Write a table of at least one row. A table that exists already becomes an earlier version of it.
 
@@ -179,7 +235,9 @@ def write(
     """
     check_place(path)
     batches, first = (batch for batch in batches if len(batch[1])), list[Batch]()
-    while sum(len(rows) for _, rows in first) < _MIN_ROWS_FOR_CODES and (batch := next(batches, None)):
+    while sum(len(rows) for _, rows in first) < _MIN_ROWS_FOR_CODES and (
+        batch := next(batches, None)
+    ):
         first.append(batch)
     if not first:
         raise ValueError("descriptions: expected at least one for the gallery, got none.")
@@ -189,17 +247,25 @@ def write(
         _index(_overwrite(path, head, chain(first, batches), {**KNOWN, **further}, sample))
 
 
-def _overwrite(path: Path, head: Row, batches: Iterable[Batch], columns: Mapping[str, type], sample: Tensor) -> Any:
+def _overwrite(
+    path: Path, head: Row, batches: Iterable[Batch], columns: Mapping[str, type], sample: Tensor
+) -> Any:
     """Write a version with only these rows, under the lock; fit an encoder to the sample if it is large enough."""
     coder, name = None, None
     if head["searched_by"] and len(sample) >= _MIN_ROWS_FOR_CODES:
         coder = Coder.fit(sample.flatten(1).float().numpy(), head["searched_by"])
         file, name = io.BytesIO(), _MAP + secrets.token_hex(8)
         np.savez(file, **coder.arrays())
-        lancedb.connect(path).create_table(name, pa.table({"arrays": pa.array([file.getvalue()], pa.large_binary())}))
+        lancedb.connect(path).create_table(
+            name, pa.table({"arrays": pa.array([file.getvalue()], pa.large_binary())})
+        )
     schema = _encoded((sample[:1], [{}]), columns, coder).schema
     schema = schema.with_metadata({_ABOUT: json.dumps({**head, "map": name})})
-    rows = (part for batch in batches for part in _encoded(batch, columns, coder).cast(schema).to_batches())
+    rows = (
+        part
+        for batch in batches
+        for part in _encoded(batch, columns, coder).cast(schema).to_batches()
+    )
     reader = pa.RecordBatchReader.from_batches(schema, rows)
     mode = "overwrite" if exists(path) else "create"
     return lancedb.connect(path).create_table(_BODIES, reader, mode=mode)
@@ -224,15 +290,26 @@ def _encoded(batch: Batch, columns: Mapping[str, type], coder: Coder | None) -> 
     descriptions, rows = batch
     values = descriptions.flatten(1).cpu().float().numpy()
     if not np.isfinite(values).all():
-        raise ValueError("descriptions: expected finite numbers, got NaN or infinity. Find the mesh that causes them.")
-    metadata = {name: pa.array([None if row.get(name) is None else kind(row[name]) for row in rows], _ARROW_TYPES[kind])
-                for name, kind in columns.items()}  # fmt: skip
+        raise ValueError(
+            "descriptions: expected finite numbers, got NaN or infinity. Find the mesh that causes them."
+        )
+    metadata = {
+        name: pa.array(
+            [None if row.get(name) is None else kind(row[name]) for row in rows], _ARROW_TYPES[kind]
+        )
+        for name, kind in columns.items()
+    }
     is_long = values.shape[1] > _MAX_SINGLE
     scale = is_long * (np.frexp(np.abs(values).max(axis=1, keepdims=True))[1] - 15)
-    numbers = {"vector": np.hstack([np.ldexp(values, -scale), scale]).astype("f2" if is_long else "f4")}
+    numbers = {
+        "vector": np.hstack([np.ldexp(values, -scale), scale]).astype("f2" if is_long else "f4")
+    }
     if coder is not None:
         numbers["code"] = coder(values).view(np.uint8).reshape(len(rows), -1)
-    lists = {name: pa.FixedShapeTensorArray.from_numpy_ndarray(array).storage for name, array in numbers.items()}
+    lists = {
+        name: pa.FixedShapeTensorArray.from_numpy_ndarray(array).storage
+        for name, array in numbers.items()
+    }
     return pa.table({**metadata, **lists})
 
 

@@ -19,9 +19,20 @@ from igps.signature.signature import SignatureConfig
 
 _SOURCE_LOCATION = re.compile(r", /\S+\.rs:.*")  # at the end of LanceDB's error messages
 
-KNOWN: dict[str, type] = {"id": str, "name": str, "class": str, "file": str, "part": str, "checksum": str,
-                          "bytes": int, "modified": int, "area": float, "volume": float, "unit": str,
-                          "thumbnail": bytes}  # fmt: skip
+KNOWN: dict[str, type] = {
+    "id": str,
+    "name": str,
+    "class": str,
+    "file": str,
+    "part": str,
+    "checksum": str,
+    "bytes": int,
+    "modified": int,
+    "area": float,
+    "volume": float,
+    "unit": str,
+    "thumbnail": bytes,
+}
 """Names and types of the columns that every gallery has, beside the description."""
 
 MANIFEST = "manifest.json"
@@ -32,7 +43,9 @@ Batch = tuple[Tensor, Sequence[Row]]
 """Descriptions (N, ...) and their rows: the columns `KNOWN`, and further ones of text or numbers."""
 
 
-def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | Descriptor) -> dict[str, Any]:
+def about_of(
+    config: SignatureConfig, reading: LoadOptions, descriptor: str | Descriptor
+) -> dict[str, Any]:
     """Return the name and checksum of a descriptor, the parameters of the Signatures and the options of reading."""
     signature = {**asdict(config), "algorithm_version": SignatureConfig.ALGORITHM_VERSION}
     return {
@@ -57,8 +70,16 @@ def check_alike(path: str | Path, found: Mapping[str, Any], wanted: Mapping[str,
 
 def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
     """Flatten nested dictionaries; keys are joined by a dot."""
-    inner = {f"{name}.{k}": v for name, value in about.items() if isinstance(value, dict) for k, v in value.items()}
-    return {**{name: value for name, value in about.items() if not isinstance(value, dict)}, **inner}
+    inner = {
+        f"{name}.{k}": v
+        for name, value in about.items()
+        if isinstance(value, dict)
+        for k, v in value.items()
+    }
+    return {
+        **{name: value for name, value in about.items() if not isinstance(value, dict)},
+        **inner,
+    }
 
 
 def _short(value: Any) -> str:
@@ -72,7 +93,11 @@ def engine_errors_as(sentence: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, RuntimeError, OSError, KeyError, TypeError, IndexError) as error:
-        reason = _SOURCE_LOCATION.sub("", str(error).splitlines()[0])[:200] if str(error) else type(error).__name__
+        reason = (
+            _SOURCE_LOCATION.sub("", str(error).splitlines()[0])[:200]
+            if str(error)
+            else type(error).__name__
+        )
         raise ValueError(f"{sentence} ({reason}).") from error
 
 
@@ -91,5 +116,7 @@ def tables() -> Any:
 def open_table(path: str | Path, version: int | None = None) -> Any:
     """Open the table of a gallery. Raise a ValueError for an index of version 0.2.0, which has other Signatures."""
     if not tables().exists(Path(path)) and (Path(path) / MANIFEST).exists():
-        raise ValueError(f"{path}: an index of version 0.2.0, of other signatures. Build a gallery in a new folder.")
+        raise ValueError(
+            f"{path}: an index of version 0.2.0, of other signatures. Build a gallery in a new folder."
+        )
     return tables().BodyTable(path, version)

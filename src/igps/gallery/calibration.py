@@ -24,8 +24,23 @@ KINDS = {
 }
 """Kinds of pairs in words, from the most alike to the least."""
 
-LEVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, *(i / 10 for i in range(1, 10)),
-          0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 1.0)  # fmt: skip
+LEVELS = (
+    0.0,
+    0.001,
+    0.002,
+    0.005,
+    0.01,
+    0.02,
+    0.05,
+    *(i / 10 for i in range(1, 10)),
+    0.95,
+    0.98,
+    0.99,
+    0.995,
+    0.998,
+    0.999,
+    1.0,
+)
 """Levels of the quantiles of distances that are stored."""
 
 FINEST = 1e-5
@@ -51,11 +66,17 @@ class Calibration:
 
     descriptor: str  # name
     model: str  # `fingerprint` of the descriptor
-    signatures: Mapping[str, int]  # version of the Signatures, and the parameters that distances depend on
+    signatures: Mapping[
+        str, int
+    ]  # version of the Signatures, and the parameters that distances depend on
     made_of: str  # the bodies that were measured, in words
-    distances: Mapping[str, Sequence[float]]  # quantiles at `LEVELS` of the descriptor's distance, for each of `KINDS`
+    distances: Mapping[
+        str, Sequence[float]
+    ]  # quantiles at `LEVELS` of the descriptor's distance, for each of `KINDS`
     n_pairs: Mapping[str, int]  # for each of `KINDS`
-    near: float  # limit of the descriptor's distance for candidates: twice the largest between copies
+    near: (
+        float  # limit of the descriptor's distance for candidates: twice the largest between copies
+    )
     same: Threshold  # limit of `surface_distance` for copies at any level of detail
     detail: Threshold  # limit, for copies, of the ratio of `surface_distance` to the larger `coarseness` of the two
     pose: Threshold  # limit of the descriptor's distance for poses of one body
@@ -81,7 +102,9 @@ class Calibration:
         """Return the largest `surface_distance` of copies, given the larger `Surfaces.coarseness` of the two bodies."""
         return min(self.same.distance, self.detail.distance * max(coarseness, FINEST))
 
-    def check(self, descriptor: str | Descriptor, module: Descriptor, config: SignatureConfig) -> None:
+    def check(
+        self, descriptor: str | Descriptor, module: Descriptor, config: SignatureConfig
+    ) -> None:
         """Raise a ValueError unless the calibration belongs to a descriptor and to Signatures of a configuration."""
         name = name_of(descriptor)
         if name != self.descriptor:
@@ -89,7 +112,9 @@ class Calibration:
             raise ValueError(f"descriptor: {expected}. For a gallery, build it with --size ignore.")
         if fingerprint(module) != self.model:
             remedy = "Make a new calibration with training/calibrate.py"
-            raise ValueError(f"{self.descriptor}: its calibration was made for other parameters. {remedy}.")
+            raise ValueError(
+                f"{self.descriptor}: its calibration was made for other parameters. {remedy}."
+            )
         params = calibration_params(config)
         for name, value in self.signatures.items():
             if params[name] != value:
@@ -107,11 +132,15 @@ class Calibration:
         """Read a calibration that `save` wrote. Raise a ValueError if the file holds none."""
         try:
             fields: dict[str, Any] = json.loads(Path(path).read_text())
-            calibration = cls(**fields | {name: Threshold(**fields[name]) for name in ("same", "detail", "pose")})
+            calibration = cls(
+                **fields | {name: Threshold(**fields[name]) for name in ("same", "detail", "pose")}
+            )
             if any(len(calibration.distances[kind]) != len(LEVELS) for kind in KINDS):
                 raise ValueError("other quantiles")
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: expected a calibration as training/calibrate.py writes it ({error}).") from error
+            raise ValueError(
+                f"{path}: expected a calibration as training/calibrate.py writes it ({error})."
+            ) from error
         return calibration
 
 

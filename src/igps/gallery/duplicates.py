@@ -51,7 +51,9 @@ class Duplicates:
     # Largest deviation of these pairs, from a sample of one surface to the other: over √area, as a length, and the unit
     # of the length if known
     largest: dict[tuple[str, str], tuple[float, float, str | None]]
-    nearly: dict[tuple[str, str], float]  # distances over √area of pairs that are not copies, but within the tolerance
+    nearly: dict[
+        tuple[str, str], float
+    ]  # distances over √area of pairs that are not copies, but within the tolerance
     n_files: int  # that were compared
     failures: tuple[Failure, ...]  # files that could not be compared
 
@@ -68,10 +70,17 @@ class BodyDistance:
 
 
 def duplicates(
-    source: SignatureDataset | Gallery, descriptor: str | Descriptor = "pretrained", *, poses: bool = False,
-    size: Size = "auto", tolerance: float = 0.0, cache_dir: str | Path | None = None,
-    calibration: Calibration | None = None, n_workers: int | None = None, progress: bool = False,
-) -> Duplicates:  # fmt: skip
+    source: SignatureDataset | Gallery,
+    descriptor: str | Descriptor = "pretrained",
+    *,
+    poses: bool = False,
+    size: Size = "auto",
+    tolerance: float = 0.0,
+    cache_dir: str | Path | None = None,
+    calibration: Calibration | None = None,
+    n_workers: int | None = None,
+    progress: bool = False,
+) -> Duplicates:
     """Find groups of files that show the same body in the same shape.
 
     Args:
@@ -97,12 +106,16 @@ def duplicates(
     if isinstance(source, Gallery):
         calibration.check(source.about["descriptor"], source.descriptor, source.config)
         chosen, dataset = source.descriptor, _files_of(source, cache_dir)
-        near = near_in_gallery(source, calibration.pose.distance if poses else calibration.near, progress)
+        near = near_in_gallery(
+            source, calibration.pose.distance if poses else calibration.near, progress
+        )
     else:
         chosen = descriptor_of(descriptor)
         calibration.check(descriptor, chosen, source.config)
         if poses:
-            descriptions = describe(source, chosen, failures=failures, n_workers=n_workers, progress=progress)
+            descriptions = describe(
+                source, chosen, failures=failures, n_workers=n_workers, progress=progress
+            )
             near = near_pairs(descriptions, chosen.distances, calibration.pose.distance, progress)
         else:
             limit = max(calibration.same.distance, tolerance)
@@ -124,7 +137,10 @@ def duplicates(
         graded = on_threads(lambda pair: surfaces.grade(*pair), list(joined), n_workers)
         for (i, j), (grade, deviation) in zip(joined, graded, strict=True):
             length, unit = surfaces.length(i)
-            grades[names[i], names[j]], largest[names[i], names[j]] = grade, (deviation, deviation * length, unit)
+            grades[names[i], names[j]], largest[names[i], names[j]] = (
+                grade,
+                (deviation, deviation * length, unit),
+            )
         group_of = {i: number for number, group in enumerate(groups) for i in group}
         for (i, j), distance in sorted(surfaces.nearly.items()):
             if group_of.get(i, -1 - i) != group_of.get(j, -1 - j):
@@ -142,7 +158,11 @@ def duplicates(
 
 
 def _join(
-    near: NearPairs, surfaces: Surfaces | None, calibration: Calibration, n_workers: int | None, progress: bool
+    near: NearPairs,
+    surfaces: Surfaces | None,
+    calibration: Calibration,
+    n_workers: int | None,
+    progress: bool,
 ) -> _Pairs:
     """Return the candidate pairs that are the same, as a spanning forest: pairs that a group has already are skipped.
 
@@ -158,8 +178,18 @@ def _join(
         if surfaces is None:
             distances = iter([distance for _, _, distance in open_pairs])
         else:
-            aligned = on_threads(lambda pair: surfaces.distance(*pair[:2], calibration), open_pairs, n_workers)
-            distances = iter(tqdm(aligned, desc="aligned", total=len(open_pairs), leave=False, disable=not progress))
+            aligned = on_threads(
+                lambda pair: surfaces.distance(*pair[:2], calibration), open_pairs, n_workers
+            )
+            distances = iter(
+                tqdm(
+                    aligned,
+                    desc="aligned",
+                    total=len(open_pairs),
+                    leave=False,
+                    disable=not progress,
+                )
+            )
         for (i, j, _), distance in zip(open_pairs, distances, strict=True):
             if distance < math.inf and group.merge(i, j):
                 joined[i, j] = distance
@@ -167,7 +197,11 @@ def _join(
 
 
 def _regroup(
-    joined: _Pairs, surfaces: Surfaces, calibration: Calibration, n_workers: int | None, progress: bool
+    joined: _Pairs,
+    surfaces: Surfaces,
+    calibration: Calibration,
+    n_workers: int | None,
+    progress: bool,
 ) -> _Pairs:
     """Split groups that a coarse file has merged, and return the pairs that form the new groups, with distances.
 
@@ -194,7 +228,12 @@ def _regroup(
     large = [members for members in _groups(joined) if len(members) > 2]
     reassigned = {i for members in large for i in members}
     final = {pair: distance for pair, distance in joined.items() if reassigned.isdisjoint(pair)}
-    for pairs in tqdm(on_threads(pairs_of, large, n_workers), desc="groups", total=len(large), disable=not progress):
+    for pairs in tqdm(
+        on_threads(pairs_of, large, n_workers),
+        desc="groups",
+        total=len(large),
+        disable=not progress,
+    ):
         final |= pairs
     return final
 
@@ -208,9 +247,12 @@ def _groups(joined: _Pairs) -> list[list[int]]:
 
 
 def body_distance(
-    dataset: SignatureDataset, descriptor: str | Descriptor = "pretrained", *,
-    calibration: Calibration | None = None, progress: bool = False,
-) -> BodyDistance:  # fmt: skip
+    dataset: SignatureDataset,
+    descriptor: str | Descriptor = "pretrained",
+    *,
+    calibration: Calibration | None = None,
+    progress: bool = False,
+) -> BodyDistance:
     """Return the distance between the two bodies of a dataset, and its meaning. For the arguments see `duplicates`.
 
     Raises:
@@ -228,7 +270,10 @@ def body_distance(
     with torch.inference_mode():
         distance = float(chosen.distances(descriptions[:1], descriptions[1:]))
     surfaces = Surfaces(dataset)
-    between, limit = surface_distance(*map(surfaces.samples, range(2))), surfaces.limit(0, 1, calibration)
+    between, limit = (
+        surface_distance(*map(surfaces.samples, range(2))),
+        surfaces.limit(0, 1, calibration),
+    )
     return BodyDistance(distance, between, limit, calibration.words(distance), between <= limit)
 
 
@@ -238,5 +283,7 @@ def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDatase
     names = tuple(row["name"] for row in rows)
     if len(set(names)) < len(names):  # from several folders
         names = tuple(row["id"] for row in rows)
-    files = Bodies(tuple(Path(row["file"]) for row in rows), names, None, tuple(row["part"] for row in rows))
+    files = Bodies(
+        tuple(Path(row["file"]) for row in rows), names, None, tuple(row["part"] for row in rows)
+    )
     return SignatureDataset(files, gallery.config, cache_dir, reading=gallery.reading)

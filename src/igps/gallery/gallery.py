@@ -41,7 +41,9 @@ class Match:
     name: str  # in its collection
     label: str | None  # its class, if known
     path: Path  # its file at the time of description
-    distance: float  # from the query, by the descriptor's own distance; without unit after re-ranking
+    distance: (
+        float  # from the query, by the descriptor's own distance; without unit after re-ranking
+    )
     # All columns of its row in the gallery
     row: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
@@ -62,7 +64,10 @@ class Gallery:
     """
 
     def __init__(
-        self, path: str | Path, descriptor: str | Descriptor | None = None, version: int | None = None
+        self,
+        path: str | Path,
+        descriptor: str | Descriptor | None = None,
+        version: int | None = None,
     ) -> None:
         self.path, self.table = Path(path), open_table(path, version)
         about = self.about
@@ -74,8 +79,12 @@ class Gallery:
         parameters = dict(about["signature"])
         version, current = parameters.pop("algorithm_version"), SignatureConfig.ALGORITHM_VERSION
         if version != current:
-            raise ValueError(f"{path}: expected signatures of version {current}, got {version}. Build it again.")
-        self.config = SignatureConfig(**{**parameters, "attributes": tuple(parameters["attributes"])})
+            raise ValueError(
+                f"{path}: expected signatures of version {current}, got {version}. Build it again."
+            )
+        self.config = SignatureConfig(
+            **{**parameters, "attributes": tuple(parameters["attributes"])}
+        )
         self.reading = LoadOptions(**about["reading"], names=about.get("names"))
 
     @property
@@ -92,9 +101,15 @@ class Gallery:
         return len(self.table)
 
     def query(
-        self, mesh: str | Path, *, top: int = 10, cache_dir: str | Path | None = None, exact: bool = False,
-        rerank: bool = False, where: str | None = None,
-    ) -> list[Match]:  # fmt: skip
+        self,
+        mesh: str | Path,
+        *,
+        top: int = 10,
+        cache_dir: str | Path | None = None,
+        exact: bool = False,
+        rerank: bool = False,
+        where: str | None = None,
+    ) -> list[Match]:
         """Return the bodies closest to the body in a file, closest first.
 
         Args:
@@ -109,14 +124,21 @@ class Gallery:
             MeshError: the mesh cannot be used.
             ValueError: the condition cannot be parsed.
         """
-        dataset = SignatureDataset([mesh], self.config, cache_dir, descriptor=self.descriptor, reading=self.reading)
+        dataset = SignatureDataset(
+            [mesh], self.config, cache_dir, descriptor=self.descriptor, reading=self.reading
+        )
         descriptions = describe(dataset, self.descriptor, n_workers=1)
         return self.nearest(descriptions, top=top, exact=exact, rerank=rerank, where=where)[0]
 
     def nearest(
-        self, descriptions: Tensor, *, top: int = 10, exact: bool = False, rerank: bool = False,
+        self,
+        descriptions: Tensor,
+        *,
+        top: int = 10,
+        exact: bool = False,
+        rerank: bool = False,
         where: str | None = None,
-    ) -> list[list[Match]]:  # fmt: skip
+    ) -> list[list[Match]]:
         """Return the bodies closest to each description (Q, ...), closest first. For the options see `query`."""
         check_at_least(1, top=top)
         matches = []
@@ -125,31 +147,48 @@ class Gallery:
             rows, distances, near = self.search(query[None], top=n_near, exact=exact, where=where)
             order = list(range(len(rows)))
             if rerank and rows:
-                ranking, n = SearchResult(torch.arange(len(rows))[None], distances[None]), min(top, len(rows))
+                ranking, n = (
+                    SearchResult(torch.arange(len(rows))[None], distances[None]),
+                    min(top, len(rows)),
+                )
                 with torch.inference_mode():
                     reranked = rerank_candidates(
                         query[None], ranking, near.__getitem__, self.descriptor.distances, top=n
                     )
                 order, distances = reranked.indices[0].tolist(), reranked.distances[0]
-            matches.append([
-                Match(rows[i]["name"], rows[i]["class"], Path(rows[i]["file"]), distance, rows[i])
-                for i, distance in zip(order, distances.tolist(), strict=True)
-            ])  # fmt: skip
+            matches.append(
+                [
+                    Match(
+                        rows[i]["name"], rows[i]["class"], Path(rows[i]["file"]), distance, rows[i]
+                    )
+                    for i, distance in zip(order, distances.tolist(), strict=True)
+                ]
+            )
         return matches
 
-    def search(self, query: Tensor, *, top: int, exact: bool = False, where: str | None = None) -> Found:
+    def search(
+        self, query: Tensor, *, top: int, exact: bool = False, where: str | None = None
+    ) -> Found:
         """Return the rows, distances and descriptions of the bodies closest to a description (1, ...)."""
         # The cosine distance, which finds the candidates, only approximates the distance of a head
         n = 4 * CANDIDATES if isinstance(self.descriptor, EmbeddedDescriptor) else CANDIDATES
         with torch.inference_mode():
             distance = self.descriptor.distances
-            return nearest_rows(self.table, query, distance, top=top, exact=exact, candidates=n, where=where)
+            return nearest_rows(
+                self.table, query, distance, top=top, exact=exact, candidates=n, where=where
+            )
 
     @classmethod
     def build(
-        cls, path: str | Path, dataset: SignatureDataset, descriptor: str | Descriptor = "pretrained", *,
-        n_workers: int | None = None, strict: bool = False, progress: bool = False,
-    ) -> tuple[Self, list[Failure]]:  # fmt: skip
+        cls,
+        path: str | Path,
+        dataset: SignatureDataset,
+        descriptor: str | Descriptor = "pretrained",
+        *,
+        n_workers: int | None = None,
+        strict: bool = False,
+        progress: bool = False,
+    ) -> tuple[Self, list[Failure]]:
         """Describe the bodies of a dataset and write a gallery. Return the gallery and the bodies that failed.
 
         A gallery that exists at `path` is unchanged until the new one is complete, and then becomes a version of it.
@@ -176,12 +215,19 @@ class Gallery:
         except ValueError as error:
             if len(failures) < len(dataset):
                 raise
-            reason = f"none of {len(failures)} bodies could be described; the first: {failures[0].error}"
+            reason = (
+                f"none of {len(failures)} bodies could be described; the first: {failures[0].error}"
+            )
             raise ValueError(f"{path}: {reason}") from error
         return cls(path, descriptor), failures
 
     def add(
-        self, dataset: SignatureDataset, *, n_workers: int | None = None, strict: bool = False, progress: bool = False
+        self,
+        dataset: SignatureDataset,
+        *,
+        n_workers: int | None = None,
+        strict: bool = False,
+        progress: bool = False,
     ) -> list[Failure]:
         """Add the bodies of a dataset. Return the bodies that failed. For the arguments see `build`.
 
@@ -191,18 +237,26 @@ class Gallery:
             ValueError: the gallery was built with other parameters of the Signatures or other options of reading.
         """
         expected = about_of(dataset.config, dataset.reading, self.descriptor)
-        check_alike(self.path, self.about, {name: expected[name] for name in ("signature", "reading")})
+        check_alike(
+            self.path, self.about, {name: expected[name] for name in ("signature", "reading")}
+        )
         known = {row["id"]: row["checksum"] for row in self.rows("id", "checksum")}
         failures, further = list[Failure](), further_columns(dataset.bodies, self.columns)
-        for batch in described_rows(dataset, self.descriptor, further, known, failures, n_workers, strict, progress):
+        for batch in described_rows(
+            dataset, self.descriptor, further, known, failures, n_workers, strict, progress
+        ):
             self.table.add(*batch, further)
         return failures
 
     @classmethod
     def merge(
-        cls, path: str | Path, others: Sequence[str | Path], descriptor: str | Descriptor | None = None, *,
+        cls,
+        path: str | Path,
+        others: Sequence[str | Path],
+        descriptor: str | Descriptor | None = None,
+        *,
         progress: bool = False,
-    ) -> Self:  # fmt: skip
+    ) -> Self:
         """Add the bodies of other galleries to the gallery at `path`, which is created if it does not exist.
 
         The other galleries stay as they are.
@@ -218,20 +272,29 @@ class Gallery:
         first, is_new = sources[0], len(sources) == len(others)
         for table in sources:
             check_alike(table.path, table.about, {**first.about, "names": table.about.get("names")})
-        owners = {name: table for table in reversed(sources) for name in table.columns}  # the first to have a column
+        owners = {
+            name: table for table in reversed(sources) for name in table.columns
+        }  # the first to have a column
         for table in sources:
             for name, kind in table.columns.items():
                 owners[name].check_kinds({name: kind})
-        with tqdm(total=sum(map(len, sources[not is_new :])), desc="entries", disable=not progress) as bar:
+        with tqdm(
+            total=sum(map(len, sources[not is_new :])), desc="entries", disable=not progress
+        ) as bar:
 
             def batches(table: Any) -> Iterator[Batch]:
                 for rows in table.batches():
                     yield table.decoded(rows)
                     bar.update(len(rows))
 
-            further = [{name: table.columns[name] for name in table.columns.keys() - KNOWN.keys()} for table in sources]
+            further = [
+                {name: table.columns[name] for name in table.columns.keys() - KNOWN.keys()}
+                for table in sources
+            ]
             if is_new:
-                tables().write(Path(path), first.about, first.head["searched_by"], batches(first), further[0])
+                tables().write(
+                    Path(path), first.about, first.head["searched_by"], batches(first), further[0]
+                )
             target = open_table(path)
             for table, kinds in zip(sources[1:], further[1:], strict=True):
                 for batch in batches(table):
@@ -253,19 +316,28 @@ class Gallery:
             raise ValueError(f"{min(wrong)}: expected one of the columns {', '.join(kinds)}.")
         if empty := [name for name in ("name", "file") if values.get(name, name) is None]:
             raise ValueError(f"{empty[0]}: expected a value, got none; it identifies the body.")
-        if bad := [name for name, value in values.items() if kinds[name] is float and not is_number(value)]:
-            raise ValueError(f"values: expected numbers in columns of numbers, got {values[bad[0]]!r} for {bad[0]}.")
-        typed = {name: None if value is None else kinds[name](value) for name, value in values.items()}
+        if bad := [
+            name for name, value in values.items() if kinds[name] is float and not is_number(value)
+        ]:
+            raise ValueError(
+                f"values: expected numbers in columns of numbers, got {values[bad[0]]!r} for {bad[0]}."
+            )
+        typed = {
+            name: None if value is None else kinds[name](value) for name, value in values.items()
+        }
         with self.table.changing(where) as table:
             return int(table.update(where=where, values=typed).rows_updated)
 
     def versions(self) -> list[dict[str, Any]]:
         """Return number, time and count of bodies of each version, oldest first. Versions are kept for a month."""
         return [
-            {"version": version["version"], "time": f"{version['timestamp']:%Y-%m-%d %H:%M:%S}",
-             "bodies": int(version["metadata"]["total_rows"])}
+            {
+                "version": version["version"],
+                "time": f"{version['timestamp']:%Y-%m-%d %H:%M:%S}",
+                "bodies": int(version["metadata"]["total_rows"]),
+            }
             for version in self.table.table.list_versions()
-        ]  # fmt: skip
+        ]
 
     def restore(self, version: int) -> None:
         """Return to an earlier version, as a new version with its content."""

@@ -28,9 +28,15 @@ _THUMBNAIL_SIZE = 40  # pixels
 
 
 def described_rows(
-    dataset: SignatureDataset, descriptor: Descriptor, kinds: Mapping[str, type], known: Mapping[str, str],
-    failures: list[Failure], n_workers: int | None, strict: bool, progress: bool,
-) -> Iterator[Batch]:  # fmt: skip
+    dataset: SignatureDataset,
+    descriptor: Descriptor,
+    kinds: Mapping[str, type],
+    known: Mapping[str, str],
+    failures: list[Failure],
+    n_workers: int | None,
+    strict: bool,
+    progress: bool,
+) -> Iterator[Batch]:
     """Yield descriptions and rows of the bodies whose checksums are not `known`; append failures to the list."""
     dataset = each_body_once(dataset)
     bodies = dataset.bodies
@@ -38,15 +44,28 @@ def described_rows(
         for start in range(0, len(dataset), _BATCH_SIZE):
             indices = range(start, min(start + _BATCH_SIZE, len(dataset)))
             # Time stamps are taken before files are read: a file that changes meanwhile is described again next time
-            metadata = dict(zip(indices, known_rows(bodies.subset(indices), kinds, dataset.reading), strict=True))
+            metadata = dict(
+                zip(
+                    indices, known_rows(bodies.subset(indices), kinds, dataset.reading), strict=True
+                )
+            )
             checksums = {i: checksum_of(dataset, i) for i in indices}
-            new = [i for i in indices if not checksums[i] or known.get(metadata[i]["id"]) != checksums[i]]
+            new = [
+                i
+                for i in indices
+                if not checksums[i] or known.get(metadata[i]["id"]) != checksums[i]
+            ]
             failed: list[Failure] = []
-            descriptions = _described(dataset.subset(new), descriptor, None if strict else failed, n_workers)
+            descriptions = _described(
+                dataset.subset(new), descriptor, None if strict else failed, n_workers
+            )
             failed_names = {failure.id for failure in failed}
             described = [i for i in new if bodies.names[i] not in failed_names]
             if described:
-                rows = [{**metadata[i], **_measured(dataset, i), "checksum": checksums[i]} for i in described]
+                rows = [
+                    {**metadata[i], **_measured(dataset, i), "checksum": checksums[i]}
+                    for i in described
+                ]
                 yield descriptions, rows
             failures += failed
             bar.update(len(indices))
@@ -63,14 +82,18 @@ def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[s
         expected = "expected column names without dots that do not begin with an underscore"
         raise ValueError(f"{LABELS_FILE}: {expected}, got {invalid[0]!r}. Rename the column.")
     if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
-        raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
+        raise ValueError(
+            f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name."
+        )
     return {
         name: float if there.get(name) is not str and all(map(is_number, values)) else str
         for name, values in bodies.columns.items()
     }
 
 
-def known_rows(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> list[dict[str, Any]]:
+def known_rows(
+    bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions
+) -> list[dict[str, Any]]:
     """Return the metadata of bodies that are known without reading their files."""
     files = _files(bodies)
     labels = bodies.labels or [None] * len(bodies)
@@ -78,7 +101,9 @@ def known_rows(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) 
     rows: list[dict[str, Any]] = []
     for file, part, name, label in zip(files, bodies.parts, bodies.names, labels, strict=True):
         id_ = file if part is None else f"{file}#{part}"
-        rows.append({"id": id_, "name": name, "class": label, "file": file, "part": part, **stamps[file]})
+        rows.append(
+            {"id": id_, "name": name, "class": label, "file": file, "part": part, **stamps[file]}
+        )
     for column, values in bodies.columns.items():
         for row, value in zip(rows, values, strict=True):
             row[column] = None if value is None else kinds[column](value)
@@ -89,13 +114,21 @@ def each_body_once(dataset: SignatureDataset) -> SignatureDataset:
     """Drop bodies that are listed twice because of a symbolic link to a folder; the alphabetically first name stays."""
     bodies = dataset.bodies
     files = list(zip(_files(bodies), bodies.parts, strict=True))
-    first = {files[i]: i for i in sorted(range(len(bodies)), key=bodies.names.__getitem__, reverse=True)}
+    first = {
+        files[i]: i for i in sorted(range(len(bodies)), key=bodies.names.__getitem__, reverse=True)
+    }
     return dataset if len(first) == len(bodies) else dataset.subset(sorted(first.values()))
 
 
 def _files(bodies: Bodies) -> list[str]:
-    folders = {folder: os.path.realpath(folder) for folder in {os.path.dirname(path) for path in bodies.paths}}
-    return [os.path.join(folders[os.path.dirname(path)], os.path.basename(path)) for path in bodies.paths]
+    folders = {
+        folder: os.path.realpath(folder)
+        for folder in {os.path.dirname(path) for path in bodies.paths}
+    }
+    return [
+        os.path.join(folders[os.path.dirname(path)], os.path.basename(path))
+        for path in bodies.paths
+    ]
 
 
 def _stamp(file: Path, reading: LoadOptions) -> dict[str, int]:
@@ -120,11 +153,19 @@ def thumbnail(signature: Signature) -> bytes:
     """Return a PNG of the surface samples of a body, seen along its shortest axis; near samples are brighter."""
     from matplotlib.image import imsave
 
-    points = np.asarray(signature.surface.points if len(signature.surface) else signature.interior.points, np.float64)
+    points = np.asarray(
+        signature.surface.points if len(signature.surface) else signature.interior.points,
+        np.float64,
+    )
     centred = points - points.mean(axis=0)
     along_axes = centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
-    width, depth = np.abs(along_axes[:, :2]).max(initial=1e-300), np.abs(along_axes[:, 2]).max(initial=1e-300)
-    columns, rows = np.rint((along_axes[:, :2] / width + 1) * (_THUMBNAIL_SIZE - 1) / 2).astype(int).T
+    width, depth = (
+        np.abs(along_axes[:, :2]).max(initial=1e-300),
+        np.abs(along_axes[:, 2]).max(initial=1e-300),
+    )
+    columns, rows = (
+        np.rint((along_axes[:, :2] / width + 1) * (_THUMBNAIL_SIZE - 1) / 2).astype(int).T
+    )
     image, file = np.zeros((_THUMBNAIL_SIZE, _THUMBNAIL_SIZE)), io.BytesIO()
     np.maximum.at(image, (rows, columns), 0.6 + 0.4 * along_axes[:, 2] / depth)
     imsave(file, image, cmap="gray", vmin=0, vmax=1, origin="lower", format="png")
@@ -138,7 +179,10 @@ def _measured(dataset: SignatureDataset, i: int) -> dict[str, Any]:
 
 
 def _described(
-    dataset: SignatureDataset, descriptor: Descriptor, failures: list[Failure] | None, n_workers: int | None
+    dataset: SignatureDataset,
+    descriptor: Descriptor,
+    failures: list[Failure] | None,
+    n_workers: int | None,
 ) -> Tensor:
     """Return the descriptions of the bodies that can be described; there may be none."""
     try:

@@ -23,7 +23,12 @@ from tqdm import tqdm
 from igps._arrays import Floats, Integers
 from igps._parallel import on_threads
 from igps.data.dataset import Failure, SignatureDataset
-from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
+from igps.gallery._alignment import (
+    SurfaceSamples,
+    TriangleSurface,
+    offset_in_place,
+    surface_distance,
+)
 from igps.gallery._moments import moments
 from igps.gallery.calibration import Calibration
 from igps.mesh.loading import load_mesh
@@ -36,7 +41,9 @@ from igps.signature.signature import Signature
 _N_CACHED_SAMPLES, _N_CACHED_MESHES = 512, 64
 _NORMALS: AttributeName = "surface_direction"
 # Lengths are over √area.
-_HOPELESS = 0.03  # distance at which an alignment is given up; a tenth of it is large between copies
+_HOPELESS = (
+    0.03  # distance at which an alignment is given up; a tenth of it is large between copies
+)
 _MAX_STRETCH = 0.1  # difference of log extents above which bodies are not aligned; copies differ by up to 0.045
 MAX_TOLERANCE = 0.02
 """Largest `tolerance`, over √area."""
@@ -52,12 +59,18 @@ _HANDLE_PRESERVING: set[Step] = {"welded", "smoothed", "subdivided"}  # steps of
 
 
 def distance_if_alike(
-    one: SurfaceSamples, other: SurfaceSamples, *, stop_at: float = 0.0, max_distance: float = math.inf
+    one: SurfaceSamples,
+    other: SurfaceSamples,
+    *,
+    stop_at: float = 0.0,
+    max_distance: float = math.inf,
 ) -> float:
     """`surface_distance`, or infinity if the extents of the two surfaces differ too much."""
     if np.abs(np.log(one.extents / other.extents)).max() > _MAX_STRETCH:
         return math.inf
-    return surface_distance(one, other, stop_at=stop_at, hopeless=_HOPELESS, max_distance=max_distance)
+    return surface_distance(
+        one, other, stop_at=stop_at, hopeless=_HOPELESS, max_distance=max_distance
+    )
 
 
 class Surfaces:
@@ -77,7 +90,9 @@ class Surfaces:
 
     def __init__(self, dataset: SignatureDataset, tolerance: float = 0.0) -> None:
         if not 0 <= tolerance <= MAX_TOLERANCE:
-            raise ValueError(f"tolerance: expected 0 to {MAX_TOLERANCE} of the root of the area, got {tolerance}.")
+            raise ValueError(
+                f"tolerance: expected 0 to {MAX_TOLERANCE} of the root of the area, got {tolerance}."
+            )
         self.failures: dict[int, Failure] = {}
         self.nearly: dict[tuple[int, int], float] = {}
         self._tolerance = tolerance
@@ -91,7 +106,9 @@ class Surfaces:
     def samples(self, i: int) -> SurfaceSamples:
         """Return the surface samples of a body; raise a MeshError if it is unusable, a ValueError without normals."""
         signature = self._signature(i)
-        samples = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
+        samples = SurfaceSamples.of(
+            signature.surface.points, signature.surface.attributes[_NORMALS], signature.area
+        )
         return replace(samples, surface=partial(self._cached_triangles, i))
 
     def coarseness(self, i: int) -> float:
@@ -107,12 +124,16 @@ class Surfaces:
         with contextlib.suppress(MeshError):  # recorded in `failures`
             one, other = self._cached_samples(i), self._cached_samples(j)
             max_distance, limit = max(calibration.same.distance, self._tolerance), 0.0
-            distance = distance_if_alike(one, other, stop_at=calibration.same.distance, max_distance=max_distance)
+            distance = distance_if_alike(
+                one, other, stop_at=calibration.same.distance, max_distance=max_distance
+            )
             if distance <= calibration.same.distance:
                 limit = self.limit(i, j, calibration)
                 if distance > limit > 0:
                     # The search stopped below `same`. A longer search may get below the limit
-                    distance = distance_if_alike(one, other, stop_at=limit, max_distance=max(limit, self._tolerance))
+                    distance = distance_if_alike(
+                        one, other, stop_at=limit, max_distance=max(limit, self._tolerance)
+                    )
             if distance <= limit:
                 return distance
             if distance <= self._tolerance:
@@ -132,8 +153,12 @@ class Surfaces:
         if (deviation := self._vertex_deviation(i, j)) <= _SAME_SURFACE:
             return "same mesh", deviation
         samples = map(self._cached_samples, (i, j))
-        deviation = surface_distance(*samples, stop_at=_SAME_SURFACE, hopeless=_HOPELESS, patch_size=1)
-        return ("same surface" if deviation <= _SAME_SURFACE else "same at another level of detail"), deviation
+        deviation = surface_distance(
+            *samples, stop_at=_SAME_SURFACE, hopeless=_HOPELESS, patch_size=1
+        )
+        return (
+            "same surface" if deviation <= _SAME_SURFACE else "same at another level of detail"
+        ), deviation
 
     def length(self, i: int) -> tuple[float, str | None]:
         """Return √area of a body, and its unit of length if known."""
@@ -146,7 +171,10 @@ class Surfaces:
         The limit is 0 if the bodies have different numbers of handles, or if their meshes have the same faces, but
         vertices at other places. Raises a MeshError if a body cannot be used.
         """
-        (coarseness_i, handles_i), (coarseness_j, handles_j) = self._cached_coarseness(i), self._cached_coarseness(j)
+        (coarseness_i, handles_i), (coarseness_j, handles_j) = (
+            self._cached_coarseness(i),
+            self._cached_coarseness(j),
+        )
         differ = None not in (handles_i, handles_j) and handles_i != handles_j
         if differ or _ROUNDING < self._vertex_deviation(i, j) < math.inf:
             return 0.0
@@ -176,7 +204,9 @@ class Surfaces:
     def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
         """Return coarseness and number of handles: None for an open mesh, or if mending may have changed it."""
         mesh = self._cached_mesh(i)
-        smoothed = TriangleSurface(mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces)
+        smoothed = TriangleSurface(
+            mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces
+        )
         handles = None
         if not set(repair_steps(mesh.notes)) - _HANDLE_PRESERVING:
             with contextlib.suppress(MeshError):
@@ -197,10 +227,14 @@ class Surfaces:
     def _vertices_and_faces(self, i: int) -> tuple[Floats, Integers]:
         """Return the vertices of the file, centred and over √area, and the faces with sorted corners."""
         mesh = self._cached_mesh(i)
-        if "subdivided" in repair_steps(mesh.notes):  # how finely depends on the number of eigenpairs
+        if "subdivided" in repair_steps(
+            mesh.notes
+        ):  # how finely depends on the number of eigenpairs
             body = self._dataset.bodies[i]
             mesh = load_mesh(body.path, self._dataset.pipeline.reading, part=body.part)
-        return (mesh.vertices - mesh.vertices.mean(axis=0)) / math.sqrt(mesh.area), np.sort(mesh.faces, axis=1)
+        return (mesh.vertices - mesh.vertices.mean(axis=0)) / math.sqrt(mesh.area), np.sort(
+            mesh.faces, axis=1
+        )
 
     def _triangles(self, i: int) -> TriangleSurface:
         mesh = self._cached_mesh(i)

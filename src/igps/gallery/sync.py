@@ -14,9 +14,14 @@ _ROWS_PER_COMMIT = 1000
 
 
 def sync(
-    gallery: Gallery, dataset: SignatureDataset, root: str | Path, *,
-    n_workers: int | None = None, strict: bool = False, progress: bool = False,
-) -> tuple[int, int, list[Failure]]:  # fmt: skip
+    gallery: Gallery,
+    dataset: SignatureDataset,
+    root: str | Path,
+    *,
+    n_workers: int | None = None,
+    strict: bool = False,
+    progress: bool = False,
+) -> tuple[int, int, list[Failure]]:
     """Bring a gallery up to date with a folder: describe new and changed files, remove deleted ones, update columns.
 
     Files whose size and modification time have not changed are not read. If the description of a body fails, its old
@@ -33,12 +38,16 @@ def sync(
     """
     dataset = each_body_once(dataset)
     kinds = further_columns(dataset.bodies, gallery.columns)
-    cleared = dict.fromkeys(gallery.columns.keys() - KNOWN.keys())  # columns that the folder no longer has
+    cleared = dict.fromkeys(
+        gallery.columns.keys() - KNOWN.keys()
+    )  # columns that the folder no longer has
     current = [{**cleared, **row} for row in known_rows(dataset.bodies, kinds, dataset.reading)]
     columns = [name for name in ("checksum", *current[0]) if name in gallery.columns]
     known = {row["id"]: row for row in gallery.rows(*columns)}
     new: list[int] = []
-    changed: dict[str, dict[str, Any]] = {}  # rows of the same content with other metadata, such as a class
+    changed: dict[
+        str, dict[str, Any]
+    ] = {}  # rows of the same content with other metadata, such as a class
     for i, row in enumerate(current):
         before = known.get(row["id"], {})
         differences = {name for name, value in row.items() if before.get(name) != value}
@@ -55,12 +64,22 @@ def sync(
     if new:
         subset = dataset.subset(new)
         failures = subset.precompute(n_workers=n_workers, strict=strict, progress=progress)
-        failures += gallery.add(subset.usable(failures), n_workers=n_workers, strict=strict, progress=progress)
+        failures += gallery.add(
+            subset.usable(failures), n_workers=n_workers, strict=strict, progress=progress
+        )
     prefix = f"{Path(root).resolve()}{os.sep}"
-    gone = [name for name in known.keys() - {row["id"] for row in current} if name.startswith(prefix)]
+    gone = [
+        name for name in known.keys() - {row["id"] for row in current} if name.startswith(prefix)
+    ]
     failed = {failure.id for failure in failures}
-    unread = {row["file"] for row in current if row["part"] is None and row["name"] in failed}  # their parts may exist
-    gone = [name for name in gone if known[name]["file"] not in unread and not _is_hidden(known[name]["file"])]
+    unread = {
+        row["file"] for row in current if row["part"] is None and row["name"] in failed
+    }  # their parts may exist
+    gone = [
+        name
+        for name in gone
+        if known[name]["file"] not in unread and not _is_hidden(known[name]["file"])
+    ]
     for where in _where_id(gone):
         gallery.remove(where)
     return len(new) - len(failures), len(gone), failures
@@ -78,5 +97,7 @@ def _is_hidden(file: str) -> bool:
 def _where_id(ids: Sequence[str]) -> Iterator[str]:
     """Yield conditions that select the rows with some ids, in groups."""
     for start in range(0, len(ids), _ROWS_PER_COMMIT):
-        quoted = ("'" + name.replace("'", "''") + "'" for name in ids[start : start + _ROWS_PER_COMMIT])
+        quoted = (
+            "'" + name.replace("'", "''") + "'" for name in ids[start : start + _ROWS_PER_COMMIT]
+        )
         yield f"id IN ({', '.join(quoted)})"

@@ -5,7 +5,14 @@ import numpy as np
 from igps._arrays import Floats, Integers, Singles, Surface
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles
 from igps.mesh.mesh import MeshError
-from igps.mesh.surface import directed_edges, face_areas, largest, longest_side, signed_volume, vertex_normals
+from igps.mesh.surface import (
+    directed_edges,
+    face_areas,
+    largest,
+    longest_side,
+    signed_volume,
+    vertex_normals,
+)
 
 _MIN_COSINE = 0.95  # of the normals of two triangles, before and after a flip of their edge, with the mean normal
 
@@ -16,7 +23,9 @@ def level_surface(field: Singles, name: str) -> Surface:
 
     for _ in range(20):
         if not (field.min() < 0 < field.max()):
-            raise MeshError(f"{name}: no grid point lies inside the body, which is too thin. Give it some thickness.")
+            raise MeshError(
+                f"{name}: no grid point lies inside the body, which is too thin. Give it some thickness."
+            )
         vertices, faces, _, _ = marching_cubes(field, 0.0, allow_degenerate=True)
         faces = faces.astype(np.int64)
         bad_edges = _non_manifold_edges(faces, len(vertices))
@@ -24,11 +33,18 @@ def level_surface(field: Singles, name: str) -> Surface:
             return vertices.astype(np.float64), faces
         # Fill the four or eight grid points around each vertex at which the surface meets itself.
         for vertex in np.unique(bad_edges):
-            low, high = np.floor(vertices[vertex]).astype(int), np.ceil(vertices[vertex]).astype(int)
-            box = tuple(slice(max(low[d], 1), min(high[d] + 1, field.shape[d] - 1)) for d in range(3))
+            low, high = (
+                np.floor(vertices[vertex]).astype(int),
+                np.ceil(vertices[vertex]).astype(int),
+            )
+            box = tuple(
+                slice(max(low[d], 1), min(high[d] + 1, field.shape[d] - 1)) for d in range(3)
+            )
             field[box] = np.minimum(field[box], -MIN_ABS_VALUE)
         field = fill_bubbles(field)
-    raise MeshError(f"{name}: no closed surface could be extracted from the grid. Raise the resolution.")
+    raise MeshError(
+        f"{name}: no closed surface could be extracted from the grid. Raise the resolution."
+    )
 
 
 def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Surface:
@@ -46,7 +62,11 @@ def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Su
             triangles = np.asfortranarray(triangles.astype(np.int32))
             points, triangles, *_ = collapse(np.asfortranarray(points), triangles, target)
     triangles = np.asarray(triangles, dtype=np.int64)
-    if len(triangles) == 0 or len(_non_manifold_edges(triangles, len(points))) or not np.isfinite(points).all():
+    if (
+        len(triangles) == 0
+        or len(_non_manifold_edges(triangles, len(points)))
+        or not np.isfinite(points).all()
+    ):
         return vertices, faces
     points, triangles = largest(points * scale, triangles)
     triangles = _flip_edges(points, triangles)
@@ -102,8 +122,13 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
         for vectors in (*old, *new):
             size = np.linalg.norm(vectors, axis=1)
             # The normal of a triangle without area does not matter.
-            is_flat &= (np.einsum("ij,ij->i", vectors, mean) > _MIN_COSINE * size) | (size < 1e-3 * length[:, 0])
-        exists = np.isin(np.minimum(c, d) * n + np.maximum(c, d), np.minimum(start, end) * n + np.maximum(start, end))
+            is_flat &= (np.einsum("ij,ij->i", vectors, mean) > _MIN_COSINE * size) | (
+                size < 1e-3 * length[:, 0]
+            )
+        exists = np.isin(
+            np.minimum(c, d) * n + np.maximum(c, d),
+            np.minimum(start, end) * n + np.maximum(start, end),
+        )
         flips = np.nonzero((gain > 1e-3) & is_flat & ~exists & (c != d))[0]
         # Each face takes part only in its best flip, and no two flips create the same edge.
         left, right, gain = side[flips] // 3, other[flips] // 3, gain[flips]
@@ -113,14 +138,19 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
         chosen = np.nonzero((gain >= best[left]) & (gain >= best[right]))[0]
         new_edges = np.minimum(c, d)[flips] * n + np.maximum(c, d)[flips]
         chosen = chosen[np.unique(new_edges[chosen], return_index=True)[1]]
-        flipped, count = np.unique(np.concatenate([left[chosen], right[chosen]]), return_counts=True)
+        flipped, count = np.unique(
+            np.concatenate([left[chosen], right[chosen]]), return_counts=True
+        )
         repeated = flipped[count > 1]
         chosen = chosen[~np.isin(left[chosen], repeated) & ~np.isin(right[chosen], repeated)]
         if not len(chosen):
             break
         a, b, c, d = (corner[flips[chosen]] for corner in (a, b, c, d))
         faces = faces.copy()
-        faces[left[chosen]], faces[right[chosen]] = np.stack([c, d, b], axis=1), np.stack([d, c, a], axis=1)
+        faces[left[chosen]], faces[right[chosen]] = (
+            np.stack([c, d, b], axis=1),
+            np.stack([d, c, a], axis=1),
+        )
     return faces
 
 

@@ -24,7 +24,10 @@ _MIN_ABS_VALUES, _STIFFNESS = (0.05, 0.3), (1.0, 0.1)
 # Excess of the first solution's Laplacian over its surroundings: up to the first value a place is smooth, from the
 # second on it is an edge. An edge bends more than the faces beside it; a thin round body bends everywhere.
 _BEND_LIMITS = (0.05, 0.2)
-_WINDOW, _WIDE_WINDOW = 0.7, 3.0  # standard deviations of the means of the Laplacian and of its surroundings, voxels
+_WINDOW, _WIDE_WINDOW = (
+    0.7,
+    3.0,
+)  # standard deviations of the means of the Laplacian and of its surroundings, voxels
 # Weight of the deviation from a signed distance to the voxels of the other side; the second derivatives have weight 1.
 _DISTANCE_WEIGHT = 0.01
 _RELAXATION = 1.4
@@ -62,7 +65,10 @@ def smooth_field(share: Singles, sides: Floats) -> Floats | Singles:
             continue
         (box,) = ndimage.find_objects(inside.view(np.uint8))
         first, last = (start + [getattr(side, end) for side in box] for end in ("start", "stop"))
-        box_low, box_high = np.maximum(first - margin, start), np.minimum(last + margin, start + inside.shape)
+        box_low, box_high = (
+            np.maximum(first - margin, start),
+            np.minimum(last + margin, start + inside.shape),
+        )
         padding = list(zip(margin - (first - box_low), margin - (box_high - last), strict=True))
         solution = _solve(np.pad(share[tuple(map(slice, box_low, box_high))], padding), sides)
         origin = first - margin  # of the solution, in the grid
@@ -79,7 +85,9 @@ def _solve(share: Singles, sides: Floats) -> Floats:
     distance = ndimage.distance_transform_edt(inside, sampling=sides)
     distance += ndimage.distance_transform_edt(~inside, sampling=sides)
     field = np.where(inside, -1.0, 1.0) * (distance - 0.5)
-    border = ndimage.maximum_filter(inside, 2 * _BAND + 1) & ~ndimage.minimum_filter(inside, 2 * _BAND + 1)
+    border = ndimage.maximum_filter(inside, 2 * _BAND + 1) & ~ndimage.minimum_filter(
+        inside, 2 * _BAND + 1
+    )
     nodes = np.flatnonzero(border)
     target = field.reshape(-1)[nodes]
     stencil = np.array([-1.0, 2, -1])
@@ -92,16 +100,23 @@ def _solve(share: Singles, sides: Floats) -> Floats:
     def relax(sharpness: Floats) -> None:
         min_abs = certainty * np.interp(sharpness.reshape(-1)[nodes], (0, 1), _MIN_ABS_VALUES)
         _relax(
-            field.reshape(-1), laplacian.reshape(-1), nodes, np.concatenate([[0], steps, -steps]),
+            field.reshape(-1),
+            laplacian.reshape(-1),
+            nodes,
+            np.concatenate([[0], steps, -steps]),
             np.concatenate([[2 * (sides**-2).sum()], -(sides**-2), -(sides**-2)]),
-            np.interp(sharpness, (0, 1), _STIFFNESS).reshape(-1), target, inside.reshape(-1)[nodes], min_abs,
-        )  # fmt: skip
+            np.interp(sharpness, (0, 1), _STIFFNESS).reshape(-1),
+            target,
+            inside.reshape(-1)[nodes],
+            min_abs,
+        )
 
     relax(np.zeros_like(field))
     # Edges are blunter across long voxels.
     bend = np.abs(ndimage.gaussian_filter(laplacian, _WINDOW, truncate=3)) * np.sqrt(sides.max())
     around, weight = (
-        ndimage.gaussian_filter(values, _WIDE_WINDOW, truncate=3) for values in (bend * border, border.astype(float))
+        ndimage.gaussian_filter(values, _WIDE_WINDOW, truncate=3)
+        for values in (bend * border, border.astype(float))
     )
     relax(np.interp(bend - around / np.maximum(weight, 1e-3), _BEND_LIMITS, (0, 1)))
     return field
@@ -115,7 +130,9 @@ def filled_volume(field: Floats | Singles, reach: float) -> tuple[float, float]:
     near = np.nonzero(np.abs(field[1:-1, 1:-1, 1:-1]) < reach)
     at = np.ravel_multi_index(tuple(index + 1 for index in near), field.shape)
     values, width = field.reshape(-1), np.full(len(at), 1e-3)
-    for step in np.cumprod([1, *field.shape[:0:-1]]).tolist():  # not its strides: splines permute the axes in memory
+    for step in np.cumprod(
+        [1, *field.shape[:0:-1]]
+    ).tolist():  # not its strides: splines permute the axes in memory
         width += np.abs(values[at + step] - values[at - step]) / 2
     share = 0.5 - values[at] / width
     n_full = np.count_nonzero(field < 0) - np.count_nonzero(values[at] < 0)
@@ -125,9 +142,16 @@ def filled_volume(field: Floats | Singles, reach: float) -> tuple[float, float]:
 
 @compiled(fastmath=REASSOCIATE)
 def _relax(
-    field: Floats, laplacian: Floats, nodes: Integers, steps: Integers, weights: Floats, stiffness: Floats,
-    target: Floats, inside: Booleans, min_abs: Floats,
-) -> None:  # fmt: skip
+    field: Floats,
+    laplacian: Floats,
+    nodes: Integers,
+    steps: Integers,
+    weights: Floats,
+    stiffness: Floats,
+    target: Floats,
+    inside: Booleans,
+    min_abs: Floats,
+) -> None:
     """Minimise the weighted squares of the Laplacian in place, by projected Gauss-Seidel sweeps.
 
     Sweeps run forwards and backwards in turn. The array `laplacian` holds the negative Laplacian, whose stencil has the

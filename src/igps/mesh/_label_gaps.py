@@ -31,7 +31,9 @@ def fill_missed_slices(mask: Booleans, notes: list[str]) -> Booleans:
             below, above = slices[: -width - 1], slices[width + 1 :]
             start, row, column = np.nonzero((below > 0) & (above > 0) & (below != above))
             pieces = np.sort([below[start, row, column], above[start, row, column]], axis=0)
-            lines.append(np.stack([*pieces, start, np.full(len(start), width), row, column], axis=1))
+            lines.append(
+                np.stack([*pieces, start, np.full(len(start), width), row, column], axis=1)
+            )
         gaps = np.concatenate(lines) if lines else np.zeros((0, 6), dtype=np.int64)
         for pair in np.unique(gaps[:, :2], axis=0):
             between = gaps[(gaps[:, :2] == pair).all(axis=1)]

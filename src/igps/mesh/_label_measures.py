@@ -39,7 +39,9 @@ class LabelVoxels:
 
     def measures(self) -> VoxelMeasures:
         n_pieces = ndimage.label(self.mask, np.ones((3, 3, 3)))[1]
-        return VoxelMeasures(int(np.count_nonzero(self.mask)), int(n_pieces), thinnest_part(self.mask))
+        return VoxelMeasures(
+            int(np.count_nonzero(self.mask)), int(n_pieces), thinnest_part(self.mask)
+        )
 
 
 def thinnest_part(mask: Booleans) -> int:
@@ -50,7 +52,9 @@ def thinnest_part(mask: Booleans) -> int:
     cubes = ndimage.maximum_filter(ndimage.minimum_filter(mask, cube), cube)
     if np.count_nonzero(cubes) >= _MIN_COVERED * n_voxels:
         return _MAX_DIAMETER
-    parts = 2 if mask.size < _MIN_WHOLE_VOXELS else 1  # an even thickness has its middle between voxels
+    parts = (
+        2 if mask.size < _MIN_WHOLE_VOXELS else 1
+    )  # an even thickness has its middle between voxels
     for axis in range(3):
         mask = np.repeat(mask, parts, axis=axis)
     radii = [float(d) if parts == 2 else (d + 1) / 2 for d in range(2, _MAX_DIAMETER + 1)]
@@ -70,7 +74,9 @@ def thinnest_part(mask: Booleans) -> int:
         for k in range(len(radii)):
             begin, end = _widen(low, high, reach[k])
             is_no_centre = depth[tuple(map(slice, begin - start, end - start))] < min_depths[k]
-            to_centre = _squared_distances(is_no_centre, reach[k])[tuple(map(slice, low - begin, high - begin))]
+            to_centre = _squared_distances(is_no_centre, reach[k])[
+                tuple(map(slice, low - begin, high - begin))
+            ]
             n_uncovered[k] += np.count_nonzero(block & (to_centre == reach[k]))
             if n_uncovered[k] > (1 - _MIN_COVERED) * parts**3 * n_voxels:
                 radii = radii[:k]  # larger balls need not be tried

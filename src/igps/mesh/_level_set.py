@@ -44,7 +44,9 @@ class Grid:
         return points * self.cell + self.origin
 
 
-def cell_sizes(vertices: Floats, faces: Integers, resolution: int, spacing: float) -> tuple[float, float]:
+def cell_sizes(
+    vertices: Floats, faces: Integers, resolution: int, spacing: float
+) -> tuple[float, float]:
     """Return the default and the minimal size of a cell, which differ only for long bodies.
 
     With the minimal size the grid has about as many cells, in all and on the surface, as a cube of side `resolution`.
@@ -70,13 +72,17 @@ def merge_near_vertices(vertices: Floats, faces: Integers) -> Surface:
     return mean, np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
 
 
-def distances(vertices: Floats, faces: Integers, shape: tuple[int, int, int]) -> tuple[Singles, Singles]:
+def distances(
+    vertices: Floats, faces: Integers, shape: tuple[int, int, int]
+) -> tuple[Singles, Singles]:
     """Return the distances (X, Y, Z), infinite beyond the band, and the nearest surface points (X, Y, Z, 3)."""
     import igl
 
     vertices, faces = np.asfortranarray(vertices), np.asfortranarray(faces)
     size = 8  # blocks that may be near the surface are halved until they are single grid points
-    blocks = np.stack(np.meshgrid(*(np.arange(0, n, size) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    blocks = np.stack(
+        np.meshgrid(*(np.arange(0, n, size) for n in shape), indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     while size > 1:
         centre = np.asfortranarray(blocks + (size - 1) / 2)
         squared, _, _ = igl.point_mesh_squared_distance(centre, vertices, faces)
@@ -85,7 +91,9 @@ def distances(vertices: Floats, faces: Integers, shape: tuple[int, int, int]) ->
         corner = size * np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         blocks = (blocks[near][:, None] + corner).reshape(-1, 3)
         blocks = blocks[(blocks < shape).all(axis=1)]
-    squared, _, point = igl.point_mesh_squared_distance(np.asfortranarray(blocks.astype(np.float64)), vertices, faces)
+    squared, _, point = igl.point_mesh_squared_distance(
+        np.asfortranarray(blocks.astype(np.float64)), vertices, faces
+    )
     distance = np.full(shape, np.inf, dtype=np.float32)
     nearest = np.zeros((*shape, 3), dtype=np.float32)
     in_band = squared <= _BAND**2
@@ -94,7 +102,9 @@ def distances(vertices: Floats, faces: Integers, shape: tuple[int, int, int]) ->
     return distance, nearest
 
 
-def level_set(distance: Singles, nearest: Singles, outside: Booleans, surface: OrientedSurface) -> Singles:
+def level_set(
+    distance: Singles, nearest: Singles, outside: Booleans, surface: OrientedSurface
+) -> Singles:
     """Return the signed distance to the surface; sheets, which enclose nothing, get about a cell of thickness."""
     from skimage.segmentation import watershed
 
@@ -121,14 +131,20 @@ def level_set(distance: Singles, nearest: Singles, outside: Booleans, surface: O
         inside[tuple(thin[surface.winding(thin) > 0.5].T)] = True
         is_solid = _is_solid(inside, at, foot, normal)
     # At least MIN_ABS_VALUE, because zero would have no sign.
-    field = np.where(inside, -1, 1) * np.clip(distance, np.float32(MIN_ABS_VALUE), np.float32(_BAND))
+    field = np.where(inside, -1, 1) * np.clip(
+        distance, np.float32(MIN_ABS_VALUE), np.float32(_BAND)
+    )
     sheet = tuple(index[~is_solid] for index in at)
     field[sheet] = distance[sheet] - _HALF_SHEET
-    field = np.where(np.abs(field) < MIN_ABS_VALUE, np.where(field < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE), field)
+    field = np.where(
+        np.abs(field) < MIN_ABS_VALUE, np.where(field < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE), field
+    )
     return fill_bubbles(field.astype(np.float32))
 
 
-def _is_solid(inside: Booleans, at: tuple[Integers, ...], foot: NDArray[Any], normal: NDArray[Any]) -> Booleans:
+def _is_solid(
+    inside: Booleans, at: tuple[Integers, ...], foot: NDArray[Any], normal: NDArray[Any]
+) -> Booleans:
     """Return whether each grid point is inside, or has an inside behind its nearest surface point."""
     is_solid = inside[at]
     for step in (0.25, 0.5, 0.75, 1.0):

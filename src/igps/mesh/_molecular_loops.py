@@ -12,7 +12,9 @@ _TURN = 2 * math.pi
 
 
 @compiled()
-def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: Integers) -> tuple[Floats, Integers]:
+def exposed_arcs(
+    centres: Floats, radii: Floats, first: Integers, neighbours: Integers
+) -> tuple[Floats, Integers]:
     """Return the arcs in which two spheres intersect outside all other balls, and which balls (A,) are exposed.
 
     No ball lies inside another. The neighbours of ball i, which intersect it, are `neighbours[first[i]:first[i + 1]]`.
@@ -31,7 +33,11 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
             j = neighbours[at]
             if j < i:
                 continue
-            ux, uy, uz = centres[j, 0] - centres[i, 0], centres[j, 1] - centres[i, 1], centres[j, 2] - centres[i, 2]
+            ux, uy, uz = (
+                centres[j, 0] - centres[i, 0],
+                centres[j, 1] - centres[i, 1],
+                centres[j, 2] - centres[i, 2],
+            )
             apart = math.sqrt(ux * ux + uy * uy + uz * uz)
             ux, uy, uz = ux / apart, uy / apart, uz / apart
             along = (apart * apart + radii[i] ** 2 - radii[j] ** 2) / (2 * apart)
@@ -39,7 +45,11 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
             if square <= 0:
                 continue
             radius = math.sqrt(square)
-            mx, my, mz = centres[i, 0] + along * ux, centres[i, 1] + along * uy, centres[i, 2] + along * uz
+            mx, my, mz = (
+                centres[i, 0] + along * ux,
+                centres[i, 1] + along * uy,
+                centres[i, 2] + along * uz,
+            )
             # Any direction across the normal.
             if abs(ux) < 0.6:
                 ax, ay, az = 0.0, uz, -uy
@@ -85,7 +95,20 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
                 if start > covered_to:
                     if n_arcs == len(arcs):
                         arcs = np.concatenate((arcs, np.empty_like(arcs)))
-                    arcs[n_arcs] = (mx, my, mz, ax, ay, az, ux, uy, uz, radius, covered_to, start - covered_to)
+                    arcs[n_arcs] = (
+                        mx,
+                        my,
+                        mz,
+                        ax,
+                        ay,
+                        az,
+                        ux,
+                        uy,
+                        uz,
+                        radius,
+                        covered_to,
+                        start - covered_to,
+                    )
                     n_arcs += 1
                     exposed[i] = exposed[j] = 1
                 if position < n_covered:
@@ -127,9 +150,17 @@ def depths(
 
 @compiled()
 def distances_outside(
-    depth: Singles, owner: NDArray[np.int32], centres: Floats, radii: Floats, first: Integers,
-    neighbours: Integers, exposed: Integers, arcs: Floats, spacing: float, reach: float,
-) -> Singles:  # fmt: skip
+    depth: Singles,
+    owner: NDArray[np.int32],
+    centres: Floats,
+    radii: Floats,
+    first: Integers,
+    neighbours: Integers,
+    exposed: Integers,
+    arcs: Floats,
+    spacing: float,
+    reach: float,
+) -> Singles:
     """Return the distance of each grid point inside the balls from the space outside all balls.
 
     The nearest point of that space lies on a sphere, on an arc of two, or at the end of an arc. If it lies on a sphere,
@@ -151,13 +182,25 @@ def distances_outside(
                 i = owner[x, y, z]
                 free = exposed[i] == 1
                 if free and first[i] < first[i + 1]:
-                    dx, dy, dz = x * spacing - centres[i, 0], y * spacing - centres[i, 1], z * spacing - centres[i, 2]
+                    dx, dy, dz = (
+                        x * spacing - centres[i, 0],
+                        y * spacing - centres[i, 1],
+                        z * spacing - centres[i, 2],
+                    )
                     size = math.sqrt(dx * dx + dy * dy + dz * dz)
                     scale = radii[i] / max(size, 1e-9)
-                    px, py, pz = centres[i, 0] + scale * dx, centres[i, 1] + scale * dy, centres[i, 2] + scale * dz
+                    px, py, pz = (
+                        centres[i, 0] + scale * dx,
+                        centres[i, 1] + scale * dy,
+                        centres[i, 2] + scale * dz,
+                    )
                     for at in range(first[i], first[i + 1]):
                         k = neighbours[at]
-                        square = (px - centres[k, 0]) ** 2 + (py - centres[k, 1]) ** 2 + (pz - centres[k, 2]) ** 2
+                        square = (
+                            (px - centres[k, 0]) ** 2
+                            + (py - centres[k, 1]) ** 2
+                            + (pz - centres[k, 2]) ** 2
+                        )
                         if square < radii[k] * radii[k]:
                             free = False
                             break
@@ -196,8 +239,16 @@ def distances_outside(
                         if a * ch + b * sh >= narrow * across:
                             square = (across - radius) ** 2 + h * h
                         else:
-                            square = (x * spacing - ex) ** 2 + (y * spacing - ey) ** 2 + (z * spacing - ez) ** 2
-                            other = (x * spacing - fx) ** 2 + (y * spacing - fy) ** 2 + (z * spacing - fz) ** 2
+                            square = (
+                                (x * spacing - ex) ** 2
+                                + (y * spacing - ey) ** 2
+                                + (z * spacing - ez) ** 2
+                            )
+                            other = (
+                                (x * spacing - fx) ** 2
+                                + (y * spacing - fy) ** 2
+                                + (z * spacing - fz) ** 2
+                            )
                             square = min(square, other)
                         if square < distance[x, y, z] ** 2:
                             distance[x, y, z] = math.sqrt(square)
@@ -224,9 +275,18 @@ def cubic_values(field: Singles, points: Floats) -> Floats:
             cell = min(max(math.floor(points[p, axis]), 1), field.shape[axis] - 3)
             t = points[p, axis] - cell
             low[axis] = cell - 1
-            weight[axis, 0], slope[axis, 0] = 0.5 * t * (-1 + t * (2 - t)), 0.5 * (-1 + t * (4 - 3 * t))
-            weight[axis, 1], slope[axis, 1] = 0.5 * (2 + t * t * (3 * t - 5)), 0.5 * t * (9 * t - 10)
-            weight[axis, 2], slope[axis, 2] = 0.5 * t * (1 + t * (4 - 3 * t)), 0.5 * (1 + t * (8 - 9 * t))
+            weight[axis, 0], slope[axis, 0] = (
+                0.5 * t * (-1 + t * (2 - t)),
+                0.5 * (-1 + t * (4 - 3 * t)),
+            )
+            weight[axis, 1], slope[axis, 1] = (
+                0.5 * (2 + t * t * (3 * t - 5)),
+                0.5 * t * (9 * t - 10),
+            )
+            weight[axis, 2], slope[axis, 2] = (
+                0.5 * t * (1 + t * (4 - 3 * t)),
+                0.5 * (1 + t * (8 - 9 * t)),
+            )
             weight[axis, 3], slope[axis, 3] = 0.5 * t * t * (t - 1), 0.5 * t * (3 * t - 2)
         value = along_x = along_y = along_z = 0.0
         for a in range(4):

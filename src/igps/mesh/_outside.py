@@ -49,7 +49,9 @@ class OrientedSurface:
     def of(cls, vertices: Floats, faces: Integers) -> Self:
         import igl
 
-        _, first, index = np.unique(np.round(vertices, 4), axis=0, return_index=True, return_inverse=True)
+        _, first, index = np.unique(
+            np.round(vertices, 4), axis=0, return_index=True, return_inverse=True
+        )
         vertices, faces = vertices[first], index.ravel()[faces]
         faces = faces[(np.diff(np.sort(faces, axis=1), axis=1) > 0).all(axis=1)]
         if not len(faces):
@@ -61,7 +63,11 @@ class OrientedSurface:
         # The outward side of an open part is a guess. Reversing a part negates its share of the winding numbers: parts
         # are reversed, one by one, as long as that brings the winding numbers closer to whole numbers.
         area = np.bincount(part, weights=face_areas(vertices, faces))
-        large = [k for k in np.argsort(-area)[:_MAX_REVERSED].tolist() if area[k] > _MIN_REVERSED_AREA * area.sum()]
+        large = [
+            k
+            for k in np.argsort(-area)[:_MAX_REVERSED].tolist()
+            if area[k] > _MIN_REVERSED_AREA * area.sum()
+        ]
         shares = [cls(vertices, faces[part == k], False).winding(points) for k in large]
         share_of_small = cls(vertices, faces[~np.isin(part, large)], False).winding(points)
         total = np.sum([share_of_small, *shares], axis=0)
@@ -76,7 +82,11 @@ class OrientedSurface:
             faces = np.ascontiguousarray(faces[:, ::-1])
         surface = cls(vertices, faces, _defect(total) < _NEARLY_CLOSED)
         is_hidden = total.reshape(2, -1).min(axis=0) > 0.5
-        if surface.is_nearly_closed or is_hidden.mean() < _MIN_HIDDEN or len(faces) > _MAX_FACES_FOR_HIDDEN:
+        if (
+            surface.is_nearly_closed
+            or is_hidden.mean() < _MIN_HIDDEN
+            or len(faces) > _MAX_FACES_FOR_HIDDEN
+        ):
             return surface
         visible = surface._drop_hidden_faces()
         return visible if visible.is_nearly_closed else surface
@@ -84,7 +94,9 @@ class OrientedSurface:
     @property
     def thickness(self) -> float:
         """Volume over area, cells: half of a plate's thickness, half of a rod's radius, a third of a ball's radius."""
-        return signed_volume(self.vertices, self.faces) / float(face_areas(self.vertices, self.faces).sum())
+        return signed_volume(self.vertices, self.faces) / float(
+            face_areas(self.vertices, self.faces).sum()
+        )
 
     def winding(self, points: NDArray[Any]) -> Floats:
         """Return the winding numbers (P,) about points (P, 3)."""
@@ -99,7 +111,10 @@ class OrientedSurface:
 
     def _drop_hidden_faces(self) -> Self:
         """Drop the faces with the inside on both sides, such as walls between solids that were put together."""
-        normals, middle = unit(area_vectors(self.vertices, self.faces)), self.vertices[self.faces].mean(axis=1)
+        normals, middle = (
+            unit(area_vectors(self.vertices, self.faces)),
+            self.vertices[self.faces].mean(axis=1),
+        )
         lower = np.minimum(*(self.winding(middle + side * normals) for side in (0.25, -0.25)))
         faces = self.faces[lower <= 0.5]
         if not len(faces):
@@ -144,7 +159,9 @@ def find_outside(distance: Singles, surface: OrientedSurface) -> tuple[Booleans,
     return watershed(-depth, markers, mask=outside) == 1, count
 
 
-def _outside_by_winding(outside: Booleans, distance: Singles, surface: OrientedSurface) -> tuple[Booleans, int]:
+def _outside_by_winding(
+    outside: Booleans, distance: Singles, surface: OrientedSurface
+) -> tuple[Booleans, int]:
     near = np.argwhere(outside & np.isfinite(distance))
     # A third of the points beside the surface suffices to see whether the flood entered anywhere.
     probe = near[near.sum(axis=1) % 3 == 0]
@@ -152,7 +169,10 @@ def _outside_by_winding(outside: Booleans, distance: Singles, surface: OrientedS
     if not len(leaked):
         return outside, 0
     # Check every flooded point near the leaks.
-    low, high = np.maximum(leaked.min(axis=0) - 4, 0), np.minimum(leaked.max(axis=0) + 5, outside.shape)
+    low, high = (
+        np.maximum(leaked.min(axis=0) - 4, 0),
+        np.minimum(leaked.max(axis=0) + 5, outside.shape),
+    )
     box = tuple(map(slice, low, high))
     points = np.argwhere(outside[box]) + low
     inside = np.zeros_like(outside)

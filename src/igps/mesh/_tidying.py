@@ -10,7 +10,15 @@ from scipy.spatial import Delaunay, cKDTree
 
 from igps._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.surface import compact, diagonal, directed_edges, face_areas, face_parts, signed_volume, undirected_edges
+from igps.mesh.surface import (
+    compact,
+    diagonal,
+    directed_edges,
+    face_areas,
+    face_parts,
+    signed_volume,
+    undirected_edges,
+)
 from igps.mesh.winding import winding_number
 
 _WELD = 1e-8  # vertices closer than this share of the bounding box's diagonal are welded
@@ -31,7 +39,9 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     The remaining vertices and faces keep their order.
     """
     n_before = len(vertices)
-    vertices, faces = compact(vertices, faces)  # the tolerance must not depend on unused vertices far away
+    vertices, faces = compact(
+        vertices, faces
+    )  # the tolerance must not depend on unused vertices far away
     n_unused = n_before - len(vertices)
     place = places(vertices)
     place = _close_cracks(vertices, place[faces])[place]
@@ -56,8 +66,12 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
 def places(vertices: Floats) -> Integers:
     """Return, for each vertex (V,), the index of the first vertex at the same place, up to a tolerance."""
-    lattice = np.round((vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny)))
-    _, first, index = np.unique(lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True)
+    lattice = np.round(
+        (vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny))
+    )
+    _, first, index = np.unique(
+        lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
     return np.asarray(first[index.ravel()])
 
 
@@ -76,8 +90,12 @@ def _close_cracks(vertices: Floats, faces: Integers) -> Integers:
     if tree.count_neighbors(tree, width) > _MAX_CRACK_NEIGHBOURS * len(boundary):
         return index
     pairs = tree.query_pairs(width, output_type="ndarray")
-    graph = sparse.coo_array((np.ones(len(pairs), dtype=np.int8), tuple(pairs.T)), shape=(len(boundary),) * 2)
-    _, first, group = np.unique(connected_components(graph, directed=False)[1], return_index=True, return_inverse=True)
+    graph = sparse.coo_array(
+        (np.ones(len(pairs), dtype=np.int8), tuple(pairs.T)), shape=(len(boundary),) * 2
+    )
+    _, first, group = np.unique(
+        connected_components(graph, directed=False)[1], return_index=True, return_inverse=True
+    )
     index[boundary] = boundary[first[group]]
     return index
 
@@ -137,7 +155,9 @@ def _drop_fins(vertices: Floats, faces: Integers) -> Integers:
     return remaining if area >= (1 - _MAX_FINS) * face_areas(vertices, faces).sum() else faces
 
 
-def drop_hidden_parts(vertices: Floats, faces: Integers, notes: list[str], *, cavities: bool = False) -> Surface:
+def drop_hidden_parts(
+    vertices: Floats, faces: Integers, notes: list[str], *, cavities: bool = False
+) -> Surface:
     """Drop the parts that lie inside the largest one, if that is closed.
 
     With `cavities`, closed parts inside that lie in no other cavity are kept and oriented inward, to bound hollows.
@@ -165,7 +185,10 @@ def drop_hidden_parts(vertices: Floats, faces: Integers, notes: list[str], *, ca
                 hollow = Mesh(*surface)
             except MeshError:
                 continue
-            if any((winding_number(other.vertices, other.faces, hollow.vertices) > 0.5).any() for other in hollows):
+            if any(
+                (winding_number(other.vertices, other.faces, hollow.vertices) > 0.5).any()
+                for other in hollows
+            ):
                 continue
             hollows.append(hollow)
             is_hidden[k] = False

@@ -5,7 +5,15 @@ import numpy as np
 from igps._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh._tidying import SPECK, fill_small_holes, orient, tidy, weld
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.surface import area_vectors, compact, diagonal, face_areas, face_parts, face_patches, unit
+from igps.mesh.surface import (
+    area_vectors,
+    compact,
+    diagonal,
+    face_areas,
+    face_parts,
+    face_patches,
+    unit,
+)
 
 _MIN_OPEN = 0.03  # a point of a surface is visible if this share of the directions on one of its sides is free
 _N_DIRECTIONS, _SAMPLES_PER_PATCH = 100, 30
@@ -40,9 +48,14 @@ def drop_inner_walls(vertices: Floats, faces: Integers, notes: list[str]) -> Sur
 
 
 def _superfluous_patch(
-    points: Floats, faces: Integers, patch: Integers, ends_at_others: Booleans, samples: Floats,
-    face_of_sample: Integers, is_visible: Booleans,
-) -> int:  # fmt: skip
+    points: Floats,
+    faces: Integers,
+    patch: Integers,
+    ends_at_others: Booleans,
+    samples: Floats,
+    face_of_sample: Integers,
+    is_visible: Booleans,
+) -> int:
     """Return the next patch to drop, or -1; dropped faces have the patch -1."""
     import igl
 
@@ -50,19 +63,27 @@ def _superfluous_patch(
     size = np.bincount(patch[is_left], face_areas(points, faces[is_left]))
     in_patch = patch_of_sample >= 0
     n_samples = np.maximum(np.bincount(patch_of_sample[in_patch], minlength=len(size)), 1)
-    visible_share = np.bincount(patch_of_sample[in_patch], is_visible[in_patch], len(size)) / n_samples
+    visible_share = (
+        np.bincount(patch_of_sample[in_patch], is_visible[in_patch], len(size)) / n_samples
+    )
     for k in np.lexsort((size, visible_share)).tolist():
         if not ends_at_others[k]:
             continue
         visible = np.ascontiguousarray(samples[(patch_of_sample == k) & is_visible])
         others = faces[is_left & (patch != k)]
-        squared = igl.point_mesh_squared_distance(visible, points, others)[0] if len(visible) else np.zeros(1)
+        squared = (
+            igl.point_mesh_squared_distance(visible, points, others)[0]
+            if len(visible)
+            else np.zeros(1)
+        )
         if np.max(squared) <= _COINCIDENT**2:
             return k
     return -1
 
 
-def _sample_patches(points: Floats, faces: Integers, patch: Integers) -> tuple[Floats, Integers, Booleans]:
+def _sample_patches(
+    points: Floats, faces: Integers, patch: Integers
+) -> tuple[Floats, Integers, Booleans]:
     """Sample each patch uniformly by area, reproducibly: points (S, 3), their faces (S,), and which are visible."""
     import igl
 
@@ -72,12 +93,20 @@ def _sample_patches(points: Floats, faces: Integers, patch: Integers) -> tuple[F
     for k in range(int(patch.max()) + 1):
         members = np.nonzero((patch == k) & (areas > 0))[0]
         if len(members):
-            chosen.append(generator.choice(members, _SAMPLES_PER_PATCH, p=areas[members] / areas[members].sum()))
+            chosen.append(
+                generator.choice(
+                    members, _SAMPLES_PER_PATCH, p=areas[members] / areas[members].sum()
+                )
+            )
     face = np.concatenate(chosen)
-    samples = np.einsum("sc,scx->sx", generator.dirichlet(np.ones(3), len(face)), points[faces[face]])
+    samples = np.einsum(
+        "sc,scx->sx", generator.dirichlet(np.ones(3), len(face)), points[faces[face]]
+    )
     normals = unit(area_vectors(points, faces[face]))
     occlusion = [
-        np.asarray(igl.ambient_occlusion(points, faces, samples, np.ascontiguousarray(side), _N_DIRECTIONS)).ravel()
+        np.asarray(
+            igl.ambient_occlusion(points, faces, samples, np.ascontiguousarray(side), _N_DIRECTIONS)
+        ).ravel()
         for side in (normals, -normals)
     ]
     return samples, face, 1 - np.minimum(*occlusion) > _MIN_OPEN
@@ -104,7 +133,9 @@ def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
             body = Mesh(points, triangles)
         except MeshError:
             return vertices, faces
-        solid = manifold3d.Manifold(manifold3d.Mesh64(body.vertices.copy(), body.faces.astype(np.uint64)))
+        solid = manifold3d.Manifold(
+            manifold3d.Mesh64(body.vertices.copy(), body.faces.astype(np.uint64))
+        )
         if solid.status() != manifold3d.Error.NoError:
             return vertices, faces
         solids.append(solid)
@@ -113,4 +144,6 @@ def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
         return vertices, faces
     mesh = union.to_mesh64()
     notes.append(f"united {len(solids)} closed parts that overlap")
-    return np.asarray(mesh.vert_properties)[:, :3].copy(), np.asarray(mesh.tri_verts, dtype=np.int64)
+    return np.asarray(mesh.vert_properties)[:, :3].copy(), np.asarray(
+        mesh.tri_verts, dtype=np.int64
+    )

@@ -92,7 +92,10 @@ class Neighbours:
         rows, columns = edges.T.ravel(), edges[:, ::-1].T.ravel()
         degree = np.maximum(np.bincount(rows, minlength=n), 1)
         length = np.tile(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 2)
-        weights, mean_length = np.ones(len(rows)), np.bincount(rows, weights=length, minlength=n) / degree
+        weights, mean_length = (
+            np.ones(len(rows)),
+            np.bincount(rows, weights=length, minlength=n) / degree,
+        )
         inverse_squares = np.maximum(length, _MIN_LENGTH) ** -2.0
         total = np.bincount(rows, weights=inverse_squares, minlength=n)
         # Zero at a vertex without neighbours, like the arithmetic mean.
@@ -156,19 +159,25 @@ def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats
             half_squares = 1 - np.einsum("ij,ij->i", here, guide[weights.indices])
             weights.data = size[weights.indices] * np.exp(-half_squares / _WIDTH**2)
             means[part] = weights @ normals
-        normals = guide = unit(means)  # after the smooth surface, each result is the guide of the next run
+        normals = guide = unit(
+            means
+        )  # after the smooth surface, each result is the guide of the next run
     return normals
 
 
 def _fit_to_normals(vertices: Floats, faces: Integers, normals: Floats, free: Floats) -> Floats:
     """Move the vertices (V, 3), where `free` (V, 1) is 1, until their faces have about the given normals (F, 3)."""
     to_vertices = _incidence(faces, len(vertices)).T.tocsr()
-    projections = (to_vertices @ (normals[:, :, None] * normals[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
+    projections = (to_vertices @ (normals[:, :, None] * normals[:, None]).reshape(-1, 9)).reshape(
+        -1, 3, 3
+    )
     share = free / np.maximum(to_vertices.sum(axis=1), 1)[:, None]
     for _ in range(_N_STEPS):
         # The mean projection, on their normals, of the vectors to the centroids of the faces around.
         heights = np.einsum("ij,ij->i", normals, vertices[faces].mean(axis=1))
-        move = to_vertices @ (heights[:, None] * normals) - np.einsum("vij,vj->vi", projections, vertices)
+        move = to_vertices @ (heights[:, None] * normals) - np.einsum(
+            "vij,vj->vi", projections, vertices
+        )
         vertices = vertices + share * move
     return vertices
 
@@ -176,7 +185,9 @@ def _fit_to_normals(vertices: Floats, faces: Integers, normals: Floats, free: Fl
 def _incidence(faces: Integers, n_vertices: int) -> sparse.csr_array:
     """(F, V) ones where a face has a vertex."""
     begins = 3 * np.arange(len(faces) + 1)
-    return sparse.csr_array((np.ones(faces.size), faces.ravel(), begins), shape=(len(faces), n_vertices))
+    return sparse.csr_array(
+        (np.ones(faces.size), faces.ravel(), begins), shape=(len(faces), n_vertices)
+    )
 
 
 def noise_and_edge(vertices: Floats, faces: Integers, around: Neighbours) -> tuple[float, float]:

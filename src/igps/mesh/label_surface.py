@@ -41,9 +41,14 @@ _MAX_THIN = 0.005  # maximal share of a label that may be too thin for a coarser
 
 
 def voxel_surface(
-    inside: ArrayLike, affine: ArrayLike | None = None, *, max_vertices: int = MAX_VERTICES, cavities: bool = False,
-    joins: bool = False, name: str = "volume",
-) -> tuple[Floats, Integers, tuple[str, ...]]:  # fmt: skip
+    inside: ArrayLike,
+    affine: ArrayLike | None = None,
+    *,
+    max_vertices: int = MAX_VERTICES,
+    cavities: bool = False,
+    joins: bool = False,
+    name: str = "volume",
+) -> tuple[Floats, Integers, tuple[str, ...]]:
     """Make a closed, outward oriented surface of the voxels of a body.
 
     The surface encloses the volume of the voxels. The centres of all voxels are on the right side of it, unless the
@@ -85,8 +90,12 @@ def voxel_surface(
     notes: list[str] = []
     mask = fill_missed_slices(mask[box], notes) if joins else mask[box]
     mask, hollows = _clean(mask, notes, MIN_VOXELS if cavities else None, name)
-    if cavities and (n_open := _n_nearly_enclosed(mask)) > _MIN_OPEN_CAVITY * np.count_nonzero(mask):
-        notes.append(f"a cavity of about {n_open} voxels is open through gaps of up to two voxels in its wall")
+    if cavities and (n_open := _n_nearly_enclosed(mask)) > _MIN_OPEN_CAVITY * np.count_nonzero(
+        mask
+    ):
+        notes.append(
+            f"a cavity of about {n_open} voxels is open through gaps of up to two voxels in its wall"
+        )
     share, factor = _coarsen(mask, spacing, max_vertices)
     mask = _thicken_contacts(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
@@ -105,7 +114,9 @@ def voxel_surface(
         radius = _BAR * math.sqrt(n_vertices / 1.5) * refinement
         field = join_pieces(field.astype(np.float32, copy=False), notes, radius)
         n_cells += np.count_nonzero(field < 0) - n_before
-    vertices, faces = _mesh(field, sides / n_parts, n_cells * (sides / n_parts).prod(), max_vertices, name)
+    vertices, faces = _mesh(
+        field, sides / n_parts, n_cells * (sides / n_parts).prod(), max_vertices, name
+    )
     # The centre of a block of `factor` voxels lies (factor - 1) / 2 beyond that of its first voxel.
     index = (vertices / sides - PAD) * factor + (factor - 1) / 2 + low
     if np.linalg.det(matrix[:3, :3]) < 0:
@@ -113,7 +124,9 @@ def voxel_surface(
     surfaces = [(index @ matrix[:3, :3].T + matrix[:3, 3], faces)]
     matrix = matrix @ np.block([[np.eye(3), low[:, None]], [np.zeros(3), 1]])
     for hollow in hollows:
-        points, triangles, cavity_notes = voxel_surface(hollow, matrix, max_vertices=max_vertices, name=name)
+        points, triangles, cavity_notes = voxel_surface(
+            hollow, matrix, max_vertices=max_vertices, name=name
+        )
         notes += [f"in a cavity: {note}" for note in cavity_notes]
         surfaces.append((points, triangles[:, ::-1]))
     return *stacked(surfaces), tuple(notes)
@@ -122,14 +135,23 @@ def voxel_surface(
 def voxel_spacing(affine: Floats, name: str) -> Floats:
     """Return the sides (3,) of a voxel, or raise a MeshError unless the affine is a finite invertible matrix (4, 4)."""
     if affine.shape != (4, 4) or not np.isfinite(affine).all():
-        raise MeshError(f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}.")
+        raise MeshError(
+            f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}."
+        )
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    if not spacing.all() or abs(np.linalg.det(affine[:3, :3] / np.where(spacing, spacing, 1))) < 1e-6:
-        raise MeshError(f"{name}: the affine is singular. Write the file again with spacing and axes of the voxels.")
+    if (
+        not spacing.all()
+        or abs(np.linalg.det(affine[:3, :3] / np.where(spacing, spacing, 1))) < 1e-6
+    ):
+        raise MeshError(
+            f"{name}: the affine is singular. Write the file again with spacing and axes of the voxels."
+        )
     return spacing
 
 
-def _clean(mask: Booleans, notes: list[str], min_hole: int | None, name: str) -> tuple[Booleans, list[Booleans]]:
+def _clean(
+    mask: Booleans, notes: list[str], min_hole: int | None, name: str
+) -> tuple[Booleans, list[Booleans]]:
     """Drop islands and fill holes. Also return the masks of the holes of at least `min_hole` voxels, none if None."""
     label, island, size = _islands(mask)
     if len(island):
@@ -137,10 +159,14 @@ def _clean(mask: Booleans, notes: list[str], min_hole: int | None, name: str) ->
         if 2 * n_dropped >= size.sum():  # such as lesions
             share = f"{name}: {n_dropped / size.sum():.0%} of the voxels lie in {len(island)} separate pieces"
             remedy = 'Read each piece as a body: LoadOptions(bodies="pieces"), --bodies pieces; or connect the pieces.'
-            raise MeshError(f"{share}, each below {_ISLAND:.0%} of the label; one body was expected. {remedy}")
+            raise MeshError(
+                f"{share}, each below {_ISLAND:.0%} of the label; one body was expected. {remedy}"
+            )
         mask = mask & ~np.isin(label, island)
         pieces = "1 small piece" if len(island) == 1 else f"{len(island)} small pieces"
-        notes.append(f"dropped {pieces} apart of {n_dropped} voxels, {n_dropped / size.sum():.1%} of the label")
+        notes.append(
+            f"dropped {pieces} apart of {n_dropped} voxels, {n_dropped / size.sum():.1%} of the label"
+        )
     # Voxels outside are connected only across faces.
     hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
     if n_hollow < 2:
@@ -181,7 +207,9 @@ def _thicken_contacts(mask: Booleans) -> Booleans:
             offset = np.array(step) - 1
             if np.abs(offset).sum() < 2 or tuple(offset) < (0, 0, 0):
                 continue
-            moved = padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(offset, mask.shape, strict=True))]
+            moved = padded[
+                tuple(slice(1 + d, 1 + d + n) for d, n in zip(offset, mask.shape, strict=True))
+            ]
             at = np.argwhere((label > 0) & (moved > 0) & (label != moved))
             for axis in np.nonzero(offset)[0][:-1]:
                 at[:, axis] += offset[axis]
@@ -195,7 +223,9 @@ def _thicken_contacts(mask: Booleans) -> Booleans:
 def _n_vertices(mask: Booleans, sides: Floats) -> float:
     """Estimate how many vertices marching cubes make on a grid as fine as the shortest side."""
     masks = [np.moveaxis(mask, axis, 0) for axis in range(3)]
-    n_cuts = np.array([np.count_nonzero(m[1:] != m[:-1]) + np.count_nonzero(m[[0, -1]]) for m in masks])
+    n_cuts = np.array(
+        [np.count_nonzero(m[1:] != m[:-1]) + np.count_nonzero(m[[0, -1]]) for m in masks]
+    )
     return float((n_cuts * sides.prod() / sides).sum() / sides.min() ** 2)
 
 
@@ -210,7 +240,9 @@ def _coarsen(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Single
         is_halved = sides < 1.5 * sides.min()
         if not _is_thick(mask, is_halved):
             break
-        coarse = block_reduce(share, tuple(np.where(is_halved, 2, 1)), np.mean)  # exact in single precision
+        coarse = block_reduce(
+            share, tuple(np.where(is_halved, 2, 1)), np.mean
+        )  # exact in single precision
         # Drop small pieces that were connected only by threads too thin for the coarse grid.
         label, island, size = _islands(coarse >= 0.5)
         if np.count_nonzero(size) - len(island) != n_pieces:
@@ -227,7 +259,9 @@ def _is_thick(mask: Booleans, axes: Booleans) -> bool:
     return bool(np.count_nonzero(mask & ~is_thick) <= _MAX_THIN * np.count_nonzero(mask))
 
 
-def _refine(field: Floats | Singles, share: Singles, n_parts: Integers, sides: Floats) -> Floats | Singles:
+def _refine(
+    field: Floats | Singles, share: Singles, n_parts: Integers, sides: Floats
+) -> Floats | Singles:
     """Interpolate the field between the centres of the voxels, and shift it to the level that gives their volume."""
     from scipy.interpolate import CubicSpline
 
@@ -237,7 +271,10 @@ def _refine(field: Floats | Singles, share: Singles, n_parts: Integers, sides: F
             index = np.arange(field.shape[axis])
             spline = CubicSpline(index, field, axis=axis, bc_type="natural")
             field = spline(np.linspace(0, index[-1], index[-1] * n + 1))
-    volume, min_abs = share.sum(dtype=np.float64) * n_parts.prod(), MIN_ABS_VALUE * float(sides.min())
+    volume, min_abs = (
+        share.sum(dtype=np.float64) * n_parts.prod(),
+        MIN_ABS_VALUE * float(sides.min()),
+    )
     for _ in range(_N_LEVELS):
         filled, slope = filled_volume(field, float(sides.sum()))
         field -= (volume - filled) / max(slope, 1e-9)
@@ -245,13 +282,18 @@ def _refine(field: Floats | Singles, share: Singles, n_parts: Integers, sides: F
     for axis, n in enumerate(n_parts.tolist()):
         both = inside & np.roll(inside, -1, axis)
         for part in range(n):
-            at = tuple(slice(part if k == axis else 0, None, step) for k, step in enumerate(n_parts.tolist()))
+            at = tuple(
+                slice(part if k == axis else 0, None, step)
+                for k, step in enumerate(n_parts.tolist())
+            )
             line = field[at]
             line[both[tuple(slice(size) for size in line.shape)] & (line > -min_abs)] = -min_abs
     return field
 
 
-def _mesh(field: Floats | Singles, sides: Floats, volume: float, max_vertices: int, name: str) -> Surface:
+def _mesh(
+    field: Floats | Singles, sides: Floats, volume: float, max_vertices: int, name: str
+) -> Surface:
     """Mesh the zero level of a field as closed pieces of this volume; the sides of a cell are about equal."""
     cell = float(sides.min())
     min_abs = MIN_ABS_VALUE * cell
@@ -261,9 +303,15 @@ def _mesh(field: Floats | Singles, sides: Floats, volume: float, max_vertices: i
     pieces = connected(vertices, faces)
     volumes = np.abs([signed_volume(*piece) for piece in pieces])
     parts = []
-    for piece in [piece for piece, size in zip(pieces, volumes, strict=True) if size > _SPECK * volumes.sum()]:
+    for piece in [
+        piece for piece, size in zip(pieces, volumes, strict=True) if size > _SPECK * volumes.sum()
+    ]:
         if signed_volume(*piece) < 0:
             piece = piece[0], piece[1][:, ::-1]
-        parts.append(simplify_surface(*piece, max(round(max_vertices * len(piece[0]) / len(vertices)), 50)))
+        parts.append(
+            simplify_surface(*piece, max(round(max_vertices * len(piece[0]) / len(vertices)), 50))
+        )
     points, triangles = stacked(parts)
-    return restore_volume(points, triangles, volume / cell**3) * cell, np.ascontiguousarray(triangles)
+    return restore_volume(points, triangles, volume / cell**3) * cell, np.ascontiguousarray(
+        triangles
+    )

@@ -10,7 +10,10 @@ _BYTES_PER_FACE = 1000
 # File size of a triangle in formats whose header has no number of triangles: OBJ, and text STL.
 _OBJ_BYTES, _TEXT_STL_BYTES = 35, 200
 _BYTES_PER_CELL = 40  # memory per grid cell while the cells inside a body are found
-_MIN_CHECKED_FILE, _MIN_CHECKED_GRID = 1 << 20, 1 << 26  # bytes; smaller files and grids are not checked
+_MIN_CHECKED_FILE, _MIN_CHECKED_GRID = (
+    1 << 20,
+    1 << 26,
+)  # bytes; smaller files and grids are not checked
 
 
 def check_memory(path: Path) -> None:
@@ -50,7 +53,9 @@ def expected_faces(path: Path) -> int:
     if suffix == ".stl":
         count = int.from_bytes(head[80:84], "little")
         n_faces = count if size == 84 + 50 * count else size // _TEXT_STL_BYTES
-    return min(n_faces, size // 2)  # a header may be damaged; a triangle takes at least two bytes in any format
+    return min(
+        n_faces, size // 2
+    )  # a header may be damaged; a triangle takes at least two bytes in any format
 
 
 def available_memory() -> int | None:
@@ -59,7 +64,11 @@ def available_memory() -> int | None:
     This is the minimum over the limits of the process, of its control groups and of the machine.
     """
     kilobytes = _number(Path("/proc/meminfo"), r"^MemAvailable:\s+")
-    bounds = (_memory_in_limits(), _memory_in_groups(), None if kilobytes is None else 1024 * kilobytes)
+    bounds = (
+        _memory_in_limits(),
+        _memory_in_groups(),
+        None if kilobytes is None else 1024 * kilobytes,
+    )
     return min((n_bytes for n_bytes in bounds if n_bytes is not None), default=None)
 
 
@@ -78,21 +87,37 @@ def _memory_in_limits() -> int | None:
     return min(available, default=None)
 
 
-def _memory_in_groups(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> int | None:
+def _memory_in_groups(
+    root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")
+) -> int | None:
     """Return the minimum over the control group of the process and its parents, for cgroup versions 1 and 2."""
     lines = [line.split(":", 2) for line in _text(own).splitlines()]
     available = []
     for mount, limit, usage, cache, controller in (
         (root, "memory.max", "memory.current", "inactive_file", ""),
-        (root / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file", "memory"),
+        (
+            root / "memory",
+            "memory.limit_in_bytes",
+            "memory.usage_in_bytes",
+            "total_inactive_file",
+            "memory",
+        ),
     ):
-        paths = [line[2].strip("/") for line in lines if len(line) == 3 and controller in line[1].split(",")]
+        paths = [
+            line[2].strip("/")
+            for line in lines
+            if len(line) == 3 and controller in line[1].split(",")
+        ]
         # A container may see its own group as the root, whatever the path says.
-        for folder in {folder for path in ["", *paths] for folder in (mount / path, *(mount / path).parents)}:
+        for folder in {
+            folder for path in ["", *paths] for folder in (mount / path, *(mount / path).parents)
+        }:
             max_bytes, current = _number(folder / limit), _number(folder / usage)
             if max_bytes is not None and current is not None:
                 # The kernel frees cached files when memory is needed.
-                available.append(max_bytes - current + (_number(folder / "memory.stat", rf"^{cache}\s+") or 0))
+                available.append(
+                    max_bytes - current + (_number(folder / "memory.stat", rf"^{cache}\s+") or 0)
+                )
     return min(available, default=None)
 
 

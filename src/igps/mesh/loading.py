@@ -45,7 +45,11 @@ def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[
 
 @one_thread()
 def load_mesh(
-    path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None, least_vertices: int = 0
+    path: str | Path,
+    options: LoadOptions = LoadOptions(),
+    *,
+    part: str | None = None,
+    least_vertices: int = 0,
 ) -> Mesh:
     """Read a mesh, a point cloud, a label volume or a molecule, and make a body of it.
 
@@ -87,21 +91,29 @@ def load_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[
 
 
 def each_body(
-    path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None,
+    path: str | Path,
+    options: LoadOptions = LoadOptions(),
+    *,
+    parts: Sequence[str | None] | None = None,
     least_vertices: int = 0,
-) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:  # fmt: skip
+) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:
     """Iterate over the bodies of a file, or over the given parts; the MeshError of an unusable body takes its place."""
     for ref, raw in each_surface(path, options, parts=parts):
         with one_thread():
             try:
-                body: Mesh | MeshError = surface_body(raw, ref, options, least_vertices=least_vertices)
+                body: Mesh | MeshError = surface_body(
+                    raw, ref, options, least_vertices=least_vertices
+                )
             except MeshError as error:
                 body = error
         yield ref, body
 
 
 def each_surface(
-    path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None
+    path: str | Path,
+    options: LoadOptions = LoadOptions(),
+    *,
+    parts: Sequence[str | None] | None = None,
 ) -> Iterator[tuple[BodyRef, RawBody]]:
     """Iterate over the unchecked surfaces of the bodies of a file, or of the given parts; see `each_body`."""
     path = Path(path)
@@ -117,7 +129,9 @@ def each_surface(
             yield ref, body
 
 
-def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None) -> RawBody:
+def read_surface(
+    path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None
+) -> RawBody:
     """Return the unchecked surface of a body as it is in the file; for `part` and the errors see `load_mesh`."""
     path = Path(path)
     bodies = _read(path, options, part)
@@ -128,13 +142,17 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
     names = [body.part for body in (bodies if part is None else list_bodies(path, options))]
     shown = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
     if part is None:
-        raise MeshError(f"{path}: holds {len(names)} bodies: {shown}. Name one as part=, or read all by load_bodies.")
+        raise MeshError(
+            f"{path}: holds {len(names)} bodies: {shown}. Name one as part=, or read all by load_bodies."
+        )
     if names == [None]:
         raise MeshError(f"{path}: is a single body, and has no body {part!r}. Leave out the name.")
     raise MeshError(f"{path}: has no body {part!r}; there are: {shown}. Choose one of them.")
 
 
-def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> Mesh:
+def surface_body(
+    raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0
+) -> Mesh:
     """Make a body of a surface, see `load_mesh`; a MeshError if the surface is not usable."""
     if raw.fault is not None:
         raise raw.fault
@@ -156,15 +174,24 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
             if options.mend == "never":
                 raise
     mesh = mend(
-        vertices, faces, how=options.mend, least_vertices=least_vertices, normals=raw.normals,
-        cavities=options.cavities, denoise=raw.denoise, name=name, notes=notes,
-    )  # fmt: skip
+        vertices,
+        faces,
+        how=options.mend,
+        least_vertices=least_vertices,
+        normals=raw.normals,
+        cavities=options.cavities,
+        denoise=raw.denoise,
+        name=name,
+        notes=notes,
+    )
     return mesh.annotated(unit=raw.unit)
 
 
 def _rounding_notes(vertices: Floats, name: str) -> list[str]:
     """Return a note if coordinates in single precision are so far from the origin that rounding changes the shape."""
-    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are rejected later
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # values that are not finite are rejected later
         single = vertices.astype(np.float32)
         step = float(np.spacing(np.abs(single).max(initial=0)))
         size = diagonal(vertices) if len(vertices) else 0.0
@@ -186,15 +213,25 @@ def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[Raw
         bodies = list(file_format.read(path, replace(options, bodies=kind), part))
         if kind == "whole":
             return [joined(bodies)]
-        return pieces(joined(bodies)) if kind == "pieces" and kind not in file_format.bodies else bodies
+        return (
+            pieces(joined(bodies))
+            if kind == "pieces" and kind not in file_format.bodies
+            else bodies
+        )
 
 
 def _body_kind(file_format: Format, options: LoadOptions) -> BodyKind:
-    return options.bodies if options.bodies in (*file_format.bodies, "whole", "pieces") else file_format.bodies[0]
+    return (
+        options.bodies
+        if options.bodies in (*file_format.bodies, "whole", "pieces")
+        else file_format.bodies[0]
+    )
 
 
 def _format(path: Path) -> Format:
-    if not os.path.isfile(path):  # unlike Path.is_file, it raises nothing for names that no file can have
+    if not os.path.isfile(
+        path
+    ):  # unlike Path.is_file, it raises nothing for names that no file can have
         if os.path.isdir(path):
             raise MeshError(f"{path}: expected a file, got a folder. Name each file in it.")
         raise MeshError(f"{path}: no such file. Check the path.")

@@ -30,7 +30,9 @@ Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertig
 MENDING_VERSION = 8
 """Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
 
-_STARTS: dict[str, Step] = {step: step for step in get_args(Step)}  # steps by the first words of their notes
+_STARTS: dict[str, Step] = {
+    step: step for step in get_args(Step)
+}  # steps by the first words of their notes
 _STARTS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
 # A mesh with too few vertices is subdivided to this multiple of the minimum: with just enough vertices the last
 # eigenfunctions would depend on the triangles.
@@ -38,10 +40,17 @@ _SUBDIVISION_FACTOR = 4
 
 
 def mend(
-    vertices: Floats, faces: Integers | None, *, how: Mending = "auto", least_vertices: int = 0,
-    normals: Floats | None = None, cavities: Cavities = "fill", denoise: bool = True, name: str = "mesh",
+    vertices: Floats,
+    faces: Integers | None,
+    *,
+    how: Mending = "auto",
+    least_vertices: int = 0,
+    normals: Floats | None = None,
+    cavities: Cavities = "fill",
+    denoise: bool = True,
+    name: str = "mesh",
     notes: tuple[str, ...] = (),
-) -> Mesh:  # fmt: skip
+) -> Mesh:
     """Make a body of a surface in any state, by as few repairs as possible.
 
     Repairs are made in this order, until the surface is a body: weld coincident vertices, drop degenerate and duplicate
@@ -67,24 +76,37 @@ def mend(
     """
     check_one_of(get_args(Mending), how=how)
     if how == "never":
-        return Mesh(vertices, np.asarray(faces), name=name, notes=notes, cavities=cavities == "keep")
+        return Mesh(
+            vertices, np.asarray(faces), name=name, notes=notes, cavities=cavities == "keep"
+        )
     if faces is None or np.size(faces) == 0:
         vertices = np.asarray(vertices, dtype=np.float64)
         if vertices.size == 0:
-            raise MeshError(f"{name}: the file is empty: no vertices and no faces. Export it again.")
+            raise MeshError(
+                f"{name}: the file is empty: no vertices and no faces. Export it again."
+            )
         check_coordinates(vertices, name)
         check_size(vertices, name)
         mesh = watertight(vertices, normals=normals, name=name)
     else:
         check_arrays(vertices, faces, name)
-        vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+        vertices, triangles = (
+            np.asarray(vertices, dtype=np.float64),
+            np.asarray(faces, dtype=np.int64),
+        )
         if len(triangles) == 1:
-            raise MeshError(f"{name}: expected a closed surface, got a single triangle. Export it again.")
+            raise MeshError(
+                f"{name}: expected a closed surface, got a single triangle. Export it again."
+            )
         corners = vertices[triangles]
         if (corners == corners[:, :1]).all():
-            raise MeshError(f"{name}: expected a surface, but all faces lie in one point. Check the file.")
+            raise MeshError(
+                f"{name}: expected a surface, but all faces lie in one point. Check the file."
+            )
         check_size(corners.reshape(-1, 3), name)  # before squares of lengths overflow or vanish
-        mesh = (_remake if how == "always" else _mend)(vertices, triangles, name, cavities == "keep", denoise)
+        mesh = (_remake if how == "always" else _mend)(
+            vertices, triangles, name, cavities == "keep", denoise
+        )
     n_outer = int(mesh.outer()[1].sum())
     if n_outer < least_vertices:
         mesh = subdivide(mesh, _SUBDIVISION_FACTOR * least_vertices + len(mesh.vertices) - n_outer)
@@ -95,7 +117,11 @@ def mend(
 
 def repair_steps(notes: Iterable[str]) -> tuple[Step, ...]:
     """Return the repairs that the notes of a `Mesh` or `Signature` record, in order and without repetition."""
-    return tuple(dict.fromkeys(step for note in notes for start, step in _STARTS.items() if note.startswith(start)))
+    return tuple(
+        dict.fromkeys(
+            step for note in notes for start, step in _STARTS.items() if note.startswith(start)
+        )
+    )
 
 
 def _mend(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
@@ -108,14 +134,21 @@ def _mend(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise:
         if body := _body(vertices, faces, notes, name, cavities, denoise):
             return body
     # These steps may give no body if there are many loose parts; their result is then discarded.
-    for step, surface, record in ((drop_inner_walls, (vertices, faces), list(notes)), (unite_parts, original, [])):
-        if len(surface[1]) and (body := _body(*step(*surface, record), record, name, cavities, denoise)):
+    for step, surface, record in (
+        (drop_inner_walls, (vertices, faces), list(notes)),
+        (unite_parts, original, []),
+    ):
+        if len(surface[1]) and (
+            body := _body(*step(*surface, record), record, name, cavities, denoise)
+        ):
             return body
     body = watertight(_smooth(vertices, faces, notes, denoise), faces, name=name)
     return body.annotated(notes=tuple(notes))
 
 
-def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, cavities: bool, denoise: bool) -> Mesh | None:
+def _body(
+    vertices: Floats, faces: Integers, notes: list[str], name: str, cavities: bool, denoise: bool
+) -> Mesh | None:
     """Return the body with this surface, smoothed if it is noisy, or None if the surface bounds no body."""
     try:
         mesh = Mesh(vertices, faces, name=name, notes=tuple(notes), cavities=cavities)
@@ -133,11 +166,17 @@ def _remake(vertices: Floats, faces: Integers, name: str, cavities: bool, denois
     for step in (None, weld):
         if step is not None:
             surface = step(vertices, faces, notes)
-        if (body := _body(*surface, notes, name, cavities, denoise)) and not crosses_itself(body.vertices, body.faces):
+        if (body := _body(*surface, notes, name, cavities, denoise)) and not crosses_itself(
+            body.vertices, body.faces
+        ):
             return body
         notes = []
     smooth = _smooth(*surface, notes, denoise)
-    body = watertight(smooth, surface[1], name=name) if notes else watertight(vertices, faces, name=name)
+    body = (
+        watertight(smooth, surface[1], name=name)
+        if notes
+        else watertight(vertices, faces, name=name)
+    )
     return body.annotated(notes=tuple(notes))
 
 

@@ -26,11 +26,30 @@ from igps.mesh.winding import winding_number
 logger = logging.getLogger(__name__)
 
 MILLIMETRES: Mapping[str, float] = {
-    "m": 1e3, "cm": 10.0, "mm": 1.0, "µm": 1e-3, "um": 1e-3, "micron": 1e-3, "microns": 1e-3, "nm": 1e-6, "Å": 1e-7,
-    "in": 25.4, "inch": 25.4, "inches": 25.4, "ft": 304.8, "feet": 304.8, "meter": 1e3, "meters": 1e3,
-    "centimeters": 10.0, "millimeter": 1.0, "millimeters": 1.0, "micrometer": 1e-3, "micrometers": 1e-3,
-    "\\u00B5m": 1e-3, "\u03bcm": 1e-3,  # the second with the Greek letter, not the sign of micro
-}  # fmt: skip
+    "m": 1e3,
+    "cm": 10.0,
+    "mm": 1.0,
+    "µm": 1e-3,
+    "um": 1e-3,
+    "micron": 1e-3,
+    "microns": 1e-3,
+    "nm": 1e-6,
+    "Å": 1e-7,
+    "in": 25.4,
+    "inch": 25.4,
+    "inches": 25.4,
+    "ft": 304.8,
+    "feet": 304.8,
+    "meter": 1e3,
+    "meters": 1e3,
+    "centimeters": 10.0,
+    "millimeter": 1.0,
+    "millimeters": 1.0,
+    "micrometer": 1e-3,
+    "micrometers": 1e-3,
+    "\\u00B5m": 1e-3,
+    "\u03bcm": 1e-3,  # the second with the Greek letter, not the sign of micro
+}
 """Length of units in millimetres, by their names in files and libraries."""
 
 
@@ -40,7 +59,9 @@ def millimetres(unit: str | None) -> float:
 
 
 _REPAIR = 'LoadOptions(mend="auto"), on the command line --mend auto,'
-_MIN_VOLUME = 1e-10  # of a body, over the cube of its diagonal; surfaces with less are folded sheets
+_MIN_VOLUME = (
+    1e-10  # of a body, over the cube of its diagonal; surfaces with less are folded sheets
+)
 # Between these diagonals, areas, volumes and eigenfunctions in single precision neither overflow nor lose digits.
 _MIN_DIAGONAL, _MAX_DIAGONAL = 1e-30, 1e30
 _MAX_DISTANCE = 1e6  # from the origin, in diagonals; the mesh keeps nine digits of its coordinates, which suffice
@@ -104,7 +125,9 @@ class Mesh:
         volume = signed_volume(vertices, faces)
         if abs(volume) <= _MIN_VOLUME * diagonal(vertices) ** 3:
             sizes = f"{volume:.3g} for a bounding box diagonal of {diagonal(vertices):.3g}"
-            raise MeshError(f"{self.name}: expected a body, but it encloses no volume ({sizes}). Thicken flat sheets.")
+            raise MeshError(
+                f"{self.name}: expected a body, but it encloses no volume ({sizes}). Thicken flat sheets."
+            )
         if volume < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
             vars(self).update(notes=(*self.notes, "was inside out: all faces turned"))
@@ -183,7 +206,9 @@ class Mesh:
         """Number of handles of all surfaces together; a MeshError for an open mesh."""
         n_vertices, n_faces = len(self.vertices), len(self.faces)
         if len(undirected_edges(self.faces, n_vertices)[0]) * 2 != n_faces * 3:
-            raise MeshError(f"{self.name}: an open surface has no genus; a closed one was expected. Close the holes.")
+            raise MeshError(
+                f"{self.name}: an open surface has no genus; a closed one was expected. Close the holes."
+            )
         # Euler's formula for C surfaces, V - E + F = 2 C - 2 genus, with 2 E = 3 F.
         return components(self.faces, n_vertices)[0] - (n_vertices - n_faces // 2) // 2
 
@@ -196,9 +221,13 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
     v, f = np.asarray(vertices), np.asarray(faces)
     check_coordinates(v, name)
     if f.size == 0:
-        raise MeshError(f"{name}: no faces. A surface is needed; a point cloud must be meshed first.")
+        raise MeshError(
+            f"{name}: no faces. A surface is needed; a point cloud must be meshed first."
+        )
     if f.ndim != 2 or f.shape[1] != 3 or not np.issubdtype(f.dtype, np.integer):
-        raise MeshError(f"{name}: faces: expected integers of shape (F, 3), got {f.dtype} of shape {f.shape}.")
+        raise MeshError(
+            f"{name}: faces: expected integers of shape (F, 3), got {f.dtype} of shape {f.shape}."
+        )
     if f.min() < 0 or f.max() >= len(v):
         bad = int(((f < 0) | (f >= len(v))).any(axis=1).sum())
         raise MeshError(
@@ -214,7 +243,9 @@ def check_coordinates(vertices: NDArray[Any], name: str) -> None:
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         fault = f"{name}: {int((~finite).sum())} vertices have NaN or infinite coordinates"
-        raise MeshError(f"{fault}, the first is vertex {int(np.argmin(finite))}. Remove them or export the file again.")
+        raise MeshError(
+            f"{fault}, the first is vertex {int(np.argmin(finite))}. Remove them or export the file again."
+        )
 
 
 def check_size(vertices: Floats, name: str) -> None:
@@ -222,7 +253,9 @@ def check_size(vertices: Floats, name: str) -> None:
     with np.errstate(over="ignore"):
         length, distance = diagonal(vertices), float(np.abs(vertices).max())
     if not _MIN_DIAGONAL <= length <= _MAX_DIAGONAL:
-        fault = f"{name}: expected a bounding box diagonal from {_MIN_DIAGONAL:g} to {_MAX_DIAGONAL:g}"
+        fault = (
+            f"{name}: expected a bounding box diagonal from {_MIN_DIAGONAL:g} to {_MAX_DIAGONAL:g}"
+        )
         raise MeshError(f"{fault}, got {length:.3g}. Scale the mesh, or remove stray vertices.")
     if distance > _MAX_DISTANCE * length:
         fault = f"{name}: expected a distance from the origin of at most {_MAX_DISTANCE:g} times the size of the mesh"
@@ -230,7 +263,9 @@ def check_size(vertices: Floats, name: str) -> None:
         raise MeshError(f"{fault}, {rounded}. Move the mesh to the origin before writing the file.")
 
 
-def _check_topology(faces: Integers, n_vertices: int, name: str, allow_open: bool, cavities: bool) -> None:
+def _check_topology(
+    faces: Integers, n_vertices: int, name: str, allow_open: bool, cavities: bool
+) -> None:
     n_repeated = int((faces == np.roll(faces, 1, axis=1)).any(axis=1).sum())
     n_unused = n_vertices - len(np.unique(faces))
     start, end = directed_edges(faces)
@@ -244,17 +279,31 @@ def _check_topology(faces: Integers, n_vertices: int, name: str, allow_open: boo
     for is_wrong, message in (
         (n_repeated, f"{n_repeated} faces use a vertex twice. {read} to drop them."),
         (n_unused, f"{n_unused} vertices belong to no face. {read} to drop them."),
-        (n_non_manifold, f"{n_non_manifold} non-manifold edges (shared by more than two faces). {read} to drop "
-         "duplicate faces; if edges remain, separate the sheets that meet there in a modelling tool."),
-        (n_boundary and not allow_open, f"open surface with {n_boundary} boundary edges. Close the holes; or read the "
-         f"file with {_REPAIR} if vertices are only duplicated there (as in every STL file); or with allow_open=True, "
-         "--allow_open, to tell inside from outside by the winding number."),
-        (n_inconsistent, f"inconsistent orientation, {n_inconsistent} edges are traversed twice in the same direction. "
-         f"{read} to orient the faces."),
-        (n_components > 1 and not cavities, f"{n_components} connected components; the commute time between them is "
-         "infinite. Read the file with LoadOptions(component='largest'), on the command line --component largest, to "
-         f"keep one; with {_REPAIR} if coincident vertices are merely not welded; or join them."),
-    ):  # fmt: skip
+        (
+            n_non_manifold,
+            f"{n_non_manifold} non-manifold edges (shared by more than two faces). {read} to drop "
+            "duplicate faces; if edges remain, separate the sheets that meet there in a modelling tool.",
+        ),
+        (
+            n_boundary and not allow_open,
+            f"open surface with {n_boundary} boundary edges. Close the holes; or read the "
+            f"file with {_REPAIR} if vertices are only duplicated there (as in every STL file); "
+            "or with allow_open=True, "
+            "--allow_open, to tell inside from outside by the winding number.",
+        ),
+        (
+            n_inconsistent,
+            f"inconsistent orientation, {n_inconsistent} edges are traversed twice in the same direction. "
+            f"{read} to orient the faces.",
+        ),
+        (
+            n_components > 1 and not cavities,
+            f"{n_components} connected components; the commute time between them is "
+            "infinite. Read the file with LoadOptions(component='largest'), "
+            "on the command line --component largest, to "
+            f"keep one; with {_REPAIR} if coincident vertices are merely not welded; or join them.",
+        ),
+    ):
         if is_wrong:
             raise MeshError(f"{name}: {message}")
 
@@ -266,12 +315,24 @@ def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
     for k, (points, triangles) in enumerate(surfaces):
         if k == outer:
             continue
-        patch = face_patches(triangles, len(points))[0]  # patches that meet in a vertex are one connected surface
-        is_outward = any(signed_volume(points, triangles[patch == i]) >= 0 for i in range(patch.max() + 1))
+        patch = face_patches(triangles, len(points))[
+            0
+        ]  # patches that meet in a vertex are one connected surface
+        is_outward = any(
+            signed_volume(points, triangles[patch == i]) >= 0 for i in range(patch.max() + 1)
+        )
         # The cavity's own surface is left out: at its vertices, its winding number may be anything from 0 to 1.
-        around = {i: winding_number(*surface, points) for i, surface in enumerate(surfaces) if i != k}
+        around = {
+            i: winding_number(*surface, points) for i, surface in enumerate(surfaces) if i != k
+        }
         lies_inside = around.pop(outer).min() >= 0.5
-        if is_outward or not lies_inside or any(abs(winding).max() > 0.5 for winding in around.values()):
-            reasons = "it is oriented outward, outside the largest surface, or inside another cavity"
+        if (
+            is_outward
+            or not lies_inside
+            or any(abs(winding).max() > 0.5 for winding in around.values())
+        ):
+            reasons = (
+                "it is oriented outward, outside the largest surface, or inside another cavity"
+            )
             fault = f"{name}: one of {len(surfaces)} closed surfaces bounds no cavity: {reasons}."
             raise MeshError(f"{fault} Read the file with {_REPAIR} or without cavities.")

@@ -25,7 +25,9 @@ from igps.mesh.surface import connected, face_areas, signed_volume, stacked, sum
 
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 
-_MARGIN = 2.5  # cells around the balls, and on both sides of the surface, in which distances are computed
+_MARGIN = (
+    2.5  # cells around the balls, and on both sides of the surface, in which distances are computed
+)
 _MAX_CELLS = 2**28
 _MAX_STEP = 0.3  # maximal step of vertices towards the surface, in cells
 # Maximal share of the area that threads between pieces add, and maximal width of a thread's end over its triangle's.
@@ -36,9 +38,13 @@ _N_ROUNDS = 2  # rounds in which vertices are spread evenly along the surface
 
 @one_thread()
 def molecular_surface(
-    molecule: Molecule, kind: SurfaceKind = "excluded", *, probe: float = 1.4, spacing: float = 0.8,
+    molecule: Molecule,
+    kind: SurfaceKind = "excluded",
+    *,
+    probe: float = 1.4,
+    spacing: float = 0.8,
     max_vertices: int | None = 3000,
-) -> Mesh:  # fmt: skip
+) -> Mesh:
     """Compute the closed surface of a molecule, in ångström.
 
     Hollows inside are filled, specks are dropped, and the remaining pieces are joined by threads where the gaps are
@@ -69,13 +75,17 @@ def molecular_surface(
     check_positive(spacing=spacing)
     if not 0 <= probe < math.inf:
         raise ValueError(f"probe: expected a radius of at least 0 Å, got {probe}.")
-    centres, radii = _outermost(molecule.positions, molecule.radii + (0.0 if kind == "van_der_waals" else probe))
+    centres, radii = _outermost(
+        molecule.positions, molecule.radii + (0.0 if kind == "van_der_waals" else probe)
+    )
     margin = _MARGIN * spacing
     low = (centres - radii[:, None]).min(axis=0) - margin
     sides = np.ceil(((centres + radii[:, None]).max(axis=0) + margin - low) / spacing) + 1
     if sides.prod() > _MAX_CELLS:
         limit = f"{molecule.name}: expected a grid of at most {_MAX_CELLS:.3g} cells of {spacing} Å"
-        raise MeshError(f"{limit}, got {sides.prod():.3g}. Raise the spacing, or remove stray atoms.")
+        raise MeshError(
+            f"{limit}, got {sides.prod():.3g}. Raise the spacing, or remove stray atoms."
+        )
     shape = (int(sides[0]), int(sides[1]), int(sides[2]))
     exact = _field(centres - low, radii, shape, spacing, probe if kind == "excluded" else 0.0)
     notes = [f"{kind.replace('_', ' ')} surface, probe {probe:g} Å, grid of {spacing:g} Å"]
@@ -88,7 +98,13 @@ def molecular_surface(
     vertices, faces = level_surface(field.copy(), molecule.name)
     vertices = _fit_to_field(np.where(field == bounded, exact, field), vertices, faces)
     vertices, faces = _one_piece(vertices, faces, max_vertices, notes)
-    return Mesh(vertices * spacing + low, faces, name=molecule.name, notes=(*molecule.notes, *notes), unit="Å")
+    return Mesh(
+        vertices * spacing + low,
+        faces,
+        name=molecule.name,
+        notes=(*molecule.notes, *notes),
+        unit="Å",
+    )
 
 
 def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
@@ -105,7 +121,9 @@ def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
     return centres[is_outermost], radii[is_outermost]
 
 
-def _field(centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, probe: float) -> Singles:
+def _field(
+    centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, probe: float
+) -> Singles:
     """Return the signed distances of the grid points to the surface (of the balls, for a probe of 0), in cells."""
     margin = _MARGIN * spacing
     depth, owner = depths(centres, radii, shape, spacing, margin)
@@ -113,7 +131,9 @@ def _field(centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing:
         first, neighbours = _neighbours(centres, radii)
         arcs, exposed = exposed_arcs(centres, radii, first, neighbours)
         reach = probe + margin
-        depth = distances_outside(depth, owner, centres, radii, first, neighbours, exposed, arcs, spacing, reach)
+        depth = distances_outside(
+            depth, owner, centres, radii, first, neighbours, exposed, arcs, spacing, reach
+        )
     return ((np.float32(probe) - depth) / np.float32(spacing)).astype(np.float32)
 
 
@@ -129,19 +149,26 @@ def _neighbours(centres: Floats, radii: Floats) -> tuple[Integers, Integers]:
     return first, neighbour[np.lexsort((np.r_[distance, distance], ball))].astype(np.int64)
 
 
-def _one_piece(vertices: Floats, faces: Integers, max_vertices: int | None, notes: list[str]) -> Surface:
+def _one_piece(
+    vertices: Floats, faces: Integers, max_vertices: int | None, notes: list[str]
+) -> Surface:
     """Drop specks, simplify each piece to its share of the vertices, and join the pieces."""
     parts = connected(vertices, faces)
     volumes = np.array([abs(signed_volume(*part)) for part in parts])
     is_speck = volumes < SPECK_VOLUME * volumes.sum()
-    if volumes[is_speck].sum() > _MAX_SPECKS * volumes.sum():  # as of a membrane, which consists of small molecules
+    if (
+        volumes[is_speck].sum() > _MAX_SPECKS * volumes.sum()
+    ):  # as of a membrane, which consists of small molecules
         is_speck[:] = False
     elif is_speck.any():
         notes.append(f"left out {is_speck.sum()} specks")
     parts = [part for part, is_small in zip(parts, is_speck, strict=True) if not is_small]
     if max_vertices is not None:
         n_vertices = sum(len(points) for points, _ in parts)
-        parts = [simplify_surface(*part, max(round(max_vertices * len(part[0]) / n_vertices), 12)) for part in parts]
+        parts = [
+            simplify_surface(*part, max(round(max_vertices * len(part[0]) / n_vertices), 12))
+            for part in parts
+        ]
     if len(parts) > 1:
         notes.append(f"joined {len(parts)} pieces by threads")
     return _join(parts)
@@ -164,7 +191,9 @@ def _fit_to_field(field: Singles, vertices: Floats, faces: Integers) -> Floats:
     heights = np.einsum("ij,ij->i", steps, normals)[:, None]
     # Average at the vertices and back, so that neighbours move alike.
     heights = _mean_at_vertices(heights, vertices, faces)[faces].mean(axis=1)
-    return vertices - 0.75 * _mean_at_vertices(heights, vertices, faces) * vertex_normals(vertices, faces)
+    return vertices - 0.75 * _mean_at_vertices(heights, vertices, faces) * vertex_normals(
+        vertices, faces
+    )
 
 
 def _steps(field: Singles, points: Floats) -> tuple[Floats, Floats]:
@@ -199,14 +228,20 @@ def _shortest_links(parts: Sequence[Floats]) -> list[tuple[int, int]]:
     """Return the minimum spanning tree of the parts (Prim) as pairs of vertices, numbered through all parts."""
     trees, links = [cKDTree(points) for points in parts], []
     starts = np.cumsum([0, *map(len, parts)]).tolist()
-    best = dict.fromkeys(range(1, len(parts)), (np.inf, 0, 0))  # shortest link of each part that is not yet in the tree
+    best = dict.fromkeys(
+        range(1, len(parts)), (np.inf, 0, 0)
+    )  # shortest link of each part that is not yet in the tree
     new = 0
     while best:
         for j in best:
             distance, vertex = trees[new].query(parts[j])
             nearest = int(distance.argmin())
             if distance[nearest] < best[j][0]:
-                best[j] = (float(distance[nearest]), starts[new] + int(vertex[nearest]), starts[j] + nearest)
+                best[j] = (
+                    float(distance[nearest]),
+                    starts[new] + int(vertex[nearest]),
+                    starts[j] + nearest,
+                )
         new = min(best, key=lambda j: best[j][0])
         links.append(best.pop(new)[1:])
     return links
@@ -215,19 +250,30 @@ def _shortest_links(parts: Sequence[Floats]) -> list[tuple[int, int]]:
 def _add_thread(vertices: Floats, faces: Integers, a: int, b: int, girth: float) -> Surface:
     """Add a thread, a tube of triangular section, between the largest triangles at two vertices."""
     areas = face_areas(vertices, faces)
-    ends = [int(at[areas[at].argmax()]) for at in (np.flatnonzero((faces == v).any(axis=1)) for v in (a, b))]
+    ends = [
+        int(at[areas[at].argmax()])
+        for at in (np.flatnonzero((faces == v).any(axis=1)) for v in (a, b))
+    ]
     rims, new = [], []
     for end, face in enumerate(ends):
         corners = vertices[faces[face]]
-        centre, perimeter = corners.mean(axis=0), np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
-        vertices = np.concatenate([vertices, centre + min(girth / perimeter, _MAX_THREAD_WIDTH) * (corners - centre)])
+        centre, perimeter = (
+            corners.mean(axis=0),
+            np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum(),
+        )
+        vertices = np.concatenate(
+            [vertices, centre + min(girth / perimeter, _MAX_THREAD_WIDTH) * (corners - centre)]
+        )
         rims.append(len(vertices) - 3 + np.arange(3))
         for i, k in ((0, 1), (1, 2), (2, 0)):
             c, d, e, f = faces[face][i], faces[face][k], rims[end][k], rims[end][i]
             new += [(c, d, e), (c, e, f)]
     # The rims face each other, so they run in opposite directions.
     rotations = [np.roll(rims[1][::-1], k) for k in range(3)]
-    other = min(rotations, key=lambda rim: float(np.linalg.norm(vertices[rims[0]] - vertices[rim], axis=1).sum()))
+    other = min(
+        rotations,
+        key=lambda rim: float(np.linalg.norm(vertices[rims[0]] - vertices[rim], axis=1).sum()),
+    )
     for i, k in ((0, 1), (1, 2), (2, 0)):
         new += [(rims[0][i], rims[0][k], other[k]), (rims[0][i], other[k], other[i])]
     return vertices, np.concatenate([np.delete(faces, ends, axis=0), np.array(new, dtype=np.int64)])

@@ -30,7 +30,9 @@ def raw_body(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, R
         bodies = object_bodies((thing, spacing), "volume")
         if len(bodies) > 1:
             several = f"volume: expected one label, got {', '.join(str(body.part) for body in bodies)[:80]}."
-            raise MeshError(f"{several} Select one, such as labels == 1, or make a SignatureDataset of all.")
+            raise MeshError(
+                f"{several} Select one, such as labels == 1, or make a SignatureDataset of all."
+            )
         raw = bodies[0].made()
         if raw.fault is not None:
             raise raw.fault
@@ -40,21 +42,33 @@ def raw_body(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, R
     path = getattr(source, "file_path", None)  # trimesh keeps the path of the file here
     name = str(file_name or (Path(path).name if path else "mesh"))
     if hasattr(thing, "get_arrays_from_intent"):
-        points, faces = (thing.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE"))
+        points, faces = (
+            thing.get_arrays_from_intent(f"NIFTI_INTENT_{kind}")
+            for kind in ("POINTSET", "TRIANGLE")
+        )
         if not points or not faces:
-            raise TypeError("mesh: expected a GIFTI image of a surface, got one without points or triangles.")
-        return name, RawBody(np.asarray(points[0].data, np.float64), np.asarray(faces[0].data, np.int64), unit="mm")
+            raise TypeError(
+                "mesh: expected a GIFTI image of a surface, got one without points or triangles."
+            )
+        return name, RawBody(
+            np.asarray(points[0].data, np.float64), np.asarray(faces[0].data, np.int64), unit="mm"
+        )
     if hasattr(thing, "points") and hasattr(thing, "faces"):
         vertices = np.asarray(thing.points, np.float64)
         corners, n_corners = corners_of_rows(np.asarray(thing.faces, dtype=np.int64))
         return name, RawBody(vertices, flat_triangles(corners, n_corners, vertices))
     if hasattr(thing, "vertices") and hasattr(thing, "faces"):
         unit = getattr(thing, "units", None) or getattr(thing, "unit", None)
-        vertices, triangles = np.asarray(thing.vertices, np.float64), np.asarray(thing.faces, np.int64)
+        vertices, triangles = (
+            np.asarray(thing.vertices, np.float64),
+            np.asarray(thing.faces, np.int64),
+        )
         return name, RawBody(vertices, triangles, unit=unit, notes=getattr(thing, "notes", ()))
     expected = "a Mesh, a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage or labels"
     got = f"{type(thing).__module__}.{type(thing).__qualname__}"
-    raise TypeError(f"mesh: expected {expected}, got {got}. Read a file with igps.load_mesh, or pass Mesh(...).")
+    raise TypeError(
+        f"mesh: expected {expected}, got {got}. Read a file with igps.load_mesh, or pass Mesh(...)."
+    )
 
 
 def _is_volume(thing: Any) -> bool:

@@ -67,5 +67,13 @@ class LoadOptions:
         """Return the options on which a body depends, for cache keys."""
         # Options that were added later are left out at their defaults, which keeps older keys valid.
         added = {"bodies": None, "threshold": 0.5, "cavities": "fill"}
-        options = {name: value for name, value in asdict(self).items() if name not in ("max_unpacked", "names")}
-        return {name: value for name, value in options.items() if name not in added or value != added[name]}
+        options = {
+            name: value
+            for name, value in asdict(self).items()
+            if name not in ("max_unpacked", "names")
+        }
+        return {
+            name: value
+            for name, value in options.items()
+            if name not in added or value != added[name]
+        }

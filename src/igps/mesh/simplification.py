@@ -28,15 +28,21 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     # In unit size, because quadrics are sums of squares. A collapse on a closed surface removes a vertex and two faces.
     centre, scale = mesh.vertices.mean(axis=0), longest_side(mesh.vertices)
     points = np.asfortranarray((mesh.vertices - centre) / scale)
-    points, faces, *_ = igl.qslim(points, np.asfortranarray(mesh.faces), max(len(mesh.faces) - 2 * surplus, 4))
+    points, faces, *_ = igl.qslim(
+        points, np.asfortranarray(mesh.faces), max(len(mesh.faces) - 2 * surplus, 4)
+    )
     if len(points) > max_vertices:
         fault = f"{mesh.name}: simplification reached only {len(points)} vertices, expected {max_vertices}"
         raise MeshError(f"{fault}; fewer would change the topology. Raise max_vertices.")
     note = f"simplified from {len(mesh.vertices)} to {len(points)} vertices"
     try:
-        return replace(mesh, vertices=points * scale + centre, faces=faces, notes=(*mesh.notes, note))
+        return replace(
+            mesh, vertices=points * scale + centre, faces=faces, notes=(*mesh.notes, note)
+        )
     except MeshError as error:
-        raise MeshError(f"{error} Simplification caused this: raise max_vertices above {max_vertices}.") from error
+        raise MeshError(
+            f"{error} Simplification caused this: raise max_vertices above {max_vertices}."
+        ) from error
 
 
 def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
@@ -50,12 +56,16 @@ def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
         length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
         # A pass cuts only edges about as long as the longest, so that edges are cut in the order of their lengths.
         cut = np.argsort(-length, kind="stable")[: n_vertices - len(vertices)]
-        vertices, faces = _cut(vertices, faces, edges, edge_of_side, cut[length[cut] > 0.7 * length.max()])
+        vertices, faces = _cut(
+            vertices, faces, edges, edge_of_side, cut[length[cut] > 0.7 * length.max()]
+        )
     note = f"subdivided from {n_before} to {len(vertices)} vertices"
     return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))
 
 
-def _cut(vertices: Floats, faces: Integers, edges: Integers, edge_of_side: Integers, cut: Integers) -> Surface:
+def _cut(
+    vertices: Floats, faces: Integers, edges: Integers, edge_of_side: Integers, cut: Integers
+) -> Surface:
     """Add the midpoints of the edges `cut` as vertices, and divide the faces at these edges."""
     middle = np.full(len(edges), -1)
     middle[cut] = len(vertices) + np.arange(len(cut))
@@ -66,7 +76,11 @@ def _cut(vertices: Floats, faces: Integers, edges: Integers, edge_of_side: Integ
     for n in (1, 2, 3):
         f, k = faces[n_cut == n], middle_of_side[n_cut == n]
         # The corners are rotated so that the cut sides come first.
-        turn = np.argmax(k >= 0, axis=1) if n == 1 else (np.argmin(k >= 0, axis=1) + 1 if n == 2 else 0)
+        turn = (
+            np.argmax(k >= 0, axis=1)
+            if n == 1
+            else (np.argmin(k >= 0, axis=1) + 1 if n == 2 else 0)
+        )
         order = (np.arange(3) + np.reshape(turn, (-1, 1))) % 3
         a, b, c = np.take_along_axis(f, np.broadcast_to(order, f.shape), axis=1).T
         p, q, r = np.take_along_axis(k, np.broadcast_to(order, k.shape), axis=1).T
@@ -74,7 +88,9 @@ def _cut(vertices: Floats, faces: Integers, edges: Integers, edge_of_side: Integ
             corners = [(a, p, c), (p, b, c)]
         elif n == 2:
             # The quadrilateral a p q c is divided along its shorter diagonal.
-            by_a = np.linalg.norm(vertices[a] - vertices[q], axis=1) < np.linalg.norm(vertices[p] - vertices[c], axis=1)
+            by_a = np.linalg.norm(vertices[a] - vertices[q], axis=1) < np.linalg.norm(
+                vertices[p] - vertices[c], axis=1
+            )
             corners = [(p, b, q), (a, np.where(by_a, q, p), c)]
             corners.append((np.where(by_a, a, p), np.where(by_a, p, q), np.where(by_a, q, c)))
         else:

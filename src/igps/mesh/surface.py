@@ -31,7 +31,9 @@ def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
 
 def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
     """Return the outward unit normals (V, 3) of the vertices: means of the face normals, weighted by area."""
-    return unit(sums(faces.ravel(), np.repeat(area_vectors(vertices, faces), 3, axis=0), len(vertices)))
+    return unit(
+        sums(faces.ravel(), np.repeat(area_vectors(vertices, faces), 3, axis=0), len(vertices))
+    )
 
 
 def sums(index: Integers, rows: Floats, n: int) -> Floats:
@@ -54,7 +56,9 @@ def mean_of_neighbours(vertices: Floats, faces: Integers) -> Floats:
 
 def unit(vectors: Floats) -> Floats:
     """Return the vectors (N, 3) scaled to length 1; zero vectors stay zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
+    return vectors / np.maximum(
+        np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny
+    )
 
 
 def box_sides(points: Floats) -> Floats:
@@ -81,14 +85,18 @@ def directed_edges(faces: Integers) -> tuple[Integers, Integers]:
 def undirected_edges(faces: Integers, n_vertices: int) -> tuple[Integers, Integers]:
     """Return the edges (E, 2) in ascending order, the smaller vertex first, and the edge (3F,) of every side."""
     start, end = directed_edges(faces)
-    keys, edge_of = np.unique(np.minimum(start, end) * n_vertices + np.maximum(start, end), return_inverse=True)
+    keys, edge_of = np.unique(
+        np.minimum(start, end) * n_vertices + np.maximum(start, end), return_inverse=True
+    )
     return np.stack([keys // n_vertices, keys % n_vertices], axis=1), edge_of
 
 
 def components(faces: Integers, n_vertices: int) -> tuple[int, NDArray[np.int32]]:
     """Return the number of connected components, and the component (V,) of each vertex, from 0."""
     start, end = directed_edges(faces)
-    graph = sparse.coo_array((np.ones(len(start), dtype=np.int8), (start, end)), shape=(n_vertices, n_vertices))
+    graph = sparse.coo_array(
+        (np.ones(len(start), dtype=np.int8), (start, end)), shape=(n_vertices, n_vertices)
+    )
     count, label = connected_components(graph, directed=False)
     return int(count), label
 
@@ -110,10 +118,14 @@ def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
     count = np.bincount(edge_of_side)
     at = (np.cumsum(count) - count)[count == 2]
     a, b = by_edge[at] // 3, by_edge[at + 1] // 3
-    graph = sparse.coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(faces), len(faces)))
+    graph = sparse.coo_array(
+        (np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(faces), len(faces))
+    )
     n_patches, patch = connected_components(graph, directed=False)
     # Faces of the patch itself do not count, also where several of them meet in an edge.
-    pairs, n_own = np.unique(np.stack([np.repeat(patch, 3), edge_of_side]), axis=1, return_counts=True)
+    pairs, n_own = np.unique(
+        np.stack([np.repeat(patch, 3), edge_of_side]), axis=1, return_counts=True
+    )
     patch_at, n_at = pairs[0], count[pairs[1]]
     n_free = np.bincount(patch_at, (n_at - n_own < 2) & (n_at != 2), n_patches)
     return patch.astype(np.int64), (n_free == 0) & (np.bincount(patch_at, n_at > 2, n_patches) > 0)
@@ -139,7 +151,9 @@ def connected(vertices: Floats, faces: Integers) -> list[Surface]:
 
 def largest(vertices: Floats, faces: Integers) -> Surface:
     """Return the connected component of the largest volume."""
-    return max(connected(*compact(vertices, faces)), key=lambda surface: abs(signed_volume(*surface)))
+    return max(
+        connected(*compact(vertices, faces)), key=lambda surface: abs(signed_volume(*surface))
+    )
 
 
 def stacked(surfaces: Sequence[Surface]) -> Surface:

@@ -20,7 +20,14 @@ from scipy.spatial import cKDTree
 from igps._arrays import Floats, Integers
 from igps._parameters import check_at_least
 from igps.mesh._isosurface import level_surface, simplify_surface
-from igps.mesh._level_set import Grid, cell_sizes, distances, join_pieces, level_set, merge_near_vertices
+from igps.mesh._level_set import (
+    Grid,
+    cell_sizes,
+    distances,
+    join_pieces,
+    level_set,
+    merge_near_vertices,
+)
 from igps.mesh._outside import OrientedSurface, find_outside
 from igps.mesh.mesh import Mesh, MeshError, check_coordinates
 from igps.mesh.surface import diagonal, face_areas, largest, longest_side, unit
@@ -37,9 +44,14 @@ _LINE = 1e-5  # points on a line in single precision have a smaller ratio of spr
 
 
 def watertight(
-    vertices: Floats, faces: Integers | None = None, *, normals: Floats | None = None, resolution: int = 96,
-    max_vertices: int | None = 5000, name: str = "mesh",
-) -> Mesh:  # fmt: skip
+    vertices: Floats,
+    faces: Integers | None = None,
+    *,
+    normals: Floats | None = None,
+    resolution: int = 96,
+    max_vertices: int | None = 5000,
+    name: str = "mesh",
+) -> Mesh:
     """Make the closed, oriented, edge-manifold surface of one body from triangles in any state, or from points.
 
     Solids keep their surface, sheets get about a cell of thickness, small openings are closed, and everything that is
@@ -66,9 +78,13 @@ def watertight(
         vertices, faces, spacing = splats(vertices, normals, resolution, name)
         notes.append("points joined by small discs")
     faces = np.asarray(faces, dtype=np.int64)
-    faces = faces[face_areas(vertices, faces) > 1e-14 * diagonal(vertices[faces].reshape(-1, 3)) ** 2]
+    faces = faces[
+        face_areas(vertices, faces) > 1e-14 * diagonal(vertices[faces].reshape(-1, 3)) ** 2
+    ]
     if not len(faces):
-        raise MeshError(f"{name}: expected a surface, but no triangle has an area. Give lines some thickness.")
+        raise MeshError(
+            f"{name}: expected a surface, but no triangle has an area. Give lines some thickness."
+        )
     faces = _drop_specks(vertices, faces, notes)
     default_size, min_size = cell_sizes(vertices, faces, resolution, spacing)
     grid = Grid.around(vertices, faces, min_size)
@@ -82,7 +98,9 @@ def watertight(
         notes.append(f"coarse: about {4 * thickness / cell:.1f} cells thick")
     if cell > min_size:
         finest, grid = grid, Grid.around(grid.from_cells(vertices), faces, cell)
-        vertices, oriented = (grid.to_cells(finest.from_cells(points)) for points in (vertices, surface.vertices))
+        vertices, oriented = (
+            grid.to_cells(finest.from_cells(points)) for points in (vertices, surface.vertices)
+        )
         surface = replace(surface, vertices=oriented)
     distance, nearest = distances(vertices, faces, grid.shape)
     outside, n_closed = find_outside(distance, surface)
@@ -140,20 +158,28 @@ def _sample_triangles(corners: Floats, spacing: float) -> tuple[Floats, Integers
     return np.concatenate(points), np.concatenate(owner)
 
 
-def splats(points: Floats, normals: Floats | None, resolution: int, name: str) -> tuple[Floats, Integers, float]:
+def splats(
+    points: Floats, normals: Floats | None, resolution: int, name: str
+) -> tuple[Floats, Integers, float]:
     """Return the vertices and faces of hexagonal discs around the points of a cloud, and the spacing of the points."""
     if len(points) < 10:
-        raise MeshError(f"{name}: expected at least 10 points for a surface, got {len(points)}. Export or scan more.")
+        raise MeshError(
+            f"{name}: expected at least 10 points for a surface, got {len(points)}. Export or scan more."
+        )
     side = longest_side(points)
     if side == 0:
         raise MeshError(f"{name}: expected a surface, but all points coincide. Check the file.")
     centred = points - points.mean(axis=0)
     _, across, along = np.linalg.eigvalsh(centred.T @ centred)
     if across < _LINE**2 * along:
-        raise MeshError(f"{name}: expected a surface, but all {len(points)} points lie on one line. Check the file.")
+        raise MeshError(
+            f"{name}: expected a surface, but all {len(points)} points lie on one line. Check the file."
+        )
     if len(points) > _MAX_POINTS:
         # Keep one point in each quarter of a cell.
-        lattice = np.floor((points - points.min(axis=0)) / (side / (4 * resolution))).astype(np.int64)
+        lattice = np.floor((points - points.min(axis=0)) / (side / (4 * resolution))).astype(
+            np.int64
+        )
         _, first = np.unique(lattice, axis=0, return_index=True)
         points, normals = points[first], None if normals is None else normals[first]
     distance, neighbours = cKDTree(points).query(points, k=min(13, len(points)))
@@ -167,13 +193,17 @@ def splats(points: Floats, normals: Floats | None, resolution: int, name: str) -
         normals = axes[:, :, 0]
     normals = np.asarray(normals, dtype=np.float64)
     if normals.shape != points.shape or not np.isfinite(normals).all():
-        raise MeshError(f"{name}: normals: expected finite numbers of shape {points.shape}. Leave out the normals.")
+        raise MeshError(
+            f"{name}: normals: expected finite numbers of shape {points.shape}. Leave out the normals."
+        )
     # Two directions in the plane, computed from the axis that is least parallel to the normal.
     axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     u = unit(np.cross(normals, axis))
     v = unit(np.cross(normals, u))
     angle = np.arange(6)[:, None] * np.pi / 3
-    rim = points[:, None] + radius[:, None, None] * (np.cos(angle) * u[:, None] + np.sin(angle) * v[:, None])
+    rim = points[:, None] + radius[:, None, None] * (
+        np.cos(angle) * u[:, None] + np.sin(angle) * v[:, None]
+    )
     fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
     faces = (6 * np.arange(len(points))[:, None, None] + fan).reshape(-1, 3)
     return rim.reshape(-1, 3), faces, spacing / 2

@@ -7,7 +7,9 @@ from igps._arrays import Floats, Integers
 from igps.mesh.surface import has_area
 
 
-def winding_number(vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]) -> Floats:
+def winding_number(
+    vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
+) -> Floats:
     """Return the winding numbers (P,) of a mesh about points (P, 3): the solid angle of its faces over 4π.
 
     They are 1 inside and 0 outside a closed, outward oriented surface, and fractions for an open one; on the surface
@@ -18,7 +20,9 @@ def winding_number(vertices: NDArray[np.floating], faces: NDArray[np.integer], p
 
     vertices, faces, points = check_mesh_and_points(vertices, faces, points)
     if not has_area(vertices[faces]).any():
-        raise ValueError("faces: expected at least one face with an area, got flat faces only; check the mesh")
+        raise ValueError(
+            "faces: expected at least one face with an area, got flat faces only; check the mesh"
+        )
     if not len(points):
         return np.zeros(0)
     return np.asarray(igl.winding_number(vertices, faces, points))
@@ -34,7 +38,9 @@ def check_mesh_and_points(
             raise ValueError(f"{name}: expected shape (n, 3), got {array.shape}")
     for name, array in (("vertices", v), ("points", p)):
         if not np.isfinite(array).all():
-            raise ValueError(f"{name}: expected finite coordinates, got NaN or infinity; remove those rows")
+            raise ValueError(
+                f"{name}: expected finite coordinates, got NaN or infinity; remove those rows"
+            )
     if not np.issubdtype(f.dtype, np.integer):
         raise ValueError(f"faces: expected integer vertex indices, got {f.dtype}")
     if len(f) == 0:

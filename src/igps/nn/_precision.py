@@ -46,7 +46,9 @@ def _is_full(backend: Any) -> bool:
 def _own_precision(backend: Any) -> str:
     # A backend without its own setting reports the inherited setting; restoring this would make it the backend's own.
     precision = backend.matmul.fp32_precision
-    inherited = getattr(backend, "fp32_precision", getattr(torch.backends, "fp32_precision", "none"))
+    inherited = getattr(
+        backend, "fp32_precision", getattr(torch.backends, "fp32_precision", "none")
+    )
     return "none" if precision == inherited else precision
 
 

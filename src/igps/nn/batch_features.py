@@ -36,7 +36,9 @@ class SampleFeatures:
     def embedded(self, embedding: nn.Module) -> Tensor:
         """Return the embedding (N, P, D) of the samples."""
         if embedding not in self._embedded:
-            self._embedded[embedding] = embedding(self.samples.eigenfunctions, self.batch.eigenvalues, self.batch.area)
+            self._embedded[embedding] = embedding(
+                self.samples.eigenfunctions, self.batch.eigenvalues, self.batch.area
+            )
         return self._embedded[embedding]
 
     def positions(self) -> Tensor:
@@ -66,7 +68,9 @@ class SampleFeatures:
     def ball_radii(self) -> Tensor:
         """Return the `ball_radii` (N, P, 2) of surface samples with directions, over √area; 1 where padded."""
         if self._ball_radii is None:
-            self._ball_radii = ball_radii(self.positions(), self.attribute("surface_direction"), self.samples.mask)
+            self._ball_radii = ball_radii(
+                self.positions(), self.attribute("surface_direction"), self.samples.mask
+            )
         return self._ball_radii
 
     def log_potential(self, embedding: nn.Module) -> Tensor:
@@ -78,12 +82,16 @@ class SampleFeatures:
         """Return the `nearest_neighbours` (N, P, k) of each sample in the embedding."""
         if embedding not in self._neighbours:
             points, mask = self.embedded(embedding), self.samples.mask
-            self._neighbours[embedding] = map_bodies(lambda x, m: nearest_neighbours(x, mask=m), points, mask)
+            self._neighbours[embedding] = map_bodies(
+                lambda x, m: nearest_neighbours(x, mask=m), points, mask
+            )
         return self._neighbours[embedding]
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
         """Return unit vectors (N, P, D), in the embedding, towards the surface or, at surface samples, out of it."""
-        other, sign = (self.batch.surface, 1) if self.kind == "interior" else (self.batch.interior, -1)
+        other, sign = (
+            (self.batch.surface, 1) if self.kind == "interior" else (self.batch.interior, -1)
+        )
         targets = embedding(other.eigenfunctions, self.batch.eigenvalues, self.batch.area)
         return sign * map_bodies(nearest_directions, self.embedded(embedding), targets, other.mask)
 
@@ -99,7 +107,9 @@ class BatchFeatures:
         self._training = training
         self._features: dict[tuple[SampleKind, int | None, bool], SampleFeatures] = {}
 
-    def of(self, kind: SampleKind, n_samples: int | None, n_training_samples: int | None) -> SampleFeatures:
+    def of(
+        self, kind: SampleKind, n_samples: int | None, n_training_samples: int | None
+    ) -> SampleFeatures:
         """Return features of `n_samples` samples at most (None: all), or of `n_training_samples` drawn in training."""
         is_random = self._training and n_training_samples is not None
         max_samples = n_training_samples if is_random else n_samples
@@ -117,7 +127,9 @@ def _at_least_single(values: Tensor) -> Tensor:
     return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
-def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest: int = _N_NEAREST) -> Tensor:
+def nearest_directions(
+    points: Tensor, targets: Tensor, mask: Tensor, n_nearest: int = _N_NEAREST
+) -> Tensor:
     """Return unit vectors (..., P, D) from points to the mean of the nearest targets (..., T, D) in the mask (..., T).
 
     All targets are averaged if there are fewer than `n_nearest`. If the mean is the point itself, the vector is zero.
@@ -133,7 +145,9 @@ def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest:
     return functional.normalize(mean - points, dim=-1)
 
 
-def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS, mask: Tensor | None = None) -> Tensor:
+def nearest_neighbours(
+    points: Tensor, n_nearest: int = N_NEIGHBOURS, mask: Tensor | None = None
+) -> Tensor:
     """Return the indices (..., P, k) of the nearest other points to each of points (..., P, D), nearest first.
 
     Only points in the mask (..., P), by default all, are neighbours. If a point has fewer than k neighbours, its own
@@ -147,4 +161,6 @@ def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS, mask: Tens
     if mask is not None:
         squares.masked_fill_(~mask.unsqueeze(-2), torch.inf)
     nearest, indices = smallest(squares, min(n_nearest, n_points - 1))
-    return torch.where(nearest < torch.inf, indices, torch.arange(n_points, device=points.device)[:, None])
+    return torch.where(
+        nearest < torch.inf, indices, torch.arange(n_points, device=points.device)[:, None]
+    )

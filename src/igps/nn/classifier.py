@@ -32,7 +32,9 @@ class Classifier(nn.Module):
         self.descriptor = descriptor
         n = descriptor.n_features
         # Each cell is normalised separately: with a common scale, most cells would have no influence.
-        self.layers = nn.Sequential(nn.BatchNorm1d(n, affine=False), nn.Dropout(dropout), nn.Linear(n, n_classes))
+        self.layers = nn.Sequential(
+            nn.BatchNorm1d(n, affine=False), nn.Dropout(dropout), nn.Linear(n, n_classes)
+        )
 
     def forward(self, batch: SignatureBatch) -> Tensor:
         """Return the logits (N, n_classes) of N shapes."""

@@ -74,7 +74,9 @@ def describe(
     if isinstance(descriptor, Descriptor):
         descriptor.requirements.check_config(dataset.config)
     if not isinstance(descriptor, nn.Module):
-        remedy = f"igps.descriptor({descriptor!r})" if isinstance(descriptor, str) else "a Descriptor"
+        remedy = (
+            f"igps.descriptor({descriptor!r})" if isinstance(descriptor, str) else "a Descriptor"
+        )
         raise TypeError(f"descriptor: expected a module, got {descriptor!r}. Give {remedy}.")
     if not len(dataset):
         raise ValueError("dataset: expected at least one mesh to describe, got none.")
@@ -89,7 +91,9 @@ def describe(
         results = _on_threads(dataset, descriptor, chunks, n_workers)
     with (
         evaluation_mode(descriptor),
-        tqdm(desc="descriptions", total=len(dataset), initial=len(descriptions), disable=not progress) as bar,
+        tqdm(
+            desc="descriptions", total=len(dataset), initial=len(descriptions), disable=not progress
+        ) as bar,
         contextlib.closing(results),
     ):
         for indices, outcomes in results:
@@ -116,7 +120,9 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
     Axes that are fitted already stay unchanged. Each body contributes its first 500 interior samples. Raises a
     ValueError if a body does not have the attribute of an axis.
     """
-    axes = [axis for axis in descriptor.modules() if isinstance(axis, Attribute) and not axis.is_fitted]
+    axes = [
+        axis for axis in descriptor.modules() if isinstance(axis, Attribute) and not axis.is_fitted
+    ]
     values: list[list[Singles]] = [[] for _ in axes]
     for signature in dataset.signatures() if axes else ():
         check_attributes(descriptor, signature.interior.attributes)
@@ -157,7 +163,10 @@ def evaluation_mode(module: nn.Module) -> Iterator[None]:
 
 
 def _on_threads(
-    dataset: SignatureDataset, descriptor: nn.Module, chunks: Sequence[Sequence[int]], n_workers: int | None
+    dataset: SignatureDataset,
+    descriptor: nn.Module,
+    chunks: Sequence[Sequence[int]],
+    n_workers: int | None,
 ) -> _Outcomes:
     """Yield chunks of indices and the outcomes of their meshes, from several threads; on a GPU, from one."""
     device = next(descriptor.parameters(), next(descriptor.buffers(), torch.empty(0))).device
@@ -181,7 +190,11 @@ def _on_processes(
     jobs = [(descriptor, dataset.subset([i]), torch.device("cpu")) for i in indices]
     for number, result in run(describe_timed, jobs, n_workers=n_workers):
         i = indices[number]
-        outcome = Failure.of(dataset.bodies, i, result.reason) if isinstance(result, Failed) else result[0][0]
+        outcome = (
+            Failure.of(dataset.bodies, i, result.reason)
+            if isinstance(result, Failed)
+            else result[0][0]
+        )
         yield [i], [outcome]
 
 
@@ -199,7 +212,9 @@ def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tup
         values: Singles = descriptor(batch.to(device)).cpu().numpy()
         seconds = time.process_time() - start
     if not np.isfinite(values).all():
-        raise MeshError(f"{dataset.bodies.paths[0]}: the description has entries that are not finite.")
+        raise MeshError(
+            f"{dataset.bodies.paths[0]}: the description has entries that are not finite."
+        )
     return values, seconds
 
 
@@ -215,7 +230,11 @@ class _DescriptionStore:
 
     def read(self) -> dict[int, Singles]:
         """Return the cached descriptions by the index of the mesh."""
-        values = {i: self._cache.get(self._key(key)) for i, key in enumerate(self._keys) if key is not None}
+        values = {
+            i: self._cache.get(self._key(key))
+            for i, key in enumerate(self._keys)
+            if key is not None
+        }
         return {i: x for i, x in values.items() if x is not None}
 
     def write(self, i: int, values: Singles) -> None:

@@ -89,7 +89,9 @@ class Descriptor(Specified, ABC):
 
         ball = trimesh.creation.icosphere(subdivisions=3)
         mesh = Mesh(ball.vertices, ball.faces)
-        config = self.requirements.apply_to(SignatureConfig(n_surface_samples=100, resolution=10, min_samples=0))
+        config = self.requirements.apply_to(
+            SignatureConfig(n_surface_samples=100, resolution=10, min_samples=0)
+        )
         with torch.no_grad():
             return self(collate([compute_signature(mesh, config)], [mesh]))[0].numel()
 
@@ -105,7 +107,9 @@ class Descriptor(Specified, ABC):
             ValueError: the descriptor contains modules of other packages, or its name is not of letters, digits and _.
         """
         if not NAME.fullmatch(self.name):
-            raise ValueError(f"name: expected letters, digits and _, got {self.name!r}. Choose another name.")
+            raise ValueError(
+                f"name: expected letters, digits and _, got {self.name!r}. Choose another name."
+            )
         save_module(self, path, dict(self.card if card is None else card))
 
     @abstractmethod
@@ -135,7 +139,9 @@ class Descriptor(Specified, ABC):
 
     def shorten(self, descriptions: Tensor) -> Tensor:
         """Map descriptions (N, D) to (N, ≤ 256) for engines with cosine distances; by default, a ValueError."""
-        raise ValueError(f"shorten: expected a descriptor of vectors, such as pretrained, got {self.name!r}.")
+        raise ValueError(
+            f"shorten: expected a descriptor of vectors, such as pretrained, got {self.name!r}."
+        )
 
 
 class BodyDescriptor(Descriptor):
@@ -166,7 +172,9 @@ class BodyDescriptor(Descriptor):
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """Return descriptions (N, ...) on the device of the batch."""
-        descriptions = [np.asarray(self.describe_body(body), dtype=np.float32) for body in batch.bodies()]
+        descriptions = [
+            np.asarray(self.describe_body(body), dtype=np.float32) for body in batch.bodies()
+        ]
         return torch.from_numpy(np.stack(descriptions)).to(batch.device)
 
 
@@ -208,9 +216,15 @@ class HistogramDescriptor(Descriptor):
             raise ValueError("histograms: expected at least one in each part, got none.")
         self.histograms = nn.ModuleList(histogram for group in groups for histogram in group)
         # Histograms in each part; None for a single histogram, whose descriptions keep its shape.
-        self._sizes = None if isinstance(histograms, DescriptionPart) else tuple(len(group) for group in groups)
+        self._sizes = (
+            None
+            if isinstance(histograms, DescriptionPart)
+            else tuple(len(group) for group in groups)
+        )
         self.name, self.source, self.invariant_to = name, source, tuple(invariant_to)
-        self.requirements = reduce(or_, (histogram.requirements for group in groups for histogram in group))
+        self.requirements = reduce(
+            or_, (histogram.requirements for group in groups for histogram in group)
+        )
 
     @property
     def parts(self) -> tuple[tuple[DescriptionPart, ...], ...]:
@@ -218,7 +232,10 @@ class HistogramDescriptor(Descriptor):
         histograms = [x for x in self.histograms if isinstance(x, DescriptionPart)]
         sizes = self._sizes or (1,)
         # Slices, as PyTorch 2.6 traces an iterator that is consumed in steps as if it started anew at each step.
-        return tuple(tuple(histograms[end - size : end]) for size, end in zip(sizes, accumulate(sizes), strict=True))
+        return tuple(
+            tuple(histograms[end - size : end])
+            for size, end in zip(sizes, accumulate(sizes), strict=True)
+        )
 
     @property
     def part_cells(self) -> tuple[int, ...]:
@@ -234,11 +251,17 @@ class HistogramDescriptor(Descriptor):
         """Return descriptions of sum 1: of a single histogram in its shape (N, ...), of several as (N, cells)."""
         if self._sizes is None:
             return self.parts[0][0](batch)
-        shares = [(1 / (len(self.parts) * len(part)), histogram) for part in self.parts for histogram in part]
+        shares = [
+            (1 / (len(self.parts) * len(part)), histogram)
+            for part in self.parts
+            for histogram in part
+        ]
 
         def concatenated(group: SignatureBatch) -> Tensor:
             features = BatchFeatures(group, self.training)
-            return torch.cat([share * histogram(features).flatten(1) for share, histogram in shares], dim=1)
+            return torch.cat(
+                [share * histogram(features).flatten(1) for share, histogram in shares], dim=1
+            )
 
         return blocks.map_by_size(concatenated, batch)
 
@@ -291,4 +314,6 @@ class EmbeddedDescriptor(Descriptor):
 
     def shorten(self, embeddings: Tensor) -> Tensor:
         """Return embeddings (N, D) with D ≤ 256 unchanged, others shortened by `Head.shorten`."""
-        return embeddings if embeddings.shape[1] <= MAX_SHORT_WIDTH else self.head.shorten(embeddings)
+        return (
+            embeddings if embeddings.shape[1] <= MAX_SHORT_WIDTH else self.head.shorten(embeddings)
+        )

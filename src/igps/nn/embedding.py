@@ -11,14 +11,19 @@ from igps.nn.specification import Specified
 from igps.retrieval.distances import row_distances
 
 EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
-_KINDS = get_args(EmbeddingKind)  # not in `_check_kind`, as older versions of torch.compile cannot trace get_args
+_KINDS = get_args(
+    EmbeddingKind
+)  # not in `_check_kind`, as older versions of torch.compile cannot trace get_args
 
 # Range of λ·area: from below the smallest of elongated bodies to beyond the 250th of any body (4π·250, Weyl's law).
 _FILTER_RANGE = (2.0, 5000.0)
 
 
 def spectral_weights(
-    eigenvalues: Tensor, area: Tensor, kind: EmbeddingKind = "commute_time", time: float | None = None
+    eigenvalues: Tensor,
+    area: Tensor,
+    kind: EmbeddingKind = "commute_time",
+    time: float | None = None,
 ) -> Tensor:
     """Return the factors √area·g(λ·area) that turn eigenfunctions into a scale-invariant embedding.
 
@@ -115,7 +120,9 @@ class SpectralEmbedding(Specified):
         _check_kind(kind, time)
         check_at_least(1, n_eigenpairs=n_eigenpairs)
         if n_knots < 0 or n_knots == 1:
-            raise ValueError(f"n_knots: expected 0 for a fixed filter or at least 2, got {n_knots}.")
+            raise ValueError(
+                f"n_knots: expected 0 for a fixed filter or at least 2, got {n_knots}."
+            )
         self.kind: EmbeddingKind = kind
         self.time, self.n_eigenpairs = time, n_eigenpairs
         self.log_gain = nn.Parameter(torch.zeros(n_knots)) if n_knots else None
@@ -148,6 +155,8 @@ def _check_kind(kind: str, time: float | None) -> None:
     if kind not in _KINDS:
         raise ValueError(f"kind: expected one of {', '.join(_KINDS)}, got {kind!r}.")
     if kind == "diffusion" and (time is None or not 0 < time < math.inf):
-        raise ValueError(f"time: expected a positive diffusion time over area for kind='diffusion', got {time}.")
+        raise ValueError(
+            f"time: expected a positive diffusion time over area for kind='diffusion', got {time}."
+        )
     if kind != "diffusion" and time is not None:
         raise ValueError(f"time: expected None for kind={kind!r}, which has no time, got {time}.")

@@ -1,9 +1,19 @@
 """The mathematics of the modules as functions of tensors, without parameters or state."""
 
 from igps.nn._kernels.balls import ball_radii
-from igps.nn._kernels.pair_values import euclidean_distances, oriented_pairs, pair_twists, point_pair_features
+from igps.nn._kernels.pair_values import (
+    euclidean_distances,
+    oriented_pairs,
+    pair_twists,
+    point_pair_features,
+)
 from igps.nn.axes.points import soft_memberships
-from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding, spectral_weights
+from igps.nn.embedding import (
+    barycentroid_potential,
+    interior_distance,
+    spectral_embedding,
+    spectral_weights,
+)
 from igps.nn.histograms.pairs import joint_histogram, pair_histogram
 from igps.nn.histograms.points import point_histogram
 from igps.retrieval import chi_square

@@ -82,16 +82,26 @@ class RetrievalLearner(LightningModule):
     ) -> None:
         super().__init__()
         # Without a configuration, modules are passed to load_from_checkpoint; the state contains their parameters.
-        self.save_hyperparameters(ignore=() if has_configuration() else ("descriptor", "distance", "loss", "miner"))
+        self.save_hyperparameters(
+            ignore=() if has_configuration() else ("descriptor", "distance", "loss", "miner")
+        )
         self.descriptor, self.distance, self.miner = descriptor, distance, miner
         self.loss = _supervised_contrastive() if loss is None else loss
         self.learning_rate, self.bin_rate, self.weight_decay = learning_rate, bin_rate, weight_decay
-        self.part_cells = descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
-        if isinstance(descriptor, HistogramDescriptor) and descriptor.n_features != sum(descriptor.part_cells):
+        self.part_cells = (
+            descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
+        )
+        if isinstance(descriptor, HistogramDescriptor) and descriptor.n_features != sum(
+            descriptor.part_cells
+        ):
             raise ValueError(
                 f"descriptor: expected only histograms, got {descriptor.name} with size. Use without_size()."
             )
-        if distance.head is not None and self.part_cells is not None and any(map(is_lazy, distance.parameters())):
+        if (
+            distance.head is not None
+            and self.part_cells is not None
+            and any(map(is_lazy, distance.parameters()))
+        ):
             # A first call sets the sizes of lazy parameters, which the optimiser needs.
             with torch.no_grad():
                 distance.head.eval()(torch.ones(1, sum(self.part_cells)))
@@ -102,7 +112,11 @@ class RetrievalLearner(LightningModule):
 
     @classmethod
     def load_from_checkpoint(
-        cls, checkpoint_path: str | Path | IO[bytes], *arguments: Any, trusted: Sequence[str] = (), **options: Any
+        cls,
+        checkpoint_path: str | Path | IO[bytes],
+        *arguments: Any,
+        trusted: Sequence[str] = (),
+        **options: Any,
     ) -> Self:
         """Load a learner as `LightningModule.load_from_checkpoint` does, on the CPU by default.
 
@@ -118,7 +132,9 @@ class RetrievalLearner(LightningModule):
         try:
             stored = torch.load(checkpoint_path, map_location="cpu", weights_only=True)
         except (UnpicklingError, EOFError, RuntimeError) as error:
-            raise ValueError(f"{checkpoint_path}: expected a checkpoint, got another or a damaged file.") from error
+            raise ValueError(
+                f"{checkpoint_path}: expected a checkpoint, got another or a damaged file."
+            ) from error
         allowed = (*_TRUSTED, *trusted)
         for path in _class_paths(stored.get("hyper_parameters", {})):
             if path.partition(".")[0] not in allowed:
@@ -141,7 +157,9 @@ class RetrievalLearner(LightningModule):
     @property
     def _head(self) -> Head:
         if self.distance.head is None:
-            raise ValueError("distance: expected a head to train, got none. Use Trainer.test for a plain descriptor.")
+            raise ValueError(
+                "distance: expected a head to train, got none. Use Trainer.test for a plain descriptor."
+            )
         return self.distance.head
 
     def setup(self, stage: str) -> None:
@@ -200,12 +218,23 @@ class RetrievalLearner(LightningModule):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Return AdamW with weight decay for the head, but not for bins and filters, whose initial values matter."""
         groups = [
-            {"params": list(self.distance.parameters()), "lr": self.learning_rate, "weight_decay": self.weight_decay},
-            {"params": list(self.descriptor.parameters()), "lr": self.bin_rate, "weight_decay": 0.0},
+            {
+                "params": list(self.distance.parameters()),
+                "lr": self.learning_rate,
+                "weight_decay": self.weight_decay,
+            },
+            {
+                "params": list(self.descriptor.parameters()),
+                "lr": self.bin_rate,
+                "weight_decay": 0.0,
+            },
         ]
         optimizer = torch.optim.AdamW([group for group in groups if group["params"]])
         epochs = max(self.trainer.max_epochs or 1, 1)
-        return {"optimizer": optimizer, "lr_scheduler": torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs)}
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs),
+        }
 
     @one_thread()
     def _log_scores(self, split: str) -> None:
@@ -236,7 +265,9 @@ class RetrievalLearner(LightningModule):
         """Describe all shapes of the training loader's dataset, each once."""
         loader = self.trainer.train_dataloader
         if not isinstance(loader, DataLoader):
-            raise ValueError(f"train_dataloaders: expected one DataLoader, got {type(loader).__name__}.")
+            raise ValueError(
+                f"train_dataloaders: expected one DataLoader, got {type(loader).__name__}."
+            )
         ordered = DataLoader(loader.dataset, batch_size=16, collate_fn=loader.collate_fn)
         batches = [(self(batch.to(self.device)), _known_labels(batch)) for batch in ordered]
         descriptions, labels = zip(*batches, strict=True)
@@ -270,5 +301,7 @@ def _supervised_contrastive() -> nn.Module:
     try:
         from pytorch_metric_learning.losses import SupConLoss
     except ImportError as error:
-        raise ImportError('training needs pytorch-metric-learning: pip install "interior-gps[metric]".') from error
+        raise ImportError(
+            'training needs pytorch-metric-learning: pip install "interior-gps[metric]".'
+        ) from error
     return SupConLoss(temperature=0.1)

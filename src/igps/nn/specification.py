@@ -35,7 +35,16 @@ _CLASS = re.compile(r"igps\.(?:nn|descriptors)(?:\.[a-z0-9_]+)*\.[A-Z][A-Za-z0-9
 # arguments of a head, whose memory can exceed the size of the file.
 _MAX_MODULES, _MAX_NUMBER, _MAX_PARAMETERS = 200, 100_000, 1_000_000
 # Errors that a damaged file can raise.
-_UNREADABLE = (SafetensorError, OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ImportError)
+_UNREADABLE = (
+    SafetensorError,
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RuntimeError,
+    ImportError,
+)
 
 
 class Specified(nn.Module):
@@ -53,7 +62,11 @@ class Specified(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the arguments that are numbers or strings, for `repr`; PyTorch adds the submodules."""
-        return ", ".join(f"{name}={x!r}" for name, x in self.made_with().items() if isinstance(x, int | float | str))
+        return ", ".join(
+            f"{name}={x!r}"
+            for name, x in self.made_with().items()
+            if isinstance(x, int | float | str)
+        )
 
 
 def specification(module: nn.Module) -> dict[str, Any]:
@@ -80,9 +93,14 @@ def specification(module: nn.Module) -> dict[str, Any]:
             return {"same_as": next(i for i, x in enumerate(modules) if value is x)}
         path = f"{type(value).__module__}.{type(value).__qualname__}"
         if not isinstance(value, Specified) or not _CLASS.fullmatch(path):
-            raise ValueError(f"descriptor: expected to be made of modules of igps and numbers, got {path} in it.")
+            raise ValueError(
+                f"descriptor: expected to be made of modules of igps and numbers, got {path} in it."
+            )
         modules.append(value)
-        return {"class_path": path, "init_args": {name: encode(x) for name, x in value.made_with().items()}}
+        return {
+            "class_path": path,
+            "init_args": {name: encode(x) for name, x in value.made_with().items()},
+        }
 
     encoded: dict[str, Any] = encode(module)
     return encoded
@@ -100,17 +118,27 @@ def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
         if set(spec) == {"same_as"}:
             return modules[spec["same_as"]]
         path, arguments = spec["class_path"], spec.get("init_args", {})
-        if not set(spec) <= {"class_path", "init_args"} or not _CLASS.fullmatch(path) or len(modules) >= _MAX_MODULES:
-            raise ValueError(f"{path!r} is no module of igps, or there are more than {_MAX_MODULES} modules")
+        if (
+            not set(spec) <= {"class_path", "init_args"}
+            or not _CLASS.fullmatch(path)
+            or len(modules) >= _MAX_MODULES
+        ):
+            raise ValueError(
+                f"{path!r} is no module of igps, or there are more than {_MAX_MODULES} modules"
+            )
         package, _, name = path.rpartition(".")
         cls = getattr(importlib.import_module(package), name, None)
         if not isinstance(cls, type) or not issubclass(cls, Specified):
             raise ValueError(f"{path} is no module of igps")
         sizes = [n for n in _integers(arguments.values()) if n > 1]
-        if max(sizes, default=0) > _MAX_NUMBER or ("Head" in name and math.prod(sizes) > max(_MAX_PARAMETERS, n_bytes)):
+        if max(sizes, default=0) > _MAX_NUMBER or (
+            "Head" in name and math.prod(sizes) > max(_MAX_PARAMETERS, n_bytes)
+        ):
             raise ValueError(f"{name} of {sizes} is too large")
         position = len(modules)
-        modules.append(nn.Identity())  # placeholder, as the arguments may contain modules with later positions
+        modules.append(
+            nn.Identity()
+        )  # placeholder, as the arguments may contain modules with later positions
         modules[position] = cls(**{name: decode(x) for name, x in arguments.items()})
         return modules[position]
 
@@ -135,13 +163,20 @@ def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) ->
     if Path(path).suffix != ".safetensors":
         save_module(module, path := Path(path) / IN_FOLDER, card)
         rows = (f"| {name} | `{json.dumps(value)}` |\n" for name, value in card.items())
-        text = _README.format(name=getattr(module, "name", type(module).__name__), rows="".join(rows))
+        text = _README.format(
+            name=getattr(module, "name", type(module).__name__), rows="".join(rows)
+        )
         path.with_name("README.md").write_text(text, encoding="utf-8")
         return
     spec = specification(module)
-    _check_unchanged(module, build_module(spec, sum(tensor.nbytes for tensor in module.state_dict().values())))
+    _check_unchanged(
+        module, build_module(spec, sum(tensor.nbytes for tensor in module.state_dict().values()))
+    )
     metadata = {"format": _FORMAT, "specification": json.dumps(spec), "card": json.dumps(card)}
-    state = {name: value.detach().cpu().clone().contiguous() for name, value in module.state_dict().items()}
+    state = {
+        name: value.detach().cpu().clone().contiguous()
+        for name, value in module.state_dict().items()
+    }
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(Path(path)) as file:
         file.write(sort_metadata(save(state, metadata=metadata)))
@@ -153,12 +188,20 @@ def _check_unchanged(module: nn.Module, rebuilt: nn.Module) -> None:
     for path, submodule in module.named_modules():
         original, changed = rebuilt_modules.get(path), [""]
         if type(original) is type(submodule):
-            public = {name: x for name, x in vars(original).items() if name[0] != "_" and name != "training"}
-            plain = {name: x for name, x in public.items() if isinstance(x, int | float | str | tuple)}
+            public = {
+                name: x
+                for name, x in vars(original).items()
+                if name[0] != "_" and name != "training"
+            }
+            plain = {
+                name: x for name, x in public.items() if isinstance(x, int | float | str | tuple)
+            }
             changed = [name for name, x in plain.items() if getattr(submodule, name, x) != x]
         if changed:
             name = ".".join(filter(None, (path, changed[0])))
-            raise ValueError(f"{name}: expected its initial value, got another, which is not saved. Make a new module.")
+            raise ValueError(
+                f"{name}: expected its initial value, got another, which is not saved. Make a new module."
+            )
 
 
 def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
@@ -183,5 +226,7 @@ def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
             raise ValueError("its card is not a mapping")
     except _UNREADABLE as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"{path}: expected a descriptor in the format {_FORMAT} ({reason}). Save it again.") from error
+        raise ValueError(
+            f"{path}: expected a descriptor in the format {_FORMAT} ({reason}). Save it again."
+        ) from error
     return module.eval(), card

@@ -17,7 +17,15 @@ from igps.analysis.groups import GroupTest
 from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
-from igps.report.drawing import PALETTE, draw_body, front_view, new_figure, paint, save_figure, shortened
+from igps.report.drawing import (
+    PALETTE,
+    draw_body,
+    front_view,
+    new_figure,
+    paint,
+    save_figure,
+    shortened,
+)
 from igps.report.page_data import finite
 from igps.report.tables import write_rows
 from igps.retrieval import PrecisionRecallCurve
@@ -30,7 +38,9 @@ LEVEL = 0.05
 _SIGNIFICANT, _OTHER = PALETTE[0], "#777777"
 
 
-def write_analysis(out: Path, name: str, rows: Sequence[Mapping[str, Any]], figure: Figure | None = None) -> None:
+def write_analysis(
+    out: Path, name: str, rows: Sequence[Mapping[str, Any]], figure: Figure | None = None
+) -> None:
     """Write rows as NAME.csv and NAME.json, and the figure, if any, as NAME.svg and NAME.png."""
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.json").write_text(json.dumps(finite(list(rows)), indent=2) + "\n")
@@ -42,12 +52,16 @@ def write_analysis(out: Path, name: str, rows: Sequence[Mapping[str, Any]], figu
 
 def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
     """Plot the effects of all tested bodies with their intervals, the largest on top; return None if there are none."""
-    tested = sorted((test for test in tests if test.effect is not None), key=lambda test: test.effect or 0)
+    tested = sorted(
+        (test for test in tests if test.effect is not None), key=lambda test: test.effect or 0
+    )
     if not tested:
         return None
     figure = new_figure(6.5, 1.2 + 0.24 * len(tested))
     axes = figure.add_subplot()
-    intervals = np.array([(test.effect, test.effect_low, test.effect_high) for test in tested], dtype=float)
+    intervals = np.array(
+        [(test.effect, test.effect_low, test.effect_high) for test in tested], dtype=float
+    )
     for y, (test, (effect, low, high)) in enumerate(zip(tested, intervals, strict=True)):
         colour = _SIGNIFICANT if (test.permanova_q or 0) <= LEVEL else _OTHER
         axes.plot([low, high], [y, y], color=colour, linewidth=1.6)
@@ -55,7 +69,9 @@ def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
     axes.axvline(0, color="#BBBBBB", linewidth=0.8, zorder=0)
     axes.set_yticks(range(len(tested)), [shortened(test.body) for test in tested])
     axes.set_xlabel("share of squared distances that the groups explain, 95 % interval")
-    axes.set_title(f"round, orange: false discovery rate at most {LEVEL:.0%}; square, grey: above", fontsize=9)
+    axes.set_title(
+        f"round, orange: false discovery rate at most {LEVEL:.0%}; square, grey: above", fontsize=9
+    )
     return figure
 
 
@@ -68,7 +84,9 @@ def outliers_figure(pictured: Sequence[tuple[Outlier, str, Mesh]]) -> Figure:
         axes.set_axis_off()
     for axes, (outlier, name, mesh) in zip(all_axes, pictured, strict=False):
         draw_body(axes, mesh)
-        title = "\n".join(wrap(f"{outlier.score:.1f}  {shortened(name)}", 38) + wrap(outlier.reason, 38))
+        title = "\n".join(
+            wrap(f"{outlier.score:.1f}  {shortened(name)}", 38) + wrap(outlier.reason, 38)
+        )
         axes.set_title(title, fontsize=6, color=_SIGNIFICANT if outlier.is_outlier else "#000000")
     return figure
 
@@ -80,7 +98,9 @@ def explanation_figure(painted: Sequence[tuple[str, Mesh, Floats]]) -> Figure:
     for row, (name, mesh, values) in zip(all_axes, painted, strict=True):
         largest = np.quantile(np.abs(values), 0.98) or 1.0
         shares = np.clip(values / largest, -1, 1)[:, None]
-        colours = np.where(shares > 0, _WHITE + shares * (_RED - _WHITE), _WHITE - shares * (_BLUE - _WHITE))
+        colours = np.where(
+            shares > 0, _WHITE + shares * (_RED - _WHITE), _WHITE - shares * (_BLUE - _WHITE)
+        )
         vertices = front_view(mesh.vertices)
         for axes, signs, side in zip(row, ([1, 1, 1], [-1, 1, -1]), ("front", "back"), strict=True):
             paint(axes, vertices * signs, mesh.faces, colours)
@@ -97,11 +117,22 @@ def map_figure(body_map: BodyMap, values: Sequence[str] | Sequence[float], title
         names, handles = sorted(set(map(str, values))), []
         for number, name in enumerate(names):
             own = [value == name for value in values]
-            marker, colour = _MAP_MARKERS[number // len(PALETTE) % len(_MAP_MARKERS)], PALETTE[number % len(PALETTE)]
-            handles.append(axes.scatter(x[own], y[own], s=20, label=name, linewidths=0.8, marker=marker, color=colour))
-        if any(names):  # with explicit handles, because Matplotlib skips labels that begin with an underscore
+            marker, colour = (
+                _MAP_MARKERS[number // len(PALETTE) % len(_MAP_MARKERS)],
+                PALETTE[number % len(PALETTE)],
+            )
+            handles.append(
+                axes.scatter(
+                    x[own], y[own], s=20, label=name, linewidths=0.8, marker=marker, color=colour
+                )
+            )
+        if any(
+            names
+        ):  # with explicit handles, because Matplotlib skips labels that begin with an underscore
             labels, n_columns = list(map(shortened, names)), 1 + len(names) // 30
-            figure.legend(handles, labels, loc="outside right upper", title=title, fontsize=7, ncols=n_columns)
+            figure.legend(
+                handles, labels, loc="outside right upper", title=title, fontsize=7, ncols=n_columns
+            )
     else:
         figure.colorbar(axes.scatter(x, y, s=20, c=values, cmap="viridis"), label=title)
     axes.set(aspect="equal", xticks=[], yticks=[], xlabel=f"stress {body_map.stress:.2f}")
@@ -112,16 +143,23 @@ def clusters_figure(clustering: Clusters, names: Sequence[str]) -> Figure:
     """Plot the tree of bodies, each labelled with its cluster and the stability of the cluster in brackets."""
     figure = new_figure(7, max(2.0, 0.6 + 0.13 * len(names)))
     axes = figure.add_subplot()
-    leaves = dendrogram(clustering.tree, orientation="left", ax=axes, link_color_func=lambda _: _OTHER)["leaves"]
+    leaves = dendrogram(
+        clustering.tree, orientation="left", ax=axes, link_color_func=lambda _: _OTHER
+    )["leaves"]
     clusters = clustering.labels[leaves]
     names = [shortened(names[i]) for i in leaves]
     stability = ["–" if np.isnan(value) else f"{value:.2f}" for value in clustering.stability]
-    labels = [f"{name}  {cluster + 1} ({stability[cluster]})" for name, cluster in zip(names, clusters, strict=True)]
+    labels = [
+        f"{name}  {cluster + 1} ({stability[cluster]})"
+        for name, cluster in zip(names, clusters, strict=True)
+    ]
     axes.set_yticks(5 + 10 * np.arange(len(leaves)), labels, fontsize=5)
     for label, cluster in zip(axes.get_yticklabels(), clusters, strict=True):
         weight = "bold" if clustering.stability[cluster] >= STABLE else "normal"
         label.set(color=PALETTE[cluster % len(PALETTE)], weight=weight)
-    axes.set_xlabel(f"distance; after each name: cluster (stability), bold for at least {STABLE}", fontsize=7)
+    axes.set_xlabel(
+        f"distance; after each name: cluster (stability), bold for at least {STABLE}", fontsize=7
+    )
     return figure
 
 
@@ -134,14 +172,23 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
         recall, precision = 100 * curve.recall.numpy(), 100 * curve.precision.numpy()
         marker = _MARKERS[i % len(_MARKERS)]
         axes.plot(
-            recall, precision, label=name, color=colour, linestyle=line, linewidth=1.4, marker=marker, markersize=4
+            recall,
+            precision,
+            label=name,
+            color=colour,
+            linestyle=line,
+            linewidth=1.4,
+            marker=marker,
+            markersize=4,
         )
     axes.set(xlim=(0, 102), ylim=(0, 102))
     axes.set_xlabel("recall: share of the query's class that is retrieved (%)")
     axes.set_ylabel("precision: share of the query's class among the retrieved (%)")
     n_queries = [curve.n_queries for curve in curves.values()]
     low, high = min(n_queries), max(n_queries)
-    axes.set_title(f"leave-one-out, mean over {high if low == high else f'{low} to {high}'} queries")
+    axes.set_title(
+        f"leave-one-out, mean over {high if low == high else f'{low} to {high}'} queries"
+    )
     axes.grid(color="#DDDDDD", linewidth=0.6)
     figure.legend(loc="outside right upper", frameon=False, title="system")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -151,4 +198,6 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
 # Curves of precision and recall beyond the first round of colours differ by line style and marker
 _STYLES, _MARKERS = ("-", "--", ":"), ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 _MAP_MARKERS = ("o", "s", "^", "x", "+", "D")
-_WHITE, _RED, _BLUE = (np.array(rgb) for rgb in ((0.9, 0.9, 0.9), (0.84, 0.25, 0.0), (0.0, 0.35, 0.7)))
+_WHITE, _RED, _BLUE = (
+    np.array(rgb) for rgb in ((0.9, 0.9, 0.9), (0.84, 0.25, 0.0), (0.0, 0.35, 0.7))
+)

@@ -25,7 +25,9 @@ PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 """Colours that remain distinct for colour-blind readers (Okabe and Ito 2008)."""
 GREY = (0.86, 0.88, 0.92)
 _RELEVANT, _IRRELEVANT, _QUERY = PALETTE[1], PALETTE[0], "#444444"
-_THUMBNAIL_VERTICES = 800  # enough for the detail of a thumbnail; drawing time grows with the number of faces
+_THUMBNAIL_VERTICES = (
+    800  # enough for the detail of a thumbnail; drawing time grows with the number of faces
+)
 _MAX_NAME_LENGTH = 60  # characters
 
 
@@ -35,15 +37,25 @@ def paint(axis: Axes, vertices: Floats, faces: Integers, colour: Any) -> None:
 
     normals = unit(area_vectors(vertices, faces))
     front = np.nonzero(normals[:, 2] > 0)[0]
-    front = front[np.argsort(vertices[faces[front], 2].mean(axis=1))]  # the painter's algorithm: far faces first
+    front = front[
+        np.argsort(vertices[faces[front], 2].mean(axis=1))
+    ]  # the painter's algorithm: far faces first
     light = normals[front] @ np.array([0.35, 0.45, 0.82])
     unlit = np.broadcast_to(colour, (len(faces), 3))[front]
     colours = np.clip(0.35 + 0.6 * light, 0, 1)[:, None] * unlit
     polygons = list(vertices[faces[front], :2])
-    axis.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours, linewidths=0.3))
+    axis.add_collection(
+        PolyCollection(polygons, facecolors=colours, edgecolors=colours, linewidths=0.3)
+    )
     low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
     (x, y), reach = (low + high) / 2, 0.54 * (high - low).max()
-    axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", xticks=[], yticks=[])
+    axis.set(
+        xlim=(x - reach, x + reach),
+        ylim=(y - reach, y + reach),
+        aspect="equal",
+        xticks=[],
+        yticks=[],
+    )
 
 
 def axes_of(points: Floats) -> Floats:
@@ -72,8 +84,12 @@ def save_figure(figure: Figure, path: Path, dpi: float | None = None) -> None:
 
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # a $ in the name of a body does not start a formula
-    with rc_context({"svg.hashsalt": "igps"}):  # otherwise, the identifiers in an SVG file are random
-        figure.savefig(path, dpi=dpi or "figure", metadata={"Date": None} if path.suffix == ".svg" else None)
+    with rc_context(
+        {"svg.hashsalt": "igps"}
+    ):  # otherwise, the identifiers in an SVG file are random
+        figure.savefig(
+            path, dpi=dpi or "figure", metadata={"Date": None} if path.suffix == ".svg" else None
+        )
 
 
 def shortened(name: str) -> str:
@@ -82,7 +98,9 @@ def shortened(name: str) -> str:
     return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:half]}…{name[1 - half :]}"
 
 
-def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progress: bool = False) -> None:
+def ranked_results(
+    root: Path, ranking: Path, out: Path, *, top: int = 8, progress: bool = False
+) -> None:
     """Save a figure with one row per class: its first mesh as the query, followed by the meshes nearest to it.
 
     The meshes lie in `root`, in one subfolder per class; `ranking` is ranking.csv that `igps retrieve` wrote for them.
@@ -98,15 +116,21 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progre
     figure = new_figure(1.25 * (top + 1), 1.45 * len(queries) + 0.6)
     axes = figure.subplots(len(queries), top + 1, squeeze=False)
     rows = zip(axes, queries, strict=True)
-    for row_axes, query in tqdm(rows, desc="ranked results", total=len(queries), disable=not progress):
+    for row_axes, query in tqdm(
+        rows, desc="ranked results", total=len(queries), disable=not progress
+    ):
         shown = [(query, f"query {query}", _QUERY)]
         for model, distance, relevant in results[query]:
-            shown.append((model, f"{model}\n{distance:#.3g}", _RELEVANT if relevant else _IRRELEVANT))
+            shown.append(
+                (model, f"{model}\n{distance:#.3g}", _RELEVANT if relevant else _IRRELEVANT)
+            )
         for axis, (name, title, colour) in zip(row_axes, shown, strict=False):
             draw_body(axis, load_mesh(root / name, LoadOptions(allow_open=True)))
             axis.set_title(title, fontsize=5.5, pad=2)
             for side in axis.spines.values():
-                side.set(color=colour, linewidth=1.6, linestyle="--" if colour == _IRRELEVANT else "-")
+                side.set(
+                    color=colour, linewidth=1.6, linestyle="--" if colour == _IRRELEVANT else "-"
+                )
     figure.suptitle(
         "Query (left) and its nearest meshes with their distances; blue: same class; orange, dashed: another class",
         fontsize=9,

@@ -24,7 +24,9 @@ class SurfaceExplanation:
 
     other: str  # name of the nearest body
     summary: str  # the largest shares of the distance, as text
-    values: tuple[NDArray[np.uint8], NDArray[np.uint8]]  # (V,) of both surfaces: 128 for no share, larger for a share
+    values: tuple[
+        NDArray[np.uint8], NDArray[np.uint8]
+    ]  # (V,) of both surfaces: 128 for no share, larger for a share
 
 
 def keep_explanations(
@@ -42,9 +44,17 @@ def keep_explanations(
     """
     indices = {name: i for i, name in enumerate(dataset.bodies.names)}
     nearest = [system.names[row[0]] for row in system.ranked()] if len(system.names) > 1 else []
-    pairs = [pair for pair in zip(system.names, nearest, strict=False) if set(pair) <= surfaces.keys() & indices.keys()]
+    pairs = [
+        pair
+        for pair in zip(system.names, nearest, strict=False)
+        if set(pair) <= surfaces.keys() & indices.keys()
+    ]
     jobs = {
-        pair[0]: (descriptor, dataset.subset([indices[name] for name in pair]), [surfaces[name] for name in pair])
+        pair[0]: (
+            descriptor,
+            dataset.subset([indices[name] for name in pair]),
+            [surfaces[name] for name in pair],
+        )
         for pair in pairs
     }
     results = run_jobs(_explain_pair, jobs, "explanation", n_workers)
@@ -62,7 +72,9 @@ def keep_explanations(
     return results
 
 
-def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[str, SurfaceExplanation]:
+def read_explanations(
+    path: Path, surfaces: Mapping[str, PageSurface]
+) -> dict[str, SurfaceExplanation]:
     """Read explanations from an archive, by name, if their surfaces have not changed; none if there is no file."""
     if not path.is_file():
         return {}
@@ -78,16 +90,23 @@ def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[s
     return results
 
 
-def _explain_pair(job: tuple[Descriptor, SignatureDataset, list[PageSurface]]) -> SurfaceExplanation:
+def _explain_pair(
+    job: tuple[Descriptor, SignatureDataset, list[PageSurface]],
+) -> SurfaceExplanation:
     descriptor, dataset, surfaces = job
     with one_thread():
         explanation = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
     shares = explanation.places or explanation.samples
-    first, second = (_vertex_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i]) for i in (0, 1))
+    first, second = (
+        _vertex_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i])
+        for i in (0, 1)
+    )
     return SurfaceExplanation(dataset.bodies.names[1], explanation.summary(), (first, second))
 
 
-def _vertex_values(mesh: Mesh, signature: Signature, shares: Shares, surface: PageSurface) -> NDArray[np.uint8]:
+def _vertex_values(
+    mesh: Mesh, signature: Signature, shares: Shares, surface: PageSurface
+) -> NDArray[np.uint8]:
     """Return the values (V,) of `SurfaceExplanation` at the vertices of a page surface."""
     axes = axes_of(signature.surface.points)
     samples = {kind: getattr(signature, kind).points @ axes for kind in SAMPLE_KINDS}

@@ -32,7 +32,9 @@ SCORE_MEANINGS = dict(  # noqa: C408
 
 
 def render_page(
-    results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, SurfaceExplanation] | None = None
+    results: Results,
+    surfaces: Mapping[str, PageSurface],
+    explanations: Mapping[str, SurfaceExplanation] | None = None,
 ) -> str:
     """Return the page of results as HTML text, with surfaces and explanations by the name of the mesh."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -40,9 +42,12 @@ def render_page(
 
     # Autoescape, because names and notes come from files
     environment = Environment(
-        loader=PackageLoader("igps.report", "template"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        loader=PackageLoader("igps.report", "template"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
         lstrip_blocks=True,
-    )  # fmt: skip
+    )
     data = data_of(results, surfaces, explanations)
     # The content security policy allows only the page's own scripts and style, identified by their hashes
     scripts = [(_TEMPLATE / name).read_text(encoding="utf-8").strip() + "\n" for name in _SCRIPTS]
@@ -73,7 +78,9 @@ def render_page(
         plot=(_PLOT_WIDTH, _PLOT_HEIGHT),
         config=_config_rows(results.config),
         disturbances=(results.robustness or {}).get("disturbances", {}),
-        outliers=[{**row, "place": indices.get(row["name"])} for row in results.outliers[:N_OUTLIERS]],
+        outliers=[
+            {**row, "place": indices.get(row["name"])} for row in results.outliers[:N_OUTLIERS]
+        ],
         n_repaired=sum(bool(shape["notes"]) for shape in data["shapes"]),
     )
 
@@ -86,7 +93,9 @@ def _title(results: Results, data: Mapping[str, Any]) -> str:
     shapes = f"{len(results.names)} shape{'s' * (len(results.names) != 1)}"
     if data["classes"]:
         shapes += f" in {len(data['classes'])} class{'es' * (len(data['classes']) != 1)}"
-    names = [system.name for system in results.systems] or list((results.robustness or {}).get("movements", {}))
+    names = [system.name for system in results.systems] or list(
+        (results.robustness or {}).get("movements", {})
+    )
     descriptors = names[0] if len(names) == 1 else f"{len(names)} descriptors"
     return f"{shapes}, {descriptors}" + (" under disturbance" if results.robustness else "")
 

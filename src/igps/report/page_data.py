@@ -22,21 +22,31 @@ _N_WRONG = 3  # shapes of other classes that are shown for each of these queries
 _MIN_RANKED = 48  # shortest ranking of a query
 _DECIMALS = 5
 _QUERY_SCORES = ("nn", "ft", "st", "map")  # scores that are shown for each query
-_MIN_MAPPED, _MAX_MAPPED = 3, 3000  # shapes of a map; more take too long to lay out and to draw in a browser
+_MIN_MAPPED, _MAX_MAPPED = (
+    3,
+    3000,
+)  # shapes of a map; more take too long to lay out and to draw in a browser
 
 
 def data_of(
-    results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, SurfaceExplanation] | None = None
+    results: Results,
+    surfaces: Mapping[str, PageSurface],
+    explanations: Mapping[str, SurfaceExplanation] | None = None,
 ) -> dict[str, Any]:
     """Return the data of the page without its surfaces; for `shapes` see `_shapes`, for `systems` `_system_data`."""
     classes = sorted(set(results.labels or ()))
     index = {name: i for i, name in enumerate(results.names)}
     sizes = Counter(results.labels or ())
-    n_ranked = max(_MIN_RANKED, 2 * max(sizes.values(), default=0))  # covers the second tier of every class
+    n_ranked = max(
+        _MIN_RANKED, 2 * max(sizes.values(), default=0)
+    )  # covers the second tier of every class
     return {
         "classes": classes,
         "shapes": _shapes(results, surfaces, classes, explanations or {}),
-        "columns": {title: [column.get(name) for name in results.names] for title, column in results.columns.items()},
+        "columns": {
+            title: [column.get(name) for name in results.names]
+            for title, column in results.columns.items()
+        },
         "systems": [_system_data(system, index, classes, n_ranked) for system in results.systems],
         "movements": finite((results.robustness or {}).get("movements", {})),
     }
@@ -92,7 +102,9 @@ def _shapes(
     return result
 
 
-def _system_data(system: System, index: Mapping[str, int], classes: Sequence[str], n_ranked: int) -> dict[str, Any]:
+def _system_data(
+    system: System, index: Mapping[str, int], classes: Sequence[str], n_ranked: int
+) -> dict[str, Any]:
     """Return the data of a descriptor.
 
     These are the `shapes` that it describes (indices among all shapes); for each of them the `top` nearest others,
@@ -105,7 +117,9 @@ def _system_data(system: System, index: Mapping[str, int], classes: Sequence[str
     indices = np.array([index[name] for name in system.names])
     distances = np.take_along_axis(system.distances.numpy(), nearest, axis=1)
     scored: dict[str, Any] = dict.fromkeys(("scores", "per_class", "per_query", "curve", "worst"))
-    if system.labels is not None and len(set(system.labels)) < len(system.labels):  # some shapes share a class
+    if system.labels is not None and len(set(system.labels)) < len(
+        system.labels
+    ):  # some shapes share a class
         scores = retrieval_scores(system.distances, system.labels)
         curve = precision_recall_curve(system.distances, system.labels)
         by_class = {str(label): values for label, values in scores.per_class().items()}
@@ -147,11 +161,15 @@ def _map(system: System) -> dict[str, Any] | None:
         "cluster": clusters.labels.tolist(),
         "stability": finite(clusters.stability, _DECIMALS),
         "n_stable": sum(stability >= STABLE for stability in clusters.stability),
-        "tree": [[int(a), int(b), _significant(height)] for a, b, height, _ in clusters.tree.tolist()],
+        "tree": [
+            [int(a), int(b), _significant(height)] for a, b, height, _ in clusters.tree.tolist()
+        ],
     }
 
 
-def _confusion(order: Integers, labels: Sequence[str], classes: Sequence[str]) -> dict[str, list[list[int]]] | None:
+def _confusion(
+    order: Integers, labels: Sequence[str], classes: Sequence[str]
+) -> dict[str, list[list[int]]] | None:
     """Count (C, C) the nearest shapes, and the first tiers, of each class of queries (row) by their class (column)."""
     if not order.size:
         return None
@@ -164,7 +182,9 @@ def _confusion(order: Integers, labels: Sequence[str], classes: Sequence[str]) -
     return {"nearest": nearest.tolist(), "tier": tier.tolist()}
 
 
-def _worst(system: System, order: Integers, scores: RetrievalScores, indices: Integers) -> list[dict[str, Any]]:
+def _worst(
+    system: System, order: Integers, scores: RetrievalScores, indices: Integers
+) -> list[dict[str, Any]]:
     """Return the queries with the worst rankings, at most `N_WORST`, the worst first.
 
     The lower the first shape of the query's class is ranked, the worse is the ranking; ties are ordered by the first
@@ -177,11 +197,19 @@ def _worst(system: System, order: Integers, scores: RetrievalScores, indices: In
     queries = np.flatnonzero(first_tier < 1).tolist()
     is_relevant = codes[order[queries]] == codes[queries][:, None]
     ranks = (is_relevant.argmax(axis=1) + 1).tolist()
-    worst = sorted(range(len(queries)), key=lambda i: (-ranks[i], first_tier[queries[i]], system.names[queries[i]]))
+    worst = sorted(
+        range(len(queries)),
+        key=lambda i: (-ranks[i], first_tier[queries[i]], system.names[queries[i]]),
+    )
     result = []
     for i in worst[:N_WORST]:
-        wrong = np.flatnonzero(~is_relevant[i, : ranks[i] - 1 or int(is_relevant[i].sum())])[:_N_WRONG] + 1
-        result.append({"query": int(indices[queries[i]]), "rank": ranks[i], "wrong": wrong.tolist()})
+        wrong = (
+            np.flatnonzero(~is_relevant[i, : ranks[i] - 1 or int(is_relevant[i].sum())])[:_N_WRONG]
+            + 1
+        )
+        result.append(
+            {"query": int(indices[queries[i]]), "rank": ranks[i], "wrong": wrong.tolist()}
+        )
     return result
 
 

@@ -32,7 +32,9 @@ class System:
     names: tuple[str, ...]  # of the meshes
     labels: tuple[str, ...] | None  # None if unknown
     distances: Tensor  # (N, N), rows are queries
-    seconds_per_mesh: float | None = None  # mean processor time of a description; None if it was not measured
+    seconds_per_mesh: float | None = (
+        None  # mean processor time of a description; None if it was not measured
+    )
 
     def ranked(self) -> Integers:
         """Return the indices (N, N − 1) of the other meshes, nearest first, ties in the order of the meshes."""
@@ -61,24 +63,40 @@ class Results:
     rows: tuple[Mapping[str, Any], ...] = ()  # table of `igps compare`, one row per descriptor
     robustness: Mapping[str, Any] | None = None  # contents of robustness.json
     unused: tuple[Unused, ...] = ()
-    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)  # notes on the mending of meshes, by name
+    notes: Mapping[str, Sequence[str]] = field(
+        default_factory=dict
+    )  # notes on the mending of meshes, by name
     config: Mapping[str, Any] = field(default_factory=dict)
-    parts: Mapping[str, str] = field(default_factory=dict)  # parts of bodies that share their file, by name
-    columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)  # by column and name of the body
-    groups: tuple[Mapping[str, Any], ...] = ()  # results of `igps groups` in the same folder, one row per body
+    parts: Mapping[str, str] = field(
+        default_factory=dict
+    )  # parts of bodies that share their file, by name
+    columns: Mapping[str, Mapping[str, str | None]] = field(
+        default_factory=dict
+    )  # by column and name of the body
+    groups: tuple[
+        Mapping[str, Any], ...
+    ] = ()  # results of `igps groups` in the same folder, one row per body
     outliers: tuple[Mapping[str, Any], ...] = ()  # results of `igps outliers` in the same folder
 
 
 def read_results(folder: Path) -> Results:
     """Read the results that `igps retrieve`, `compare` or `robustness` wrote to a folder; the latest, if several."""
-    readers = {_RETRIEVAL: _read_retrieval, _COMPARISON: _read_comparison, _ROBUSTNESS: _read_robustness}
+    readers = {
+        _RETRIEVAL: _read_retrieval,
+        _COMPARISON: _read_comparison,
+        _ROBUSTNESS: _read_robustness,
+    }
     times = {name: (folder / name).stat().st_mtime for name in readers if (folder / name).is_file()}
     if not times:
         raise FileNotFoundError(
             f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve`, `igps compare` and "
             "`python -m training.study robustness` write with --out."
         )
-    sources, notes, unused = _read_json(folder / MESHES_FILE), dict[str, list[str]](), list[Unused]()
+    sources, notes, unused = (
+        _read_json(folder / MESHES_FILE),
+        dict[str, list[str]](),
+        list[Unused](),
+    )
     for name, note in map(dict.values, _read_rows(folder / "notes.csv")):
         notes.setdefault(name, []).append(note)
     for *descriptor, name, error in map(dict.values, _read_rows(folder / "failures.csv")):
@@ -135,12 +153,21 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         if meshes is None:
             paths = tuple(Path(mesh["path"]) for mesh in summary["meshes"])
         else:
-            paths = tuple(meshes / file_name_of(name, part) for name, part in zip(names, parts, strict=True))
+            paths = tuple(
+                meshes / file_name_of(name, part) for name, part in zip(names, parts, strict=True)
+            )
         columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
-        bodies, reading = Bodies(paths, names, None, parts, columns), LoadOptions(**summary["reading"])
-        return SignatureDataset(bodies, SignatureConfig(**summary["signature"]), summary["cache_dir"], reading=reading)
+        bodies, reading = (
+            Bodies(paths, names, None, parts, columns),
+            LoadOptions(**summary["reading"]),
+        )
+        return SignatureDataset(
+            bodies, SignatureConfig(**summary["signature"]), summary["cache_dir"], reading=reading
+        )
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected the format {_FORMAT} ({error}). Run the command again.") from error
+        raise ValueError(
+            f"{path}: expected the format {_FORMAT} ({error}). Run the command again."
+        ) from error
 
 
 def _read_retrieval(folder: Path) -> Results:
@@ -169,18 +196,29 @@ def _read_robustness(folder: Path) -> Results:
     unused: dict[tuple[str, str], Unused] = {}
     for descriptor, movements in summary["movements"].items():
         for column, movement in movements.items():
-            if column in summary["disturbances"]:  # the other columns have pairs of poses in place of meshes
+            if (
+                column in summary["disturbances"]
+            ):  # the other columns have pairs of poses in place of meshes
                 names.update(dict.fromkeys([*movement["each"], *movement["notes"]]))
             for file, reason in movement["notes"].items():
                 unused.setdefault((file, reason), Unused(file, f"{column}: {reason}", descriptor))
     config = summary.get("config", {})
-    return Results("robustness", tuple(names), None, robustness=summary, unused=tuple(unused.values()), config=config)
+    return Results(
+        "robustness",
+        tuple(names),
+        None,
+        robustness=summary,
+        unused=tuple(unused.values()),
+        config=config,
+    )
 
 
 def _read_system(path: Path, name: str, seconds: float | None = None) -> System:
     with np.load(path) as archive:
         names = tuple(archive["names"].tolist())
-        labels = tuple(str(label) for label in archive["labels"].tolist()) if "labels" in archive else ()
+        labels = (
+            tuple(str(label) for label in archive["labels"].tolist()) if "labels" in archive else ()
+        )
         distances = torch.from_numpy(archive["distances"])
     if len(labels) not in (0, len(names)) or distances.shape != (len(names), len(names)):
         raise ValueError(

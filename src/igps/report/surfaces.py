@@ -38,9 +38,13 @@ _N_NEIGHBOURS = 4  # samples whose mean is the potential of a vertex
 class PageSurface:
     """The simplified surface of a body on the page."""
 
-    vertices: NDArray[np.uint16]  # (V, 3) in the bounding cube, the longest principal axis along y, the next along x
+    vertices: NDArray[
+        np.uint16
+    ]  # (V, 3) in the bounding cube, the longest principal axis along y, the next along x
     faces: NDArray[np.uint16]  # (F, 3), counter-clockwise seen from outside
-    potential: NDArray[np.uint8]  # (V,) barycentroid potential, 0 at its minimum on the surface, 255 at its maximum
+    potential: NDArray[
+        np.uint8
+    ]  # (V,) barycentroid potential, 0 at its minimum on the surface, 255 at its maximum
     potential_range: tuple[float, float]  # minimum and maximum of the potential, no unit
     n_vertices: int  # of the original mesh, as the following fields
     n_faces: int
@@ -57,10 +61,14 @@ class PageSurface:
 
 def fitting_vertices(n_shapes: int) -> int:
     """Return the largest number of vertices of each surface that keeps a page of n shapes below 30 MB."""
-    return int(np.clip(_MAX_BYTES / _BYTES_PER_VERTEX / max(n_shapes, 1), _MIN_VERTICES, _MAX_VERTICES))
+    return int(
+        np.clip(_MAX_BYTES / _BYTES_PER_VERTEX / max(n_shapes, 1), _MIN_VERTICES, _MAX_VERTICES)
+    )
 
 
-def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, PageSurface]:
+def keep_surfaces(
+    path: Path, dataset: SignatureDataset, *, n_workers: int | None = None
+) -> dict[str, PageSurface]:
     """Return the surfaces of meshes by name, from an archive where possible; compute and store the others.
 
     The surface of a mesh file that has changed is computed again; that of a deleted file is used from the archive. A
@@ -68,7 +76,11 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
     """
     stored = read_surfaces(path)
     names, bodies = dataset.bodies.names, dataset.bodies
-    missing = [i for i, name in enumerate(names) if not _is_current(dataset.pipeline, bodies[i], stored.get(name))]
+    missing = [
+        i
+        for i, name in enumerate(names)
+        if not _is_current(dataset.pipeline, bodies[i], stored.get(name))
+    ]
     if missing:
         make = partial(_surface_of_body, dataset.pipeline, fitting_vertices(len(names)))
         stored |= run_jobs(make, {names[i]: bodies[i] for i in missing}, "picture", n_workers)
@@ -104,7 +116,9 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
     except MeshError:  # a surface whose handles close is good enough for display
         vertices, faces = clustered(mesh.vertices, mesh.faces, n_vertices)
     samples = signature.surface.points
-    potential = np.sqrt(np.square(signature.surface.eigenfunctions, dtype=np.float64) @ (1 / signature.eigenvalues))
+    potential = np.sqrt(
+        np.square(signature.surface.eigenfunctions, dtype=np.float64) @ (1 / signature.eigenvalues)
+    )
     distances, nearest = cKDTree(samples).query(vertices, min(_N_NEIGHBOURS, len(samples)))
     distances, nearest = distances.reshape(len(vertices), -1), nearest.reshape(len(vertices), -1)
     weights = 1 / (distances + 1e-6 * mesh.diagonal)
@@ -114,10 +128,17 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
     lowest, highest = rotated.min(axis=0), rotated.max(axis=0)
     in_cube = (rotated - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
     return PageSurface(
-        np.rint(STEPS * in_cube).astype(np.uint16), faces.astype(np.uint16),
-        np.rint(255 * (values - low) / ((high - low) or 1)).astype(np.uint8), (low, high),
-        len(mesh.vertices), len(mesh.faces), mesh.area, mesh.volume, key, mesh.unit,
-    )  # fmt: skip
+        np.rint(STEPS * in_cube).astype(np.uint16),
+        faces.astype(np.uint16),
+        np.rint(255 * (values - low) / ((high - low) or 1)).astype(np.uint8),
+        (low, high),
+        len(mesh.vertices),
+        len(mesh.faces),
+        mesh.area,
+        mesh.volume,
+        key,
+        mesh.unit,
+    )
 
 
 def write_surfaces(path: Path, surfaces: Mapping[str, PageSurface]) -> None:
@@ -149,16 +170,26 @@ def read_surfaces(path: Path) -> dict[str, PageSurface]:
         return {}
     with np.load(path) as archive:
         if "format" not in archive or str(archive["format"]) != _FORMAT:
-            raise ValueError(f"{path}: expected an archive of the format {_FORMAT}. Delete it and run again.")
+            raise ValueError(
+                f"{path}: expected an archive of the format {_FORMAT}. Delete it and run again."
+            )
         arrays = {name: archive[name] for name in archive}
     ends = np.cumsum(arrays["counts"], axis=0)
-    columns = [np.split(arrays[name], ends[:, i])[:-1] for name, i in (("vertices", 0), ("faces", 1), ("potential", 0))]
-    columns += [arrays[name].tolist() for name in ("names", "measures", "mesh_counts", "keys", "units")]
+    columns = [
+        np.split(arrays[name], ends[:, i])[:-1]
+        for name, i in (("vertices", 0), ("faces", 1), ("potential", 0))
+    ]
+    columns += [
+        arrays[name].tolist() for name in ("names", "measures", "mesh_counts", "keys", "units")
+    ]
     return {
-        name: PageSurface(vertices, faces, potential, (low, high), n_v, n_f, area, volume, key, unit or None)
-        for vertices, faces, potential, name, (low, high, area, volume), (n_v, n_f), key, unit in zip(
-            *columns, strict=True
+        name: PageSurface(
+            vertices, faces, potential, (low, high), n_v, n_f, area, volume, key, unit or None
         )
+        for vertices, faces, potential, name, (low, high, area, volume), (
+            n_v,
+            n_f,
+        ), key, unit in zip(*columns, strict=True)
     }
 
 
@@ -180,15 +211,21 @@ def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Float
     low, extent = vertices.min(axis=0), longest_side(vertices)
     resolution = max(2, int(np.sqrt(n_vertices)))
     while True:
-        cells = np.minimum((vertices - low) * (resolution / extent), resolution - 1).astype(np.int64)
+        cells = np.minimum((vertices - low) * (resolution / extent), resolution - 1).astype(
+            np.int64
+        )
         codes = cells @ np.array([resolution**2, resolution, 1])
         present, cell_of = np.unique(codes, return_inverse=True)
         if len(present) <= n_vertices or resolution == 1:
             break
         resolution = max(1, int(0.93 * resolution))
     counts = np.bincount(cell_of)
-    means = np.stack([np.bincount(cell_of, vertices[:, axis]) / counts for axis in range(3)], axis=1)
+    means = np.stack(
+        [np.bincount(cell_of, vertices[:, axis]) / counts for axis in range(3)], axis=1
+    )
     clusters = cell_of[faces]
-    clusters = clusters[(clusters != np.roll(clusters, 1, axis=1)).all(axis=1)]  # without collapsed faces
+    clusters = clusters[
+        (clusters != np.roll(clusters, 1, axis=1)).all(axis=1)
+    ]  # without collapsed faces
     _, first = np.unique(np.sort(clusters, axis=1), axis=0, return_index=True)
     return compact(means, clusters[np.sort(first)])

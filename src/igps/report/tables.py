@@ -11,7 +11,16 @@ from igps.analysis.doctor import Finding
 from igps.analysis.groups import GroupTest
 from igps.retrieval import RetrievalScores
 
-TITLES = dict(nn="NN", ft="FT", st="ST", e="E", dcg="DCG", adr="ADR", adr_self="ADR self", map="mAP")  # noqa: C408
+TITLES = {
+    "nn": "NN",
+    "ft": "FT",
+    "st": "ST",
+    "e": "E",
+    "dcg": "DCG",
+    "adr": "ADR",
+    "adr_self": "ADR self",
+    "map": "mAP",
+}
 """Column titles of the scores, by name."""
 
 
@@ -30,13 +39,21 @@ def write_rows(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]])
 def scores_table(scores: RetrievalScores) -> str:
     """Return a text table of scores in percent: one line for all queries, one per class."""
     columns = {name: title for name, title in TITLES.items() if name in scores.mean()}
-    rows = {"all": scores.mean(), **{str(label): values for label, values in scores.per_class().items()}}
+    rows = {
+        "all": scores.mean(),
+        **{str(label): values for label, values in scores.per_class().items()},
+    }
     width = max(len(name) for name in rows)
     lines = [" " * width + "".join(f"{title:>10}" for title in columns.values())]
-    lines += [f"{name:<{width}}" + "".join(f"{100 * row[key]:>10.1f}" for key in columns) for name, row in rows.items()]
+    lines += [
+        f"{name:<{width}}" + "".join(f"{100 * row[key]:>10.1f}" for key in columns)
+        for name, row in rows.items()
+    ]
     lines.append(f"percent, {scores.n_queries} queries, each against all others")
     if scores.n_excluded:
-        lines.append(f"not used as queries, because they are alone in their class: {scores.n_excluded}")
+        lines.append(
+            f"not used as queries, because they are alone in their class: {scores.n_excluded}"
+        )
     return "\n".join(lines)
 
 
@@ -44,14 +61,22 @@ def comparison_table(results: Sequence[Result]) -> str:
     """Return a text table with one line per descriptor: scores in percent, meshes described, seconds per mesh."""
     rows = [result.row() for result in results]
     width = max(len(row["descriptor"]) for row in rows)
-    lines = [" " * width + "".join(f"{title:>10}" for title in (*TITLES.values(), "meshes", "s/mesh"))]
+    lines = [
+        " " * width + "".join(f"{title:>10}" for title in (*TITLES.values(), "meshes", "s/mesh"))
+    ]
     for row in rows:
-        scores = "".join(f"{'–' if row[key] is None else f'{100 * row[key]:.1f}':>10}" for key in TITLES)
+        scores = "".join(
+            f"{'–' if row[key] is None else f'{100 * row[key]:.1f}':>10}" for key in TITLES
+        )
         seconds = "–" if row["seconds_per_mesh"] is None else f"{row['seconds_per_mesh']:.3f}"
         lines.append(f"{row['descriptor']:<{width}}{scores}{row['n_models']:>10}{seconds:>10}")
     lines.append("scores in percent, each mesh against all others that the descriptor describes")
     lines.append("s/mesh: mean processor time of a description, without that of the signature")
-    lines += [f"{result.descriptor.name}: no scores: {result.error}" for result in results if result.error is not None]
+    lines += [
+        f"{result.descriptor.name}: no scores: {result.error}"
+        for result in results
+        if result.error is not None
+    ]
     return "\n".join(lines)
 
 
@@ -67,8 +92,12 @@ def findings_table(findings: Sequence[Finding]) -> str:
     lines = [f"{'':<{width}}{header}{'vertices':>10}{'after':>9}{'seconds':>9}{'MB':>7}  steps"]
     for finding in findings:
         voxels = finding.voxels
-        counts = ("", "", "") if voxels is None else (voxels.n_voxels, voxels.n_pieces, voxels.thinnest)
-        start = f"{finding.id:<{width}}" + ("{:>10}{:>8}{:>10}".format(*counts) if has_voxels else "")
+        counts = (
+            ("", "", "") if voxels is None else (voxels.n_voxels, voxels.n_pieces, voxels.thinnest)
+        )
+        start = f"{finding.id:<{width}}" + (
+            "{:>10}{:>8}{:>10}".format(*counts) if has_voxels else ""
+        )
         if finding.error is not None:
             lines.append(f"{start}  cannot be used: {finding.error}")
             continue
@@ -99,5 +128,7 @@ def groups_table(tests: Sequence[GroupTest]) -> str:
         cells = [*(f"{p:.4f}" for p in numbers), f"{test.effect:.3f}"]
         cells += [f"{test.effect_low:.3f} to {test.effect_high:.3f}", f"{test.auc:.2f}", sizes]
         lines.append(f"{test.body:<{width}}" + row(*cells))
-    lines.append("p: by permutation; q: false discovery rate over the bodies; effect: share of squared distances")
+    lines.append(
+        "p: by permutation; q: false discovery rate over the bodies; effect: share of squared distances"
+    )
     return "\n".join(lines)

@@ -11,7 +11,9 @@ TILE = 64
 
 
 @compiled()
-def fill(queries: NDArray[Real], gallery: NDArray[Real], is_chi_square: bool, distances: NDArray[Real]) -> None:
+def fill(
+    queries: NDArray[Real], gallery: NDArray[Real], is_chi_square: bool, distances: NDArray[Real]
+) -> None:
     """Write the sums of (a−b)² / (a+b), or of (a−b)², over the cells of rows (Q, cells) and (G, cells) to (Q, G)."""
     for begin in range(0, len(gallery), TILE):
         for q in range(len(queries)):

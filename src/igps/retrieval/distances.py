@@ -90,9 +90,17 @@ class _ChiSquare(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         a, b = ctx.saved_tensors
         if torch.is_grad_enabled():  # derivatives of the gradient are needed, too
-            leaves = [leaf for leaf, is_needed in zip((a, b), ctx.needs_input_grad, strict=True) if is_needed]
-            gradients = iter(torch.autograd.grad(_chi_square_by_torch(a, b), leaves, grad, create_graph=True))
-            return tuple(next(gradients) if is_needed else None for is_needed in ctx.needs_input_grad)
+            leaves = [
+                leaf
+                for leaf, is_needed in zip((a, b), ctx.needs_input_grad, strict=True)
+                if is_needed
+            ]
+            gradients = iter(
+                torch.autograd.grad(_chi_square_by_torch(a, b), leaves, grad, create_graph=True)
+            )
+            return tuple(
+                next(gradients) if is_needed else None for is_needed in ctx.needs_input_grad
+            )
         grad_a, grad_b = torch.zeros_like(a), torch.zeros_like(b)
         for q, g, c in _tiles(a, b):
             # With u = (a−b)/(a+b): ∂/∂a (a−b)²/(a+b) = 2u − u², and ∂/∂b = −2u − u².
@@ -144,7 +152,9 @@ def _sums_by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
 def _ratio(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """(a−b)/(a+b), 0 where both are 0, and a−b for all pairs of rows, each (Q, G, cells)."""
     difference = a[:, None] - b
-    total = (a[:, None] + b).clamp_min_(torch.finfo(a.dtype).tiny)  # 0/tiny = 0: an empty cell needs no mask
+    total = (a[:, None] + b).clamp_min_(
+        torch.finfo(a.dtype).tiny
+    )  # 0/tiny = 0: an empty cell needs no mask
     return torch.div(difference, total, out=total), difference
 
 
@@ -169,7 +179,9 @@ def _row_distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 # By default without the faster matrix product, whose cancellation leaves non-zero distances on the diagonal.
-def row_distances(a: Tensor, b: Tensor, compute_mode: str = "donot_use_mm_for_euclid_dist") -> Tensor:
+def row_distances(
+    a: Tensor, b: Tensor, compute_mode: str = "donot_use_mm_for_euclid_dist"
+) -> Tensor:
     """Euclidean distances (..., I, J) of rows (..., I, D) and (..., J, D); for the mode see `torch.cdist`."""
     if not in_transforms():
         return torch.cdist(a, b, compute_mode=compute_mode)
@@ -209,7 +221,9 @@ def _unit(name: str, rows: Tensor) -> Tensor:
 def check_tensor(name: str, value: Any) -> None:
     """Raise a ValueError if an argument is not a tensor, but for example a NumPy array."""
     if not isinstance(value, Tensor):
-        raise ValueError(f"{name}: expected a tensor, got {type(value).__name__}; convert with torch.as_tensor")
+        raise ValueError(
+            f"{name}: expected a tensor, got {type(value).__name__}; convert with torch.as_tensor"
+        )
 
 
 def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[Tensor, Tensor]:
@@ -228,18 +242,28 @@ def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[T
             f"{tuple(gallery.shape[1:])}; compute both with the same configuration"
         )
     if queries.device != gallery.device:
-        raise ValueError(f"gallery: expected the queries' device {queries.device}, got {gallery.device}; move one")
+        raise ValueError(
+            f"gallery: expected the queries' device {queries.device}, got {gallery.device}; move one"
+        )
     dtype = torch.promote_types(torch.promote_types(queries.dtype, gallery.dtype), torch.float32)
     return queries.flatten(1).to(dtype), gallery.flatten(1).to(dtype)
 
 
 def _check_entries(name: str, tensor: Tensor, *, non_negative: bool) -> None:
     if not tensor.is_floating_point():
-        raise ValueError(f"{name}: expected a real floating dtype, got {tensor.dtype}; convert with .float()")
+        raise ValueError(
+            f"{name}: expected a real floating dtype, got {tensor.dtype}; convert with .float()"
+        )
     if torch.compiler.is_compiling() or tensor.numel() == 0:
         return
-    low, high = torch.stack(torch.aminmax(tensor.detach())).tolist()  # both are NaN if any entry is NaN
+    low, high = torch.stack(
+        torch.aminmax(tensor.detach())
+    ).tolist()  # both are NaN if any entry is NaN
     if not (math.isfinite(low) and math.isfinite(high)):
-        raise ValueError(f"{name}: expected finite entries, got NaN or infinity; look for the descriptor with them")
+        raise ValueError(
+            f"{name}: expected finite entries, got NaN or infinity; look for the descriptor with them"
+        )
     if non_negative and low < 0:
-        raise ValueError(f"{name}: expected entries ≥ 0, got {low:g}; compare embeddings by euclidean or cosine")
+        raise ValueError(
+            f"{name}: expected entries ≥ 0, got {low:g}; compare embeddings by euclidean or cosine"
+        )

@@ -61,7 +61,9 @@ def rerank_graph(
     graph = _symmetric(neighbours, distances)
     values = graph.data / mean
     if diffusion:
-        average = 1 - (graph.nnz - diffused.sum()) / n_pairs  # pairs outside the graph have distance 1
+        average = (
+            1 - (graph.nnz - diffused.sum()) / n_pairs
+        )  # pairs outside the graph have distance 1
         values = (1 - share) * diffused / max(average, _TINY) + share * values
         del diffused
     total = values.sum()
@@ -72,9 +74,13 @@ def rerank_graph(
     values = (1 - share) * jaccard(weights, graph, progress) + share * values / average
     if keep_nearest:
         values = _with_nearest_first(values, graph, neighbours[:, 0])
-    reranked = _with_values(graph, values)[np.repeat(np.arange(n), m), neighbours.ravel()].reshape(n, m)
+    reranked = _with_values(graph, values)[np.repeat(np.arange(n), m), neighbours.ravel()].reshape(
+        n, m
+    )
     order = np.argsort(reranked, axis=1, kind="stable")
-    return SearchResult(*(torch.from_numpy(np.take_along_axis(x, order, axis=1)) for x in (neighbours, reranked)))
+    return SearchResult(
+        *(torch.from_numpy(np.take_along_axis(x, order, axis=1)) for x in (neighbours, reranked))
+    )
 
 
 def _diffused(neighbours: Integers, distances: Floats, half: int, diffusion: float) -> Floats:
@@ -103,7 +109,9 @@ def _neighbourhoods(
     n = graph.shape[0]
     n_nearest = max(n_neighbours, n_expanded - 1)
     slices = map(slice, graph.indptr, graph.indptr[1:])
-    nearest = [graph.indices[row][distances[row].argsort(kind="stable")[:n_nearest]] for row in slices]
+    nearest = [
+        graph.indices[row][distances[row].argsort(kind="stable")[:n_nearest]] for row in slices
+    ]
     order = np.column_stack([np.arange(n), nearest])  # each shape, then its nearest ones
     members, half_members = (_reciprocal(order[:, : k + 1]) for k in (n_neighbours, half))
     joins = sparse.csr_array(members @ half_members.T).multiply(members).tocsr()
@@ -115,7 +123,11 @@ def _neighbourhoods(
     similarity = np.exp(np.divide(distances, scale, out=scale), out=scale)
     entries = np.where(rows == columns, 1.0, _with_values(graph, similarity)[rows, columns])
     weights = sparse.csr_array((entries, (rows, columns)), shape=(n, n))
-    weights = _binary(order[:, :n_expanded]) @ sparse.diags_array(1 / (n_expanded * weights.sum(axis=1))) @ weights
+    weights = (
+        _binary(order[:, :n_expanded])
+        @ sparse.diags_array(1 / (n_expanded * weights.sum(axis=1)))
+        @ weights
+    )
     weights = sparse.csr_array(weights)
     weights.sort_indices()
     return weights
@@ -142,7 +154,9 @@ def _symmetric(neighbours: Integers, values: Floats) -> sparse.csr_array:
     structure = neighbours.ravel().astype(dtype), np.arange(0, n * m + 1, m, dtype=dtype)
     matrix = sparse.csr_array((values.flatten(), *structure), shape=(n, n))
     matrix.sort_indices()
-    ones = sparse.csr_array((np.ones(n * m, dtype=np.int8), matrix.indices, matrix.indptr), shape=(n, n))
+    ones = sparse.csr_array(
+        (np.ones(n * m, dtype=np.int8), matrix.indices, matrix.indptr), shape=(n, n)
+    )
     counts = ones + ones.T.tocsr()  # each pair occurs once or twice; a byte per pair saves memory
     rows = _rows(counts)
     means = matrix[rows, counts.indices]  # 0 where the pair does not occur
@@ -153,7 +167,9 @@ def _symmetric(neighbours: Integers, values: Floats) -> sparse.csr_array:
 
 def _binary(neighbours: Integers) -> sparse.csr_array:
     n, m = neighbours.shape
-    return sparse.csr_array((np.ones(n * m), (np.repeat(np.arange(n), m), neighbours.ravel())), shape=(n, n))
+    return sparse.csr_array(
+        (np.ones(n * m), (np.repeat(np.arange(n), m), neighbours.ravel())), shape=(n, n)
+    )
 
 
 def _reciprocal(neighbours: Integers) -> sparse.csr_array:
@@ -179,12 +195,16 @@ def _with_nearest_first(values: Floats, graph: sparse.csr_array, nearest: Intege
     smallest = values.min(where=~is_nearest & (values > 0), initial=np.inf)
     result, distances = values.copy(), graph.data[is_nearest]
     # At most half of the smallest other value, so that rounding to single precision makes no ties.
-    result[is_nearest] = 0.5 * (smallest if np.isfinite(smallest) else 1.0) * distances / max(distances.max(), _TINY)
+    result[is_nearest] = (
+        0.5 * (smallest if np.isfinite(smallest) else 1.0) * distances / max(distances.max(), _TINY)
+    )
     return result
 
 
 @compiled()
-def walks(lists: Integers, starts: Integers, columns: Integers, steps: Floats, n_rounds: int, sums: Floats) -> None:
+def walks(
+    lists: Integers, starts: Integers, columns: Integers, steps: Floats, n_rounds: int, sums: Floats
+) -> None:
     """Add to `sums` (N, L), for each member of each shape's list, the sum over all walks from shape to member.
 
     Walks stay in the list. A list (N, L) starts with its own shape. For each list, (I - S) x = e is solved by conjugate

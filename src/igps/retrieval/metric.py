@@ -39,19 +39,30 @@ class RetrievalScoresMetric(Metric):
 
     def update(self, descriptors: Tensor, labels: Tensor, ids: Sequence[str] | None = None) -> None:
         """Add descriptors (N, ...), integer labels (N,) and unique names of shapes; a ValueError if lengths differ."""
-        if labels.ndim != 1 or labels.is_floating_point() or descriptors.ndim < 2 or len(labels) != len(descriptors):
+        if (
+            labels.ndim != 1
+            or labels.is_floating_point()
+            or descriptors.ndim < 2
+            or len(labels) != len(descriptors)
+        ):
             raise ValueError(
                 f"labels: expected one integer for each of the descriptors (N, ...), got {tuple(labels.shape)} of "
                 f"{labels.dtype} for descriptors {tuple(descriptors.shape)}"
             )
         if ids is not None and len(ids) != len(labels):
-            raise ValueError(f"ids: expected one name for each of {len(labels)} descriptors, got {len(ids)}")
+            raise ValueError(
+                f"ids: expected one name for each of {len(labels)} descriptors, got {len(ids)}"
+            )
         if self.labels and (ids is None) == bool(self.ids):
             raise ValueError("ids: expected in every update or in none, got them in some")
         self.descriptors.append(descriptors.detach())
         self.labels.append(labels)
         if ids is not None:
-            self.ids.append(torch.tensor([_hash64(name) for name in ids], dtype=torch.int64, device=labels.device))
+            self.ids.append(
+                torch.tensor(
+                    [_hash64(name) for name in ids], dtype=torch.int64, device=labels.device
+                )
+            )
 
     def compute(self) -> dict[str, Tensor]:
         """Return the mean scores by name; a ValueError if no two descriptors share a label."""
@@ -61,9 +72,14 @@ class RetrievalScoresMetric(Metric):
             unique = torch.from_numpy(np.sort(first)).to(labels.device)
             descriptors, labels = descriptors[unique], labels[unique]
         scores = retrieval_scores(self.distance(descriptors, descriptors), labels)
-        return {name: torch.tensor(value, device=descriptors.device) for name, value in scores.mean().items()}
+        return {
+            name: torch.tensor(value, device=descriptors.device)
+            for name, value in scores.mean().items()
+        }
 
 
 def _hash64(name: str) -> int:
     """A 64-bit hash, the same in every process: processes can exchange numbers, but no strings."""
-    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little", signed=True)
+    return int.from_bytes(
+        hashlib.blake2b(name.encode(), digest_size=8).digest(), "little", signed=True
+    )

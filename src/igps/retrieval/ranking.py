@@ -27,9 +27,13 @@ def rank(distances: Tensor) -> Tensor:
             f"distances: expected a real matrix (Q, G), got shape {tuple(distances.shape)} of {distances.dtype}; "
             "compute it with a function of igps.retrieval.distances"
         )
-    smallest = distances.detach().amin().item() if distances.numel() else 0.0  # NaN if any entry is NaN
+    smallest = (
+        distances.detach().amin().item() if distances.numel() else 0.0
+    )  # NaN if any entry is NaN
     if smallest != smallest:
-        raise ValueError("distances: expected numbers, got NaN, which has no rank; look for the descriptor with NaN")
+        raise ValueError(
+            "distances: expected numbers, got NaN, which has no rank; look for the descriptor with NaN"
+        )
     if smallest < 0:
         raise ValueError(
             f"distances: expected entries ≥ 0 (smaller is closer), the smallest is {smallest:g}; give distances in "
@@ -39,7 +43,11 @@ def rank(distances: Tensor) -> Tensor:
 
 
 def search(
-    query_descriptors: Tensor, gallery_descriptors: Tensor, *, top: int, distance: Distance = chi_square
+    query_descriptors: Tensor,
+    gallery_descriptors: Tensor,
+    *,
+    top: int,
+    distance: Distance = chi_square,
 ) -> SearchResult:
     """Return the `top` gallery entries closest to each query, ties in gallery order.
 

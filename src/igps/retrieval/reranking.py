@@ -64,29 +64,46 @@ def rerank(
     """
     check_tensor("distances", distances)
     if distances.ndim != 2 or distances.shape[0] != distances.shape[1]:
-        raise ValueError(f"distances: expected (N, N), of a collection to itself, got {tuple(distances.shape)}.")
+        raise ValueError(
+            f"distances: expected (N, N), of a collection to itself, got {tuple(distances.shape)}."
+        )
     if not bool((distances >= 0).all() and torch.isfinite(distances).all()):
         raise ValueError("distances: expected finite numbers ≥ 0, got others.")
     check_at_least(1, n_neighbours=n_neighbours, n_expanded=n_expanded)
     if not (0 <= share <= 1 and 0 <= diffusion < 1):
-        raise ValueError(f"share, diffusion: expected 0 to 1, and 0 to less than 1, got {share} and {diffusion}.")
+        raise ValueError(
+            f"share, diffusion: expected 0 to 1, and 0 to less than 1, got {share} and {diffusion}."
+        )
     n = len(distances)
     if n < 2:
         return torch.zeros_like(distances)
     k, n_expanded = min(n_neighbours, n - 1), min(n_expanded, n)
     low, high = _LIST_LIMITS
-    n_listed = n - 1 if n <= MAX_DENSE else min(max(low, min(high, _MAX_PAIRS // n), k, n_expanded), n - 1)
+    n_listed = (
+        n - 1 if n <= MAX_DENSE else min(max(low, min(high, _MAX_PAIRS // n), k, n_expanded), n - 1)
+    )
     mean = float((distances.sum(dtype=torch.float64) - distances.trace()) / (n * (n - 1)))
     mean = max(mean, torch.finfo(torch.float64).tiny)
     others = distances.clone().fill_diagonal_(torch.inf)
-    order = others.argsort(dim=1, stable=True) if n <= MAX_DENSE else others.topk(n_listed, largest=False).indices
+    order = (
+        others.argsort(dim=1, stable=True)
+        if n <= MAX_DENSE
+        else others.topk(n_listed, largest=False).indices
+    )
     order = order[:, :n_listed]
     nearest = SearchResult(order.cpu(), distances.gather(1, order).cpu())
-    lists = rerank_graph(nearest, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest, progress=progress)
-    result = distances / mean  # for pairs without common neighbours, which each step puts at distance 1
+    lists = rerank_graph(
+        nearest, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest, progress=progress
+    )
+    result = (
+        distances / mean
+    )  # for pairs without common neighbours, which each step puts at distance 1
     for _ in range(2 if diffusion else 1):
         result = result.mul_(share).add_(1 - share)
-    rows, columns = torch.arange(n, device=result.device)[:, None].expand(-1, n_listed), lists.indices.to(result.device)
+    rows, columns = (
+        torch.arange(n, device=result.device)[:, None].expand(-1, n_listed),
+        lists.indices.to(result.device),
+    )
     values = lists.distances.to(result)
     result[rows, columns] = values
     result[columns, rows] = values
@@ -94,7 +111,12 @@ def rerank(
 
 
 def rerank_candidates(
-    queries: Tensor, found: SearchResult, descriptions: Callable[[Tensor], Tensor], distance: Distance, *, top: int
+    queries: Tensor,
+    found: SearchResult,
+    descriptions: Callable[[Tensor], Tensor],
+    distance: Distance,
+    *,
+    top: int,
 ) -> SearchResult:
     """Re-rank the search results of each query by `rerank` of the query and these results alone.
 
@@ -111,7 +133,9 @@ def rerank_candidates(
     for query, entries in zip(queries, found.indices, strict=True):
         members = torch.cat([query[None], descriptions(entries).to(query)])
         distances = distance(members, members)
-        distances = torch.minimum(distances, distances.T).fill_diagonal_(0)  # the two triangles differ by rounding
+        distances = torch.minimum(distances, distances.T).fill_diagonal_(
+            0
+        )  # the two triangles differ by rounding
         reranked = rerank(distances)[:1, 1:]
         best = rank(reranked)[:, :top]
         results.append((entries[best[0].to(entries.device)], reranked.gather(1, best)[0]))

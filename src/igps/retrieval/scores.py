@@ -63,14 +63,23 @@ class RetrievalScores:
     def per_class(self) -> dict[Hashable, dict[str, float]]:
         """Return the means over the scored queries of each class that has any, classes in order of appearance."""
         queries: dict[Hashable, list[int]] = {}
-        for query, (label, scored) in enumerate(zip(self.labels, self.scored.tolist(), strict=True)):
+        for query, (label, scored) in enumerate(
+            zip(self.labels, self.scored.tolist(), strict=True)
+        ):
             if scored:
                 queries.setdefault(label, []).append(query)
-        return {label: self._mean_over(torch.tensor(members, device="cpu")) for label, members in queries.items()}
+        return {
+            label: self._mean_over(torch.tensor(members, device="cpu"))
+            for label, members in queries.items()
+        }
 
     def _mean_over(self, queries: Tensor) -> dict[str, float]:
         scores = {name: getattr(self, name) for name in SCORE_NAMES}
-        return {name: float(values[queries].mean()) for name, values in scores.items() if values is not None}
+        return {
+            name: float(values[queries].mean())
+            for name, values in scores.items()
+            if values is not None
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +141,16 @@ def retrieval_scores(
     adr_self = None
     if gallery_labels is None:
         hits_self = torch.cat([torch.ones_like(hits[:, :1]), hits + 1], dim=1)
-        adr_self = defined(at_rank((hits_self / ranks).cumsum(1), n_relevant + 1) / (n_relevant + 1))
+        adr_self = defined(
+            at_rank((hits_self / ranks).cumsum(1), n_relevant + 1) / (n_relevant + 1)
+        )
     return RetrievalScores(
         nn=defined(relevant[:, 0]),
         ft=defined(at_rank(hits, n_relevant) / n_relevant),
         st=defined(at_rank(hits, 2 * n_relevant) / n_relevant),
-        e=defined(2 * hits[:, e_ranks - 1] / (e_ranks + n_relevant)),  # 2/(1/P + 1/R') with P = h/32, R' = h/R
+        e=defined(
+            2 * hits[:, e_ranks - 1] / (e_ranks + n_relevant)
+        ),  # 2/(1/P + 1/R') with P = h/32, R' = h/R
         dcg=defined((relevant * discount).sum(1) / ideal_gain),
         adr=defined(at_rank(dynamic_recall, n_relevant) / n_relevant),
         adr_self=adr_self,
@@ -164,14 +177,18 @@ def precision_recall_curve(
     # The tolerance undoes rounding: a recall of 0.55 with 100 relevant entries needs 55 hits, not 56.
     hits_needed = (recall * n_relevant - 1e-6).ceil()
     first_rank = torch.searchsorted(hits, hits_needed)
-    return PrecisionRecallCurve(recall, interpolated.gather(1, first_rank).mean(0), n_queries=len(hits))
+    return PrecisionRecallCurve(
+        recall, interpolated.gather(1, first_rank).mean(0), n_queries=len(hits)
+    )
 
 
 def _ranked_relevance(
     distances: Tensor | NDArray[Any], query_labels: Labels, gallery_labels: Labels | None
 ) -> tuple[Tensor, tuple[Hashable, ...]]:
     """rel(k) of every query, float64 on the CPU: (Q, G), or (Q, Q−1) without the query itself; and the query labels."""
-    order = rank(distances if isinstance(distances, Tensor) else torch.as_tensor(distances, device="cpu")).cpu()
+    order = rank(
+        distances if isinstance(distances, Tensor) else torch.as_tensor(distances, device="cpu")
+    ).cpu()
     n_queries, n_gallery = order.shape
     queries = _label_tuple("query_labels", query_labels, n_queries)
     if gallery_labels is None:
@@ -187,7 +204,11 @@ def _ranked_relevance(
         gallery = _label_tuple("gallery_labels", gallery_labels, n_gallery)
     codes: dict[Hashable, int] = {}
     query_codes, gallery_codes = (
-        torch.tensor([codes.setdefault(label, len(codes)) for label in labels], dtype=torch.int64, device="cpu")
+        torch.tensor(
+            [codes.setdefault(label, len(codes)) for label in labels],
+            dtype=torch.int64,
+            device="cpu",
+        )
         for labels in (queries, gallery)
     )
     relevant = gallery_codes[order] == query_codes[:, None]
@@ -204,11 +225,19 @@ def _label_tuple(name: str, labels: Labels, n_expected: int) -> tuple[Hashable, 
         if labels.ndim != 1:
             raise ValueError(f"{name}: expected shape (N,), got {tuple(labels.shape)}")
         labels = labels.tolist()
-    if isinstance(labels, str) or not all(isinstance(label, str | numbers.Integral) for label in labels):
+    if isinstance(labels, str) or not all(
+        isinstance(label, str | numbers.Integral) for label in labels
+    ):
         shown = reprlib.repr(labels)
-        raise ValueError(f"{name}: expected an integer tensor or a sequence of integers or strings, got {shown}")
+        raise ValueError(
+            f"{name}: expected an integer tensor or a sequence of integers or strings, got {shown}"
+        )
     if -1 in labels:
-        raise ValueError(f"{name}: expected known classes, got −1, which means unknown. Leave such shapes out.")
+        raise ValueError(
+            f"{name}: expected known classes, got −1, which means unknown. Leave such shapes out."
+        )
     if len(labels) != n_expected:
-        raise ValueError(f"{name}: expected {n_expected} labels, one per row or column of distances, got {len(labels)}")
+        raise ValueError(
+            f"{name}: expected {n_expected} labels, one per row or column of distances, got {len(labels)}"
+        )
     return tuple(labels)

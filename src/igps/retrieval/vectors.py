@@ -28,7 +28,9 @@ class VectorMap:
     """
 
     searched_by: SearchDistance  # the distance of the descriptions
-    mean: Singles | None = None  # (F,) of the descriptions or their features; None if descriptions stay as they are
+    mean: Singles | None = (
+        None  # (F,) of the descriptions or their features; None if descriptions stay as they are
+    )
     components: Singles | None = None  # (D, F) principal directions, orthonormal
 
     @classmethod
@@ -49,7 +51,8 @@ class VectorMap:
         if self.components is None or self.mean is None:
             return np.ascontiguousarray(descriptions, dtype=np.float32)
         blocks = [
-            (_features(descriptions[i : i + _BLOCK_ROWS], self.searched_by) - self.mean) @ self.components.T
+            (_features(descriptions[i : i + _BLOCK_ROWS], self.searched_by) - self.mean)
+            @ self.components.T
             for i in range(0, len(descriptions), _BLOCK_ROWS)
         ]
         return np.concatenate([*blocks, np.zeros((0, len(self.components)), dtype=np.float32)])

@@ -55,13 +55,20 @@ class ArticulatedShapes:
         ValueError: an argument is out of range, or (on access) a shape cannot be made at this resolution.
     """
 
-    def __init__(self, n_classes: int = 8, n_per_class: int = 10, seed: int = 0, n_vertices: int = 3000) -> None:
+    def __init__(
+        self, n_classes: int = 8, n_per_class: int = 10, seed: int = 0, n_vertices: int = 3000
+    ) -> None:
         check_at_least(1, n_classes=n_classes, n_per_class=n_per_class)
         check_at_least(0, seed=seed)
         check_at_least(500, n_vertices=n_vertices)
         if n_classes > len(TEMPLATES):
             raise ValueError(f"n_classes must be at most {len(TEMPLATES)}, got {n_classes}")
-        self.n_classes, self.n_per_class, self.seed, self.n_vertices = n_classes, n_per_class, seed, n_vertices
+        self.n_classes, self.n_per_class, self.seed, self.n_vertices = (
+            n_classes,
+            n_per_class,
+            seed,
+            n_vertices,
+        )
 
     def __len__(self) -> int:
         return self.n_classes * self.n_per_class
@@ -83,7 +90,11 @@ class ArticulatedShapes:
     @property
     def names(self) -> list[str]:
         """The unique name of each shape, ``class/number``."""
-        return [f"{name}/{number:02d}" for name in self.class_names for number in range(self.n_per_class)]
+        return [
+            f"{name}/{number:02d}"
+            for name in self.class_names
+            for number in range(self.n_per_class)
+        ]
 
     def __getitem__(self, index: int) -> GeneratedShape:
         """Generate a shape, in a fraction of a second, without a cache; a ValueError if no pose gives a valid mesh."""
@@ -105,7 +116,9 @@ class ArticulatedShapes:
             # Later attempts bend less: most failures are limbs that touch.
             body = pose(skeleton, rng, 1.0 - 0.8 * attempt / _MAX_ATTEMPTS, rotation)
             vertices, faces, spacing = mesh(body, target)
-            vertices = roughen(vertices, faces, spacing * rng.uniform(0.0, 0.12), 10.0 * spacing, rng)
+            vertices = roughen(
+                vertices, faces, spacing * rng.uniform(0.0, 0.12), 10.0 * spacing, rng
+            )
             fault = defect(vertices, faces, skeleton.genus, self.n_vertices)
             if fault is None:
                 vertices += rng.uniform(-1.0, 1.0, 3)
@@ -125,9 +138,15 @@ class ArticulatedShapes:
             ValueError: ``root`` holds shapes of another seed, resolution or version.
         """
         folder = shapes_folder(
-            root, generator="ArticulatedShapes", version=_VERSION, seed=self.seed, n_vertices=self.n_vertices
+            root,
+            generator="ArticulatedShapes",
+            version=_VERSION,
+            seed=self.seed,
+            n_vertices=self.n_vertices,
         )
-        for index, name in enumerate(tqdm(self.names, desc="shapes", unit="shape", disable=not progress)):
+        for index, name in enumerate(
+            tqdm(self.names, desc="shapes", unit="shape", disable=not progress)
+        ):
             path = folder / f"{name}.off"
             if not is_whole_off(path):
                 shape = self[index]
@@ -145,7 +164,9 @@ def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
         with atomic_write(manifest) as file:
             file.write(expected.encode())
     elif (recorded := manifest.read_text(encoding="utf-8")) != expected:
-        raise ValueError(f"root={str(root)!r} holds shapes of {recorded}, not of {expected}. Choose another folder.")
+        raise ValueError(
+            f"root={str(root)!r} holds shapes of {recorded}, not of {expected}. Choose another folder."
+        )
     return folder
 
 

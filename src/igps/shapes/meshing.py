@@ -38,17 +38,26 @@ def mesh(body: Sequence[Placed], target: int) -> tuple[Floats, Integers, float]:
     return _relax(body, vertices, faces, spacing), faces, spacing
 
 
-def roughen(vertices: Floats, faces: Integers, amplitude: float, wavelength: float, rng: np.random.Generator) -> Floats:
+def roughen(
+    vertices: Floats, faces: Integers, amplitude: float, wavelength: float, rng: np.random.Generator
+) -> Floats:
     """Move vertices (V,3) along their normals by random waves; ``amplitude`` is the standard deviation."""
     waves = rng.normal(size=(12, 3)) * (2.0 * np.pi / wavelength / np.sqrt(3.0))
     phases = rng.uniform(0.0, 2.0 * np.pi, 12)
     noise = np.zeros(len(vertices))
     for wave, phase in zip(waves, phases, strict=True):
-        noise += np.sin(vertices[:, 0] * wave[0] + vertices[:, 1] * wave[1] + vertices[:, 2] * wave[2] + phase)
-    return vertices + surface.vertex_normals(vertices, faces) * (amplitude * noise / np.sqrt(6.0))[:, None]
+        noise += np.sin(
+            vertices[:, 0] * wave[0] + vertices[:, 1] * wave[1] + vertices[:, 2] * wave[2] + phase
+        )
+    return (
+        vertices
+        + surface.vertex_normals(vertices, faces) * (amplitude * noise / np.sqrt(6.0))[:, None]
+    )
 
 
-def defect(vertices: Floats, faces: Integers, genus: int, n_vertices: int, min_angle: float = _MIN_ANGLE) -> str | None:
+def defect(
+    vertices: Floats, faces: Integers, genus: int, n_vertices: int, min_angle: float = _MIN_ANGLE
+) -> str | None:
     """Return what makes a mesh unfit for the benchmark, in words, or None; ``min_angle`` in degrees."""
     import igl
 
@@ -124,5 +133,7 @@ def _relax(body: Sequence[Placed], vertices: Floats, faces: Integers, spacing: f
         step = (adjacency @ vertices) / degree - vertices
         step -= normals * (step * normals).sum(axis=1, keepdims=True)
         vertices = vertices + 0.7 * step
-        vertices -= normals * np.clip(_distance(body, vertices), -0.5 * spacing, 0.5 * spacing)[:, None]
+        vertices -= (
+            normals * np.clip(_distance(body, vertices), -0.5 * spacing, 0.5 * spacing)[:, None]
+        )
     return vertices

@@ -28,7 +28,9 @@ class Part:
     group: str = "body"  # parts of one group share their proportions
     bend: Vector = ORIGIN  # limits of the joint (raise, swing, twist), degrees
     at: Vector = ORIGIN  # position of the joint in the frame of the parent
-    turn: Floats = field(default_factory=lambda: np.eye(3))  # frame of the joint at rest, in that of the parent
+    turn: Floats = field(
+        default_factory=lambda: np.eye(3)
+    )  # frame of the joint at rest, in that of the parent
     blend: float = 0.06  # distance within which the union with other solids is smooth
     lift: float = 0.0  # distance of the origin of the solid from the joint, along z
     children: tuple[Part, ...] = ()
@@ -96,13 +98,19 @@ def turned(axes: str, *degrees: float) -> Floats:
 
 def circle(count: int, phase: float = 0.0) -> list[tuple[float, float]]:
     """Return equally spaced points (cos, sin) of the unit circle."""
-    return [(float(np.cos(a)), float(np.sin(a))) for a in phase + 2.0 * np.pi * np.arange(count) / count]
+    return [
+        (float(np.cos(a)), float(np.sin(a))) for a in phase + 2.0 * np.pi * np.arange(count) / count
+    ]
 
 
 def limb(
-    group: str, lengths: Sequence[float], radii: Sequence[float], bends: Sequence[tuple[float, float]],
-    tip: Sequence[Part] = (), knee: Vector = UP,
-) -> Part:  # fmt: skip
+    group: str,
+    lengths: Sequence[float],
+    radii: Sequence[float],
+    bends: Sequence[tuple[float, float]],
+    tip: Sequence[Part] = (),
+    knee: Vector = UP,
+) -> Part:
     """Return a chain of tapered capsules with the parts ``tip`` at its end.
 
     Args:
@@ -114,12 +122,20 @@ def limb(
     children = tuple(tip)
     for i in reversed(range(len(lengths))):
         cone = Cone(lengths[i], radii[i], radii[i + 1])
-        part = Part(cone, group, (*bends[min(i, len(bends) - 1)], 0.0), blend=0.5 * radii[i], children=children)
+        part = Part(
+            cone,
+            group,
+            (*bends[min(i, len(bends) - 1)], 0.0),
+            blend=0.5 * radii[i],
+            children=children,
+        )
         children = (part.joined((0.0, 0.0, lengths[i - 1]), knee) if i else part,)
     return children[0]
 
 
-def pose(skeleton: Skeleton, rng: np.random.Generator, flex: float, rotation: Floats) -> list[Placed]:
+def pose(
+    skeleton: Skeleton, rng: np.random.Generator, flex: float, rotation: Floats
+) -> list[Placed]:
     """Draw proportions and joint angles, up to ``flex`` times their limits, and place all solids."""
     proportions: dict[str, tuple[float, float]] = {}
     placed: list[Placed] = []
@@ -130,8 +146,13 @@ def pose(skeleton: Skeleton, rng: np.random.Generator, flex: float, rotation: Fl
             proportions[part.group] = (float(thick), float(length))
         angles = flex * np.array(part.bend) * rng.uniform(-1.0, 1.0, 3)
         frame = frame @ part.turn @ turned("xyz", *angles)
-        solid, factors = part.solid.stretched(*proportions[part.group]), part.solid.factors(*proportions[part.group])
-        placed.append(Placed(solid, frame, origin + frame[:, 2] * (part.lift * factors[2]), part.blend))
+        solid, factors = (
+            part.solid.stretched(*proportions[part.group]),
+            part.solid.factors(*proportions[part.group]),
+        )
+        placed.append(
+            Placed(solid, frame, origin + frame[:, 2] * (part.lift * factors[2]), part.blend)
+        )
         for child in part.children:
             place(child, frame, origin + frame @ (factors * np.array(child.at)))
 

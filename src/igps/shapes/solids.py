@@ -83,7 +83,9 @@ class Arc(Solid):
         turned = np.linspace(0.0, self.angle, 33)
         y, z = self.bend * (1.0 - np.cos(turned)), self.bend * np.sin(turned)
         slack = wide + 0.01 * self.bend
-        return np.array([-wide, y.min() - slack, z.min() - slack]), np.array([wide, y.max() + slack, z.max() + slack])
+        return np.array([-wide, y.min() - slack, z.min() - slack]), np.array(
+            [wide, y.max() + slack, z.max() + slack]
+        )
 
     def stretched(self, thick: float, length: float) -> Solid:
         return Arc(self.bend * length, self.angle, self.start * thick, self.end * thick)
@@ -109,7 +111,10 @@ class Ring(Solid):
         return 1
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        return np.hypot(np.hypot(x, np.maximum(np.abs(z) - self.side, 0.0)) - self.radius, y) - self.tube
+        return (
+            np.hypot(np.hypot(x, np.maximum(np.abs(z) - self.side, 0.0)) - self.radius, y)
+            - self.tube
+        )
 
     def box(self) -> tuple[Floats, Floats]:
         wide = self.radius + self.tube
@@ -152,8 +157,12 @@ class Box(Solid):
     rounding: float
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        a, b, c = (np.abs(q) - (0.5 * s - self.rounding) for q, s in zip((x, y, z), self.size, strict=True))
-        outside = np.sqrt(np.maximum(a, 0.0) ** 2 + np.maximum(b, 0.0) ** 2 + np.maximum(c, 0.0) ** 2)
+        a, b, c = (
+            np.abs(q) - (0.5 * s - self.rounding) for q, s in zip((x, y, z), self.size, strict=True)
+        )
+        outside = np.sqrt(
+            np.maximum(a, 0.0) ** 2 + np.maximum(b, 0.0) ** 2 + np.maximum(c, 0.0) ** 2
+        )
         return outside + np.minimum(np.maximum(np.maximum(a, b), c), 0.0) - self.rounding
 
     def box(self) -> tuple[Floats, Floats]:
@@ -173,7 +182,9 @@ class Shell(Solid):
 
     @property
     def genus(self) -> int:
-        return 0 if self.profile[0][0] == 0.0 else 1  # a profile that starts off the axis is a tube, open at both ends
+        return (
+            0 if self.profile[0][0] == 0.0 else 1
+        )  # a profile that starts off the axis is a tube, open at both ends
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         radial = np.hypot(x, y)
@@ -181,7 +192,9 @@ class Shell(Solid):
         for (r0, z0), (r1, z1) in itertools.pairwise(self.profile):
             dr, dz = r1 - r0, z1 - z0
             along = np.clip(((radial - r0) * dr + (z - z0) * dz) / (dr * dr + dz * dz), 0.0, 1.0)
-            np.minimum(squared, (radial - r0 - along * dr) ** 2 + (z - z0 - along * dz) ** 2, out=squared)
+            np.minimum(
+                squared, (radial - r0 - along * dr) ** 2 + (z - z0 - along * dz) ** 2, out=squared
+            )
         return np.sqrt(squared) - 0.5 * self.wall
 
     def box(self) -> tuple[Floats, Floats]:

@@ -25,7 +25,12 @@ from scipy import sparse
 from igps._arrays import Floats, Integers
 from igps._threads import SERIAL, Team
 from igps.mesh.surface import has_area
-from igps.signature._weight_loops import add_near_faces, fill_cluster_terms, fill_hats, find_far_clusters
+from igps.signature._weight_loops import (
+    add_near_faces,
+    fill_cluster_terms,
+    fill_hats,
+    find_far_clusters,
+)
 from igps.signature.ordering import principal_axes, spatial_order
 
 _LEAF_SIZE = 32  # hats in the smallest clusters; a cluster costs as much as 19 hats
@@ -54,7 +59,9 @@ class HatSurface:
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         faces = faces[has_area(vertices[faces])]
         if len(faces) == 0:
-            raise ValueError("faces: expected at least one face with an area, got flat ones only; check the mesh")
+            raise ValueError(
+                "faces: expected at least one face with an area, got flat ones only; check the mesh"
+            )
         used = np.flatnonzero(np.bincount(faces.ravel(), minlength=len(vertices)))
         self.axes = principal_axes(vertices[used])
         vertices = vertices @ self.axes
@@ -70,7 +77,13 @@ class HatSurface:
         normals /= double_areas
         inward = np.cross(normals[:, None], sides[:, :2])
         squared_sides = np.square(sides).sum(axis=2)
-        columns = corners.reshape(-1, 9), normals, inward.reshape(-1, 6), squared_sides, double_areas
+        columns = (
+            corners.reshape(-1, 9),
+            normals,
+            inward.reshape(-1, 6),
+            squared_sides,
+            double_areas,
+        )
         self.table = np.concatenate(columns, axis=1)
         n_corners = 3 * len(faces)
         arrays = np.ones(n_corners), self.faces.ravel(), np.arange(n_corners + 1)
@@ -87,13 +100,19 @@ class HatSurface:
         """
         near = np.zeros((len(hats) + 1, x.shape[1]), dtype=bool)
         fill_hats(x, hats, self.hats, ratio, out[len(out) - len(hats) :], near)
-        add_near_faces(x, hats, near, (self.faces, self.table, self.face_starts, self.incident_faces), out)
+        add_near_faces(
+            x, hats, near, (self.faces, self.table, self.face_starts, self.incident_faces), out
+        )
 
 
 def _hats(
-    vertices: Floats, incidence: sparse.csr_matrix, corners: Floats, normals: Floats, third_areas: Floats,
+    vertices: Floats,
+    incidence: sparse.csr_matrix,
+    corners: Floats,
+    normals: Floats,
+    third_areas: Floats,
     squared_sides: Floats,
-) -> Floats:  # fmt: skip
+) -> Floats:
     """Return `HatSurface.hats`, from third_areas (F, 1) and `incidence` (V, 3 F), which sums over the corners.
 
     Over a face with corners v, a, b and t = v + a + b the hat of v has the mean (v + t)/4 and the second moment
@@ -101,7 +120,13 @@ def _hats(
     """
     total = corners.sum(axis=1)
     moments = _outer(total, total) + corners.transpose(0, 2, 1) @ corners
-    columns = [np.ones_like(third_areas), total, normals, moments.reshape(-1, 9), _outer(normals, total).reshape(-1, 9)]
+    columns = [
+        np.ones_like(third_areas),
+        total,
+        normals,
+        moments.reshape(-1, 9),
+        _outer(normals, total).reshape(-1, 9),
+    ]
     sums = incidence @ np.repeat(third_areas * np.concatenate(columns, axis=1), 3, axis=0)
     mass, total, flux, moments, normal_moments = np.split(sums, (1, 4, 7, 16), axis=1)
     total, moments = total / mass, moments.reshape(-1, 3, 3) / mass[..., None]
@@ -113,14 +138,22 @@ def _hats(
     normal_moments = normal_moments.reshape(-1, 3, 3) / 4 + _outer(flux, vertices / 4 - centres)
     trace = np.trace(covariance, axis1=1, axis2=2)[:, None]
     # Longer of the two sides at each corner.
-    longest = np.sqrt(np.maximum(np.roll(squared_sides, -1, axis=1), np.roll(squared_sides, -2, axis=1)))
+    longest = np.sqrt(
+        np.maximum(np.roll(squared_sides, -1, axis=1), np.roll(squared_sides, -2, axis=1))
+    )
     extents = np.maximum.reduceat(longest.ravel()[incidence.indices], incidence.indptr[:-1])
     constant = (flux * to_vertex).sum(axis=1, keepdims=True)
     linear = -4 * np.einsum("vij,vi->vj", normal_moments, to_vertex) - 2 * trace * flux
     parts = [
-        centres, extents[:, None] + np.linalg.norm(to_vertex, axis=1, keepdims=True), constant, flux,
-        -2 * trace * constant, linear, -4 * _entries(normal_moments), 12 * _entries(covariance),
-    ]  # fmt: skip
+        centres,
+        extents[:, None] + np.linalg.norm(to_vertex, axis=1, keepdims=True),
+        constant,
+        flux,
+        -2 * trace * constant,
+        linear,
+        -4 * _entries(normal_moments),
+        12 * _entries(covariance),
+    ]
     return np.concatenate(parts, axis=1)
 
 
@@ -130,7 +163,9 @@ def _outer(left: Floats, right: Floats) -> Floats:
 
 def _entries(forms: Floats) -> Floats:
     """Return the coefficients (n, 6) of xx, xy, xz, yy, yz, zz of quadratic forms (n, 3, 3)."""
-    return ((forms + forms.transpose(0, 2, 1)) * _HALF_DIAGONAL)[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
+    return ((forms + forms.transpose(0, 2, 1)) * _HALF_DIAGONAL)[
+        :, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+    ]
 
 
 @dataclass(frozen=True)
@@ -140,7 +175,9 @@ class HatClusters:
     centres: Floats  # (C, 3), level by level
     radii: Floats  # (C,) of balls about the centres that contain the balls of the hats
     level_starts: Integers  # (n_levels + 1,) first cluster of each level, and C
-    sums: NDArray[np.floating]  # (C, 19, K) the 19 sums of each function, see the docstring of the module
+    sums: NDArray[
+        np.floating
+    ]  # (C, 19, K) the 19 sums of each function, see the docstring of the module
     n_hats: int  # V
 
     @classmethod
@@ -155,7 +192,9 @@ class HatClusters:
             starts = np.arange(0, n_hats, size)
             counts = np.diff(np.append(starts, n_hats))
             centre = np.add.reduceat(hats[:, :3], starts) / counts[:, None]
-            extents = np.linalg.norm(hats[:, :3] - np.repeat(centre, counts, axis=0), axis=1) + hats[:, 3]
+            extents = (
+                np.linalg.norm(hats[:, :3] - np.repeat(centre, counts, axis=0), axis=1) + hats[:, 3]
+            )
             centres.append(centre)
             radii.append(np.maximum.reduceat(extents, starts))
         level_starts = np.cumsum([0, *map(len, radii)])
@@ -164,7 +203,9 @@ class HatClusters:
         def fill(level: int) -> None:
             terms = np.empty((n_hats, _N_TERMS), functions.dtype)
             fill_cluster_terms(hats, sizes[level], centres[level], radii[level], terms)
-            for cluster, start in enumerate(range(0, n_hats, sizes[level]), start=level_starts[level]):
+            for cluster, start in enumerate(
+                range(0, n_hats, sizes[level]), start=level_starts[level]
+            ):
                 part = slice(start, start + sizes[level])
                 np.matmul(terms[part].T, functions[part], out=sums[cluster])
 
@@ -174,4 +215,6 @@ class HatClusters:
     def far_clusters(self, x: Floats, ratio: float) -> tuple[Integers, Integers]:
         """Return the clusters that are `ratio` or more radii from the box of points x (3, n), and the other hats."""
         box = x.min(axis=1), x.max(axis=1)
-        return find_far_clusters(*box, self.centres, self.radii, self.level_starts, ratio, _LEAF_SIZE, self.n_hats)
+        return find_far_clusters(
+            *box, self.centres, self.radii, self.level_starts, ratio, _LEAF_SIZE, self.n_hats
+        )

@@ -7,14 +7,23 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 
-_TINY = math.ulp(1.0) ** 2  # keeps the logarithm of a side finite at points on the side, where its factor is 0
+_TINY = (
+    math.ulp(1.0) ** 2
+)  # keeps the logarithm of a side finite at points on the side, where its factor is 0
 
 
 @compiled()
 def fill_potentials(
-    points: Floats, block: int, patches: Floats, min_distances: Floats, level_starts: Integers, branching: int,
-    squared_limits: Floats, faces: Floats, out: Floats,
-) -> None:  # fmt: skip
+    points: Floats,
+    block: int,
+    patches: Floats,
+    min_distances: Floats,
+    level_starts: Integers,
+    branching: int,
+    squared_limits: Floats,
+    faces: Floats,
+    out: Floats,
+) -> None:
     """Fill `out` (n,) with the potentials at points, one block of neighbouring points at a time.
 
     Args:
@@ -31,7 +40,9 @@ def fill_potentials(
     n_levels = len(level_starts) - 1
     x, is_far = np.empty((3, block)), np.empty(block)
     # The stack holds at most all patches of the coarsest level, and the children of one patch for each level below.
-    stack = np.empty((level_starts[n_levels] - level_starts[n_levels - 1] + branching * n_levels, 2), np.int64)
+    stack = np.empty(
+        (level_starts[n_levels] - level_starts[n_levels - 1] + branching * n_levels, 2), np.int64
+    )
     for start in range(0, len(points), block):
         n = min(block, len(points) - start)
         low, high = points[start].copy(), points[start].copy()
@@ -61,12 +72,20 @@ def fill_potentials(
                     stack[n_stacked, 0], stack[n_stacked, 1] = child, level - 1
                     n_stacked += 1
             else:
-                add_face(patches[patch], squared_limits[patch], faces[patch], block_points, is_far, sums)
+                add_face(
+                    patches[patch], squared_limits[patch], faces[patch], block_points, is_far, sums
+                )
 
 
 @compiled()
 def add_series(
-    patch: Floats, scale: float, share: float, target: Floats, points: Floats, is_far: Floats, sums: Floats
+    patch: Floats,
+    scale: float,
+    share: float,
+    target: Floats,
+    points: Floats,
+    is_far: Floats,
+    sums: Floats,
 ) -> None:
     """Add the series of a patch (10,), A/r + A (3/2 dᵀCd − ½ tr C r²)/r⁵, where points (3, n) have `is_far` (n,) = 1.
 
@@ -87,7 +106,9 @@ def add_series(
 
 
 @compiled()
-def add_face(patch: Floats, squared_limit: float, face: Floats, points: Floats, is_far: Floats, sums: Floats) -> None:
+def add_face(
+    patch: Floats, squared_limit: float, face: Floats, points: Floats, is_far: Floats, sums: Floats
+) -> None:
     """Add the potential of one face at points (3, n): by the series of its quarters, or near it in closed form."""
     n_far = 0
     for i in range(points.shape[1]):

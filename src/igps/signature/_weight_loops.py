@@ -14,8 +14,12 @@ from igps._compiled import FUSE, compiled
 SurfaceArrays = tuple[Integers, Floats, Integers, Integers]
 """Faces, table, face_starts and incident_faces of a `HatSurface`."""
 
-_N_PAIRS = 128  # pairs of a face and a point computed at a time: their data stay in the first-level cache
-_ON_SURFACE = 2e-9  # half-diagonals; points closer than this are on the surface, or in the plane of a face
+_N_PAIRS = (
+    128  # pairs of a face and a point computed at a time: their data stay in the first-level cache
+)
+_ON_SURFACE = (
+    2e-9  # half-diagonals; points closer than this are on the surface, or in the plane of a face
+)
 _TAN = math.tan(math.pi / 8)
 # Coefficients of arctan(√q)/√q for √q ≤ tan π/8, accurate to rounding, from the highest power down.
 _ARCTAN = tuple(
@@ -28,7 +32,14 @@ _ARCTAN = tuple(
 
 @compiled()
 def find_far_clusters(
-    low: Floats, high: Floats, centres: Floats, radii: Floats, starts: Integers, ratio: float, leaf: int, n_hats: int
+    low: Floats,
+    high: Floats,
+    centres: Floats,
+    radii: Floats,
+    starts: Integers,
+    ratio: float,
+    leaf: int,
+    n_hats: int,
 ) -> tuple[Integers, Integers]:
     """Return the clusters that are `ratio` or more radii from a box, and the hats in none of these, ascending."""
     clusters, hats = np.empty(len(radii), np.int64), np.empty(n_hats, np.int64)
@@ -62,7 +73,9 @@ def find_far_clusters(
 
 
 @compiled(fastmath=FUSE)
-def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: Floats, near: Booleans) -> None:
+def fill_hats(
+    x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: Floats, near: Booleans
+) -> None:
     """Fill the weights (h, n) of the chosen hats (h,), 0 at points within `ratio` radii; mark those in `near`."""
     n = x.shape[1]
     squared = np.empty(n)
@@ -79,7 +92,12 @@ def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: 
             distance = a * a + b * b + c * c
             inverse = 1 / distance
             linear = f + f0 * a + f1 * b + f2 * c
-            second = s + a * (s0 + s00 * a + s01 * b + s02 * c) + b * (s1 + s11 * b + s12 * c) + c * (s2 + s22 * c)
+            second = (
+                s
+                + a * (s0 + s00 * a + s01 * b + s02 * c)
+                + b * (s1 + s11 * b + s12 * c)
+                + c * (s2 + s22 * c)
+            )
             third = a * (b00 * a + b01 * b + b02 * c) + b * (b11 * b + b12 * c) + b22 * c * c
             value = ((third * linear * inverse + second) * inverse + linear) * (inverse * inverse)
             row[i] = 0.0 if distance < limit else value
@@ -89,10 +107,17 @@ def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: 
 
 
 @compiled(fastmath=FUSE)
-def fill_clusters(x: Floats, chosen: Integers, centres: Floats, radii: Floats, terms: Floats) -> None:
+def fill_clusters(
+    x: Floats, chosen: Integers, centres: Floats, radii: Floats, terms: Floats
+) -> None:
     """Fill the terms (19 c, n) of the chosen clusters (c,): |e|² times e, its products of two, and of three."""
     for k in range(len(chosen)):
-        c0, c1, c2, radius = centres[chosen[k], 0], centres[chosen[k], 1], centres[chosen[k], 2], radii[chosen[k]]
+        c0, c1, c2, radius = (
+            centres[chosen[k], 0],
+            centres[chosen[k], 1],
+            centres[chosen[k], 2],
+            radii[chosen[k]],
+        )
         out = terms[19 * k : 19 * k + 19]
         for i in range(x.shape[1]):
             a, b, c = c0 - x[0, i], c1 - x[1, i], c2 - x[2, i]
@@ -102,13 +127,34 @@ def fill_clusters(x: Floats, chosen: Integers, centres: Floats, radii: Floats, t
             sa, sb, sc = scale * a, scale * b, scale * c
             aa, ab, ac, bb, bc, cc = sa * a, sa * b, sa * c, sb * b, sb * c, sc * c
             out[0, i], out[1, i], out[2, i] = sa, sb, sc
-            out[3, i], out[4, i], out[5, i], out[6, i], out[7, i], out[8, i] = aa, ab, ac, bb, bc, cc
-            out[9, i], out[10, i], out[11, i], out[12, i], out[13, i] = aa * a, aa * b, aa * c, ab * b, ab * c
-            out[14, i], out[15, i], out[16, i], out[17, i], out[18, i] = ac * c, bb * b, bb * c, bc * c, cc * c
+            out[3, i], out[4, i], out[5, i], out[6, i], out[7, i], out[8, i] = (
+                aa,
+                ab,
+                ac,
+                bb,
+                bc,
+                cc,
+            )
+            out[9, i], out[10, i], out[11, i], out[12, i], out[13, i] = (
+                aa * a,
+                aa * b,
+                aa * c,
+                ab * b,
+                ab * c,
+            )
+            out[14, i], out[15, i], out[16, i], out[17, i], out[18, i] = (
+                ac * c,
+                bb * b,
+                bb * c,
+                bc * c,
+                cc * c,
+            )
 
 
 @compiled()
-def add_near_faces(x: Floats, chosen: Integers, near: Booleans, surface: SurfaceArrays, weights: Floats) -> None:
+def add_near_faces(
+    x: Floats, chosen: Integers, near: Booleans, surface: SurfaceArrays, weights: Floats
+) -> None:
     """Add the closed form to the weights (…, n), whose last h rows are those of the chosen hats (h,).
 
     It is added where a hat is `near` a point (h + 1, n); the last row of `near` is False. For points on the surface all
@@ -143,7 +189,17 @@ def add_near_faces(x: Floats, chosen: Integers, near: Booleans, surface: Surface
                     pairs[0, n_pairs], pairs[1, n_pairs] = face, i
                     n_pairs += 1
             if n_pairs >= _N_PAIRS:
-                add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, face_at, barycentric)
+                add_faces(
+                    x,
+                    pairs[:, :n_pairs],
+                    faces,
+                    table,
+                    row_of,
+                    near,
+                    hat_weights,
+                    face_at,
+                    barycentric,
+                )
                 n_pairs = 0
     add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, face_at, barycentric)
     for i in range(n):
@@ -156,9 +212,16 @@ def add_near_faces(x: Floats, chosen: Integers, near: Booleans, surface: Surface
 
 @compiled()
 def add_faces(
-    x: Floats, pairs: Integers, faces: Integers, table: Floats, row_of: Integers, near: Booleans, weights: Floats,
-    face_at: Integers, barycentric: Floats,
-) -> None:  # fmt: skip
+    x: Floats,
+    pairs: Integers,
+    faces: Integers,
+    table: Floats,
+    row_of: Integers,
+    near: Booleans,
+    weights: Floats,
+    face_at: Integers,
+    barycentric: Floats,
+) -> None:
     """Add the closed form for pairs (2, m) of a face and a point, accurate up to the surface.
 
     If a point is on the surface, the first face that contains it is written to face_at (n,), and its barycentric
@@ -170,7 +233,11 @@ def add_faces(
     because N_l = λ_l n + h n̂×e_l. The length of N_l is taken from this identity, too: all terms agree near a side.
     """
     n_pairs = pairs.shape[1]
-    projections, squares, cosines = np.empty((n_pairs, 4)), np.empty(3 * n_pairs), np.empty(3 * n_pairs)
+    projections, squares, cosines = (
+        np.empty((n_pairs, 4)),
+        np.empty(3 * n_pairs),
+        np.empty(3 * n_pairs),
+    )
     for m in range(n_pairs):
         row, i = table[pairs[0, m]], pairs[1, m]
         a0, a1, a2 = row[0] - x[0, i], row[1] - x[1, i], row[2] - x[2, i]
@@ -187,7 +254,12 @@ def add_faces(
         cosines[3 * m] = b0 * c0 + b1 * c1 + b2 * c2
         cosines[3 * m + 1] = c0 * a0 + c1 * a1 + c2 * a2
         cosines[3 * m + 2] = a0 * b0 + a1 * b1 + a2 * b2
-        projections[m, 0], projections[m, 1], projections[m, 2], projections[m, 3] = area_0, area_1, area_2, height
+        projections[m, 0], projections[m, 1], projections[m, 2], projections[m, 3] = (
+            area_0,
+            area_1,
+            area_2,
+            height,
+        )
     divide_angles(squares, cosines)
     for m in range(n_pairs):
         face, i = pairs[0, m], pairs[1, m]
@@ -201,7 +273,11 @@ def add_faces(
         for corner in range(3):
             left, right, k = (corner + 2) % 3, (corner + 1) % 3, row_of[faces[face, corner]]
             if near[k, i]:
-                second = g[corner] * sides[corner] + g[left] * (sides[right] - half) + g[right] * (sides[left] - half)
+                second = (
+                    g[corner] * sides[corner]
+                    + g[left] * (sides[right] - half)
+                    + g[right] * (sides[left] - half)
+                )
                 weights[k, i] += (second * height + s_over_h * areas[corner]) / (2 * row[21])
             on_face &= areas[corner] >= -_ON_SURFACE * math.sqrt(sides[corner])
             total_area += max(areas[corner], 0.0)
@@ -230,7 +306,9 @@ def divide_angles(squares: Floats, cosines: Floats) -> None:
 
 
 @compiled(fastmath=FUSE)
-def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, terms: Singles) -> None:
+def fill_cluster_terms(
+    hats: Floats, size: int, centres: Floats, radii: Floats, terms: Singles
+) -> None:
     """Fill the contribution (V, 19) of each hat to the sums of its cluster, which consists of `size` consecutive hats.
 
     The moments of n dS about the cluster's centre are F = ∫ λ n, T + F sᵀ, and 2 T s + F E, where T is the symmetric
@@ -240,7 +318,11 @@ def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, 
     """
     for hat in range(len(hats)):
         p, out, centre, scale = hats[hat], terms[hat], centres[hat // size], 1 / radii[hat // size]
-        s0, s1, s2 = scale * (p[0] - centre[0]), scale * (p[1] - centre[1]), scale * (p[2] - centre[2])
+        s0, s1, s2 = (
+            scale * (p[0] - centre[0]),
+            scale * (p[1] - centre[1]),
+            scale * (p[2] - centre[2]),
+        )
         cubed, squared = scale * scale * scale, scale * scale
         f0, f1, f2 = cubed * p[5], cubed * p[6], cubed * p[7]
         # S is −4 dᵀTd, and B is 12 dᵀCd; entries off the diagonal count twice.
@@ -248,7 +330,11 @@ def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, 
         t00, t01, t02 = tilt * p[12], tilt * p[13], tilt * p[14]
         t11, t12, t22 = tilt * p[15], tilt * p[16], tilt * p[17]
         e00, e11, e22 = spread * p[18] + s0 * s0, spread * p[21] + s1 * s1, spread * p[23] + s2 * s2
-        e01, e02, e12 = spread * p[19] + 2 * s0 * s1, spread * p[20] + 2 * s0 * s2, spread * p[22] + 2 * s1 * s2
+        e01, e02, e12 = (
+            spread * p[19] + 2 * s0 * s1,
+            spread * p[20] + 2 * s0 * s2,
+            spread * p[22] + 2 * s1 * s2,
+        )
         out[0], out[1], out[2] = f0, f1, f2
         n00, n11, n22 = t00 + f0 * s0, t11 + f1 * s1, t22 + f2 * s2
         trace = n00 + n11 + n22

@@ -13,13 +13,20 @@ from igps.signature.surface_potential import surface_potential
 AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 
-def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
+def interior_attributes(
+    mesh: Mesh, points: Floats, names: Sequence[AttributeName]
+) -> Mapping[str, Singles]:
     """Return the named attributes (P,), or (P, 3) for a direction, of interior points (P, 3); none depends on scale."""
-    functions = {function.__name__: function for function in (depth, electrostatic_potential, surface_direction)}
+    functions = {
+        function.__name__: function
+        for function in (depth, electrostatic_potential, surface_direction)
+    }
     return {name: functions[name](mesh, points).astype(np.float32) for name in names}
 
 
-def surface_attributes(mesh: Mesh, faces: Integers, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
+def surface_attributes(
+    mesh: Mesh, faces: Integers, names: Sequence[AttributeName]
+) -> Mapping[str, Singles]:
     """Return the named attributes of points on faces (P,): only "surface_direction", here the outward normal (P, 3)."""
     if "surface_direction" not in names:
         return {}
@@ -45,7 +52,9 @@ def _vectors_to_surface(mesh: Mesh, points: Floats) -> Floats:
     import igl
 
     *_, nearest = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(points), np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(mesh.vertices),
+        np.ascontiguousarray(mesh.faces),
     )
     return np.asarray(nearest) - points
 

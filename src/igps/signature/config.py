@@ -65,7 +65,9 @@ class SignatureConfig:
     def __post_init__(self) -> None:
         check_at_least(1, n_eigenpairs=self.n_eigenpairs, resolution=self.resolution)
         check_at_least(1, n_surface_samples=self.n_surface_samples)
-        check_at_least(0, min_samples=self.min_samples, least_vertices=self.least_vertices, seed=self.seed)
+        check_at_least(
+            0, min_samples=self.min_samples, least_vertices=self.least_vertices, seed=self.seed
+        )
         check_one_of(get_args(Backend), backend=self.backend)
         if self.max_vertices is not None and self.max_vertices <= self.n_kept + 1:
             raise ValueError(
@@ -75,7 +77,9 @@ class SignatureConfig:
         names, known = tuple(self.attributes), get_args(AttributeName)  # JSON and YAML have lists
         object.__setattr__(self, "attributes", names)
         if not set(names) <= set(known) or len(set(names)) < len(names):
-            raise ValueError(f"attributes: expected distinct names among {', '.join(known)}, got {', '.join(names)}.")
+            raise ValueError(
+                f"attributes: expected distinct names among {', '.join(known)}, got {', '.join(names)}."
+            )
 
     @classmethod
     def paper(cls) -> Self:
@@ -122,13 +126,22 @@ class SignatureConfig:
             n_vertices = max(n_vertices, self.DEFAULT_EIGENPAIRS + 2)
         for n_eigenpairs in sizes:
             for attributes in dict.fromkeys((self.attributes, all_attributes)):
-                candidate = replace(self, n_eigenpairs=n_eigenpairs, attributes=attributes, least_vertices=n_vertices)
+                candidate = replace(
+                    self,
+                    n_eigenpairs=n_eigenpairs,
+                    attributes=attributes,
+                    least_vertices=n_vertices,
+                )
                 if candidate.as_dict() != self.as_dict():
                     yield candidate
 
     def as_dict(self) -> dict[str, Any]:
         """Return the parameters and the algorithm's version by name, without `least_vertices` if it has its default."""
-        parameters = {**asdict(self), "n_eigenpairs": self.n_kept, "algorithm_version": self.ALGORITHM_VERSION}
+        parameters = {
+            **asdict(self),
+            "n_eigenpairs": self.n_kept,
+            "algorithm_version": self.ALGORITHM_VERSION,
+        }
         if self.n_vertices_read == self.n_kept + 2:
             del parameters["least_vertices"]
         return parameters

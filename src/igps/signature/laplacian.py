@@ -40,7 +40,9 @@ def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_ma
     try:
         import robust_laplacian
     except ImportError as error:
-        raise ImportError('backend="robust" needs robust-laplacian: pip install "interior-gps[robust]".') from error
+        raise ImportError(
+            'backend="robust" needs robust-laplacian: pip install "interior-gps[robust]".'
+        ) from error
     # Scale the mesh to unit size, because robust-laplacian mollifies by an absolute length.
     scale = longest_side(mesh.vertices)
     centred = (mesh.vertices - mesh.vertices.mean(axis=0)) / scale
@@ -61,8 +63,12 @@ def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
         longest = np.sqrt(squared[is_thin].max(axis=1, keepdims=True))
         lengths = np.sqrt(squared[is_thin]) + _MOLLIFIER * longest
         squared[is_thin] = lengths**2
-        c, b, a = np.sort(lengths, axis=1).T  # Heron's formula in Kahan's arrangement, stable for needles
-        double_area[is_thin] = 2 * (np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4)
+        c, b, a = np.sort(
+            lengths, axis=1
+        ).T  # Heron's formula in Kahan's arrangement, stable for needles
+        double_area[is_thin] = 2 * (
+            np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4
+        )
     # cot at corner i = (b·b + c·c − a·a) / (4 area), where a is the edge opposite corner i.
     cotangents = (squared.sum(axis=1, keepdims=True) - 2 * squared) / (2 * double_area[:, None])
     mass = _mixed_voronoi_mass(mesh.faces, cotangents, squared, double_area / 2, len(mesh.vertices))
@@ -78,7 +84,9 @@ def _stiffness(faces: Integers, cotangents: Floats, n_vertices: int) -> sparse.c
     return sparse.diags(np.asarray(weights.sum(axis=1)).ravel(), format="csr") - weights
 
 
-def _mixed_voronoi_mass(faces: Integers, cotangents: Floats, squared: Floats, area: Floats, n_vertices: int) -> Floats:
+def _mixed_voronoi_mass(
+    faces: Integers, cotangents: Floats, squared: Floats, area: Floats, n_vertices: int
+) -> Floats:
     # Meyer et al. 2002, section 3.3. The Voronoi area of corner i is the sum of edge² · cot / 8 over the two edges
     # at i, with the angle opposite the edge. In an obtuse face the corners get fixed shares of the area instead.
     share = squared * cotangents / 8

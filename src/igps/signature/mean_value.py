@@ -32,26 +32,41 @@ logger = logging.getLogger(__name__)
 
 _BLOCK_BYTES = 256 * 2**20  # largest block of weights
 _GROUP_SIZE = 192  # points for which the same clusters are far
-_COPY_ROWS = 2**10  # rows of the functions copied at a time: source and copy then fit into the processor's cache
+_COPY_ROWS = (
+    2**10
+)  # rows of the functions copied at a time: source and copy then fit into the processor's cache
 _REGISTER_SIZE = 16  # single-precision numbers in a register
 _MIN_TEAM_VERTICES = 2**14  # smallest mesh for which several threads pay
 _MIN_FAR_RATIO = 1.1  # smallest distance, in radii, at which a series is used
 _HAT_ERROR = 3.5e-3  # error of the hats' series one radius away; it falls with the third power of the distance
-_CLUSTER_ERROR = 2.2e-3  # error of the clusters' series one radius from the cluster's ball; it falls likewise
+_CLUSTER_ERROR = (
+    2.2e-3  # error of the clusters' series one radius from the cluster's ball; it falls likewise
+)
 _MIN_FINE_VERTICES = 2000  # on coarser meshes errors were up to three times larger:
 _COARSE_GAIN = 3  # the target for their accuracy is divided by this factor
-_MIN_CLUSTER_VERTICES = 2**13  # smallest mesh for which clusters pay; without them a value depends only on its point
-_MIN_FLOAT32_ACCURACY = 1e-4  # smallest accuracy for which the product with the functions may be in single precision
+_MIN_CLUSTER_VERTICES = (
+    2**13
+)  # smallest mesh for which clusters pay; without them a value depends only on its point
+_MIN_FLOAT32_ACCURACY = (
+    1e-4  # smallest accuracy for which the product with the functions may be in single precision
+)
 _N_CHECKED = 12  # points that are also evaluated exactly, to check the approximation
 _N_CHECK_PARTNERS = 64  # points whose distances from the checked ones are compared
-_CHECK_LINE = (0.11, 0.37, 1.0)  # in principal axes, the longest last; oblique, to give points distinct positions
+_CHECK_LINE = (
+    0.11,
+    0.37,
+    1.0,
+)  # in principal axes, the longest last; oblique, to give points distinct positions
 _MAX_APPROXIMATIONS = 2  # then the closed form is used
 
 
 def extend(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer], functions: NDArray[np.floating],
-    points: NDArray[np.floating], **options: Any,
-) -> Floats:  # fmt: skip
+    vertices: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    functions: NDArray[np.floating],
+    points: NDArray[np.floating],
+    **options: Any,
+) -> Floats:
     """Extend surface functions (V, K) to points (P, 3); options and errors are those of `Extension`.
 
     The result is (P, K). For the identity (V, V) as functions it is the mean value coordinates, whose rows sum to 1.
@@ -80,12 +95,22 @@ class Extension:
     """
 
     def __init__(
-        self, vertices: NDArray[np.floating], faces: NDArray[np.integer], functions: NDArray[np.floating], *,
-        divisors: NDArray[np.floating] | None = None, accuracy: float | None = None, dtype: DTypeLike | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        vertices: NDArray[np.floating],
+        faces: NDArray[np.integer],
+        functions: NDArray[np.floating],
+        *,
+        divisors: NDArray[np.floating] | None = None,
+        accuracy: float | None = None,
+        dtype: DTypeLike | None = None,
+    ) -> None:
         check_fraction(accuracy=accuracy)
         if dtype is None:
-            dtype = np.float32 if accuracy is not None and accuracy >= _MIN_FLOAT32_ACCURACY else np.float64
+            dtype = (
+                np.float32
+                if accuracy is not None and accuracy >= _MIN_FLOAT32_ACCURACY
+                else np.float64
+            )
         if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise ValueError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
         scaled, scaled_faces, _ = _scaled(vertices, faces, np.zeros((0, 3)))
@@ -100,7 +125,9 @@ class Extension:
             if not (np.isfinite(values.sum()) or np.isfinite(values).all()):
                 raise ValueError("functions: expected finite values, got NaN or infinity")
         if divisors is not None and np.shape(divisors) != values.shape[1:]:
-            raise ValueError(f"divisors: expected shape {values.shape[1:]}, one per function, got {np.shape(divisors)}")
+            raise ValueError(
+                f"divisors: expected shape {values.shape[1:]}, one per function, got {np.shape(divisors)}"
+            )
         self._surface = HatSurface(scaled, scaled_faces)
         order = self._surface.order
         self._n_functions = values.shape[1]
@@ -131,28 +158,38 @@ class Extension:
             target = None if attempt + 1 == _MAX_APPROXIMATIONS else 0.5 * target * accuracy / error
             logger.info(
                 "mean value coordinates: error %.1e exceeds accuracy %.1e, evaluated again %s",
-                error, accuracy, "exactly" if target is None else f"with {target:.1e}",
-            )  # fmt: skip
+                error,
+                accuracy,
+                "exactly" if target is None else f"with {target:.1e}",
+            )
         return out
 
     def _values(self, sums: NDArray[np.floating]) -> NDArray[np.floating]:
         totals = sums[:, -1:]
         if not (np.isfinite(totals) & (totals != 0)).all():
-            raise ValueError("points: expected mean value weights with a non-zero sum, got 0 or inf; close the mesh")
+            raise ValueError(
+                "points: expected mean value weights with a non-zero sum, got 0 or inf; close the mesh"
+            )
         return sums[:, : self._n_functions] / totals
 
-    def _weighted_sums(self, x: Floats, target: float | None) -> Iterator[tuple[Integers, NDArray[np.floating]]]:
+    def _weighted_sums(
+        self, x: Floats, target: float | None
+    ) -> Iterator[tuple[Integers, NDArray[np.floating]]]:
         """Yield, for n points at a time, their indices (n,) and the columns (V, K) summed with their weights (n, K)."""
         surface, columns = self._surface, self._columns
         hat_ratio, cluster_ratio = _far_ratios(target)
         order = spatial_order(x, _GROUP_SIZE)
 
-        def sum_group(clusters: HatClusters | None, start: int) -> list[tuple[Integers, NDArray[np.floating]]]:
+        def sum_group(
+            clusters: HatClusters | None, start: int
+        ) -> list[tuple[Integers, NDArray[np.floating]]]:
             group = order[start : start + _GROUP_SIZE]
             far, hats, values = np.empty(0, np.int64), np.arange(len(columns)), columns
             if clusters is not None:
                 far, hats = clusters.far_clusters(x[group].T, cluster_ratio)
-                values = np.concatenate([clusters.sums[far].reshape(-1, columns.shape[1]), columns[hats]])
+                values = np.concatenate(
+                    [clusters.sums[far].reshape(-1, columns.shape[1]), columns[hats]]
+                )
             results = []
             size = max(1, min(_GROUP_SIZE, _BLOCK_BYTES // (8 * len(values))))
             for rows in (group[i : i + size] for i in range(0, len(group), size)):
@@ -182,14 +219,20 @@ class Extension:
         order = np.argsort(x @ np.array(_CHECK_LINE))
 
         def at_steps(count: int) -> Integers:
-            return order[np.linspace(0, len(order) - 1, min(count, len(order))).round().astype(np.int64)]
+            return order[
+                np.linspace(0, len(order) - 1, min(count, len(order))).round().astype(np.int64)
+            ]
 
         chosen = at_steps(_N_CHECKED)
         weights = np.empty((len(self._surface.order), len(chosen)))
-        self._surface.fill_weights(np.ascontiguousarray(x[chosen].T), np.arange(len(weights)), math.inf, weights)
+        self._surface.fill_weights(
+            np.ascontiguousarray(x[chosen].T), np.arange(len(weights)), math.inf, weights
+        )
         checked, others = values[chosen], values[at_steps(_N_CHECK_PARTNERS)]
         # To first order, a distance d changes by error · (checked − others) / d.
-        errors = checked - self._values(weights.astype(self._columns.dtype, copy=False).T @ self._columns)
+        errors = checked - self._values(
+            weights.astype(self._columns.dtype, copy=False).T @ self._columns
+        )
         changes = (errors * checked).sum(axis=1, keepdims=True) - errors @ others.T
         squared = cdist(checked, others, "sqeuclidean")
         relative = np.abs(changes)[squared > 0] / squared[squared > 0]
@@ -212,5 +255,7 @@ def _scaled(
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     centre, scale = (low + high) / 2, np.linalg.norm(high - low) / 2
     if not scale > 0:
-        raise ValueError("vertices: expected distinct positions, got the same for all; check the mesh")
+        raise ValueError(
+            "vertices: expected distinct positions, got the same for all; check the mesh"
+        )
     return (vertices - centre) / scale, faces, (points - centre) / scale

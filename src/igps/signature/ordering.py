@@ -28,7 +28,10 @@ _ANCHOR_WEIGHTS = 0.1 / np.sqrt([1.0, 2.0, 3.0, 5.0])
 
 
 def ordering_keys(
-    eigenfunctions: NDArray[np.floating], eigenvalues: Floats, area: float, tie_breakers: Floats | float = 0.0
+    eigenfunctions: NDArray[np.floating],
+    eigenvalues: Floats,
+    area: float,
+    tie_breakers: Floats | float = 0.0,
 ) -> Floats:
     """Return a key (P,), dimensionless, for each point of a body, for an order independent of the numbering.
 
@@ -85,7 +88,12 @@ def _keys(embedding: Floats, tie_breakers: Floats | float) -> Floats:
 def nearest_spacing(points: Floats) -> Floats:
     """Return each point's (P, 3) mean distance from its neighbours, over the mean of all: tie-breakers (P,)."""
     n_neighbours = min(_N_NEIGHBOURS + 1, len(points))
-    distance = cKDTree(points).query(points, n_neighbours)[0].reshape(len(points), n_neighbours).mean(axis=1)
+    distance = (
+        cKDTree(points)
+        .query(points, n_neighbours)[0]
+        .reshape(len(points), n_neighbours)
+        .mean(axis=1)
+    )
     return distance / max(distance.mean(), np.finfo(float).tiny)
 
 
@@ -115,7 +123,9 @@ def spatial_order(points: Floats, size: int) -> Integers:
     n_cuts = max(0, math.ceil(math.log2(max(1, n_points) / size)))
     order = np.minimum(np.arange(size << n_cuts), n_points)
     # Index n_points is padding: the mean point for bounding boxes, behind all others for cuts.
-    padded = np.ascontiguousarray(np.vstack([points, points.mean(axis=0) if n_points else np.zeros(3)]).T)
+    padded = np.ascontiguousarray(
+        np.vstack([points, points.mean(axis=0) if n_points else np.zeros(3)]).T
+    )
     for cut in range(n_cuts):
         boxes = padded.take(order, axis=1).reshape(3, 1 << cut, -1)
         along = boxes[np.ptp(boxes, axis=2).argmax(axis=0), np.arange(1 << cut)]

@@ -67,7 +67,9 @@ def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
     if name == "screened_potential":
         return screened_potential(molecule, points)
     if name not in _COLUMNS:
-        raise ValueError(f"attributes: expected names among {', '.join(RESIDUE_ATTRIBUTES)}, got {name!r}.")
+        raise ValueError(
+            f"attributes: expected names among {', '.join(RESIDUE_ATTRIBUTES)}, got {name!r}."
+        )
     means = residue_means(molecule, points, _COLUMNS[name](molecule))
     return means[:, 0] if means.shape[1] == 1 else means
 
@@ -76,7 +78,10 @@ def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[M
     """Return a function for values (R, 1) by residue name: the default for amino acids not in the table, else NaN."""
 
     def column(molecule: Molecule) -> Floats:
-        values = [table.get(name, default if name in VOLUMES else np.nan) for name in molecule.residue_names]
+        values = [
+            table.get(name, default if name in VOLUMES else np.nan)
+            for name in molecule.residue_names
+        ]
         return np.array(values, dtype=float)[:, None]
 
     return column
@@ -91,7 +96,9 @@ def _kinds(molecule: Molecule) -> Floats:
     """Return the kind of each residue as a one-hot row (R, 25)."""
     index = {name: i for i, name in enumerate(RESIDUE_KINDS)}
     index |= {f"D{base}": index[base] for base in "ACG"} | {"DT": index["U"], "T": index["U"]}
-    return np.eye(len(RESIDUE_KINDS))[[index.get(name, index["other"]) for name in molecule.residue_names]]
+    return np.eye(len(RESIDUE_KINDS))[
+        [index.get(name, index["other"]) for name in molecule.residue_names]
+    ]
 
 
 _COLUMNS: Mapping[str, Callable[[Molecule], Floats]] = {

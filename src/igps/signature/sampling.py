@@ -28,7 +28,9 @@ class SurfacePoints:
         return np.einsum("pi,pid->pd", self.weights, values[self.mesh.faces[self.face]])
 
 
-def surface_points(mesh: Mesh, n_points: int, seed: int, keys: Floats | None = None) -> SurfacePoints:
+def surface_points(
+    mesh: Mesh, n_points: int, seed: int, keys: Floats | None = None
+) -> SurfacePoints:
     """Draw random points, uniformly distributed over the surface.
 
     Keys (V,) of the vertices, see `igps.signature.ordering`, give faces and corners an order independent of their
@@ -43,7 +45,9 @@ def surface_points(mesh: Mesh, n_points: int, seed: int, keys: Floats | None = N
     order = np.argsort(corner_keys.sum(axis=1), kind="stable")
     face = order[systematic_sample(area[order], n_points, generator)]
     weights = np.empty((n_points, 3))
-    np.put_along_axis(weights, np.argsort(corner_keys, axis=1)[face], _in_triangles(n_points, generator), axis=1)
+    np.put_along_axis(
+        weights, np.argsort(corner_keys, axis=1)[face], _in_triangles(n_points, generator), axis=1
+    )
     return SurfacePoints(mesh, face, weights)
 
 

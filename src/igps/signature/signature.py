@@ -28,7 +28,14 @@ from igps.spectra import ConvergenceError, Spectrum, eigenpairs
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["SAMPLE_KINDS", "SampleKind", "Samples", "Signature", "SignatureConfig", "compute_signature"]
+__all__ = [
+    "SAMPLE_KINDS",
+    "SampleKind",
+    "Samples",
+    "Signature",
+    "SignatureConfig",
+    "compute_signature",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -124,7 +131,9 @@ class Signature:
     @property
     def barycentroid(self) -> Floats:
         """Interior sample (3,) of smallest potential Σ φₖ²/λₖ, a centre that hardly moves with pose (Rustamov 2010)."""
-        potential = np.square(self.interior.eigenfunctions, dtype=np.float64) @ (1 / self.eigenvalues)
+        potential = np.square(self.interior.eigenfunctions, dtype=np.float64) @ (
+            1 / self.eigenvalues
+        )
         return self.interior.points[int(np.argmin(potential))]
 
     def map_samples(self, change: Callable[[Samples], Samples]) -> Signature:
@@ -136,7 +145,9 @@ class Signature:
 
         def cut(samples: Samples) -> Samples:
             items = samples.attributes.items()
-            attributes: dict[str, Singles] = {name: values for name, values in items if name in config.attributes}
+            attributes: dict[str, Singles] = {
+                name: values for name, values in items if name in config.attributes
+            }
             functions = np.ascontiguousarray(samples.eigenfunctions[:, : config.n_kept])
             return replace(samples, eigenfunctions=functions, attributes=attributes)
 
@@ -145,7 +156,9 @@ class Signature:
 
 
 @one_thread()
-def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | None = None) -> Signature:
+def compute_signature(
+    mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | None = None
+) -> Signature:
     """Sample the eigenfunctions of a mesh in its interior and on its surface (Rustamov 2010, section 3).
 
     The eigenfunctions of a body with cavities are those of its outer surface. Mean value coordinates of the outer
@@ -183,10 +196,16 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
     spectrum, notes = _spectrum(outer, config)
-    eigenvalues, functions, residual = spectrum.eigenvalues, spectrum.eigenfunctions, spectrum.residual
+    eigenvalues, functions, residual = (
+        spectrum.eigenvalues,
+        spectrum.eigenfunctions,
+        spectrum.residual,
+    )
     roots = np.sqrt(eigenvalues)
     # The accuracy is that of interior distances, which are distances between rows of eigenfunctions over √λ.
-    extend = Extension(outer.vertices, outer.faces, functions, divisors=roots, accuracy=config.accuracy)
+    extend = Extension(
+        outer.vertices, outer.faces, functions, divisors=roots, accuracy=config.accuracy
+    )
     if not is_outer.all():
         functions = np.empty((len(mesh.vertices), len(eigenvalues)))
         functions[is_outer] = spectrum.eigenfunctions
@@ -201,9 +220,17 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
                 "triangles are too ill-shaped: pass backend='robust', or remesh."
             )
     return Signature(
-        eigenvalues, interior, surface, mesh.area, mesh.volume, config, mesh.name,
-        notes=(*mesh.notes, *notes), residual=residual, unit=mesh.unit,
-    )  # fmt: skip
+        eigenvalues,
+        interior,
+        surface,
+        mesh.area,
+        mesh.volume,
+        config,
+        mesh.name,
+        notes=(*mesh.notes, *notes),
+        residual=residual,
+        unit=mesh.unit,
+    )
 
 
 def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str, ...]]:
@@ -211,7 +238,13 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
 
     def solve(config: SignatureConfig) -> Spectrum:
         matrices = laplacian(mesh, config.backend)
-        return eigenpairs(*matrices, config.n_kept, positions=mesh.vertices, tolerance=_MAX_RESIDUAL, seed=config.seed)
+        return eigenpairs(
+            *matrices,
+            config.n_kept,
+            positions=mesh.vertices,
+            tolerance=_MAX_RESIDUAL,
+            seed=config.seed,
+        )
 
     try:
         return solve(config), ()
@@ -221,7 +254,9 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
         try:
             spectrum = solve(replace(config, backend="robust"))
         except ImportError as import_error:
-            raise ConvergenceError(f"{mesh.name}: {failure}. Remesh the body; or else: {import_error}") from failure
+            raise ConvergenceError(
+                f"{mesh.name}: {failure}. Remesh the body; or else: {import_error}"
+            ) from failure
         except (ConvergenceError, ValueError) as second_failure:
             raise ConvergenceError(
                 f"{mesh.name}: the eigenpairs fail with the cotangent matrices ({failure}) and with the "
@@ -232,18 +267,30 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
         return spectrum, (note,)
 
 
-def _interior(mesh: Mesh, extend: Extension, eigenvalues: Floats, points: Floats, config: SignatureConfig) -> Samples:
+def _interior(
+    mesh: Mesh, extend: Extension, eigenvalues: Floats, points: Floats, config: SignatureConfig
+) -> Samples:
     """Return the samples at interior points (P, 3), by the extension of the eigenfunctions over √λ."""
     values = extend(points)
     values *= np.sqrt(eigenvalues)
-    order = np.argsort(ordering_keys(values, eigenvalues, mesh.area, nearest_spacing(points)), kind="stable")
+    order = np.argsort(
+        ordering_keys(values, eigenvalues, mesh.area, nearest_spacing(points)), kind="stable"
+    )
     points, values = points[order], values[order]
-    return Samples(points, np.asarray(values, dtype=np.float32), interior_attributes(mesh, points, config.attributes))
+    return Samples(
+        points,
+        np.asarray(values, dtype=np.float32),
+        interior_attributes(mesh, points, config.attributes),
+    )
 
 
-def _surface(mesh: Mesh, functions: Floats, eigenvalues: Floats, config: SignatureConfig) -> Samples:
+def _surface(
+    mesh: Mesh, functions: Floats, eigenvalues: Floats, config: SignatureConfig
+) -> Samples:
     tie_breakers = vertex_area_shares(mesh.faces, face_areas(mesh.vertices, mesh.faces))
     keys = ordering_keys(functions, eigenvalues, mesh.area, tie_breakers)
     points = surface_points(mesh, config.n_surface_samples, config.seed, keys)
     values = points.interpolate(functions).astype(np.float32)
-    return Samples(points.positions, values, surface_attributes(mesh, points.face, config.attributes))
+    return Samples(
+        points.positions, values, surface_attributes(mesh, points.face, config.attributes)
+    )

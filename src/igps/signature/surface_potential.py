@@ -22,10 +22,14 @@ from igps.signature.ordering import spatial_order
 
 _BLOCK_SIZE = 32  # points for which the same patches are far
 _BRANCHING = 8  # patches that are merged into one of the next level
-_MIN_HEIGHT = 1e-14  # of a face, relative to its longest side: flatter faces have no numerical normal
+_MIN_HEIGHT = (
+    1e-14  # of a face, relative to its longest side: flatter faces have no numerical normal
+)
 
 
-def surface_potential(vertices: Floats, faces: Integers, points: Floats, accuracy: float = 1e-3) -> Floats:
+def surface_potential(
+    vertices: Floats, faces: Integers, points: Floats, accuracy: float = 1e-3
+) -> Floats:
     """Return ∫ dS/|x − s| (P,), length, over a triangle mesh, at points x (P, 3) inside, outside or on the surface.
 
     The accuracy is a proved bound on the relative error of every value. The largest error seen at 10⁻³ was 4·10⁻⁶, on
@@ -35,7 +39,9 @@ def surface_potential(vertices: Floats, faces: Integers, points: Floats, accurac
     centre, scale = corners.mean(axis=(0, 1)), longest_side(vertices)
     corners = (corners - centre) / scale
     sides = np.roll(corners, -1, axis=1) - corners
-    heights = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / np.square(sides).sum(axis=2).max(axis=1)
+    heights = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / np.square(sides).sum(
+        axis=2
+    ).max(axis=1)
     corners = corners[heights > _MIN_HEIGHT]
     x = (np.asarray(points, np.float64) - centre) / scale
     out = np.zeros(len(x))
@@ -47,16 +53,26 @@ def surface_potential(vertices: Floats, faces: Integers, points: Floats, accurac
         levels.append(levels[-1].merged(_BRANCHING))
     whole_faces = levels[0]
     # Quarters have their centroids at the centroid of the face and half-way to its corners.
-    quarters = _Patches(whole_faces.areas / 4, whole_faces.centres, whole_faces.covariances / 4, whole_faces.radii / 2)
+    quarters = _Patches(
+        whole_faces.areas / 4,
+        whole_faces.centres,
+        whole_faces.covariances / 4,
+        whole_faces.radii / 2,
+    )
     squared_limits = np.square(quarters.min_distances(accuracy) + whole_faces.radii / 2)
     order = spatial_order(x, _BLOCK_SIZE)
     potentials = np.empty(len(x))
     fill_potentials(
-        x[order], _BLOCK_SIZE, np.concatenate([level.table for level in levels]),
+        x[order],
+        _BLOCK_SIZE,
+        np.concatenate([level.table for level in levels]),
         np.concatenate([level.min_distances(accuracy) for level in levels]),
-        np.cumsum([0, *(len(level.areas) for level in levels)]), _BRANCHING, squared_limits, _face_table(corners),
+        np.cumsum([0, *(len(level.areas) for level in levels)]),
+        _BRANCHING,
+        squared_limits,
+        _face_table(corners),
         potentials,
-    )  # fmt: skip
+    )
     out[order] = potentials * scale
     return out
 
@@ -75,8 +91,15 @@ class _Patches:
         """Make a patch of each triangle (n, 3, 3)."""
         centres = corners.mean(axis=1)
         arms = corners - centres[:, None]
-        areas = np.linalg.norm(np.cross(arms[:, 0] - arms[:, 1], arms[:, 0] - arms[:, 2]), axis=1) / 2
-        return _Patches(areas, centres, arms.transpose(0, 2, 1) @ arms / 12, np.linalg.norm(arms, axis=2).max(axis=1))
+        areas = (
+            np.linalg.norm(np.cross(arms[:, 0] - arms[:, 1], arms[:, 0] - arms[:, 2]), axis=1) / 2
+        )
+        return _Patches(
+            areas,
+            centres,
+            arms.transpose(0, 2, 1) @ arms / 12,
+            np.linalg.norm(arms, axis=2).max(axis=1),
+        )
 
     def merged(self, size: int) -> _Patches:
         """Merge each `size` consecutive patches into one."""
@@ -87,7 +110,9 @@ class _Patches:
         arms = self.centres - centres[group]
         moments = self.areas[:, None, None] * (self.covariances + arms[:, :, None] * arms[:, None])
         radii = np.maximum.reduceat(np.linalg.norm(arms, axis=1) + self.radii, starts)
-        return _Patches(areas, centres, np.add.reduceat(moments, starts) / areas[:, None, None], radii)
+        return _Patches(
+            areas, centres, np.add.reduceat(moments, starts) / areas[:, None, None], radii
+        )
 
     def min_distances(self, accuracy: float) -> Floats:
         """Return the distances (n,) from the centroids beyond which the series has this relative accuracy."""
@@ -100,7 +125,9 @@ class _Patches:
     def table(self) -> Floats:
         """Columns (n, 10): centroid, area, and the quadratic form A·(3/2 C − ½ tr C·1) as xx, yy, zz, 2xy, 2xz, 2yz."""
         trace = np.trace(self.covariances, axis1=1, axis2=2)
-        form = self.areas[:, None, None] * (1.5 * self.covariances - 0.5 * trace[:, None, None] * np.eye(3))
+        form = self.areas[:, None, None] * (
+            1.5 * self.covariances - 0.5 * trace[:, None, None] * np.eye(3)
+        )
         entries = form[:, (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)] * [1, 1, 1, 2, 2, 2]
         return np.concatenate([self.centres, self.areas[:, None], entries], axis=1)
 
@@ -113,4 +140,6 @@ def _face_table(corners: Floats) -> Floats:
     normals = normals / double_areas
     lengths = np.linalg.norm(sides, axis=2)
     outward = np.cross(sides / lengths[..., None], normals[:, None])
-    return np.concatenate([corners.reshape(-1, 9), normals, outward.reshape(-1, 9), lengths, double_areas], axis=1)
+    return np.concatenate(
+        [corners.reshape(-1, 9), normals, outward.reshape(-1, 9), lengths, double_areas], axis=1
+    )

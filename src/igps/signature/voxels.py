@@ -46,7 +46,11 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
             cells = np.nonzero(inside)
             return np.stack([axis[i] for axis, i in zip(axes, cells, strict=True)], axis=1)
         if min_samples == 0 or resolution >= max_resolution:
-            remedy = "lower min_samples" if min_samples else "raise the resolution, or set min_samples to refine it"
+            remedy = (
+                "lower min_samples"
+                if min_samples
+                else "raise the resolution, or set min_samples to refine it"
+            )
             raise MeshError(
                 f"{mesh.name}: expected at least {max(min_samples, 1)} cells inside, got {count} in a grid of "
                 f"{resolution} along the longest side. The body is too thin for this grid: {remedy}."
@@ -71,7 +75,10 @@ def grid_axes(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Floats]:
     cell = (high - low).max() / resolution
     # A small tolerance keeps a side of exactly n cells at n cells in spite of rounding.
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1).astype(int)
-    x, y, z = ((low[i] + high[i]) / 2 + (np.arange(counts[i]) - (counts[i] - 1) / 2) * cell for i in range(3))
+    x, y, z = (
+        (low[i] + high[i]) / 2 + (np.arange(counts[i]) - (counts[i] - 1) / 2) * cell
+        for i in range(3)
+    )
     return x, y, z
 
 
@@ -128,8 +135,13 @@ def _scan(
     row = row[up]
 
     # Columns: the points of each such segment on the lines y = const, half-open in y.
-    column_down, column_up = np.searchsorted(y_axis, y[down], "left"), np.searchsorted(y_axis, y[up], "left")
-    segment, column = _ranges(np.minimum(column_down, column_up), np.maximum(column_down, column_up))
+    column_down, column_up = (
+        np.searchsorted(y_axis, y[down], "left"),
+        np.searchsorted(y_axis, y[up], "left"),
+    )
+    segment, column = _ranges(
+        np.minimum(column_down, column_up), np.maximum(column_down, column_up)
+    )
     # +1 where the outward normal points towards +x: seen from there, the upward edge has the larger y.
     sign = np.where(column_up > column_down, 1, -1)[segment].astype(np.int32)
     y0, y1, x0, x1 = (values[segment] for values in (y[down], y[up], x[down], x[up]))
@@ -139,14 +151,18 @@ def _scan(
     position = np.searchsorted(x_axis, crossing, "left")
     size = (len(x_axis) + 1, len(y_axis), len(z_axis))
     flat = np.ravel_multi_index((position, column, row[segment]), size)
-    crossings = np.bincount(flat, weights=sign, minlength=int(np.prod(size))).reshape(size).astype(np.int32)
+    crossings = (
+        np.bincount(flat, weights=sign, minlength=int(np.prod(size))).reshape(size).astype(np.int32)
+    )
     # The points with smaller x than a crossing have indices below its position.
     after = np.cumsum(crossings[::-1], axis=0)[::-1][1:]
     before = -np.cumsum(crossings, axis=0)[:-1]
 
     share_density = np.zeros(size, dtype=bool)
     # Use the first axis with several points: an axis across a flat body may have only one.
-    cell = next((float(axis[1] - axis[0]) for axis in axes if len(axis) > 1), longest_side(vertices))
+    cell = next(
+        (float(axis[1] - axis[0]) for axis in axes if len(axis) > 1), longest_side(vertices)
+    )
     for neighbour in (position - 1, position):
         clipped = np.clip(neighbour, 0, len(x_axis) - 1)
         is_close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell

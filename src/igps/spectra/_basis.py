@@ -48,12 +48,16 @@ class Basis:
         if self.overwrites_basis:
             self._basis, self._single = torch.from_numpy(self._memory), None
         elif n_rows * n_columns <= MAX_HUGE_PAGE_ENTRIES:
-            self._basis, self._single = (torch.from_numpy(np.empty(shape, dtype)) for dtype in (np.float64, np.float32))
+            self._basis, self._single = (
+                torch.from_numpy(np.empty(shape, dtype)) for dtype in (np.float64, np.float32)
+            )
         else:
             self._basis = torch.empty(shape, dtype=torch.float64, device="cpu")
             self._single = torch.empty(shape, dtype=torch.float32, device="cpu")
 
-    def _sum_pieces(self, function: Callable[[slice], tuple[torch.Tensor, ...]]) -> tuple[torch.Tensor, ...]:
+    def _sum_pieces(
+        self, function: Callable[[slice], tuple[torch.Tensor, ...]]
+    ) -> tuple[torch.Tensor, ...]:
         """Call a function for each piece of the columns, and add its results in the order of the pieces."""
         totals, *others = self._team.each(function, self._pieces)
         for parts in others:

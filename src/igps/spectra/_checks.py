@@ -19,11 +19,15 @@ def canonical(matrix: sparse.csr_array) -> sparse.csr_array:
     return matrix
 
 
-def checked_entries(matrix: sparse.csr_array, indptr: np.ndarray, indices: np.ndarray) -> sparse.csr_array:
+def checked_entries(
+    matrix: sparse.csr_array, indptr: np.ndarray, indices: np.ndarray
+) -> sparse.csr_array:
     """Return the canonical matrix, and check that it stores the same entries as a known structure."""
     matrix = canonical(matrix)
     if not (np.array_equal(matrix.indptr, indptr) and np.array_equal(matrix.indices, indices)):
-        raise ValueError("matrix: expected the stored entries of the analysed matrix, got others. Analyse it anew.")
+        raise ValueError(
+            "matrix: expected the stored entries of the analysed matrix, got others. Analyse it anew."
+        )
     return matrix
 
 
@@ -45,10 +49,14 @@ def checked_stiffness(
 ) -> sparse.csr_array:
     """Check all arguments; return the stiffness as an exactly symmetric csr array, which may be the argument."""
     if not sparse.issparse(stiffness):
-        raise ValueError(f"stiffness: expected a scipy sparse matrix, got {type(stiffness).__name__}.")
+        raise ValueError(
+            f"stiffness: expected a scipy sparse matrix, got {type(stiffness).__name__}."
+        )
     n_vertices = len(mass)
     if mass.ndim != 1 or stiffness.shape != (n_vertices, n_vertices):
-        raise ValueError(f"stiffness and mass: expected (V, V) and (V,), got {stiffness.shape} and {mass.shape}.")
+        raise ValueError(
+            f"stiffness and mass: expected (V, V) and (V,), got {stiffness.shape} and {mass.shape}."
+        )
     check_at_least(1, n_eigenpairs=n_eigenpairs)
     if n_eigenpairs + 1 >= n_vertices:
         raise ValueError(
@@ -57,9 +65,13 @@ def checked_stiffness(
         )
     stiffness = canonical(sparse.csr_array(stiffness, dtype=np.float64))
     if not np.isfinite(stiffness.data).all():
-        raise ValueError("stiffness: expected finite entries, got NaN or infinity. Repair degenerate triangles.")
+        raise ValueError(
+            "stiffness: expected finite entries, got NaN or infinity. Repair degenerate triangles."
+        )
     if not np.isfinite(mass).all() or mass.min() <= 0:
-        raise ValueError("mass: expected finite entries > 0, got others. Remove unused vertices and empty triangles.")
+        raise ValueError(
+            "mass: expected finite entries > 0, got others. Remove unused vertices and empty triangles."
+        )
     if stiffness.trace() < 0:
         raise ValueError(
             "stiffness: expected a positive semi-definite matrix, got a negative trace. Pass -stiffness if your "
@@ -71,7 +83,9 @@ def checked_stiffness(
     is_symmetric = all(map(np.array_equal, *arrays))
     magnitude = abs(stiffness)
     if not is_symmetric and abs(stiffness - transpose).max() > TOLERANCE * magnitude.max():
-        raise ValueError("stiffness: expected a symmetric matrix, got one that differs from its transpose.")
+        raise ValueError(
+            "stiffness: expected a symmetric matrix, got one that differs from its transpose."
+        )
     # Relative to each row, so that the zero mode is recognised at any scale and in spite of slivers.
     if (np.abs(stiffness.sum(axis=1)) > TOLERANCE * magnitude.sum(axis=1)).any():
         raise ValueError(
@@ -79,7 +93,9 @@ def checked_stiffness(
             "other sums."
         )
     symmetric = stiffness if is_symmetric else sparse.csr_array((stiffness + transpose) / 2)
-    n_components = connected_components(_significant(symmetric), directed=False, return_labels=False)
+    n_components = connected_components(
+        _significant(symmetric), directed=False, return_labels=False
+    )
     if n_components > 1:
         raise ValueError(
             f"stiffness: expected 1 connected component, got {n_components}, each with a zero eigenvalue. Join the "
@@ -91,7 +107,11 @@ def checked_stiffness(
 def _significant(stiffness: sparse.csr_array) -> sparse.csr_array:
     """Return the matrix without entries that are rounding errors of zero, which would connect components."""
     entries, diagonal = stiffness.tocoo(), stiffness.diagonal()
-    large = np.abs(entries.data) > ROUNDING * np.minimum(diagonal[entries.row], diagonal[entries.col])
+    large = np.abs(entries.data) > ROUNDING * np.minimum(
+        diagonal[entries.row], diagonal[entries.col]
+    )
     if large.all():
         return stiffness
-    return sparse.csr_array((entries.data[large], (entries.row[large], entries.col[large])), shape=stiffness.shape)
+    return sparse.csr_array(
+        (entries.data[large], (entries.row[large], entries.col[large])), shape=stiffness.shape
+    )

@@ -12,7 +12,9 @@ from igps.spectra._tree import Nodes, Structure
 
 
 @compiled(inline="always")
-def assemble(node: int, tree: Structure, values: Floats, shift: float, updates: Floats, scratch: Scratch) -> None:
+def assemble(
+    node: int, tree: Structure, values: Floats, shift: float, updates: Floats, scratch: Scratch
+) -> None:
     """Write the upper triangle of a node's front (S + B, S + B), including the Schur complements of its children."""
     own_start, boundary_start = tree.own_start, tree.boundary_start
     boundary_row, front = scratch.boundary_row, scratch.front
@@ -44,19 +46,33 @@ def assemble(node: int, tree: Structure, values: Floats, shift: float, updates: 
 
 @compiled()
 def eliminate(
-    nodes: Nodes, max_own: int, tree: Structure, values: Floats, shift: float, updates: Floats, blocks: Floats,
+    nodes: Nodes,
+    max_own: int,
+    tree: Structure,
+    values: Floats,
+    shift: float,
+    updates: Floats,
+    blocks: Floats,
     scratch: Scratch,
-) -> tuple[int, int]:  # fmt: skip
+) -> tuple[int, int]:
     """Eliminate a range of nodes; return the number of negative pivots, and the node where the elimination stopped.
 
     It stops before the end of the range at a node with more than ``max_own`` own unknowns, or whose pivots must be
     taken in another order. The front of that node is assembled.
     """
     n_negative = 0
-    own_start, boundary_start, front, inverse = tree.own_start, tree.boundary_start, scratch.front, scratch.inverse
+    own_start, boundary_start, front, inverse = (
+        tree.own_start,
+        tree.boundary_start,
+        scratch.front,
+        scratch.inverse,
+    )
     for node in range(nodes[0], nodes[1]):
         assemble(node, tree, values, shift, updates, scratch)
-        n_own, n_boundary = own_start[node + 1] - own_start[node], boundary_start[node + 1] - boundary_start[node]
+        n_own, n_boundary = (
+            own_start[node + 1] - own_start[node],
+            boundary_start[node + 1] - boundary_start[node],
+        )
         width = n_own + n_boundary
         if n_own > max_own:
             return n_negative, node
@@ -73,15 +89,21 @@ def eliminate(
             continue
         coupling, elimination = (front, n_own, width), (blocks, begin + n_own, width)
         shape = (n_own, n_boundary, n_own)
-        product(shape, -1.0, (inverse, ZERO, ONE, padded), coupling, False, elimination, elimination)
+        product(
+            shape, -1.0, (inverse, ZERO, ONE, padded), coupling, False, elimination, elimination
+        )
         # Compute the upper triangle of the Schur complement, a few rows at a time.
         for i in range(0, n_boundary, ROWS):
             n_rows, skipped = min(ROWS, n_boundary - i), max(0, min(i, n_boundary - COLUMNS))
             product(
-                (n_rows, n_boundary - skipped, n_own), 1.0, (front, n_own + i, width, ONE),
-                (blocks, begin + n_own + skipped, width), True, (front, (n_own + i) * width + n_own + skipped, width),
+                (n_rows, n_boundary - skipped, n_own),
+                1.0,
+                (front, n_own + i, width, ONE),
+                (blocks, begin + n_own + skipped, width),
+                True,
+                (front, (n_own + i) * width + n_own + skipped, width),
                 (updates, update_begin + i * n_boundary + skipped, n_boundary),
-            )  # fmt: skip
+            )
     return n_negative, nodes[1]
 
 
@@ -96,7 +118,13 @@ def add_row(target: Floats, target_row: int, source: Floats, source_row: Any, b:
 
 @compiled()
 def forward(
-    nodes: Nodes, right: Floats, tree: Structure, blocks: Floats, x: Floats, carried: Floats, max_rows: int
+    nodes: Nodes,
+    right: Floats,
+    tree: Structure,
+    blocks: Floats,
+    x: Floats,
+    carried: Floats,
+    max_rows: int,
 ) -> None:
     """Pass upwards through a range of nodes: x, (V, b) flat, becomes D x, and Eᵀ x is carried to the boundary's owners.
 
@@ -107,7 +135,10 @@ def forward(
     children, parent_row, carried_start = tree.children, tree.parent_row, tree.carried_start
     rows = np.empty(max_rows * b)
     for node in range(nodes[0], nodes[1]):
-        n_own, n_boundary = own_start[node + 1] - own_start[node], boundary_start[node + 1] - boundary_start[node]
+        n_own, n_boundary = (
+            own_start[node + 1] - own_start[node],
+            boundary_start[node + 1] - boundary_start[node],
+        )
         width, own_x = n_own + n_boundary, x[own_start[node] * b :]
         for i in range(n_own):
             vertex = np.uint64(order[own_start[node] + i])
@@ -118,13 +149,23 @@ def forward(
             child = children[node, side]
             if child >= 0:
                 source, base = carried[carried_start[child] * b :], boundary_start[child]
-                k = np.int64(0)  # a plain 0 has another type, for which Numba would compile `add_row` again
+                k = np.int64(
+                    0
+                )  # a plain 0 has another type, for which Numba would compile `add_row` again
                 while k < boundary_start[child + 1] - base and parent_row[base + k] < n_own:
                     add_row(own_x, parent_row[base + k], source, k, b)
                     k += 1
         # D is symmetric: one product with the transposed block gives both D x and Eᵀ x.
         block, product_rows = (blocks, tree.block_start[node], width, ONE), (rows, ZERO, b)
-        product((width, b, n_own), 1.0, block, (x, own_start[node] * b, b), False, product_rows, product_rows)
+        product(
+            (width, b, n_own),
+            1.0,
+            block,
+            (x, own_start[node] * b, b),
+            False,
+            product_rows,
+            product_rows,
+        )
         for i in range(n_own * b):
             own_x[i] = rows[i]
         for side in range(2):
@@ -141,21 +182,42 @@ def forward(
 
 
 @compiled()
-def backward(nodes: Nodes, tree: Structure, blocks: Floats, x: Floats, max_rows: int, solution: Floats) -> None:
+def backward(
+    nodes: Nodes, tree: Structure, blocks: Floats, x: Floats, max_rows: int, solution: Floats
+) -> None:
     """Pass downwards through a range of nodes: x, (V, b) flat, becomes D x + E x_boundary, the solution (b, V)."""
     b = len(solution)
-    order, own_start, boundary_start, boundary = tree.order, tree.own_start, tree.boundary_start, tree.boundary
+    order, own_start, boundary_start, boundary = (
+        tree.order,
+        tree.own_start,
+        tree.boundary_start,
+        tree.boundary,
+    )
     boundary_x, rows = np.empty(max_rows * b), np.empty(max_rows * b)
     for node in range(nodes[1] - 1, nodes[0] - 1, -1):
-        n_own, n_boundary = own_start[node + 1] - own_start[node], boundary_start[node + 1] - boundary_start[node]
+        n_own, n_boundary = (
+            own_start[node + 1] - own_start[node],
+            boundary_start[node + 1] - boundary_start[node],
+        )
         own_x, width = x[own_start[node] * b :], n_own + n_boundary
         for k in range(n_boundary):
-            row, source = np.uint64(k * b), np.uint64(boundary[boundary_start[node] + k]) * np.uint64(b)
+            row, source = (
+                np.uint64(k * b),
+                np.uint64(boundary[boundary_start[node] + k]) * np.uint64(b),
+            )
             for c in range(np.uint64(b)):
                 boundary_x[row + c] = x[source + c]
         elimination = (blocks, tree.block_start[node] + n_own, ONE, width)
         shape, product_rows = (n_own, b, n_boundary), (rows, ZERO, b)
-        product(shape, 1.0, elimination, (boundary_x, ZERO, b), True, (x, own_start[node] * b, b), product_rows)
+        product(
+            shape,
+            1.0,
+            elimination,
+            (boundary_x, ZERO, b),
+            True,
+            (x, own_start[node] * b, b),
+            product_rows,
+        )
         for i in range(n_own * b):
             own_x[i] = rows[i]
         for i in range(n_own):

@@ -35,8 +35,12 @@ class RitzPairs:
     """Eigenpairs of the projected problem, ordered by eigenvalue."""
 
     eigenvalues: torch.Tensor  # (m,) of A
-    residuals: torch.Tensor  # (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator
-    coefficients: torch.Tensor  # (m + b, m) of these vectors, not normalised, in the basis including its next block
+    residuals: (
+        torch.Tensor
+    )  # (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator
+    coefficients: (
+        torch.Tensor
+    )  # (m + b, m) of these vectors, not normalised, in the basis including its next block
     below_shift: torch.Tensor  # (m,) whether θ < 0
 
     def leading(self, n_below: int, tolerance: float) -> torch.Tensor:
@@ -58,9 +62,14 @@ class Krylov(Basis):
     """
 
     def __init__(
-        self, factors: Factors, zero_mode: np.ndarray, block_size: int, capacity: int, generator: np.random.Generator,
+        self,
+        factors: Factors,
+        zero_mode: np.ndarray,
+        block_size: int,
+        capacity: int,
+        generator: np.random.Generator,
         team: Team = SERIAL,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(zero_mode, capacity, team)
         self._factors, self._generator, self._block_size = factors, generator, block_size
         # Rows _previous:_current and _current:_stop of the basis are the last two blocks; the last awaits `expand`.
@@ -68,7 +77,9 @@ class Krylov(Basis):
         self._interval = INTERVAL
         self._coupling = torch.empty(0, 0, dtype=torch.float64, device="cpu")
         # Random vectors consist mostly of high frequencies, which one application of the operator removes.
-        self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], is_orthogonal=True)
+        self._append(
+            self._orthonormal(self._apply(self._random(block_size)), near=1)[0], is_orthogonal=True
+        )
 
     @property
     def size(self) -> int:
@@ -101,7 +112,10 @@ class Krylov(Basis):
         self._projected[new, last] = coupling
         self._projected[last, new] = coupling.T
         self._coupling = coupling
-        if self._stop - self._n_orthogonal >= self._interval * len(block) and self._reorthogonalise() > MAX_LOSS:
+        if (
+            self._stop - self._n_orthogonal >= self._interval * len(block)
+            and self._reorthogonalise() > MAX_LOSS
+        ):
             self._interval = 1
 
     def widen(self) -> None:
@@ -109,7 +123,9 @@ class Krylov(Basis):
         self._reorthogonalise()
         block, _ = self._orthonormal(self._random(self._block_size), near=self._previous)
         self._append(block, is_orthogonal=True)
-        self._coupling = torch.cat([self._coupling, self._coupling.new_zeros(len(block), self._coupling.shape[1])])
+        self._coupling = torch.cat(
+            [self._coupling, self._coupling.new_zeros(len(block), self._coupling.shape[1])]
+        )
 
     def ritz_pairs(self, shift: float) -> RitzPairs:
         self._reorthogonalise()
@@ -133,14 +149,18 @@ class Krylov(Basis):
         The steps may run in any order. Entry i of a vector becomes row ``order[i]``.
         """
         coefficients = _coefficients(ritz, index).numpy()
-        vectors = torch.empty(self._basis.shape[1], len(index), dtype=torch.float64, device="cpu").numpy()
+        vectors = torch.empty(
+            self._basis.shape[1], len(index), dtype=torch.float64, device="cpu"
+        ).numpy()
 
         def combine(piece: slice) -> None:
             vectors[order[piece]] = self._basis[1 : self._stop, piece].numpy().T @ coefficients
 
         return vectors, [partial(combine, piece) for piece in self._small_pieces()]
 
-    def eigenvectors_in_place(self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray) -> np.ndarray:
+    def eigenvectors_in_place(
+        self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray
+    ) -> np.ndarray:
         """Return the same eigenvectors (V, K), written over the basis, which is lost; see `overwrites_basis`."""
         coefficients = _coefficients(ritz, index)
         n_vertices, n_vectors = self._basis.shape[1], coefficients.shape[1]
@@ -219,7 +239,9 @@ class Krylov(Basis):
         r[is_lost] = 0
         rows = torch.from_numpy(np.ascontiguousarray(q.T))
         if is_lost.any():
-            rows[torch.from_numpy(is_lost)] = self._random(int(is_lost.sum())) / math.sqrt(block.shape[1])
+            rows[torch.from_numpy(is_lost)] = self._random(int(is_lost.sum())) / math.sqrt(
+                block.shape[1]
+            )
         return rows, torch.from_numpy(r[:, np.argsort(order)])
 
     def _factor_quickly(
@@ -251,4 +273,6 @@ def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
     """Return the inverse of a lower triangular matrix."""
-    return torch.linalg.solve_triangular(factor, torch.eye(len(factor), dtype=factor.dtype, device="cpu"), upper=False)
+    return torch.linalg.solve_triangular(
+        factor, torch.eye(len(factor), dtype=factor.dtype, device="cpu"), upper=False
+    )

@@ -46,9 +46,14 @@ class ConvergenceError(RuntimeError):
 
 
 def lanczos(
-    matrix: sparse.csr_array, zero_mode: np.ndarray, n_eigenpairs: int, positions: np.ndarray | None, tolerance: float,
-    seed: int, inside: bool,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    matrix: sparse.csr_array,
+    zero_mode: np.ndarray,
+    n_eigenpairs: int,
+    positions: np.ndarray | None,
+    tolerance: float,
+    seed: int,
+    inside: bool,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix with one zero mode (V,), of length 1.
 
     A shift inside the spectrum is fast. With a shift below it, A − σI is definite, and its factors are accurate.
@@ -56,7 +61,10 @@ def lanczos(
     # Solves are faster if vectors are stored in elimination order.
     tree, matrix, order = analyse(matrix, positions).arranged(matrix)
     zero_mode = zero_mode[order]
-    is_small = n_eigenpairs <= MAX_SMALL_BLOCK_PAIRS or n_eigenpairs * len(zero_mode) > MAX_LARGE_BLOCK_RESULT
+    is_small = (
+        n_eigenpairs <= MAX_SMALL_BLOCK_PAIRS
+        or n_eigenpairs * len(zero_mode) > MAX_LARGE_BLOCK_RESULT
+    )
     block_size = SMALL_BLOCK if is_small else LARGE_BLOCK
     per_eigenpair = BASIS_PER_EIGENPAIR if inside else BASIS_PER_EIGENPAIR_BELOW
     digits = -math.log10(max(tolerance, ROUNDING)) - 7
@@ -68,11 +76,15 @@ def lanczos(
     generator = np.random.default_rng(seed)
     with Team(None if n_eigenpairs * len(zero_mode) >= MIN_TEAM_RESULT else 1) as team:
         if inside:
-            shift, factors = _factorize_inside(tree, matrix, zero_mode, n_eigenpairs, tolerance, team)
+            shift, factors = _factorize_inside(
+                tree, matrix, zero_mode, n_eigenpairs, tolerance, team
+            )
         else:
             shift, factors = SHIFT_BELOW, tree.factorize(matrix, SHIFT_BELOW, team)
         n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
-        krylov = Krylov(factors, zero_mode, block_size, first_size + 3 * block_size, generator, team)
+        krylov = Krylov(
+            factors, zero_mode, block_size, first_size + 3 * block_size, generator, team
+        )
         while krylov.size < first_size:
             krylov.expand()
         while True:
@@ -83,7 +95,9 @@ def lanczos(
                 n_found, bound = gap
                 wanted = converged[:n_eigenpairs]
                 count = partial(tree.inertia, matrix, bound, team)
-                if krylov.overwrites_basis:  # count first: if some are missing, the basis is still needed
+                if (
+                    krylov.overwrites_basis
+                ):  # count first: if some are missing, the basis is still needed
                     vectors, n_negative = None, count()
                 else:  # count and compute the vectors in parallel
                     vectors, fill_steps = krylov.eigenvectors(ritz, wanted, order)
@@ -100,15 +114,24 @@ def lanczos(
                     )
                 logger.debug("found %d of %d eigenvalues below %g", n_found, n_present, bound)
             if krylov.size > max_size:
-                raise ConvergenceError(f"found {len(converged)} of {n_eigenpairs} pairs with a basis of {krylov.size}")
-            if gap is not None or krylov.size > max_size / 2:  # pairs are missing, or convergence is slow
+                raise ConvergenceError(
+                    f"found {len(converged)} of {n_eigenpairs} pairs with a basis of {krylov.size}"
+                )
+            if (
+                gap is not None or krylov.size > max_size / 2
+            ):  # pairs are missing, or convergence is slow
                 krylov.widen()
             for _ in range(2):
                 krylov.expand()
 
 
 def _factorize_inside(
-    tree: Tree, matrix: sparse.csr_array, zero_mode: np.ndarray, n_eigenpairs: int, tolerance: float, team: Team
+    tree: Tree,
+    matrix: sparse.csr_array,
+    zero_mode: np.ndarray,
+    n_eigenpairs: int,
+    tolerance: float,
+    team: Team,
 ) -> tuple[float, Factors]:
     """Return a shift with about SHIFT_RANK of the wanted eigenvalues below it, and an accurate factorization.
 

@@ -62,7 +62,9 @@ class Tree:
     subtrees: list[Nodes]  # can be eliminated and solved in parallel
     above: list[Nodes]  # the other nodes, each after its children
 
-    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = SERIAL) -> Factors:
+    def factorize(
+        self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = SERIAL
+    ) -> Factors:
         """Factorize ``matrix − shift · I``, of which both triangles are read; every team gives the same bits.
 
         A ValueError is raised if the matrix stores other entries than the analysed one, a SingularMatrixError if a
@@ -78,17 +80,27 @@ class Tree:
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
         """Return the tree and the matrix with unknowns in elimination order, and the former index (V,) of each."""
         order = self.structure.order
-        matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)[order][:, order]
+        matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)[order][
+            :, order
+        ]
         matrix.sort_indices()
-        indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
+        indptr, indices = (
+            array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices)
+        )
         identity = np.arange(len(order))
-        structure = self.structure._replace(indptr=indptr, indices=indices, order=identity, position=identity)
+        structure = self.structure._replace(
+            indptr=indptr, indices=indices, order=identity, position=identity
+        )
         return replace(self, structure=structure), matrix, order
 
-    def _eliminate(self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None) -> int:
+    def _eliminate(
+        self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None
+    ) -> int:
         """Eliminate all nodes, write to `blocks` if given, and return the number of negative eigenvalues."""
         matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)
-        n_updates = (self.structure.update_start + np.diff(self.structure.boundary_start) ** 2).max()
+        n_updates = (
+            self.structure.update_start + np.diff(self.structure.boundary_start) ** 2
+        ).max()
         values, updates = matrix.data.astype(np.float64, copy=False), np.empty(n_updates)
 
         def eliminate(nodes: Nodes) -> int:
@@ -97,7 +109,13 @@ class Tree:
         return sum(team.each(eliminate, self.subtrees)) + sum(map(eliminate, self.above))
 
     def _eliminate_range(
-        self, nodes: Nodes, values: Floats, shift: float, updates: Floats, blocks: Floats | None, team: Team
+        self,
+        nodes: Nodes,
+        values: Floats,
+        shift: float,
+        updates: Floats,
+        blocks: Floats | None,
+        team: Team,
     ) -> int:
         """Eliminate a range of nodes as `_eliminate`, and write the complements for later nodes to `updates`."""
         (begin, end), structure = nodes, self.structure
@@ -113,13 +131,18 @@ class Tree:
         scratch = Scratch(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
         n_negative, node = 0, begin
         while True:
-            n_new, node = loops.eliminate((node, end), MAX_COMPILED, structure, values, shift, updates, blocks, scratch)
+            n_new, node = loops.eliminate(
+                (node, end), MAX_COMPILED, structure, values, shift, updates, blocks, scratch
+            )
             n_negative += n_new
             if node == end:
                 return n_negative
             n_own, n_boundary = int(own_sizes[node - begin]), int(boundary_sizes[node - begin])
             width = n_own + n_boundary
-            block, update = blocks[structure.block_start[node] :], updates[structure.update_start[node] :]
+            block, update = (
+                blocks[structure.block_start[node] :],
+                updates[structure.update_start[node] :],
+            )
             n_negative += _eliminate_node(
                 torch.from_numpy(front[: width**2].reshape(width, width)),
                 torch.from_numpy(block[: n_own * width].reshape(n_own, width)),
@@ -144,7 +167,10 @@ class Factors:
         right = right_hand_sides.T.contiguous().numpy()
         solution = torch.empty(b, n_vertices, dtype=torch.float64, device="cpu")
         n_boundary = np.diff(structure.boundary_start)
-        x, carried = np.empty(n_vertices * b), np.empty((structure.carried_start + n_boundary).max() * b)
+        x, carried = (
+            np.empty(n_vertices * b),
+            np.empty((structure.carried_start + n_boundary).max() * b),
+        )
         max_rows = int((np.diff(structure.own_start) + n_boundary).max())
 
         def forward(nodes: Nodes) -> None:
@@ -162,7 +188,9 @@ class Factors:
         return solution.T
 
 
-def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = LEAF_SIZE) -> Tree:
+def analyse(
+    matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = LEAF_SIZE
+) -> Tree:
     """Compute elimination order and fronts for all matrices with one symmetric sparsity pattern.
 
     Args:
@@ -176,11 +204,15 @@ def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, 
     """
     matrix, coordinates = checked_graph(matrix, coordinates)
     node, n_levels = nested_dissection(matrix, coordinates, leaf_size)
-    indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
+    indptr, indices = (
+        array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices)
+    )
     return Tree(*tree_structure(node, n_levels, indptr, indices))
 
 
-def _eliminate_node(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:
+def _eliminate_node(
+    front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team
+) -> int:
     """Write D, E and the complement, from a front: both upper triangles. Return the number of negative pivots."""
     n_own, n_boundary = len(block), len(update)
     pivot, coupling = front[:n_own, :n_own].triu(), front[:n_own, n_own:]
@@ -194,7 +226,12 @@ def _eliminate_node(front: torch.Tensor, block: torch.Tensor, update: torch.Tens
 
     def complement(piece: slice) -> None:
         cols = slice(piece.start, None)
-        torch.addmm(trailing[piece, cols], coupling[:, piece].T, elimination[:, cols], out=update[piece, cols])
+        torch.addmm(
+            trailing[piece, cols],
+            coupling[:, piece].T,
+            elimination[:, cols],
+            out=update[piece, cols],
+        )
 
     team.each(eliminate, pieces)
     team.each(complement, pieces)
@@ -208,8 +245,12 @@ def _invert(pivot: torch.Tensor) -> tuple[torch.Tensor, int]:
         return torch.cholesky_inverse(factor), 0
     factor, order, failed = torch.linalg.ldl_factor_ex(pivot)
     if failed:
-        raise SingularMatrixError("shift: expected regular pivot blocks, got a singular one. Change it slightly.")
-    inverse = torch.linalg.ldl_solve(factor, order, torch.eye(len(pivot), dtype=pivot.dtype, device="cpu"))
+        raise SingularMatrixError(
+            "shift: expected regular pivot blocks, got a singular one. Change it slightly."
+        )
+    inverse = torch.linalg.ldl_solve(
+        factor, order, torch.eye(len(pivot), dtype=pivot.dtype, device="cpu")
+    )
     # Bunch–Kaufman: a 1×1 pivot counts by its sign; a 2×2 pivot, of negative indices, has an eigenvalue of each sign.
     n_negative = ((order > 0) & (factor.diagonal() < 0)).sum() + (order < 0).sum() // 2
     return (inverse + inverse.T) / 2, int(n_negative)

@@ -32,16 +32,25 @@ def hop_coordinates(graph: sparse.csr_array, n_landmarks: int = 3) -> np.ndarray
     return np.stack(columns, axis=1)
 
 
-def checked_graph(matrix: sparse.csr_array, coordinates: np.ndarray | None) -> tuple[sparse.csr_array, np.ndarray]:
+def checked_graph(
+    matrix: sparse.csr_array, coordinates: np.ndarray | None
+) -> tuple[sparse.csr_array, np.ndarray]:
     """Return the matrix with sorted entries, and coordinates of its vertices, with the errors of `analyse`."""
     matrix = canonical(matrix)
     n_vertices = matrix.shape[0]
     transpose = matrix.tocsc()
-    if not (np.array_equal(transpose.indptr, matrix.indptr) and np.array_equal(transpose.indices, matrix.indices)):
-        raise ValueError("matrix: expected entry (j, i) wherever (i, j) is stored, got an asymmetric pattern.")
+    if not (
+        np.array_equal(transpose.indptr, matrix.indptr)
+        and np.array_equal(transpose.indices, matrix.indices)
+    ):
+        raise ValueError(
+            "matrix: expected entry (j, i) wherever (i, j) is stored, got an asymmetric pattern."
+        )
     rows = np.repeat(np.arange(n_vertices), np.diff(matrix.indptr))
     if np.count_nonzero(rows == matrix.indices) != n_vertices:
-        raise ValueError("matrix: expected all diagonal entries to be stored, got fewer. Store zeros explicitly.")
+        raise ValueError(
+            "matrix: expected all diagonal entries to be stored, got fewer. Store zeros explicitly."
+        )
     if coordinates is None:
         coordinates = hop_coordinates(matrix)
     if coordinates.ndim != 2 or len(coordinates) != n_vertices:
@@ -49,7 +58,9 @@ def checked_graph(matrix: sparse.csr_array, coordinates: np.ndarray | None) -> t
     return matrix, coordinates
 
 
-def nested_dissection(graph: sparse.csr_array, coordinates: np.ndarray, leaf_size: int) -> tuple[np.ndarray, int]:
+def nested_dissection(
+    graph: sparse.csr_array, coordinates: np.ndarray, leaf_size: int
+) -> tuple[np.ndarray, int]:
     """Return the tree node of each vertex, numbered as in a heap (children 2i+1 and 2i+2), and the number of levels.
 
     Each part is cut across one coordinate, at a position in a window around the median. Coordinate and position are
@@ -60,12 +71,16 @@ def nested_dissection(graph: sparse.csr_array, coordinates: np.ndarray, leaf_siz
     n_vertices = graph.shape[0]
     depth = max(0, int(np.ceil(np.log2(n_vertices / leaf_size))))
     orders = [np.argsort(column, kind="stable") for column in coordinates.T]
-    indptr, indices = (array.astype(np.int32, copy=False) for array in (graph.indptr, graph.indices))
+    indptr, indices = (
+        array.astype(np.int32, copy=False) for array in (graph.indptr, graph.indices)
+    )
     return _dissect(np.stack(orders), indptr, indices, depth, CUT_WINDOW), depth + 1
 
 
 @compiled()
-def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth: int, window: float) -> np.ndarray:
+def _dissect(
+    orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth: int, window: float
+) -> np.ndarray:
     """Return the node of each vertex. The orders (d, V), vertices sorted by each coordinate, are overwritten.
 
     Vertices outside the current part have rank −1, which is the largest unsigned number. The highest (signed) and the
@@ -80,7 +95,10 @@ def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth:
     right = np.empty(n_vertices, orders.dtype)
     begin, end = np.zeros(1, np.int64), np.full(1, n_vertices, np.int64)
     for level in range(depth):
-        next_begin, next_end = np.zeros(2 ** (level + 1), np.int64), np.zeros(2 ** (level + 1), np.int64)
+        next_begin, next_end = (
+            np.zeros(2 ** (level + 1), np.int64),
+            np.zeros(2 ** (level + 1), np.int64),
+        )
         for part in range(2**level):
             first, size = begin[part], end[part] - begin[part]
             if size == 0:
@@ -97,7 +115,10 @@ def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth:
                     lowest, highest = np.uint32(i), np.int32(i)
                     for k in range(np.uint64(indptr[order[i]]), np.uint64(indptr[order[i] + 1])):
                         neighbour_rank = rank[np.uint32(indices[k])]
-                        lowest, highest = min(lowest, np.uint32(neighbour_rank)), max(highest, neighbour_rank)
+                        lowest, highest = (
+                            min(lowest, np.uint32(neighbour_rank)),
+                            max(highest, neighbour_rank),
+                        )
                     low[i], high[i] = lowest, highest
                     n_highest[highest + 1] += 1
                     n_lowest[lowest + 1] += 1
@@ -110,7 +131,11 @@ def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth:
                     if i > 0 and abs(i - size / 2) <= max(window * size, 1.0):
                         left_size, right_size = i - n_closed, n_opened - i
                         if min(left_size, right_size) < cut_size:
-                            cut, cut_size, is_left = i, min(left_size, right_size), left_size <= right_size
+                            cut, cut_size, is_left = (
+                                i,
+                                min(left_size, right_size),
+                                left_size <= right_size,
+                            )
                 if cut_size >= min_size:
                     continue
                 min_size = cut_size
@@ -138,7 +163,10 @@ def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth:
                     order[n_left + i] = right[i]
                 if c == 0:
                     next_begin[2 * part], next_end[2 * part] = first, first + n_left
-                    next_begin[2 * part + 1], next_end[2 * part + 1] = first + n_left, first + n_left + n_right
+                    next_begin[2 * part + 1], next_end[2 * part + 1] = (
+                        first + n_left,
+                        first + n_left + n_right,
+                    )
         begin, end = next_begin, next_end
     for part in range(2**depth):
         for i in range(begin[part], end[part]):

@@ -73,7 +73,9 @@ def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np
         n_negative += negative
         # Multiply the eliminated rows by the inverse of their pivot block.
         eliminated, scaled = (matrix, k * width, width), (rows, ZERO, width)
-        product((size, width, size), 1.0, (pivot, ZERO, STEP, ONE), eliminated, False, scaled, scaled)
+        product(
+            (size, width, size), 1.0, (pivot, ZERO, STEP, ONE), eliminated, False, scaled, scaled
+        )
         for i in range(size):
             for j in range(size):
                 rows[i * width + k + j] = pivot[i * STEP + j]
@@ -90,7 +92,9 @@ def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np
 
 
 @compiled()
-def load(matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width: int, is_reversed: bool) -> None:
+def load(
+    matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width: int, is_reversed: bool
+) -> None:
     """Copy a symmetric matrix (n, width) from the upper triangle of a front, and pad its rows with zeros."""
     for i in range(n):
         for j in range(i, n):
@@ -102,14 +106,24 @@ def load(matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width:
 
 
 @compiled(inline="always")
-def residual_norm(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, scratch: np.ndarray) -> float:
+def residual_norm(
+    matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, scratch: np.ndarray
+) -> float:
     """Return the Frobenius norm of I − A X for a matrix A and its computed inverse X."""
     residual = (scratch, ZERO, width)
     for i in range(n * width):
         scratch[i] = 0.0
     for i in range(n):
         scratch[i * width + i] = 1.0
-    product((n, width, n), -1.0, (matrix, ZERO, width, ONE), (inverse, ZERO, width), True, residual, residual)
+    product(
+        (n, width, n),
+        -1.0,
+        (matrix, ZERO, width, ONE),
+        (inverse, ZERO, width),
+        True,
+        residual,
+        residual,
+    )
     squares = 0.0
     for i in range(n * width):
         squares += scratch[i] ** 2
@@ -130,7 +144,10 @@ def invert_front(scratch: Scratch, n: int, front_width: int, width: int) -> int:
         n_negative = invert(inverse, n, width, scratch.rows, scratch.columns)
         if n_negative > 0:
             load(scratch.pivot_copy, scratch.front, n, front_width, width, is_reversed)
-            if not residual_norm(scratch.pivot_copy, inverse, n, width, scratch.residual) <= MAX_RESIDUAL:
+            if (
+                not residual_norm(scratch.pivot_copy, inverse, n, width, scratch.residual)
+                <= MAX_RESIDUAL
+            ):
                 continue
         if n_negative >= 0:
             if is_reversed:

@@ -42,14 +42,18 @@ def loops_beat_blas() -> bool:
     """Return whether compiled loops are faster than PyTorch's BLAS for products of a few long rows with many."""
     from llvmlite import binding
 
-    has_mkl_avx512 = torch.backends.mkl.is_available() and binding.get_host_cpu_features().get("avx512f", False)
+    has_mkl_avx512 = torch.backends.mkl.is_available() and binding.get_host_cpu_features().get(
+        "avx512f", False
+    )
     return not has_mkl_avx512 or binding.get_host_cpu_name().startswith("znver")
 
 
 def overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Tensor:
     """Return the products (n, m) of rows (n, V) with other rows (m, V), over a piece of the columns."""
     if loops_beat_blas():
-        return torch.from_numpy(overlaps_by_loops(rows.numpy(), others.numpy(), piece.start, piece.stop))
+        return torch.from_numpy(
+            overlaps_by_loops(rows.numpy(), others.numpy(), piece.start, piece.stop)
+        )
     return (others[:, piece] @ rows[:, piece].T).T  # MKL is faster with the longer operand first
 
 
@@ -77,19 +81,50 @@ def _tile(n_columns: int) -> Any:
 
     def tile(
         context: Any,
-        a: Any, a_at: Any, a_step: Any, a_stride: Any,
-        x: Any, x_at: Any, x_step: Any,
-        add: Any, source: Any, source_at: Any, source_step: Any,
-        out: Any, out_at: Any, out_step: Any,
-        n_rows: Any, n_terms: Any, scale: Any,
-    ) -> Any:  # fmt: skip
+        a: Any,
+        a_at: Any,
+        a_step: Any,
+        a_stride: Any,
+        x: Any,
+        x_at: Any,
+        x_step: Any,
+        add: Any,
+        source: Any,
+        source_at: Any,
+        source_step: Any,
+        out: Any,
+        out_at: Any,
+        out_step: Any,
+        n_rows: Any,
+        n_terms: Any,
+        scale: Any,
+    ) -> Any:
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            names = ("a", "a_at", "a_step", "a_stride", "x", "x_at", "x_step", "add", "source", "source_at",
-                     "source_step", "out", "out_at", "out_step", "n_rows", "n_terms", "scale")  # fmt: skip
+            names = (
+                "a",
+                "a_at",
+                "a_step",
+                "a_stride",
+                "x",
+                "x_at",
+                "x_step",
+                "add",
+                "source",
+                "source_at",
+                "source_step",
+                "out",
+                "out_at",
+                "out_step",
+                "n_rows",
+                "n_terms",
+                "scale",
+            )
             arguments = dict(zip(names, values, strict=True))
             for numba_type, name in zip(signature.args, names, strict=True):
                 if isinstance(numba_type, types.Array):
-                    arguments[name] = context.make_array(numba_type)(context, builder, arguments[name]).data
+                    arguments[name] = context.make_array(numba_type)(
+                        context, builder, arguments[name]
+                    ).data
 
             def pointer(name: str, offset: Any) -> Any:
                 return builder.gep(arguments[name], [builder.add(arguments[name + "_at"], offset)])
@@ -98,22 +133,31 @@ def _tile(n_columns: int) -> Any:
                 """Fill a vector with a number."""
                 if n_columns == 1:
                     return value
-                first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.IntType(32)(0))
-                return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), n_columns), None))
+                first = builder.insert_element(
+                    ir.Constant(vector, ir.Undefined), value, ir.IntType(32)(0)
+                )
+                return builder.shuffle_vector(
+                    first, first, ir.Constant(ir.VectorType(ir.IntType(32), n_columns), None)
+                )
 
             def row(name: str, index: Any) -> Any:
                 start = pointer(name, builder.mul(index, arguments[name + "_step"]))
                 return builder.bitcast(start, vector.as_pointer())
 
             last = builder.sub(arguments["n_rows"], integer(1))
-            rows = [builder.select(builder.icmp_signed("<", integer(i), last), integer(i), last) for i in range(ROWS)]
+            rows = [
+                builder.select(builder.icmp_signed("<", integer(i), last), integer(i), last)
+                for i in range(ROWS)
+            ]
             columns_of_a = [pointer("a", builder.mul(i, arguments["a_stride"])) for i in rows]
             sums = [cgutils.alloca_once_value(builder, ir.Constant(vector, None)) for _ in rows]
             with cgutils.for_range(builder, arguments["n_terms"]) as loop:
                 x_row = builder.load(row("x", loop.index), align=8)
                 offset = builder.mul(loop.index, arguments["a_step"])
                 for column, total in zip(columns_of_a, sums, strict=True):
-                    term = builder.fmul(broadcast(builder.load(builder.gep(column, [offset]))), x_row, flags=fused)
+                    term = builder.fmul(
+                        broadcast(builder.load(builder.gep(column, [offset]))), x_row, flags=fused
+                    )
                     builder.store(builder.fadd(builder.load(total), term, flags=fused), total)
             scale = broadcast(arguments["scale"])
             products = [builder.fmul(builder.load(total), scale, flags=fused) for total in sums]
@@ -121,7 +165,9 @@ def _tile(n_columns: int) -> Any:
                 with added:
                     source_rows = [builder.load(row("source", i), align=8) for i in rows]
                     for i, source_row, result in zip(rows, source_rows, products, strict=True):
-                        builder.store(builder.fadd(source_row, result, flags=fused), row("out", i), align=8)
+                        builder.store(
+                            builder.fadd(source_row, result, flags=fused), row("out", i), align=8
+                        )
                 with alone:
                     for i, result in zip(rows, products, strict=True):
                         builder.store(result, row("out", i), align=8)
@@ -129,8 +175,24 @@ def _tile(n_columns: int) -> Any:
 
         i64 = types.int64
         argument_types = (
-            a, i64, i64, i64, x, i64, i64, types.boolean, source, i64, i64, out, i64, i64, i64, i64, types.float64,
-        )  # fmt: skip
+            a,
+            i64,
+            i64,
+            i64,
+            x,
+            i64,
+            i64,
+            types.boolean,
+            source,
+            i64,
+            i64,
+            out,
+            i64,
+            i64,
+            i64,
+            i64,
+            types.float64,
+        )
         return types.void(*argument_types), generate
 
     return intrinsic(tile)
@@ -141,7 +203,15 @@ narrow_tile: Any = Lazy(partial(_tile, 1))
 
 
 @compiled()
-def product(shape: tuple[int, int, int], scale: float, a: Strided, x: Rows, add: bool, source: Rows, out: Rows) -> None:
+def product(
+    shape: tuple[int, int, int],
+    scale: float,
+    a: Strided,
+    x: Rows,
+    add: bool,
+    source: Rows,
+    out: Rows,
+) -> None:
     """Compute out ← scale · Aᵀ X, plus the source if `add`; shape is (m, n, k) for out (m, n), A (k, m) and X (k, n).
 
     Rows of n numbers are written once or twice: ``out`` may not be the source, unless n is a multiple of COLUMNS.
@@ -152,15 +222,45 @@ def product(shape: tuple[int, int, int], scale: float, a: Strided, x: Rows, add:
         if n < COLUMNS:
             for j in range(n):
                 narrow_tile(
-                    a[0], a[1] + i * a[3], a[2], a[3], x[0], x[1] + j, x[2], add, source[0],
-                    source[1] + i * source[2] + j, source[2], out[0], out[1] + i * out[2] + j, out[2], n_rows, k, scale,
-                )  # fmt: skip
+                    a[0],
+                    a[1] + i * a[3],
+                    a[2],
+                    a[3],
+                    x[0],
+                    x[1] + j,
+                    x[2],
+                    add,
+                    source[0],
+                    source[1] + i * source[2] + j,
+                    source[2],
+                    out[0],
+                    out[1] + i * out[2] + j,
+                    out[2],
+                    n_rows,
+                    k,
+                    scale,
+                )
         for begin in range(0, n if n >= COLUMNS else 0, COLUMNS):
             j = min(begin, n - COLUMNS)
             tile(
-                a[0], a[1] + i * a[3], a[2], a[3], x[0], x[1] + j, x[2], add, source[0],
-                source[1] + i * source[2] + j, source[2], out[0], out[1] + i * out[2] + j, out[2], n_rows, k, scale,
-            )  # fmt: skip
+                a[0],
+                a[1] + i * a[3],
+                a[2],
+                a[3],
+                x[0],
+                x[1] + j,
+                x[2],
+                add,
+                source[0],
+                source[1] + i * source[2] + j,
+                source[2],
+                out[0],
+                out[1] + i * out[2] + j,
+                out[2],
+                n_rows,
+                k,
+                scale,
+            )
 
 
 @compiled()

@@ -30,7 +30,9 @@ class Structure(NamedTuple):
     parent_row: np.ndarray  # row of each boundary entry in the front of the node's parent
     block_start: np.ndarray  # (N + 1,) start of each node's block [D E] in the array of blocks
     update_start: np.ndarray  # (N,) start of its Schur complement on the stack of complements
-    carried_start: np.ndarray  # (N,) start of its contribution to the right-hand sides on their stack
+    carried_start: (
+        np.ndarray
+    )  # (N,) start of its contribution to the right-hand sides on their stack
 
 
 def tree_structure(
@@ -57,21 +59,41 @@ def tree_structure(
     own_start = np.append(0, np.cumsum(np.bincount(node_of, minlength=n_nodes)))
     depth = np.empty(n_nodes, np.int64)
     depth[node_at] = np.log2(np.arange(1, n_nodes + 1))
-    boundary_start, boundary, rows = _boundaries(own_start, parent, depth, position, indptr, indices)
+    boundary_start, boundary, rows = _boundaries(
+        own_start, parent, depth, position, indptr, indices
+    )
     n_own, n_boundary = np.diff(own_start), np.diff(boundary_start)
     subtrees = parallel_subtrees(n_levels, len(node))
     in_subtrees = {n for begin, end in subtrees for n in range(begin, end)}
     above = [(n, n + 1) for n in range(n_nodes) if n not in in_subtrees]
     blocks = np.append(0, np.cumsum(n_own * (n_own + n_boundary)))
-    updates, carried = (stack_starts(children, sizes, [*subtrees, *above]) for sizes in (n_boundary**2, n_boundary))
+    updates, carried = (
+        stack_starts(children, sizes, [*subtrees, *above]) for sizes in (n_boundary**2, n_boundary)
+    )
     structure = Structure(
-        indptr, indices, order, position, own_start, children, boundary_start, boundary, rows, blocks, updates, carried
+        indptr,
+        indices,
+        order,
+        position,
+        own_start,
+        children,
+        boundary_start,
+        boundary,
+        rows,
+        blocks,
+        updates,
+        carried,
     )
     return structure, subtrees, above
 
 
 def _boundaries(
-    own_start: Integers, parent: Integers, depth: Integers, position: Integers, indptr: np.ndarray, indices: np.ndarray
+    own_start: Integers,
+    parent: Integers,
+    depth: Integers,
+    position: Integers,
+    indptr: np.ndarray,
+    indices: np.ndarray,
 ) -> tuple[Integers, Integers, Integers]:
     """Return the start of each node's boundary, the boundaries, and the row of each entry in the parent's front.
 
@@ -97,8 +119,16 @@ def _boundaries(
     node, boundary = np.divmod(pairs, n_vertices)
     start = np.append(0, np.cumsum(np.bincount(node, minlength=n_nodes)))
     parents = parent[node]
-    on_boundary = np.diff(own_start)[parents] + np.searchsorted(pairs, parents * n_vertices + boundary) - start[parents]
-    return start, boundary, np.where(boundary < own_start[parents + 1], boundary - own_start[parents], on_boundary)
+    on_boundary = (
+        np.diff(own_start)[parents]
+        + np.searchsorted(pairs, parents * n_vertices + boundary)
+        - start[parents]
+    )
+    return (
+        start,
+        boundary,
+        np.where(boundary < own_start[parents + 1], boundary - own_start[parents], on_boundary),
+    )
 
 
 def parallel_subtrees(n_levels: int, n_unknowns: int) -> list[Nodes]:
@@ -110,7 +140,9 @@ def parallel_subtrees(n_levels: int, n_unknowns: int) -> list[Nodes]:
     subtrees, begin = [], 0
     for number in range(1, 2**depth + 1):
         subtrees.append((begin, begin + 2 ** (n_levels - depth) - 1))
-        begin = subtrees[-1][1] + (number & -number).bit_length() - 1  # skips the parents that it completes
+        begin = (
+            subtrees[-1][1] + (number & -number).bit_length() - 1
+        )  # skips the parents that it completes
     return subtrees
 
 
@@ -120,7 +152,11 @@ def stack_starts(children: np.ndarray, sizes: np.ndarray, ranges: list[Nodes]) -
     Each range of nodes has its own stack. A result stays there until its parent is computed: the results of both
     children are then on top, and the parent's result replaces them.
     """
-    starts, lengths, left_child = np.zeros(len(sizes), dtype=np.int64), sizes.tolist(), children[:, 0].tolist()
+    starts, lengths, left_child = (
+        np.zeros(len(sizes), dtype=np.int64),
+        sizes.tolist(),
+        children[:, 0].tolist(),
+    )
     end = 0
     for first, last in ranges:
         top = end

@@ -112,8 +112,12 @@ def eigenpairs(
     """
     mass = checked_mass(mass)
     stiffness = checked_stiffness(stiffness, mass, n_eigenpairs)
-    if positions is not None and (positions.shape != (len(mass), 3) or not np.isfinite(positions).all()):
-        raise ValueError(f"positions: expected finite values of shape ({len(mass)}, 3), got {positions.shape}.")
+    if positions is not None and (
+        positions.shape != (len(mass), 3) or not np.isfinite(positions).all()
+    ):
+        raise ValueError(
+            f"positions: expected finite values of shape ({len(mass)}, 3), got {positions.shape}."
+        )
 
     area = mass.sum()
     scale = np.sqrt(area / mass)
@@ -124,7 +128,9 @@ def eigenpairs(
         return eigh(matrix.toarray(), subset_by_index=(1, n_eigenpairs), overwrite_a=True)
 
     def krylov(inside: bool) -> tuple[np.ndarray, np.ndarray]:
-        return lanczos(matrix, np.sqrt(mass / area), n_eigenpairs, positions, tolerance, seed, inside)
+        return lanczos(
+            matrix, np.sqrt(mass / area), n_eigenpairs, positions, tolerance, seed, inside
+        )
 
     def arpack() -> tuple[np.ndarray, np.ndarray]:
         n_computed = min(n_eigenpairs + N_GUARDS, len(mass) - 2)
@@ -134,7 +140,9 @@ def eigenpairs(
         return eigenvalues[:n_eigenpairs], eigenfunctions[:, :n_eigenpairs] * np.sqrt(mass)[:, None]
 
     is_small = len(mass) <= max(MAX_DENSE_VERTICES, MAX_DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs)
-    solvers: list[Solver] = [dense, arpack] if is_small else [partial(krylov, True), partial(krylov, False), arpack]
+    solvers: list[Solver] = (
+        [dense, arpack] if is_small else [partial(krylov, True), partial(krylov, False), arpack]
+    )
     eigenvalues, vectors, residual = _first_success(solvers, matrix, tolerance)
     vectors /= np.sqrt(mass)[:, None]
     return Spectrum(eigenvalues / area, vectors, mass, residual)
@@ -153,13 +161,22 @@ def _first_success(
             order = np.argsort(eigenvalues, kind="stable")
             if (order[1:] < order[:-1]).any():  # possible in a multiplet
                 eigenvalues = eigenvalues[order]
-                for start in range(0, len(vectors), REORDERED_ROWS):  # in parts: a full copy may take gigabytes
+                for start in range(
+                    0, len(vectors), REORDERED_ROWS
+                ):  # in parts: a full copy may take gigabytes
                     rows = vectors[start : start + REORDERED_ROWS]
                     rows[:] = rows[:, order]
             return eigenvalues, vectors, residual
-        except (ConvergenceError, SingularMatrixError, np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+        except (
+            ConvergenceError,
+            SingularMatrixError,
+            np.linalg.LinAlgError,
+            torch.linalg.LinAlgError,
+        ) as error:
             if solver is solvers[-1]:
-                raise ConvergenceError(f"no solver reached the tolerance; the last error: {error}") from error
+                raise ConvergenceError(
+                    f"no solver reached the tolerance; the last error: {error}"
+                ) from error
             if solver is solvers[-2]:
                 logger.warning("falling back to ARPACK: %s", error)
             else:
@@ -174,24 +191,37 @@ def _arpack(
     shift = -0.01 / mass.sum()
     try:
         eigenvalues, eigenfunctions = eigsh(
-            stiffness.tocsc(), n_eigenpairs + 1, sparse.diags_array(mass, format="csc"), sigma=shift, v0=start
+            stiffness.tocsc(),
+            n_eigenpairs + 1,
+            sparse.diags_array(mass, format="csc"),
+            sigma=shift,
+            v0=start,
         )
     except (ArpackError, RuntimeError) as error:
-        raise ConvergenceError(f"ARPACK failed to compute {n_eigenpairs} eigenpairs: {error}") from error
+        raise ConvergenceError(
+            f"ARPACK failed to compute {n_eigenpairs} eigenpairs: {error}"
+        ) from error
     order = np.argsort(eigenvalues)[1:]
     return eigenvalues[order], eigenfunctions[:, order]
 
 
 def _prove_complete(
-    matrix: sparse.csr_array, eigenvalues: np.ndarray, n_eigenpairs: int, positions: np.ndarray | None
+    matrix: sparse.csr_array,
+    eigenvalues: np.ndarray,
+    n_eigenpairs: int,
+    positions: np.ndarray | None,
 ) -> None:
     gap = gap_after(torch.from_numpy(eigenvalues), n_eigenpairs)
     if gap is None:
-        raise ConvergenceError(f"no gap after eigenvalue {n_eigenpairs} for the proof. Use more or fewer eigenpairs.")
+        raise ConvergenceError(
+            f"no gap after eigenvalue {n_eigenpairs} for the proof. Use more or fewer eigenpairs."
+        )
     n_found, bound = gap
     n_present = analyse(matrix, positions).inertia(matrix, bound) - 1
     if n_present != n_found:
-        raise ConvergenceError(f"found {n_found} of {n_present} eigenvalues below {bound:.6g} / area")
+        raise ConvergenceError(
+            f"found {n_found} of {n_present} eigenvalues below {bound:.6g} / area"
+        )
 
 
 def _residual(
@@ -210,7 +240,11 @@ def _residual(
         residuals = np.sqrt(squares[part]) / np.abs(values)
         largest = max(largest, float(residuals.max()))
         if not (residuals <= tolerance).all():
-            rounding = np.linalg.norm(abs(matrix) @ np.abs(vectors[:, part]), axis=0) * ROUNDING / np.abs(values)
+            rounding = (
+                np.linalg.norm(abs(matrix) @ np.abs(vectors[:, part]), axis=0)
+                * ROUNDING
+                / np.abs(values)
+            )
             allowed = np.maximum(tolerance, np.minimum(tolerance + rounding, RESIDUAL_LIMIT))
             failed = ~(residuals <= allowed)
             if failed.any():
@@ -224,7 +258,11 @@ def _residual(
 
 @compiled()
 def _defects(
-    values: np.ndarray, indptr: np.ndarray, indices: np.ndarray, eigenvalues: np.ndarray, vectors: np.ndarray
+    values: np.ndarray,
+    indptr: np.ndarray,
+    indices: np.ndarray,
+    eigenvalues: np.ndarray,
+    vectors: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return squared lengths (K,) of A y − λ y and its products (K,) with y, for a csr matrix A and vectors (V, K)."""
     n_vertices, n_vectors = vectors.shape

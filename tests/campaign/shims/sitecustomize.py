@@ -20,7 +20,9 @@ def _no_rename() -> None:
     def refusing(move):  # type: ignore[no-untyped-def]
         def moved(source, target, **options):  # type: ignore[no-untyped-def]
             if os.path.exists(target) and str(target).endswith(".safetensors"):
-                raise PermissionError(13, "The process cannot access the file because it is used by another", target)
+                raise PermissionError(
+                    13, "The process cannot access the file because it is used by another", target
+                )
             return move(source, target, **options)
 
         return moved
@@ -38,13 +40,19 @@ def _no_space(limit: int) -> None:
 
     def limited_open(file, mode="r", *arguments, **options):  # type: ignore[no-untyped-def]
         stream = builtin_open(file, mode, *arguments, **options)
-        if (".safetensors" not in str(file) and ".partial" not in str(file)) or not set(mode) & set("wax"):
+        if (".safetensors" not in str(file) and ".partial" not in str(file)) or not set(mode) & set(
+            "wax"
+        ):
             return stream
         root = os.path.dirname(os.path.dirname(os.path.abspath(file)))
 
         class Full(io.BufferedWriter):
             def write(self, data):  # type: ignore[no-untyped-def, override]
-                used = sum(os.path.getsize(os.path.join(at, name)) for at, _, names in os.walk(root) for name in names)
+                used = sum(
+                    os.path.getsize(os.path.join(at, name))
+                    for at, _, names in os.walk(root)
+                    for name in names
+                )
                 if used + len(data) > limit:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
                 return super().write(data)

@@ -25,7 +25,11 @@ def moved(batch: SignatureBatch, motion: Tensor, shift: Tensor) -> SignatureBatc
     directions = surface.attributes["surface_direction"] @ motion
     return replace(
         batch,
-        surface=replace(surface, points=surface.points @ motion + shift, attributes={"surface_direction": directions}),
+        surface=replace(
+            surface,
+            points=surface.points @ motion + shift,
+            attributes={"surface_direction": directions},
+        ),
     )
 
 
@@ -55,8 +59,12 @@ def test_it_is_the_share_of_samples_in_each_cell() -> None:
                 aside = place - height * axis
                 distance = np.linalg.norm(aside)
                 towards = direction @ axis * (1 if height >= 0 else -1)
-                cells = [hat(height, along), hat(distance, beside), hat(towards, cosine),
-                         hat(direction @ aside / distance, outward)]  # fmt: skip
+                cells = [
+                    hat(height, along),
+                    hat(distance, beside),
+                    hat(towards, cosine),
+                    hat(direction @ aside / distance, outward),
+                ]
                 expected[k] += np.einsum("a,b,c,d->abcd", *cells)
         np.testing.assert_allclose(found[i], expected / (3 * len(points)), atol=1e-6)
 
@@ -64,7 +72,9 @@ def test_it_is_the_share_of_samples_in_each_cell() -> None:
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored: bool) -> None:
     batch, histogram = two_bodies(), AxialHistogram(EMBEDDING)
-    motion = torch.from_numpy(Rotation.random(random_state=0).as_matrix()).float() * (-1 if mirrored else 1)
+    motion = torch.from_numpy(Rotation.random(random_state=0).as_matrix()).float() * (
+        -1 if mirrored else 1
+    )
     expected = histogram(batch)
     found = histogram(scaled(moved(batch, motion, torch.tensor([1.0, -2.0, 0.5])), 2.0))
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
@@ -80,7 +90,9 @@ def test_padding_changes_nothing() -> None:
 
 def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end() -> None:
     generator = torch.Generator().manual_seed(0)
-    brick = (torch.rand(20000, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor([1.0, 3.0, 2.0])
+    brick = (torch.rand(20000, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor(
+        [1.0, 3.0, 2.0]
+    )
     far = torch.tensor([[0.0, -4.0, 0.0]], dtype=torch.float64)
     turn = torch.from_numpy(Rotation.from_euler("xyz", (0.3, 0.5, -0.2)).as_matrix())
     points = torch.cat([brick, far.expand(50, 3)]) @ turn.T + 7
@@ -95,22 +107,30 @@ def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end(
 def test_a_limb_that_moves_hardly_turns_the_axes() -> None:
     """A trunk of low potential, and a heavy limb of high potential that sweeps a right angle."""
     generator = torch.Generator().manual_seed(1)
-    trunk = (torch.rand(600, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor([0.6, 2.0, 0.4])
+    trunk = (torch.rand(600, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor(
+        [0.6, 2.0, 0.4]
+    )
     limb = torch.rand(400, 1, generator=generator, dtype=torch.float64) * 2
     weights = torch.cat([torch.full((600,), 0.4), torch.full((400,), 1.0)]).double() ** -4
     axes, plain = [], []
     for direction in ([1.0, 1.0, 0.0], [1.0, -0.2, 0.0]):
         points = torch.cat([trunk, limb * torch.tensor(direction)])
         axes.append(principal_axes(points[None], weights[None])[1][0, :, 0])
-        plain.append(principal_axes(points[None], torch.ones(1, 1000, dtype=torch.float64))[1][0, :, 0])
-    turned = [float(torch.rad2deg(torch.arccos((one @ other).abs()))) for one, other in (axes, plain)]
+        plain.append(
+            principal_axes(points[None], torch.ones(1, 1000, dtype=torch.float64))[1][0, :, 0]
+        )
+    turned = [
+        float(torch.rad2deg(torch.arccos((one @ other).abs()))) for one, other in (axes, plain)
+    ]
     assert turned[0] < 10 < 30 < turned[1]
 
 
 def test_it_has_gradients_of_places_and_directions() -> None:
     batch = two_bodies()
     points = batch.surface.points.clone().requires_grad_()
-    histogram = AxialHistogram(EMBEDDING)(replace(batch, surface=replace(batch.surface, points=points)))
+    histogram = AxialHistogram(EMBEDDING)(
+        replace(batch, surface=replace(batch.surface, points=points))
+    )
     histogram.square().sum().backward()
     assert points.grad is not None
     assert torch.isfinite(points.grad).all()
@@ -118,7 +138,9 @@ def test_it_has_gradients_of_places_and_directions() -> None:
 
 
 def test_needs_and_errors() -> None:
-    assert AxialHistogram(EMBEDDING).requirements == Requirements(n_eigenpairs=6, attributes=("surface_direction",))
+    assert AxialHistogram(EMBEDDING).requirements == Requirements(
+        n_eigenpairs=6, attributes=("surface_direction",)
+    )
     with pytest.raises(ValueError, match="n_bins: expected four numbers, each at least 2"):
         AxialHistogram(EMBEDDING, n_bins=(8, 5, 4, 1))
     with pytest.raises(ValueError, match="n_samples: expected at least 2"):

@@ -63,8 +63,13 @@ def test_branches_are_as_long_as_pieces_stay_apart() -> None:
         lengths = []
         order = np.argsort(-heights).tolist()
         for n, point in enumerate(order):
-            peaks = {max(piece, key=lambda k: heights[k]) for piece in pieces_of(set(order[: n + 1]), graph)}
-            lengths += [height - heights[point] for peak, height in living.items() if peak not in peaks]
+            peaks = {
+                max(piece, key=lambda k: heights[k])
+                for piece in pieces_of(set(order[: n + 1]), graph)
+            }
+            lengths += [
+                height - heights[point] for peak, height in living.items() if peak not in peaks
+            ]
             living = {peak: heights[peak] for peak in peaks}
         lengths += [height - heights.min() for height in living.values()]
         expected = np.sort(lengths)[::-1][:4]
@@ -79,17 +84,26 @@ def test_pieces_count_by_their_sizes_and_lengths() -> None:
     assert found.shape == (2, 3, 4, 3)
     sizes, lengths = np.linspace(-6, -0.5, 4).tolist(), np.linspace(-1, 2.5, 3).tolist()
     for i in range(2):
-        points = batch.surface.points[i, batch.surface.mask[i]].numpy() / np.sqrt(float(batch.area[i]))
+        points = batch.surface.points[i, batch.surface.mask[i]].numpy() / np.sqrt(
+            float(batch.area[i])
+        )
         coordinates = embedded(batch, i, "surface", 5).numpy()
-        graph, order = joined(coordinates), np.argsort(-np.linalg.norm(coordinates, axis=1)).tolist()
+        graph, order = (
+            joined(coordinates),
+            np.argsort(-np.linalg.norm(coordinates, axis=1)).tolist(),
+        )
         expected = np.zeros((3, 4, 3))
         for level, share in enumerate(LEVELS):
             for piece in pieces_of(set(order[: round(share * len(order))]), graph):
                 size, places = len(piece) / len(order), points[sorted(piece)]
                 length = 2.0**-9
                 if len(piece) >= 4:
-                    length = float(np.sqrt(12 * np.linalg.eigvalsh(np.cov(places.T, ddof=0))[-1] / size))
-                cell = np.outer(hat(float(np.log2(size)), sizes), hat(float(np.log2(length)), lengths))
+                    length = float(
+                        np.sqrt(12 * np.linalg.eigvalsh(np.cov(places.T, ddof=0))[-1] / size)
+                    )
+                cell = np.outer(
+                    hat(float(np.log2(size)), sizes), hat(float(np.log2(length)), lengths)
+                )
                 expected[level] += len(piece) * cell
         np.testing.assert_allclose(found[i], expected / expected.sum(), atol=1e-5)
 
@@ -98,8 +112,13 @@ def star(n_arms: int, length: float, seed: int) -> SignatureBatch:
     """Arms that start at 1 from the origin and reach to exp(length), in an embedding of as many dimensions."""
     generator = torch.Generator().manual_seed(seed)
     along = torch.linspace(0, length, 60).exp()
-    arms = [torch.zeros(60, n_arms).index_fill(1, torch.tensor([k]), 1.0) * along[:, None] for k in range(n_arms)]
-    middle = torch.nn.functional.normalize(torch.rand(200, n_arms, generator=generator), dim=1) * 0.999
+    arms = [
+        torch.zeros(60, n_arms).index_fill(1, torch.tensor([k]), 1.0) * along[:, None]
+        for k in range(n_arms)
+    ]
+    middle = (
+        torch.nn.functional.normalize(torch.rand(200, n_arms, generator=generator), dim=1) * 0.999
+    )
     points = torch.cat([*arms, middle])
     noise = 1e-4 * torch.rand(points.shape, generator=generator)
     return batch_of((points + noise)[None], points=points[None, :, :3].contiguous())
@@ -114,7 +133,9 @@ def test_as_many_shares_are_large_as_there_are_arms(n_arms: int) -> None:
 
 def test_pieces_of_a_star_are_its_arms() -> None:
     """Each of three arms has 60 of 380 points: the binary log is −2.66, between the last two centres."""
-    found = PieceHistogram((180 / 380,), SpectralEmbedding(), n_bins=(6, 5))(star(3, 1.0, seed=3))[0, 0]
+    found = PieceHistogram((180 / 380,), SpectralEmbedding(), n_bins=(6, 5))(star(3, 1.0, seed=3))[
+        0, 0
+    ]
     of_sizes = np.array(hat(float(np.log2(60 / 380)), np.linspace(-6, -0.5, 6).tolist()))
     np.testing.assert_allclose(found.sum(dim=1), of_sizes, atol=0.02)
     assert float(found[:, 3:].sum()) > 0.9  # rods
@@ -136,7 +157,9 @@ def test_the_order_of_samples_changes_nothing(make: Maker) -> None:
     batch, histogram = alone(two_bodies(), 0), make(embedding=EMBEDDING)
     order = torch.randperm(40, generator=torch.Generator().manual_seed(5))
     surface = batch.surface
-    other = replace(surface, points=surface.points[:, order], eigenfunctions=surface.eigenfunctions[:, order])
+    other = replace(
+        surface, points=surface.points[:, order], eigenfunctions=surface.eigenfunctions[:, order]
+    )
     torch.testing.assert_close(histogram(replace(batch, surface=other)), histogram(batch))
 
 
@@ -146,7 +169,9 @@ def test_a_subset_of_the_samples_is_told(make: Maker) -> None:
     expected = make(embedding=EMBEDDING)(replace(batch, surface=batch.surface.subset(20, seed=0)))
     torch.testing.assert_close(make(embedding=EMBEDDING, n_samples=20)(batch), expected)
     interior = make(embedding=EMBEDDING, samples="interior")(batch)
-    torch.testing.assert_close(interior, make(embedding=EMBEDDING)(replace(batch, surface=batch.interior)))
+    torch.testing.assert_close(
+        interior, make(embedding=EMBEDDING)(replace(batch, surface=batch.interior))
+    )
 
 
 @BOTH
@@ -168,7 +193,9 @@ def test_needs_and_what_is_refused(make: Maker) -> None:
     none = replace(batch.surface, mask=torch.zeros_like(batch.surface.mask))
     with pytest.raises(ValueError, match="samples: expected at least one of each body, got none"):
         make(embedding=EMBEDDING)(replace(batch, surface=none))
-    broken = replace(batch.surface, eigenfunctions=torch.full_like(batch.surface.eigenfunctions, torch.nan))
+    broken = replace(
+        batch.surface, eigenfunctions=torch.full_like(batch.surface.eigenfunctions, torch.nan)
+    )
     with pytest.raises(ValueError, match="expected finite numbers, got NaN or infinity"):
         make(embedding=EMBEDDING)(replace(batch, surface=broken))
 
@@ -177,7 +204,9 @@ def test_layouts_that_are_none_are_named() -> None:
     with pytest.raises(ValueError, match="n_branches: expected at least 2, got 1"):
         BranchHistogram(n_branches=1)
     for levels in ((), (0.5, 0.2), (0.0, 0.5), (0.5, 1.5)):
-        with pytest.raises(ValueError, match="levels: expected shares above 0 and up to 1, ascending"):
+        with pytest.raises(
+            ValueError, match="levels: expected shares above 0 and up to 1, ascending"
+        ):
             PieceHistogram(levels)
     with pytest.raises(ValueError, match="n_bins: expected two numbers, each at least 2"):
         PieceHistogram(n_bins=(1, 5))
@@ -196,7 +225,9 @@ def test_gradients_are_those_of_differences() -> None:
         return BranchHistogram(SpectralEmbedding(), n_branches=3).double()(batch_of(values))
 
     def pieces(values: Tensor) -> Tensor:
-        return PieceHistogram((0.5, 0.9), SpectralEmbedding()).double()(batch_of(embedding, points=values))
+        return PieceHistogram((0.5, 0.9), SpectralEmbedding()).double()(
+            batch_of(embedding, points=values)
+        )
 
     assert torch.autograd.gradcheck(branches, embedding.requires_grad_())
     embedding.requires_grad_(False)
@@ -207,7 +238,9 @@ def test_gradients_are_those_of_differences() -> None:
 def test_a_program_is_compiled_around_them(make: Maker) -> None:
     batch, module = two_bodies(), make(embedding=EMBEDDING)
     torch.compiler.reset()
-    torch.testing.assert_close(torch.compile(module, backend="aot_eager")(batch), module(batch), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        torch.compile(module, backend="aot_eager")(batch), module(batch), rtol=0, atol=1e-6
+    )
 
 
 @BOTH

@@ -61,7 +61,9 @@ def test_pieces_are_components_named_by_their_peaks(seed: int) -> None:
 
 def on_a_path(values: Sequence[float]) -> tuple[Tensor, Tensor]:
     last = len(values) - 1
-    return torch.tensor(values), torch.tensor([[max(k - 1, 0), min(k + 1, last)] for k in range(last + 1)])
+    return torch.tensor(values), torch.tensor(
+        [[max(k - 1, 0), min(k + 1, last)] for k in range(last + 1)]
+    )
 
 
 def test_the_lower_of_two_peaks_ends_where_they_meet() -> None:
@@ -92,7 +94,9 @@ def test_points_outside_the_mask_are_not_there() -> None:
     numbers = mask.nonzero()[:, 0]
     place = torch.full((80,), -1)
     place[numbers] = torch.arange(len(numbers))
-    own = torch.where(mask[neighbours], neighbours, torch.arange(80)[:, None])  # without those that are not there
+    own = torch.where(
+        mask[neighbours], neighbours, torch.arange(80)[:, None]
+    )  # without those that are not there
     expected = merge_tree(values[mask], place[own[mask]], [5, 20])
     tree = merge_tree(values.masked_fill(~mask, torch.nan), neighbours, [5, 20], mask)
     assert torch.equal(tree.peaks, numbers[expected.peaks])

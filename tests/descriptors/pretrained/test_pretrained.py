@@ -68,7 +68,9 @@ def test_rich_is_its_histograms_side_by_side_with_equal_shares(
             expected += [histogram(batch).flatten(1) / (3 * len(part)) for histogram in part]
     torch.testing.assert_close(histograms[[0, 7]], torch.cat(expected, dim=1), rtol=1e-4, atol=1e-7)
     for part in histograms.split(CELLS, dim=1):
-        torch.testing.assert_close(part.sum(dim=1), torch.full((len(part),), 1 / 3), rtol=1e-4, atol=0)
+        torch.testing.assert_close(
+            part.sum(dim=1), torch.full((len(part),), 1 / 3), rtol=1e-4, atol=0
+        )
     # The distance of the whole is then the mean of those of the parts, each a histogram of sum 1.
     of_parts = [chi_square(3 * part, 3 * part) for part in histograms.split(CELLS, dim=1)]
     whole = found.distances(histograms, histograms)
@@ -77,8 +79,12 @@ def test_rich_is_its_histograms_side_by_side_with_equal_shares(
 
 def test_a_class_is_closer_to_itself(dataset: SignatureDataset, histograms: torch.Tensor) -> None:
     """NN and FT of `rich`; as a control, FT of shuffled labels, where 2 of 35 other shapes (6 %) match."""
-    scores = retrieval_scores(igps.descriptor("rich").distances(histograms, histograms), dataset.labels).mean()
-    shuffled = dataset.labels[torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))]
+    scores = retrieval_scores(
+        igps.descriptor("rich").distances(histograms, histograms), dataset.labels
+    ).mean()
+    shuffled = dataset.labels[
+        torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))
+    ]
     by_chance = retrieval_scores(chi_square(histograms, histograms), shuffled).mean()
     assert scores["nn"] > 0.9
     assert scores["ft"] > 0.7
@@ -93,37 +99,52 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
     stored = {name: tensor.double() for name, tensor in load_file(PRETRAINED).items()}
 
     def level(name: str, parts: tuple[int, ...]) -> Tensor:
-        of_level = {key.rsplit(".", 1)[1]: tensor for key, tensor in stored.items() if f".{name}." in key}
+        of_level = {
+            key.rsplit(".", 1)[1]: tensor for key, tensor in stored.items() if f".{name}." in key
+        }
         assert of_level["part_cells"].long().tolist() == list(PART_CELLS)
         sizes = [PART_CELLS[i] for i in parts]
         seen = torch.cat([roots.split(PART_CELLS, dim=1)[i] for i in parts], dim=1)
         projected = [
             part @ directions[: part.shape[1]].T
             for part, directions in zip(
-                (seen - of_level["mean"]).split(sizes, dim=1), of_level["directions"].split(sizes, dim=1), strict=True
+                (seen - of_level["mean"]).split(sizes, dim=1),
+                of_level["directions"].split(sizes, dim=1),
+                strict=True,
             )
         ]
         if of_level["lengths"]:
             vectors = torch.cat(projected, dim=1)
-            return torch.cat([vectors, (1 - vectors.square().sum(dim=1, keepdim=True)).sqrt()], dim=1)
+            return torch.cat(
+                [vectors, (1 - vectors.square().sum(dim=1, keepdim=True)).sqrt()], dim=1
+            )
         return normalize(torch.cat([normalize(one) for one in projected], dim=1))
 
     classes = level("class_head", CLASS_PARTS)
     bodies = [level(f"body_heads.{k}", (part,)) for k, part in enumerate(BODY_PARTS)]
     share, scales, exponents = (stored[f"head.{name}"] for name in ("share", "scales", "exponents"))
     found = describe(part, module)
-    expected = torch.cat([(1 - share).sqrt() * classes, *((share / 2).sqrt() * one for one in bodies)], dim=1)
+    expected = torch.cat(
+        [(1 - share).sqrt() * classes, *((share / 2).sqrt() * one for one in bodies)], dim=1
+    )
     torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
     from_mean = torch.stack([one[:, :-1].square().sum(dim=1) for one in bodies]).mean(dim=0).sqrt()
     shorter = (torch.outer(from_mean, from_mean).sqrt() / (0.5 / 2**0.5)).sqrt()
-    exponent, between = torch.zeros(4, 4, dtype=torch.float64), torch.ones(4, 4, dtype=torch.float64)
+    exponent, between = (
+        torch.zeros(4, 4, dtype=torch.float64),
+        torch.ones(4, 4, dtype=torch.float64),
+    )
     for one, scale, power in zip(bodies, scales, exponents, strict=True):
         apart = torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist")
         exponent += (apart * shorter / scale) ** 20
         between *= apart**power
     differ = (1 - torch.exp(-exponent)) * (1 - torch.exp(-((between / 0.1) ** 20)))
-    distances = 0.95 * (1 - classes @ classes.T) * differ + 0.05 * (1 - torch.exp(-((between / 0.1) ** 2)))
-    torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
+    distances = 0.95 * (1 - classes @ classes.T) * differ + 0.05 * (
+        1 - torch.exp(-((between / 0.1) ** 2))
+    )
+    torch.testing.assert_close(
+        module.distances(found, found).double(), distances, atol=2e-3, rtol=0
+    )
 
 
 def test_pretrained_gives_unit_vectors_and_short_ones(dataset: SignatureDataset) -> None:
@@ -135,7 +156,9 @@ def test_pretrained_gives_unit_vectors_and_short_ones(dataset: SignatureDataset)
     assert short.shape == (len(dataset), 256)
     for vectors in (found, short):
         torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(dataset)), atol=1e-5, rtol=0)
-    whole, of_short = (retrieval_scores(cosine(one, one), dataset.labels).mean()["ft"] for one in (found, short))
+    whole, of_short = (
+        retrieval_scores(cosine(one, one), dataset.labels).mean()["ft"] for one in (found, short)
+    )
     assert of_short > whole - 0.02
 
 
@@ -170,7 +193,9 @@ def test_a_head_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_
     assert not loaded.training
     torch.testing.assert_close(describe(dataset, loaded), head(described), atol=5e-3, rtol=0)
     shipped = pretrained().head(described)
-    assert shipped.shape[1] != head(described).shape[1] or not torch.allclose(shipped, head(described), atol=0.1)
+    assert shipped.shape[1] != head(described).shape[1] or not torch.allclose(
+        shipped, head(described), atol=0.1
+    )
 
 
 def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_numbers(
@@ -178,17 +203,23 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_nu
 ) -> None:
     """By the places of samples; `torch.cdist` has none of them, and pieces of one sample have no spread."""
     batch, pretrained = dataset.batch([0]).to(torch.float64), igps.descriptor("pretrained").double()
-    batch = replace(batch, interior=batch.interior.subset(200, 0), surface=batch.surface.subset(200, 0))
+    batch = replace(
+        batch, interior=batch.interior.subset(200, 0), surface=batch.surface.subset(200, 0)
+    )
     generator = torch.Generator().manual_seed(2)
     places, along = batch.surface.points, torch.randn(1, 200, 3, generator=generator).double()
     upstream = torch.randn(pretrained.n_features, generator=generator).double()
 
     def loss(points: Tensor) -> Tensor:
-        return (pretrained(replace(batch, surface=replace(batch.surface, points=points))) * upstream).sum()
+        return (
+            pretrained(replace(batch, surface=replace(batch.surface, points=points))) * upstream
+        ).sum()
 
     leaf = places.clone().requires_grad_()
     expected = (torch.autograd.grad(loss(leaf), leaf)[0] * along).sum()
-    torch.testing.assert_close(torch.func.jvp(loss, (places,), (along,))[1], expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        torch.func.jvp(loss, (places,), (along,))[1], expected, rtol=1e-6, atol=0
+    )
     assert torch.isfinite(torch.func.jvp(torch.func.grad(loss), (places,), (along,))[1]).all()
 
 
@@ -199,7 +230,9 @@ def test_shipped_file_is_small() -> None:
 def test_a_file_of_another_head_is_named(tmp_path: Path) -> None:
     path = tmp_path / "other.safetensors"
     save_file({"head.mean": torch.zeros(3)}, path)
-    with pytest.raises(ValueError, match=r"other\.safetensors: expected the parameters of `pretrained`"):
+    with pytest.raises(
+        ValueError, match=r"other\.safetensors: expected the parameters of `pretrained`"
+    ):
         pretrained(path)
     with pytest.raises(FileNotFoundError):
         pretrained(tmp_path / "missing.safetensors")
@@ -212,13 +245,19 @@ def test_coordinates_within_a_class_separate_a_small_difference_from_sampling() 
     ball = trimesh.creation.icosphere(subdivisions=3)
 
     def described(width: float, seed: int) -> Tensor:
-        body = Mesh(ball.vertices * [0.8 * width, 0.6, 1.6] + [0.3, 0, 0] * ball.vertices[:, 2:] ** 2, ball.faces)
+        body = Mesh(
+            ball.vertices * [0.8 * width, 0.6, 1.6] + [0.3, 0, 0] * ball.vertices[:, 2:] ** 2,
+            ball.faces,
+        )
         return descriptor(collate([compute_signature(body, replace(config, seed=seed))]))
 
     descriptions = torch.cat([described(width, seed) for width in (1.0, 1.03) for seed in range(3)])
     apart = {
         name: torch.cdist(rows, rows)
-        for name, rows in (("whole", descriptions), ("within", descriptor.coordinates(descriptions, within_class=True)))
+        for name, rows in (
+            ("whole", descriptions),
+            ("within", descriptor.coordinates(descriptions, within_class=True)),
+        )
     }
     same = torch.block_diag(*2 * [torch.ones(3, 3)]).bool()
     assert apart["within"][same].max() < apart["within"][~same].min()

@@ -20,7 +20,9 @@ def test_shares_are_those_of_a_loop() -> None:
     assert found.shape == (2, 7)
     assert found.dtype == torch.float32
     for i in range(2):
-        radius = (3 * float(batch.volume[i]) / (4 * math.pi)) ** (1 / 3)  # of the ball of this volume
+        radius = (3 * float(batch.volume[i]) / (4 * math.pi)) ** (
+            1 / 3
+        )  # of the ball of this volume
         shares = [float(batch.eigenvalues[i, k - 1]) * radius**2 / (2 * k) / 6 for k in range(1, 7)]
         torch.testing.assert_close(found[i], torch.tensor([*shares, 1 - sum(shares)]))
 
@@ -31,7 +33,9 @@ def test_a_spectrum_that_follows_weyl_has_equal_shares() -> None:
     line = 4 * torch.pi * torch.arange(1, 13, dtype=torch.float64) / batch.area[:, None]
     found = SpectrumShares(12)(replace(batch, eigenvalues=line))
     own = 4 * torch.pi * (3 * batch.volume / (4 * torch.pi)) ** (2 / 3) / batch.area
-    torch.testing.assert_close(found[:, :12].double(), (own / 24)[:, None].expand(2, 12), atol=1e-7, rtol=0)
+    torch.testing.assert_close(
+        found[:, :12].double(), (own / 24)[:, None].expand(2, 12), atol=1e-7, rtol=0
+    )
 
 
 def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off() -> None:

@@ -38,7 +38,9 @@ def test_hats_are_the_linear_kernel() -> None:
     expected = [hat(float(value), centres) for value in values]
     result = soft_memberships(values, torch.tensor(centres, dtype=torch.float64))
     np.testing.assert_allclose(result, expected, atol=1e-14)
-    assert torch.equal(soft_memberships(values, torch.tensor([0.4])), torch.ones(8, 1, dtype=torch.float64))
+    assert torch.equal(
+        soft_memberships(values, torch.tensor([0.4])), torch.ones(8, 1, dtype=torch.float64)
+    )
     in_rows = soft_memberships(values.view(2, 4), torch.tensor(centres, dtype=torch.float64))
     np.testing.assert_allclose(in_rows.flatten(0, 1), expected, atol=1e-14)
 
@@ -49,7 +51,9 @@ def test_hats_are_differentiable_in_both_arguments() -> None:
     assert torch.autograd.gradcheck(soft_memberships, (values, centres))
 
 
-@pytest.mark.parametrize("axis", [Potential(4, 1.5), Attribute("depth", [0.1875, 0.5625, 0.9375, 1.3125])])
+@pytest.mark.parametrize(
+    "axis", [Potential(4, 1.5), Attribute("depth", [0.1875, 0.5625, 0.9375, 1.3125])]
+)
 def test_hard_classes_are_those_of_the_nearest_centre(axis: PointAxis) -> None:
     values = torch.tensor([0.0, 0.3749, 0.375, 0.7, 0.75, 1.125, 1.5, 9.0])
     expected = [0, 0, 1, 1, 2, 3, 3, 3]
@@ -59,7 +63,9 @@ def test_hard_classes_are_those_of_the_nearest_centre(axis: PointAxis) -> None:
 
 @pytest.mark.parametrize("options", [{}, {"soft": True}, {"learnable": True}])
 @pytest.mark.parametrize("depths", [[0.1, 0.35, 0.4, 0.95], [0.2, 0.3], [0.4]])
-def test_members_are_memberships_without_their_zeros(options: dict[str, bool], depths: list[float]) -> None:
+def test_members_are_memberships_without_their_zeros(
+    options: dict[str, bool], depths: list[float]
+) -> None:
     axis = Attribute("depth", depths, **options)  # type: ignore[arg-type]
     values = torch.tensor([[0.0, 0.1, 0.3, 0.35], [0.5, 0.9, 1.0, torch.nan]])
     mask = values.isfinite()
@@ -75,7 +81,9 @@ def test_soft_classes_are_hats(options: dict[str, bool]) -> None:
     axis = Potential(3, 0.9, **options)
     assert axis.soft
     values = torch.linspace(0, 1.2, 30)
-    np.testing.assert_allclose(axis.memberships(values).detach(), soft_classes(values, [0.15, 0.45, 0.75]), atol=1e-6)
+    np.testing.assert_allclose(
+        axis.memberships(values).detach(), soft_classes(values, [0.15, 0.45, 0.75]), atol=1e-6
+    )
     assert len(list(axis.parameters())) == ("learnable" in options)
 
 
@@ -83,13 +91,19 @@ def test_values_of_points() -> None:
     seen = view()
     potential = Potential().values(seen, SpectralEmbedding(n_eigenpairs=4))
     for i, n in enumerate((40, 25)):
-        np.testing.assert_allclose(potential[i, :n], embedded(two_bodies(), i, n_eigenpairs=4).norm(dim=1), rtol=1e-5)
-    assert torch.equal(Attribute("depth", [0.1, 0.2]).values(seen, nn.Identity()), seen.samples.attributes["depth"])
+        np.testing.assert_allclose(
+            potential[i, :n], embedded(two_bodies(), i, n_eigenpairs=4).norm(dim=1), rtol=1e-5
+        )
+    assert torch.equal(
+        Attribute("depth", [0.1, 0.2]).values(seen, nn.Identity()), seen.samples.attributes["depth"]
+    )
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
     for soft in (False, True):
-        with pytest.raises(ValueError, match="Attribute: expected finite values, got NaN or infinity"):
+        with pytest.raises(
+            ValueError, match="Attribute: expected finite values, got NaN or infinity"
+        ):
             Attribute("depth", [0.1, 0.2], soft=soft).memberships(torch.tensor([0.1, torch.nan]))
 
 
@@ -100,12 +114,16 @@ def test_a_missing_attribute_lists_what_there_is() -> None:
     ):
         Attribute("charge", [0.1, 0.2]).values(view("surface"), nn.Identity())
     bare = batch_of(torch.rand(1, 5, 3))
-    with pytest.raises(ValueError, match="expected the interior samples to have 'surface_direction'"):
+    with pytest.raises(
+        ValueError, match="expected the interior samples to have 'surface_direction'"
+    ):
         PairCosines().pairs(SampleFeatures(bare, "interior", bare.interior), SpectralEmbedding())
 
 
 def test_directions_are_no_classes() -> None:
-    with pytest.raises(ValueError, match="expected a scalar, got 'surface_direction', which is a direction"):
+    with pytest.raises(
+        ValueError, match="expected a scalar, got 'surface_direction', which is a direction"
+    ):
         Attribute("surface_direction", [0.0, 1.0]).values(view(), nn.Identity())
 
 
@@ -136,11 +154,15 @@ def test_shapes() -> None:
 def test_named_axes_are_made_as_they_are_by_default() -> None:
     assert {name: type(axis_of(name)) for name in AXES} == dict(AXES)
     assert isinstance(axis_of("interior_distance"), PairAxis)
-    np.testing.assert_allclose(axis_of("potential").centres(), np.arange(4) * 0.375 + 0.1875, rtol=1e-6)
+    np.testing.assert_allclose(
+        axis_of("potential").centres(), np.arange(4) * 0.375 + 0.1875, rtol=1e-6
+    )
 
 
 def test_a_wrong_name_lists_the_axes() -> None:
-    with pytest.raises(ValueError, match=r"axes: expected one of potential, interior_distance, .*, got 'geodesic'"):
+    with pytest.raises(
+        ValueError, match=r"axes: expected one of potential, interior_distance, .*, got 'geodesic'"
+    ):
         axis_of("geodesic")
 
 
@@ -155,7 +177,10 @@ def test_a_wrong_name_lists_the_axes() -> None:
         (lambda: InteriorDistance(reach=0.0), "reach: expected a positive number, got 0"),
         (lambda: Potential(0), "n_classes: expected at least 1, got 0"),
         (lambda: Potential(2.5), "n_classes: expected a whole number, got 2.5"),  # type: ignore[arg-type]
-        (lambda: Attribute("depth", [0.2, 0.1]), "start: expected finite values in ascending order"),
+        (
+            lambda: Attribute("depth", [0.2, 0.1]),
+            "start: expected finite values in ascending order",
+        ),
     ],
 )
 def test_impossible_axes_are_refused(make, message: str) -> None:  # type: ignore[no-untyped-def]

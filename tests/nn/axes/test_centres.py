@@ -9,12 +9,20 @@ from igps.nn.axes.centres import OrderedCentres, interval_centres
 
 def test_interval_centres_lie_in_the_middle_of_equal_intervals() -> None:
     edges = np.linspace(0, 1.5, 5)
-    np.testing.assert_allclose(interval_centres(4, 1.5, "n_classes"), (edges[1:] + edges[:-1]) / 2, rtol=1e-6)
+    np.testing.assert_allclose(
+        interval_centres(4, 1.5, "n_classes"), (edges[1:] + edges[:-1]) / 2, rtol=1e-6
+    )
 
 
-@pytest.mark.parametrize(("n", "largest"), [(0, 1.0), (3, 0.0), (3, float("inf")), (3, float("nan"))])
+@pytest.mark.parametrize(
+    ("n", "largest"), [(0, 1.0), (3, 0.0), (3, float("inf")), (3, float("nan"))]
+)
 def test_impossible_intervals_are_refused(n: int, largest: float) -> None:
-    expected = "n_bins: expected at least 1, got 0" if n == 0 else f"reach: expected a positive number, got {largest}"
+    expected = (
+        "n_bins: expected at least 1, got 0"
+        if n == 0
+        else f"reach: expected a positive number, got {largest}"
+    )
     with pytest.raises(ValueError, match=expected):
         interval_centres(n, largest, "n_bins")
 

@@ -15,7 +15,9 @@ from igps.nn.heads.classifier import folds
 PARTS = (12, 8)
 
 
-def drawn(n_classes: int, n_of_each: int, noise: float = 0.6, seed: int = 0) -> tuple[Tensor, Tensor]:
+def drawn(
+    n_classes: int, n_of_each: int, noise: float = 0.6, seed: int = 0
+) -> tuple[Tensor, Tensor]:
     """Histograms about a mean of each class, which is the same for every seed; classes 10, 11, ..."""
     means = torch.rand(n_classes, sum(PARTS), generator=torch.Generator().manual_seed(9)) ** 3
     labels = torch.arange(n_classes).repeat_interleave(n_of_each)
@@ -34,13 +36,18 @@ def test_folds_hold_out_each_shape_once_and_leave_every_class() -> None:
 
 def test_scores_are_those_of_the_kernel_head_and_probabilities_their_softmax() -> None:
     histograms, labels = drawn(4, 8)
-    head, kernel = ClassifierHead().fit(histograms, labels, PARTS), KernelHead().fit(histograms, labels, PARTS)
+    head, kernel = (
+        ClassifierHead().fit(histograms, labels, PARTS),
+        KernelHead().fit(histograms, labels, PARTS),
+    )
     new, _ = drawn(4, 5, seed=1)
     torch.testing.assert_close(head.scores(new), kernel.scores(new), rtol=0, atol=1e-6)
     torch.testing.assert_close(head(new), kernel(new), rtol=0, atol=1e-6)
     probabilities = head.probabilities(new)
     torch.testing.assert_close(probabilities.sum(dim=1), torch.ones(20))
-    torch.testing.assert_close(probabilities, (kernel.scores(new) / head.calibration).softmax(dim=1))
+    torch.testing.assert_close(
+        probabilities, (kernel.scores(new) / head.calibration).softmax(dim=1)
+    )
 
 
 def test_the_temperature_is_the_likeliest_on_what_is_held_out() -> None:
@@ -53,7 +60,9 @@ def test_the_temperature_is_the_likeliest_on_what_is_held_out() -> None:
         truth += labels[out].tolist()
 
     def loss(temperature: float) -> float:
-        return float(log_loss(truth, (torch.cat(scores).double() / temperature).softmax(dim=1).numpy()))
+        return float(
+            log_loss(truth, (torch.cat(scores).double() / temperature).softmax(dim=1).numpy())
+        )
 
     found = float(head.calibration)
     assert loss(found) <= min(loss(found * factor) for factor in (0.5, 0.9, 1.1, 2.0))
@@ -75,7 +84,11 @@ def test_strangeness_is_what_its_formula_says() -> None:
             other = head.whitened.whitened_parts(theirs)[part]
             distances += share * (1 - other @ one[i]) / head.medians[part]
             start += PARTS[part]
-        distances += head.shares[-1] * prior.distances(prior(new[i : i + 1]), prior(histograms))[0] / head.medians[-1]
+        distances += (
+            head.shares[-1]
+            * prior.distances(prior(new[i : i + 1]), prior(histograms))[0]
+            / head.medians[-1]
+        )
         nearest = sorted(distances[labels == 10 + taken_for].tolist())[:2]
         assert found == pytest.approx(sum(nearest) / 2 - float(score), abs=1e-4)
 

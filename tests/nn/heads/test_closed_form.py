@@ -29,7 +29,9 @@ def collection() -> tuple[Tensor, Tensor]:
     """Histograms of 8 classes of 6 shapes; all classes vary along the same two directions, and much."""
     generator = torch.Generator().manual_seed(0)
     kinds = torch.rand(8, 1, N_CELLS, generator=generator)
-    nuisance = torch.randn(8, 6, 2, generator=generator) @ torch.randn(2, N_CELLS, generator=generator)
+    nuisance = torch.randn(8, 6, 2, generator=generator) @ torch.randn(
+        2, N_CELLS, generator=generator
+    )
     noise = 0.05 * torch.randn(8, 6, N_CELLS, generator=generator)
     histograms = (kinds + 0.5 * nuisance + noise).exp().flatten(0, 1)
     return histograms / histograms.sum(dim=1, keepdim=True), torch.arange(8).repeat_interleave(6)
@@ -42,9 +44,13 @@ def ft(embedding: Tensor, labels: Tensor) -> float:
 def test_whitening_is_the_inverse_root_of_the_covariance(collection: tuple[Tensor, Tensor]) -> None:
     histograms, labels = collection
     roots = histograms.double().sqrt().numpy()
-    residuals = np.concatenate([roots[labels == c] - roots[labels == c].mean(axis=0) for c in range(8)])
+    residuals = np.concatenate(
+        [roots[labels == c] - roots[labels == c].mean(axis=0) for c in range(8)]
+    )
     within = residuals.T @ residuals
-    within /= within.trace() / 40  # the mean of the 40 eigenvalues that the residuals of 48 shapes of 8 classes allow
+    within /= (
+        within.trace() / 40
+    )  # the mean of the 40 eigenvalues that the residuals of 48 shapes of 8 classes allow
     values, vectors = np.linalg.eigh(within + 0.5 * np.eye(N_CELLS))
     expected = (roots - roots.mean(axis=0)) @ vectors / np.sqrt(values) @ vectors.T
     head = WhitenedHead(n_directions=40, shrinkage=0.5).fit(histograms, labels)
@@ -56,7 +62,9 @@ def test_few_directions_are_the_largest(collection: tuple[Tensor, Tensor]) -> No
     few = WhitenedHead(n_directions=3).fit(histograms, labels)
     many = WhitenedHead(n_directions=40).fit(histograms, labels)
     torch.testing.assert_close(few.gains, many.gains[:, :3])
-    torch.testing.assert_close((few.directions @ many.directions[:3].T).abs(), torch.eye(3), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        (few.directions @ many.directions[:3].T).abs(), torch.eye(3), atol=1e-4, rtol=0
+    )
 
 
 def test_parts_are_whitened_one_by_one(collection: tuple[Tensor, Tensor]) -> None:
@@ -75,10 +83,16 @@ def test_kernels_of_parts_are_averaged(collection: tuple[Tensor, Tensor]) -> Non
         whitened = WhitenedHead().fit(part, labels)(part).double().numpy()
         distances = 1 - whitened @ whitened.T
         # torch's median of an even number of values is the lower one of the two in the middle
-        kernels.append(np.exp(-distances / np.sort(distances[np.triu_indices(48, 1)])[(48 * 47 // 2 - 1) // 2]))
-    oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(np.mean(kernels, axis=0), np.eye(8)[labels])
+        kernels.append(
+            np.exp(-distances / np.sort(distances[np.triu_indices(48, 1)])[(48 * 47 // 2 - 1) // 2])
+        )
+    oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(
+        np.mean(kernels, axis=0), np.eye(8)[labels]
+    )
     head = KernelHead().fit(histograms, labels, (20, 40))
-    np.testing.assert_allclose(head.scores(histograms), oracle.predict(np.mean(kernels, axis=0)), atol=2e-3)
+    np.testing.assert_allclose(
+        head.scores(histograms), oracle.predict(np.mean(kernels, axis=0)), atol=2e-3
+    )
     copy = KernelHead()
     copy.load_state_dict(head.state_dict())
     torch.testing.assert_close(copy(histograms), head(histograms))
@@ -140,7 +154,9 @@ def test_kernel_head_is_kernel_ridge_regression(collection: tuple[Tensor, Tensor
 
 
 def test_identical_shapes_have_no_direction() -> None:
-    histograms = torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.0, 0.25, 0.75], [0.0, 0.25, 0.75]])
+    histograms = torch.tensor(
+        [[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.0, 0.25, 0.75], [0.0, 0.25, 0.75]]
+    )
     head = WhitenedHead().fit(histograms, torch.tensor([0, 0, 1, 1]))
     centred = histograms.sqrt() - histograms.sqrt().mean(dim=0)
     torch.testing.assert_close(head(histograms), normalize(centred))
@@ -155,7 +171,9 @@ def test_classes_keep_their_names(collection: tuple[Tensor, Tensor]) -> None:
 @pytest.mark.parametrize("kind", [WhitenedHead, KernelHead])
 @pytest.mark.parametrize("part_cells", [None, (20, 40)])
 def test_state_round_trips_into_a_head_of_other_sizes(
-    collection: tuple[Tensor, Tensor], kind: type[WhitenedHead | KernelHead], part_cells: tuple[int, int] | None
+    collection: tuple[Tensor, Tensor],
+    kind: type[WhitenedHead | KernelHead],
+    part_cells: tuple[int, int] | None,
 ) -> None:
     histograms, labels = collection
     head = kind().fit(histograms, labels, part_cells)
@@ -173,7 +191,9 @@ def test_a_head_is_fitted_anew(collection: tuple[Tensor, Tensor]) -> None:
     histograms, labels = collection
     for kind in (WhitenedHead, KernelHead):
         again = kind().fit(histograms[:24, :30], labels[:24], (10, 20)).fit(histograms, labels)
-        torch.testing.assert_close(again(histograms), kind().fit(histograms, labels)(histograms), rtol=0, atol=0)
+        torch.testing.assert_close(
+            again(histograms), kind().fit(histograms, labels)(histograms), rtol=0, atol=0
+        )
 
 
 def test_errors_name_the_argument(collection: tuple[Tensor, Tensor]) -> None:
@@ -204,7 +224,9 @@ def test_errors_name_the_argument(collection: tuple[Tensor, Tensor]) -> None:
         KernelHead(temperature=0)
     for kind in (WhitenedHead, KernelHead):
         for share in (0, 1):
-            with pytest.raises(ValueError, match=f"prior_share: expected a number between 0 and 1, got {share}"):
+            with pytest.raises(
+                ValueError, match=f"prior_share: expected a number between 0 and 1, got {share}"
+            ):
                 kind(prior_share=share)
     with pytest.raises(RuntimeError, match="expected to be fitted first"):
         KernelHead()(histograms)
@@ -268,11 +290,17 @@ def test_an_indefinite_kernel_is_projected_on_its_positive_eigenvectors(
     head = KernelHead(stepped, prior_share=0.9, ridge=-float(values[0])).fit(histograms, labels)
     positive = vectors[:, values > 0]
     projection = positive @ positive.T
-    oracle = KernelRidge(alpha=-values[0], kernel="precomputed").fit(projection @ kernel, np.eye(8)[labels])
-    np.testing.assert_allclose(head.scores(histograms), oracle.predict(kernel @ projection), atol=1e-4)
+    oracle = KernelRidge(alpha=-values[0], kernel="precomputed").fit(
+        projection @ kernel, np.eye(8)[labels]
+    )
+    np.testing.assert_allclose(
+        head.scores(histograms), oracle.predict(kernel @ projection), atol=1e-4
+    )
 
 
-def test_weights_and_temperature_are_loaded(collection: tuple[Tensor, Tensor], prior: WhitenedHead) -> None:
+def test_weights_and_temperature_are_loaded(
+    collection: tuple[Tensor, Tensor], prior: WhitenedHead
+) -> None:
     """Into heads that were made with others."""
     pairs = (
         (WhitenedHead(prior=prior, prior_share=0.2), WhitenedHead(prior=WhitenedHead())),
@@ -293,7 +321,9 @@ def test_whitened_distance_is_the_weighted_mean_with_the_priors(
         head = WhitenedHead(prior=given, prior_share=0.3).fit(histograms, labels)
         beside = head(histograms)
         found = head.distances(beside, beside[:9])
-        torch.testing.assert_close(found, (0.7 * cosine(own, own) + 0.3 * of_prior)[:, :9], atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            found, (0.7 * cosine(own, own) + 0.3 * of_prior)[:, :9], atol=1e-6, rtol=0
+        )
         whole = 0.7 * cosine(own, own) + 0.3 * cosine(other, other)
         torch.testing.assert_close(cosine(beside, beside), whole, atol=1e-6, rtol=0)
     with pytest.raises(RuntimeError, match="WhitenedHead: expected to be fitted first"):
@@ -336,7 +366,9 @@ class Stretched(Head):
         super().__init__()
         self.head, self.n_cells = head, n_cells
 
-    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Stretched:
+    def fit(
+        self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None
+    ) -> Stretched:
         raise AssertionError("a prior stays as it is")
 
     def forward(self, descriptions: Tensor) -> Tensor:
@@ -353,7 +385,10 @@ def test_without_separation_all_parts_have_equal_weights(
     """A single class, or two classes of identical shapes."""
     histograms, _ = collection
     again = torch.cat([histograms[:6], histograms[:6]])
-    for shapes, labels in ((histograms[:6], torch.zeros(6)), (again, torch.arange(2).repeat_interleave(6))):
+    for shapes, labels in (
+        (histograms[:6], torch.zeros(6)),
+        (again, torch.arange(2).repeat_interleave(6)),
+    ):
         beside = WhitenedHead(prior=prior).fit(shapes, labels, (20, 40))
         assert beside.part_shares.tolist() == [0.5, 0.5]
         alone = WhitenedHead().fit(shapes, labels, (20, 40))(histograms)
@@ -374,13 +409,19 @@ def test_the_priors_kernel_is_one_more(
         distances = (1 - (vectors @ vectors[train].T).double().numpy()) ** exponent
         kernels.append(np.exp(-distances / np.median(distances[train][np.triu_indices(24, 1)])))
     kernel = 0.375 * (kernels[0] + kernels[1]) + 0.25 * kernels[2]
-    oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(kernel[train], np.eye(8)[labels[train]])
+    oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(
+        kernel[train], np.eye(8)[labels[train]]
+    )
     given = prior if power == 1 else squared
     head = KernelHead(given, prior_share=0.25).fit(histograms[train], labels[train], (20, 40))
-    np.testing.assert_allclose(head.scores(histograms[test]), oracle.predict(kernel[test]), atol=2e-3)
+    np.testing.assert_allclose(
+        head.scores(histograms[test]), oracle.predict(kernel[test]), atol=2e-3
+    )
 
 
-def test_one_shape_of_each_class_leaves_the_prior_alone(collection: tuple[Tensor, Tensor], prior: WhitenedHead) -> None:
+def test_one_shape_of_each_class_leaves_the_prior_alone(
+    collection: tuple[Tensor, Tensor], prior: WhitenedHead
+) -> None:
     histograms, labels = collection
     vectors = prior(histograms).double().numpy()
     distances = 1 - vectors @ vectors[::6].T
@@ -425,11 +466,15 @@ def fitted_heads(collection: tuple[Tensor, Tensor]) -> list[Head]:
     prior = TwoLevelHead(WCCNHead([0]), body_heads, scales=(0.1, 0.2), exponents=(0.3, 0.7))
     prior.fit(*collection, [20, 40])
     priors = (None, prior)
-    made = [head(prior=one) for head in (WhitenedHead, KernelHead, ClassifierHead) for one in priors]
+    made = [
+        head(prior=one) for head in (WhitenedHead, KernelHead, ClassifierHead) for one in priors
+    ]
     return [prior, *(head.fit(*collection, [20, 40]) for head in made)]
 
 
-def test_fitted_heads_are_traced_whole_and_take_half_precision(collection: tuple[Tensor, Tensor]) -> None:
+def test_fitted_heads_are_traced_whole_and_take_half_precision(
+    collection: tuple[Tensor, Tensor],
+) -> None:
     histograms = collection[0]
     for head in fitted_heads(collection):
         expected = head(histograms)

@@ -23,7 +23,9 @@ def histograms() -> torch.Tensor:
     return counts / counts.sum(dim=(1, 2), keepdim=True)
 
 
-def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(histograms: torch.Tensor) -> None:
+def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(
+    histograms: torch.Tensor,
+) -> None:
     torch.manual_seed(0)
     head = ProjectionHead(width=5, n_hidden=16)
     histograms.requires_grad_()
@@ -35,7 +37,9 @@ def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(histograms:
     assert histograms.grad.abs().max() > 0
 
 
-def test_linear_head_with_identity_weights_ranks_like_hellingers_distance(histograms: torch.Tensor) -> None:
+def test_linear_head_with_identity_weights_ranks_like_hellingers_distance(
+    histograms: torch.Tensor,
+) -> None:
     head = ProjectionHead(width=24, n_hidden=0).eval()
     head(histograms)  # which tells its size
     with torch.no_grad():
@@ -78,7 +82,9 @@ def test_impossible_inputs_are_refused(histograms: torch.Tensor) -> None:
         ProjectionHead(width=0)
     with pytest.raises(ValueError, match="at least two training shapes, got 1"):
         ProjectionHead().fit(histograms[:1], torch.zeros(1))
-    with pytest.raises(ValueError, match="descriptions: expected histograms, entries ≥ 0, got a negative one"):
+    with pytest.raises(
+        ValueError, match="descriptions: expected histograms, entries ≥ 0, got a negative one"
+    ):
         ProjectionHead()(histograms - 0.5)
 
 
@@ -92,7 +98,9 @@ def test_share_goes_from_plain_to_learned(histograms: torch.Tensor) -> None:
         distance.calibrate(histograms)
         pairs = torch.triu_indices(12, 12, 1).unbind()
         result = distance(histograms, histograms)
-        torch.testing.assert_close(result, expected / expected[pairs].median(), atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(
+            result, expected / expected[pairs].median(), atol=1e-5, rtol=1e-4
+        )
 
 
 @pytest.mark.parametrize(
@@ -126,23 +134,32 @@ def test_the_head_alone_is_what_a_descriptor_under_it_deploys(
     pairs = torch.triu_indices(12, 12, 1).unbind()
     unit = deployed.distances(vectors, vectors)[pairs].median()
     assert unit > 0
-    torch.testing.assert_close(distance(histograms[:5], histograms), expected / unit, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(
+        distance(histograms[:5], histograms), expected / unit, atol=1e-5, rtol=1e-4
+    )
 
 
 def test_without_head_it_is_the_paper(histograms: torch.Tensor) -> None:
     distance = BlendedDistance()
     distance.calibrate(histograms)
-    torch.testing.assert_close(distance(histograms, histograms), chi_square(histograms, histograms), atol=0, rtol=0)
+    torch.testing.assert_close(
+        distance(histograms, histograms), chi_square(histograms, histograms), atol=0, rtol=0
+    )
 
 
 def test_plain_distance_may_be_another(histograms: torch.Tensor) -> None:
     flat = histograms.flatten(1)
-    torch.testing.assert_close(BlendedDistance(plain=euclidean)(flat, flat), euclidean(flat, flat), atol=0, rtol=0)
+    torch.testing.assert_close(
+        BlendedDistance(plain=euclidean)(flat, flat), euclidean(flat, flat), atol=0, rtol=0
+    )
     head = ProjectionHead(width=4).eval()
     head(flat)
     distance = BlendedDistance(head, euclidean, share=0.0)
     distance.calibrate(flat)
-    expected = euclidean(flat, flat) / euclidean(flat, flat)[torch.triu_indices(12, 12, 1).unbind()].median()
+    expected = (
+        euclidean(flat, flat)
+        / euclidean(flat, flat)[torch.triu_indices(12, 12, 1).unbind()].median()
+    )
     torch.testing.assert_close(distance(flat, flat), expected)
 
 
@@ -155,7 +172,9 @@ def test_state_round_trips_into_one_without_sizes(histograms: torch.Tensor) -> N
     other_size = BlendedDistance(ProjectionHead().fit(histograms[:, :1], torch.zeros(12)).eval())
     for two in (BlendedDistance(ProjectionHead().eval()), other_size):
         two.load_state_dict(state)
-        torch.testing.assert_close(two(histograms, histograms), one(histograms, histograms), atol=0, rtol=0)
+        torch.testing.assert_close(
+            two(histograms, histograms), one(histograms, histograms), atol=0, rtol=0
+        )
         for name, value in two.state_dict().items():
             assert torch.equal(value, state[name]), name
 

@@ -66,21 +66,28 @@ def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-6)
 
 
-def test_parts_have_equal_shares_and_others_do_not_count(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_parts_have_equal_shares_and_others_do_not_count(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
     histograms, classes, _ = collection
     cells = (12, 18, 10)
     alone = [WCCNHead().fit(part, classes)(part) for part in histograms.split(cells, dim=1)]
     head = WCCNHead((0, 2)).fit(histograms, classes, cells)
     expected = (cosine(alone[0], alone[0]) + cosine(alone[2], alone[2])) / 2
     found = head(histograms)
-    assert found.shape == (len(histograms), 12 + 10)  # a part has at most as many directions as cells
+    assert found.shape == (
+        len(histograms),
+        12 + 10,
+    )  # a part has at most as many directions as cells
     torch.testing.assert_close(cosine(found, found), expected, atol=2e-4, rtol=0)
     changed = histograms.clone()
     changed[:, 12:30] = torch.rand(len(changed), 18, generator=torch.Generator().manual_seed(1))
     torch.testing.assert_close(head(changed), found, atol=1e-6, rtol=0)
 
 
-def test_with_lengths_distances_are_those_of_mahalanobis(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_with_lengths_distances_are_those_of_mahalanobis(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
     """Against SciPy's `sqrtm`, up to one common factor; the last number makes the length of the vector 1."""
     histograms, _, bodies = collection
     expected = torch.from_numpy(projected(histograms, bodies, 0.2))
@@ -93,10 +100,14 @@ def test_with_lengths_distances_are_those_of_mahalanobis(collection: tuple[Tenso
     assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
 
 
-def test_shapes_far_from_the_training_shapes_have_unit_vectors(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_shapes_far_from_the_training_shapes_have_unit_vectors(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
     histograms, _, bodies = collection
     head = WCCNHead(n_directions=10, lengths=True).fit(histograms, bodies)
-    alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(1.0)  # one cell each; training shapes fill all 40 cells
+    alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(
+        1.0
+    )  # one cell each; training shapes fill all 40 cells
     torch.testing.assert_close(head(alone).norm(dim=1), torch.ones(N_CELLS), atol=1e-5, rtol=0)
 
 
@@ -108,29 +119,44 @@ def test_the_distance_is_what_the_formula_says(
     monkeypatch.setattr(two_level, "_SAME_CLASS", same_class)
     histograms, classes, bodies = collection
     class_head = WCCNHead(n_directions=20)
-    body_heads = WCCNHead((0,), n_directions=6, lengths=True), WCCNHead((1,), n_directions=5, lengths=True)
+    body_heads = (
+        WCCNHead((0,), n_directions=6, lengths=True),
+        WCCNHead((1,), n_directions=5, lengths=True),
+    )
     head = TwoLevelHead(class_head, body_heads, scales=(0.2, 0.3), exponents=(0.3, 0.7), share=0.3)
     vectors = head.fit(histograms, classes, (15, 25), bodies=bodies)(histograms)
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
     x, y, z = (one(histograms).double() for one in (class_head, *body_heads))
     products = 0.7 * x @ x.T + 0.15 * y @ y.T + 0.15 * z @ z.T
     torch.testing.assert_close((vectors @ vectors.T).double(), products, atol=1e-5, rtol=0)
-    torch.testing.assert_close(head.within_class(vectors)[:, :7].double(), 0.15**0.5 * y, atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        head.within_class(vectors)[:, :7].double(), 0.15**0.5 * y, atol=1e-6, rtol=0
+    )
     first, second = (
-        torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist") for one in (y, z)
+        torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist")
+        for one in (y, z)
     )
     apart = first**0.3 * second**0.7
-    usual, from_mean = 0.5 / 2**0.5, ((y[:, :-1].norm(dim=1) ** 2 + z[:, :-1].norm(dim=1) ** 2) / 2).sqrt()
+    usual, from_mean = (
+        0.5 / 2**0.5,
+        ((y[:, :-1].norm(dim=1) ** 2 + z[:, :-1].norm(dim=1) ** 2) / 2).sqrt(),
+    )
     shorter = (torch.outer(from_mean, from_mean).sqrt() / usual).sqrt()
     by_class = 1 - x @ x.T
     all_near = torch.exp(
-        -((by_class / same_class) ** 20) - (first * shorter / 0.2) ** 20 - (second * shorter / 0.3) ** 20
+        -((by_class / same_class) ** 20)
+        - (first * shorter / 0.2) ** 20
+        - (second * shorter / 0.3) ** 20
     )
     near = torch.exp(-((apart / 0.1) ** 20))
-    expected = 0.95 * by_class * (1 - all_near) * (1 - near) + 0.05 * (1 - torch.exp(-((apart / 0.1) ** 2)))
+    expected = 0.95 * by_class * (1 - all_near) * (1 - near) + 0.05 * (
+        1 - torch.exp(-((apart / 0.1) ** 2))
+    )
     found = head.distances(vectors, vectors).double()
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
-    torch.testing.assert_close(head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0
+    )
     assert ((all_near > 0.2) & (all_near < 0.9)).any()  # each case occurs
     assert ((near > 0.2) & (near < 0.9)).any()
     assert ((first < 0.15) & (all_near < 0.1)).any()
@@ -141,19 +167,27 @@ def test_the_distance_is_what_the_formula_says(
 
 def test_body_heads_can_have_shapes_of_their_own(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, classes, bodies = collection
-    head = TwoLevelHead().fit(histograms[:200], classes[:200], bodies=bodies[200:], body_descriptions=histograms[200:])
+    head = TwoLevelHead().fit(
+        histograms[:200], classes[:200], bodies=bodies[200:], body_descriptions=histograms[200:]
+    )
     of_class, of_body = WCCNHead(), WCCNHead(n_directions=64, shrinkage=0.3, lengths=True)
     of_class.fit(histograms[:200], classes[:200])
     of_body.fit(histograms[200:], bodies[200:])
     expected = 0.5**0.5 * torch.cat([of_class(histograms), of_body(histograms)], dim=1)
     torch.testing.assert_close(head(histograms), expected)
-    _, _, axes = np.linalg.svd(expected[:200].double().numpy(), full_matrices=False)  # of the shapes of classes
+    _, _, axes = np.linalg.svd(
+        expected[:200].double().numpy(), full_matrices=False
+    )  # of the shapes of classes
     short = head.shorten(head(histograms))
     projected = torch.from_numpy(expected.double().numpy() @ axes.T)
-    torch.testing.assert_close(cosine(short, short).double(), cosine(projected, projected), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        cosine(short, short).double(), cosine(projected, projected), atol=1e-4, rtol=0
+    )
 
 
-def test_distances_of_equal_vectors_have_a_gradient(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_distances_of_equal_vectors_have_a_gradient(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
     histograms, classes, bodies = collection
     body_heads = [WCCNHead((part,), n_directions=6, lengths=True) for part in range(2)]
     head = TwoLevelHead(body_heads=body_heads, scales=(0.1, 0.1), exponents=(0.2, 0.8))
@@ -165,7 +199,9 @@ def test_distances_of_equal_vectors_have_a_gradient(collection: tuple[Tensor, Te
     assert vectors.grad is not None
     assert torch.isfinite(vectors.grad).all()
     point = torch.zeros(1, vectors.shape[1]).index_fill_(1, torch.tensor([0]), 1.0)
-    _, slope = torch.func.jvp(lambda x: head.distances(x, point), (point,), (torch.ones_like(point),))
+    _, slope = torch.func.jvp(
+        lambda x: head.distances(x, point), (point,), (torch.ones_like(point),)
+    )
     assert torch.isfinite(slope).all()
 
 
@@ -185,11 +221,15 @@ def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to
     generator = torch.Generator().manual_seed(1)
     shape = (12, 2, 3, 4)  # classes, bodies, individuals, poses
     kinds = torch.randn(12, 1, 1, 1, N_CELLS, generator=generator)
-    of_bodies = torch.randn(12, 2, 1, 1, 4, generator=generator) @ torch.randn(4, N_CELLS, generator=generator)
+    of_bodies = torch.randn(12, 2, 1, 1, 4, generator=generator) @ torch.randn(
+        4, N_CELLS, generator=generator
+    )
     of_poses, of_individuals = torch.zeros(*shape, N_CELLS), torch.zeros(*shape, N_CELLS)
     of_poses[..., :10] = torch.randn(*shape, 10, generator=generator)
     of_individuals[..., 30:] = torch.randn(12, 2, 3, 1, 10, generator=generator)
-    cells = (0.8 * kinds + 0.3 * of_bodies + 0.3 * of_poses + 0.05 * of_individuals).exp().flatten(0, 3)
+    cells = (
+        (0.8 * kinds + 0.3 * of_bodies + 0.3 * of_poses + 0.05 * of_individuals).exp().flatten(0, 3)
+    )
     histograms = cells / cells.sum(dim=1, keepdim=True)
     individuals = torch.arange(72).repeat_interleave(4)
     bodies, classes = individuals // 3, individuals // 6
@@ -200,7 +240,12 @@ def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to
         head.fit(histograms[seen], classes[seen], bodies=fitted_to[seen])
         vectors = head(histograms[~seen])
         distances = head.distances(vectors, vectors)
-        found.append([retrieval_scores(distances, one[~seen]).mean()["ft"] for one in (individuals, bodies, classes)])
+        found.append(
+            [
+                retrieval_scores(distances, one[~seen]).mean()["ft"]
+                for one in (individuals, bodies, classes)
+            ]
+        )
     assert found[1][0] > found[0][0] + 0.1
     assert found[1][1] > found[0][1] - 0.02
     assert found[1][2] > found[0][2] - 0.02
@@ -225,7 +270,9 @@ def test_short_vectors_span_the_leading_singular_directions(
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-4)
 
 
-def test_both_levels_score_better_than_with_the_other_head_alone(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_both_levels_score_better_than_with_the_other_head_alone(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
     """FT on held-out classes, by bodies and by classes, exceeds that of the other level's head by 0.05."""
     histograms, classes, bodies = collection
     seen = classes < N_CLASSES // 2
@@ -235,7 +282,8 @@ def test_both_levels_score_better_than_with_the_other_head_alone(collection: tup
     vectors = head(rest)
     distances = head.distances(vectors, vectors)
     found = {
-        level: retrieval_scores(distances, labels).mean()["ft"] for level, labels in (("b", of_body), ("c", of_class))
+        level: retrieval_scores(distances, labels).mean()["ft"]
+        for level, labels in (("b", of_body), ("c", of_class))
     }
     assert found["b"] > ft(head.class_head(rest), of_body) + 0.05
     assert found["c"] > ft(head.body_heads[0](rest), of_class) + 0.05
@@ -243,14 +291,18 @@ def test_both_levels_score_better_than_with_the_other_head_alone(collection: tup
 
 def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, classes, bodies = collection
-    fitted = TwoLevelHead(WCCNHead((0,), 5), [WCCNHead((1,), 6, lengths=True)], scales=[0.3], share=0.3)
+    fitted = TwoLevelHead(
+        WCCNHead((0,), 5), [WCCNHead((1,), 6, lengths=True)], scales=[0.3], share=0.3
+    )
     fitted.fit(histograms, classes, (15, 25), bodies=bodies)
     other = TwoLevelHead(WCCNHead((0,)), [WCCNHead((1,), lengths=True)])
     other.load_state_dict(fitted.state_dict())
     torch.testing.assert_close(other(histograms), fitted(histograms))
     vectors = other(histograms)
     assert vectors.shape == (len(histograms), 5 + 6 + 1)
-    torch.testing.assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
+    torch.testing.assert_close(
+        other.distances(vectors, vectors), fitted.distances(vectors, vectors)
+    )
     torch.testing.assert_close(other.shorten(vectors), fitted.shorten(vectors))
     level = WCCNHead((1,))  # the state includes `lengths`
     level.load_state_dict(fitted.body_heads[0].state_dict())
@@ -283,16 +335,22 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
     with pytest.raises(RuntimeError, match="expected to be fitted first"):
         WCCNHead()(histograms)
     for scales in ([0.0], [0.1, 0.2]):
-        with pytest.raises(ValueError, match="scales: expected a positive scale for each of 1 body heads, got"):
+        with pytest.raises(
+            ValueError, match="scales: expected a positive scale for each of 1 body heads, got"
+        ):
             TwoLevelHead(scales=scales)
     with pytest.raises(ValueError, match="share: expected a number between 0 and 1, got 1"):
         TwoLevelHead(share=1)
     with pytest.raises(ValueError, match="body_heads: expected heads with lengths"):
         TwoLevelHead(body_heads=[WCCNHead()])
     for exponents in ((), (0.9,), (-1.0,), (0.5, 0.5)):
-        with pytest.raises(ValueError, match="exponents: expected a positive number for each of 1 body heads"):
+        with pytest.raises(
+            ValueError, match="exponents: expected a positive number for each of 1 body heads"
+        ):
             TwoLevelHead(exponents=exponents)
-    with pytest.raises(ValueError, match="bodies: expected one for each of 10 descriptions, got 320"):
+    with pytest.raises(
+        ValueError, match="bodies: expected one for each of 10 descriptions, got 320"
+    ):
         TwoLevelHead().fit(histograms, classes, body_descriptions=histograms[:10])
     with pytest.raises(RuntimeError, match="TwoLevelHead: expected to be fitted first"):
         TwoLevelHead().shorten(histograms)

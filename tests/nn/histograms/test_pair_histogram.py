@@ -27,11 +27,22 @@ from igps.nn.axes import (
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms import PairHistogram, pair_histogram
-from loops import Axis, cosines, distances, equal_bins, hard_classes, pair_histogram_by_loops, product, soft_classes
+from loops import (
+    Axis,
+    cosines,
+    distances,
+    equal_bins,
+    hard_classes,
+    pair_histogram_by_loops,
+    product,
+    soft_classes,
+)
 
 DEVICES = [
     "cpu",
-    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")),
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+    ),
 ]
 FINE, COARSE = SpectralEmbedding(n_eigenpairs=6), SpectralEmbedding(n_eigenpairs=2)
 DEPTH = (0.2, 0.5, 0.9)
@@ -56,7 +67,9 @@ class Look:
 
     def positions(self) -> Tensor:
         samples = getattr(self.batch, self.kind)
-        return samples.points[self.i, samples.mask[self.i]].double() / self.batch.area[self.i].sqrt()
+        return (
+            samples.points[self.i, samples.mask[self.i]].double() / self.batch.area[self.i].sqrt()
+        )
 
     def attribute(self, name: str) -> Tensor:
         samples = getattr(self.batch, self.kind)
@@ -77,9 +90,13 @@ class Look:
         other = self.embedding(kind="surface" if self.kind == "interior" else "interior")
         directions = []
         for point in own:
-            nearest = sorted(other, key=lambda target, point=point: float((target - point).norm()))[:8]  # type: ignore[misc]
+            nearest = sorted(other, key=lambda target, point=point: float((target - point).norm()))[
+                :8
+            ]  # type: ignore[misc]
             directions.append(sign * normalize(torch.stack(nearest).mean(dim=0) - point, dim=0))
-        return [(values, [a - 1 for a in ANGLES]) for values in cosines(own, torch.stack(directions))]
+        return [
+            (values, [a - 1 for a in ANGLES]) for values in cosines(own, torch.stack(directions))
+        ]
 
     def potential(self, n_classes: int, soft: bool = False) -> np.ndarray:
         potential = self.embedding().norm(dim=1)
@@ -89,12 +106,18 @@ class Look:
 
     def depth(self, soft: bool = False) -> np.ndarray:
         depth = self.attribute("depth")
-        return soft_classes(depth, DEPTH) if soft else hard_classes(depth, [(0.2 + 0.5) / 2, (0.5 + 0.9) / 2])
+        return (
+            soft_classes(depth, DEPTH)
+            if soft
+            else hard_classes(depth, [(0.2 + 0.5) / 2, (0.5 + 0.9) / 2])
+        )
 
 
 # What a histogram is made of, and classes and pairs of one shape by the definition.
 Case = tuple[
-    Callable[[], Sequence[PointAxis | PairAxis]], Callable[[Look], list[np.ndarray]], Callable[[Look], list[Axis]]
+    Callable[[], Sequence[PointAxis | PairAxis]],
+    Callable[[Look], list[np.ndarray]],
+    Callable[[Look], list[Axis]],
 ]
 CASES: dict[str, Case] = {
     "potential × interior": (
@@ -107,8 +130,16 @@ CASES: dict[str, Case] = {
         lambda look: [look.potential(3, soft=True)],
         lambda look: [look.interior(7)],
     ),
-    "interior alone": (lambda: [InteriorDistance(9, 2.0)], lambda look: [], lambda look: [look.interior(9, 2.0)]),
-    "Euclidean alone": (lambda: [EuclideanDistance(5)], lambda look: [], lambda look: [look.euclidean(5)]),
+    "interior alone": (
+        lambda: [InteriorDistance(9, 2.0)],
+        lambda look: [],
+        lambda look: [look.interior(9, 2.0)],
+    ),
+    "Euclidean alone": (
+        lambda: [EuclideanDistance(5)],
+        lambda look: [],
+        lambda look: [look.euclidean(5)],
+    ),
     "potential × depth × interior": (
         lambda: [Potential(2), Attribute("depth", DEPTH), InteriorDistance(5)],
         lambda look: [look.potential(2), look.depth()],
@@ -120,7 +151,11 @@ CASES: dict[str, Case] = {
         lambda look: [look.interior(5)],
     ),
     "soft depth × soft potential × Euclidean": (
-        lambda: [Attribute("depth", DEPTH, soft=True), Potential(2, soft=True), EuclideanDistance(5)],
+        lambda: [
+            Attribute("depth", DEPTH, soft=True),
+            Potential(2, soft=True),
+            EuclideanDistance(5),
+        ],
         lambda look: [look.depth(soft=True), look.potential(2, soft=True)],
         lambda look: [look.euclidean(5)],
     ),
@@ -140,8 +175,12 @@ CASES: dict[str, Case] = {
         lambda look: [look.interior(6), look.interior(5, 2.0, n=2)],
     ),
     "soft potential × interior × interior × Euclidean": (
-        lambda: [Potential(2, soft=True), InteriorDistance(4), InteriorDistance(3, embedding=COARSE),
-                 EuclideanDistance(2)],
+        lambda: [
+            Potential(2, soft=True),
+            InteriorDistance(4),
+            InteriorDistance(3, embedding=COARSE),
+            EuclideanDistance(2),
+        ],
         lambda look: [look.potential(2, soft=True)],
         lambda look: [look.interior(4), look.interior(3, n=2), look.euclidean(2)],
     ),
@@ -167,7 +206,12 @@ CASES: dict[str, Case] = {
         lambda look: [look.interior(4), *look.in_space()],
     ),
     "soft potential × depth × interior × cosines in the embedding": (
-        lambda: [Potential(2, soft=True), Attribute("depth", DEPTH), InteriorDistance(2), EmbeddedPairCosines(3)],
+        lambda: [
+            Potential(2, soft=True),
+            Attribute("depth", DEPTH),
+            InteriorDistance(2),
+            EmbeddedPairCosines(3),
+        ],
         lambda look: [look.potential(2, soft=True), look.depth()],
         lambda look: [look.interior(2), *look.in_embedding()],
     ),
@@ -176,12 +220,14 @@ CASES: dict[str, Case] = {
         lambda look: [look.potential(2)],
         lambda look: [look.interior(4), *look.in_space()],
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", ["interior", "surface"])
 @pytest.mark.parametrize("name", CASES)
-def test_product_of_axes_equals_brute_force_loop(batch: SignatureBatch, name: str, kind: str) -> None:
+def test_product_of_axes_equals_brute_force_loop(
+    batch: SignatureBatch, name: str, kind: str
+) -> None:
     make, classes, pairs = CASES[name]
     histogram = PairHistogram(make(), FINE, kind)  # type: ignore[arg-type]
     result = histogram(batch)
@@ -191,7 +237,9 @@ def test_product_of_axes_equals_brute_force_loop(batch: SignatureBatch, name: st
     for i, n in enumerate(N_POINTS):
         look = Look(batch, i, kind)
         memberships = product(*(classes(look) or [np.ones((n, 1))]))
-        np.testing.assert_allclose(result[i], pair_histogram_by_loops(memberships, pairs(look)), atol=1e-6)
+        np.testing.assert_allclose(
+            result[i], pair_histogram_by_loops(memberships, pairs(look)), atol=1e-6
+        )
 
 
 def learn(*modules: nn.Module) -> None:
@@ -208,7 +256,11 @@ def test_learned_axes_equal_brute_force_loop(batch: SignatureBatch, with_cosines
     potential, depth = Potential(2, learnable=True), Attribute("depth", DEPTH, learnable=True)
     interior, euclidean = InteriorDistance(4, learnable=True), EuclideanDistance(3, learnable=True)
     angles = PairCosines(3, learnable=True)
-    axes = [potential, depth, interior, angles] if with_cosines else [potential, depth, interior, euclidean]
+    axes = (
+        [potential, depth, interior, angles]
+        if with_cosines
+        else [potential, depth, interior, euclidean]
+    )
     learn(*axes)
     result = PairHistogram(axes, FINE)(batch)
     assert result.requires_grad
@@ -221,7 +273,10 @@ def test_learned_axes_equal_brute_force_loop(batch: SignatureBatch, with_cosines
         pairs = [(look.interior(2)[0], interior.centres().tolist())]
         if with_cosines:
             towards, between = angles.towards_centres().tolist(), angles.between_centres().tolist()
-            pairs += [(look.in_space()[k][0], centres) for k, centres in enumerate((towards, towards, between))]
+            pairs += [
+                (look.in_space()[k][0], centres)
+                for k, centres in enumerate((towards, towards, between))
+            ]
         else:
             pairs.append((look.euclidean(2)[0], euclidean.centres().tolist()))
         expected = pair_histogram_by_loops(memberships, pairs)
@@ -252,7 +307,9 @@ def test_an_axis_of_ones_own_counts_values_of_its_own(batch: SignatureBatch) -> 
         look = Look(batch, i)
         depth = look.attribute("depth").double().numpy()
         axes = [look.interior(4), (np.abs(np.subtract.outer(depth, depth)), [0.0, 0.1, 0.5])]
-        np.testing.assert_allclose(result[i], pair_histogram_by_loops(look.potential(2), axes), atol=1e-6)
+        np.testing.assert_allclose(
+            result[i], pair_histogram_by_loops(look.potential(2), axes), atol=1e-6
+        )
 
 
 def test_defaults_are_the_papers_histogram(batch: SignatureBatch) -> None:
@@ -275,13 +332,21 @@ def test_names_are_axes(batch: SignatureBatch) -> None:
     [
         ([InteriorDistance(5)], (1, 5)),
         ([Potential(3), InteriorDistance(5)], (6, 5)),
-        ([InteriorDistance(5), Potential(3), EuclideanDistance(2), Attribute("depth", DEPTH)], (45, 5, 2)),
+        (
+            [InteriorDistance(5), Potential(3), EuclideanDistance(2), Attribute("depth", DEPTH)],
+            (45, 5, 2),
+        ),
         ([EuclideanDistance(2), InteriorDistance(5)], (1, 2, 5)),
-        ([PairCosines(3), EuclideanDistance(2), Potential(2), InteriorDistance(5)], (3, 2, 5, 3, 3, 3)),
+        (
+            [PairCosines(3), EuclideanDistance(2), Potential(2), InteriorDistance(5)],
+            (3, 2, 5, 3, 3, 3),
+        ),
         ([PairCosines(2), EmbeddedPairCosines(3)], (1, 2, 2, 2, 3, 3, 3)),
     ],
 )
-def test_order_of_the_dimensions(batch: SignatureBatch, axes: list[PointAxis | PairAxis], shape: tuple) -> None:
+def test_order_of_the_dimensions(
+    batch: SignatureBatch, axes: list[PointAxis | PairAxis], shape: tuple
+) -> None:
     """Pairs of classes; distances in the given order; cosines in the given order."""
     histogram = PairHistogram(axes)
     assert histogram.shape == shape
@@ -291,10 +356,23 @@ def test_order_of_the_dimensions(batch: SignatureBatch, axes: list[PointAxis | P
 
 def test_needs_are_those_of_all_axes() -> None:
     far = SpectralEmbedding(n_eigenpairs=30)
-    axes = [Attribute("depth", DEPTH), Attribute("my own", [1.0]), EuclideanDistance(), PairCosines()]
+    axes = [
+        Attribute("depth", DEPTH),
+        Attribute("my own", [1.0]),
+        EuclideanDistance(),
+        PairCosines(),
+    ]
     assert PairHistogram(axes, far).requirements == Requirements(0, ("depth", "surface_direction"))
-    assert PairHistogram([*axes, InteriorDistance(embedding=COARSE)], far).requirements.n_eigenpairs == 2
-    assert PairHistogram([Potential(), InteriorDistance(embedding=COARSE)], far).requirements.n_eigenpairs == 30
+    assert (
+        PairHistogram([*axes, InteriorDistance(embedding=COARSE)], far).requirements.n_eigenpairs
+        == 2
+    )
+    assert (
+        PairHistogram(
+            [Potential(), InteriorDistance(embedding=COARSE)], far
+        ).requirements.n_eigenpairs
+        == 30
+    )
     assert PairHistogram([InteriorDistance(embedding=far)], COARSE).requirements == Requirements(30)
 
 
@@ -302,8 +380,12 @@ def test_summing_a_dimension_out_leaves_the_rest(batch: SignatureBatch) -> None:
     """Whatever the algorithm that counts it."""
     interior, euclidean = InteriorDistance(32), EuclideanDistance(16)
     joint = PairHistogram([Potential(4), interior, euclidean])(batch)
-    torch.testing.assert_close(joint.sum(dim=3), PairHistogram([Potential(4), interior])(batch), atol=1e-6, rtol=0)
-    torch.testing.assert_close(joint.sum(dim=2), PairHistogram([Potential(4), euclidean])(batch), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        joint.sum(dim=3), PairHistogram([Potential(4), interior])(batch), atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(
+        joint.sum(dim=2), PairHistogram([Potential(4), euclidean])(batch), atol=1e-6, rtol=0
+    )
     for angles in (PairCosines(3), EmbeddedPairCosines(3)):
         oriented = PairHistogram([Potential(4), interior, angles])(batch)
         expected = PairHistogram([Potential(4), interior])(batch)
@@ -329,14 +411,18 @@ def test_batch_equals_single_shapes_whatever_the_padding() -> None:
     padded[~mask] = torch.nan
     result = PairHistogram()(batch_of(padded, mask))
     for i, points in enumerate((embedding, embedding[::3])):
-        np.testing.assert_allclose(result[i], pair_histogram(points, points.norm(dim=1)), atol=1e-14)
+        np.testing.assert_allclose(
+            result[i], pair_histogram(points, points.norm(dim=1)), atol=1e-14
+        )
 
 
 def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     """Embedding, positions and directions of one shape, float64."""
     generator = torch.Generator().manual_seed(seed)
     embedding = torch.randn(n_points, 4, generator=generator, dtype=torch.float64) * 0.6
-    directions = normalize(torch.randn(n_points, 3, generator=generator, dtype=torch.float64), dim=1)
+    directions = normalize(
+        torch.randn(n_points, 3, generator=generator, dtype=torch.float64), dim=1
+    )
     return embedding, torch.rand(n_points, 3, generator=generator, dtype=torch.float64), directions
 
 
@@ -344,8 +430,22 @@ def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     ("make", "padding"),
     [
         (lambda: [Potential(soft=True), InteriorDistance(8)], torch.nan),
-        (lambda: [Potential(learnable=True), InteriorDistance(8, learnable=True), EuclideanDistance(4)], torch.nan),
-        (lambda: [Potential(2, learnable=True), InteriorDistance(4), PairCosines(3, learnable=True)], torch.nan),
+        (
+            lambda: [
+                Potential(learnable=True),
+                InteriorDistance(8, learnable=True),
+                EuclideanDistance(4),
+            ],
+            torch.nan,
+        ),
+        (
+            lambda: [
+                Potential(2, learnable=True),
+                InteriorDistance(4),
+                PairCosines(3, learnable=True),
+            ],
+            torch.nan,
+        ),
         (lambda: [InteriorDistance(4), EmbeddedPairCosines(3)], 0.0),
         (lambda: [InteriorDistance(4), EmbeddedPairCosines(3)], 9.0),
     ],
@@ -362,7 +462,11 @@ def test_padding_changes_neither_result_nor_gradient_of_the_samples(
     layer = PairHistogram(make())
     batch = layer(batch_of(padded, mask, places, {"surface_direction": directions.repeat(2, 1, 1)}))
     single = embedding[::3].clone().requires_grad_()
-    alone = layer(batch_of(single[None], None, points[None, ::3], {"surface_direction": directions[None, ::3]}))
+    alone = layer(
+        batch_of(
+            single[None], None, points[None, ::3], {"surface_direction": directions[None, ::3]}
+        )
+    )
     torch.testing.assert_close(batch[1], alone[0], rtol=0, atol=1e-14)
     (expected,) = torch.autograd.grad(alone.square().sum(), single)
     (gradient,) = torch.autograd.grad(batch[1].square().sum(), padded)
@@ -373,7 +477,9 @@ def test_padding_changes_neither_result_nor_gradient_of_the_samples(
 def test_gradient_through_classes_and_layout() -> None:
     """By learned centres and by the embedding, whose norm is the potential; against finite differences."""
     embedding = some(9, seed=2)[0].requires_grad_()
-    layer = PairHistogram([Potential(3, learnable=True), InteriorDistance(4, 2.0, learnable=True)]).double()
+    layer = PairHistogram(
+        [Potential(3, learnable=True), InteriorDistance(4, 2.0, learnable=True)]
+    ).double()
     names = ["axes.1.centres.log_gap", "axes.0.centres.log_gap"]
 
     def histogram(embedding: Tensor, *parameters: Tensor) -> Tensor:
@@ -382,7 +488,9 @@ def test_gradient_through_classes_and_layout() -> None:
         )
 
     generator = torch.Generator().manual_seed(3)
-    parameters = [torch.randn(n, generator=generator, dtype=torch.float64, requires_grad=True) for n in (4, 3)]
+    parameters = [
+        torch.randn(n, generator=generator, dtype=torch.float64, requires_grad=True) for n in (4, 3)
+    ]
     leaves = (embedding, *parameters)
     for gradient in torch.autograd.grad(histogram(*leaves).square().sum(), leaves):
         assert (gradient.abs() > 1e-6).any()
@@ -392,8 +500,12 @@ def test_gradient_through_classes_and_layout() -> None:
 def test_gradient_of_learned_cosines_is_that_of_finite_differences() -> None:
     embedding, points, directions = some(7)
     angles = PairCosines(3, learnable=True)
-    layer = PairHistogram([Potential(2, learnable=True), InteriorDistance(3, 4.0, learnable=True), angles]).double()
-    weights = torch.randn(layer.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    layer = PairHistogram(
+        [Potential(2, learnable=True), InteriorDistance(3, 4.0, learnable=True), angles]
+    ).double()
+    weights = torch.randn(
+        layer.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     batch = batch_of(embedding[None], None, points[None], {"surface_direction": directions[None]})
     parameters = list(layer.parameters())
     assert len(parameters) == 4
@@ -401,7 +513,9 @@ def test_gradient_of_learned_cosines_is_that_of_finite_differences() -> None:
     def loss() -> Tensor:
         return (layer(batch)[0] * weights).sum()
 
-    for parameter, gradient in zip(parameters, torch.autograd.grad(loss(), parameters), strict=True):
+    for parameter, gradient in zip(
+        parameters, torch.autograd.grad(loss(), parameters), strict=True
+    ):
         entry = int(gradient.abs().argmax())
         moved = []
         with torch.no_grad():
@@ -419,14 +533,22 @@ def test_soft_classes_tend_to_hard_ones() -> None:
     centres = (torch.arange(4, dtype=torch.float64) + 0.5) * 1.5 / 4
     potential = centres[torch.randint(4, (60,), generator=torch.Generator().manual_seed(0))]
     embedding = directions * potential[:, None]
-    result = PairHistogram([Potential(soft=True), InteriorDistance(16)]).double()(batch_of(embedding[None]))[0]
+    result = PairHistogram([Potential(soft=True), InteriorDistance(16)]).double()(
+        batch_of(embedding[None])
+    )[0]
     np.testing.assert_allclose(result, pair_histogram(embedding, potential, n_bins=16), atol=1e-8)
 
 
 def test_values_beyond_the_ranges_stay_in_the_last_cells() -> None:
     embedding, points, _ = some(50)
-    axes = [Potential(learnable=True), InteriorDistance(learnable=True), EuclideanDistance(4, learnable=True)]
-    result = PairHistogram(axes)(batch_of(embedding[None] * 1000, None, points[None] * 1000))[0].detach()
+    axes = [
+        Potential(learnable=True),
+        InteriorDistance(learnable=True),
+        EuclideanDistance(4, learnable=True),
+    ]
+    result = PairHistogram(axes)(batch_of(embedding[None] * 1000, None, points[None] * 1000))[
+        0
+    ].detach()
     assert float(result.sum()) == pytest.approx(1)
     assert float(result[-1, -1, -1]) > 0.9
 
@@ -443,17 +565,22 @@ def test_a_range_that_is_no_positive_number_is_refused(name: str, value: float) 
 def two_layouts(options: dict[str, bool], *more: Callable[..., PairAxis]) -> PairHistogram:
     learned = {"learnable": options.get("learnable", False)}
     points = [Potential(**options), Attribute("depth", [-0.1, 0.2, 0.5], **options)]  # type: ignore[arg-type]
-    return PairHistogram([*points, InteriorDistance(**learned), *(axis(**learned) for axis in more)])
+    return PairHistogram(
+        [*points, InteriorDistance(**learned), *(axis(**learned) for axis in more)]
+    )
 
 
 @pytest.mark.parametrize(
-    "more", [(), (EuclideanDistance,), (partial(PairCosines, 3),), (partial(EmbeddedPairCosines, 3),)]
+    "more",
+    [(), (EuclideanDistance,), (partial(PairCosines, 3),), (partial(EmbeddedPairCosines, 3),)],
 )
 def test_learned_layout_starts_as_the_fixed_one(more: tuple[Callable[..., PairAxis], ...]) -> None:
     embedding, points, directions = (value[None].float() for value in some(30))
     attributes = {"depth": points[:, :, 0], "surface_direction": directions}
     batch = batch_of(embedding, None, points, attributes)
-    fixed, learned = (two_layouts(options, *more)(batch) for options in ({"soft": True}, {"learnable": True}))
+    fixed, learned = (
+        two_layouts(options, *more)(batch) for options in ({"soft": True}, {"learnable": True})
+    )
     assert not fixed.requires_grad
     assert learned.requires_grad
     np.testing.assert_allclose(learned.detach(), fixed, atol=1e-6)
@@ -498,7 +625,9 @@ def test_layout_survives_its_state() -> None:
 def test_half_precision_and_autocast_count_in_single(device: str, cosines: bool) -> None:
     embedding = some(60)[0].to(device, torch.bfloat16)
     more = [EmbeddedPairCosines(3, learnable=True)] if cosines else []
-    layer = PairHistogram([Potential(learnable=True), InteriorDistance(16, learnable=True), *more]).to(device)
+    layer = PairHistogram(
+        [Potential(learnable=True), InteriorDistance(16, learnable=True), *more]
+    ).to(device)
 
     def run(points: Tensor) -> tuple[Tensor, list[Tensor]]:
         leaf = points.clone().requires_grad_()
@@ -514,8 +643,12 @@ def test_half_precision_and_autocast_count_in_single(device: str, cosines: bool)
     torch.testing.assert_close(hard, PairHistogram().to(device)(batch_of(embedding.float()[None])))
     # What comes by way of the directions, on a GPU also of the potential, is rounded before it is summed, and partly
     # cancels.
-    rounding = 0.01 * float(expected_gradients[0].abs().max()) if cosines or device == "cuda" else 1e-6
-    torch.testing.assert_close(gradients[0].float(), expected_gradients[0], rtol=0.01, atol=rounding)
+    rounding = (
+        0.01 * float(expected_gradients[0].abs().max()) if cosines or device == "cuda" else 1e-6
+    )
+    torch.testing.assert_close(
+        gradients[0].float(), expected_gradients[0], rtol=0.01, atol=rounding
+    )
     torch.testing.assert_close(gradients[1:], expected_gradients[1:], rtol=1e-4, atol=1e-7)
 
 
@@ -524,18 +657,29 @@ def test_half_precision_and_autocast_count_in_single(device: str, cosines: bool)
 def test_cuda_equals_cpu(batch: SignatureBatch, name: str) -> None:
     histogram = PairHistogram(CASES[name][0](), SpectralEmbedding(n_eigenpairs=6))
     expected = histogram(batch)
-    torch.testing.assert_close(histogram.cuda()(batch.to("cuda")).cpu(), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        histogram.cuda()(batch.to("cuda")).cpu(), expected, rtol=0, atol=1e-6
+    )
 
 
 def test_impossible_histograms_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"axes: expected one of potential, interior_distance, .*got 'depth'"):
+    with pytest.raises(
+        ValueError, match=r"axes: expected one of potential, interior_distance, .*got 'depth'"
+    ):
         PairHistogram(["depth", "interior_distance"])
-    with pytest.raises(ValueError, match="axes: expected axes of points or of pairs, got SpectralEmbedding"):
+    with pytest.raises(
+        ValueError, match="axes: expected axes of points or of pairs, got SpectralEmbedding"
+    ):
         PairHistogram([SpectralEmbedding()])  # type: ignore[list-item]
     for axes in ([], ["potential"]):
-        with pytest.raises(ValueError, match="axes: expected at least one axis of pairs, such as 'interior_distance'"):
+        with pytest.raises(
+            ValueError,
+            match="axes: expected at least one axis of pairs, such as 'interior_distance'",
+        ):
             PairHistogram(axes)
-    with pytest.raises(ValueError, match="samples: expected one of interior, surface, got 'volume'"):
+    with pytest.raises(
+        ValueError, match="samples: expected one of interior, surface, got 'volume'"
+    ):
         PairHistogram(samples="volume")  # type: ignore[arg-type]
 
 
@@ -547,7 +691,8 @@ def test_a_single_sample_forms_no_pair(argument: str) -> None:
 
 def test_bad_batch_is_refused(batch: SignatureBatch) -> None:
     with pytest.raises(
-        ValueError, match=r"expected the interior samples to have 'charge', got \['depth', 'surface_direction'\]"
+        ValueError,
+        match=r"expected the interior samples to have 'charge', got \['depth', 'surface_direction'\]",
     ):
         PairHistogram([Attribute("charge", [0.1, 0.2]), InteriorDistance()])(batch)
     broken = batch_of(torch.rand(1, 5, 3), None, None, {"depth": torch.full((1, 5), torch.nan)})

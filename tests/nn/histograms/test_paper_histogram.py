@@ -12,7 +12,9 @@ from igps.nn._kernels.pairs import class_pairs
 from igps.nn.histograms import pair_histogram
 
 
-def by_loops(embedding: np.ndarray, potential: np.ndarray, d_max: float, u_max: float, c: int, b: int) -> np.ndarray:
+def by_loops(
+    embedding: np.ndarray, potential: np.ndarray, d_max: float, u_max: float, c: int, b: int
+) -> np.ndarray:
     """The definition, one pair at a time."""
     rows = {pair: i for i, pair in enumerate(class_pairs(c))}
     histogram = np.zeros((len(rows), b))
@@ -36,17 +38,23 @@ def cloud() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize(("n_classes", "n_bins"), [(1, 64), (4, 64), (3, 7), (8, 2)])
-def test_equals_brute_force_loop(cloud: tuple[torch.Tensor, torch.Tensor], n_classes: int, n_bins: int) -> None:
+def test_equals_brute_force_loop(
+    cloud: tuple[torch.Tensor, torch.Tensor], n_classes: int, n_bins: int
+) -> None:
     embedding, potential = cloud
     expected = by_loops(embedding.numpy(), potential.numpy(), 4.0, 1.5, n_classes, n_bins)
     result = pair_histogram(embedding, potential, n_classes=n_classes, n_bins=n_bins)
     np.testing.assert_allclose(result, expected, atol=1e-12)
-    single = pair_histogram(embedding.float(), potential.float(), n_classes=n_classes, n_bins=n_bins)
+    single = pair_histogram(
+        embedding.float(), potential.float(), n_classes=n_classes, n_bins=n_bins
+    )
     assert single.dtype == torch.float32
     np.testing.assert_allclose(single, expected, atol=1e-6)
 
 
-def test_values_beyond_the_ranges_stay_in_the_last_cells(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_values_beyond_the_ranges_stay_in_the_last_cells(
+    cloud: tuple[torch.Tensor, torch.Tensor],
+) -> None:
     embedding, potential = cloud
     far = pair_histogram(embedding * 100, potential * 100)
     assert far.sum() == pytest.approx(1)
@@ -58,7 +66,9 @@ def test_values_beyond_the_ranges_stay_in_the_last_cells(cloud: tuple[torch.Tens
 def test_does_not_depend_on_order_or_on_the_basis(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
     embedding, potential = cloud
     order = torch.randperm(len(embedding), generator=torch.Generator().manual_seed(0))
-    rotation = torch.linalg.qr(torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))).Q
+    rotation = torch.linalg.qr(
+        torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    ).Q
     turned = pair_histogram(embedding[order] @ rotation, potential[order])
     np.testing.assert_allclose(turned, pair_histogram(embedding, potential), atol=1e-10)
 
@@ -67,13 +77,19 @@ def test_does_not_depend_on_order_or_on_the_basis(cloud: tuple[torch.Tensor, tor
     ("embedding", "potential", "message"),
     [
         (torch.zeros(1, 3), torch.zeros(1), "two points"),
-        (torch.zeros(5, 3), torch.zeros(4), r"potential: expected shape \(5,\), one per point, got \(4,\)"),
+        (
+            torch.zeros(5, 3),
+            torch.zeros(4),
+            r"potential: expected shape \(5,\), one per point, got \(4,\)",
+        ),
         (torch.zeros(5), torch.zeros(5), r"embedding: expected shape \(P, D\), got \(5,\)"),
         (torch.full((5, 3), torch.nan), torch.zeros(5), "finite"),
         (torch.zeros(5, 3), -torch.ones(5), "non-negative"),
     ],
 )
-def test_bad_input_is_refused(embedding: torch.Tensor, potential: torch.Tensor, message: str) -> None:
+def test_bad_input_is_refused(
+    embedding: torch.Tensor, potential: torch.Tensor, message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         pair_histogram(embedding, potential)
 
@@ -87,9 +103,12 @@ def test_half_precision_is_counted_in_single(cloud: tuple[torch.Tensor, torch.Te
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("n_bins", 1), ("n_classes", 0), ("distance_range", 0.0), ("potential_range", -1.0)]
+    ("name", "value"),
+    [("n_bins", 1), ("n_classes", 0), ("distance_range", 0.0), ("potential_range", -1.0)],
 )
-def test_bad_layout_is_refused(cloud: tuple[torch.Tensor, torch.Tensor], name: str, value: float) -> None:
+def test_bad_layout_is_refused(
+    cloud: tuple[torch.Tensor, torch.Tensor], name: str, value: float
+) -> None:
     with pytest.raises(ValueError, match=f"{name}: expected .*, got {value}"):
         pair_histogram(*cloud, **{name: value})
 

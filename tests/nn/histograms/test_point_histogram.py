@@ -40,8 +40,10 @@ def test_it_is_the_share_of_samples_in_each_cell() -> None:
         points = batch.surface.points[i, real] / batch.area[i].sqrt().float()
         directions = batch.surface.attributes["surface_direction"][i, real]
         radii = ball_radii(points[None], directions[None], real[real][None])[0].log()
-        inside, outside = ([math.log(a) + k * math.log(b / a) / (n - 1) for k in range(n)] for a, b, n in
-                           ((0.05, 0.6, 3), (0.05, 0.9, 2)))  # fmt: skip
+        inside, outside = (
+            [math.log(a) + k * math.log(b / a) / (n - 1) for k in range(n)]
+            for a, b, n in ((0.05, 0.6, 3), (0.05, 0.9, 2))
+        )
         memberships = product(
             soft_classes(radii[:, 0], inside),
             soft_classes(radii[:, 1], outside),
@@ -71,12 +73,16 @@ def test_needs() -> None:
 
 
 def test_what_it_cannot_count_is_named() -> None:
-    with pytest.raises(ValueError, match=r"axes: expected axes of points, got \['EuclideanDistance'\]"):
+    with pytest.raises(
+        ValueError, match=r"axes: expected axes of points, got \['EuclideanDistance'\]"
+    ):
         PointHistogram([EuclideanDistance()])  # type: ignore[list-item]
     with pytest.raises(ValueError, match="axes: expected axes of points"):
         PointHistogram([])
     batch = two_bodies()
-    with pytest.raises(ValueError, match="samples: expected surface samples for ball radii, got interior samples"):
+    with pytest.raises(
+        ValueError, match="samples: expected surface samples for ball radii, got interior samples"
+    ):
         BallRadius().values(SampleFeatures(batch, "interior", batch.interior), SpectralEmbedding())
     with pytest.raises(ValueError, match="side: expected one of inside, outside, got 'left'"):
         BallRadius("left")  # type: ignore[arg-type]
@@ -91,7 +97,9 @@ def test_the_function_counts_memberships_by_masks_and_weights() -> None:
     random = np.random.default_rng(0)
     one, other, weights = random.random((2, 5, 3)), random.random((2, 5, 2)), random.random((2, 5))
     mask = np.array([[True] * 5, [True, True, False, True, False]])
-    expected = np.einsum("npc,npd,np->ncd", one, other, mask * weights) / mask.sum(axis=1)[:, None, None]
+    expected = (
+        np.einsum("npc,npd,np->ncd", one, other, mask * weights) / mask.sum(axis=1)[:, None, None]
+    )
     given = [torch.from_numpy(array).requires_grad_() for array in (one, other, weights)]
 
     def count(one: torch.Tensor, other: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:

@@ -43,7 +43,9 @@ def ball_radii(request: pytest.FixtureRequest) -> Radii:
 
     def radii(points: Tensor, directions: Tensor) -> Tensor:
         leaf = points[None].clone().requires_grad_(not compiled)
-        found = balls.ball_radii(leaf, directions[None], torch.ones(1, len(points), dtype=torch.bool))[0]
+        found = balls.ball_radii(
+            leaf, directions[None], torch.ones(1, len(points), dtype=torch.bool)
+        )[0]
         assert found.requires_grad is not compiled
         return found.detach()
 
@@ -56,7 +58,9 @@ def test_radii_are_those_of_the_definition(ball_radii: Radii) -> None:
     directions = normalize(torch.randn(60, 3, generator=generator, dtype=torch.float64), dim=1)
     found = ball_radii(points, directions)
     for side, column in ((1, 0), (-1, 1)):
-        np.testing.assert_allclose(found[:, column], by_definition(points, directions, side), rtol=1e-6)
+        np.testing.assert_allclose(
+            found[:, column], by_definition(points, directions, side), rtol=1e-6
+        )
 
 
 def test_near_points_keep_their_digits_in_single_precision(ball_radii: Radii) -> None:
@@ -84,14 +88,18 @@ def test_a_rod_is_as_thick_as_it_is(ball_radii: Radii) -> None:
     assert 0.045 < float(radii.median()) < 0.055
 
 
-def test_two_plates_have_half_their_thickness_inside_and_half_their_gap_outside(ball_radii: Radii) -> None:
+def test_two_plates_have_half_their_thickness_inside_and_half_their_gap_outside(
+    ball_radii: Radii,
+) -> None:
     plates = [trimesh.creation.box((0.6, 0.6, 0.1)) for _ in range(2)]
     plates[1].apply_translation((0, 0, 0.3))  # a gap of 0.2
     points, directions = on(trimesh.util.concatenate(plates), 4000)
     inner = points[:, :2].abs().amax(dim=1) < 0.15
     radii = ball_radii(points, directions)
     assert float(radii[inner, 0].median()) == pytest.approx(0.05, rel=0.1)
-    into_the_gap = inner & (((points[:, 2] - 0.05).abs() < 1e-6) | ((points[:, 2] - 0.25).abs() < 1e-6))
+    into_the_gap = inner & (
+        ((points[:, 2] - 0.05).abs() < 1e-6) | ((points[:, 2] - 0.25).abs() < 1e-6)
+    )
     assert float(radii[into_the_gap, 1].median()) == pytest.approx(0.1, rel=0.1)
 
 
@@ -107,7 +115,9 @@ def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii: Radi
 def test_three_samples_are_enough_and_two_are_not(ball_radii: Radii) -> None:
     points, outward = torch.eye(3), torch.tensor([0.0, 0.0, 1.0])
     assert ball_radii(points, outward.expand(3, 3)).tolist() == [[10.0, 10.0]] * 3
-    with pytest.raises(ValueError, match="samples: expected at least 3 of each body for its balls, got 2"):
+    with pytest.raises(
+        ValueError, match="samples: expected at least 3 of each body for its balls, got 2"
+    ):
         ball_radii(points[:2], outward.expand(2, 3))
 
 
@@ -119,7 +129,9 @@ def test_points_that_coincide_touch_no_ball(ball_radii: Radii) -> None:
 def test_what_is_not_finite_is_refused(ball_radii: Radii) -> None:
     points = torch.eye(3)
     points[1, 1] = torch.nan
-    with pytest.raises(ValueError, match="expected finite points and directions, got NaN or infinity"):
+    with pytest.raises(
+        ValueError, match="expected finite points and directions, got NaN or infinity"
+    ):
         ball_radii(points, torch.eye(3))
 
 
@@ -131,7 +143,9 @@ def test_padding_does_not_change_radii(ball_radii: Radii) -> None:
     for fill in (0.0, torch.nan):
         padded = points.masked_fill(~mask[:, :, None], fill)
         for gradient in (False, True):
-            found = balls.ball_radii(padded.clone().requires_grad_(gradient), directions, mask).detach()
+            found = balls.ball_radii(
+                padded.clone().requires_grad_(gradient), directions, mask
+            ).detach()
             assert (found[1, 11:] == 1).all()
             for i, n in enumerate((30, 11)):
                 torch.testing.assert_close(

@@ -17,9 +17,16 @@ def bodies(*copies: int) -> SignatureBatch:
     """Bodies of 40 interior samples, each of which occurs several times."""
     body = alone(two_bodies(), 0)
     return SignatureBatch.concatenate(
-        [replace(body, interior=body.interior.map(lambda values, n=n: values.repeat(1, n, *[1] * (values.ndim - 2))))
-         for n in copies]
-    )  # fmt: skip
+        [
+            replace(
+                body,
+                interior=body.interior.map(
+                    lambda values, n=n: values.repeat(1, n, *[1] * (values.ndim - 2))
+                ),
+            )
+            for n in copies
+        ]
+    )
 
 
 @pytest.mark.parametrize(
@@ -33,7 +40,10 @@ def bodies(*copies: int) -> SignatureBatch:
     ],
 )
 def test_groups_are_padded_to_their_largest_body(
-    copies: tuple[int, ...], on_cpu: bool, widths: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
+    copies: tuple[int, ...],
+    on_cpu: bool,
+    widths: list[tuple[int, int]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda device: on_cpu)
     batch, found = bodies(*copies), []
@@ -71,19 +81,25 @@ def test_padding_beyond_the_largest_body_is_cut() -> None:
 @pytest.mark.parametrize("several", [False, True])
 def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several: bool) -> None:
     histogram = PairHistogram(["interior_distance"], samples="interior")
-    descriptor = HistogramDescriptor([histogram, PairHistogram(samples="surface")] if several else histogram)
+    descriptor = HistogramDescriptor(
+        [histogram, PairHistogram(samples="surface")] if several else histogram
+    )
     batch = bodies(1, 30, 2)
 
     def described(batch: SignatureBatch) -> tuple[Tensor, Tensor]:
         functions = batch.interior.eigenfunctions.clone().requires_grad_()
-        result = descriptor(replace(batch, interior=replace(batch.interior, eigenfunctions=functions)))
+        result = descriptor(
+            replace(batch, interior=replace(batch.interior, eigenfunctions=functions))
+        )
         return result.detach(), torch.autograd.grad(result.square().sum(), functions)[0]
 
     descriptions, gradients = described(batch)
     for i in range(3):
         description, gradient = described(alone(batch, i))
         torch.testing.assert_close(descriptions[i], description[0], rtol=0, atol=1e-6)
-        torch.testing.assert_close(gradients[i, : gradient.shape[1]], gradient[0], rtol=1e-4, atol=1e-7)
+        torch.testing.assert_close(
+            gradients[i, : gradient.shape[1]], gradient[0], rtol=1e-4, atol=1e-7
+        )
         assert not gradients[i, gradient.shape[1] :].any()
 
 
@@ -92,7 +108,9 @@ def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body() -> None:
 
     def second_derivatives(batch: SignatureBatch) -> Tensor:
         functions = batch.interior.eigenfunctions.double().requires_grad_()
-        result = descriptor(replace(batch, interior=replace(batch.interior, eigenfunctions=functions)))
+        result = descriptor(
+            replace(batch, interior=replace(batch.interior, eigenfunctions=functions))
+        )
         gradient = torch.autograd.grad(result.square().sum(), functions, create_graph=True)[0]
         return torch.autograd.grad(gradient.square().sum(), functions)[0]
 
@@ -100,4 +118,6 @@ def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body() -> None:
     for i in range(3):
         expected = second_derivatives(alone(batch, i))[0]
         assert expected.any()
-        torch.testing.assert_close(found[i, : len(expected), : expected.shape[1]], expected, rtol=1e-6, atol=1e-12)
+        torch.testing.assert_close(
+            found[i, : len(expected), : expected.shape[1]], expected, rtol=1e-6, atol=1e-12
+        )

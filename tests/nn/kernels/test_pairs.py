@@ -18,7 +18,13 @@ from conftest import torch_threads
 from igps import _threads as threads
 from igps.nn._kernels import blocks, count_by_loops, count_by_torch
 from igps.nn._kernels.pairs import class_pairs
-from igps.nn.axes import PairValues, euclidean_distances, oriented_pairs, pair_twists, point_pair_features
+from igps.nn.axes import (
+    PairValues,
+    euclidean_distances,
+    oriented_pairs,
+    pair_twists,
+    point_pair_features,
+)
 from igps.nn.histograms import joint_histogram
 from loops import Axis, cosines, distances, pair_histogram_by_loops, twists
 
@@ -26,8 +32,13 @@ FEW = [0.3, 0.5, 0.52, 1.9]
 EQUAL = [0.25, 0.75, 1.25, 1.75, 2.25]
 MANY = [0.1, 0.4, 0.401, 0.4012, 0.4013, 0.7, 0.9, 1.0, 1.1, 1.15, 1.3, 1.5, 1.6, 1.9, 2.2, 2.9]
 TOWARDS, AMONG, TWISTS = [-0.7, 0.1, 0.6], [-0.5, 0.3], [-0.4, 0.0, 0.4]
-BACK_ENDS = ["compiled", "torch", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(),
-                                                                                reason="no CUDA device"))]  # fmt: skip
+BACK_ENDS = [
+    "compiled",
+    "torch",
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+    ),
+]
 
 
 @pytest.fixture(params=BACK_ENDS)
@@ -67,7 +78,9 @@ def differences(heights: Tensor, centres: Tensor) -> PairValues:
 
 
 def centres(values: Sequence[float], like: Tensor) -> Tensor:
-    return torch.tensor(values, dtype=torch.promote_types(like.dtype, torch.float32), device=like.device)
+    return torch.tensor(
+        values, dtype=torch.promote_types(like.dtype, torch.float32), device=like.device
+    )
 
 
 # Layouts of axes, each with what is counted and what a loop counts.
@@ -92,7 +105,9 @@ KINDS: dict[str, tuple[Callable[..., PairValues], Callable[..., list[Axis]]]] = 
         lambda s: oriented_pairs(
             s["points"], s["directions"], centres(TOWARDS, s["points"]), centres(AMONG, s["points"])
         ),
-        lambda s: list(zip(cosines(s["points"], s["directions"]), (TOWARDS, TOWARDS, AMONG), strict=True)),
+        lambda s: list(
+            zip(cosines(s["points"], s["directions"]), (TOWARDS, TOWARDS, AMONG), strict=True)
+        ),
     ),
     "twists": (
         lambda s: pair_twists(s["points"], s["directions"], centres(TWISTS, s["points"])),
@@ -100,16 +115,31 @@ KINDS: dict[str, tuple[Callable[..., PairValues], Callable[..., list[Axis]]]] = 
     ),
     "cosines of five": (
         lambda s: oriented_pairs(
-            s["coordinates"], normalize(s["coordinates"].roll(1, 0), dim=1), *[centres(AMONG, s["points"])] * 2
+            s["coordinates"],
+            normalize(s["coordinates"].roll(1, 0), dim=1),
+            *[centres(AMONG, s["points"])] * 2,
         ),
-        lambda s: [(v, AMONG) for v in cosines(s["coordinates"], normalize(s["coordinates"].roll(1, 0), dim=1))],
+        lambda s: [
+            (v, AMONG)
+            for v in cosines(s["coordinates"], normalize(s["coordinates"].roll(1, 0), dim=1))
+        ],
     ),
 }
 LAYOUTS = [
-    ["equal"], ["many"], ["own"], ["few", "many"], ["equal", "own"], ["few", "equal", "many"], ["cosines"],
-    ["few", "cosines"], ["cosines", "equal"], ["own", "cosines", "many"], ["cosines", "cosines of five"],
-    ["twists"], ["equal", "twists"],
-]  # fmt: skip
+    ["equal"],
+    ["many"],
+    ["own"],
+    ["few", "many"],
+    ["equal", "own"],
+    ["few", "equal", "many"],
+    ["cosines"],
+    ["few", "cosines"],
+    ["cosines", "equal"],
+    ["own", "cosines", "many"],
+    ["cosines", "cosines of five"],
+    ["twists"],
+    ["equal", "twists"],
+]
 
 
 def counted(layout: Sequence[str], given: dict[str, Tensor]) -> Tensor:
@@ -119,7 +149,11 @@ def counted(layout: Sequence[str], given: dict[str, Tensor]) -> Tensor:
 @pytest.mark.parametrize("layout", LAYOUTS, ids=" × ".join)
 @pytest.mark.parametrize(("n_classes", "block"), [(1, None), (3, None), (3, (1, 4)), (3, (5, 6))])
 def test_histogram_is_the_sum_of_hats_over_all_pairs(
-    device: str, layout: list[str], n_classes: int, block: tuple[int, int] | None, monkeypatch: pytest.MonkeyPatch
+    device: str,
+    layout: list[str],
+    n_classes: int,
+    block: tuple[int, int] | None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     given = some(n_classes=n_classes)
     if block is not None:
@@ -127,10 +161,14 @@ def test_histogram_is_the_sum_of_hats_over_all_pairs(
         n_values = max(1, sum("cosines" not in kind for kind in layout))
         monkeypatch.setattr(count_by_loops, "_MAX_COLUMNS", n_columns)
         monkeypatch.setattr(count_by_loops, "_BLOCK_SIZE", n_rows * n_columns * n_values)
-        monkeypatch.setattr(count_by_torch, "_BLOCK", n_rows * len(given["points"]) * 4 ** len(layout))
+        monkeypatch.setattr(
+            count_by_torch, "_BLOCK", n_rows * len(given["points"]) * 4 ** len(layout)
+        )
     result = counted(layout, {name: value.to(device) for name, value in given.items()}).cpu()
     axes = [axis for kind in layout for axis in KINDS[kind][1](given)]
-    np.testing.assert_allclose(result, pair_histogram_by_loops(given["memberships"], axes), atol=1e-12)
+    np.testing.assert_allclose(
+        result, pair_histogram_by_loops(given["memberships"], axes), atol=1e-12
+    )
     assert float(result.sum()) == pytest.approx(1, abs=1e-12)
     single = counted(layout, {name: value.float().to(device) for name, value in given.items()})
     assert single.dtype == torch.float32
@@ -139,19 +177,33 @@ def test_histogram_is_the_sum_of_hats_over_all_pairs(
 
 @pytest.mark.parametrize(
     "layout",
-    [[0.5, 0.5 + 1e-9, 0.5 + 2e-9, 0.9, 0.9001, 1.1], [1e-3, 1e4], [-1.0, 0.7, 0.8], [-2.0, -1.0], [0.001, 0.002]],
+    [
+        [0.5, 0.5 + 1e-9, 0.5 + 2e-9, 0.9, 0.9001, 1.1],
+        [1e-3, 1e4],
+        [-1.0, 0.7, 0.8],
+        [-2.0, -1.0],
+        [0.001, 0.002],
+    ],
 )
 def test_any_spacing_of_centres_is_exact(device: str, layout: list[float]) -> None:
     given = some(40)
-    pairs = [euclidean_distances(given["coordinates"].to(device), centres(layout, given["points"]).to(device))]
+    pairs = [
+        euclidean_distances(
+            given["coordinates"].to(device), centres(layout, given["points"]).to(device)
+        )
+    ]
     result = joint_histogram(given["memberships"].to(device), pairs)
-    expected = pair_histogram_by_loops(given["memberships"], [(distances(given["coordinates"]), layout)])
+    expected = pair_histogram_by_loops(
+        given["memberships"], [(distances(given["coordinates"]), layout)]
+    )
     np.testing.assert_allclose(result.cpu(), expected, atol=1e-12)
 
 
 def test_distance_on_a_centre_is_exact(device: str) -> None:
     line = torch.arange(9, dtype=torch.float64, device=device)[:, None]
-    result = joint_histogram(torch.ones_like(line), [euclidean_distances(line, centres([1, 3, 4, 7], line))])
+    result = joint_histogram(
+        torch.ones_like(line), [euclidean_distances(line, centres([1, 3, 4, 7], line))]
+    )
     n = {d: 9 - d for d in range(1, 9)}
     expected = [n[1] + n[2] / 2, n[2] / 2 + n[3]]
     expected += [n[4] + n[5] * 2 / 3 + n[6] / 3, n[5] / 3 + n[6] * 2 / 3 + n[7] + n[8]]
@@ -163,8 +215,12 @@ def test_narrow_ramps_tend_to_a_plain_histogram(device: str) -> None:
     coordinates = some(60)["coordinates"].to(device)
     edges = torch.tensor([0.5, 1.0, 1.7, 2.0], dtype=torch.float64)
     layout = torch.stack([edges - 1e-9, edges + 1e-9], dim=1).flatten().to(device)
-    result = joint_histogram(coordinates.new_ones(60, 1), [euclidean_distances(coordinates, layout)])[0].cpu()
-    counts = np.histogram(torch.pdist(coordinates).cpu(), [0, *edges.tolist(), np.inf])[0] / (60 * 59 / 2)
+    result = joint_histogram(
+        coordinates.new_ones(60, 1), [euclidean_distances(coordinates, layout)]
+    )[0].cpu()
+    counts = np.histogram(torch.pdist(coordinates).cpu(), [0, *edges.tolist(), np.inf])[0] / (
+        60 * 59 / 2
+    )
     # Within an interval between close pairs, the count is shared by its two ends.
     merged = [result[0], *result[1:-1].view(-1, 2).sum(dim=1), result[-1]]
     np.testing.assert_allclose(torch.stack(merged), counts, atol=1e-12)
@@ -185,7 +241,10 @@ def test_whole_pairs_of_single_precision_are_as_those_of_double(layout: list[flo
     points = torch.randn(2300, 3, generator=generator).sort(dim=0).values * 0.4
     memberships = one_hot(torch.randint(3, (2300,), generator=generator), 3).double()
     result, expected = (
-        joint_histogram(memberships.to(dtype), [euclidean_distances(points.to(dtype), torch.tensor(layout).to(dtype))])
+        joint_histogram(
+            memberships.to(dtype),
+            [euclidean_distances(points.to(dtype), torch.tensor(layout).to(dtype))],
+        )
         for dtype in (torch.float32, torch.float64)
     )
     np.testing.assert_allclose(result, expected, atol=1e-7)
@@ -197,7 +256,8 @@ def test_a_block_of_pairs_that_all_fall_into_one_bin(spread: float, bin_of_all: 
     points = torch.arange(1.0, 2401.0)[:, None] * spread
     expected = one_hot(torch.tensor([bin_of_all]), 5).float()
     assert torch.equal(
-        joint_histogram(torch.ones(2400, 1), [euclidean_distances(points, torch.tensor(EQUAL))]), expected
+        joint_histogram(torch.ones(2400, 1), [euclidean_distances(points, torch.tensor(EQUAL))]),
+        expected,
     )
 
 
@@ -213,7 +273,9 @@ def test_features_are_those_of_a_loop() -> None:
     given = some(12)
     i, j = np.triu_indices(12, 1)
     expected = cosines(given["points"], given["directions"])
-    for feature, one in zip(point_pair_features(given["points"], given["directions"]), expected, strict=True):
+    for feature, one in zip(
+        point_pair_features(given["points"], given["directions"]), expected, strict=True
+    ):
         np.testing.assert_allclose(feature, one[i, j], atol=1e-12)
 
 
@@ -234,14 +296,20 @@ def test_points_that_coincide_have_no_line(device: str) -> None:
     first, second, _ = point_pair_features(points, directions)
     assert first == second == 0
     angles = torch.tensor([-1.0, 0.0, 1.0], device=device)
-    result = joint_histogram(points.new_ones(2, 1), [oriented_pairs(points, directions, angles, angles)])
+    result = joint_histogram(
+        points.new_ones(2, 1), [oriented_pairs(points, directions, angles, angles)]
+    )
     assert float(result[0, 1, 1].sum()) == pytest.approx(1)
 
 
 def test_a_reflection_turns_the_order_of_twists(device: str) -> None:
     given = {name: values.to(device) for name, values in some().items()}
     mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64, device=device)
-    mirrored = {**given, "points": given["points"] * mirror, "directions": given["directions"] * mirror}
+    mirrored = {
+        **given,
+        "points": given["points"] * mirror,
+        "directions": given["directions"] * mirror,
+    }
     counts = counted(["equal", "twists"], given)
     assert float((counts - counts.flip(-1)).abs().max()) > 1e-3
     torch.testing.assert_close(counted(["equal", "twists"], mirrored), counts.flip(-1))
@@ -270,14 +338,19 @@ def test_no_cell_is_negative(device: str, joint: bool) -> None:
     below = torch.nextafter(layout[1:].cpu(), torch.zeros(())).repeat(20)
     length = torch.cat([below, below * (1 - 6e-8 * torch.rand(len(below), generator=generator))])
     ends = torch.zeros(len(length), 2, 3)
-    ends[:, 1] = length[:, None] * normalize(torch.randn(len(length), 3, generator=generator), dim=1)
+    ends[:, 1] = length[:, None] * normalize(
+        torch.randn(len(length), 3, generator=generator), dim=1
+    )
     soft = torch.rand(len(length), 2, 1, generator=generator)
     axes = [ends, ends.roll(1, dims=2)] if joint else [ends]
     result = joint_histogram(
-        torch.cat([soft, 1 - soft], dim=2).to(device), [euclidean_distances(one.to(device), layout) for one in axes]
+        torch.cat([soft, 1 - soft], dim=2).to(device),
+        [euclidean_distances(one.to(device), layout) for one in axes],
     )
     assert result.min() >= 0
-    torch.testing.assert_close(result.flatten(1).sum(dim=1), torch.ones(len(length), device=device), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        result.flatten(1).sum(dim=1), torch.ones(len(length), device=device), atol=1e-6, rtol=0
+    )
 
 
 def test_no_cell_of_cosines_is_negative(device: str) -> None:
@@ -288,7 +361,10 @@ def test_no_cell_of_cosines_is_negative(device: str) -> None:
     directions = torch.stack([both.cos(), both.sin(), torch.zeros_like(both)], dim=2)
     points = torch.zeros(800, 2, 3)
     points[:, 1, 0] = (0.75 - below).expand(-1, 20).flatten()
-    angles, bins = (torch.arange(5) * 0.4 - 0.8).to(device), (torch.arange(6) * 0.5 + 0.25).to(device)
+    angles, bins = (
+        (torch.arange(5) * 0.4 - 0.8).to(device),
+        (torch.arange(6) * 0.5 + 0.25).to(device),
+    )
     pairs = [
         euclidean_distances(points.to(device), bins),
         oriented_pairs(points.to(device), directions.to(device), angles, angles),
@@ -305,9 +381,13 @@ def test_shapes_of_any_sizes_are_counted_as_alone(device: str) -> None:
     }
     mask = torch.arange(40, device=device) < torch.tensor(sizes, device=device)[:, None]
     layout = centres(MANY, padded["points"])
-    together = joint_histogram(padded["memberships"], [euclidean_distances(padded["coordinates"], layout)], mask)
+    together = joint_histogram(
+        padded["memberships"], [euclidean_distances(padded["coordinates"], layout)], mask
+    )
     for found, one in zip(together, shapes, strict=True):
-        expected = joint_histogram(one["memberships"], [euclidean_distances(one["coordinates"], layout)])
+        expected = joint_histogram(
+            one["memberships"], [euclidean_distances(one["coordinates"], layout)]
+        )
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
@@ -320,11 +400,21 @@ def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
         with torch_threads(n_threads):
             histogram = counted(["many", "cosines"], given)
             if upstream is None:
-                upstream = torch.randn(histogram.shape, generator=torch.Generator().manual_seed(4)).double()
-            leaves = [given[name] for name in ("memberships", "coordinates", "points", "directions")]
+                upstream = torch.randn(
+                    histogram.shape, generator=torch.Generator().manual_seed(4)
+                ).double()
+            leaves = [
+                given[name] for name in ("memberships", "coordinates", "points", "directions")
+            ]
             results.append([histogram.detach(), *torch.autograd.grad(histogram, leaves, upstream)])
-            with ThreadPoolExecutor(1) as pool:  # a new thread inherits what the workers must not have changed
-                assert pool.submit(torch.get_num_threads).result() == torch.get_num_threads() == n_threads
+            with ThreadPoolExecutor(
+                1
+            ) as pool:  # a new thread inherits what the workers must not have changed
+                assert (
+                    pool.submit(torch.get_num_threads).result()
+                    == torch.get_num_threads()
+                    == n_threads
+                )
     for other in results[1:]:
         assert all(torch.equal(one, same) for one, same in zip(results[0], other, strict=True))
 
@@ -341,7 +431,9 @@ def dense(memberships: Tensor, values: Sequence[Tensor], layouts: Sequence[Tenso
         shares = share if shares is None else shares.unsqueeze(-1) * share
     rows = []
     for a, b in class_pairs(memberships.shape[1]):
-        weight = memberships[i, a] * memberships[j, b] + (memberships[i, b] * memberships[j, a] if a != b else 0)
+        weight = memberships[i, a] * memberships[j, b] + (
+            memberships[i, b] * memberships[j, a] if a != b else 0
+        )
         rows.append(torch.tensordot(weight, shares, dims=1))
     return torch.stack(rows) / len(i)
 
@@ -366,7 +458,11 @@ def test_gradients_equal_those_of_the_dense_definition(
             points, directions = one.inputs
             line = normalize(points[j] - points[i], dim=1)
             ends = [(directions[i] * line).sum(dim=1), -(directions[j] * line).sum(dim=1)]
-            values += [torch.maximum(*ends), torch.minimum(*ends), (directions[i] * directions[j]).sum(dim=1)]
+            values += [
+                torch.maximum(*ends),
+                torch.minimum(*ends),
+                (directions[i] * directions[j]).sum(dim=1),
+            ]
         elif kind == "twists":
             way = one.inputs[0][j] - one.inputs[0][i]
             turned = torch.linalg.cross(one.inputs[1][i], one.inputs[1][j])
@@ -378,7 +474,9 @@ def test_gradients_equal_those_of_the_dense_definition(
     leaves = list({id(leaf): leaf for leaf in leaves}.values())
     expected = dense(given["memberships"], values, [c for one in pairs for c in one.centres])
     result = joint_histogram(given["memberships"], pairs)
-    upstream = torch.randn(result.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64).to(device)
+    upstream = torch.randn(
+        result.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64
+    ).to(device)
     for by_hand, by_torch in zip(
         torch.autograd.grad(result, leaves, upstream, retain_graph=True),
         torch.autograd.grad(expected, leaves, upstream),
@@ -391,12 +489,17 @@ def test_gradients_equal_those_of_the_dense_definition(
 @pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"], ["twists"]])
 def test_gradcheck(device: str, layout: list[str]) -> None:
     given = some(7, n_classes=2, seed=1)
-    names = ["memberships", *dict.fromkeys({"many": "coordinates", "own": "heights"}.get(k, "points") for k in layout)]
+    names = [
+        "memberships",
+        *dict.fromkeys({"many": "coordinates", "own": "heights"}.get(k, "points") for k in layout),
+    ]
     leaves = [given[name].to(device).requires_grad_() for name in names]
 
     def histogram(logits: Tensor, *others: Tensor) -> Tensor:
         moved = dict(zip(names, (logits.softmax(dim=1), *others), strict=True))
-        return counted(layout, {**{name: value.to(device) for name, value in given.items()}, **moved})
+        return counted(
+            layout, {**{name: value.to(device) for name, value in given.items()}, **moved}
+        )
 
     for gradient in torch.autograd.grad(histogram(*leaves).square().sum(), leaves):
         assert (gradient.abs() > 1e-9).any()
@@ -449,12 +552,27 @@ def good() -> dict[str, Tensor]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({name: value[:1] for name, value in some(5, 2).items()}, "two points to form a pair, got 1"),
-        ({"points": torch.zeros(4, 3)}, r"expected values for each of 5 points, got shape \(4, 3\)"),
+        (
+            {name: value[:1] for name, value in some(5, 2).items()},
+            "two points to form a pair, got 1",
+        ),
+        (
+            {"points": torch.zeros(4, 3)},
+            r"expected values for each of 5 points, got shape \(4, 3\)",
+        ),
         ({"points": torch.full((5, 3), torch.nan)}, "expected finite values, got NaN or infinity"),
-        ({"coordinates": torch.full((5, 3), torch.inf)}, "expected finite values, got NaN or infinity"),
-        ({"points": torch.tensor([[-1e19], [1e19]] * 2 + [[0.0]])}, "expected distances that can be squared"),
-        ({"memberships": torch.full((5, 2), 0.4)}, "memberships: expected non-negative rows of sum 1"),
+        (
+            {"coordinates": torch.full((5, 3), torch.inf)},
+            "expected finite values, got NaN or infinity",
+        ),
+        (
+            {"points": torch.tensor([[-1e19], [1e19]] * 2 + [[0.0]])},
+            "expected distances that can be squared",
+        ),
+        (
+            {"memberships": torch.full((5, 2), 0.4)},
+            "memberships: expected non-negative rows of sum 1",
+        ),
         ({"memberships": torch.tensor([[1.5, -0.5]] * 5)}, "non-negative"),
         ({"memberships": torch.full((5, 2), torch.nan)}, "sum 1"),
     ],
@@ -471,14 +589,21 @@ def test_bad_points_are_refused(
 @pytest.mark.parametrize("layout", [[0.5, 0.5, 1.0], [0.5, torch.inf], [torch.nan, 1.0], [1.0], []])
 def test_bad_centres_are_refused(layout: list[float]) -> None:
     points, bins = torch.rand(5, 3), torch.tensor(layout)
-    for pairs in ([euclidean_distances(points, bins)], [oriented_pairs(points, points, bins, torch.rand(2).sort()[0])]):
-        with pytest.raises(ValueError, match="centres: expected two or more finite, ascending values"):
+    for pairs in (
+        [euclidean_distances(points, bins)],
+        [oriented_pairs(points, points, bins, torch.rand(2).sort()[0])],
+    ):
+        with pytest.raises(
+            ValueError, match="centres: expected two or more finite, ascending values"
+        ):
             joint_histogram(torch.ones(5, 1), pairs)
 
 
 def test_directions_are_of_the_shape_of_the_points() -> None:
     points, layout = torch.rand(10, 3), torch.tensor([0.0, 1.0])
-    with pytest.raises(ValueError, match=r"directions: expected the shape of the points, \(10, 3\), got \(10, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"directions: expected the shape of the points, \(10, 3\), got \(10, 2\)"
+    ):
         oriented_pairs(points, points[:, :2], layout, layout)
     for inputs in ((points * torch.inf, points), (points, points * torch.inf)):
         with pytest.raises(ValueError, match="expected finite values"):

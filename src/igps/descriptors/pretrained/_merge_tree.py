@@ -20,7 +20,9 @@ class MergeTree(NamedTuple):
     pieces: Tensor  # (L, P) the peak of the component of each point at each level; −1 for points below the level
 
 
-def merge_trees(features: SampleFeatures, embedding: nn.Module, levels: Sequence[float] = ()) -> tuple[Tensor, Tensor]:
+def merge_trees(
+    features: SampleFeatures, embedding: nn.Module, levels: Sequence[float] = ()
+) -> tuple[Tensor, Tensor]:
     """Compute the merge tree of log U for the samples of each body, where U is the barycentroid potential.
 
     Two samples are neighbours if one is among the nearest to the other in the embedding. The levels (L,) are sizes of
@@ -35,7 +37,9 @@ def merge_trees(features: SampleFeatures, embedding: nn.Module, levels: Sequence
         ValueError: a potential is not finite, or a body has no samples.
     """
     values, neighbours = features.log_potential(embedding).detach(), features.neighbours(embedding)
-    saddles_and_pieces: tuple[Tensor, Tensor] = _operator(values, neighbours, features.samples.mask, list(levels))
+    saddles_and_pieces: tuple[Tensor, Tensor] = _operator(
+        values, neighbours, features.samples.mask, list(levels)
+    )
     return saddles_and_pieces
 
 
@@ -44,26 +48,36 @@ def merge_trees(features: SampleFeatures, embedding: nn.Module, levels: Sequence
     mutates_args=(),
     schema="(Tensor values, Tensor neighbours, Tensor mask, float[] levels) -> (Tensor, Tensor)",
 )
-def _operator(values: Tensor, neighbours: Tensor, mask: Tensor, levels: list[float]) -> tuple[Tensor, Tensor]:
+def _operator(
+    values: Tensor, neighbours: Tensor, mask: Tensor, levels: list[float]
+) -> tuple[Tensor, Tensor]:
     saddles, pieces = _empty_outputs(values, neighbours, mask, levels)
     saddles, pieces = saddles.cpu(), pieces.cpu()
-    for i, (heights, nearest, is_sample) in enumerate(zip(values.cpu(), neighbours.cpu(), mask.cpu(), strict=True)):
+    for i, (heights, nearest, is_sample) in enumerate(
+        zip(values.cpu(), neighbours.cpu(), mask.cpu(), strict=True)
+    ):
         if not (n := int(is_sample.sum())):
             raise ValueError("samples: expected at least one of each body, got none.")
-        tree = merge_tree(heights, nearest, [max(1, round(share * n)) for share in levels], is_sample)
+        tree = merge_tree(
+            heights, nearest, [max(1, round(share * n)) for share in levels], is_sample
+        )
         saddles[i] = torch.arange(len(heights), device="cpu").scatter(0, tree.peaks, tree.saddles)
         pieces[i] = tree.pieces
     return saddles.to(values.device), pieces.to(values.device)
 
 
 @_operator.register_fake
-def _empty_outputs(values: Tensor, neighbours: Tensor, mask: Tensor, levels: list[float]) -> tuple[Tensor, Tensor]:
+def _empty_outputs(
+    values: Tensor, neighbours: Tensor, mask: Tensor, levels: list[float]
+) -> tuple[Tensor, Tensor]:
     n_shapes, n_points = values.shape
     saddles = values.new_empty(n_shapes, n_points, dtype=torch.int64)
     return saddles, saddles.new_empty(n_shapes, len(levels), n_points)
 
 
-def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = (), mask: Tensor | None = None) -> MergeTree:
+def merge_tree(
+    values: Tensor, neighbours: Tensor, counts: Sequence[int] = (), mask: Tensor | None = None
+) -> MergeTree:
     """Compute the merge tree of a function on a graph of points. All tensors are on the CPU.
 
     From the highest value down, each point joins the components of its higher neighbours. Where it joins two
@@ -92,13 +106,24 @@ def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = (), m
     by_lower = np.argsort(lower)  # the order of pairs with the same lower point does not matter
     branches = np.empty((len(order), 2), np.int64)
     pieces = np.full((len(counts), len(values)), -1, np.int64)
-    n = _merge(order, higher[by_lower], lower[by_lower], np.array(counts, np.int64), branches, pieces)
-    return MergeTree(torch.from_numpy(branches[:n, 0]), torch.from_numpy(branches[:n, 1]), torch.from_numpy(pieces))
+    n = _merge(
+        order, higher[by_lower], lower[by_lower], np.array(counts, np.int64), branches, pieces
+    )
+    return MergeTree(
+        torch.from_numpy(branches[:n, 0]),
+        torch.from_numpy(branches[:n, 1]),
+        torch.from_numpy(pieces),
+    )
 
 
 @compiled()
 def _merge(
-    order: Integers, higher: Integers, lower: Integers, counts: Integers, branches: Integers, pieces: Integers
+    order: Integers,
+    higher: Integers,
+    lower: Integers,
+    counts: Integers,
+    branches: Integers,
+    pieces: Integers,
 ) -> int:
     """Write the branches and pieces of a merge tree, and return the number of branches.
 

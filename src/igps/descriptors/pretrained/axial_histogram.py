@@ -63,7 +63,12 @@ class AxialHistogram(SampleHistogram):
             raise ValueError(f"n_bins: expected four numbers, each at least 2, got {n_bins}.")
         self.embedding = embedding or SpectralEmbedding()
         self.n_bins = n_bins
-        ends = {"along": (-_REACH, _REACH), "beside": (0, _REACH), "cosine": (-1, 1), "outward": (-1, 1)}
+        ends = {
+            "along": (-_REACH, _REACH),
+            "beside": (0, _REACH),
+            "cosine": (-1, 1),
+            "outward": (-1, 1),
+        }
         for n, (name, (first, last)) in zip(n_bins, ends.items(), strict=True):
             self.register_buffer(name, torch.linspace(first, last, n))
 
@@ -79,32 +84,54 @@ class AxialHistogram(SampleHistogram):
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, 3, ...) histograms of the samples of N shapes."""
-        mask, potential = features.samples.mask, barycentroid_potential(features.embedded(self.embedding))
+        mask, potential = (
+            features.samples.mask,
+            barycentroid_potential(features.embedded(self.embedding)),
+        )
         # Padding may hold any value, and must not count.
         points, directions, potential, sample_weights = (
             values.masked_fill(~mask.view(*mask.shape, *[1] * (values.ndim - 2)), 0)
             for values in (
-                features.positions(), features.attribute("surface_direction"), potential,
+                features.positions(),
+                features.attribute("surface_direction"),
+                potential,
                 features.weights_or_ones(potential),
             )
-        )  # fmt: skip
-        if not torch.compiler.is_compiling() and not torch.isfinite(points.sum() + directions.sum() + potential.sum()):
+        )
+        if not torch.compiler.is_compiling() and not torch.isfinite(
+            points.sum() + directions.sum() + potential.sum()
+        ):
             raise ValueError("AxialHistogram: expected finite values, got NaN or infinity.")
-        with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False) if in_transforms() else nullcontext():
+        with (
+            torch.no_grad(),
+            forward_ad._set_fwd_grad_enabled(False) if in_transforms() else nullcontext(),
+        ):
             weights = potential.double().clamp_min(torch.finfo().tiny).pow(_POWER) * mask
             centre, axes = (values.to(points.dtype) for values in principal_axes(points, weights))
         n_points = mask.sum(dim=1)
         positions, directions = (points - centre) @ axes * mask[:, :, None], directions @ axes
-        positions = positions / (positions.square().sum(dim=(1, 2)) / n_points).sqrt()[:, None, None]
+        positions = (
+            positions / (positions.square().sum(dim=(1, 2)) / n_points).sqrt()[:, None, None]
+        )
         # Components along each axis, (N, 3, P), and along the two other axes, (N, 3, P, 2)
         height, axial = positions.mT, directions.mT
-        across, radial = (torch.stack([values.roll(n, 1) for n in (1, 2)], dim=3) for values in (height, axial))
+        across, radial = (
+            torch.stack([values.roll(n, 1) for n in (1, 2)], dim=3) for values in (height, axial)
+        )
         outward = (radial * normalize(across, dim=3)).sum(dim=3)
-        place = [soft_memberships(height, self.along), soft_memberships(across.norm(dim=3), self.beside)]
+        place = [
+            soft_memberships(height, self.along),
+            soft_memberships(across.norm(dim=3), self.beside),
+        ]
         # Relative to the nearer end of the axis, so that a body and its mirror image agree
         towards_end = torch.where(height < 0, -axial, axial)
-        direction = [soft_memberships(towards_end, self.cosine), soft_memberships(outward, self.outward)]
-        counts = counted(joint(place) * sample_weights[:, None, :, None], joint(direction), n_points[:, None])
+        direction = [
+            soft_memberships(towards_end, self.cosine),
+            soft_memberships(outward, self.outward),
+        ]
+        counts = counted(
+            joint(place) * sample_weights[:, None, :, None], joint(direction), n_points[:, None]
+        )
         return counts.view(-1, *self.shape) / 3
 
 

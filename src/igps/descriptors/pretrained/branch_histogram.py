@@ -67,10 +67,14 @@ class BranchHistogram(SampleHistogram):
             shares = shares * (limbs @ weights[:, :, None])[:, :, 0] / limbs.sum(dim=2).clamp_min(1)
         histogram = functional.pad(shares, (0, self.n_branches - shares.shape[1]))
         # If the potential is constant, the only branch has length 0.
-        return torch.where(total > 0, histogram, functional.pad(torch.ones_like(total), (0, self.n_branches - 1)))
+        return torch.where(
+            total > 0, histogram, functional.pad(torch.ones_like(total), (0, self.n_branches - 1))
+        )
 
 
-def _limbs(saddles: Tensor, longest: Tensor, heights: Tensor, neighbours: Tensor, mask: Tensor) -> Tensor:
+def _limbs(
+    saddles: Tensor, longest: Tensor, heights: Tensor, neighbours: Tensor, mask: Tensor
+) -> Tensor:
     """(B, P) whether each sample belongs to each of the longest branches: to its piece just above its saddle."""
     order = heights.masked_fill(~mask, -torch.inf).argsort(descending=True, stable=True)
     n_above = order.argsort()[saddles[longest]].clamp_min(1)

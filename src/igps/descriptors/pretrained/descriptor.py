@@ -9,7 +9,14 @@ from igps.descriptors.pretrained.axial_histogram import AxialHistogram
 from igps.descriptors.pretrained.branch_histogram import BranchHistogram
 from igps.descriptors.pretrained.piece_histogram import PieceHistogram
 from igps.descriptors.pretrained.spectrum_shares import SpectrumShares
-from igps.nn.axes import BallRadius, EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairCosines, Potential
+from igps.nn.axes import (
+    BallRadius,
+    EmbeddedPairCosines,
+    EuclideanDistance,
+    InteriorDistance,
+    PairCosines,
+    Potential,
+)
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.heads.two_level import TwoLevelHead
@@ -45,13 +52,22 @@ def pretrained_parts() -> HistogramDescriptor:
     n = N_ORIENTED_SAMPLES
     # The spacing of 2,000 samples is 0.022 √area. Thinner parts all belong to the first class.
     balls = [BallRadius("inside", 0.022, 0.25), BallRadius("outside", 0.03, 1.5)]
-    potentials = [Potential(6, 0.9, embedding=embeddings[4], soft=True), Potential(6, 0.96, soft=True)]
+    potentials = [
+        Potential(6, 0.9, embedding=embeddings[4], soft=True),
+        Potential(6, 0.96, soft=True),
+    ]
     return HistogramDescriptor(
         [
             PairHistogram([Potential(4), InteriorDistance(64)], embeddings[64], "surface"),
-            PairHistogram([InteriorDistance(6, 3.0), EmbeddedPairCosines(5)], embeddings[16], n_samples=n),
-            PairHistogram([EuclideanDistance(6, 1.0), PairCosines(5)], embeddings[50], "surface", n_samples=n),
-            PairHistogram([InteriorDistance(8, 3.0), PairCosines(5)], embeddings[50], "surface", n_samples=n),
+            PairHistogram(
+                [InteriorDistance(6, 3.0), EmbeddedPairCosines(5)], embeddings[16], n_samples=n
+            ),
+            PairHistogram(
+                [EuclideanDistance(6, 1.0), PairCosines(5)], embeddings[50], "surface", n_samples=n
+            ),
+            PairHistogram(
+                [InteriorDistance(8, 3.0), PairCosines(5)], embeddings[50], "surface", n_samples=n
+            ),
             AxialHistogram(embeddings[16]),
             PointHistogram([*balls, *potentials], embeddings[16]),
             BranchHistogram(embeddings[16], n_samples=n),
@@ -100,5 +116,7 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
     try:
         module.load_state_dict({name: tensor.float() for name, tensor in load_file(path).items()})
     except RuntimeError as error:
-        raise ValueError(f"{path}: expected the parameters of `pretrained` of this version, got others.") from error
+        raise ValueError(
+            f"{path}: expected the parameters of `pretrained` of this version, got others."
+        ) from error
     return module.eval()

@@ -57,7 +57,9 @@ class PieceHistogram(SampleHistogram):
     ) -> None:
         super().__init__(samples, n_samples, n_training_samples)
         if not levels or list(levels) != sorted(levels) or not 0 < levels[0] <= levels[-1] <= 1:
-            raise ValueError(f"levels: expected shares above 0 and up to 1, ascending, got {tuple(levels)}.")
+            raise ValueError(
+                f"levels: expected shares above 0 and up to 1, ascending, got {tuple(levels)}."
+            )
         if len(n_bins) != 2 or min(n_bins) < 2:
             raise ValueError(f"n_bins: expected two numbers, each at least 2, got {n_bins}.")
         self.levels, self.n_bins = tuple(levels), n_bins
@@ -73,7 +75,10 @@ class PieceHistogram(SampleHistogram):
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, L, ...) histograms of the samples of N shapes."""
         mask, points = features.samples.mask, features.positions()
-        points, weights = points.masked_fill(~mask[:, :, None], 0), features.weights_or_ones(points[..., 0])
+        points, weights = (
+            points.masked_fill(~mask[:, :, None], 0),
+            features.weights_or_ones(points[..., 0]),
+        )
         is_traced = torch.compiler.is_compiling()  # traced code cannot depend on values of tensors
         if not is_traced and not torch.isfinite(points).all():
             raise ValueError("PieceHistogram: expected finite positions, got NaN or infinity.")
@@ -87,7 +92,9 @@ class PieceHistogram(SampleHistogram):
 
         def sums(values: Tensor) -> Tensor:
             """Sum values (N, P, k) or (N, L, P, k) of the samples over each piece: (N, L, pieces, k)."""
-            values = torch.where(remains[..., None], values if values.ndim == 4 else values[:, None], 0)
+            values = torch.where(
+                remains[..., None], values if values.ndim == 4 else values[:, None], 0
+            )
             zeros = values.new_zeros(*remains.shape[:2], n_pieces, values.shape[-1])
             return zeros.scatter_add(2, piece[..., None].expand_as(values), values)
 
@@ -97,11 +104,15 @@ class PieceHistogram(SampleHistogram):
         covariance = sums((centred[..., :, None] * centred[..., None, :]).flatten(3)) / n_points
         # Small pieces get distinct eigenvalues: equal ones have no second derivatives.
         is_small = n_points < _MIN_SAMPLES
-        covariance = torch.where(is_small, covariance.new_tensor([1, 0, 0, 0, 2, 0, 0, 0, 3]), covariance)
+        covariance = torch.where(
+            is_small, covariance.new_tensor([1, 0, 0, 0, 2, 0, 0, 0, 3]), covariance
+        )
         largest = torch.linalg.eigvalsh(covariance.unflatten(3, (3, 3)))[..., -1]
         sizes = n_points[..., 0] / mask.sum(dim=1)[:, None, None]
         squared_lengths = 12 * torch.where(is_small[..., 0], 0, largest) / sizes
         lengths = squared_lengths.clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
-        size_memberships = soft_memberships(sizes.log2(), self.sizes) * sums(weights[..., None].to(points.dtype))
+        size_memberships = soft_memberships(sizes.log2(), self.sizes) * sums(
+            weights[..., None].to(points.dtype)
+        )
         counts = size_memberships.mT @ soft_memberships(lengths, self.lengths)
         return counts / remains.sum(dim=(1, 2))[:, None, None, None]

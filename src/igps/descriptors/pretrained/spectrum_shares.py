@@ -58,9 +58,17 @@ class SpectrumShares(DescriptionPart):
         """(N, K + 1) shares of N shapes."""
         batch = features.batch
         k = torch.arange(1, self.n_eigenpairs + 1, device=batch.eigenvalues.device)
-        smallest_area = (36 * math.pi) ** (1 / 3) * batch.volume.to(batch.eigenvalues)[:, None].pow(2 / 3)
-        ratios = batch.eigenvalues[:, : self.n_eigenpairs] * smallest_area / (8 * math.pi * self.n_eigenpairs * k)
-        shares = (ratios / ratios.sum(dim=1, keepdim=True).clamp_min(1)).to(batch.surface.eigenfunctions.dtype)
+        smallest_area = (36 * math.pi) ** (1 / 3) * batch.volume.to(batch.eigenvalues)[:, None].pow(
+            2 / 3
+        )
+        ratios = (
+            batch.eigenvalues[:, : self.n_eigenpairs]
+            * smallest_area
+            / (8 * math.pi * self.n_eigenpairs * k)
+        )
+        shares = (ratios / ratios.sum(dim=1, keepdim=True).clamp_min(1)).to(
+            batch.surface.eigenfunctions.dtype
+        )
         cells = torch.cat([shares, (1 - shares.sum(dim=1, keepdim=True)).clamp_min(0)], dim=1)
         weights = batch.surface.attributes.get(WEIGHT)
         if weights is None:

@@ -11,20 +11,55 @@ folder. `Format.beside` lists the other files that it reads.
 from pathlib import Path
 
 from igps.mesh._label_measures import LabelVoxels, VoxelMeasures
-from igps.mesh.formats import archives, brains, clouds, molecules, obj, off, ply, scenes, stl, threemf, volumes, vtk
+from igps.mesh.formats import (
+    archives,
+    brains,
+    clouds,
+    molecules,
+    obj,
+    off,
+    ply,
+    scenes,
+    stl,
+    threemf,
+    volumes,
+    vtk,
+)
 from igps.mesh.formats._format import Format, RawBody, faults, stat_key
 from igps.mesh.options import LoadOptions
 
 __all__ = [
-    "FORMATS", "Format", "LabelVoxels", "RawBody", "VoxelMeasures", "dependencies_of", "format_of", "is_searched",
-    "searched_suffixes", "stat_key",
-]  # fmt: skip
+    "FORMATS",
+    "Format",
+    "LabelVoxels",
+    "RawBody",
+    "VoxelMeasures",
+    "dependencies_of",
+    "format_of",
+    "is_searched",
+    "searched_suffixes",
+    "stat_key",
+]
 
 FORMATS: tuple[Format, ...] = (
-    off.FORMAT, obj.FORMAT, ply.FORMAT, stl.FORMAT, clouds.FORMAT, threemf.FORMAT, scenes.GLTF, scenes.STEP,
-    scenes.OTHERS, vtk.LEGACY, vtk.XML, brains.GIFTI, brains.FREESURFER, volumes.FORMAT,
-    molecules.FORMAT, archives.ARCHIVE, archives.COMPRESSED,
-)  # fmt: skip
+    off.FORMAT,
+    obj.FORMAT,
+    ply.FORMAT,
+    stl.FORMAT,
+    clouds.FORMAT,
+    threemf.FORMAT,
+    scenes.GLTF,
+    scenes.STEP,
+    scenes.OTHERS,
+    vtk.LEGACY,
+    vtk.XML,
+    brains.GIFTI,
+    brains.FREESURFER,
+    volumes.FORMAT,
+    molecules.FORMAT,
+    archives.ARCHIVE,
+    archives.COMPRESSED,
+)
 
 
 def format_of(path: str | Path) -> Format | None:
@@ -32,7 +67,9 @@ def format_of(path: str | Path) -> Format | None:
     name = Path(path).name.lower()
     if any(name.endswith(kind.ignored) for kind in FORMATS):
         return None
-    matches = {suffix: kind for kind in FORMATS for suffix in kind.suffixes if name.endswith(suffix)}
+    matches = {
+        suffix: kind for kind in FORMATS for suffix in kind.suffixes if name.endswith(suffix)
+    }
     return matches[max(matches, key=len)] if matches else None
 
 

@@ -27,7 +27,9 @@ class RawBody:
     """A surface as it was read, not yet checked; a point cloud has no faces."""
 
     vertices: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (V, 3) length
-    faces: Integers = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))  # (F, 3) vertex indices
+    faces: Integers = field(
+        default_factory=lambda: np.zeros((0, 3), dtype=np.int64)
+    )  # (F, 3) vertex indices
     part: str | None = None  # name among the bodies of the file; None if the file is a single body
     unit: str | None = None  # unit of length, such as "mm"; None if the file does not state it
     normals: Floats | None = None  # (V, 3), of a point cloud whose file has them
@@ -35,7 +37,9 @@ class RawBody:
     fault: MeshError | None = None  # why this body has no surface, while others of its file may
     make: Callable[[], RawBody] | None = None  # computes the surface if that takes time; see `made`
     voxels: Callable[[], LabelVoxels] | None = None  # returns the voxels of a label
-    denoise: bool = True  # whether the surface may be noisy; False if it was computed from voxels or atoms
+    denoise: bool = (
+        True  # whether the surface may be noisy; False if it was computed from voxels or atoms
+    )
 
     def made(self) -> RawBody:
         """Return this body with its surface, or with the fault that left it without one."""
@@ -54,14 +58,21 @@ class Format:
     suffixes: tuple[str, ...]  # lower case, with the dot; the longest that ends a file name wins
     read: Callable[[Path, LoadOptions, str | None], Sequence[RawBody]]
     bodies: tuple[BodyKind, ...] = ("whole",)  # supported `LoadOptions.bodies`, the default first
-    is_searched: bool = True  # whether a search of folders takes files with these suffixes for bodies
+    is_searched: bool = (
+        True  # whether a search of folders takes files with these suffixes for bodies
+    )
     ignored: tuple[str, ...] = ()  # suffixes of files of this format that hold no surface
     extra: str | None = None  # the extra of this package that installs the modules `read` needs
-    beside: Callable[[Path, LoadOptions], Sequence[Path]] | None = None  # finds other files on which the bodies depend
+    beside: Callable[[Path, LoadOptions], Sequence[Path]] | None = (
+        None  # finds other files on which the bodies depend
+    )
 
 
 def deferred(
-    make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], LabelVoxels] | None = None
+    make: Callable[[], Mesh],
+    part: str | None,
+    unit: str | None,
+    voxels: Callable[[], LabelVoxels] | None = None,
 ) -> RawBody:
     """Return a body whose surface is computed on demand; if that fails, the file's other bodies can still be read."""
 
@@ -70,7 +81,9 @@ def deferred(
             mesh = make()
         except MeshError as fault:
             return RawBody(part=part, fault=fault, voxels=voxels)
-        return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels, denoise=False)
+        return RawBody(
+            mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels, denoise=False
+        )
 
     return RawBody(part=part, make=compute)
 
@@ -85,7 +98,9 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
     if not joinable:
         return RawBody(fault=next((body.fault for body in bodies if body.fault), None))
     for body in meshes:
-        if body.faces.min() < 0 or body.faces.max() >= len(body.vertices):  # would refer to another body
+        if body.faces.min() < 0 or body.faces.max() >= len(
+            body.vertices
+        ):  # would refer to another body
             raise ValueError(f"{body.part} refers to vertices that are not there")
     units = {body.unit for body in joinable}
     normals = [body.normals for body in joinable if body.normals is not None]
@@ -104,14 +119,19 @@ def pieces(whole: RawBody) -> list[RawBody]:
     if not len(faces):
         return [whole]
     check_arrays(vertices, faces, "the whole")
-    vertices, faces = compact(vertices, faces)  # unused vertices would widen the bounding box, which scales `places`
+    vertices, faces = compact(
+        vertices, faces
+    )  # unused vertices would widen the bounding box, which scales `places`
     # Triangles need not share vertices: they are connected by position
     owner, areas = face_parts(vertices, places(vertices)[faces])
     small = are_specks(areas)
     notes = (*whole.notes, f"left out {int(small.sum())} specks") if small.any() else whole.notes
     order = [k for k in np.argsort(np.unique(owner, return_index=True)[1]) if not small[k]]
     surfaces = [compact(vertices, faces[owner == k]) for k in order]
-    return [replace(whole, vertices=v, faces=f, part=f"piece {i}", notes=notes) for i, (v, f) in enumerate(surfaces, 1)]
+    return [
+        replace(whole, vertices=v, faces=f, part=f"piece {i}", notes=notes)
+        for i, (v, f) in enumerate(surfaces, 1)
+    ]
 
 
 def distinct(names: Iterable[str]) -> list[str]:
@@ -129,7 +149,11 @@ def distinct(names: Iterable[str]) -> list[str]:
 def stat_key(*paths: Path) -> tuple[int, int, int]:
     """Return the total size of files in bytes, and their latest mtime and ctime in nanoseconds."""
     stats = [os.stat(path) for path in paths]
-    return sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats), max(s.st_ctime_ns for s in stats)
+    return (
+        sum(s.st_size for s in stats),
+        max(s.st_mtime_ns for s in stats),
+        max(s.st_ctime_ns for s in stats),
+    )
 
 
 def text_of(path: Path) -> str:

@@ -4,7 +4,9 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 
-_MAX_EAR_CORNERS = 2000  # larger polygons are cut into fans: ear clipping takes quadratic time or worse
+_MAX_EAR_CORNERS = (
+    2000  # larger polygons are cut into fans: ear clipping takes quadratic time or worse
+)
 
 
 def triangles(corners: Integers, n_corners: Integers) -> Integers:
@@ -19,9 +21,13 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
     large = np.flatnonzero(n_corners > 4)
     if len(large):
         n_triangles = n_corners[large] - 2
-        at = np.arange(n_triangles.sum()) - np.repeat(np.cumsum(n_triangles) - n_triangles, n_triangles)
+        at = np.arange(n_triangles.sum()) - np.repeat(
+            np.cumsum(n_triangles) - n_triangles, n_triangles
+        )
         first = np.repeat(starts[large], n_triangles)
-        pieces.append(np.stack([corners[first], corners[first + at + 1], corners[first + at + 2]], axis=1))
+        pieces.append(
+            np.stack([corners[first], corners[first + at + 1], corners[first + at + 2]], axis=1)
+        )
     return np.concatenate(pieces)
 
 
@@ -51,14 +57,22 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
     following[starts + n_corners - 1] = corners[starts]
     # Doubled area vectors of the triangles in the fans, and of whole polygons
     in_fan = np.cross(vertices[corners] - vertices[first], vertices[following] - vertices[first])
-    total = np.stack([np.bincount(owner, in_fan[:, axis], len(n_corners)) for axis in range(3)], axis=1)
+    total = np.stack(
+        [np.bincount(owner, in_fan[:, axis], len(n_corners)) for axis in range(3)], axis=1
+    )
     with np.errstate(invalid="ignore"):  # coordinates that are not finite are refused later
-        is_flipped = np.einsum("ij,ij->i", in_fan, total[owner]) < -1e-9 * np.einsum("ij,ij->i", total, total)[owner]
+        is_flipped = (
+            np.einsum("ij,ij->i", in_fan, total[owner])
+            < -1e-9 * np.einsum("ij,ij->i", total, total)[owner]
+        )
     is_folded = np.zeros(len(n_corners), dtype=bool)
     is_folded[owner[is_flipped]] = True
     is_folded &= n_corners <= _MAX_EAR_CORNERS
     fans = triangles(corners[~is_folded[owner]], n_corners[~is_folded])
-    clipped = [_clip_ears(corners[starts[i] :][: n_corners[i]], vertices, total[i]) for i in np.flatnonzero(is_folded)]
+    clipped = [
+        _clip_ears(corners[starts[i] :][: n_corners[i]], vertices, total[i])
+        for i in np.flatnonzero(is_folded)
+    ]
     return np.concatenate([fans, *clipped])
 
 

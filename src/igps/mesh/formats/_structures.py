@@ -22,7 +22,15 @@ SUFFIXES = frozenset({".pdb", ".ent", ".cif", ".mmcif", ".pqr"})
 _MAX_BYTES = 2**31  # twice the largest structures of the Protein Data Bank
 _ATOM_LINE = re.compile(rb"^(?:ATOM  |HETATM)[^\r\n]*", re.MULTILINE)
 # Columns of _atom_site without which gemmi reads no atoms.
-_REQUIRED_COLUMNS = ("id", "type_symbol", "label_asym_id", "label_alt_id", "Cartn_x", "Cartn_y", "Cartn_z")
+_REQUIRED_COLUMNS = (
+    "id",
+    "type_symbol",
+    "label_asym_id",
+    "label_alt_id",
+    "Cartn_x",
+    "Cartn_y",
+    "Cartn_z",
+)
 _END_LINE = re.compile(rb"^END[ \t]*$", re.MULTILINE)
 # The chain, number and insertion code of a residue in a PQR file, as in "A12B"; chain and code may be missing.
 _RESIDUE_NUMBER = re.compile(r"([A-Za-z]?)(-?\d+)([A-Za-z]?)")
@@ -46,15 +54,24 @@ def read_structures(path: Path) -> dict[str, gemmi.Structure]:
         if suffix_of(path) in (".pdb", ".ent"):
             return {"": _pdb(_frames_as_models(_ATOM_LINE.sub(_mark_missing, text)))}
         document = gemmi.cif.read_string(text.decode("utf-8", "replace"))
-        blocks = [block for block in document if block.find_values("_atom_site.id")] or [document[0]]
+        blocks = [block for block in document if block.find_values("_atom_site.id")] or [
+            document[0]
+        ]
         for block in blocks:
-            if missing := [name for name in _REQUIRED_COLUMNS if not block.find_values(f"_atom_site.{name}")]:
+            if missing := [
+                name for name in _REQUIRED_COLUMNS if not block.find_values(f"_atom_site.{name}")
+            ]:
                 raise ValueError(f"_atom_site has no {', '.join(missing)}")
             _mark_unknown(block)
         names = distinct(block.name for block in blocks) if len(blocks) > 1 else [""]
-        return {name: gemmi.make_structure_from_block(block) for name, block in zip(names, blocks, strict=True)}
+        return {
+            name: gemmi.make_structure_from_block(block)
+            for name, block in zip(names, blocks, strict=True)
+        }
     except (RuntimeError, ValueError, IndexError) as error:
-        fault = f"{path}: not readable as a structure, or cut short ({' '.join(str(error).split())})."
+        fault = (
+            f"{path}: not readable as a structure, or cut short ({' '.join(str(error).split())})."
+        )
         raise MeshError(f"{fault} Download or export it again.") from error
 
 
@@ -63,22 +80,32 @@ def parts_of(
 ) -> Iterator[tuple[str, list[gemmi.Chain], list[str]]]:
     """Yield the name of each body, its chains, and notes."""
     gemmi = gemmi_module()
-    for name, structure, model in ((name, item, model) for name, item in structures.items() for model in item):
+    for name, structure, model in (
+        (name, item, model) for name, item in structures.items() for model in item
+    ):
         prefix = f"{name} " * bool(name) + f"model {model.num} " * (len(structure) > 1)
         if bodies == "chains":
             # The atoms of a chain may stand in several places of the file
             for label in dict.fromkeys(chain.name for chain in model):
-                yield f"{path}#{prefix}chain {label or 'without name'}", [c for c in model if c.name == label], []
+                yield (
+                    f"{path}#{prefix}chain {label or 'without name'}",
+                    [c for c in model if c.name == label],
+                    [],
+                )
         elif bodies == "assembly" and len(structure.assemblies):
             assembly = structure.assemblies[0]
             try:
                 chains = gemmi.make_assembly(assembly, model, gemmi.HowToNameCopiedChain.AddNumber)
             except RuntimeError as error:
                 fault = f"{path}: {prefix}assembly {assembly.name} cannot be made of the file's chains ({error})."
-                raise MeshError(f"{fault} Take the whole file, its models or its chains as bodies.") from error
+                raise MeshError(
+                    f"{fault} Take the whole file, its models or its chains as bodies."
+                ) from error
             yield f"{path}#{prefix}assembly {assembly.name}", list(chains), []
         else:
-            notes = ["the file defines no assembly: the model was used"] if bodies == "assembly" else []
+            notes = (
+                ["the file defines no assembly: the model was used"] if bodies == "assembly" else []
+            )
             yield f"{path}#{prefix}".strip("# "), list(model), notes
 
 
@@ -87,22 +114,30 @@ def gemmi_module() -> Any:
     try:
         import gemmi
     except ImportError as error:
-        raise ImportError('Structures of molecules need gemmi: pip install "interior-gps[molecules]".') from error
+        raise ImportError(
+            'Structures of molecules need gemmi: pip install "interior-gps[molecules]".'
+        ) from error
     return gemmi
 
 
 def _read_text(path: Path) -> bytes:
     if suffix_of(path) not in SUFFIXES:
-        raise MeshError(f"{path}: expected a structure in {', '.join(sorted(SUFFIXES))}, gzipped or not.")
+        raise MeshError(
+            f"{path}: expected a structure in {', '.join(sorted(SUFFIXES))}, gzipped or not."
+        )
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
     try:
         with gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb") as file:
             text = file.read(_MAX_BYTES + 1)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise MeshError(f"{path}: the gzipped file is cut short or damaged ({error}). Download it again.") from error
+        raise MeshError(
+            f"{path}: the gzipped file is cut short or damaged ({error}). Download it again."
+        ) from error
     if len(text) > _MAX_BYTES:
-        raise MeshError(f"{path}: expected at most {_MAX_BYTES:,} bytes of text, got more. Check the file.")
+        raise MeshError(
+            f"{path}: expected at most {_MAX_BYTES:,} bytes of text, got more. Check the file."
+        )
     if not text.strip():
         raise MeshError(f"{path}: the file is empty. Export it again.")
     return text.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
@@ -168,7 +203,9 @@ def _pqr(text: bytes, path: Path) -> gemmi.Structure:
             chain = chain or [match[1]]
         except ValueError as error:
             fault = f"{path}: line {number} is no atom of a PQR file ({error})."
-            raise MeshError(f"{fault} It may be cut short. Write it again, with blanks between fields.") from error
+            raise MeshError(
+                f"{fault} It may be cut short. Write it again, with blanks between fields."
+            ) from error
         residues = chains.setdefault(chain[0], [])
         key = gemmi.SeqId(int(match[2]), match[3] or " ")
         if not residues or residues[-1].seqid != key or residues[-1].name != residue:

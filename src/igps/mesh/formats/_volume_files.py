@@ -25,7 +25,8 @@ _MAX_HEADER = 1 << 24  # bytes
 _MGH_FOOTER = 20  # bytes between voxels and tags
 # The line of a NRRD or MetaImage header that names the file of the voxels; ":" may stand for "=" in MetaImage.
 _DATA_FILE = re.compile(
-    rb"(?:ElementDataFile[ \t]*[=:]|^data ?file:)[ \t]*(?:\./)?(.*?)[ \t]*\r?$", re.MULTILINE | re.IGNORECASE
+    rb"(?:ElementDataFile[ \t]*[=:]|^data ?file:)[ \t]*(?:\./)?(.*?)[ \t]*\r?$",
+    re.MULTILINE | re.IGNORECASE,
 )
 
 
@@ -36,14 +37,18 @@ class RawVolume:
     layers: list[NDArray[Any]]  # (X, Y, Z) of any type
     affine: Floats  # (4, 4) from voxel indices to the world
     names: dict[int, str] = field(default_factory=dict)  # of the values of a single layer
-    segments: list[tuple[str, int, int]] = field(default_factory=list)  # (name, layer, value), if the file lists them
+    segments: list[tuple[str, int, int]] = field(
+        default_factory=list
+    )  # (name, layer, value), if the file lists them
     unit: str | None = "mm"  # of length; None if the file states no lengths
 
 
 def read_raw(path: Path) -> RawVolume:
     """Read a volume with the reader for its suffix."""
     if (reader := READERS.get(suffix_of(path))) is None:
-        raise MeshError(f"{path}: not a format of volumes. Convert it to one of {', '.join(READERS)}.")
+        raise MeshError(
+            f"{path}: not a format of volumes. Convert it to one of {', '.join(READERS)}."
+        )
     return reader(path)
 
 
@@ -53,20 +58,32 @@ def suffix_of(path: Path) -> str:
     return ".nii.gz" if name.endswith(".nii.gz") else path.suffix.lower()
 
 
-def check_voxels(path: str | Path, shape: Sequence[int], n_bytes: int, n_components: int = 1) -> None:
+def check_voxels(
+    path: str | Path, shape: Sequence[int], n_bytes: int, n_components: int = 1
+) -> None:
     """Raise a MeshError unless a volume has three axes, several slices, one value a voxel, and fits into memory."""
     if n_components != 1:
-        raise MeshError(f"{path}: {n_components} values in each voxel, as in colours; expected one label. {_EXPORT}")
+        raise MeshError(
+            f"{path}: {n_components} values in each voxel, as in colours; expected one label. {_EXPORT}"
+        )
     size = [int(n) for n in shape]
     while len(size) > 3 and size[-1] == 1:
         size.pop()
     shown = " × ".join(map(str, size))
     if len(size) != 3:
-        raise MeshError(f"{path}: expected three axes, got {len(size)} axes, {shown}. Export each volume to a file.")
+        raise MeshError(
+            f"{path}: expected three axes, got {len(size)} axes, {shown}. Export each volume to a file."
+        )
     if min(size) < 2:
-        raise MeshError(f"{path}: {shown} voxels are a single slice, which has no volume. Export the whole stack.")
+        raise MeshError(
+            f"{path}: {shown} voxels are a single slice, which has no volume. Export the whole stack."
+        )
     remedy = "Crop or resample the volume; if it is smaller, its header is damaged."
-    check_fits(math.prod(size) * (n_bytes + _WORK_BYTES), f"{path}: {math.prod(size):,} voxels need", remedy)
+    check_fits(
+        math.prod(size) * (n_bytes + _WORK_BYTES),
+        f"{path}: {math.prod(size):,} voxels need",
+        remedy,
+    )
 
 
 def _not_integers(path: str | Path, kind: str) -> MeshError:
@@ -90,13 +107,19 @@ def of_nibabel(image: Any, path: str | Path) -> RawVolume:
     values = np.asanyarray(image.dataobj).reshape(image.shape[:3])
     affine, names = np.array(image.affine, dtype=np.float64), {}
     if isinstance(image, nibabel.Nifti1Pair):  # the base class of all NIfTI images
-        affine[:3] *= {1: 1e3, 3: 1e-3}.get(int(image.header["xyzt_units"]) % 8, 1.0)  # metres, micrometres
+        affine[:3] *= {1: 1e3, 3: 1e-3}.get(
+            int(image.header["xyzt_units"]) % 8, 1.0
+        )  # metres, micrometres
         names = names_in_extensions(
-            bytes(x.get_content_bytes()) if hasattr(x, "get_content_bytes") else str(x.get_content()).encode()
+            bytes(x.get_content_bytes())
+            if hasattr(x, "get_content_bytes")
+            else str(x.get_content()).encode()
             for x in image.header.extensions
         )
     elif isinstance(image, nibabel.MGHImage) and image.file_map["image"].filename:
-        with image.file_map["image"].get_prepare_fileobj("rb") as file:  # nibabel does not read the tags
+        with image.file_map["image"].get_prepare_fileobj(
+            "rb"
+        ) as file:  # nibabel does not read the tags
             file.seek(image.header.get_footer_offset() + _MGH_FOOTER)
             names = names_in_tags(file.read(_MAX_HEADER))
     return RawVolume([values], affine, names)
@@ -115,7 +138,9 @@ def _simple_itk(path: Path) -> RawVolume:
     n_layers = reader.GetNumberOfComponents() if segments else 1
     if "complex" in SimpleITK.GetPixelIDValueAsString(reader.GetPixelID()):
         raise _not_integers(path, "complex numbers")
-    check_voxels(path, reader.GetSize(), 8 * n_layers, 1 if segments else reader.GetNumberOfComponents())
+    check_voxels(
+        path, reader.GetSize(), 8 * n_layers, 1 if segments else reader.GetNumberOfComponents()
+    )
     image = reader.Execute()
     values = SimpleITK.GetArrayFromImage(image)  # (Z, Y, X) or (Z, Y, X, layers)
     layers = [values[..., i].T for i in range(values.shape[3])] if values.ndim == 4 else [values.T]
@@ -128,15 +153,21 @@ def _simple_itk(path: Path) -> RawVolume:
         unit = _nrrd_unit(header)
     affine[:3] *= MILLIMETRES.get(unit, 1.0)
     segments = [segment for segment in segments if segment[1] < len(layers)]
-    return RawVolume(layers, _LPS_TO_RAS @ affine, segments=segments, unit="mm" if unit in MILLIMETRES else None)
+    return RawVolume(
+        layers, _LPS_TO_RAS @ affine, segments=segments, unit="mm" if unit in MILLIMETRES else None
+    )
 
 
 def _check_directions(header: bytes, path: Path) -> None:
     """Raise a MeshError if a NRRD header lacks the direction of an axis: ITK would make one up."""
     if line := re.search(rb"^space directions:(.*)$", header, re.MULTILINE):
-        known = [vector for vector in re.findall(rb"\(.*?\)", line[1]) if b"nan" not in vector.lower()]
+        known = [
+            vector for vector in re.findall(rb"\(.*?\)", line[1]) if b"nan" not in vector.lower()
+        ]
         if len(known) != 3:
-            raise MeshError(f"{path}: expected directions of three axes in space, got {len(known)}. Export it again.")
+            raise MeshError(
+                f"{path}: expected directions of three axes in space, got {len(known)}. Export it again."
+            )
 
 
 def _nrrd_unit(header: bytes) -> str:
@@ -158,7 +189,9 @@ def _segments(metadata: dict[str, str]) -> list[tuple[str, int, int]]:
             name = metadata.get(f"Segment{number}_Name", "")
             segments.append((name, int(layer) if layer.isdigit() else 0, int(value or 1)))
     for index, group in enumerate(json.loads(metadata.get(_MITK, "[]"))):
-        segments += [(label.get("name", ""), index, int(label["value"])) for label in group["labels"] or ()]
+        segments += [
+            (label.get("name", ""), index, int(label["value"])) for label in group["labels"] or ()
+        ]
     return segments
 
 
@@ -169,16 +202,25 @@ def detached(path: Path) -> list[Path]:
     names = [line.decode("utf-8", "replace") for line in _DATA_FILE.findall(_header(path))]
     for name in names:
         if "/" in name or "\\" in name or name.upper().startswith("LIST"):
-            raise MeshError(f"{path}: expected voxels in a file of the same folder, got {name!r}. Save it as one file.")
+            raise MeshError(
+                f"{path}: expected voxels in a file of the same folder, got {name!r}. Save it as one file."
+            )
     return [path.with_name(name) for name in names if name and name != "LOCAL"]
 
 
 def _header(path: Path) -> bytes:
     """Read the header of a NRRD or MetaImage file, without the voxels that may follow."""
-    end = re.compile(rb"\n\r?\n" if suffix_of(path) in _NRRD else rb"^\s*ElementDataFile\s*[=:].*\n", re.MULTILINE)
+    end = re.compile(
+        rb"\n\r?\n" if suffix_of(path) in _NRRD else rb"^\s*ElementDataFile\s*[=:].*\n",
+        re.MULTILINE,
+    )
     with path.open("rb") as file:
         header = b""
-        while (match := end.search(header)) is None and len(header) < _MAX_HEADER and (block := file.read(1 << 16)):
+        while (
+            (match := end.search(header)) is None
+            and len(header) < _MAX_HEADER
+            and (block := file.read(1 << 16))
+        ):
             header += block
     return header if match is None else header[: match.end()]
 
@@ -189,11 +231,15 @@ def _highdicom(path: Path) -> RawVolume:
 
     dataset = pydicom.dcmread(path)
     if (modality := dataset.get("Modality", "none")) != "SEG":
-        raise MeshError(f"{path}: expected DICOM of modality SEG, got {modality}. Export the labels as DICOM SEG.")
+        raise MeshError(
+            f"{path}: expected DICOM of modality SEG, got {modality}. Export the labels as DICOM SEG."
+        )
     segmentation = Segmentation.from_dataset(dataset, copy=False)
     geometry = segmentation.get_volume_geometry()
     if geometry is None:
-        raise MeshError(f"{path}: its slices are not evenly spaced. Resample the segmentation to even slices.")
+        raise MeshError(
+            f"{path}: its slices are not evenly spaced. Resample the segmentation to even slices."
+        )
     numbers = [int(number) for number in segmentation.segment_numbers]
     check_voxels(path, geometry.spatial_shape, 4)
     try:
@@ -202,13 +248,21 @@ def _highdicom(path: Path) -> RawVolume:
         check_voxels(path, geometry.spatial_shape, 8 * len(numbers))
         # The failed attempt keeps tables of the first object locked
         segmentation = Segmentation.from_dataset(pydicom.dcmread(path), copy=False)
-        layers = [np.asarray(segmentation.get_volume(segment_numbers=[n]).array)[..., 0] for n in numbers]
+        layers = [
+            np.asarray(segmentation.get_volume(segment_numbers=[n]).array)[..., 0] for n in numbers
+        ]
     is_separate = (len(layers) == len(numbers) and len(numbers) > 1) or layers[0].dtype.kind == "f"
     names = [str(segmentation.get_segment_description(number).segment_label) for number in numbers]
-    places = [(layer, 1) for layer in range(len(numbers))] if is_separate else [(0, number) for number in numbers]
+    places = (
+        [(layer, 1) for layer in range(len(numbers))]
+        if is_separate
+        else [(0, number) for number in numbers]
+    )
     segments = [(name, *place) for name, place in zip(names, places, strict=True)]
     # Axes of the arrays: slices, rows, columns, as in the affine of `geometry`
-    return RawVolume(layers, _LPS_TO_RAS @ np.array(geometry.affine, dtype=np.float64), segments=segments)
+    return RawVolume(
+        layers, _LPS_TO_RAS @ np.array(geometry.affine, dtype=np.float64), segments=segments
+    )
 
 
 def _tifffile(path: Path) -> RawVolume:
@@ -224,11 +278,19 @@ def _tifffile(path: Path) -> RawVolume:
         shape = [n for n in series.shape if n > 1] if len(series.shape) > 3 else list(series.shape)
         pages = [series]
         if len(shape) < 3:  # slices that were written one by one
-            pages = [page for page in file.series if (page.shape, page.dtype) == (series.shape, series.dtype)]
+            pages = [
+                page
+                for page in file.series
+                if (page.shape, page.dtype) == (series.shape, series.dtype)
+            ]
             shape = [len(pages), *shape]
         check_voxels(path, shape, dtype.itemsize)
         try:
-            values = series.asarray() if len(pages) == 1 else np.stack([page.asarray() for page in pages])
+            values = (
+                series.asarray()
+                if len(pages) == 1
+                else np.stack([page.asarray() for page in pages])
+            )
         except ValueError as error:
             if "imagecodecs" not in str(error):
                 raise
@@ -249,16 +311,26 @@ def _tiff_sides(file: Any) -> tuple[tuple[float, float, float], str | None]:
             scale = MILLIMETRES.get(unit[1] if unit else "µm")
             if size and scale:
                 known[axis] = float(size[1]) * scale
-        return ((known["X"], known["Y"], known["Z"]), "mm") if len(known) == 3 else ((1.0, 1.0, 1.0), None)
+        return (
+            ((known["X"], known["Y"], known["Z"]), "mm")
+            if len(known) == 3
+            else ((1.0, 1.0, 1.0), None)
+        )
     metadata, tags = file.imagej_metadata, file.pages[0].tags
     if metadata is None:
         return (1.0, 1.0, 1.0), None
     # ImageJ omits resolutions of 1. Without a unit the ratios of the sides still hold
-    resolutions = [tags[name].value if (name := f"{axis}Resolution") in tags else (1, 1) for axis in "XY"]
+    resolutions = [
+        tags[name].value if (name := f"{axis}Resolution") in tags else (1, 1) for axis in "XY"
+    ]
     x, y = (length / n if n and length else 1.0 for n, length in resolutions)
     scale = MILLIMETRES.get(str(metadata.get("unit")))
     factor = scale or 1.0
-    return (factor * x, factor * y, factor * (abs(float(metadata.get("spacing", 1))) or 1.0)), "mm" if scale else None
+    return (
+        factor * x,
+        factor * y,
+        factor * (abs(float(metadata.get("spacing", 1))) or 1.0),
+    ), "mm" if scale else None
 
 
 READERS: dict[str, Callable[[Path], RawVolume]] = {

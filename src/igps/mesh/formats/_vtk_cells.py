@@ -20,17 +20,32 @@ _WITHOUT_AREA = (0, 1, 2, 3, 4)  # empty cells, points and lines
 
 def surface(corners: Integers, n_corners: Integers, kinds: Integers, vertices: Floats) -> Integers:
     """Return the surface (F, 3) of cells, whose corners are laid end to end; a ValueError for unsupported cells."""
-    unknown = set(np.unique(kinds).tolist()) - {*_WITHOUT_AREA, TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, *_SIDES}
+    unknown = set(np.unique(kinds).tolist()) - {
+        *_WITHOUT_AREA,
+        TRIANGLE,
+        STRIP,
+        POLYGON,
+        PIXEL,
+        QUAD,
+        *_SIDES,
+    }
     if unknown:
-        raise ValueError(f"cells of type {min(unknown)}; expected flat polygons, or volumes with straight edges")
+        raise ValueError(
+            f"cells of type {min(unknown)}; expected flat polygons, or volumes with straight edges"
+        )
     flat = np.isin(kinds, (TRIANGLE, POLYGON, QUAD))
     faces = [flat_triangles(corners[np.repeat(flat, n_corners)], n_corners[flat], vertices)]
     starts = np.cumsum(n_corners) - n_corners
-    for kind, n in ((PIXEL, 4), *((kind, max(map(max, sides)) + 1) for kind, sides in _SIDES.items())):
+    for kind, n in (
+        (PIXEL, 4),
+        *((kind, max(map(max, sides)) + 1) for kind, sides in _SIDES.items()),
+    ):
         if (n_corners[kinds == kind] != n).any():
             raise ValueError(f"cells of type {kind} with other than {n} corners")
     pixels = starts[kinds == PIXEL, None]
-    faces.append(triangles(corners[pixels + np.array([0, 1, 3, 2])].ravel(), np.full(len(pixels), 4)))
+    faces.append(
+        triangles(corners[pixels + np.array([0, 1, 3, 2])].ravel(), np.full(len(pixels), 4))
+    )
     for strip in np.flatnonzero(kinds == STRIP):
         faces.append(strip_triangles(corners[starts[strip] : starts[strip] + n_corners[strip]]))
     sides: dict[int, list[Integers]] = {3: [], 4: []}
@@ -47,5 +62,7 @@ def surface(corners: Integers, n_corners: Integers, kinds: Integers, vertices: F
 
 def _unshared(sides: Integers) -> Integers:
     """Return the sides that occur once, in any order of their corners."""
-    _, index, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    _, index, count = np.unique(
+        np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
     return sides[count[index.ravel()] == 1]

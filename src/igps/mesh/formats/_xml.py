@@ -48,7 +48,9 @@ def inflated(content: bytes, n_bytes: int, name: str = "zlib") -> bytes:
     if name == "lzma":
         unpacked = lzma.LZMADecompressor().decompress(content, n_bytes + 1)
     else:
-        unpacked = zlib.decompressobj(wbits=47).decompress(content, n_bytes + 1)  # zlib or gzip by the header
+        unpacked = zlib.decompressobj(wbits=47).decompress(
+            content, n_bytes + 1
+        )  # zlib or gzip by the header
     if len(unpacked) != n_bytes:
         raise ValueError(f"a block unpacks to {len(unpacked)} bytes or more, expected {n_bytes}")
     return unpacked

@@ -27,7 +27,9 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     with tempfile.TemporaryDirectory() as folder:
         for name, unpacked in _unpack(path, Path(folder), options):
             try:
-                if part in (None, name) and (inner := _read_unpacked(unpacked, path, options, None)):
+                if part in (None, name) and (
+                    inner := _read_unpacked(unpacked, path, options, None)
+                ):
                     bodies.append(replace(joined(inner), part=name))
             except MeshError as fault:
                 if options.bodies != "objects":  # otherwise the whole would be incomplete
@@ -49,7 +51,9 @@ def read_compressed(path: Path, options: LoadOptions, part: str | None) -> list[
     return bodies
 
 
-def _read_unpacked(unpacked: Path, path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+def _read_unpacked(
+    unpacked: Path, path: Path, options: LoadOptions, part: str | None
+) -> list[RawBody]:
     """Read the bodies of a file unpacked from `path`; none if its format is unknown or is that of an archive."""
     from igps.mesh.formats import format_of
 
@@ -69,9 +73,13 @@ def _unpack(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str, P
     with _members(path, options) as members:
         for name, stream in members:
             member = PurePosixPath(name.replace("\\", "/"))
-            target = folder / member  # outside of the folder if the name begins with a slash, or a drive of Windows
+            target = (
+                folder / member
+            )  # outside of the folder if the name begins with a slash, or a drive of Windows
             # Parts with a leading dot are "..", or hidden: macOS adds hidden files with the suffixes of the others
-            is_inside = target.is_relative_to(folder) and not any(part.startswith(".") for part in member.parts)
+            is_inside = target.is_relative_to(folder) and not any(
+                part.startswith(".") for part in member.parts
+            )
             if is_inside and member.name:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 _copy(stream, target)
@@ -90,8 +98,15 @@ def _members(path: Path, options: LoadOptions) -> Iterator[Iterator[tuple[str, I
         return
     suffix = path.suffix.lower()
     opener = _OPENERS.get({".tgz": ".gz", ".tbz2": ".bz2", ".txz": ".xz"}.get(suffix, suffix), open)
-    with opener(path, "rb") as stream, tarfile.open(fileobj=_LimitedStream(stream, path, options), mode="r|") as packed:
-        yield ((info.name, file) for info in packed if info.isreg() and (file := packed.extractfile(info)))
+    with (
+        opener(path, "rb") as stream,
+        tarfile.open(fileobj=_LimitedStream(stream, path, options), mode="r|") as packed,
+    ):
+        yield (
+            (info.name, file)
+            for info in packed
+            if info.isreg() and (file := packed.extractfile(info))
+        )
 
 
 class _LimitedStream(io.RawIOBase):
@@ -101,7 +116,9 @@ class _LimitedStream(io.RawIOBase):
         self._stream, self._path, self._limit, self._n_read = stream, path, options.max_unpacked, 0
 
     def read(self, size: int = -1) -> bytes:
-        content = bytes(self._stream.read(min(size, self._limit + 1) if size >= 0 else self._limit + 1))
+        content = bytes(
+            self._stream.read(min(size, self._limit + 1) if size >= 0 else self._limit + 1)
+        )
         self._n_read += len(content)
         check_unpacked(self._n_read, self._path, self._limit)
         return content

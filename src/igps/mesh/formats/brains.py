@@ -14,11 +14,18 @@ from igps.mesh.formats import _xml
 from igps.mesh.formats._format import Format, RawBody, check_unpacked
 from igps.mesh.options import LoadOptions
 
-_TYPES = {"NIFTI_TYPE_FLOAT32": "f4", "NIFTI_TYPE_FLOAT64": "f8", "NIFTI_TYPE_INT32": "i4", "NIFTI_TYPE_UINT8": "u1"}
+_TYPES = {
+    "NIFTI_TYPE_FLOAT32": "f4",
+    "NIFTI_TYPE_FLOAT64": "f8",
+    "NIFTI_TYPE_INT32": "i4",
+    "NIFTI_TYPE_UINT8": "u1",
+}
 _POINTS, _TRIANGLES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
 _MAX_AXES = 6
 _MAGIC = b"\xff\xff\xfe"
-_SCANNER_TAG = np.array([2, 1], ">i4").tobytes()  # behind the triangles if the points are in the coordinates of images
+_SCANNER_TAG = np.array(
+    [2, 1], ">i4"
+).tobytes()  # behind the triangles if the points are in the coordinates of images
 # Lines at the end of a FreeSurfer file: axes and centre of the volume from which the surface was made.
 _VOLUME_AXES = re.compile(rb"^[xyzc]ras\s*=\s*(\S+)\s+(\S+)\s+(\S+)", re.MULTILINE)
 # The axes of that volume in the coordinates of the surface.
@@ -35,8 +42,12 @@ def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBo
         if (intent := element.get("Intent")) in (_POINTS, _TRIANGLES)
     }
     if len(arrays) < 2:
-        raise ValueError("no surface in it: expected points and triangles, which maps of values on a surface lack")
-    return [RawBody(arrays[_POINTS].astype(np.float64), arrays[_TRIANGLES].astype(np.int64), unit="mm")]
+        raise ValueError(
+            "no surface in it: expected points and triangles, which maps of values on a surface lack"
+        )
+    return [
+        RawBody(arrays[_POINTS].astype(np.float64), arrays[_TRIANGLES].astype(np.int64), unit="mm")
+    ]
 
 
 def gifti_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
@@ -44,7 +55,11 @@ def gifti_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.gener
     arrays = {}
     for number, element in enumerate(_xml.parse(path.read_bytes()).iter("DataArray"), 1):
         if element.get("Intent") not in (_POINTS, _TRIANGLES):
-            names = [entry.findtext("Value") for entry in element.iter("MD") if entry.findtext("Name") == "Name"]
+            names = [
+                entry.findtext("Value")
+                for entry in element.iter("MD")
+                if entry.findtext("Name") == "Name"
+            ]
             arrays[(names or [None])[0] or f"array {number}"] = _array(element, path, options)
     return arrays
 
@@ -62,7 +77,9 @@ def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.gen
     elif encoding in ("Base64Binary", "GZipBase64Binary"):
         content = base64.b64decode("".join(text.split()), validate=True)
         content = _xml.inflated(content, n_bytes) if encoding.startswith("GZip") else content
-        values = np.frombuffer(content, kind.newbyteorder("<" if element.get("Endian") == "LittleEndian" else ">"))
+        values = np.frombuffer(
+            content, kind.newbyteorder("<" if element.get("Endian") == "LittleEndian" else ">")
+        )
     else:
         raise ValueError(f"its numbers are encoded as {encoding}, which is not supported")
     is_column_major = element.get("ArrayIndexingOrder") == "ColumnMajorOrder"
@@ -77,7 +94,9 @@ def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[
     n_vertices, n_faces = (int(n) for n in np.frombuffer(content, ">i4", 2, at))
     n_expected, n_bytes = 12 * (n_vertices + n_faces), len(content) - at - 8
     if min(n_vertices, n_faces) < 0 or n_bytes < n_expected:
-        raise ValueError(f"expected {n_vertices} vertices, {n_faces} triangles, {n_expected} bytes, got {n_bytes}")
+        raise ValueError(
+            f"expected {n_vertices} vertices, {n_faces} triangles, {n_expected} bytes, got {n_bytes}"
+        )
     vertices = np.frombuffer(content, ">f4", 3 * n_vertices, at + 8).astype(np.float64)
     faces = np.frombuffer(content, ">i4", 3 * n_faces, at + 8 + 12 * n_vertices).astype(np.int64)
     return [RawBody(vertices.reshape(-1, 3), faces.reshape(-1, 3), unit="mm")]
@@ -100,5 +119,7 @@ def in_scanner(path: Path, points: Floats) -> Floats:
     return points @ _SURFACE_AXES.T @ axes[:3] + axes[3]
 
 
-GIFTI = Format("GIFTI", (".gii",), read_gifti, ignored=(".func.gii", ".label.gii", ".shape.gii", ".time.gii"))
+GIFTI = Format(
+    "GIFTI", (".gii",), read_gifti, ignored=(".func.gii", ".label.gii", ".shape.gii", ".time.gii")
+)
 FREESURFER = Format("FreeSurfer", _SUFFIXES, read_freesurfer)

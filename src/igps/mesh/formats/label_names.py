@@ -47,13 +47,23 @@ def read_label_names(path: str | Path) -> dict[int, str]:
     path = Path(path)
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise MeshError(f"{path}: {path.stat().st_size:,} bytes are too many for a table of names. Check the path.")
+            raise MeshError(
+                f"{path}: {path.stat().st_size:,} bytes are too many for a table of names. Check the path."
+            )
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
-        raise MeshError(f"{path}: the table of names is not readable ({error}). Check the path.") from error
-    names = _parse_json(text) if path.suffix.lower() == ".json" else _parse_csv(text) or _parse_lines(text)
+        raise MeshError(
+            f"{path}: the table of names is not readable ({error}). Check the path."
+        ) from error
+    names = (
+        _parse_json(text)
+        if path.suffix.lower() == ".json"
+        else _parse_csv(text) or _parse_lines(text)
+    )
     if not names:
-        tables = "label descriptions of ITK-SNAP, a colour table of 3D Slicer, FreeSurfer or FSLeyes"
+        tables = (
+            "label descriptions of ITK-SNAP, a colour table of 3D Slicer, FreeSurfer or FSLeyes"
+        )
         formats = f"{tables}, CSV with the columns label,name, or JSON from numbers to names"
         raise MeshError(f"{path}: names no label. Expected {formats}.")
     return names
@@ -69,7 +79,9 @@ def table_beside(path: Path) -> Path | None:
                 read_label_names(table)
                 return table
             except MeshError as error:
-                logger.info("%s: the file beside it is not used as a table of names: %s", path, error)
+                logger.info(
+                    "%s: the file beside it is not used as a table of names: %s", path, error
+                )
     return None
 
 
@@ -125,8 +137,13 @@ def _parse_csv(text: str) -> dict[int, str]:
     lines = text.splitlines()
     rows = csv.DictReader(lines, delimiter="\t" if lines and "\t" in lines[0] else ",")
     columns = {(column or "").strip().lower(): column for column in rows.fieldnames or ()}
-    labels = next((columns[key] for key in ("labelvalue", "label", "index", "id", "value") if key in columns), None)
-    names = next((columns[key] for key in ("name", "label_name", "labelname") if key in columns), None)
+    labels = next(
+        (columns[key] for key in ("labelvalue", "label", "index", "id", "value") if key in columns),
+        None,
+    )
+    names = next(
+        (columns[key] for key in ("name", "label_name", "labelname") if key in columns), None
+    )
     if labels is None or names is None:
         return {}
     pairs = ((str(row[labels] or "").strip(), str(row[names] or "")) for row in rows)
@@ -141,7 +158,13 @@ def _parse_json(text: str) -> dict[int, str]:
     table = content.get("labels", content) if isinstance(content, dict) else {}
     rows = table.items() if isinstance(table, dict) else ()
     pairs = ((value, key) if isinstance(value, int) else (key, value) for key, value in rows)
-    return cleaned({int(label): name for label, name in pairs if _is_number(str(label)) and isinstance(name, str)})
+    return cleaned(
+        {
+            int(label): name
+            for label, name in pairs
+            if _is_number(str(label)) and isinstance(name, str)
+        }
+    )
 
 
 def _is_number(text: str) -> bool:

@@ -16,10 +16,24 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps._parameters import check_one_of
 from igps.mesh.formats._format import Format, RawBody, deferred, stat_key
-from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structures, suffix_of
+from igps.mesh.formats._structures import (
+    SUFFIXES,
+    gemmi_module,
+    parts_of,
+    read_structures,
+    suffix_of,
+)
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
-from igps.mesh.residues import BACKBONE, CHARGED_ATOMS, PHOSPHATES, STANDARD, WATER, residue_ball, side_chain_ball
+from igps.mesh.residues import (
+    BACKBONE,
+    CHARGED_ATOMS,
+    PHOSPHATES,
+    STANDARD,
+    WATER,
+    residue_ball,
+    side_chain_ball,
+)
 
 if TYPE_CHECKING:
     import gemmi
@@ -28,7 +42,9 @@ logger = logging.getLogger(__name__)
 
 MoleculeBodies = Literal["chains", "models", "assembly"]
 
-_INFERRED_ELEMENTS = frozenset("HCNOSP")  # by the first letter of an atom's name, if the file states no element
+_INFERRED_ELEMENTS = frozenset(
+    "HCNOSP"
+)  # by the first letter of an atom's name, if the file states no element
 # Elements of residues with standard names; selenium is that of selenomethionine.
 _STANDARD_ELEMENTS = frozenset({*_INFERRED_ELEMENTS, "D", "Se"})
 _UNKNOWN_RADIUS = 1.7  # Å, of atoms of unknown elements: that of carbon
@@ -55,13 +71,21 @@ class Molecule:
     radii: Floats  # (A,) van der Waals radii, Å
     charges: Floats  # (A,) elementary charges
     residue_of: Integers  # (A,) index of the residue of each ball
-    residue_names: tuple[str, ...]  # codes of three letters; a modified amino acid has the code of its parent
-    residue_positions: Floats  # (R, 3) Å, positions of Cα, or of a residue without Cα the mean of its atoms
-    b_factors: Floats  # (R,) means over atoms: B-factors, Å², or pLDDT of predicted models; NaN if unknown
+    residue_names: tuple[
+        str, ...
+    ]  # codes of three letters; a modified amino acid has the code of its parent
+    residue_positions: (
+        Floats  # (R, 3) Å, positions of Cα, or of a residue without Cα the mean of its atoms
+    )
+    b_factors: (
+        Floats  # (R,) means over atoms: B-factors, Å², or pLDDT of predicted models; NaN if unknown
+    )
     notes: tuple[str, ...] = ()  # remarks on how the structure was read
 
     def __repr__(self) -> str:
-        return f"Molecule({self.name!r}, {len(self.residue_names)} residues, {len(self.radii)} balls)"
+        return (
+            f"Molecule({self.name!r}, {len(self.residue_names)} residues, {len(self.radii)} balls)"
+        )
 
 
 def is_structure(path: str | Path) -> bool:
@@ -70,7 +94,11 @@ def is_structure(path: str | Path) -> bool:
 
 
 def read_molecule(
-    path: str | Path, bodies: MoleculeBodies = "chains", *, ligands: bool = False, hydrogens: bool = False
+    path: str | Path,
+    bodies: MoleculeBodies = "chains",
+    *,
+    ligands: bool = False,
+    hydrogens: bool = False,
 ) -> list[Molecule]:
     """Read the bodies of a structure file: PDB, mmCIF or PQR, gzipped or not.
 
@@ -113,19 +141,30 @@ def read_molecule(
         fault = f"{path}: no atoms of a molecule with positions, in {len(parts)} {bodies}."
         raise MeshError(f"{fault} Check that the file is complete, and not of water alone.")
     for name in left_out:
-        logger.warning("%s: no atoms of a polymer, left out. Read it with ligands=True, or check the file.", name)
+        logger.warning(
+            "%s: no atoms of a polymer, left out. Read it with ligands=True, or check the file.",
+            name,
+        )
     return molecules
 
 
 @lru_cache(maxsize=1)
-def molecules_by_part(path: Path, changed: tuple[int, int, int], bodies: MoleculeBodies) -> dict[str, Molecule]:
+def molecules_by_part(
+    path: Path, changed: tuple[int, int, int], bodies: MoleculeBodies
+) -> dict[str, Molecule]:
     """Return the bodies of a structure file by part; `changed`, its `stat_key`, is part of the cache key."""
     molecules = read_molecule(path, bodies)
-    return {molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule for molecule in molecules}
+    return {
+        molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule
+        for molecule in molecules
+    }
 
 
 def _molecules(
-    parts: list[tuple[str, list[gemmi.Chain], list[str]]], ligands: bool, hydrogens: bool, is_pqr: bool
+    parts: list[tuple[str, list[gemmi.Chain], list[str]]],
+    ligands: bool,
+    hydrogens: bool,
+    is_pqr: bool,
 ) -> tuple[list[Molecule], list[str]]:
     """Build the molecules of parts; return also the names of parts without usable atoms."""
     molecules, left_out = [], []
@@ -149,13 +188,22 @@ class _Builder:
 
     def molecule(self, name: str, notes: list[str]) -> Molecule:
         origin = ["radii and charges are those of the PQR file"] if self.is_pqr else []
-        counted = [text.format(self._count[key]) for key, text in _NOTES.items() if self._count[key]]
+        counted = [
+            text.format(self._count[key]) for key, text in _NOTES.items() if self._count[key]
+        ]
         positions, radii, charges, residue_of = map(np.array, zip(*self.balls, strict=True))
         names, centres, b_factors = zip(*self._residues, strict=True)
         return Molecule(
-            name, positions, radii, charges, residue_of, names, np.array(centres), np.array(b_factors),
+            name,
+            positions,
+            radii,
+            charges,
+            residue_of,
+            names,
+            np.array(centres),
+            np.array(b_factors),
             (*notes, *origin, *counted),
-        )  # fmt: skip
+        )
 
     def add_chain(self, chain: gemmi.Chain) -> None:
         seen: set[str] = set()
@@ -184,11 +232,25 @@ class _Builder:
             return False
         self._count["residue"] += in_polymer and not is_known
         positions = np.array([atom.pos.tolist() for atom in atoms])
-        alpha = next((i for i, atom in enumerate(atoms) if atom.name == "CA"), None) if in_polymer else None
+        alpha = (
+            next((i for i, atom in enumerate(atoms) if atom.name == "CA"), None)
+            if in_polymer
+            else None
+        )
         b_factor = np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms]))
-        self._residues.append((name, positions.mean(axis=0) if alpha is None else positions[alpha], b_factor))
-        charged = (PHOSPHATES if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {})) if in_polymer else {}
-        if alpha is not None and not self.is_pqr and (named == {"CA"} or (named <= BACKBONE and name != "GLY")):
+        self._residues.append(
+            (name, positions.mean(axis=0) if alpha is None else positions[alpha], b_factor)
+        )
+        charged = (
+            (PHOSPHATES if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {}))
+            if in_polymer
+            else {}
+        )
+        if (
+            alpha is not None
+            and not self.is_pqr
+            and (named == {"CA"} or (named <= BACKBONE and name != "GLY"))
+        ):
             self._add_coarse_ball(name, atoms, positions, sum(charged.values()))
             if named == {"CA"}:
                 return True
@@ -212,7 +274,9 @@ class _Builder:
     def _add_ball(self, position: Floats, radius: float, charge: float) -> None:
         self.balls.append((position, radius, charge, len(self._residues) - 1))
 
-    def _add_coarse_ball(self, name: str, atoms: list[gemmi.Atom], positions: Floats, charge: float) -> None:
+    def _add_coarse_ball(
+        self, name: str, atoms: list[gemmi.Atom], positions: Floats, charge: float
+    ) -> None:
         """Add the ball for a missing side chain, or for a residue of Cα alone."""
         position_of = {atom.name: position for atom, position in zip(atoms, positions, strict=True)}
         if len(position_of) == 1:
@@ -239,18 +303,24 @@ class _Builder:
         for _, group in groupby(enumerate(chain), key):
             residues = [residue for _, residue in group]
             self._count["alternative"] += len(residues) - 1
-            yield max(residues, key=lambda residue: max((atom.occ for atom in residue), default=0.0))
+            yield max(
+                residues, key=lambda residue: max((atom.occ for atom in residue), default=0.0)
+            )
 
     def _atoms(self, residue: gemmi.Residue) -> list[gemmi.Atom]:
         """Return the atoms that have a position, each at its alternative location of the highest occupancy."""
         chosen: dict[Any, Any] = {}
         gemmi = gemmi_module()
-        is_standard = residue.name in STANDARD or gemmi.find_tabulated_residue(residue.name).is_standard()
+        is_standard = (
+            residue.name in STANDARD or gemmi.find_tabulated_residue(residue.name).is_standard()
+        )
         for number, atom in enumerate(residue):
             # If names begin in the wrong column, gemmi takes Cα for calcium
             if is_standard and atom.element.name not in _STANDARD_ELEMENTS:
                 atom.element = gemmi.Element("X")
-            is_hydrogen = atom.is_hydrogen() or (not atom.element.atomic_number and _first_letter(atom) == "H")
+            is_hydrogen = atom.is_hydrogen() or (
+                not atom.element.atomic_number and _first_letter(atom) == "H"
+            )
             if is_hydrogen and not self.hydrogens:
                 continue
             if not np.isfinite(atom.pos.tolist()).all():
@@ -282,7 +352,9 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """Return the surfaces of the chains, models or assemblies of a structure file, in ångström."""
     from igps.mesh.molecular_surface import molecular_surface
 
-    bodies: MoleculeBodies = options.bodies if options.bodies in ("chains", "assembly") else "models"
+    bodies: MoleculeBodies = (
+        options.bodies if options.bodies in ("chains", "assembly") else "models"
+    )
     molecules = molecules_by_part(path, stat_key(path), bodies)
     names = [name for name in molecules if part in (None, name)]
     return [deferred(partial(molecular_surface, molecules[name]), name, "Å") for name in names]

@@ -18,7 +18,10 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     coordinates: list[str] = []
     polygons: list[str] = []
     n_before: list[int] = []  # vertices above each polygon: negative indices count back from there
-    starts: dict[str, list[tuple[int, str]]] = {"o": [], "g": []}  # of objects and groups: first polygon, and name
+    starts: dict[str, list[tuple[int, str]]] = {
+        "o": [],
+        "g": [],
+    }  # of objects and groups: first polygon, and name
     for line in text_of(path).replace("\\\n\n", " ").replace("\\\n", " ").split("\n"):
         word, _, fields = line.lstrip().replace("\t", " ").partition(" ")
         if word == "v":
@@ -35,7 +38,9 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     if not polygons:
         return [RawBody(vertices)]
     corners, n_corners = _corners(polygons, np.array(n_before, dtype=np.int64))
-    names, owner = _owners(starts, len(polygons)) if options.bodies == "objects" else ([], np.zeros(0))
+    names, owner = (
+        _owners(starts, len(polygons)) if options.bodies == "objects" else ([], np.zeros(0))
+    )
     if len(names) < 2:
         return [RawBody(vertices, flat_triangles(corners, n_corners, vertices))]
     bodies = []
@@ -62,11 +67,17 @@ def _corners(polygons: list[str], n_before: Integers) -> tuple[Integers, Integer
     return np.where(corners > 0, corners - 1, corners + np.repeat(n_before, n_corners)), n_corners
 
 
-def _owners(starts: dict[str, list[tuple[int, str]]], n_polygons: int) -> tuple[list[str], Integers]:
+def _owners(
+    starts: dict[str, list[tuple[int, str]]], n_polygons: int
+) -> tuple[list[str], Integers]:
     """Return the names of objects (or groups) with polygons, and for each polygon the index of its object, (P,)."""
     parts = [(0, "unnamed"), *(starts["o"] or starts["g"])]
     ends = [*(first for first, _ in parts[1:]), n_polygons]
-    ranges = [(name or "unnamed", end - first) for (first, name), end in zip(parts, ends, strict=True) if end > first]
+    ranges = [
+        (name or "unnamed", end - first)
+        for (first, name), end in zip(parts, ends, strict=True)
+        if end > first
+    ]
     names = [name for name, _ in ranges]
     # Objects of the same name are separate, but a group may continue further down
     names = distinct(names) if starts["o"] else names

@@ -23,16 +23,22 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     if not lines:
         raise ValueError("expected OFF, followed by the numbers of vertices and faces")
     if "BINARY" in lines[0]:
-        raise ValueError("expected numbers as text, got bytes (OFF BINARY); export it as text, or as PLY")
+        raise ValueError(
+            "expected numbers as text, got bytes (OFF BINARY); export it as text, or as PLY"
+        )
     if "4" in kind:
         raise ValueError("expected three coordinates for each vertex, got four (4OFF)")
     n_vertices, n_faces, *_ = map(int, lines[0].split())
     coordinates, rows = lines[1 : n_vertices + 1], lines[n_vertices + 1 :][:n_faces]
     if min(n_vertices, n_faces) < 0 or len(rows) < n_faces or len(coordinates) < n_vertices:
-        raise ValueError(f"expected {n_vertices} vertices and {n_faces} faces, got {len(lines) - 1} lines")
+        raise ValueError(
+            f"expected {n_vertices} vertices and {n_faces} faces, got {len(lines) - 1} lines"
+        )
     if not coordinates:
         return [RawBody()]
-    vertices = np.array([line.split()[:3] for line in coordinates], dtype=np.float64).reshape(n_vertices, 3)
+    vertices = np.array([line.split()[:3] for line in coordinates], dtype=np.float64).reshape(
+        n_vertices, 3
+    )
     corners, n_corners = _corners(rows)
     if corners.min(initial=0) < 0 or corners.max(initial=0) >= n_vertices:
         raise ValueError("a face refers to a vertex that is not there")

@@ -14,9 +14,23 @@ from igps.mesh.options import LoadOptions
 
 # Type codes of both `struct` and NumPy
 _TYPES = {
-    "char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d",
-    "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d",
-}  # fmt: skip
+    "char": "b",
+    "uchar": "B",
+    "short": "h",
+    "ushort": "H",
+    "int": "i",
+    "uint": "I",
+    "float": "f",
+    "double": "d",
+    "int8": "b",
+    "uint8": "B",
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "float32": "f",
+    "float64": "d",
+}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNERS = ("vertex_index", "vertex_indices")
 _HAS_FACES = re.compile(rb"element\s+(face|tristrips)\s+0*[1-9]")
@@ -28,7 +42,12 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     head, end, body = path.read_bytes().partition(b"end_header")
     try:
         polygons = _polygons(head.decode("latin-1"), body.partition(b"\n")[2])
-    except (ValueError, KeyError, IndexError, struct.error):  # a rare file, or a broken one: trimesh names the fault
+    except (
+        ValueError,
+        KeyError,
+        IndexError,
+        struct.error,
+    ):  # a rare file, or a broken one: trimesh names the fault
         polygons = None
     if polygons is not None:
         return [RawBody(*polygons)]
@@ -51,7 +70,9 @@ def _polygons(head: str, body: bytes) -> Surface | None:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
             name, kind, *length = words[:0:-1]
-            elements[-1][2].append((name, _TYPES[kind], _TYPES[length[0]] if len(length) > 1 else ""))
+            elements[-1][2].append(
+                (name, _TYPES[kind], _TYPES[length[0]] if len(length) > 1 else "")
+            )
     if [name for name, _, _ in elements[:2]] not in (["vertex", "face"], ["vertex", "tristrips"]):
         return None
     (_, n_vertices, vertex_properties), (element, n_faces, face_properties) = elements[:2]
@@ -60,7 +81,9 @@ def _polygons(head: str, body: bytes) -> Surface | None:
     if any(length for _, _, length in others) or at < 0 or min(n_vertices, n_faces) < 1:
         return None
     if order is None:
-        content = _read_text(body, [name for name, _, _ in vertex_properties], n_vertices, n_faces, at)
+        content = _read_text(
+            body, [name for name, _, _ in vertex_properties], n_vertices, n_faces, at
+        )
     else:
         vertex_type = np.dtype([(name, order + kind) for name, kind, _ in vertex_properties])
         content = _read_binary(body, vertex_type, n_vertices, n_faces, face_properties, at, order)
@@ -76,31 +99,46 @@ def _polygons(head: str, body: bytes) -> Surface | None:
     return vertices, flat_triangles(corners, n_corners, vertices)
 
 
-def _read_text(text: bytes, names: list[str], n_vertices: int, n_faces: int, at: int) -> Polygons | None:
+def _read_text(
+    text: bytes, names: list[str], n_vertices: int, n_faces: int, at: int
+) -> Polygons | None:
     """Read polygons as text; `at` is the index of the corners among the properties of a face."""
     lines = [line for line in text.splitlines() if line and not line.isspace()]
     coordinates, faces = lines[:n_vertices], lines[n_vertices : n_vertices + n_faces]
     if len(faces) < n_faces:  # trimesh would silently read a part
-        raise EOFError(f"expected {n_vertices} vertices and {n_faces} faces, got {len(lines)} lines")
+        raise EOFError(
+            f"expected {n_vertices} vertices and {n_faces} faces, got {len(lines)} lines"
+        )
     if at == 0 and all(line.startswith(b"3 ") for line in faces):
         return None
     rows = [line.split() for line in faces]
     if all(row[at] == b"3" for row in rows):
         return None
     columns = [names.index(axis) for axis in "xyz"]
-    vertices = np.loadtxt(coordinates, np.float64, comments=None, usecols=columns, ndmin=2, encoding="latin-1")
+    vertices = np.loadtxt(
+        coordinates, np.float64, comments=None, usecols=columns, ndmin=2, encoding="latin-1"
+    )
     polygons = [tuple(map(int, row[at + 1 : at + 1 + int(row[at])])) for row in rows]
-    is_complete = all(len(polygon) == int(row[at]) for polygon, row in zip(polygons, rows, strict=True))
+    is_complete = all(
+        len(polygon) == int(row[at]) for polygon, row in zip(polygons, rows, strict=True)
+    )
     return (vertices, polygons) if is_complete else None
 
 
 def _read_binary(
-    body: bytes, vertex_type: np.dtype[np.void], n_vertices: int, n_faces: int, face_properties: list[Property],
-    at: int, order: str,
-) -> Polygons | None:  # fmt: skip
+    body: bytes,
+    vertex_type: np.dtype[np.void],
+    n_vertices: int,
+    n_faces: int,
+    face_properties: list[Property],
+    at: int,
+    order: str,
+) -> Polygons | None:
     rows = np.frombuffer(body, vertex_type, n_vertices)
     offset, polygons = rows.nbytes, list[tuple[int, ...]]()
-    triangle_type = [(f"{i}", order + (length or kind)) for i, (_, kind, length) in enumerate(face_properties)]
+    triangle_type = [
+        (f"{i}", order + (length or kind)) for i, (_, kind, length) in enumerate(face_properties)
+    ]
     triangle_type.insert(at + 1, ("corners", f"3{order}{face_properties[at][1]}"))
     is_long_enough = len(body) - offset >= n_faces * np.dtype(triangle_type).itemsize
     if is_long_enough and (np.frombuffer(body, triangle_type, n_faces, offset)[f"{at}"] == 3).all():

@@ -18,7 +18,11 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     content = path.read_bytes()
     n_declared = int.from_bytes(content[80:_HEADER], "little")
     is_exact = len(content) == _HEADER + _TRIANGLE.itemsize * n_declared
-    is_text = not is_exact and content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
+    is_text = (
+        not is_exact
+        and content.lstrip()[:5].lower() == b"solid"
+        and b"facet" in content[:4096].lower()
+    )
     corners, notes = _read_text(content) if is_text else _read_binary(content, n_declared)
     if not len(corners):
         raise ValueError("no triangle in it")
@@ -28,7 +32,9 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 def _read_text(content: bytes) -> tuple[Floats, tuple[str, ...]]:
     corners = np.array(b"\n".join(_VERTEX.findall(content)).split(), dtype=np.float64)
     if len(corners) % 9:
-        raise ValueError(f"{len(corners) // 3} vertices do not make whole triangles; the file is cut short")
+        raise ValueError(
+            f"{len(corners) // 3} vertices do not make whole triangles; the file is cut short"
+        )
     return corners.reshape(-1, 3), ()
 
 
@@ -36,7 +42,9 @@ def _read_binary(content: bytes, n_declared: int) -> tuple[Floats, tuple[str, ..
     """Read the triangles of the file, even if their number differs from that in the header."""
     n_complete = max(len(content) - _HEADER, 0) // _TRIANGLE.itemsize
     n = min(n_complete, n_declared) or n_complete
-    notes = () if n == n_declared else (f"the header declares {n_declared} triangles: {n} were read",)
+    notes = (
+        () if n == n_declared else (f"the header declares {n_declared} triangles: {n} were read",)
+    )
     rows = np.frombuffer(content, _TRIANGLE, n, _HEADER) if n else np.zeros(0, _TRIANGLE)
     return rows["corners"].reshape(-1, 3).astype(np.float64), notes
 

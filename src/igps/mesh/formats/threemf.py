@@ -15,7 +15,14 @@ from igps.mesh.formats import _xml
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct, joined
 from igps.mesh.options import LoadOptions
 
-_UNITS = {"micron": "µm", "millimeter": "mm", "centimeter": "cm", "inch": "in", "foot": "ft", "meter": "m"}
+_UNITS = {
+    "micron": "µm",
+    "millimeter": "mm",
+    "centimeter": "cm",
+    "inch": "in",
+    "foot": "ft",
+    "meter": "m",
+}
 _MAX_DEPTH = 32  # of objects within objects
 _MIN_BYTES = 100  # the least memory that a placed object takes
 
@@ -52,13 +59,19 @@ class _Model:
             with archive.open(self._member) as stream:
                 _xml.walk(stream, self._start)
             referred = {placed.key[0] for obj in self.objects.values() for placed in obj.components}
-            members.extend(sorted((referred | {placed.key[0] for placed in self.items}) - set(members)))
+            members.extend(
+                sorted((referred | {placed.key[0] for placed in self.items}) - set(members))
+            )
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         if name == "vertex":
-            self._object.vertices.extend((float(attributes["x"]), float(attributes["y"]), float(attributes["z"])))
+            self._object.vertices.extend(
+                (float(attributes["x"]), float(attributes["y"]), float(attributes["z"]))
+            )
         elif name == "triangle":
-            self._object.triangles.extend((int(attributes["v1"]), int(attributes["v2"]), int(attributes["v3"])))
+            self._object.triangles.extend(
+                (int(attributes["v1"]), int(attributes["v2"]), int(attributes["v3"]))
+            )
         elif name == "object":
             number = attributes["id"]
             label = attributes.get("name") or attributes.get("partnumber") or f"object {number}"
@@ -72,9 +85,13 @@ class _Model:
 
     def _placed(self, attributes: dict[str, str]) -> _Placed:
         numbers = attributes.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
-        path = next((value for key, value in attributes.items() if key.rpartition(":")[2] == "path"), "").lstrip("/")
+        path = next(
+            (value for key, value in attributes.items() if key.rpartition(":")[2] == "path"), ""
+        ).lstrip("/")
         matrix = np.array(numbers, dtype=np.float64).reshape(4, 3)
-        return _Placed((path or self._member, attributes["objectid"]), matrix, attributes.get("partnumber", ""))
+        return _Placed(
+            (path or self._member, attributes["objectid"]), matrix, attributes.get("partnumber", "")
+        )
 
     def leaves(self, placed: _Placed, budget: list[int], depth: int = 0) -> Iterator[RawBody]:
         """Yield the surfaces of an object and of its components, while the bytes left in `budget` suffice."""
@@ -85,10 +102,14 @@ class _Model:
         if budget[0] < 0:
             return
         if obj.triangles:
-            vertices = np.frombuffer(obj.vertices).reshape(-1, 3) @ placed.matrix[:3] + placed.matrix[3]
+            vertices = (
+                np.frombuffer(obj.vertices).reshape(-1, 3) @ placed.matrix[:3] + placed.matrix[3]
+            )
             faces = np.frombuffer(obj.triangles, dtype=np.int64).reshape(-1, 3)
             is_mirrored = np.linalg.det(placed.matrix[:3]) < 0
-            yield RawBody(vertices, np.ascontiguousarray(faces[:, ::-1]) if is_mirrored else faces.copy())
+            yield RawBody(
+                vertices, np.ascontiguousarray(faces[:, ::-1]) if is_mirrored else faces.copy()
+            )
         for component in obj.components:
             matrix = component.matrix @ placed.matrix[:3]
             matrix[3] += placed.matrix[3]
@@ -105,13 +126,19 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
             raise ValueError("no model in it")
         main = next((name for name in names if name.lower() == "3d/3dmodel.model"), names[0])
         model = _Model(archive, main)
-    items = model.items or [_Placed(key, np.eye(4, 3)) for key, obj in model.objects.items() if obj.triangles]
+    items = model.items or [
+        _Placed(key, np.eye(4, 3)) for key, obj in model.objects.items() if obj.triangles
+    ]
     budget = [options.max_unpacked]
     leaves = [list(model.leaves(item, budget)) for item in items]
     check_unpacked(options.max_unpacked - budget[0], path, options.max_unpacked)
     names = distinct(item.name or model.objects[item.key].name for item in items)
-    parts = [(name, joined(surfaces)) for name, surfaces in zip(names, leaves, strict=True) if surfaces]
-    return [RawBody(body.vertices, body.faces, name, _UNITS.get(model.unit)) for name, body in parts]
+    parts = [
+        (name, joined(surfaces)) for name, surfaces in zip(names, leaves, strict=True) if surfaces
+    ]
+    return [
+        RawBody(body.vertices, body.faces, name, _UNITS.get(model.unit)) for name, body in parts
+    ]
 
 
 FORMAT = Format("3MF", (".3mf",), read, bodies=("whole", "objects"))

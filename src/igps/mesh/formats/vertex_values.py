@@ -32,7 +32,9 @@ def read(path: Path) -> Arrays:
     else:
         arrays = {path.suffix.lstrip("."): _freesurfer(path)}
     if not arrays:
-        raise MeshError(f"{path}: expected values at vertices, got none. Export the file with values.")
+        raise MeshError(
+            f"{path}: expected values at vertices, got none. Export the file with values."
+        )
     return {key: np.asarray(values, dtype=np.float64) for key, values in arrays.items()}
 
 
@@ -42,8 +44,14 @@ def read_tetrahedra(path: Path) -> tuple[Floats, Integers, Arrays]:
     if not len(data.tetrahedra) or not data.values:
         raise MeshError(f"{path}: expected tetrahedra with values at their points. Export both.")
     if data.tetrahedra.min() < 0 or data.tetrahedra.max() >= len(data.vertices):
-        raise MeshError(f"{path}: a tetrahedron refers to a point that is not there. Export it again.")
-    return data.vertices, data.tetrahedra, {name: values.astype(float) for name, values in data.values.items()}
+        raise MeshError(
+            f"{path}: a tetrahedron refers to a point that is not there. Export it again."
+        )
+    return (
+        data.vertices,
+        data.tetrahedra,
+        {name: values.astype(float) for name, values in data.values.items()},
+    )
 
 
 def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
@@ -52,22 +60,34 @@ def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
         return arrays[name]
     if not name and len(arrays) == 1:
         return next(iter(arrays.values()))
-    raise MeshError(f"{path}: expected one of its arrays {', '.join(arrays)}, got {name!r}. Name it as FILE#ARRAY.")
+    raise MeshError(
+        f"{path}: expected one of its arrays {', '.join(arrays)}, got {name!r}. Name it as FILE#ARRAY."
+    )
 
 
 def _ply(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the properties of vertices other than coordinates, normals and colours."""
-    scene = trimesh.load_scene(BytesIO(path.read_bytes()), file_type="ply", process=False, fix_texture=False)
+    scene = trimesh.load_scene(
+        BytesIO(path.read_bytes()), file_type="ply", process=False, fix_texture=False
+    )
     columns = ply_columns(scene).items()
     ignored = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
-    return {name: values[:, 0] if values.shape[1] == 1 else values for name, values in columns if name not in ignored}
+    return {
+        name: values[:, 0] if values.shape[1] == 1 else values
+        for name, values in columns
+        if name not in ignored
+    }
 
 
 def _freesurfer(path: Path) -> NDArray[np.generic]:
     content = path.read_bytes()
     if not content.startswith(b"\xff\xff\xff") or len(content) < 15:
-        raise ValueError("expected PLY, VTK or GIFTI by its suffix, or a file of values of FreeSurfer")
+        raise ValueError(
+            "expected PLY, VTK or GIFTI by its suffix, or a file of values of FreeSurfer"
+        )
     n, _, n_values = (int(x) for x in np.frombuffer(content, ">i4", 3, 3))
     if n < 1 or n_values != 1 or len(content) < 15 + 4 * n:
-        raise ValueError(f"expected {n} values in {4 * n} bytes, got {n_values} a vertex in {len(content) - 15} bytes")
+        raise ValueError(
+            f"expected {n} values in {4 * n} bytes, got {n_values} a vertex in {len(content) - 15} bytes"
+        )
     return np.frombuffer(content, ">f4", n, 15)

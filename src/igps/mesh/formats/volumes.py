@@ -18,7 +18,14 @@ from scipy.optimize import linear_sum_assignment
 from igps._arrays import Booleans, Floats
 from igps.mesh._label_measures import LabelVoxels
 from igps.mesh.formats._format import Format, RawBody, deferred, faults
-from igps.mesh.formats._volume_files import READERS, RawVolume, detached, of_nibabel, read_raw, suffix_of
+from igps.mesh.formats._volume_files import (
+    READERS,
+    RawVolume,
+    detached,
+    of_nibabel,
+    read_raw,
+    suffix_of,
+)
 from igps.mesh.formats.label_names import cleaned, read_label_names, table_beside
 from igps.mesh.label_surface import MIN_VOXELS, voxel_spacing, voxel_surface
 from igps.mesh.mending import Cavities, Mending, mend
@@ -28,7 +35,9 @@ from igps.mesh.options import LoadOptions
 # Volumes with more values than _MAX_LABELS are refused as images. So are those with more than _MAX_UNCHECKED values if
 # less than a share _MIN_EQUAL of adjacent voxels are equal; labels as thin as two voxels have a share of one half.
 _MAX_LABELS, _MAX_UNCHECKED, _MIN_EQUAL = 20_000, 50, 0.3
-_LABEL_TOLERANCE = 0.01  # distance of a label from a whole number: NIfTI may store labels as scaled integers
+_LABEL_TOLERANCE = (
+    0.01  # distance of a label from a whole number: NIfTI may store labels as scaled integers
+)
 
 Box = tuple[slice, slice, slice]
 
@@ -60,7 +69,9 @@ class LabelVolume:
         MeshError: no labels, labels other than whole numbers from 0, ambiguous names, or a singular affine.
     """
 
-    layers: tuple[NDArray[Any], ...]  # (X, Y, Z) whole numbers, 0 is the background; several if segments overlap
+    layers: tuple[
+        NDArray[Any], ...
+    ]  # (X, Y, Z) whole numbers, 0 is the background; several if segments overlap
     affine: Floats  # (4, 4) from voxel indices to the world
     name: str = "volume"  # used in messages, usually the path
     names: dict[int, str] | None = None  # of labels
@@ -73,7 +84,9 @@ class LabelVolume:
         voxel_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
         if not self.bodies:
             notes = f" ({'; '.join(self.notes)})" if self.notes else ""
-            raise MeshError(f"{self.name}: no voxel has a label, all are 0{notes}. Check the export.")
+            raise MeshError(
+                f"{self.name}: no voxel has a label, all are 0{notes}. Check the export."
+            )
         seen: dict[str, int] = {}  # a given name may equal one that was made distinct by its number
         for body in self.bodies:
             if (other := seen.setdefault(body.name, body.label)) != body.label:
@@ -89,9 +102,13 @@ class LabelVolume:
             for value, n_voxels, box in _count_labels(labels, self.name):
                 label = known.get(value, value if len(self.layers) == 1 else None)
                 if label is not None:
-                    bodies.append(LabelBody(label, names.get(label, str(label)), n_voxels, layer, value, box))
+                    bodies.append(
+                        LabelBody(label, names.get(label, str(label)), n_voxels, layer, value, box)
+                    )
         uses = Counter(body.name for body in bodies)
-        distinct = (replace(x, name=f"{x.name} ({x.label})") if uses[x.name] > 1 else x for x in bodies)
+        distinct = (
+            replace(x, name=f"{x.name} ({x.label})") if uses[x.name] > 1 else x for x in bodies
+        )
         return tuple(sorted(distinct, key=lambda body: body.label))
 
     def body(self, part: int | str) -> LabelBody:
@@ -101,7 +118,9 @@ class LabelVolume:
         by_key |= {key: body for body in self.bodies for key in (body.label, body.name)}
         if part in by_key:
             return by_key[part]
-        known = ", ".join(body.name for body in self.bodies[:10]) + (", …" if len(self.bodies) > 10 else "")
+        known = ", ".join(body.name for body in self.bodies[:10]) + (
+            ", …" if len(self.bodies) > 10 else ""
+        )
         raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
 
     def mask(self, part: int | str) -> Booleans:
@@ -112,7 +131,9 @@ class LabelVolume:
     def voxels(self, part: int | str) -> LabelVoxels:
         """Return the mask of a label with its place in the volume."""
         low = np.array([side.start for side in self.body(part).box])
-        return LabelVoxels(self.mask(part), low, self.layers[0].shape, np.asarray(self.affine, dtype=np.float64))
+        return LabelVoxels(
+            self.mask(part), low, self.layers[0].shape, np.asarray(self.affine, dtype=np.float64)
+        )
 
 
 def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) -> LabelVolume:
@@ -134,7 +155,10 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
 
 
 def volume_in_memory(
-    labels: Any, spacing: Sequence[float] | None = None, name: str = "volume", options: LoadOptions = LoadOptions()
+    labels: Any,
+    spacing: Sequence[float] | None = None,
+    name: str = "volume",
+    options: LoadOptions = LoadOptions(),
 ) -> LabelVolume:
     """Make a volume of an array (X, Y, Z) and the sides of a voxel, in millimetres, or of an image of nibabel."""
     if hasattr(labels, "dataobj"):
@@ -144,28 +168,41 @@ def volume_in_memory(
         is_volume = array.ndim == 3 and array.size > 0 and array.dtype.kind in "biuf"
         if not is_volume or (spacing is not None and len(spacing) != 3):
             got = f"{array.dtype} of shape {array.shape}, spacing {spacing}"
-            raise MeshError(f"{name}: expected labels of shape (X, Y, Z) and three sides of a voxel, got {got}.")
-        raw = RawVolume([array], np.diag([*(spacing or (1, 1, 1)), 1.0]), unit="mm" if spacing else None)
+            raise MeshError(
+                f"{name}: expected labels of shape (X, Y, Z) and three sides of a voxel, got {got}."
+            )
+        raw = RawVolume(
+            [array], np.diag([*(spacing or (1, 1, 1)), 1.0]), unit="mm" if spacing else None
+        )
     return _labelled(raw, name, options)
 
 
-def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto", cavities: Cavities = "fill") -> Mesh:
+def label_surface(
+    volume: LabelVolume, part: int | str, *, how: Mending = "auto", cavities: Cavities = "fill"
+) -> Mesh:
     """Return the surface of a label, by number or name, in world coordinates; see `voxel_surface` and `mend`."""
     body = volume.body(part)
     name = f"{volume.name}#{body.name}"
     affine = np.array(volume.affine, dtype=np.float64)
     affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
     mask, affine = _reoriented(volume.mask(part), affine)
-    vertices, faces, notes = voxel_surface(mask, affine, cavities=cavities == "keep", joins=how != "never", name=name)
+    vertices, faces, notes = voxel_surface(
+        mask, affine, cavities=cavities == "keep", joins=how != "never", name=name
+    )
     if (volume.names or {}).get(body.label, body.name) != body.name:
-        notes = (*notes, "another label has the same name: the number was appended. Give names by a table")
+        notes = (
+            *notes,
+            "another label has the same name: the number was appended. Give names by a table",
+        )
     notes = (*volume.notes, *notes)
     return mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name, notes=notes)
 
 
 def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
     """Permute and flip the axes to run as nearly along x, y, z as possible, whatever order a format stores them in."""
-    order = linear_sum_assignment(-np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0))[1]
+    order = linear_sum_assignment(-np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0))[
+        1
+    ]
     mask, affine = mask.transpose(order), affine[:, [*order, 3]]
     for axis in np.nonzero(np.diag(affine)[:3] < 0)[0]:
         affine[:3, 3] += affine[:3, axis] * (mask.shape[axis] - 1)
@@ -174,7 +211,9 @@ def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
     return np.ascontiguousarray(mask), affine
 
 
-def _labelled(raw: RawVolume, name: str, options: LoadOptions, path: Path | None = None) -> LabelVolume:
+def _labelled(
+    raw: RawVolume, name: str, options: LoadOptions, path: Path | None = None
+) -> LabelVolume:
     """Turn the values of a volume into labels, and find their names; see `read_label_volume`."""
     notes: list[str] = []
     layers = tuple(_integer_labels(values, name, options.threshold, notes) for values in raw.layers)
@@ -183,8 +222,13 @@ def _labelled(raw: RawVolume, name: str, options: LoadOptions, path: Path | None
         # The same value may stand for different segments in different layers
         values = [value for _, _, value in raw.segments]
         labels = values if len(set(values)) == len(values) else list(range(1, len(values) + 1))
-        segments = tuple((label, layer, value) for label, (_, layer, value) in zip(labels, raw.segments, strict=True))
-        names = cleaned({label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True)})
+        segments = tuple(
+            (label, layer, value)
+            for label, (_, layer, value) in zip(labels, raw.segments, strict=True)
+        )
+        names = cleaned(
+            {label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True)}
+        )
     if options.names is not None:
         names = read_label_names(options.names)
     elif not names and path is not None:
@@ -193,39 +237,57 @@ def _labelled(raw: RawVolume, name: str, options: LoadOptions, path: Path | None
         is_mask = label in (1, 255) and bool(((layers[0] == 0) | (layers[0] == label)).all())
         if not names and not raw.segments and is_mask:
             names = {label: path.name[: -len(suffix_of(path))]}
-    return LabelVolume(layers, raw.affine, name, names, segments, raw.unit, tuple(dict.fromkeys(notes)))
+    return LabelVolume(
+        layers, raw.affine, name, names, segments, raw.unit, tuple(dict.fromkeys(notes))
+    )
 
 
-def _integer_labels(values: NDArray[Any], name: str, threshold: float, notes: list[str]) -> NDArray[Any]:
+def _integer_labels(
+    values: NDArray[Any], name: str, threshold: float, notes: list[str]
+) -> NDArray[Any]:
     """Convert values to labels of the smallest unsigned type; probabilities are binarised at the threshold."""
     if values.dtype.kind == "f":
         if n_bad := int(np.count_nonzero(~np.isfinite(values))):
-            raise MeshError(f"{name}: {n_bad} voxels are NaN or infinite, expected labels. Set them to 0.")
+            raise MeshError(
+                f"{name}: {n_bad} voxels are NaN or infinite, expected labels. Set them to 0."
+            )
         slabs = values.T if values.flags.f_contiguous else values  # a copy of all may be too large
-        odd = np.concatenate([np.empty(0), *(x[np.abs(x - np.rint(x)) > _LABEL_TOLERANCE] for x in slabs)])
+        odd = np.concatenate(
+            [np.empty(0), *(x[np.abs(x - np.rint(x)) > _LABEL_TOLERANCE] for x in slabs)]
+        )
         # Probabilities may leave [0, 1]: SPM stores bytes times a rounded 1/255, and resampling overshoots
         if len(odd) and values.min() >= -_LABEL_TOLERANCE and values.max() <= 1 + _LABEL_TOLERANCE:
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
             return (values >= threshold).astype(np.uint8)
         if len(odd):
             fault = f"{name}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}."
-            raise MeshError(f"{fault} Resample to the nearest neighbour, or give probabilities between 0 and 1.")
+            raise MeshError(
+                f"{fault} Resample to the nearest neighbour, or give probabilities between 0 and 1."
+            )
     low, high = (int(np.rint(values.min())), int(np.rint(values.max()))) if values.size else (0, 0)
     if low < 0:
         fault = f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}"
-        raise MeshError(f"{fault}; expected 0 and positive numbers. Export the labels if it is an image.")
+        raise MeshError(
+            f"{fault}; expected 0 and positive numbers. Export the labels if it is an image."
+        )
     if high >= 2**31:
-        raise MeshError(f"{name}: label {high} is too large, expected less than 2³¹. Renumber the labels.")
+        raise MeshError(
+            f"{name}: label {high} is too large, expected less than 2³¹. Renumber the labels."
+        )
     if values.dtype.kind != "f":
         return np.asarray(values, dtype=np.min_scalar_type(high))
-    return np.rint(values, out=np.empty_like(values, dtype=np.min_scalar_type(high)), casting="unsafe")
+    return np.rint(
+        values, out=np.empty_like(values, dtype=np.min_scalar_type(high)), casting="unsafe"
+    )
 
 
 def _count_labels(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]]:
     """Return the values that occur except 0, ascending, with their counts and bounding boxes."""
     array = np.asarray(labels)
     if array.ndim != 3 or array.dtype.kind not in "biu":
-        raise MeshError(f"{name}: expected whole numbers of shape (X, Y, Z), got {array.dtype} of shape {array.shape}.")
+        raise MeshError(
+            f"{name}: expected whole numbers of shape (X, Y, Z), got {array.dtype} of shape {array.shape}."
+        )
     array = array.view(np.uint8) if array.dtype.kind == "b" else array
     if array.size and array.min() < 0:
         raise MeshError(f"{name}: expected labels from 0, got {array.min()}. Renumber them.")
@@ -243,7 +305,9 @@ def _count_labels(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]
         values, counts = values[start:], counts[start:]
     n = len(values)
     if n > _MAX_LABELS or (n > _MAX_UNCHECKED and _is_speckled(array, values[counts.argmax()])):
-        raise MeshError(f"{name}: {n} values, which look like an image and not like labels. Export the labels.")
+        raise MeshError(
+            f"{name}: {n} values, which look like an image and not like labels. Export the labels."
+        )
     boxes = [box for box in ndimage.find_objects(numbered) if box is not None]
     return zip(values.tolist(), counts.tolist(), boxes, strict=True)
 
@@ -252,14 +316,18 @@ def _is_speckled(labels: NDArray[Any], most_frequent: int) -> bool:
     """Return whether few neighbours along x are equal, without the background and the most frequent value."""
     counted = (labels != 0) & (labels != most_frequent)
     pairs = counted[1:] & counted[:-1]
-    return bool(np.count_nonzero(pairs & (labels[1:] == labels[:-1])) < _MIN_EQUAL * np.count_nonzero(pairs))
+    return bool(
+        np.count_nonzero(pairs & (labels[1:] == labels[:-1])) < _MIN_EQUAL * np.count_nonzero(pairs)
+    )
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     return label_bodies(read_label_volume(path, options), options, part)
 
 
-def label_bodies(volume: LabelVolume, options: LoadOptions, part: str | None = None) -> list[RawBody]:
+def label_bodies(
+    volume: LabelVolume, options: LoadOptions, part: str | None = None
+) -> list[RawBody]:
     """Return deferred bodies of a volume: its labels, or all of them as the whole or in pieces, by `options`."""
     if options.bodies in ("whole", "pieces"):
         labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
@@ -269,7 +337,10 @@ def label_bodies(volume: LabelVolume, options: LoadOptions, part: str | None = N
     if options.bodies == "whole":
         return [deferred(partial(surface, 1), None, volume.unit, partial(volume.voxels, 1))]
     names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
-    return [deferred(partial(surface, name), name, volume.unit, partial(volume.voxels, name)) for name in names]
+    return [
+        deferred(partial(surface, name), name, volume.unit, partial(volume.voxels, name))
+        for name in names
+    ]
 
 
 def _in_pieces(volume: LabelVolume) -> LabelVolume:
@@ -281,7 +352,12 @@ def _in_pieces(volume: LabelVolume) -> LabelVolume:
         is_speck[:] = False
     names = {k: f"piece {i}" for i, k in enumerate((np.flatnonzero(~is_speck[1:]) + 1).tolist(), 1)}
     notes = (f"left out {is_speck.sum()} specks",) if is_speck.any() else ()
-    return replace(volume, layers=(np.where(is_speck[label], 0, label),), names=names, notes=(*volume.notes, *notes))
+    return replace(
+        volume,
+        layers=(np.where(is_speck[label], 0, label),),
+        names=names,
+        notes=(*volume.notes, *notes),
+    )
 
 
 def _beside(path: Path, options: LoadOptions) -> list[Path]:
@@ -290,4 +366,6 @@ def _beside(path: Path, options: LoadOptions) -> list[Path]:
     return [*detached(path), *([table] if table else [])]
 
 
-FORMAT = Format("a label volume", tuple(READERS), read, ("labels", "pieces"), extra="volumes", beside=_beside)
+FORMAT = Format(
+    "a label volume", tuple(READERS), read, ("labels", "pieces"), extra="volumes", beside=_beside
+)

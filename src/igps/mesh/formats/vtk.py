@@ -21,15 +21,27 @@ from igps.mesh.formats._format import Format, RawBody, check_unpacked, corners_o
 from igps.mesh.options import LoadOptions
 
 _LEGACY_TYPES = {  # VTK writes vtkIdType as int
-    "float": "f4", "double": "f8", "int": "i4", "unsigned_int": "u4", "long": "i8", "vtktypeint64": "i8",
-    "vtktypeint32": "i4", "short": "i2", "unsigned_short": "u2", "char": "i1", "unsigned_char": "u1", "vtkidtype": "i4",
-}  # fmt: skip
+    "float": "f4",
+    "double": "f8",
+    "int": "i4",
+    "unsigned_int": "u4",
+    "long": "i8",
+    "vtktypeint64": "i8",
+    "vtktypeint32": "i4",
+    "short": "i2",
+    "unsigned_short": "u2",
+    "char": "i1",
+    "unsigned_char": "u1",
+    "vtkidtype": "i4",
+}
 _BLANK_LINE = re.compile(rb"\n\r?\n")
 # Types of cells by the sections of legacy and of XML files.
 _LEGACY_CELLS = {"POLYGONS": _vtk_cells.POLYGON, "TRIANGLE_STRIPS": _vtk_cells.STRIP}
 _XML_CELLS = {"Polys": _vtk_cells.POLYGON, "Strips": _vtk_cells.STRIP}
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
-Cells = tuple[Integers, Integers, Integers]  # corners laid end to end; corner counts of cells; types of cells
+Cells = tuple[
+    Integers, Integers, Integers
+]  # corners laid end to end; corner counts of cells; types of cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,15 +110,22 @@ class _Legacy:
         """Read points and cells; return also the first line behind them."""
         vertices = np.zeros((0, 3))
         cells: list[Cells] = []
-        while (words := self.line().split()) and words[0].upper() not in ("POINT_DATA", "CELL_DATA"):
+        while (words := self.line().split()) and words[0].upper() not in (
+            "POINT_DATA",
+            "CELL_DATA",
+        ):
             word = words[0].upper()
             if word == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
                 raise ValueError(f"expected POLYDATA or UNSTRUCTURED_GRID, got {words[1]}")
             if word == "POINTS":
-                vertices = self.numbers(3 * int(words[1]), words[2]).astype(np.float64).reshape(-1, 3)
+                vertices = (
+                    self.numbers(3 * int(words[1]), words[2]).astype(np.float64).reshape(-1, 3)
+                )
             elif word in ("POLYGONS", "TRIANGLE_STRIPS", "CELLS", "VERTICES", "LINES"):
                 corners, n_corners = self.cells(int(words[1]), int(words[2]))
-                cells.append((corners, n_corners, np.full(len(n_corners), _LEGACY_CELLS.get(word, 0))))
+                cells.append(
+                    (corners, n_corners, np.full(len(n_corners), _LEGACY_CELLS.get(word, 0)))
+                )
             elif word == "CELL_TYPES" and cells:
                 cells[-1] = (*cells[-1][:2], self.numbers(int(words[1]), "int").astype(np.int64))
         return vertices, cells, " ".join(words).upper()
@@ -120,7 +139,9 @@ class _Legacy:
             if word in ("POINT_DATA", "CELL_DATA"):
                 is_of_points, n = word == "POINT_DATA", int(words[1])
                 continue
-            n_arrays = int(words[2]) if word == "FIELD" else word in ("VECTORS", "NORMALS", "SCALARS")
+            n_arrays = (
+                int(words[2]) if word == "FIELD" else word in ("VECTORS", "NORMALS", "SCALARS")
+            )
             for _ in range(n_arrays):
                 if word == "FIELD":
                     name, width, length, kind = self.line().split()
@@ -130,7 +151,9 @@ class _Legacy:
                     width, before = words[3] if len(words) > 3 else "1", self._at
                     if not self.line().upper().startswith("LOOKUP_TABLE"):
                         self._at = before
-                values = self.numbers(int(width) * int(length), kind).reshape(int(length), int(width))
+                values = self.numbers(int(width) * int(length), kind).reshape(
+                    int(length), int(width)
+                )
                 if is_of_points and int(length) == n_points:
                     arrays[name] = _squeezed(values)
         return arrays
@@ -165,9 +188,18 @@ def _squeezed(values: NDArray[np.generic]) -> NDArray[np.generic]:
 def _tetrahedra(cells: list[Cells]) -> Integers:
     rows = [np.zeros((0, 4), dtype=np.int64)]
     for corners, n_corners, kinds in cells:
-        if len(kinds) == len(n_corners) and (n_corners >= 0).all() and n_corners.sum() == len(corners):
+        if (
+            len(kinds) == len(n_corners)
+            and (n_corners >= 0).all()
+            and n_corners.sum() == len(corners)
+        ):
             starts = np.cumsum(n_corners) - n_corners
-            rows.append(corners[starts[(kinds == _vtk_cells.TETRAHEDRON) & (n_corners == 4), None] + np.arange(4)])
+            rows.append(
+                corners[
+                    starts[(kinds == _vtk_cells.TETRAHEDRON) & (n_corners == 4), None]
+                    + np.arange(4)
+                ]
+            )
     return np.concatenate(rows)
 
 
@@ -177,7 +209,9 @@ def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody
     pieces = list(file.root.iter("Piece"))
     if len(pieces) == 1:
         return [_body(*file.geometry(pieces[0]))]
-    return [_body(*file.geometry(piece), f"piece {number}") for number, piece in enumerate(pieces, 1)]
+    return [
+        _body(*file.geometry(piece), f"piece {number}") for number, piece in enumerate(pieces, 1)
+    ]
 
 
 class _Xml:
@@ -195,10 +229,14 @@ class _Xml:
             content = content[:start] + b"</VTKFile>"
         self.root = _xml.parse(content)
         self._order: Literal["<", ">"] = "<" if self.root.get("byte_order") != "BigEndian" else ">"
-        self._header = np.dtype(f"{self._order}u{8 if self.root.get('header_type') == 'UInt64' else 4}")
+        self._header = np.dtype(
+            f"{self._order}u{8 if self.root.get('header_type') == 'UInt64' else 4}"
+        )
         name = self.root.get("compressor")
         if name is not None and name not in _COMPRESSORS:
-            raise ValueError(f"expected compression by zlib, LZMA or none, got {name}; export it anew")
+            raise ValueError(
+                f"expected compression by zlib, LZMA or none, got {name}; export it anew"
+            )
         self._compressor = None if name is None else _COMPRESSORS[name]
 
     def geometry(self, piece: Element) -> tuple[Floats, list[Cells]]:
@@ -208,25 +246,38 @@ class _Xml:
         vertices = self.array(points).astype(np.float64).reshape(-1, 3)
         cells: list[Cells] = []
         for group in (*_XML_CELLS, "Cells"):
-            arrays = {element.get("Name"): self.array(element) for element in piece.findall(f"{group}/DataArray")}
+            arrays = {
+                element.get("Name"): self.array(element)
+                for element in piece.findall(f"{group}/DataArray")
+            }
             if len(arrays) >= 2:
-                n_corners = np.asarray(np.diff(arrays["offsets"].astype(np.int64), prepend=0), dtype=np.int64)
+                n_corners = np.asarray(
+                    np.diff(arrays["offsets"].astype(np.int64), prepend=0), dtype=np.int64
+                )
                 kinds = arrays.get("types", np.full(len(n_corners), _XML_CELLS.get(group, 0)))
-                cells.append((arrays["connectivity"].astype(np.int64), n_corners, kinds.astype(np.int64)))
+                cells.append(
+                    (arrays["connectivity"].astype(np.int64), n_corners, kinds.astype(np.int64))
+                )
         return vertices, cells
 
     def array(self, element: Element) -> NDArray[np.generic]:
         name = element.get("type", "")
-        kind = np.dtype(f"{'f' if name.startswith('F') else name[0].lower()}{int(name.lstrip('UIntFloa')) // 8}")
+        kind = np.dtype(
+            f"{'f' if name.startswith('F') else name[0].lower()}{int(name.lstrip('UIntFloa')) // 8}"
+        )
         kind = kind.newbyteorder(self._order)
         encoding, text = element.get("format"), element.text or ""
         if encoding == "ascii":
             values = _xml.from_text(text, kind)
         elif encoding == "appended":
-            values = np.frombuffer(self._decode(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind)
+            values = np.frombuffer(
+                self._decode(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind
+            )
         else:
             values = np.frombuffer(self._decode("".join(text.split()).encode(), False), kind)
-        self._n_unpacked += values.nbytes  # a sum, as thousands of arrays may refer to the same bytes
+        self._n_unpacked += (
+            values.nbytes
+        )  # a sum, as thousands of arrays may refer to the same bytes
         check_unpacked(self._n_unpacked, self._path, self._options.max_unpacked)
         return values
 
@@ -239,7 +290,9 @@ class _Xml:
         header = _first((3 + n) * size, content, is_raw)
         _, n_bytes, n_last, *packed_sizes = np.frombuffer(header, self._header).tolist()
         check_unpacked(n * n_bytes, self._path, self._options.max_unpacked)
-        packed = _first(sum(packed_sizes), content[len(header) if is_raw else _n_letters(len(header)) :], is_raw)
+        packed = _first(
+            sum(packed_sizes), content[len(header) if is_raw else _n_letters(len(header)) :], is_raw
+        )
         blocks, at = [], 0
         for number, n_packed in enumerate(packed_sizes):
             n_unpacked = n_last if number == n - 1 and n_last else n_bytes

@@ -41,7 +41,9 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     points, directions = points.to(dtype), directions.to(dtype)
     if not torch.compiler.is_compiling():
         if (n_points := int(mask.sum(dim=1).min())) < _RANK:
-            raise ValueError(f"samples: expected at least {_RANK} of each body for its balls, got {n_points}.")
+            raise ValueError(
+                f"samples: expected at least {_RANK} of each body for its balls, got {n_points}."
+            )
         if not (torch.isfinite(points[mask]).all() and torch.isfinite(directions[mask]).all()):
             raise ValueError("samples: expected finite points and directions, got NaN or infinity.")
     differentiable = torch.is_grad_enabled() and (points.requires_grad or directions.requires_grad)
@@ -60,7 +62,9 @@ def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     """Return radii (N, P, 2) by differentiable operations of PyTorch."""
     # In double precision, as matrix products lose digits of the nearest points, which decide.
     dtype = points.dtype
-    points, directions = (x.masked_fill(~mask[:, :, None], 0).double() for x in (points, directions))
+    points, directions = (
+        x.masked_fill(~mask[:, :, None], 0).double() for x in (points, directions)
+    )
     with full_precision():
         lengths = points.square().sum(dim=2)
         squares = (lengths[:, :, None] + lengths[:, None] - 2 * points @ points.mT).clamp_min(0)
@@ -82,7 +86,9 @@ def _columns(vectors: Tensor) -> Singles:
 
 
 @compiled()
-def write_curvatures(points: NDArray[Real], directions: NDArray[Real], min_sine: float, out: NDArray[Real]) -> None:
+def write_curvatures(
+    points: NDArray[Real], directions: NDArray[Real], min_sine: float, out: NDArray[Real]
+) -> None:
     """Write 1 / third smallest radius inside and outside at each point to (P, 2); 0 if there are fewer than three.
 
     Points and directions are (3, P). Pairs are processed row by row, without a matrix of all pairs.

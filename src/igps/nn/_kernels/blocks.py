@@ -22,7 +22,9 @@ def uses_loops(device: torch.device) -> bool:
     return device.type == "cpu" and not torch.compiler.is_compiling() and not in_transforms()
 
 
-def map_bodies(function: Callable[..., Tensor], points: Tensor, others: Tensor, *more: Tensor) -> Tensor:
+def map_bodies(
+    function: Callable[..., Tensor], points: Tensor, others: Tensor, *more: Tensor
+) -> Tensor:
     """Apply a function to tensors of N bodies, (N, P, ...), (N, T, ...) and more, in batches of bodies.
 
     The function takes memory for P·T pairs of each body. On the CPU a batch is one body, whose pairs then stay in the
@@ -31,8 +33,14 @@ def map_bodies(function: Callable[..., Tensor], points: Tensor, others: Tensor, 
     tensors = (points, others, *more)
     if torch.compiler.is_compiling():
         return function(*tensors)
-    n_bodies = 1 if uses_loops(points.device) else max(1, BLOCK // (points.shape[1] * others.shape[1] or 1))
-    return torch.cat([function(*batch) for batch in zip(*(x.split(n_bodies) for x in tensors), strict=True)])
+    n_bodies = (
+        1
+        if uses_loops(points.device)
+        else max(1, BLOCK // (points.shape[1] * others.shape[1] or 1))
+    )
+    return torch.cat(
+        [function(*batch) for batch in zip(*(x.split(n_bodies) for x in tensors), strict=True)]
+    )
 
 
 def map_by_size(function: Callable[[SignatureBatch], Tensor], batch: SignatureBatch) -> Tensor:
@@ -43,11 +51,15 @@ def map_by_size(function: Callable[[SignatureBatch], Tensor], batch: SignatureBa
     """
     if torch.compiler.is_compiling():
         return function(batch)
-    sizes: list[list[int]] = torch.stack([_last(kind.mask) for kind in (batch.interior, batch.surface)], dim=1).tolist()
+    sizes: list[list[int]] = torch.stack(
+        [_last(kind.mask) for kind in (batch.interior, batch.surface)], dim=1
+    ).tolist()
     groups: list[list[int]] = []
     for i in sorted(range(len(sizes)), key=sizes.__getitem__, reverse=True):
         pairs = zip(sizes[groups[-1][0]], sizes[i], strict=True) if groups else ()
-        if groups and all(abs(a - b) <= max(_MAX_PADDING * max(a, b), _FREE_PADDING) for a, b in pairs):
+        if groups and all(
+            abs(a - b) <= max(_MAX_PADDING * max(a, b), _FREE_PADDING) for a, b in pairs
+        ):
             groups[-1].append(i)
         else:
             groups.append([i])
@@ -57,13 +69,17 @@ def map_by_size(function: Callable[[SignatureBatch], Tensor], batch: SignatureBa
         groups = [*small, *([i] for group in groups if group not in small for i in group)]
 
     def cut_to(members: list[int]) -> SignatureBatch:
-        n_interior, n_surface = (max(kind) for kind in zip(*(sizes[i] for i in members), strict=True))
+        n_interior, n_surface = (
+            max(kind) for kind in zip(*(sizes[i] for i in members), strict=True)
+        )
         interior = batch.interior.map(lambda values: values[:, :n_interior])
         surface = batch.surface.map(lambda values: values[:, :n_surface])
         return replace(batch, interior=interior, surface=surface)
 
     def result(group: list[int]) -> Tensor:
-        return function(cut_to(group)[group[0] : group[0] + 1] if len(group) == 1 else cut_to(group)[group])
+        return function(
+            cut_to(group)[group[0] : group[0] + 1] if len(group) == 1 else cut_to(group)[group]
+        )
 
     if len(groups) == 1:
         return function(cut_to(groups[0]))
@@ -73,4 +89,9 @@ def map_by_size(function: Callable[[SignatureBatch], Tensor], batch: SignatureBa
 
 def _last(mask: Tensor) -> Tensor:
     """Return the numbers (N,) of the last true entries of a mask (N, P), counted from 1, or 0 without any."""
-    return (mask * torch.arange(1, mask.shape[1] + 1, device=mask.device)).cummax(dim=1).values[:, -1:].sum(dim=1)
+    return (
+        (mask * torch.arange(1, mask.shape[1] + 1, device=mask.device))
+        .cummax(dim=1)
+        .values[:, -1:]
+        .sum(dim=1)
+    )

@@ -60,9 +60,15 @@ class CompiledCount(torch.autograd.Function):
         weights, *tensors = ctx.saved_tensors
         if torch.is_grad_enabled():  # for second derivatives, which the loops do not have
             layout, needed = ctx.shapes.layout, ctx.needs_input_grad[1:]
-            counts = count_by_torch(layout.classes, layout.n_classes, layout.pairs, layout.mask, weights, *tensors)
-            leaves = [t for t, is_needed in zip((weights, *tensors), needed, strict=True) if is_needed]
-            by_leaves = iter(torch.autograd.grad(counts, leaves, upstream, create_graph=True, allow_unused=True))
+            counts = count_by_torch(
+                layout.classes, layout.n_classes, layout.pairs, layout.mask, weights, *tensors
+            )
+            leaves = [
+                t for t, is_needed in zip((weights, *tensors), needed, strict=True) if is_needed
+            ]
+            by_leaves = iter(
+                torch.autograd.grad(counts, leaves, upstream, create_graph=True, allow_unused=True)
+            )
             return None, *(next(by_leaves) if is_needed else None for is_needed in needed)
         totals = [torch.zeros_like(tensor) for tensor in (weights, *tensors)]
 
@@ -119,9 +125,15 @@ class _Shapes:
         self.n_points: list[int] = layout.mask.sum(dim=1).tolist()
         centres = [x.detach() for x in centres_of(with_tensors(layout.pairs, tensors))]
         self.bins, self.dtype = [len(x) for x in centres], centres[0].dtype
-        self.n_counts = layout.n_classes * (layout.n_classes + 1) // 2, math.prod(self.bins) << len(self.bins)
+        self.n_counts = (
+            layout.n_classes * (layout.n_classes + 1) // 2,
+            math.prod(self.bins) << len(self.bins),
+        )
         kinds = [kind for pair in layout.pairs for kind in pair.kinds]
-        self.n_values, self.n_oriented = sum(kind != COSINES for kind in kinds), kinds.count(COSINES)
+        self.n_values, self.n_oriented = (
+            sum(kind != COSINES for kind in kinds),
+            kinds.count(COSINES),
+        )
         self.can_pack = kinds in ([VALUES], [DISTANCES]) and self.dtype == torch.float32
         padded = pad_sequence(centres, batch_first=True).numpy()
         empty = np.empty(0)  # in place of the norms and vectors of each shape
@@ -132,29 +144,56 @@ class _Shapes:
 class _Shape:
     """The arguments of the loops for one shape, without padding; for a gradient also the derivatives by its counts."""
 
-    def __init__(self, shapes: _Shapes, number: int, tensors: Sequence[Tensor], upstream: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        shapes: _Shapes,
+        number: int,
+        tensors: Sequence[Tensor],
+        upstream: Tensor | None = None,
+    ) -> None:
         self.shapes, self.n_points = shapes, (n_points := shapes.n_points[number])
         self.order = shapes.order[number, :n_points]
-        classes, weights = (np.ascontiguousarray(x[number, :, :n_points]) for x in (shapes.classes, shapes.weights))
+        classes, weights = (
+            np.ascontiguousarray(x[number, :, :n_points]) for x in (shapes.classes, shapes.weights)
+        )
         self.members = classes, weights
         self.packs = shapes.can_pack and len(classes) == 1 and bool((weights == 1).all())
-        own = [t.detach()[number].index_select(0, self.order) if t.ndim > 1 else t.detach() for t in tensors]
+        own = [
+            t.detach()[number].index_select(0, self.order) if t.ndim > 1 else t.detach()
+            for t in tensors
+        ]
         self.pairs = with_tensors(shapes.layout.pairs, own)
-        self.centred = [_centre(pair.inputs[0]) if DISTANCES in pair.kinds else None for pair in self.pairs]
+        self.centred = [
+            _centre(pair.inputs[0]) if DISTANCES in pair.kinds else None for pair in self.pairs
+        ]
         n_columns = min(n_points, _MAX_COLUMNS)
-        n_matrices = shapes.n_values if upstream is None else shapes.n_values + 4 * shapes.n_oriented
+        n_matrices = (
+            shapes.n_values if upstream is None else shapes.n_values + 4 * shapes.n_oriented
+        )
         n_rows = min(max(1, _BLOCK_SIZE // (n_columns * max(1, n_matrices))), n_columns)
         self.block = n_rows, n_columns
-        blocks = [(row, column) for row in range(0, n_points, n_rows) for column in range(row, n_points, n_columns)]
+        blocks = [
+            (row, column)
+            for row in range(0, n_points, n_rows)
+            for column in range(row, n_points, n_columns)
+        ]
         n_shares = min(_N_SHARES, len(blocks)) if math.prod(shapes.n_counts) <= _MAX_COUNTS else 1
         self.shares = [blocks[k::n_shares] for k in range(n_shares)]
-        self.upstream = np.empty(0) if upstream is None else _copy_bins_to_corners(upstream.to(shapes.dtype)).numpy()
+        self.upstream = (
+            np.empty(0)
+            if upstream is None
+            else _copy_bins_to_corners(upstream.to(shapes.dtype)).numpy()
+        )
         norms, row = torch.zeros(shapes.n_values, n_points, dtype=shapes.dtype, device="cpu"), 0
         for pair, centred in zip(self.pairs, self.centred, strict=True):
             if centred is not None:
                 norms[row] = centred.square().sum(dim=1)
             row += sum(kind != COSINES for kind in pair.kinds)
-        vectors = [torch.stack([x.T for x in pair.inputs], dim=1) for pair in self.pairs if COSINES in pair.kinds]
+        vectors = [
+            torch.stack([x.T for x in pair.inputs], dim=1)
+            for pair in self.pairs
+            if COSINES in pair.kinds
+        ]
         oriented = norms.new_zeros(0, 2, 0, n_points)
         if vectors:
             oriented = pad_sequence(vectors, batch_first=True).transpose(1, 2).contiguous()
@@ -167,7 +206,9 @@ class _Shape:
         for row, column in blocks:
             values = self._view(buffer, row, column)
             self._write_values(values, row, column)
-            count_block(values.numpy(), self.axes, row, column, *self.members, self.packs, total.numpy())
+            count_block(
+                values.numpy(), self.axes, row, column, *self.members, self.packs, total.numpy()
+            )
         return [total]
 
     def gradients(self, blocks: Blocks) -> list[Tensor]:
@@ -175,42 +216,69 @@ class _Shape:
         by_weights = torch.zeros(self.members[1].shape, dtype=torch.float64, device="cpu")
         by_centres = torch.zeros(self.axes.centres.shape, dtype=torch.float64, device="cpu")
         by_inputs = [[torch.zeros_like(x) for x in pair.inputs] for pair in self.pairs]
-        value_buffer, cosine_buffer = self._buffer(self.shapes.n_values), self._buffer(4 * self.shapes.n_oriented)
+        value_buffer, cosine_buffer = (
+            self._buffer(self.shapes.n_values),
+            self._buffer(4 * self.shapes.n_oriented),
+        )
         for row, column in blocks:
-            values, by_cosines = self._view(value_buffer, row, column), self._view(cosine_buffer, row, column)
+            values, by_cosines = (
+                self._view(value_buffer, row, column),
+                self._view(cosine_buffer, row, column),
+            )
             self._write_values(values, row, column)
             gradient_block(
-                values.numpy(), self.axes, row, column, *self.members, self.upstream,
-                by_cosines.view(-1, 4, *by_cosines.shape[1:]).numpy(), by_weights.numpy(), by_centres.numpy(),
-            )  # fmt: skip
-            rows, columns = slice(row, row + values.shape[1]), slice(column, column + values.shape[2])
+                values.numpy(),
+                self.axes,
+                row,
+                column,
+                *self.members,
+                self.upstream,
+                by_cosines.view(-1, 4, *by_cosines.shape[1:]).numpy(),
+                by_weights.numpy(),
+                by_centres.numpy(),
+            )
+            rows, columns = (
+                slice(row, row + values.shape[1]),
+                slice(column, column + values.shape[2]),
+            )
             next_value, next_cosine = iter(values), iter(by_cosines)
             for pair, centred, totals in zip(self.pairs, self.centred, by_inputs, strict=True):
                 if centred is not None:
-                    _add_by_points(next(next_value), centred, rows, columns, totals[0][:, : centred.shape[1]])
+                    _add_by_points(
+                        next(next_value), centred, rows, columns, totals[0][:, : centred.shape[1]]
+                    )
                     continue
                 n = len(pair.inputs)
                 leaves = [x[part].requires_grad_() for part in (rows, columns) for x in pair.inputs]
                 with torch.enable_grad():
                     if COSINES in pair.kinds:
-                        factors = zip(cosine_factors(*leaves[:n]), cosine_factors(*leaves[n:]), strict=True)
+                        factors = zip(
+                            cosine_factors(*leaves[:n]), cosine_factors(*leaves[n:]), strict=True
+                        )
                         outputs = torch.stack([left @ right.T for (left, _), (_, right) in factors])
                         upstream = torch.stack([next(next_cosine) for _ in outputs])
                         _add_by_points(next(next_cosine), pair.inputs[0], rows, columns, totals[0])
                     else:
-                        [outputs] = pair.between([x[None] for x in leaves[:n]], [x[None] for x in leaves[n:]])
+                        [outputs] = pair.between(
+                            [x[None] for x in leaves[:n]], [x[None] for x in leaves[n:]]
+                        )
                         upstream = torch.stack([next(next_value) for _ in outputs])
                 for k, gradient in enumerate(torch.autograd.grad(outputs, leaves, upstream)):
                     totals[k % n][rows if k < n else columns] += gradient
         return [by_weights, by_centres, *(gradient for totals in by_inputs for gradient in totals)]
 
     def _buffer(self, n_matrices: int) -> Tensor:
-        return torch.empty(n_matrices * math.prod(self.block), dtype=self.shapes.dtype, device="cpu")
+        return torch.empty(
+            n_matrices * math.prod(self.block), dtype=self.shapes.dtype, device="cpu"
+        )
 
     def _view(self, buffer: Tensor, row: int, column: int) -> Tensor:
         """Return a view (R, I, J) of a buffer for the block that starts at a row and column."""
         n_matrices = len(buffer) // math.prod(self.block)
-        n = [min(size, self.n_points - first) for size, first in zip(self.block, (row, column), strict=True)]
+        n = [
+            min(size, self.n_points - first)
+            for size, first in zip(self.block, (row, column), strict=True)
+        ]
         return buffer[: n_matrices * math.prod(n)].view(n_matrices, *n)
 
     def _write_values(self, values: Tensor, row: int, column: int) -> None:
@@ -221,14 +289,19 @@ class _Shape:
             if centred is not None:
                 _write_products(centred, rows, columns, next(matrices))
             elif VALUES in pair.kinds:
-                between = pair.between([x[None, rows] for x in pair.inputs], [x[None, columns] for x in pair.inputs])
+                between = pair.between(
+                    [x[None, rows] for x in pair.inputs], [x[None, columns] for x in pair.inputs]
+                )
                 for value in between[0]:
                     next(matrices).copy_(value)
 
 
 def _inverse_gaps(centres: Numbers, bins: Sequence[int]) -> tuple[Numbers, Booleans]:
     """Return `inverse_gaps` (K, B − 1) and `has_equal_gaps` (K,) of `Axes`, for centres (K, B)."""
-    inverse, is_equal = np.zeros((len(bins), centres.shape[1] - 1), centres.dtype), np.zeros(len(bins), bool)
+    inverse, is_equal = (
+        np.zeros((len(bins), centres.shape[1] - 1), centres.dtype),
+        np.zeros(len(bins), bool),
+    )
     for k, n in enumerate(bins):
         gaps = np.diff(centres[k, :n])
         inverse[k, : n - 1] = 1 / gaps
@@ -264,7 +337,9 @@ def _write_products(points: Tensor, rows: slice, columns: slice, out: Tensor) ->
         torch.mm(points[row:end], points[first : columns.stop].T, out=part)
 
 
-def _add_by_points(by_squares: Tensor, points: Tensor, rows: slice, columns: slice, total: Tensor) -> None:
+def _add_by_points(
+    by_squares: Tensor, points: Tensor, rows: slice, columns: slice, total: Tensor
+) -> None:
     """Add the derivatives by points (P, D) to a total, from the derivatives by squared distances (I, J)."""
     x, y = points[rows], points[columns]
     total[rows] += 2 * (x * by_squares.sum(dim=1, keepdim=True) - by_squares @ y)

@@ -16,11 +16,19 @@ from igps.retrieval.distances import in_transforms
 
 
 def count_by_torch(
-    classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor, weights: Tensor, *tensors: Tensor
+    classes: Tensor,
+    n_classes: int,
+    pairs: Sequence[PairValues],
+    mask: Tensor,
+    weights: Tensor,
+    *tensors: Tensor,
 ) -> Tensor:
     """Return float64 counts (N, C(C+1)/2, B, ...), see `count_pairs`."""
     # Padding may hold infinity, and 0 times infinity is NaN.
-    clean = [t.masked_fill(~mask.view(*mask.shape, *[1] * (t.ndim - 2)), 0) if t.ndim > 1 else t for t in tensors]
+    clean = [
+        t.masked_fill(~mask.view(*mask.shape, *[1] * (t.ndim - 2)), 0) if t.ndim > 1 else t
+        for t in tensors
+    ]
     weights = weights.masked_fill(~mask[:, :, None], 0)
     n_shapes, n_points, n_members = classes.shape
     bins = [len(centres) for centres in centres_of(pairs)]
@@ -45,13 +53,22 @@ def count_by_torch(
 
 
 def _count_rows(
-    first: int, end: int, classes: Tensor, n_classes: int, pairs: Sequence[PairValues], weights: Tensor, *others: Tensor
+    first: int,
+    end: int,
+    classes: Tensor,
+    n_classes: int,
+    pairs: Sequence[PairValues],
+    weights: Tensor,
+    *others: Tensor,
 ) -> Tensor:
     """Return counts (N, C, C·cells), by both classes, of pairs of the points [first, end) with later points."""
     pairs = with_tensors(pairs, others)
     bins = [len(centres) for centres in centres_of(pairs)]
     with full_precision():
-        values = [p.between([x[:, first:end] for x in p.inputs], [x[:, first:] for x in p.inputs]) for p in pairs]
+        values = [
+            p.between([x[:, first:end] for x in p.inputs], [x[:, first:] for x in p.inputs])
+            for p in pairs
+        ]
     # Each row is first counted separately, by the class of the column's point only, as this adds fewer numbers, and few
     # to the same cell. Indices and weights are (N, I, J, M), finally (N, I, J, M·2^K), for the corners of each cell.
     index = classes[:, None, first:]
@@ -71,6 +88,10 @@ def _count_rows(
         index = torch.cat([index, index + stride], dim=3)
     own = weights[:, first:end].double()
     n_cells = n_classes * math.prod(bins)
-    rows = own.new_zeros(*own.shape[:2], n_cells).scatter_add(2, index.flatten(2), weight.double().flatten(2))
-    memberships = own.new_zeros(*own.shape[:2], n_classes).scatter_add(2, classes[:, first:end], own)
+    rows = own.new_zeros(*own.shape[:2], n_cells).scatter_add(
+        2, index.flatten(2), weight.double().flatten(2)
+    )
+    memberships = own.new_zeros(*own.shape[:2], n_classes).scatter_add(
+        2, classes[:, first:end], own
+    )
     return memberships.mT @ rows

@@ -21,7 +21,10 @@ def smallest(values: Tensor, n: int) -> tuple[Tensor, Tensor]:
         return top.values, top.indices
     # Faster than PyTorch, which copies and partly sorts each row.
     rows = values.contiguous().numpy().reshape(-1, values.shape[-1])
-    entries, columns = np.full((len(rows), n), np.inf, rows.dtype), np.zeros((len(rows), n), np.int64)
+    entries, columns = (
+        np.full((len(rows), n), np.inf, rows.dtype),
+        np.zeros((len(rows), n), np.int64),
+    )
     if n:
         keep_smallest(rows, entries, columns)
     shape = (*values.shape[:-1], n)

@@ -32,7 +32,9 @@ class Row(NamedTuple):
     """Results for the pairs of one row of a block, with an entry for each of J columns."""
 
     cells: Indices  # (J,) index of the cell of each pair, over all axes
-    shares: Numbers  # (K, J) position of the value between the centres below and above it, from 0 to 1
+    shares: (
+        Numbers  # (K, J) position of the value between the centres below and above it, from 0 to 1
+    )
     features: Numbers  # (S, 5, J) see `cosines`
     interval: Indices  # (J,) scratch space
 
@@ -55,13 +57,17 @@ def whole_vectors(first: int, n_columns: int) -> int:
 
 
 @compiled(inline="always")
-def locate_row(values: Numbers, i: int, axes: Axes, point: int, column: int, start: int, result: Row) -> None:
+def locate_row(
+    values: Numbers, i: int, axes: Axes, point: int, column: int, start: int, result: Row
+) -> None:
     """Fill in the result for row i of a block, the row of a point, from column ``start`` on; see `count_block`."""
     result.cells[start:] = 0
     k = r = s = np.int64(0)  # with a literal 0, `locate` would be compiled a second time
     for kind in axes.kinds:
         if kind == COSINES:
-            cosines(axes.oriented[s, 0], axes.oriented[s, 1], point, column, start, result.features[s])
+            cosines(
+                axes.oriented[s, 0], axes.oriented[s, 1], point, column, start, result.features[s]
+            )
             for f in range(3):
                 locate(result.features[s, f, start:], axes, k, start, result)
                 k += 1
@@ -84,7 +90,9 @@ def distances(products: Numbers, norm: Any, norms: Numbers) -> None:
 
 
 @compiled()
-def cosines(points: Numbers, directions: Numbers, point: int, column: int, start: int, features: Numbers) -> None:
+def cosines(
+    points: Numbers, directions: Numbers, point: int, column: int, start: int, features: Numbers
+) -> None:
     """Fill in the features (5, J) of a point and the points of the columns from ``start`` on.
 
     The features are the larger and the smaller cosine of the directions with the connecting line, the cosine between
@@ -103,7 +111,9 @@ def cosines(points: Numbers, directions: Numbers, point: int, column: int, start
     for d in range(len(points)):
         x, u = points[d, point], directions[d, point]
         xs, us = points[d, column + start :], directions[d, column + start :]
-        for j in range(n):  # separate loops, as the compiler does not vectorise loops over many arrays
+        for j in range(
+            n
+        ):  # separate loops, as the compiler does not vectorise loops over many arrays
             line = xs[j] - x
             length[j] += line * line
             larger[j] += u * line

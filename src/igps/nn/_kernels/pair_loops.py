@@ -15,7 +15,16 @@ import numpy as np
 
 from igps._arrays import Floats
 from igps._compiled import compiled
-from igps.nn._kernels.pair_cells import COSINES, DISTANCES, Axes, Indices, Numbers, locate_row, new_row, whole_vectors
+from igps.nn._kernels.pair_cells import (
+    COSINES,
+    DISTANCES,
+    Axes,
+    Indices,
+    Numbers,
+    locate_row,
+    new_row,
+    whole_vectors,
+)
 from igps.nn._kernels.pair_sums import (
     LANES,
     add_axes,
@@ -31,7 +40,14 @@ from igps.nn._kernels.pair_sums import (
 
 @compiled()
 def count_block(
-    values: Numbers, axes: Axes, row: int, column: int, classes: Indices, weights: Floats, packs: bool, total: Floats
+    values: Numbers,
+    axes: Axes,
+    row: int,
+    column: int,
+    classes: Indices,
+    weights: Floats,
+    packs: bool,
+    total: Floats,
 ) -> None:
     """Count a block of pairs.
 
@@ -65,10 +81,21 @@ def count_block(
         if i > 0:
             is_same = True
             for m in range(n_members):
-                is_same &= classes[m, point] == classes[m, point - 1] and weights[m, point] == weights[m, point - 1]
+                is_same &= (
+                    classes[m, point] == classes[m, point - 1]
+                    and weights[m, point] == weights[m, point - 1]
+                )
             if not is_same:
                 unpack(packed, sums)
-                flush(by_class, lowest * n_corners, (highest + 1) * n_corners, classes, weights, point - 1, total)
+                flush(
+                    by_class,
+                    lowest * n_corners,
+                    (highest + 1) * n_corners,
+                    classes,
+                    weights,
+                    point - 1,
+                    total,
+                )
                 lowest, highest = empty_range
         locate_row(values, i, axes, point, column, start, result)
         cell, shares = result.cells[first:], result.shares
@@ -78,7 +105,12 @@ def count_block(
         for m in range(n_members):
             home_m, weight = home[m, first:], weights[m, column + first :]
             if packs:
-                pack_pairs(result.cells[start:], home[0, start:], shares[0, start:], result.interval[start:])
+                pack_pairs(
+                    result.cells[start:],
+                    home[0, start:],
+                    shares[0, start:],
+                    result.interval[start:],
+                )
                 add_whole_pairs(cell, result.interval[first:], packed)
             elif n_axes == 1:
                 add_one_axis(cell, home_m, shares[0, first:], weight, sums)
@@ -87,14 +119,30 @@ def count_block(
             else:
                 add_axes(cell, home_m, shares, first, weight, sums)
     unpack(packed, sums)
-    flush(by_class, lowest * n_corners, (highest + 1) * n_corners, classes, weights, row + n_rows - 1, total)
+    flush(
+        by_class,
+        lowest * n_corners,
+        (highest + 1) * n_corners,
+        classes,
+        weights,
+        row + n_rows - 1,
+        total,
+    )
 
 
 @compiled()
 def gradient_block(
-    values: Numbers, axes: Axes, row: int, column: int, classes: Indices, weights: Floats, upstream: Numbers,
-    by_cosines: Numbers, by_weights: Floats, by_centres: Floats,
-) -> None:  # fmt: skip
+    values: Numbers,
+    axes: Axes,
+    row: int,
+    column: int,
+    classes: Indices,
+    weights: Floats,
+    upstream: Numbers,
+    by_cosines: Numbers,
+    by_weights: Floats,
+    by_centres: Floats,
+) -> None:
     """Compute the gradient of `count_block`, which has the same first arguments.
 
     Args:
@@ -130,14 +178,18 @@ def gradient_block(
                     if row_weight == 0 and column_weight == 0:
                         continue
                     pair = np.uint32(pair_row(classes[m, point], classes[n, other], n_classes))
-                    mean = interpolate(upstream[pair], corner, shares, j, row_weight * column_weight, slopes)
+                    mean = interpolate(
+                        upstream[pair], corner, shares, j, row_weight * column_weight, slopes
+                    )
                     by_weights[m, point] += column_weight * mean
                     by_weights[n, other] += row_weight * mean
             cell: Any = cells[j]
             for k in range(n_axes - 1, -1, -1):
                 share, width = np.float64(shares[k, j]), np.uint32(axes.n_centres[k])
                 q, cell = np.uint32(cell % width), np.uint32(cell // width)
-                is_inside = share < 1 and (share > 0 or q > 0)  # on a centre, the slope of the interval above is taken
+                is_inside = share < 1 and (
+                    share > 0 or q > 0
+                )  # on a centre, the slope of the interval above is taken
                 gap = np.uint32(0) if axes.has_equal_gaps[k] else q
                 slope = slopes[k] * axes.inverse_gaps[k, gap] if is_inside else 0.0
                 by_centres[k, q] -= slope * (1 - share)
@@ -158,7 +210,9 @@ def gradient_block(
                     s += 1
                     continue
                 if kind == DISTANCES:  # the derivative for coinciding points is set to 0
-                    values[r, i, j] = slopes[k] / (2 * values[r, i, j]) if values[r, i, j] > 0 else 0.0
+                    values[r, i, j] = (
+                        slopes[k] / (2 * values[r, i, j]) if values[r, i, j] > 0 else 0.0
+                    )
                 else:
                     values[r, i, j] = slopes[k]
                 k += 1
@@ -166,7 +220,9 @@ def gradient_block(
 
 
 @compiled(inline="always")
-def interpolate(upstream: Numbers, start: Any, shares: Numbers, j: int, weight: float, slopes: Floats) -> float:
+def interpolate(
+    upstream: Numbers, start: Any, shares: Numbers, j: int, weight: float, slopes: Floats
+) -> float:
     """Return the mean of upstream derivatives (cells·2^K,) at the corners of the cell of pair j, by its shares (K, J).
 
     The corners begin at index ``start``. The derivatives of the mean by the shares, times the weight, are added to the
@@ -189,8 +245,14 @@ def interpolate(upstream: Numbers, start: Any, shares: Numbers, j: int, weight: 
             other_shares = 1.0
             for other in range(n_outer):
                 if other != k:
-                    other_shares *= corner_share(shares[other, j], corner >> (n_outer - 1 - other) & 1)
-            slopes[k] += weight * other_shares * (inner_mean if corner >> (n_outer - 1 - k) & 1 else -inner_mean)
+                    other_shares *= corner_share(
+                        shares[other, j], corner >> (n_outer - 1 - other) & 1
+                    )
+            slopes[k] += (
+                weight
+                * other_shares
+                * (inner_mean if corner >> (n_outer - 1 - k) & 1 else -inner_mean)
+            )
             outer_share *= corner_share(shares[k, j], corner >> (n_outer - 1 - k) & 1)
         slopes[n_outer] += weight * outer_share * (above - below)
         slopes[n_outer + 1] += weight * outer_share * (q - p + one * (s - r - q + p))

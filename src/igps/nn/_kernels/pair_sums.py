@@ -49,7 +49,9 @@ def unpack(packed: Integers, sums: Floats) -> None:
 
 
 @compiled(fastmath=FUSE)
-def add_one_axis(cell: Indices, home: Indices, share: Numbers, weights: Floats, sums: Floats) -> None:
+def add_one_axis(
+    cell: Indices, home: Indices, share: Numbers, weights: Floats, sums: Floats
+) -> None:
     """Add pairs (n,) of one row to the sums (cells, 2).
 
     The class of a pair's second point determines its first cell (``home``); the weights are those of the second point.
@@ -63,7 +65,13 @@ def add_one_axis(cell: Indices, home: Indices, share: Numbers, weights: Floats, 
 
 @compiled(fastmath=FUSE)
 def add_two_axes(
-    cell: Indices, home: Indices, first: Numbers, second: Numbers, weights: Floats, sums: Floats, corner: Any
+    cell: Indices,
+    home: Indices,
+    first: Numbers,
+    second: Numbers,
+    weights: Floats,
+    sums: Floats,
+    corner: Any,
 ) -> None:
     """`add_one_axis` for the shares along two axes, to the four corners from ``corner`` on."""
     for j in range(len(cell)):
@@ -85,9 +93,16 @@ def quarters(weight: float, first: float, second: float) -> tuple[float, float, 
 
 
 @compiled(fastmath=FUSE)
-def add_four_axes(cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
+def add_four_axes(
+    cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats
+) -> None:
     """`add_axes` for four axes, as of a distance and three cosines; a single pass takes half of the time."""
-    one, two, three, four = shares[0, first:], shares[1, first:], shares[2, first:], shares[3, first:]
+    one, two, three, four = (
+        shares[0, first:],
+        shares[1, first:],
+        shares[2, first:],
+        shares[3, first:],
+    )
     for j in range(len(cell)):
         i = np.uint32(cell[j] + home[j])
         inner = quarters(1.0, np.float64(three[j]), np.float64(four[j]))
@@ -100,7 +115,9 @@ def add_four_axes(cell: Indices, home: Indices, shares: Numbers, first: int, wei
 
 
 @compiled(fastmath=FUSE)
-def add_corners(sums: Floats, cell: Any, corner: Any, weight: float, parts: tuple[float, float, float, float]) -> None:
+def add_corners(
+    sums: Floats, cell: Any, corner: Any, weight: float, parts: tuple[float, float, float, float]
+) -> None:
     """Add the parts of a weight to the four corners of a cell from ``corner`` on."""
     sums[cell, corner] += weight * parts[0]
     sums[cell, corner + 1] += weight * parts[1]
@@ -109,7 +126,9 @@ def add_corners(sums: Floats, cell: Any, corner: Any, weight: float, parts: tupl
 
 
 @compiled()
-def add_axes(cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
+def add_axes(
+    cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats
+) -> None:
     """`add_one_axis` for two or more axes, whose shares (K, J) are used from column ``first`` on."""
     n_outer = len(shares) - 2
     part = np.empty(len(cell))
@@ -123,7 +142,15 @@ def add_axes(cell: Indices, home: Indices, shares: Numbers, first: int, weights:
             else:
                 for j in range(len(cell)):
                     part[j] -= part[j] * shares[k, first + j]
-        add_two_axes(cell, home, shares[n_outer, first:], shares[n_outer + 1, first:], part, sums, np.int64(4 * corner))
+        add_two_axes(
+            cell,
+            home,
+            shares[n_outer, first:],
+            shares[n_outer + 1, first:],
+            part,
+            sums,
+            np.int64(4 * corner),
+        )
 
 
 @compiled(inline="always")
@@ -134,7 +161,9 @@ def pair_row(first: int, second: int, n_classes: int) -> int:
 
 
 @compiled()
-def flush(sums: Floats, start: int, end: int, classes: Indices, weights: Floats, point: int, total: Floats) -> None:
+def flush(
+    sums: Floats, start: int, end: int, classes: Indices, weights: Floats, point: int, total: Floats
+) -> None:
     """Add columns [start, end) of the sums (C, cells·corners) to the total, by a point's weights (M, P); clear them."""
     n_classes = len(sums)
     for other in range(n_classes):

@@ -19,11 +19,15 @@ class PairValues:
     A value must not depend on the order of the two points.
     """
 
-    inputs: tuple[Tensor, ...]  # (N, P, ...) or (P, ...) each, finite: the values are computed from them
+    inputs: tuple[
+        Tensor, ...
+    ]  # (N, P, ...) or (P, ...) each, finite: the values are computed from them
     centres: tuple[Tensor, ...]  # (B,) ascending, for each of the k values
     # Differentiable function from inputs (N, I, ...) of I points and (N, J, ...) of J points to values (N, k, I, J)
     between: Callable[[Inputs, Inputs], Tensor]
-    kinds: tuple[int, ...] = ()  # how compiled loops obtain the values, see `pair_cells`; by default from `between`
+    kinds: tuple[
+        int, ...
+    ] = ()  # how compiled loops obtain the values, see `pair_cells`; by default from `between`
 
     def __post_init__(self) -> None:
         if not self.kinds:
@@ -40,7 +44,9 @@ def euclidean_distances(points: Tensor, centres: Tensor) -> PairValues:
     return PairValues((points,), (centres,), _distances, (DISTANCES,))
 
 
-def oriented_pairs(points: Tensor, directions: Tensor, towards: Tensor, among: Tensor) -> PairValues:
+def oriented_pairs(
+    points: Tensor, directions: Tensor, towards: Tensor, among: Tensor
+) -> PairValues:
     """Return the three `point_pair_features` of points with directions.
 
     Args:
@@ -53,7 +59,9 @@ def oriented_pairs(points: Tensor, directions: Tensor, towards: Tensor, among: T
         ValueError: points and directions have different shapes.
     """
     if (shape := directions.shape) != points.shape:
-        raise ValueError(f"directions: expected the shape of the points, {tuple(points.shape)}, got {tuple(shape)}.")
+        raise ValueError(
+            f"directions: expected the shape of the points, {tuple(points.shape)}, got {tuple(shape)}."
+        )
     return PairValues((points, directions), (towards, towards, among), _cosines, (COSINES,))
 
 
@@ -75,8 +83,15 @@ def cosine_factors(points: Tensor, directions: Tensor) -> list[tuple[Tensor, Ten
     (y, v).
     """
     own, ones = (directions * points).sum(dim=-1, keepdim=True), torch.ones_like(points[..., :1])
-    extended_points, extended_directions = torch.cat([points, ones], dim=-1), torch.cat([directions, -own], dim=-1)
-    return [(extended_directions, extended_points), (extended_points, extended_directions), (directions, directions)]
+    extended_points, extended_directions = (
+        torch.cat([points, ones], dim=-1),
+        torch.cat([directions, -own], dim=-1),
+    )
+    return [
+        (extended_directions, extended_points),
+        (extended_points, extended_directions),
+        (directions, directions),
+    ]
 
 
 def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -101,7 +116,9 @@ def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Ten
 def _distances(rows: Inputs, columns: Inputs) -> Tensor:
     centre = rows[0].detach().mean(dim=-2, keepdim=True)  # preserves digits in the squares
     x, y = rows[0] - centre, columns[0] - centre
-    squares = x.square().sum(dim=-1).unsqueeze(-1) + y.square().sum(dim=-1).unsqueeze(-2) - 2 * x @ y.mT
+    squares = (
+        x.square().sum(dim=-1).unsqueeze(-1) + y.square().sum(dim=-1).unsqueeze(-2) - 2 * x @ y.mT
+    )
     # At 0 the square root has no derivative, so coinciding points get a derivative of 0.
     return torch.where(squares > 0, torch.where(squares > 0, squares, 1).sqrt(), 0).unsqueeze(-3)
 
@@ -111,7 +128,9 @@ def _cosines(rows: Inputs, columns: Inputs) -> Tensor:
     *products, among = (left @ right.mT for (left, _), (_, right) in factors)
     inverse = _inverse_distances(rows[0], columns[0])
     by_row, by_column = ((x * inverse).clamp(-1, 1) for x in products)
-    return torch.stack([torch.maximum(by_row, by_column), torch.minimum(by_row, by_column), among], dim=-3)
+    return torch.stack(
+        [torch.maximum(by_row, by_column), torch.minimum(by_row, by_column), among], dim=-3
+    )
 
 
 def _twists(rows: Inputs, columns: Inputs) -> Tensor:
@@ -128,7 +147,9 @@ def _inverse_distances(x: Tensor, y: Tensor) -> Tensor:
         squares = row_distances(x, y).square()
     else:
         coordinates = zip(x.unbind(-1), y.unbind(-1), strict=True)
-        squares = sum(((a.unsqueeze(-1) - b.unsqueeze(-2)).square() for a, b in coordinates), x.new_zeros(()))
+        squares = sum(
+            ((a.unsqueeze(-1) - b.unsqueeze(-2)).square() for a, b in coordinates), x.new_zeros(())
+        )
     return torch.where(squares > 0, torch.where(squares > 0, squares, 1).rsqrt(), 0)
 
 
@@ -146,6 +167,10 @@ def with_tensors(pairs: Sequence[PairValues], tensors: Sequence[Tensor]) -> list
     """Return the values with their inputs and centres replaced by tensors, in order."""
     remaining = iter(tensors)
     return [
-        replace(p, inputs=tuple(next(remaining) for _ in p.inputs), centres=tuple(next(remaining) for _ in p.centres))
+        replace(
+            p,
+            inputs=tuple(next(remaining) for _ in p.inputs),
+            centres=tuple(next(remaining) for _ in p.centres),
+        )
         for p in pairs
     ]

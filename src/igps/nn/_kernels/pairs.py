@@ -29,7 +29,9 @@ def class_pairs(n_classes: int) -> list[tuple[int, int]]:
     return list(combinations_with_replacement(range(n_classes), 2))
 
 
-def count_pairs(classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor) -> Tensor:
+def count_pairs(
+    classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor
+) -> Tensor:
     """Return the share of all pairs of points in each pair of classes and in each bin, for N shapes.
 
     An unordered pair of distinct points counts once. Each point belongs to M classes, with weights of sum 1; the pair
@@ -50,7 +52,12 @@ def count_pairs(classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequenc
     tensors = [weights, *(tensor for pair in pairs for tensor in (*pair.inputs, *pair.centres))]
     tensors = [tensor.to(dtype) for tensor in tensors]
     with torch.autocast(classes.device.type, enabled=False):
-        templates = [k for pair in pairs for k, template in enumerate(TEMPLATES) if pair.between is template.between]
+        templates = [
+            k
+            for pair in pairs
+            for k, template in enumerate(TEMPLATES)
+            if pair.between is template.between
+        ]
         if torch.compiler.is_compiling() and not _is_exporting() and len(templates) == len(pairs):
             counts = _operator(classes, n_classes, templates, mask, tensors)
         else:
@@ -59,10 +66,18 @@ def count_pairs(classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequenc
         return (counts / (n_points * (n_points - 1) / 2)).to(dtype)
 
 
-def _count(classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor, tensors: list[Tensor]) -> Tensor:
+def _count(
+    classes: Tensor,
+    n_classes: int,
+    pairs: Sequence[PairValues],
+    mask: Tensor,
+    tensors: list[Tensor],
+) -> Tensor:
     """Return float64 counts (N, C(C+1)/2, B, ...), by the back end for the device and type of the tensors."""
     if blocks.uses_loops(classes.device) and tensors[0].dtype in (torch.float32, torch.float64):
-        counts: Tensor = CompiledCount.apply(Layout(classes, n_classes, tuple(pairs), mask), *tensors)
+        counts: Tensor = CompiledCount.apply(
+            Layout(classes, n_classes, tuple(pairs), mask), *tensors
+        )
         return counts
     return count_by_torch(classes, n_classes, pairs, mask, *tensors)
 
@@ -77,20 +92,35 @@ _ARGUMENTS = "Tensor classes, int n_classes, int[] templates, Tensor mask, Tenso
 
 
 @library.custom_op("igps::count_pairs", mutates_args=(), schema=f"({_ARGUMENTS}) -> Tensor")
-def _operator(classes: Tensor, n_classes: int, templates: list[int], mask: Tensor, tensors: list[Tensor]) -> Tensor:
+def _operator(
+    classes: Tensor, n_classes: int, templates: list[int], mask: Tensor, tensors: list[Tensor]
+) -> Tensor:
     """`_count` as an operator of PyTorch, with gradients by the tensors."""
     return _count(classes, n_classes, _from_templates(templates, tensors), mask, tensors)
 
 
 @_operator.register_fake
-def _(classes: Tensor, n_classes: int, templates: list[int], mask: Tensor, tensors: list[Tensor]) -> Tensor:
+def _(
+    classes: Tensor, n_classes: int, templates: list[int], mask: Tensor, tensors: list[Tensor]
+) -> Tensor:
     bins = [len(centres) for centres in centres_of(_from_templates(templates, tensors))]
-    return classes.new_empty(mask.shape[0], n_classes * (n_classes + 1) // 2, *bins, dtype=torch.float64)
+    return classes.new_empty(
+        mask.shape[0], n_classes * (n_classes + 1) // 2, *bins, dtype=torch.float64
+    )
 
 
-@library.custom_op("igps::count_pairs_backward", mutates_args=(), schema=f"(Tensor upstream, {_ARGUMENTS}) -> Tensor[]")
+@library.custom_op(
+    "igps::count_pairs_backward",
+    mutates_args=(),
+    schema=f"(Tensor upstream, {_ARGUMENTS}) -> Tensor[]",
+)
 def _gradients(
-    upstream: Tensor, classes: Tensor, n_classes: int, templates: list[int], mask: Tensor, tensors: list[Tensor]
+    upstream: Tensor,
+    classes: Tensor,
+    n_classes: int,
+    templates: list[int],
+    mask: Tensor,
+    tensors: list[Tensor],
 ) -> list[Tensor]:
     keys = torch._C.DispatchKey
     # PyTorch disables autograd inside an operator.
@@ -106,7 +136,12 @@ def _gradients(
 
 @_gradients.register_fake
 def _(
-    upstream: Tensor, classes: Tensor, n_classes: int, templates: list[int], mask: Tensor, tensors: list[Tensor]
+    upstream: Tensor,
+    classes: Tensor,
+    n_classes: int,
+    templates: list[int],
+    mask: Tensor,
+    tensors: list[Tensor],
 ) -> list[Tensor]:
     return [torch.empty_like(tensor) for tensor in tensors]
 
@@ -118,7 +153,13 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 def _backward(ctx: Any, upstream: Tensor) -> tuple[None, None, None, None, list[Tensor]]:
     classes, mask, *tensors = ctx.saved_tensors
-    return None, None, None, None, _gradients(upstream, classes, ctx.n_classes, ctx.templates, mask, tensors)
+    return (
+        None,
+        None,
+        None,
+        None,
+        _gradients(upstream, classes, ctx.n_classes, ctx.templates, mask, tensors),
+    )
 
 
 _operator.register_autograd(_backward, setup_context=_setup_context)
@@ -147,4 +188,6 @@ def check_pairs(pairs: Sequence[PairValues], mask: Tensor) -> None:
         if not bool(torch.isfinite(real).all()):
             raise ValueError("points: expected finite values, got NaN or infinity.")
         if VALUES not in pair.kinds and not bool((real.square().sum(dim=-1) < max_square).all()):
-            raise ValueError("points: expected distances that can be squared, got larger ones. Choose a larger unit.")
+            raise ValueError(
+                "points: expected distances that can be squared, got larger ones. Choose a larger unit."
+            )

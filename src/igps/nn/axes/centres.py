@@ -40,8 +40,15 @@ class OrderedCentres(Specified):
     def __init__(self, start: Tensor | Sequence[float], learnable: bool = False) -> None:
         super().__init__()
         values = torch.as_tensor(start, dtype=torch.float32)
-        if values.ndim != 1 or not len(values) or not torch.isfinite(values).all() or (values.diff() <= 0).any():
-            raise ValueError(f"start: expected finite values in ascending order, got {values.tolist()}.")
+        if (
+            values.ndim != 1
+            or not len(values)
+            or not torch.isfinite(values).all()
+            or (values.diff() <= 0).any()
+        ):
+            raise ValueError(
+                f"start: expected finite values in ascending order, got {values.tolist()}."
+            )
         # A copy, as safetensors refuses tensors that share memory.
         self.register_buffer("start", values.clone())
         self.log_gap = nn.Parameter(torch.zeros(len(values))) if learnable else None
@@ -51,6 +58,12 @@ class OrderedCentres(Specified):
         if self.log_gap is None:
             return self.start
         first = self.start[:1]
-        origin = torch.where(first > 0, 0, first - self.start.diff()[:1]) if len(self.start) > 1 else first.clamp(max=0)
+        origin = (
+            torch.where(first > 0, 0, first - self.start.diff()[:1])
+            if len(self.start) > 1
+            else first.clamp(max=0)
+        )
         gaps = torch.cat([origin, self.start]).diff()
-        return origin + (gaps * (_MIN_GAP + (1 - _MIN_GAP) / math.log(2) * softplus(self.log_gap))).cumsum(0)
+        return origin + (
+            gaps * (_MIN_GAP + (1 - _MIN_GAP) / math.log(2) * softplus(self.log_gap))
+        ).cumsum(0)

@@ -10,7 +10,12 @@ from torch import Tensor, nn
 
 from igps._parameters import check_at_least
 from igps.data.requirements import Requirements, embedding_requirements
-from igps.nn._kernels.pair_values import PairValues, euclidean_distances, oriented_pairs, pair_twists
+from igps.nn._kernels.pair_values import (
+    PairValues,
+    euclidean_distances,
+    oriented_pairs,
+    pair_twists,
+)
 from igps.nn.axes.centres import OrderedCentres, interval_centres
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.specification import Specified
@@ -94,7 +99,12 @@ class InteriorDistance(DistanceAxis):
     """
 
     def __init__(
-        self, n_bins: int = 64, reach: float = 4.0, *, embedding: nn.Module | None = None, learnable: bool = False
+        self,
+        n_bins: int = 64,
+        reach: float = 4.0,
+        *,
+        embedding: nn.Module | None = None,
+        learnable: bool = False,
     ) -> None:
         super().__init__(n_bins, reach, learnable=learnable)
         self.embedding = embedding
@@ -193,4 +203,6 @@ class PairTwist(PairAxis):
 
     def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Return the twists of the positions over √area and the surface directions."""
-        return pair_twists(features.positions(), features.attribute("surface_direction"), self.centres())
+        return pair_twists(
+            features.positions(), features.attribute("surface_direction"), self.centres()
+        )

@@ -63,7 +63,10 @@ class PointAxis(Specified, ABC):
         ValueError if a value in the mask (..., P) is not finite.
         """
         # Code traced by `torch.compile` cannot raise.
-        if not torch.compiler.is_compiling() and not torch.isfinite(torch.where(mask, values, 0)).all():
+        if (
+            not torch.compiler.is_compiling()
+            and not torch.isfinite(torch.where(mask, values, 0)).all()
+        ):
             raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
         centres = self.centres().to(values.dtype)
         if not self.soft or len(centres) == 1:
@@ -119,13 +122,23 @@ class BallRadius(PointAxis):
     """
 
     def __init__(
-        self, side: Side = "inside", smallest: float = 0.022, largest: float = 0.25, n_classes: int = 4
+        self,
+        side: Side = "inside",
+        smallest: float = 0.022,
+        largest: float = 0.25,
+        n_classes: int = 4,
     ) -> None:
         check_one_of(_SIDES, side=side)
         check_at_least(2, n_classes=n_classes)
         if not 0 < smallest < largest < math.inf:
-            raise ValueError(f"smallest, largest: expected 0 < smallest < largest, got {smallest} and {largest}.")
-        super().__init__(torch.linspace(math.log(smallest), math.log(largest), n_classes), soft=True, learnable=False)
+            raise ValueError(
+                f"smallest, largest: expected 0 < smallest < largest, got {smallest} and {largest}."
+            )
+        super().__init__(
+            torch.linspace(math.log(smallest), math.log(largest), n_classes),
+            soft=True,
+            learnable=False,
+        )
         self.side = side
 
     def requirements(self, embedding: nn.Module) -> Requirements:
@@ -135,7 +148,9 @@ class BallRadius(PointAxis):
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """Return the logarithms (N, P) of the radii over √area; raise a ValueError for interior samples."""
         if features.kind != "surface":
-            raise ValueError("samples: expected surface samples for ball radii, got interior samples.")
+            raise ValueError(
+                "samples: expected surface samples for ball radii, got interior samples."
+            )
         return features.ball_radii()[..., _SIDES.index(self.side)].log()
 
 
@@ -164,8 +179,14 @@ class Attribute(PointAxis):
         learnable: bool = False,
     ) -> None:
         if (centres is None) == (quantiles is None) or (quantiles is not None and quantiles < 2):
-            raise ValueError(f"{name}: expected centres, or at least 2 quantiles, got {centres} and {quantiles}.")
-        super().__init__([float(i) for i in range(quantiles or 0)] if centres is None else centres, soft, learnable)
+            raise ValueError(
+                f"{name}: expected centres, or at least 2 quantiles, got {centres} and {quantiles}."
+            )
+        super().__init__(
+            [float(i) for i in range(quantiles or 0)] if centres is None else centres,
+            soft,
+            learnable,
+        )
         self.name, self.quantiles = name, quantiles
         if quantiles is not None:
             self.register_buffer("fitted", torch.tensor(False))
@@ -202,7 +223,9 @@ class Attribute(PointAxis):
         self.check_fitted()
         values = features.attribute(self.name)
         if values.ndim != 2:
-            raise ValueError(f"attributes: expected a scalar, got {self.name!r}, which is a direction.")
+            raise ValueError(
+                f"attributes: expected a scalar, got {self.name!r}, which is a direction."
+            )
         return values
 
 

@@ -10,7 +10,9 @@ from torch import Tensor
 from igps.nn.specification import Specified
 from igps.retrieval.distances import cosine, square_root
 
-_MIN_RELATIVE_SQUARE = 1e-10  # directions with smaller sums of squares, over the largest sum, are rounding errors
+_MIN_RELATIVE_SQUARE = (
+    1e-10  # directions with smaller sums of squares, over the largest sum, are rounding errors
+)
 
 
 class Head(Specified, ABC):
@@ -22,7 +24,9 @@ class Head(Specified, ABC):
     """
 
     @abstractmethod
-    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
+    def fit(
+        self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None
+    ) -> Self:
         """Fit everything that is not trained by gradients to the training shapes.
 
         Args:
@@ -49,9 +53,13 @@ class Head(Specified, ABC):
     def shorten(self, embeddings: Tensor) -> Tensor:
         """Map embeddings (N, D) to (N, ≤ 256) of length 1 with nearly the same cosines; by default, a ValueError."""
         got = f"{type(self).__name__} and embeddings of {embeddings.shape[1]} numbers"
-        raise ValueError(f"shorten: expected a head that shortens its embeddings, such as TwoLevelHead, got {got}.")
+        raise ValueError(
+            f"shorten: expected a head that shortens its embeddings, such as TwoLevelHead, got {got}."
+        )
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *arguments: Any
+    ) -> None:
         for name, buffer in self.named_buffers(recurse=False):
             stored = state_dict.get(prefix + name)
             if stored is not None and stored.shape != buffer.shape and stored.ndim == buffer.ndim:
@@ -63,10 +71,14 @@ class Head(Specified, ABC):
         """Copy `part_cells` and `lengths` to Python: reading buffers of a GPU is slow, and impossible in tracing."""
         buffers = self.named_buffers(recurse=False)
         # A dictionary, as fingerprints ignore dictionaries.
-        self._noted: dict[str, Any] = {name: x.tolist() for name, x in buffers if name in ("part_cells", "lengths")}
+        self._noted: dict[str, Any] = {
+            name: x.tolist() for name, x in buffers if name in ("part_cells", "lengths")
+        }
 
     def _not_fitted(self) -> RuntimeError:
-        return RuntimeError(f"{type(self).__name__}: expected to be fitted first. Call fit(descriptions, labels).")
+        return RuntimeError(
+            f"{type(self).__name__}: expected to be fitted first. Call fit(descriptions, labels)."
+        )
 
 
 def square_roots(histograms: Tensor) -> Tensor:
@@ -80,14 +92,18 @@ def square_roots(histograms: Tensor) -> Tensor:
 def check_cells(cells: Tensor, n_expected: int) -> None:
     """Raise a ValueError unless descriptions (N, cells) have as many cells as the training shapes."""
     if cells.shape[1] != n_expected:
-        raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
+        raise ValueError(
+            f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}."
+        )
 
 
 def check_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
     """Return `part_cells` as a tensor, by default one part of all cells; raise a ValueError for a wrong sum."""
     sizes = list(part_cells or (cells.shape[1],))
     if min(sizes) < 1 or sum(sizes) != cells.shape[1]:
-        raise ValueError(f"part_cells: expected cells that add up to {cells.shape[1]}, got {sizes}.")
+        raise ValueError(
+            f"part_cells: expected cells that add up to {cells.shape[1]}, got {sizes}."
+        )
     return torch.tensor(sizes, device=cells.device)
 
 
@@ -95,7 +111,9 @@ def check_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
     """Return the labels (N,) on the device of the descriptions (N, ...); raise a ValueError for another shape."""
     n = len(descriptions)
     if labels.shape != (n,):
-        raise ValueError(f"labels: expected one for each of {n} descriptions, got shape {tuple(labels.shape)}.")
+        raise ValueError(
+            f"labels: expected one for each of {n} descriptions, got shape {tuple(labels.shape)}."
+        )
     return labels.to(descriptions.device)
 
 
@@ -103,14 +121,19 @@ def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
     """Return the classes (N,) of descriptions, numbered from 0; raise a ValueError if no class has two members."""
     _, members = check_labels(descriptions, labels).unique(return_inverse=True)
     if int(members.max()) + 1 == len(members):
-        raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
+        raise ValueError(
+            "labels: expected a class of at least two shapes, got as many classes as shapes."
+        )
     return members
 
 
 def class_means(rows: Tensor, members: Tensor) -> Tensor:
     """Return the means (C, D) of rows (N, D) by their classes (N,), which are numbered from 0 without gaps."""
     n_members = torch.bincount(members)
-    return rows.new_zeros(len(n_members), rows.shape[1]).index_add_(0, members, rows) / n_members[:, None]
+    return (
+        rows.new_zeros(len(n_members), rows.shape[1]).index_add_(0, members, rows)
+        / n_members[:, None]
+    )
 
 
 def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
@@ -120,13 +143,17 @@ def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """
     n_rows, width = rows.shape
     is_wide = width > n_rows
-    squares, axes = torch.linalg.eigh(rows @ rows.T if is_wide else rows.T @ rows)  # of the smaller matrix
+    squares, axes = torch.linalg.eigh(
+        rows @ rows.T if is_wide else rows.T @ rows
+    )  # of the smaller matrix
     n = min(n, int((squares > _MIN_RELATIVE_SQUARE * squares[-1]).sum()))
     squares, axes = squares.flip(0)[:n], axes.flip(1)[:, :n]
     return (axes.T @ rows) / squares.sqrt()[:, None] if is_wide else axes.T, squares
 
 
-def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: int) -> tuple[Tensor, Tensor]:
+def within_class_whitening(
+    residuals: Tensor, rank: int, shrinkage: float, n: int
+) -> tuple[Tensor, Tensor]:
     """Return the directions along which shapes of one class differ most, and the gains that whiten them, for `damped`.
 
     Let W be the covariance within classes over its mean eigenvalue, and s the shrinkage. Up to a factor,

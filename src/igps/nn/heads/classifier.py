@@ -15,7 +15,9 @@ from igps.nn.heads.closed_form import KernelHead
 _MAX_FOLDS = 5
 _TEMPERATURES = torch.logspace(-2.5, 0, 60)  # candidates of the calibration
 _N_NEAREST = 2  # training shapes of the predicted class that strangeness is computed from
-_FALSE_UNKNOWN_RATE = 0.05  # share of held-out shapes of known classes that are classified as unknown
+_FALSE_UNKNOWN_RATE = (
+    0.05  # share of held-out shapes of known classes that are classified as unknown
+)
 
 
 class ClassifierHead(KernelHead):
@@ -53,7 +55,12 @@ class ClassifierHead(KernelHead):
 
     @torch.no_grad()
     def fit(
-        self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None, *, calibrate: bool = True
+        self,
+        descriptions: Tensor,
+        labels: Tensor,
+        part_cells: Sequence[int] | None = None,
+        *,
+        calibrate: bool = True,
     ) -> Self:
         """Fit to the training shapes, and calibrate on folds of them.
 
@@ -77,7 +84,9 @@ class ClassifierHead(KernelHead):
         self.members = torch.searchsorted(self.classes, labels.to(self.classes))
         if classes:
             logits, targets = torch.cat(scores), torch.cat(classes)
-            losses = [functional.cross_entropy(logits / t, targets) for t in _TEMPERATURES.to(logits)]
+            losses = [
+                functional.cross_entropy(logits / t, targets) for t in _TEMPERATURES.to(logits)
+            ]
             self.calibration.copy_(_TEMPERATURES[int(torch.stack(losses).argmin())])
             self.strange_from.copy_(torch.cat(strangeness).quantile(1 - _FALSE_UNKNOWN_RATE))
         return self
@@ -92,7 +101,11 @@ class ClassifierHead(KernelHead):
         part_distances = self._distances(self._vectors(descriptions)) / self.medians[:, None, None]
         distances = torch.einsum("k,kij->ij", self.shares, part_distances)
         other = self.members != predicted[:, None]
-        nearest = distances.masked_fill(other, math.inf).topk(min(_N_NEAREST, len(self.members)), largest=False).values
+        nearest = (
+            distances.masked_fill(other, math.inf)
+            .topk(min(_N_NEAREST, len(self.members)), largest=False)
+            .values
+        )
         is_real = torch.isfinite(nearest)  # a class may have fewer shapes
         return nearest.where(is_real, 0).sum(dim=1) / is_real.sum(dim=1) - scores
 

@@ -21,7 +21,9 @@ from igps.nn.heads.base import (
 )
 from igps.retrieval.distances import cosine
 
-_MIN_CLASS_SIZE = 6  # with fewer training shapes per class on average, the temperature of the softmax is raised
+_MIN_CLASS_SIZE = (
+    6  # with fewer training shapes per class on average, the temperature of the softmax is raised
+)
 _MIN_VARIANCE = 1e-8  # smaller variances of distances are rounding errors
 
 
@@ -65,7 +67,11 @@ class WhitenedHead(Head):
     prior_share: Tensor
 
     def __init__(
-        self, n_directions: int = 64, shrinkage: float = 0.3, prior: Head | None = None, prior_share: float = 1 / 3
+        self,
+        n_directions: int = 64,
+        shrinkage: float = 0.3,
+        prior: Head | None = None,
+        prior_share: float = 1 / 3,
     ) -> None:
         super().__init__()
         check_at_least(1, n_directions=n_directions)
@@ -80,20 +86,30 @@ class WhitenedHead(Head):
         self.register_buffer("part_shares", torch.ones(0))
 
     @torch.no_grad()
-    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
+    def fit(
+        self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None
+    ) -> Self:
         """Fit mean and directions to the training shapes, see `Head.fit`."""
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
         means = class_means(roots, members)
         self.centre(descriptions, part_cells)
         residuals = self.parts((roots - means[members]).double())
-        for part, directions, gains in zip(residuals, self.parts(self.directions), self.gains, strict=True):
-            rank = len(roots) - len(means)  # the maximum for residuals of N shapes in C classes: N − C
-            own_directions, own_gains = within_class_whitening(part, rank, self.shrinkage, self.n_directions)
+        for part, directions, gains in zip(
+            residuals, self.parts(self.directions), self.gains, strict=True
+        ):
+            rank = len(roots) - len(
+                means
+            )  # the maximum for residuals of N shapes in C classes: N − C
+            own_directions, own_gains = within_class_whitening(
+                part, rank, self.shrinkage, self.n_directions
+            )
             directions[: len(own_directions)] = own_directions
             gains[: len(own_gains)] = own_gains
         if self.prior is not None and len(means) > 1:
-            discriminants = torch.stack([_discriminant(part, members) for part in self.whitened_parts(roots)])
+            discriminants = torch.stack(
+                [_discriminant(part, members) for part in self.whitened_parts(roots)]
+            )
             if discriminants.sum() > 0:
                 self.part_shares = discriminants / discriminants.sum()
         return self
@@ -116,7 +132,10 @@ class WhitenedHead(Head):
         roots = square_roots(descriptions)
         if len(self.mean):
             factors = self.part_shares.sqrt()
-            own = torch.cat([x * part for x, part in zip(factors, self.whitened_parts(roots), strict=True)], dim=1)
+            own = torch.cat(
+                [x * part for x, part in zip(factors, self.whitened_parts(roots), strict=True)],
+                dim=1,
+            )
         else:
             own = functional.normalize(roots, dim=1)
         if self.prior is None:
@@ -130,14 +149,18 @@ class WhitenedHead(Head):
             return cosine(queries, gallery)
         if not len(self.mean):
             raise self._not_fitted()
-        own, priors = zip(*(x.tensor_split([len(self.mean)], dim=1) for x in (queries, gallery)), strict=True)
+        own, priors = zip(
+            *(x.tensor_split([len(self.mean)], dim=1) for x in (queries, gallery)), strict=True
+        )
         prior_distances = self.prior.distances(*(x / self.prior_share.sqrt() for x in priors))
         return (1 - self.prior_share) * cosine(*own) + self.prior_share * prior_distances
 
     def whitened_parts(self, roots: Tensor) -> list[Tensor]:
         """Return the whitened unit vectors (N, cells) of each part, from the square roots (N, D) of histograms."""
         check_cells(roots, len(self.mean))
-        parts = zip(self.parts(roots - self.mean), self.parts(self.directions), self.gains, strict=True)
+        parts = zip(
+            self.parts(roots - self.mean), self.parts(self.directions), self.gains, strict=True
+        )
         return [functional.normalize(damped(*part), dim=1) for part in parts]
 
     def parts(self, cells: Tensor) -> tuple[Tensor, ...]:
@@ -205,7 +228,9 @@ class KernelHead(Head):
         self.register_buffer("classes", torch.zeros(0, dtype=torch.long))
 
     @torch.no_grad()
-    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
+    def fit(
+        self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None
+    ) -> Self:
         """Fit whitening and regression to the training shapes, see `Head.fit`."""
         self.classes, members = check_labels(descriptions, labels).unique(return_inverse=True)
         if len(self.classes) < 2:
@@ -220,14 +245,18 @@ class KernelHead(Head):
         share = 0.0 if self.prior is None else self.prior_share if has_class_variation else 1.0
         shares = [(1 - share) / n_parts] * n_parts + ([] if self.prior is None else [share])
         self.shares = self.anchors.new_tensor(shares)
-        i, j = torch.triu_indices(len(self.anchors), len(self.anchors), 1, device=self.anchors.device)
+        i, j = torch.triu_indices(
+            len(self.anchors), len(self.anchors), 1, device=self.anchors.device
+        )
         distances = self._distances(self.anchors)[:, i, j]
         self.medians = distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny)
         values, vectors = torch.linalg.eigh(self._kernel(self.anchors).double())
         factors = torch.where(values > 0, 1 / (values + self.ridge), 0)
         targets = functional.one_hot(members, len(self.classes)).double()
         # Contiguous as after loading from a file, so that products with them are rounded in the same way.
-        self.coefficients = (vectors * factors @ (vectors.T @ targets)).to(self.anchors.dtype).contiguous()
+        self.coefficients = (
+            (vectors * factors @ (vectors.T @ targets)).to(self.anchors.dtype).contiguous()
+        )
         return self
 
     def scores(self, descriptions: Tensor) -> Tensor:

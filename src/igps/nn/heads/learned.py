@@ -28,7 +28,9 @@ class ProjectionHead(Head):
     mean: Tensor
     scale: Tensor
 
-    def __init__(self, width: int = 64, n_hidden: int = 256, dropout: float = 0.5, cell_dropout: float = 0.2) -> None:
+    def __init__(
+        self, width: int = 64, n_hidden: int = 256, dropout: float = 0.5, cell_dropout: float = 0.2
+    ) -> None:
         super().__init__()
         check_at_least(1, width=width)
         self.register_buffer("mean", torch.zeros(0))
@@ -39,14 +41,18 @@ class ProjectionHead(Head):
         self.layers = nn.Sequential(*layers)
 
     @torch.no_grad()
-    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
+    def fit(
+        self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None
+    ) -> Self:
         """Fit the centring and scaling of the inputs to the histograms (N, ...) of the training shapes, N ≥ 2.
 
         The layers are trained by gradients; labels and parts are ignored.
         """
         roots = square_roots(descriptions)
         if len(roots) < 2:
-            raise ValueError(f"descriptions: expected those of at least two training shapes, got {len(roots)}.")
+            raise ValueError(
+                f"descriptions: expected those of at least two training shapes, got {len(roots)}."
+            )
         self.mean = roots.mean(dim=0)
         # One scale for all cells, as a scale for each would amplify the cells that are nearly always empty.
         self.scale.copy_(roots.std(dim=0).mean().clamp_min(torch.finfo(roots.dtype).tiny))
@@ -76,7 +82,9 @@ class BlendedDistance(nn.Module):
     plain_unit: Tensor
     learned_unit: Tensor
 
-    def __init__(self, head: Head | None = None, plain: Distance | None = None, share: float = 0.5) -> None:
+    def __init__(
+        self, head: Head | None = None, plain: Distance | None = None, share: float = 0.5
+    ) -> None:
         super().__init__()
         if not 0 <= share <= 1:
             raise ValueError(f"share: expected a number from 0 to 1, got {share}.")

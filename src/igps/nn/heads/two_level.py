@@ -19,8 +19,12 @@ _STEEPNESS = 20  # exponent of the factors that rise from 0 to 1
 _SAME_CLASS = 0.55  # nearly all poses of a scanned body have smaller distances by the class head
 _SAME_BODY = 0.1  # nearly all pairs of poses of an unseen generated body are nearer
 _WEIGHT = 0.05  # of the term that orders bodies that are nearly alike
-_MIN_DISTANCE = 1e-7  # shorter distances are rounding errors, and fractional powers have no derivative at 0
-_MAX_RATIO = 16  # of a distance to its scale: greater ones could overflow, and the factor is 1 long before
+_MIN_DISTANCE = (
+    1e-7  # shorter distances are rounding errors, and fractional powers have no derivative at 0
+)
+_MAX_RATIO = (
+    16  # of a distance to its scale: greater ones could overflow, and the factor is 1 long before
+)
 
 
 class TwoLevelHead(Head):
@@ -75,7 +79,9 @@ class TwoLevelHead(Head):
     ) -> None:
         super().__init__()
         self.class_head = class_head or WCCNHead()
-        self.body_heads = nn.ModuleList(body_heads or [WCCNHead(n_directions=64, shrinkage=0.3, lengths=True)])
+        self.body_heads = nn.ModuleList(
+            body_heads or [WCCNHead(n_directions=64, shrinkage=0.3, lengths=True)]
+        )
         n_heads = len(self.body_heads)
         exponents = [1 / n_heads] * n_heads if exponents is None else exponents
         check_fraction(share=share)
@@ -128,13 +134,18 @@ class TwoLevelHead(Head):
         for head in self._body_heads():
             head.fit(body_descriptions, bodies, part_cells)
         embeddings = self(descriptions)
-        self.principal = principal_directions(embeddings.double(), MAX_SHORT_WIDTH)[0].to(embeddings.dtype)
+        self.principal = principal_directions(embeddings.double(), MAX_SHORT_WIDTH)[0].to(
+            embeddings.dtype
+        )
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
         """Map histograms (N, ...) to embeddings (N, D) of length 1, with the columns of the body heads last."""
         classes = (1 - self.share).sqrt() * self.class_head(descriptions)
-        return torch.cat([classes, *(self._root_share * head(descriptions) for head in self._body_heads())], dim=1)
+        return torch.cat(
+            [classes, *(self._root_share * head(descriptions) for head in self._body_heads())],
+            dim=1,
+        )
 
     def within_class(self, embeddings: Tensor) -> Tensor:
         """Return the columns of embeddings (N, D) by the body heads.
@@ -152,7 +163,9 @@ class TwoLevelHead(Head):
         if not len(self.principal):
             raise self._not_fitted()
         if embeddings.shape[1] != self.principal.shape[1]:
-            raise ValueError(f"embeddings: expected {self.principal.shape[1]} numbers each, got {embeddings.shape[1]}.")
+            raise ValueError(
+                f"embeddings: expected {self.principal.shape[1]} numbers each, got {embeddings.shape[1]}."
+            )
         return nn.functional.normalize(embeddings @ self.principal.T, dim=1)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
@@ -170,13 +183,18 @@ class TwoLevelHead(Head):
         exponent = exponent * (lengths / _USUAL_LENGTH**2).pow(_STEEPNESS / 4)
         exponent = exponent + (classes / _SAME_CLASS).pow(_STEEPNESS)
         differ = torch.expm1(-exponent) * torch.expm1(-(bodies / _SAME_BODY).pow(_STEEPNESS))
-        return (1 - _WEIGHT) * classes * differ - _WEIGHT * torch.expm1(-(bodies / _SAME_BODY).square())
+        return (1 - _WEIGHT) * classes * differ - _WEIGHT * torch.expm1(
+            -(bodies / _SAME_BODY).square()
+        )
 
     def _compared(self, embeddings: Tensor) -> list[Tensor]:
         """Return the `n_compared` columns of embeddings (N, D) by each body head, without its share."""
         heads = self._body_heads()
         parts = self.within_class(embeddings).split([head.n_numbers for head in heads], dim=1)
-        return [part[:, : head.n_compared] / self._root_share for part, head in zip(parts, heads, strict=True)]
+        return [
+            part[:, : head.n_compared] / self._root_share
+            for part, head in zip(parts, heads, strict=True)
+        ]
 
     def _body_heads(self) -> list[WCCNHead]:
         return [head for head in self.body_heads if isinstance(head, WCCNHead)]

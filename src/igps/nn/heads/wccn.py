@@ -69,7 +69,9 @@ class WCCNHead(Head):
         self._note_buffers()
 
     @torch.no_grad()
-    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
+    def fit(
+        self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None
+    ) -> Self:
         """Fit mean and directions to the training shapes, see `Head.fit`."""
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
@@ -136,7 +138,13 @@ class WCCNHead(Head):
         """Return the centred cells (N, cells) and the directions (n_directions, cells) of each used part."""
         sizes = self._sizes()
         centred = used - self.mean
-        return list(zip(centred.split(sizes, 1), self.directions.to(centred.dtype).split(sizes, 1), strict=True))
+        return list(
+            zip(
+                centred.split(sizes, 1),
+                self.directions.to(centred.dtype).split(sizes, 1),
+                strict=True,
+            )
+        )
 
     def _select_parts(self, roots: Tensor) -> Tensor:
         """Return the cells (N, cells) of all used parts."""

@@ -4,4 +4,11 @@ from igps.nn.histograms.base import DescriptionPart, SampleHistogram
 from igps.nn.histograms.pairs import PairHistogram, joint_histogram, pair_histogram
 from igps.nn.histograms.points import PointHistogram
 
-__all__ = ["DescriptionPart", "PairHistogram", "PointHistogram", "SampleHistogram", "joint_histogram", "pair_histogram"]
+__all__ = [
+    "DescriptionPart",
+    "PairHistogram",
+    "PointHistogram",
+    "SampleHistogram",
+    "joint_histogram",
+    "pair_histogram",
+]

@@ -55,7 +55,9 @@ class DescriptionPart(Specified, ABC):
         """
         if isinstance(batch, BatchFeatures):
             return self.of_features(batch)
-        return map_by_size(lambda group: self.of_features(BatchFeatures(group, self.training)), batch)
+        return map_by_size(
+            lambda group: self.of_features(BatchFeatures(group, self.training)), batch
+        )
 
 
 class SampleHistogram(DescriptionPart):
@@ -74,7 +76,10 @@ class SampleHistogram(DescriptionPart):
     embedding: nn.Module
 
     def __init__(
-        self, samples: SampleKind, n_samples: int | None = None, n_training_samples: int | None = None
+        self,
+        samples: SampleKind,
+        n_samples: int | None = None,
+        n_training_samples: int | None = None,
     ) -> None:
         super().__init__()
         check_one_of(SAMPLE_KINDS, samples=samples)
@@ -121,7 +126,9 @@ class AxesHistogram(SampleHistogram):
 
 def joint(memberships: list[Tensor]) -> Tensor:
     """Return memberships (..., P, C) in all combinations of the classes of several axes."""
-    return reduce(lambda first, second: (first[..., :, None] * second[..., None, :]).flatten(-2), memberships)
+    return reduce(
+        lambda first, second: (first[..., :, None] * second[..., None, :]).flatten(-2), memberships
+    )
 
 
 def counted(first: Tensor, second: Tensor, n_points: Tensor) -> Tensor:

@@ -60,10 +60,14 @@ class PairHistogram(AxesHistogram):
         super().__init__(samples, n_samples, n_training_samples)
         modules = [axis_of(axis) if isinstance(axis, str) else axis for axis in axes]
         if unknown := [axis for axis in modules if not isinstance(axis, PointAxis | PairAxis)]:
-            raise ValueError(f"axes: expected axes of points or of pairs, got {type(unknown[0]).__name__}.")
+            raise ValueError(
+                f"axes: expected axes of points or of pairs, got {type(unknown[0]).__name__}."
+            )
         self.axes = nn.ModuleList(modules)
         if not self.pair_axes:
-            raise ValueError("axes: expected at least one axis of pairs, such as 'interior_distance', got none.")
+            raise ValueError(
+                "axes: expected at least one axis of pairs, such as 'interior_distance', got none."
+            )
         self.embedding = embedding or SpectralEmbedding()
 
     @property
@@ -90,7 +94,9 @@ class PairHistogram(AxesHistogram):
         return count_pairs(classes, weights, n_classes, pairs, mask)
 
 
-def joint_histogram(memberships: Tensor, pairs: Sequence[PairValues], mask: Tensor | None = None) -> Tensor:
+def joint_histogram(
+    memberships: Tensor, pairs: Sequence[PairValues], mask: Tensor | None = None
+) -> Tensor:
     """Return the joint histogram of all pairs of points by the classes of the points and the bins of the pairs' values.
 
     Args:
@@ -111,12 +117,20 @@ def joint_histogram(memberships: Tensor, pairs: Sequence[PairValues], mask: Tens
     mask = torch.ones_like(memberships[..., 0], dtype=torch.bool) if mask is None else mask
     check_pairs(pairs, mask)
     for centres in centres_of(pairs):
-        if centres.ndim != 1 or len(centres) < 2 or not bool(((centres.diff() > 0) & centres[1:].isfinite()).all()):
-            raise ValueError(f"centres: expected two or more finite, ascending values, got {centres.tolist()}.")
+        if (
+            centres.ndim != 1
+            or len(centres) < 2
+            or not bool(((centres.diff() > 0) & centres[1:].isfinite()).all())
+        ):
+            raise ValueError(
+                f"centres: expected two or more finite, ascending values, got {centres.tolist()}."
+            )
     real = memberships[mask]
     # Both comparisons are false for NaN.
     if not bool((real >= 0).all() & ((real.sum(dim=1) - 1).abs() < 1e-3).all()):
-        raise ValueError("memberships: expected non-negative rows of sum 1, got others; divide each row by its sum.")
+        raise ValueError(
+            "memberships: expected non-negative rows of sum 1, got others; divide each row by its sum."
+        )
     return count_pairs(*largest_members(memberships, mask), memberships.shape[2], pairs, mask)
 
 
@@ -153,7 +167,9 @@ def pair_histogram(
     if embedding.ndim != 2:
         raise ValueError(f"embedding: expected shape (P, D), got {tuple(embedding.shape)}.")
     if potential.shape != embedding.shape[:1]:
-        raise ValueError(f"potential: expected shape ({len(embedding)},), one per point, got {tuple(potential.shape)}.")
+        raise ValueError(
+            f"potential: expected shape ({len(embedding)},), one per point, got {tuple(potential.shape)}."
+        )
     if not bool(((potential >= 0) & torch.isfinite(potential)).all()):
         raise ValueError("potential: expected non-negative, finite values, got others.")
     check_at_least(1, n_classes=n_classes)
@@ -161,5 +177,9 @@ def pair_histogram(
     check_positive(distance_range=distance_range, potential_range=potential_range)
     classes = (potential * (n_classes / potential_range)).long().clamp_(max=n_classes - 1)
     dtype = torch.promote_types(embedding.dtype, torch.float32)
-    centres = (torch.arange(n_bins, dtype=dtype, device=embedding.device) + 0.5) * (distance_range / n_bins)
-    return joint_histogram(one_hot(classes, n_classes).to(dtype), [euclidean_distances(embedding, centres)])
+    centres = (torch.arange(n_bins, dtype=dtype, device=embedding.device) + 0.5) * (
+        distance_range / n_bins
+    )
+    return joint_histogram(
+        one_hot(classes, n_classes).to(dtype), [euclidean_distances(embedding, centres)]
+    )

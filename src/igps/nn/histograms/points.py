@@ -41,7 +41,9 @@ class PointHistogram(AxesHistogram):
         super().__init__(samples, n_samples, n_training_samples)
         if not axes or not all(isinstance(axis, PointAxis) for axis in axes):
             names = [type(axis).__name__ for axis in axes]
-            raise ValueError(f"axes: expected axes of points, got {names}. Axes of pairs belong to a PairHistogram.")
+            raise ValueError(
+                f"axes: expected axes of points, got {names}. Axes of pairs belong to a PairHistogram."
+            )
         self.axes = nn.ModuleList(axes)
         self.embedding = embedding or SpectralEmbedding()
 
@@ -62,7 +64,9 @@ class PointHistogram(AxesHistogram):
         return point_histogram(memberships, mask, features.weights())
 
 
-def point_histogram(memberships: Sequence[Tensor], mask: Tensor, weights: Tensor | None = None) -> Tensor:
+def point_histogram(
+    memberships: Sequence[Tensor], mask: Tensor, weights: Tensor | None = None
+) -> Tensor:
     """Return the joint histogram of the samples of each body, from their memberships in the classes of each axis.
 
     Args:
