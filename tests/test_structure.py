@@ -20,6 +20,7 @@ FLOORS = (
     ("data",),
     ("nn",),
     ("descriptors",),
+    ("learning",),
     ("gallery",),
     ("analysis",),
     ("report",),
