@@ -1,12 +1,16 @@
-# `make demo` and `make test` set up everything they need in .venv, on a fresh machine.
+# Every target sets up what it needs in .venv, on a fresh machine.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PACKAGE := $(VENV)/.ready-package
 READY := $(VENV)/.ready
+# pip reports errors, and no warnings: it warns once for each package that a local index lacks. Python compiles a module
+# when it is first imported, which is cheaper than compiling all of them now.
+INSTALL := $(BIN)/python -m pip install --quiet --quiet --no-compile --constraint constraints.txt
 
 .PHONY: demo test lint docs release-check campaign shrec07 bench clean
 
-demo: $(READY)
+demo: $(PACKAGE)
 	$(BIN)/igps demo --out build/demo
 
 # One process per core, at most eight, because each loads torch. Neighbouring tests share fixtures, so --dist worksteal
@@ -19,10 +23,15 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# make campaign [SMALL=1]: broken meshes and bodies, killed processes, machine faults, properties; less
-# than half an hour on two cores. SMALL=1 takes two minutes and leaves out machine faults.
-campaign: $(READY)
+# make campaign [SMALL=1]: broken meshes and bodies, killed processes, machine faults, properties, deliberate faults;
+# half an hour on two cores. SMALL=1 takes two minutes and leaves out machine faults and deliberate faults.
+campaign: $(READY) $(if $(SMALL),,$(VENV)/.ready-campaign)
 	$(BIN)/python tests/campaign/campaign.py $(if $(SMALL),--small)
+
+$(VENV)/.ready-campaign: $(READY)
+	@echo "Installing the packages that deliberate faults need in $(VENV)"
+	@$(INSTALL) --editable ".[campaign]"
+	@touch $@
 
 # make shrec07 DATA=folder-of-meshes-with-labels.csv [WRITE=1]: compares the scores of the named descriptors with the
 # expected ones; WRITE=1 writes the scores as the expected ones.
@@ -31,11 +40,17 @@ shrec07: $(READY)
 	$(BIN)/python tests/campaign/shrec07.py "$(DATA)" $(if $(WRITE),--write)
 
 # torch is installed first, pinned: the newest build would bring gigabytes of CUDA libraries.
-$(READY): pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test,lint]"
-	touch $(READY)
+$(PACKAGE): pyproject.toml constraints.txt
+	@echo "Installing igps and the packages that it needs in $(VENV)"
+	@$(PYTHON) -m venv $(VENV)
+	@$(INSTALL) torch
+	@$(INSTALL) --editable .
+	@touch $@
+
+$(READY): $(PACKAGE)
+	@echo "Installing the packages that tests and lint need in $(VENV)"
+	@$(INSTALL) --editable ".[test,lint]"
+	@touch $@
 
 # make release-check: tests the wheel and the source archive in empty environments, with the lowest and the newest
 # versions of the dependencies; needs some gigabytes of disk.
@@ -47,8 +62,9 @@ docs: $(READY) $(VENV)/.ready-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 $(VENV)/.ready-docs: $(READY)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
-	touch $@
+	@echo "Installing the packages that the documentation needs in $(VENV)"
+	@$(INSTALL) --editable ".[docs]"
+	@touch $@
 
 # make bench [DATA=folder-of-meshes-with-labels.csv]
 bench: $(READY)
