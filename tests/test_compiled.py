@@ -1,4 +1,3 @@
-import gc
 import os
 import subprocess
 import sys
@@ -42,22 +41,6 @@ def test_a_compiled_loop_is_the_function_that_it_was_made_of():
 def test_importing_a_compiled_loop_imports_no_compiler():
     code = "import sys, igps, igps._compiled; igps._compiled.compiled()(lambda x: x); sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
-@pytest.mark.parametrize("is_collected", [True, False])
-def test_compiling_restores_the_garbage_collector(is_collected: bool) -> None:
-    def doubled(x: float) -> float:
-        return 2 * x
-
-    before = gc.isenabled()
-    try:
-        (gc.enable if is_collected else gc.disable)()
-        compiled()(doubled).dispatcher.compile(
-            "float64(float64)"
-        )  # such a form is never read from disk
-        assert gc.isenabled() is is_collected
-    finally:
-        (gc.enable if before else gc.disable)()
 
 
 def test_loops_of_an_earlier_version_are_compiled_anew(tmp_path: Path) -> None:

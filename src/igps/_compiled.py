@@ -5,7 +5,6 @@ per version. Compiled code releases the global interpreter lock (GIL) and uses o
 threads run side by side.
 """
 
-import gc
 import os
 from collections.abc import Callable
 from functools import cache, update_wrapper
@@ -92,25 +91,8 @@ def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 def _numba() -> ModuleType:
     """Import Numba. A fork waits until no thread compiles, because a lock that is held stays locked in the child."""
     import numba
-    from numba.core import event
     from numba.core.compiler_lock import global_compiler_lock as lock
 
-    was_enabled: list[
-        bool
-    ] = []  # a stack, as compiling a function compiles the functions that it calls
-
-    class GarbageCollectionOff(event.Listener):
-        """Turns off garbage collection, which would take a tenth of the time of compiling with its many objects."""
-
-        def on_start(self, event: object) -> None:
-            was_enabled.append(gc.isenabled())
-            gc.disable()
-
-        def on_end(self, event: object) -> None:
-            if was_enabled.pop():
-                gc.enable()
-
-    event.register("numba:compile", GarbageCollectionOff())
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(
             before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release

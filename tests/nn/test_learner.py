@@ -300,6 +300,17 @@ def test_the_mode_of_each_module_outlives_a_fit(
     assert modes == [[True, False, True]] * 2
 
 
+@pytest.mark.parametrize("precision", ["64-true", "bf16-true", "16-true"])
+def test_a_precision_that_would_write_into_batches_is_refused_with_the_remedy(
+    items: list[LabelledSignature], tmp_path: Path, precision: str
+) -> None:
+    run = Trainer(precision=precision, accelerator="cpu", logger=False, default_root_dir=tmp_path)  # type: ignore[arg-type]
+    with pytest.raises(
+        ValueError, match=f"precision: expected one of .*bf16-mixed, got {precision}"
+    ):
+        run.fit(learner(), loader(items))
+
+
 def test_a_checkpoint_that_names_a_foreign_class_is_refused(
     items: list[LabelledSignature], tmp_path: Path
 ) -> None:

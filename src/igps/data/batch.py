@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 import torch
@@ -260,21 +260,6 @@ class SignatureBatch:
             self.ids[i],
             mesh,
         )
-
-
-def _refuse(batch: Any, name: str, value: Any) -> None:
-    # Lightning would replace the error of a frozen dataclass by one that names neither the batch nor the remedy
-    raise AttributeError(
-        f"{name}: a batch is fixed. Make another one by dataclasses.replace, or by batch.to(torch.float64). Lightning "
-        'modifies batches, except for precision "32-true", "16-mixed" or "bf16-mixed"; Fabric does, except for '
-        '"32-true". Use one of these, in Fabric with torch.autocast around the module.'
-    )
-
-
-for _kind in (SampleBatch, SignatureBatch):
-    _kind.__setattr__ = _refuse  # type: ignore[method-assign]
-# Safe to load with torch.load(weights_only=True): they hold only tensors and names
-torch.serialization.add_safe_globals([SampleBatch, SignatureBatch])
 
 
 def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:

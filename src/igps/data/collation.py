@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data._utils.collate import default_collate_fn_map
 
 from igps.data._shared_memory import empty_arrays
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, attribute_names
@@ -20,8 +19,8 @@ def collate(
 ) -> SignatureBatch:
     """Pad Signatures and collate them to a batch.
 
-    The default `collate_fn` of a `DataLoader` does the same, also for Signatures inside tuples or dictionaries. In a
-    worker process of a DataLoader, the batch lies in shared memory.
+    For a `DataLoader(dataset, collate_fn=collate)`. In a worker process of a DataLoader, the batch lies in shared
+    memory.
 
     Example:
         >>> import trimesh
@@ -79,10 +78,6 @@ def collate(
     return SignatureBatch(
         eigenvalues, interior, surface, area, volume, labels, ids, surfaces, units
     )
-
-
-for _kind in (LabelledSignature, Signature):
-    default_collate_fn_map[_kind] = lambda items, *, collate_fn_map: collate(items)
 
 
 def _sample_columns(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:

@@ -21,6 +21,8 @@ from igps.nn.heads.base import Head
 from igps.nn.heads.learned import BlendedDistance
 from igps.retrieval.metric import RetrievalScoresMetric
 
+# Precisions with which Lightning leaves batches as they are.
+_PRECISIONS = ("32-true", "16-mixed", "bf16-mixed")
 # Packages whose classes a checkpoint may name by default.
 _TRUSTED = ("igps", "torch", "pytorch_lightning", "pytorch_metric_learning")
 
@@ -163,9 +165,14 @@ class RetrievalLearner(LightningModule):
         return self.distance.head
 
     def setup(self, stage: str) -> None:
-        """Raise a ValueError if there is no head to train, before the optimiser is created."""
+        """Raise a ValueError if there is no head to train, or if the precision of the trainer cannot be used."""
         if stage == "fit":
             _ = self._head
+        if self.trainer.precision not in _PRECISIONS:
+            raise ValueError(
+                f"precision: expected one of {', '.join(_PRECISIONS)}, got {self.trainer.precision}. "
+                "Others make Lightning write into batches, which are fixed."
+            )
 
     def on_train_start(self) -> None:
         """Fit the head to the training shapes, or centre its inputs on them; skipped in a resumed run."""

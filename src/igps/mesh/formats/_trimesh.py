@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,6 @@ from numpy.typing import NDArray
 
 from igps.mesh.formats._format import RawBody, check_unpacked, distinct
 from igps.mesh.options import LoadOptions
-
-# Errors name the file and its fault; the tracebacks that trimesh logs by default add nothing
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 class FolderResolver(trimesh.resolvers.Resolver):
