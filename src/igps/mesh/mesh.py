@@ -50,12 +50,34 @@ MILLIMETRES: Mapping[str, float] = {
     "\\u00B5m": 1e-3,
     "\u03bcm": 1e-3,  # the second with the Greek letter, not the sign of micro
 }
-"""Length of units in millimetres, by their names in files and libraries."""
+"""Length of units in millimetres, by the names that bodies carry."""
 
 
 def millimetres(unit: str | None) -> float:
     """Return the length of a unit in millimetres, 1 if the unit is unknown."""
     return MILLIMETRES.get(unit or "mm", 1.0)
+
+
+_PREFIXES = {"": 1e3, "centi": 10.0, "milli": 1.0, "micro": 1e-3, "nano": 1e-6}
+_WRITTEN_OUT = {
+    f"{prefix}{ending}": length
+    for prefix, length in _PREFIXES.items()
+    for ending in ("meter", "meters", "metre", "metres")
+}
+
+
+def unit_of_length(name: str) -> float | None:
+    """Return the length in millimetres of a unit by its name in a file, in any case; None if it is no known unit.
+
+    Example:
+        >>> unit_of_length("Microns"), unit_of_length("nanometre"), unit_of_length("pixel")
+        (0.001, 1e-06, None)
+    """
+    name = name.strip()
+    if name in MILLIMETRES:
+        return MILLIMETRES[name]
+    lower = name.lower()
+    return _WRITTEN_OUT.get(lower, MILLIMETRES.get(lower))
 
 
 _REPAIR = 'LoadOptions(mend="auto"), on the command line --mend auto,'

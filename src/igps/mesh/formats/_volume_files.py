@@ -3,7 +3,9 @@
 import json
 import math
 import re
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Floats
+from igps.mesh.formats._streams import check_gzip, check_zlib
 from igps.mesh.formats.label_names import names_in_extensions, names_in_tags
 from igps.mesh.limits import check_fits
-from igps.mesh.mesh import MILLIMETRES, MeshError
+from igps.mesh.mesh import MeshError, unit_of_length
 
 _WORK_BYTES = 4  # bytes a voxel to hold and count labels, beyond those of the file
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # DICOM and ITK use LPS
@@ -23,6 +26,13 @@ _NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")
 _MITK = "org.mitk.multilabel.segmentation.labelgroups"
 _MAX_HEADER = 1 << 24  # bytes
 _MGH_FOOTER = 20  # bytes between voxels and tags
+_MAX_TAGS = 1 << 26  # bytes around the voxels of a compressed NIfTI or MGH file
+# Spacings closer than this, as a share, differ by the rounding of a header.
+_SPACING_TOLERANCE = 0.01
+_META_COMPRESSED = re.compile(
+    rb"^\s*CompressedData\s*[=:]\s*(true|1|yes)", re.MULTILINE | re.IGNORECASE
+)
+_META_SIZE = re.compile(rb"^\s*CompressedDataSize\s*[=:]\s*(\d+)", re.MULTILINE | re.IGNORECASE)
 # The line of a NRRD or MetaImage header that names the file of the voxels; ":" may stand for "=" in MetaImage.
 _DATA_FILE = re.compile(
     rb"(?:ElementDataFile[ \t]*[=:]|^data ?file:)[ \t]*(?:\./)?(.*?)[ \t]*\r?$",
@@ -41,6 +51,7 @@ class RawVolume:
         default_factory=list
     )  # (name, layer, value), if the file lists them
     unit: str | None = "mm"  # of length; None if the file states no lengths
+    notes: list[str] = field(default_factory=list)  # remarks on its geometry, for the user
 
 
 def read_raw(path: Path) -> RawVolume:
@@ -93,7 +104,13 @@ def _not_integers(path: str | Path, kind: str) -> MeshError:
 def _nibabel(path: Path) -> RawVolume:
     import nibabel
 
-    return of_nibabel(nibabel.load(path), path)
+    image = nibabel.load(path)
+    volume = of_nibabel(image, path)
+    if path.suffix.lower() in (".gz", ".mgz"):  # nibabel stops behind the last voxel
+        (values,) = volume.layers
+        n_bytes = values.size * np.dtype(image.get_data_dtype()).itemsize
+        check_gzip(path, n_bytes, n_more=_MAX_TAGS)
+    return volume
 
 
 def of_nibabel(image: Any, path: str | Path) -> RawVolume:
@@ -105,8 +122,11 @@ def of_nibabel(image: Any, path: str | Path) -> RawVolume:
         raise _not_integers(path, f"{'colours' if dtype.fields else 'complex numbers'} ({dtype})")
     check_voxels(path, image.shape, max(dtype.itemsize, 1))
     values = np.asanyarray(image.dataobj).reshape(image.shape[:3])
-    affine, names = np.array(image.affine, dtype=np.float64), {}
+    affine = np.array(image.affine, dtype=np.float64)
+    names: dict[int, str] = {}
+    notes: list[str] = []
     if isinstance(image, nibabel.Nifti1Pair):  # the base class of all NIfTI images
+        notes = _spacing_notes(image)
         affine[:3] *= {1: 1e3, 3: 1e-3}.get(
             int(image.header["xyzt_units"]) % 8, 1.0
         )  # metres, micrometres
@@ -122,7 +142,22 @@ def of_nibabel(image: Any, path: str | Path) -> RawVolume:
         ) as file:  # nibabel does not read the tags
             file.seek(image.header.get_footer_offset() + _MGH_FOOTER)
             names = names_in_tags(file.read(_MAX_HEADER))
-    return RawVolume([values], affine, names)
+    return RawVolume([values], affine, names, notes=notes)
+
+
+def _spacing_notes(image: Any) -> list[str]:
+    """Return a note if the two geometries of a NIfTI header, sform and qform, differ in the size of a voxel."""
+    if not image.header["sform_code"]:
+        return []
+    sides = {
+        "sform": np.linalg.norm(image.affine[:3, :3], axis=0),
+        "qform": np.abs(image.header["pixdim"][1:4].astype(np.float64)),
+    }
+    if np.allclose(sides["sform"], sides["qform"], rtol=_SPACING_TOLERANCE, atol=0):
+        return []
+    shown = {name: " × ".join(f"{side:.4g}" for side in three) for name, three in sides.items()}
+    both = f"the sform states voxels of {shown['sform']} mm, the qform {shown['qform']} mm"
+    return [f"{both}: the sform was used"]
 
 
 def _simple_itk(path: Path) -> RawVolume:
@@ -141,21 +176,69 @@ def _simple_itk(path: Path) -> RawVolume:
     check_voxels(
         path, reader.GetSize(), 8 * n_layers, 1 if segments else reader.GetNumberOfComponents()
     )
-    image = reader.Execute()
+    n_bytes = math.prod(reader.GetSize()) * reader.GetNumberOfComponents() * _value_bytes(reader)
+    with _checked(path, n_bytes) as sound:
+        reader.SetFileName(str(sound))
+        image = reader.Execute()
     values = SimpleITK.GetArrayFromImage(image)  # (Z, Y, X) or (Z, Y, X, layers)
     layers = [values[..., i].T for i in range(values.shape[3])] if values.ndim == 4 else [values.T]
     affine = np.eye(4)
     affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
-    unit = "mm"
-    if suffix_of(path) in _NRRD:
-        _check_directions(header := _header(path), path)
-        unit = _nrrd_unit(header)
-    affine[:3] *= MILLIMETRES.get(unit, 1.0)
     segments = [segment for segment in segments if segment[1] < len(layers)]
-    return RawVolume(
-        layers, _LPS_TO_RAS @ affine, segments=segments, unit="mm" if unit in MILLIMETRES else None
-    )
+    volume = RawVolume(layers, _LPS_TO_RAS @ affine, segments=segments)
+    if suffix_of(path) in _NRRD:
+        header = _header(path)
+        _check_directions(header, path)
+        _apply_nrrd_unit(volume, header)
+    return volume
+
+
+def _value_bytes(reader: Any) -> int:
+    """Return the size in bytes of a value of a voxel."""
+    import SimpleITK
+
+    pixel = SimpleITK.Image([1, 1, 1], reader.GetPixelID(), reader.GetNumberOfComponents())
+    return int(pixel.GetSizeOfPixelComponent())
+
+
+@contextmanager
+def _checked(path: Path, n_bytes: int) -> Iterator[Path]:
+    """Yield a file that ITK reads rightly, after its compressed data, if any, was read to its end.
+
+    ITK compares no checksum, and fills what is missing with memory that was never written. Without the size of the
+    compressed data, which MetaImage need not state, it reads nothing: such a file is written anew with that size.
+    """
+    header = _header(path)
+    files = detached(path)
+    data = files[0] if files else path
+    start = 0 if files else len(header)
+    if suffix_of(path) in _NRRD:
+        if re.search(rb"^encoding:\s*(gz|gzip)\s*$", header, re.MULTILINE | re.IGNORECASE):
+            check_gzip(data, n_bytes, start=start)
+        yield path
+        return
+    if not _META_COMPRESSED.search(header):
+        yield path
+        return
+    with data.open("rb") as stream:
+        stream.seek(start)
+        n_packed = check_zlib(stream, data, n_bytes)
+        stated = _META_SIZE.search(header)
+        if stated is not None:
+            if int(stated[1]) != n_packed:
+                fault = f"{path}: states {int(stated[1])} compressed bytes, but has {n_packed}"
+                raise MeshError(f"{fault}. Export it again.")
+            yield path
+            return
+        stream.seek(start)
+        packed = stream.read(n_packed)
+    with tempfile.TemporaryDirectory() as folder:
+        complete = Path(folder) / "volume.mha"
+        lines = _DATA_FILE.sub(b"", header).rstrip()
+        size = b"CompressedDataSize = %d" % n_packed
+        complete.write_bytes(lines + b"\n" + size + b"\nElementDataFile = LOCAL\n" + packed)
+        yield complete
 
 
 def _check_directions(header: bytes, path: Path) -> None:
@@ -170,11 +253,30 @@ def _check_directions(header: bytes, path: Path) -> None:
             )
 
 
-def _nrrd_unit(header: bytes) -> str:
-    """Return the unit of length of a NRRD header, which ITK ignores; millimetres if the header states none."""
-    line = re.search(rb"^(?:space )?units:(.*)$", header, re.MULTILINE)
-    units = set(re.findall(r'"([^"]+)"', line[1].decode("utf-8", "replace"))) if line else set()
-    return (units.pop() if len(units) == 1 else "several") if units else "mm"
+def _apply_nrrd_unit(volume: RawVolume, header: bytes) -> None:
+    """Scale a volume to millimetres by the unit of a NRRD header, which ITK ignores.
+
+    Without a unit, distances of voxels are taken for millimetres, as is usual; without distances there is no unit.
+    """
+    if not re.search(rb"^(spacings|space directions):", header, re.MULTILINE | re.IGNORECASE):
+        volume.unit = None
+        limits = re.search(rb"^axis ?(mins|maxs):", header, re.MULTILINE | re.IGNORECASE)
+        source = "only axis minima and maxima, which are not read" if limits else "no spacing"
+        volume.notes.append(f"the header has {source}: voxels were taken as 1 × 1 × 1")
+        return
+    line = re.search(rb"^(?:space )?units:(.*)$", header, re.MULTILINE | re.IGNORECASE)
+    text = line[1].decode("utf-8", "replace") if line else ""
+    names = set(re.findall(r'"([^"]+)"', text))
+    if not names:
+        return
+    lengths = {unit_of_length(name) for name in names}
+    length = lengths.pop() if len(lengths) == 1 else None
+    if length is None:
+        volume.unit = None
+        shown = ", ".join(repr(name) for name in sorted(names))
+        volume.notes.append(f"the header states the units {shown}: lengths have no unit")
+        return
+    volume.affine[:3] *= length
 
 
 def _segments(metadata: dict[str, str]) -> list[tuple[str, int, int]]:
@@ -308,7 +410,7 @@ def _tiff_sides(file: Any) -> tuple[tuple[float, float, float], str | None]:
         for axis in "XYZ":
             size = re.search(rf'\bPhysicalSize{axis}="([\d.eE+-]+)"', file.ome_metadata)
             unit = re.search(rf'\bPhysicalSize{axis}Unit="([^"]*)"', file.ome_metadata)
-            scale = MILLIMETRES.get(unit[1] if unit else "µm")
+            scale = unit_of_length(unit[1] if unit else "µm")
             if size and scale:
                 known[axis] = float(size[1]) * scale
         return (
@@ -324,7 +426,7 @@ def _tiff_sides(file: Any) -> tuple[tuple[float, float, float], str | None]:
         tags[name].value if (name := f"{axis}Resolution") in tags else (1, 1) for axis in "XY"
     ]
     x, y = (length / n if n and length else 1.0 for n, length in resolutions)
-    scale = MILLIMETRES.get(str(metadata.get("unit")))
+    scale = unit_of_length(str(metadata.get("unit")))
     factor = scale or 1.0
     return (
         factor * x,

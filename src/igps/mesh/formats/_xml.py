@@ -44,13 +44,16 @@ def from_text(text: str, kind: np.dtype) -> NDArray[np.generic]:
 
 
 def inflated(content: bytes, n_bytes: int, name: str = "zlib") -> bytes:
-    """Decompress a block with zlib or lzma; a ValueError if the result has not `n_bytes` bytes."""
-    if name == "lzma":
-        unpacked = lzma.LZMADecompressor().decompress(content, n_bytes + 1)
-    else:
-        unpacked = zlib.decompressobj(wbits=47).decompress(
-            content, n_bytes + 1
-        )  # zlib or gzip by the header
+    """Decompress a block with zlib or lzma; a ValueError unless it is complete and has `n_bytes` bytes.
+
+    A checksum is compared only at the end of the stream, so that one more byte is asked for than expected.
+    """
+    inflater: Any = lzma.LZMADecompressor()
+    if name != "lzma":
+        inflater = zlib.decompressobj(wbits=47)  # zlib or gzip by the header
+    unpacked: bytes = inflater.decompress(content, n_bytes + 1)
     if len(unpacked) != n_bytes:
         raise ValueError(f"a block unpacks to {len(unpacked)} bytes or more, expected {n_bytes}")
+    if not inflater.eof or inflater.unused_data:
+        raise ValueError("a compressed block is cut short, or longer than it should be")
     return unpacked

@@ -18,6 +18,7 @@ from igps.mesh.formats._format import Format, RawBody, check_unpacked, faults, j
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
+_BLOCK = 1 << 20  # bytes
 _OPENERS: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
 
 
@@ -107,6 +108,9 @@ def _members(path: Path, options: LoadOptions) -> Iterator[Iterator[tuple[str, I
             for info in packed
             if info.isreg() and (file := packed.extractfile(info))
         )
+        # Behind the last member stand the checksums of the compressed stream.
+        while stream.read(_BLOCK):
+            pass
 
 
 class _LimitedStream(io.RawIOBase):

@@ -215,7 +215,7 @@ def _labelled(
     raw: RawVolume, name: str, options: LoadOptions, path: Path | None = None
 ) -> LabelVolume:
     """Turn the values of a volume into labels, and find their names; see `read_label_volume`."""
-    notes: list[str] = []
+    notes = list(raw.notes)
     layers = tuple(_integer_labels(values, name, options.threshold, notes) for values in raw.layers)
     segments, names = None, raw.names
     if raw.segments:
