@@ -1,5 +1,6 @@
 """STL: the corners of triangles, as text or bytes. Equal corners are merged, as the format has no shared vertices."""
 
+import codecs
 import re
 from pathlib import Path
 
@@ -12,30 +13,37 @@ from igps.mesh.options import LoadOptions
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 _HEADER = 84  # bytes, with the number of triangles at the end
 _VERTEX = re.compile(rb"vertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
+_NAME = re.compile(rb"^[ \t]*(end)?solid\b[^\r\n]*[\r\n]", re.MULTILINE | re.IGNORECASE)
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     content = path.read_bytes()
     n_declared = int.from_bytes(content[80:_HEADER], "little")
-    is_exact = len(content) == _HEADER + _TRIANGLE.itemsize * n_declared
-    is_text = (
-        not is_exact
-        and content.lstrip()[:5].lower() == b"solid"
-        and b"facet" in content[:4096].lower()
-    )
-    corners, notes = _read_text(content) if is_text else _read_binary(content, n_declared)
+    n_needed = _HEADER + _TRIANGLE.itemsize * n_declared
+    # The letters of a text, taken for a number of triangles, would need 27 GB.
+    is_binary = n_declared > 0 and n_needed <= len(content)
+    corners = np.zeros((0, 3)) if is_binary else _read_text(content)
+    notes: tuple[str, ...] = ()
+    if not len(corners):
+        corners, notes = _read_binary(content, n_declared)
     if not len(corners):
         raise ValueError("no triangle in it")
     return [RawBody(*merged(corners), notes=notes)]
 
 
-def _read_text(content: bytes) -> tuple[Floats, tuple[str, ...]]:
-    corners = np.array(b"\n".join(_VERTEX.findall(content)).split(), dtype=np.float64)
+def _read_text(content: bytes) -> Floats:
+    """Return the corners of triangles in text (3F, 3), none if there are none. The name of a solid is any text."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        content = content.decode("utf-16", "replace").encode()
+    found = _VERTEX.findall(_NAME.sub(b"", content))
+    if not found and b"facet" in content.lower():  # all in one line
+        found = _VERTEX.findall(content)
+    corners = np.array(b"\n".join(found).split(), dtype=np.float64)
     if len(corners) % 9:
         raise ValueError(
-            f"{len(corners) // 3} vertices do not make whole triangles; the file is cut short"
+            f"{len(found)} vertices do not make whole triangles; the file is cut short"
         )
-    return corners.reshape(-1, 3), ()
+    return corners.reshape(-1, 3)
 
 
 def _read_binary(content: bytes, n_declared: int) -> tuple[Floats, tuple[str, ...]]:
