@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,11 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from igps.mesh.formats._format import RawBody, check_unpacked, distinct
+from igps._arrays import Floats
+from igps.mesh.formats._format import RawBody, check_unpacked, distinct, joined
 from igps.mesh.options import LoadOptions
+
+_RANDOM_END = "_[0-9a-fA-F]{6}"  # of the names that trimesh makes up
 
 
 class FolderResolver(trimesh.resolvers.Resolver):
@@ -45,7 +50,11 @@ class FolderResolver(trimesh.resolvers.Resolver):
 def objects(
     path: Path, options: LoadOptions, content: bytes | None = None, **loading: Any
 ) -> list[RawBody]:
-    """Return a body for each node of a scene that has a geometry; `loading` is passed to trimesh."""
+    """Return a body for each node of a scene that has a geometry; `loading` is passed to trimesh.
+
+    Trimesh makes a node of its own, with a name that ends at random, for each material of a glTF mesh. Here, these are
+    parts of the node that is in the file.
+    """
     loading = {"file_type": path.suffix.lower().lstrip("."), **loading}
     stream = BytesIO(path.read_bytes() if content is None else content)
     scene = trimesh.load_scene(
@@ -57,33 +66,42 @@ def objects(
         for name, x in scene.geometry.items()
     }
     check_unpacked(sum(sizes[name] for _, _, name in nodes), path, options.max_unpacked)
-    bodies = []
-    for part, (_, matrix, name) in zip(
-        distinct(str(node) for node, _, _ in nodes), nodes, strict=True
-    ):
-        geometry = scene.geometry[name]
-        vertices = np.asarray(geometry.vertices, dtype=np.float64)
-        if not np.array_equal(matrix, np.eye(4)):
-            vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-        if isinstance(geometry, trimesh.PointCloud):
-            columns = ply_columns(scene)
-            normals = [
-                columns[name].astype(np.float64) for name in ("nx", "ny", "nz") if name in columns
-            ]
-            bodies.append(
-                RawBody(
-                    vertices, part=part, normals=np.hstack(normals) if len(normals) == 3 else None
-                )
-            )
-        elif isinstance(geometry, trimesh.Trimesh):
-            faces = np.asarray(geometry.faces, dtype=np.int64)
-            faces = (
-                faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
-            )  # turned back if mirrored
-            bodies.append(RawBody(vertices, np.ascontiguousarray(faces), part))
-    if not bodies:
+    surfaces: dict[str, list[RawBody]] = {}
+    for node, matrix, name in nodes:
+        surface = _surface(scene, scene.geometry[name], matrix)
+        if surface is not None:
+            surfaces.setdefault(_node_in_file(scene, node), []).append(surface)
+    if not surfaces:
         raise ValueError("it holds no surface")
-    return bodies
+    names = distinct(surfaces)
+    parts = zip(names, surfaces.values(), strict=True)
+    return [replace(joined(own), part=name) for name, own in parts]
+
+
+def _node_in_file(scene: trimesh.Scene, node: str) -> str:
+    """Return the node of the file to which a node of trimesh belongs: its parent, if it is one of its materials."""
+    parent = scene.graph.transforms.parents.get(node)
+    is_material = parent is not None and re.fullmatch(re.escape(parent) + _RANDOM_END, node)
+    return str(parent if is_material else node)
+
+
+def _surface(scene: trimesh.Scene, geometry: Any, matrix: Floats) -> RawBody | None:
+    """Return the surface or the points of a node, placed by its matrix (4, 4); None for lines."""
+    vertices = np.asarray(geometry.vertices, dtype=np.float64)
+    if not np.array_equal(matrix, np.eye(4)):
+        vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    if isinstance(geometry, trimesh.PointCloud):
+        columns = ply_columns(scene)
+        normals = [columns[name] for name in ("nx", "ny", "nz") if name in columns]
+        if len(normals) < 3:
+            return RawBody(vertices)
+        return RawBody(vertices, normals=np.hstack(normals).astype(np.float64))
+    if not isinstance(geometry, trimesh.Trimesh):
+        return None
+    faces = np.asarray(geometry.faces, dtype=np.int64)
+    if np.linalg.det(matrix[:3, :3]) < 0:  # the matrix mirrors: turned back
+        faces = faces[:, ::-1]
+    return RawBody(vertices, np.ascontiguousarray(faces))
 
 
 def ply_columns(scene: trimesh.Scene) -> dict[str, NDArray[Any]]:

@@ -21,10 +21,12 @@ from igps.mesh.surface import signed_volume
 # Tolerances of the triangulation of curved faces: distance as a share of the edge length, and angle in radians.
 _DEFLECTION, _ANGLE = 0.005, 0.2
 _DRACO = "KHR_draco_mesh_compression"  # trimesh decompresses it if DracoPy is installed
-_FAN, _MAX_ITEM = (
-    6,
-    64,
-)  # the mode of fans of triangles; bytes of the largest item of an array, a 4 × 4 matrix
+_INSTANCES = "EXT_mesh_gpu_instancing"
+# Required extensions that leave the geometry as it is, or only store it as smaller integers.
+_OF_MATERIALS = ("KHR_materials_", "KHR_texture_", "EXT_texture_")
+_HARMLESS = ("KHR_lights_punctual", "KHR_mesh_quantization", "KHR_xmp_json_ld")
+_FAN = 6  # the mode of fans of triangles
+_MAX_ITEM = 64  # bytes of the largest item of an array, a 4 × 4 matrix
 _CONVERT = (
     "import sys, cascadio; cascadio.step_to_glb(*sys.argv[1:], "
     f"tol_linear={_DEFLECTION}, tol_relative=True, tol_angular={_ANGLE}, merge_primitives=True)"
@@ -41,35 +43,72 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 
 
 def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """Read the objects of a glTF scene, in metres."""
+    """Read the objects of a glTF scene, in metres. An object is a node, with all its materials."""
     scene = _scene(path)
+    _check_extensions(scene)
+    _check_poses(scene)
+    check_unpacked(_array_bytes(scene), path, options.max_unpacked)
+    bodies = objects(path, options)
+    return [replace(body, unit="m") for body in bodies]
+
+
+def _check_extensions(scene: dict[str, Any]) -> None:
+    """Raise a ValueError if a glTF scene requires an extension that may change its geometry and is not known here."""
     for name in scene.get("extensionsRequired", []):
-        if name.endswith("_compression") and (name != _DRACO or find_spec("DracoPy") is None):
+        if name == _DRACO and find_spec("DracoPy") is not None:
+            continue
+        if name in _HARMLESS or name.startswith(_OF_MATERIALS):
+            continue
+        kind = "compressed by" if name.endswith("_compression") else "made with"
+        raise ValueError(f"it is {kind} {name}, which is not supported; export it without")
+
+
+def _check_poses(scene: dict[str, Any]) -> None:
+    """Raise a ValueError for skins, morph targets and instances, which move or copy vertices; trimesh ignores them."""
+    remedy = "apply it in the program that made the file, and export again"
+    meshes = scene.get("meshes", [])
+    for node in scene.get("nodes", []):
+        if "mesh" not in node:
+            continue
+        if "skin" in node:
+            raise ValueError(f"a skin deforms it, which is not supported; {remedy}")
+        if _INSTANCES in node.get("extensions", {}):
+            raise ValueError(f"{_INSTANCES} copies parts of it, which is not supported; {remedy}")
+        mesh = meshes[node["mesh"]]
+        weights = node.get("weights", mesh.get("weights", []))
+        if any(weights) and any(item.get("targets") for item in mesh["primitives"]):
             raise ValueError(
-                f"it is compressed by {name}, which is not supported; export it uncompressed"
+                f"weights of morph targets deform it, which is not supported; {remedy}"
             )
-    # Trimesh fills arrays without bytes with zeros, and copies an array at each use
-    n_bytes = sum(
-        _MAX_ITEM * abs(array["count"])
-        for array in scene.get("accessors", [])
-        if "bufferView" not in array
-    )
-    for primitive in (item for mesh in scene.get("meshes", []) for item in mesh["primitives"]):
+
+
+def _array_bytes(scene: dict[str, Any]) -> int:
+    """Return the bytes of the arrays of a scene as trimesh will hold them; a ValueError for those it would misread.
+
+    Trimesh fills arrays without bytes with zeros, and copies an array at each use.
+    """
+    accessors = scene.get("accessors", [])
+    n_bytes = 0
+    for array in accessors:
+        if "bufferView" not in array:
+            n_bytes += _MAX_ITEM * abs(array["count"])
+    primitives = [item for mesh in scene.get("meshes", []) for item in mesh["primitives"]]
+    for primitive in primitives:
         if primitive.get("mode") == _FAN:  # trimesh would skip it
             raise ValueError(
                 "it holds fans of triangles, which are not supported; export it as plain triangles"
             )
         sizes = ((primitive["attributes"].get("POSITION"), 24), (primitive.get("indices"), 8))
-        used = [(scene["accessors"][number], size) for number, size in sizes if number is not None]
-        n_bytes += sum(size * abs(array["count"]) for array, size in used)
-        if any(
-            "sparse" in array or array.get("normalized") for array, _ in used
-        ):  # trimesh would misread it
-            raise ValueError(
-                "its coordinates are sparse or normalized, which is not supported; export it uncompressed"
-            )
-    check_unpacked(n_bytes, path, options.max_unpacked)
-    return [replace(body, unit="m") for body in objects(path, options)]
+        for number, size in sizes:
+            if number is None:
+                continue
+            array = accessors[number]
+            n_bytes += size * abs(array["count"])
+            if "sparse" in array or array.get("normalized"):
+                raise ValueError(
+                    "its coordinates are sparse or normalized, which is not supported; export it uncompressed"
+                )
+    return n_bytes
 
 
 def _scene(path: Path) -> dict[str, Any]:
