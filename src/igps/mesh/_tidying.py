@@ -30,6 +30,7 @@ _MAX_CRACK_NEIGHBOURS = 50
 SPECK = 2e-3
 _MAX_FINS = 0.05  # fins are dropped if all of them together have at most this share of the area
 # A hole is small if a circle as long as its rim has at most this share of the area of its part of the surface.
+_MAX_OPENINGS = 32  # a net or a crumbled scan has more
 _SMALL_HOLE = 0.03
 
 
@@ -216,6 +217,16 @@ def fill_small_holes(vertices: Floats, faces: Integers, notes: list[str]) -> Sur
     return vertices, faces
 
 
+def closed_by_rims(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, float]:
+    """Close each opening by the soap film that its rim spans; return also the share of the films in the area."""
+    n_faces = len(faces)
+    for loop in _boundary_loops(faces)[:_MAX_OPENINGS]:
+        vertices, faces = _span(vertices, faces, loop)
+    areas = face_areas(vertices, faces)
+    total = areas.sum()
+    return vertices, faces, float(areas[n_faces:].sum() / total) if total else 0.0
+
+
 def _boundary_loops(faces: Integers) -> list[Integers]:
     """Return the rims of holes, in the direction of the faces that would fill them; no loop meets itself.
 
@@ -254,6 +265,15 @@ def _boundary_loops(faces: Integers) -> list[Integers]:
 
 def _fill_hole(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
     """Fill a hole with the triangulation of a disc of rings, spaced like the rim and bent like a thin plate."""
+    n_vertices = len(vertices)
+    vertices, faces = _span(vertices, faces, loop)
+    if len(vertices) == n_vertices:
+        return vertices, faces
+    return _fair(vertices, faces, n_vertices), faces
+
+
+def _span(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
+    """Close a rim with the triangulation of a disc of rings, spaced like the rim and taut like a soap film."""
     n = len(loop)
     if n == 3:
         return vertices, np.vstack([faces, loop[None]])
@@ -271,8 +291,7 @@ def _fill_hole(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
     points = np.vstack([rim, np.zeros((len(plane) - n, 3))])
     points[n:] = _solve_umbrella(points, patch, n, order=1)
     index = np.concatenate([loop, len(vertices) + np.arange(len(points) - n)])
-    faces = np.vstack([faces, index[patch]])
-    return _fair(np.vstack([vertices, points[n:]]), faces, len(vertices)), faces
+    return np.vstack([vertices, points[n:]]), np.vstack([faces, index[patch]])
 
 
 def _circle(turns: Floats, radius: float) -> Floats:

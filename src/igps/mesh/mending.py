@@ -14,11 +14,19 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 from igps._parameters import check_one_of
-from igps.mesh._tidying import drop_hidden_parts, fill_small_holes, tidy, weld
+from igps.mesh._tidying import (
+    closed_by_rims,
+    drop_hidden_parts,
+    fill_small_holes,
+    orient,
+    tidy,
+    weld,
+)
 from igps.mesh._union import drop_inner_walls, unite_parts
 from igps.mesh.denoising import is_noisy, remove_noise
 from igps.mesh.mesh import Mesh, MeshError, check_arrays, check_coordinates, check_size
 from igps.mesh.simplification import subdivide
+from igps.mesh.surface import signed_volume
 from igps.mesh.watertight import crosses_itself, watertight
 
 logger = logging.getLogger(__name__)
@@ -27,16 +35,24 @@ Mending = Literal["auto", "never", "always"]
 Cavities = Literal["fill", "keep"]
 Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
-MENDING_VERSION = 8
+MENDING_VERSION = 9
 """Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
 
 _STARTS: dict[str, Step] = {
     step: step for step in get_args(Step)
 }  # steps by the first words of their notes
-_STARTS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
+_STARTS |= {
+    "dropped": "welded",
+    "turned": "welded",
+    "made watertight": "watertight",
+}
 # A mesh with too few vertices is subdivided to this multiple of the minimum: with just enough vertices the last
 # eigenfunctions would depend on the triangles.
 _SUBDIVISION_FACTOR = 4
+
+
+# A shell is named open if this share of its surface is missing, and it has less than this share of the volume within.
+_MIN_MISSING, _MAX_SHELL = 0.05, 0.5
 
 
 def mend(
@@ -134,16 +150,33 @@ def _mend(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise:
         if body := _body(vertices, faces, notes, name, cavities, denoise):
             return body
     # These steps may give no body if there are many loose parts; their result is then discarded.
-    for step, surface, record in (
-        (drop_inner_walls, (vertices, faces), list(notes)),
+    tidied = vertices, faces
+    for step, surface, earlier in (
+        (drop_inner_walls, tidied, notes),
         (unite_parts, original, []),
     ):
-        if len(surface[1]) and (
-            body := _body(*step(*surface, record), record, name, cavities, denoise)
-        ):
+        if not len(surface[1]):
+            continue
+        record = list(earlier)
+        points, triangles = step(*surface, record)
+        body = _body(points, triangles, record, name, cavities, denoise)
+        if body is not None:
             return body
     body = watertight(_smooth(vertices, faces, notes, denoise), faces, name=name)
+    notes += _open_notes(vertices, faces, body.volume)
     return body.annotated(notes=tuple(notes))
+
+
+def _open_notes(vertices: Floats, faces: Integers, volume: float) -> list[str]:
+    """Return a note if an open surface became a thin shell, although closed by its rims it would hold far more."""
+    if not len(faces):
+        return []
+    points, triangles, missing = closed_by_rims(vertices, orient(faces, []))
+    inside = abs(signed_volume(points, triangles))
+    if missing < _MIN_MISSING or volume > _MAX_SHELL * inside:
+        return []
+    share = f"open: {missing:.0%} of the surface is missing"
+    return [f"{share}, so it became a shell around {inside:.3g}; close it if it is a solid body"]
 
 
 def _body(
