@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import gzip
-import importlib
-import inspect
-import linecache
 import logging
 import os
 import pickle
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import MethodType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,7 +27,6 @@ from igps.data.attribute_sources import (
     attribute_sources,
     fill_missing,
 )
-from igps.data.attributes import FunctionAttribute
 from igps.data.dataset import SignatureDataset
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
@@ -713,189 +707,73 @@ def stem_and_height(body: BodyRef, points: np.ndarray) -> np.ndarray:
     return len(body.path.stem) + points[:, 2]
 
 
-FACTOR = 2.0
-
-
-def scaled(body: BodyRef, points: np.ndarray) -> np.ndarray:
-    return FACTOR * points[:, 0]
-
-
 def times(points: np.ndarray, factor: float = 2.0) -> np.ndarray:
     return factor * points[:, 0]
 
 
-def test_a_function_of_body_and_points_is_a_source_that_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def with_functions(folder: Path, **functions: Callable[..., np.ndarray]) -> SignatureDataset:
+    return SignatureDataset(folder / "shapes", CONFIG, folder / "cache", attributes=functions)
+
+
+@pytest.mark.parametrize("tag", [None, "stem and height 1"])
+def test_a_function_of_body_and_points_gives_an_attribute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tag: str | None
 ) -> None:
+    """Two copies of one file, which their names tell apart."""
+    if tag is not None:
+        monkeypatch.setattr(stem_and_height, "cache_tag", tag, raising=False)
     write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
-    write_body(tmp_path / "shapes" / "bbb.off", 1.2, 0.7)
-    given = {"told": stem_and_height, "x": times}
-    dataset = SignatureDataset(tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes=given)
-    for item, n_letters in zip(dataset, (1, 3), strict=True):
-        points = item.signature.interior.points
-        np.testing.assert_allclose(
-            item.signature.interior.attributes["told"], n_letters + points[:, 2], atol=1e-5
-        )
-        np.testing.assert_allclose(
-            item.signature.interior.attributes["x"], 2 * points[:, 0], atol=1e-5
-        )
-    tag = FunctionAttribute(stem_and_height).cache_tag(None)
-    kept = SignatureDataset(
-        tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes={"told": stem_and_height}
-    )
-    monkeypatch.setattr(FunctionAttribute, "__call__", lambda *given: pytest.fail("it is kept"))
-    assert len(list(kept)) == 2
-    monkeypatch.setattr(inspect, "getsource", lambda function: "return points[:, 1]")
-    assert FunctionAttribute(stem_and_height).cache_tag(None) != tag
+    shutil.copy(tmp_path / "shapes" / "a.off", tmp_path / "shapes" / "bbb.off")
+    for _ in range(2):
+        dataset = with_functions(tmp_path, named=stem_and_height, x=times)
+        for item, n_letters in zip(dataset, (1, 3), strict=True):
+            samples = item.signature.interior
+            expected = n_letters + samples.points[:, 2]
+            np.testing.assert_allclose(samples.attributes["named"], expected, atol=1e-5)
+            doubled = 2 * samples.points[:, 0]
+            np.testing.assert_allclose(samples.attributes["x"], doubled, atol=1e-5)
 
 
-def test_a_function_of_the_name_of_a_body_tells_copies_of_a_file_apart(tmp_path: Path) -> None:
-    for name in ("a", "bbb"):
-        write_body(tmp_path / "shapes" / f"{name}.off", 0.8, 0.9)
-    dataset = SignatureDataset(
-        tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes={"told": stem_and_height}
-    )
-    for item, n_letters in zip(dataset, (1, 3), strict=True):
-        samples = item.signature.interior
-        np.testing.assert_allclose(
-            samples.attributes["told"], n_letters + samples.points[:, 2], atol=1e-5
-        )
+@pytest.mark.parametrize("takes_body", [True, False])
+def test_values_of_a_function_are_cached_under_its_tag(tmp_path: Path, takes_body: bool) -> None:
+    write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
+    calls: list[int] = []
+
+    def of_points(points: np.ndarray) -> np.ndarray:
+        calls.append(len(points))
+        return points[:, 0]
+
+    def of_body(body: BodyRef, points: np.ndarray) -> np.ndarray:
+        return of_points(points)
+
+    function = of_body if takes_body else of_points
+    for _ in range(2):  # without a tag, it is called at each access
+        list(with_functions(tmp_path, along=function))
+    assert len(calls) == 4
+    calls.clear()
+    function.cache_tag = "along 1"  # type: ignore[attr-defined]
+    for _ in range(2):
+        dataset = with_functions(tmp_path, along=function)
+        list(dataset)
+    assert len(calls) == 1
+    first = dataset.cached_keys()
+    function.cache_tag = "along 2"  # type: ignore[attr-defined]
+    dataset = with_functions(tmp_path, along=function)
+    list(dataset)
+    assert len(calls) == 2
+    assert None not in first
+    assert dataset.cached_keys() != first
 
 
-def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: Path) -> None:
-    write_body(tmp_path / "a.off", 0.8, 0.9)
-    factor = 2.0
-    around = SimpleNamespace(factor=2.0)
-    without: dict[str, Callable[..., np.ndarray]] = {}
-    exec("def written(body, points): return points[:, 0]", without)
-    for function, said in (
-        (lambda body, points: factor * points[:, 0], "uses variables that a cache key cannot hold"),
-        (
-            lambda body, points, around=around: around.factor * points[:, 0],
-            "uses variables that a cache key cannot hold",
-        ),
-        (
-            MethodType(lambda around, body, points: around.factor * points[:, 0], around),
-            "uses variables that a cache key",
-        ),
-        (without["written"], "the source code of written is not available"),
-    ):
-        with pytest.raises(ValueError, match=rf"attributes: .*{said}.*cache_tag"):
-            SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"told": function})
+@pytest.mark.parametrize("tag", ["", 1])
+def test_a_tag_that_is_no_text_is_refused(tmp_path: Path, tag: object) -> None:
+    def height(points: np.ndarray) -> np.ndarray:
+        return points[:, 2]
 
-
-def test_constants_that_a_function_uses_tell_it_from_itself(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def tag() -> str:
-        return FunctionAttribute(scaled).cache_tag(None)
-
-    first = tag()
-    monkeypatch.setitem(globals(), "FACTOR", 3.0)
-    assert tag() != first
-    monkeypatch.setitem(globals(), "FACTOR", 2.0)
-    assert tag() == first
-    monkeypatch.setitem(globals(), "FACTOR", np.ones(3))
-    with pytest.raises(
-        ValueError, match=r"attributes: scaled uses variables that a cache key cannot hold"
-    ):
-        tag()
-
-
-def doubled(x: np.ndarray) -> np.ndarray:
-    return np.array([FACTOR * one for one in x])
-
-
-class Shift:
-    by = 1.0
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        return doubled(x) + self.by
-
-
-def helped(body: BodyRef, points: np.ndarray) -> np.ndarray:
-    return Shift()(points[:, 0])
-
-
-def test_the_cache_tag_depends_on_helpers_and_the_globals_they_use(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Another constant, helper or class gives another tag; the original ones give the first tag again."""
-
-    def tag() -> str:
-        return FunctionAttribute(helped).cache_tag(None)
-
-    first, found = tag(), []
-    monkeypatch.setitem(globals(), "FACTOR", 3.0)
-    found.append(tag())
-    monkeypatch.undo()
-    monkeypatch.setitem(globals(), "doubled", times)
-    found.append(tag())
-    monkeypatch.undo()
-    monkeypatch.setitem(globals(), "Shift", times)
-    found.append(tag())
-    monkeypatch.undo()
-    assert len({first, *found}) == 4
-    assert tag() == first
-    monkeypatch.setitem(globals(), "doubled", SimpleNamespace(factor=2.0))
-    with pytest.raises(
-        ValueError, match=r"attributes: Shift uses variables that a cache key cannot hold"
-    ):
-        tag()
-
-
-def test_helpers_of_another_module_tell_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As functions by name, and as attributes of a module."""
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "user.py").write_text(
-        "import helpers\nfrom helpers import one\n\n"
-        "def by_name(body, points):\n    return one(points)\n\n"
-        "def by_module(body, points):\n    return helpers.two(points) * helpers.BY\n"
-    )
-    tags: list[tuple[str, str]] = []
-    for one, two, by in ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2)):
-        text = (
-            f"BY = {by}\n\ndef one(x):\n    return {one} * x\n\ndef two(x):\n    return {two} * x\n"
-        )
-        (tmp_path / "helpers.py").write_text(text)
-        for name in ("helpers", "user"):
-            sys.modules.pop(name, None)
-        linecache.clearcache()
-        importlib.invalidate_caches()
-        shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)
-        user = importlib.import_module("user")
-        tags.append(
-            tuple(FunctionAttribute(f).cache_tag(None) for f in (user.by_name, user.by_module))
-        )
-    by_name, by_module = zip(*tags, strict=True)
-    assert len(set(by_name)) == 2
-    assert len(set(by_module)) == 3
-
-
-def test_functions_in_one_line_are_told_apart(tmp_path: Path) -> None:
-    """They have one name and one source; and that of a lambda may end before its body."""
-    write_body(tmp_path / "a.off", 0.8, 0.9)
-
-    pair = (lambda body, points: points[:, 0], lambda body, points: points[:, 1])
-
-    for axis, function in enumerate(pair):
-        (item,) = SignatureDataset(
-            tmp_path, CONFIG, tmp_path / "cache", attributes={"along": function}
-        )
-        samples = item.signature.interior
-        np.testing.assert_allclose(samples.attributes["along"], samples.points[:, axis], atol=1e-5)
-
-
-def test_default_arguments_are_part_of_the_cache_key(tmp_path: Path) -> None:
-    """Such as functions that are made in a loop."""
-    write_body(tmp_path / "a.off", 0.8, 0.9)
-    for axis in range(3):
-        given = {"along": lambda body, points, axis=axis: points[:, axis]}
-        (item,) = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes=given)
-        samples = item.signature.interior
-        np.testing.assert_allclose(samples.attributes["along"], samples.points[:, axis], atol=1e-5)
+    height.cache_tag = tag  # type: ignore[attr-defined]
+    write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
+    with pytest.raises(ValueError, match="expected a text, or a method, as cache_tag of height"):
+        with_functions(tmp_path, height=height)
 
 
 def test_a_body_of_all_models_has_the_residues_of_all(tmp_path: Path) -> None:

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from igps._arrays import Floats
-from igps.data._function_keys import function_key
 from igps.mesh.loading import BodyRef
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature
 
-PointFunction = Callable[..., NDArray[np.floating[Any]]]
+Values = NDArray[np.floating[Any]]
+PointFunction = Callable[..., Values]
+"""A function of points (P, 3), or of a body and points, to values (P,) or (P, C)."""
+BodyFunction = Callable[[BodyRef, Floats], Values]
 
 
 @runtime_checkable
@@ -25,7 +27,7 @@ class AttributeSource(Protocol):
     def cache_tag(self, body: BodyRef) -> str:
         """Return all that the values depend on besides the points, such as a checksum of the image."""
 
-    def __call__(self, body: BodyRef, points: Floats) -> NDArray[np.floating[Any]]:
+    def __call__(self, body: BodyRef, points: Floats) -> Values:
         """Return values (P,) or (P, C) at points (P, 3) in the coordinates of the body's file."""
 
 
@@ -39,23 +41,27 @@ class FileSource(Protocol):
 
 @dataclass(frozen=True)
 class FunctionAttribute:
-    """A function `(body, points)` as an attribute source.
+    """A function `(body, points)` as an attribute source, with a text that identifies the function."""
 
-    The cache key contains the function and the user's functions and classes that it uses. A ValueError is raised if
-    they use variables that a key cannot hold, or if their source code is not available.
-    """
+    function: BodyFunction
+    tag: str
 
-    function: Callable[[BodyRef, Floats], NDArray[np.floating[Any]]]
+    def cache_tag(self, body: BodyRef) -> str:
+        """Return the text, and the body, whose path and part the function may use."""
+        return f"function {self.tag} {body}"
 
-    def __post_init__(self) -> None:
-        self.cache_tag(None)
-
-    def cache_tag(self, body: BodyRef | None) -> str:
-        """Return a key of the function, and the body, whose path and part the function may use."""
-        return f"function {function_key(self.function)} {body}"
-
-    def __call__(self, body: BodyRef, points: Floats) -> NDArray[np.floating[Any]]:
+    def __call__(self, body: BodyRef, points: Floats) -> Values:
         return self.function(body, points)
+
+
+@dataclass(frozen=True)
+class OfPoints:
+    """A function of points as a function `(body, points)`."""
+
+    function: Callable[[Floats], Values]
+
+    def __call__(self, body: BodyRef, points: Floats) -> Values:
+        return self.function(points)
 
 
 def _takes_body(function: Callable[..., Any]) -> bool:
@@ -65,27 +71,40 @@ def _takes_body(function: Callable[..., Any]) -> bool:
     except (TypeError, ValueError):
         return False
     positional = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
-    return sum(p.kind in positional and p.default is p.empty for p in parameters) == 2
+    required = [p for p in parameters if p.kind in positional and p.default is p.empty]
+    return len(required) == 2
 
 
 def split_attributes(
     attributes: Mapping[str, AttributeSource | PointFunction],
-) -> tuple[dict[str, AttributeSource], dict[str, PointFunction]]:
-    """Split attributes into sources, whose values are cached, and functions of points, called at each access."""
+) -> tuple[dict[str, AttributeSource], dict[str, BodyFunction]]:
+    """Split attributes into sources, whose values are cached, and functions, which are called at each access.
+
+    A function is a source if its attribute `cache_tag` holds a text.
+    """
     sources: dict[str, AttributeSource] = {}
-    functions: dict[str, PointFunction] = {}
+    functions: dict[str, BodyFunction] = {}
     for name, value in attributes.items():
         if not callable(value) or name in get_args(AttributeName):
             raise ValueError(
-                f"attributes: expected functions or sources by names other than {', '.join(get_args(AttributeName))}, "
-                f"got {name}={value!r}. These attributes of the library are set by SignatureConfig(attributes=...)."
+                f"attributes: expected functions or sources by names other than "
+                f"{', '.join(get_args(AttributeName))}, got {name}={value!r}. These attributes of the "
+                "library are set by SignatureConfig(attributes=...)."
             )
-        if isinstance(value, AttributeSource):
+        tag = getattr(value, "cache_tag", None)
+        if callable(tag):
             sources[name] = value
-        elif _takes_body(value):
-            sources[name] = FunctionAttribute(value)
+            continue
+        function = value if _takes_body(value) else OfPoints(value)
+        if tag is None:
+            functions[name] = function
+        elif isinstance(tag, str) and tag:
+            sources[name] = FunctionAttribute(function, tag)
         else:
-            functions[name] = value
+            raise ValueError(
+                f"attributes: expected a text, or a method, as cache_tag of {name}, got {tag!r}. "
+                "Change it whenever the function gives other values."
+            )
     return sources, functions
 
 
@@ -93,10 +112,10 @@ def with_attribute(
     signature: Signature, name: str, values: Mapping[SampleKind, ArrayLike]
 ) -> Signature:
     """Return a Signature with an additional attribute; raise a ValueError if a sample lacks a finite row of values."""
+    changed = {}
     try:
-        interior, surface = (
-            getattr(signature, kind).with_attributes({name: values[kind]}) for kind in SAMPLE_KINDS
-        )
+        for kind in SAMPLE_KINDS:
+            changed[kind] = getattr(signature, kind).with_attributes({name: values[kind]})
     except ValueError as error:
         raise ValueError(f"{signature.name}: attributes: {error}") from error
-    return replace(signature, interior=interior, surface=surface)
+    return replace(signature, **changed)

@@ -54,9 +54,10 @@ class SignatureDataset(Dataset[LabelledSignature]):
         labels: class names of the given paths.
         classes: rule for the class of a body, see `ClassRule`; "folder" if None.
         reading: options for reading files.
-        attributes: additional attributes of the samples by name. Values of an `AttributeSource` or a function `(body,
-            points)` are cached separately from the Signatures. A function of points, from (P, 3) in coordinates of the
-            file to (P,) or (P, C), is called at each access.
+        attributes: additional attributes of the samples by name. Each is an `AttributeSource`, or a function of points
+            `(points)` or `(body, points)`, from (P, 3) in coordinates of the file to (P,) or (P, C). Values of a
+            source are cached. Values of a function are cached if it has an attribute `cache_tag`, a text that you
+            change whenever the function gives other values; otherwise it is called at each access.
         pre_transform: transform of every Signature before it is cached; its `cache_tag` is part of the cache key.
         transform: transform of a Signature at each access; see `igps.data.transforms`.
 
@@ -108,7 +109,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and self._functions:
             raise ValueError(
-                "pre_transform: expected attributes with a cache_tag, got a function of points."
+                "pre_transform: expected attributes with a cache_tag, got a function without one. "
+                'Give it one, such as height.cache_tag = "height 1".'
             )
         directory = Path(cache_dir or default_cache_dir())
         self.config, self.reading = config.resolved(), reading
@@ -172,7 +174,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         cached = None if (hit := self._hits[i]) is None else self.pipeline.read(hit)
         signature = replace(cached or self.pipeline.signature(self.bodies[i]), name=name)
         for attribute, function in self._functions.items():
-            values = {kind: function(getattr(signature, kind).points) for kind in SAMPLE_KINDS}
+            points = {kind: getattr(signature, kind).points for kind in SAMPLE_KINDS}
+            values = {kind: function(self.bodies[i], points[kind]) for kind in SAMPLE_KINDS}
             signature = with_attribute(signature, attribute, values)
         return signature
 
