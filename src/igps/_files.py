@@ -1,5 +1,6 @@
-"""Atomic and reproducible writing of files."""
+"""Atomic and reproducible writing of files, and reading of tables as spreadsheets save them."""
 
+import codecs
 import contextlib
 import json
 import os
@@ -34,3 +35,20 @@ def sort_metadata(content: bytes) -> bytes:
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 8)
     return b"".join((len(text).to_bytes(8, "little"), text, memoryview(content)[end:]))
+
+
+def table_text(path: Path) -> str:
+    """Read a text file in UTF-8, in UTF-16 with its mark, or else in cp1252, as Windows writes it."""
+    content = path.read_bytes()
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", "replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252", "replace")
+
+
+def delimiter_of(text: str) -> str:
+    """Return what separates the columns of a table: a comma, a semicolon or a tab, by its first line."""
+    first_line = text.partition("\n")[0]
+    return max(",;\t", key=first_line.count)

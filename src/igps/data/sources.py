@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import logging
 import math
 import os
@@ -12,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
+from igps._files import delimiter_of, table_text
 from igps.data.attributes import AttributeSource, FileSource
 from igps.mesh.formats import is_searched, searched_suffixes
 from igps.mesh.loading import BodyRef, list_bodies
@@ -288,15 +290,18 @@ def _parts(path: Path, options: LoadOptions) -> Sequence[str | None]:
 
 def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
     file = root / LABELS_FILE
-    with file.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.DictReader(stream, skipinitialspace=True, restval="")
+    text = table_text(file)
+    with io.StringIO(text, newline="") as stream:
+        reader = csv.DictReader(
+            stream, delimiter=delimiter_of(text), skipinitialspace=True, restval=""
+        )
         try:
-            reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
+            reader.fieldnames = [_column_name(name) for name in reader.fieldnames or ()]
             rows = [
                 (reader.line_num, {name: "".join(value).strip() for name, value in row.items()})
                 for row in reader
             ]
-        except (UnicodeDecodeError, csv.Error) as error:
+        except csv.Error as error:
             raise ValueError(
                 f"{file}: not readable as a table ({error}). Save it as CSV in UTF-8."
             ) from error
@@ -340,6 +345,12 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
     return bodies
 
 
+def _column_name(name: str) -> str:
+    """Return the name of a column without spaces around it; those with a meaning may be in any case."""
+    name = name.strip()
+    return name.lower() if name.lower() in ("file", "body", "label") else name
+
+
 def _bodies_in_files(
     rows: Sequence[tuple[Path, str, str | None, str | None]],
     options: LoadOptions,
@@ -367,7 +378,9 @@ def _files_in(folder: Path) -> list[Path]:
     ):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for path in (
-            Path(parent, name) for name in names if not name.startswith(".") and is_searched(name)
+            Path(parent, name)
+            for name in names
+            if not name.startswith(".") and is_searched(Path(parent, name))
         ):
             if not _is_utf8(path):
                 logger.warning("%s: left out, its name is not UTF-8. Rename it.", os.fsencode(path))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from igps._arrays import Floats
+from igps._arrays import Floats, Integers
 from igps._threads import one_thread
 from igps.mesh._tidying import weld_boundaries
 from igps.mesh.formats import FORMATS, Format, RawBody, format_of
@@ -22,6 +22,8 @@ from igps.mesh.surface import compact, diagonal, face_parts
 logger = logging.getLogger(__name__)
 
 _COARSE = 0.004  # rounding step of coordinates, over the size of the body, that changes eigenvalues by about 1 %
+
+_MAX_LOST = 0.01  # largest share of faces that may be dropped because a vertex has no coordinates
 
 
 @dataclass(frozen=True)
@@ -158,6 +160,9 @@ def surface_body(
         raise raw.fault
     name = str(ref)
     vertices, faces, notes = raw.vertices, raw.faces, raw.notes
+    if options.mend != "never":
+        vertices, faces, dropped = _with_coordinates(vertices, faces)
+        notes = (*notes, *dropped)
     if options.component == "largest" and len(faces):
         check_arrays(vertices, faces, name)
         connected = faces if options.mend == "never" else weld_boundaries(vertices, faces)
@@ -185,6 +190,24 @@ def surface_body(
         notes=notes,
     )
     return mesh.annotated(unit=raw.unit)
+
+
+def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:
+    """Drop a few vertices that are not finite, with their faces; or return all if they are more than a sliver."""
+    is_lost = ~np.isfinite(vertices).all(axis=1)
+    is_valid = len(faces) == 0 or (faces.min() >= 0 and faces.max() < len(vertices))
+    if not is_lost.any() or not is_valid:
+        return vertices, faces, []
+    has_lost = is_lost[faces].any(axis=1)
+    share = has_lost.mean() if len(faces) else is_lost.mean()
+    if share > _MAX_LOST:
+        return vertices, faces, []
+    note = (
+        f"dropped {int(is_lost.sum())} vertices without coordinates and {int(has_lost.sum())} faces"
+    )
+    if not len(faces):
+        return vertices[~is_lost], faces, [note]
+    return *compact(vertices, faces[~has_lost]), [note]
 
 
 def _rounding_notes(vertices: Floats, name: str) -> list[str]:

@@ -63,14 +63,19 @@ FORMATS: tuple[Format, ...] = (
 
 
 def format_of(path: str | Path) -> Format | None:
-    """Return the format of a file by its suffix, the longest known one that ends the file's name; None if unknown."""
+    """Return the format of a file by the longest known suffix, or else by its first bytes; None if unknown."""
     name = Path(path).name.lower()
     if any(name.endswith(kind.ignored) for kind in FORMATS):
         return None
     matches = {
         suffix: kind for kind in FORMATS for suffix in kind.suffixes if name.endswith(suffix)
     }
-    return matches[max(matches, key=len)] if matches else None
+    if matches:
+        return matches[max(matches, key=len)]
+    for kind in FORMATS:
+        if kind.recognises is not None and kind.recognises(Path(path)):
+            return kind
+    return None
 
 
 def dependencies_of(path: Path, options: LoadOptions = LoadOptions()) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,6 +21,8 @@ from igps.mesh.surface import compact, face_parts, stacked
 
 # The start of messages of ITK, which names a line of its source and the address of an object.
 _ITK_PREFIX = re.compile(r"^Exception thrown in SimpleITK .*ERROR: (\w+\(0x\w+\): )?")
+
+ONLY_LINES = "it holds lines, such as centre lines, which bound no body; export the surface instead"
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +66,8 @@ class Format:
     )
     ignored: tuple[str, ...] = ()  # suffixes of files of this format that hold no surface
     extra: str | None = None  # the extra of this package that installs the modules `read` needs
+    # tells a file of this format whose name ends with no known suffix
+    recognises: Callable[[Path], bool] | None = None
     beside: Callable[[Path, LoadOptions], Sequence[Path]] | None = (
         None  # finds other files on which the bodies depend
     )
@@ -157,8 +162,11 @@ def stat_key(*paths: Path) -> tuple[int, int, int]:
 
 
 def text_of(path: Path) -> str:
-    """Read a file as UTF-8, or else as Latin-1, which decodes any bytes; carriage returns become line feeds."""
-    content = path.read_bytes().replace(b"\r", b"\n")
+    """Read a file as UTF-8, as UTF-16 with its mark, or else as Latin-1; carriage returns become line feeds."""
+    content = path.read_bytes()
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        content = content.decode("utf-16", "replace").encode()
+    content = content.replace(b"\r", b"\n")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -6,6 +6,7 @@ from igps._arrays import Floats, Integers
 from igps.mesh.formats._polygons import flat_triangles, strip_triangles, triangles
 
 # Types of cells by VTK's numbers.
+LINES = LINE, POLY_LINE = 3, 4
 TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, TETRAHEDRON = 5, 6, 7, 8, 9, 10
 # Faces of tetrahedra, voxels, hexahedra, wedges and pyramids, outward, as indices of their corners in VTK's order.
 _SIDES: dict[int, tuple[tuple[int, ...], ...]] = {
@@ -15,7 +16,7 @@ _SIDES: dict[int, tuple[tuple[int, ...], ...]] = {
     13: ((0, 1, 2), (3, 5, 4), (0, 3, 4, 1), (1, 4, 5, 2), (2, 5, 3, 0)),
     14: ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
 }
-_WITHOUT_AREA = (0, 1, 2, 3, 4)  # empty cells, points and lines
+_WITHOUT_AREA = (0, 1, 2, *LINES)  # empty cells, points and lines
 
 
 def surface(corners: Integers, n_corners: Integers, kinds: Integers, vertices: Floats) -> Integers:

@@ -31,7 +31,8 @@ _VOLUME_AXES = re.compile(rb"^[xyzc]ras\s*=\s*(\S+)\s+(\S+)\s+(\S+)", re.MULTILI
 # The axes of that volume in the coordinates of the surface.
 _SURFACE_AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _KINDS = ("pial", "white", "inflated", "orig", "smoothwm", "sphere", "sphere.reg")
-_SUFFIXES = tuple(f"{side}.{kind}" for side in ("lh", "rh") for kind in _KINDS)
+_SIDES = ("lh.", "rh.")
+_SUFFIXES = tuple(side + kind for side in _SIDES for kind in _KINDS)
 
 
 def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -108,9 +109,9 @@ def in_scanner(path: Path, points: Floats) -> Floats:
     FreeSurfer's triangle files have their origin in the centre of a volume, whose position and axes stand at the end of
     the file. The points of other files are returned unchanged: they are in the coordinates of images.
     """
-    if not path.name.lower().endswith(_SUFFIXES):
-        return points
     content = path.read_bytes()
+    if not content.startswith(_MAGIC):
+        return points
     at = content.find(b"\n\n") + 2
     tail = content[at + 8 + 12 * int(np.frombuffer(content, ">i4", 2, at).sum()) :]
     axes = np.array(_VOLUME_AXES.findall(tail), dtype=np.float64)  # and the centre, (4, 3)
@@ -119,7 +120,19 @@ def in_scanner(path: Path, points: Floats) -> Floats:
     return points @ _SURFACE_AXES.T @ axes[:3] + axes[3]
 
 
+def is_freesurfer(path: Path) -> bool:
+    """Return whether a file is a surface of FreeSurfer: "lh." or "rh.", any ending, and the first bytes of the format.
+
+    FreeSurfer 7 and FastSurfer write many endings, such as lh.pial.T1 and lh.white.preaparc, and also maps of values
+    on the surface (lh.thickness), which begin with other bytes.
+    """
+    if not path.name.lower().startswith(_SIDES) or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
 GIFTI = Format(
     "GIFTI", (".gii",), read_gifti, ignored=(".func.gii", ".label.gii", ".shape.gii", ".time.gii")
 )
-FREESURFER = Format("FreeSurfer", _SUFFIXES, read_freesurfer)
+FREESURFER = Format("FreeSurfer", _SUFFIXES, read_freesurfer, recognises=is_freesurfer)

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from igps._files import delimiter_of, table_text
 from igps.mesh.mesh import MeshError
 
 logger = logging.getLogger(__name__)
@@ -50,7 +51,7 @@ def read_label_names(path: str | Path) -> dict[int, str]:
             raise MeshError(
                 f"{path}: {path.stat().st_size:,} bytes are too many for a table of names. Check the path."
             )
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
+        text = table_text(path)
     except OSError as error:
         raise MeshError(
             f"{path}: the table of names is not readable ({error}). Check the path."
@@ -134,8 +135,7 @@ def _parse_lines(text: str) -> dict[int, str]:
 
 
 def _parse_csv(text: str) -> dict[int, str]:
-    lines = text.splitlines()
-    rows = csv.DictReader(lines, delimiter="\t" if lines and "\t" in lines[0] else ",")
+    rows = csv.DictReader(text.splitlines(), delimiter=delimiter_of(text))
     columns = {(column or "").strip().lower(): column for column in rows.fieldnames or ()}
     labels = next(
         (columns[key] for key in ("labelvalue", "label", "index", "id", "value") if key in columns),
@@ -146,8 +146,12 @@ def _parse_csv(text: str) -> dict[int, str]:
     )
     if labels is None or names is None:
         return {}
-    pairs = ((str(row[labels] or "").strip(), str(row[names] or "")) for row in rows)
-    return cleaned({int(label): name for label, name in pairs if _is_number(label)})
+    numbered: dict[int, str] = {}
+    for row in rows:
+        number = _whole_number(str(row[labels] or ""))
+        if number is not None:
+            numbered[number] = str(row[names] or "")
+    return cleaned(numbered)
 
 
 def _parse_json(text: str) -> dict[int, str]:
@@ -157,15 +161,16 @@ def _parse_json(text: str) -> dict[int, str]:
         return {}
     table = content.get("labels", content) if isinstance(content, dict) else {}
     rows = table.items() if isinstance(table, dict) else ()
-    pairs = ((value, key) if isinstance(value, int) else (key, value) for key, value in rows)
-    return cleaned(
-        {
-            int(label): name
-            for label, name in pairs
-            if _is_number(str(label)) and isinstance(name, str)
-        }
-    )
+    numbered: dict[int, str] = {}
+    for key, value in rows:
+        label, name = (value, key) if isinstance(value, int | float) else (key, value)
+        number = _whole_number(str(label))
+        if number is not None and isinstance(name, str):
+            numbered[number] = name
+    return cleaned(numbered)
 
 
-def _is_number(text: str) -> bool:
-    return text.isascii() and text.isdigit()
+def _whole_number(text: str) -> int | None:
+    """Return the label that a text names, such as "3", or "3.0" from a spreadsheet; None if it names none."""
+    match = re.fullmatch(r"([0-9]+)(\.0*)?", text.strip())
+    return int(match[1]) if match else None

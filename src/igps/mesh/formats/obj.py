@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from igps._arrays import Integers
-from igps.mesh.formats._format import Format, RawBody, distinct, text_of
+from igps.mesh.formats._format import ONLY_LINES, Format, RawBody, distinct, text_of
 from igps.mesh.formats._polygons import flat_triangles
 from igps.mesh.options import LoadOptions
 
@@ -22,6 +22,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         "o": [],
         "g": [],
     }  # of objects and groups: first polygon, and name
+    has_lines = False
     for line in text_of(path).replace("\\\n\n", " ").replace("\\\n", " ").split("\n"):
         word, _, fields = line.lstrip().replace("\t", " ").partition(" ")
         if word == "v":
@@ -29,6 +30,8 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         elif word == "f":
             polygons.append(fields)
             n_before.append(len(coordinates))
+        elif word == "l":
+            has_lines = True
         elif word in starts:
             starts[word].append((len(polygons), fields.strip()))
     if not coordinates:
@@ -36,6 +39,8 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     # Weights and colours may follow the coordinates
     vertices = np.loadtxt(coordinates, np.float64, comments="#", usecols=(0, 1, 2), ndmin=2)
     if not polygons:
+        if has_lines:
+            raise ValueError(ONLY_LINES)
         return [RawBody(vertices)]
     corners, n_corners = _corners(polygons, np.array(n_before, dtype=np.int64))
     names, owner = (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from igps._arrays import Floats, Integers
 from igps.mesh.formats import _vtk_cells, _xml
-from igps.mesh.formats._format import Format, RawBody, check_unpacked, corners_of_rows
+from igps.mesh.formats._format import ONLY_LINES, Format, RawBody, check_unpacked, corners_of_rows
 from igps.mesh.options import LoadOptions
 
 _LEGACY_TYPES = {  # VTK writes vtkIdType as int
@@ -36,8 +36,16 @@ _LEGACY_TYPES = {  # VTK writes vtkIdType as int
 }
 _BLANK_LINE = re.compile(rb"\n\r?\n")
 # Types of cells by the sections of legacy and of XML files.
-_LEGACY_CELLS = {"POLYGONS": _vtk_cells.POLYGON, "TRIANGLE_STRIPS": _vtk_cells.STRIP}
-_XML_CELLS = {"Polys": _vtk_cells.POLYGON, "Strips": _vtk_cells.STRIP}
+_LEGACY_CELLS = {
+    "POLYGONS": _vtk_cells.POLYGON,
+    "TRIANGLE_STRIPS": _vtk_cells.STRIP,
+    "LINES": _vtk_cells.POLY_LINE,
+}
+_XML_CELLS = {
+    "Polys": _vtk_cells.POLYGON,
+    "Strips": _vtk_cells.STRIP,
+    "Lines": _vtk_cells.POLY_LINE,
+}
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
 Cells = tuple[
     Integers, Integers, Integers
@@ -316,11 +324,16 @@ def _n_letters(n_bytes: int) -> int:
 def _body(vertices: Floats, cells: list[Cells], part: str | None = None) -> RawBody:
     """Make a body of the surface of cells; a ValueError if the counts do not add up."""
     faces = [np.zeros((0, 3), dtype=np.int64)]
+    has_lines = False
     for corners, n_corners, kinds in cells:
         if len(kinds) != len(n_corners) or (n_corners < 0).any() or n_corners.sum() != len(corners):
             raise ValueError("the numbers of cells and corners do not agree")
         faces.append(_vtk_cells.surface(corners, n_corners, kinds, vertices))
-    return RawBody(vertices, np.concatenate(faces), part)
+        has_lines |= bool(np.isin(kinds, _vtk_cells.LINES).any())
+    triangles = np.concatenate(faces)
+    if has_lines and not len(triangles):
+        raise ValueError(ONLY_LINES)
+    return RawBody(vertices, triangles, part)
 
 
 LEGACY = Format("VTK", (".vtk",), read_legacy)
