@@ -17,8 +17,8 @@ from sklearn.utils import check_array, estimator_checks
 from sklearn.utils.estimator_checks import check_estimator
 
 from igps.data.dataset import SignatureDataset
-from igps.descriptors.d2 import D2
 from igps.descriptors.interior import interior
+from igps.descriptors.literature.d2 import D2
 from igps.descriptors.molecular import SizedHistograms
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh

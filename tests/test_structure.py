@@ -21,6 +21,7 @@ FLOORS = (
     ("data",),
     ("nn",),
     ("descriptors",),
+    ("learning",),
     ("gallery",),
     ("analysis",),
     ("report",),

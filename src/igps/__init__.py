@@ -10,12 +10,12 @@ N shapes, Q queries, G gallery, D embedding width.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from igps.analysis.fitting import fit
 from igps.data.batch import SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.requirements import register_descriptors
 from igps.descriptors import descriptor, load
+from igps.learning.fitting import fit
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions

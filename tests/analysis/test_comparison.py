@@ -12,7 +12,7 @@ from igps.analysis import comparison
 from igps.analysis.comparison import Result, compare
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
-from igps.descriptors.d2 import D2
+from igps.descriptors.literature.d2 import D2
 from igps.nn.descriptor import Descriptor
 from igps.retrieval import retrieval_scores
 from igps.signature.signature import SignatureConfig

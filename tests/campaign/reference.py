@@ -14,7 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from igps import Mesh, PairHistogram, SignatureConfig, SpectralEmbedding, collate, compute_signature
-from igps.descriptors.d2 import D2
+from igps.descriptors.literature.d2 import D2
 from igps.nn.axes import InteriorDistance, Potential
 from igps.signature.signature import Signature
 

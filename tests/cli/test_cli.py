@@ -21,7 +21,7 @@ from commands import run
 from igps import cli
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
-from igps.descriptors.d2 import D2
+from igps.descriptors.literature.d2 import D2
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.retrieval import chi_square, rerank, retrieval_scores

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 import igps as library
-from igps.analysis.fitting import classify
 from igps.cli import main
+from igps.learning.fitting import classify
 from igps.nn.description import describe
 from own_descriptors import write_egg
 

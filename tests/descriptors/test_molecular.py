@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from igps.analysis.explanation import explain
-from igps.analysis.fitting import split_head
 from igps.data.collation import collate
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.molecular import Shares, molecular
+from igps.learning.fitting import split_head
 from igps.mesh.formats.molecules import Molecule
 from igps.mesh.molecular_surface import molecular_surface
 from igps.mesh.residues import CHARGED_ATOMS, VOLUMES, residue_ball

@@ -12,7 +12,7 @@ import torch
 import igps
 from igps.data.requirements import Requirements
 from igps.descriptors import NAMES
-from igps.descriptors.d2 import D2
+from igps.descriptors.literature.d2 import D2
 from igps.signature.signature import SignatureConfig
 
 THIRTEEN = (
@@ -35,7 +35,7 @@ OWN = """
 import numpy as np
 
 import igps
-from igps.descriptors.d2 import D2
+from igps.descriptors.literature.d2 import D2
 
 
 class Roundness(igps.BodyDescriptor):

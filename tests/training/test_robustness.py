@@ -16,8 +16,8 @@ from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies, find_bodies
 from igps.descriptors import descriptor
-from igps.descriptors.d2 import D2
 from igps.descriptors.interior import interior
+from igps.descriptors.literature.d2 import D2
 from igps.mesh.loading import load_mesh
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig, compute_signature

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 import igps
-from igps.analysis.fitting import split_head
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, split_seen
+from igps.learning.fitting import split_head
 from igps.nn.description import describe
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
 from igps._arrays import Floats, Integers
-from igps.descriptors._geodesics import edge_graph
+from igps.descriptors.literature._geodesics import edge_graph
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import components, face_areas, vertex_normals

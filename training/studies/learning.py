@@ -11,10 +11,10 @@ from torch import Tensor
 from torchmetrics.functional.classification import binary_auroc, multiclass_calibration_error
 
 import igps
-from igps.analysis.fitting import Goal, classify, fit, split_head
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
 from igps.descriptors.fingerprint import cache_tag
+from igps.learning.fitting import Goal, classify, fit, split_head
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads.base import Head

@@ -20,7 +20,7 @@ def scales(
     seed: int = 77,
     n_individuals: int = 0,
 ) -> None:
-    """Print the scales of descriptors, for `igps.descriptors.individual.SCALES`.
+    """Print the scales of descriptors, for `igps.descriptors.size_and_side.SCALES`.
 
     Args:
         descriptors: names of descriptors; all of the library if not given.

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
-from igps.descriptors._geodesics import edge_graph, farthest_points
+from igps.descriptors.literature._geodesics import edge_graph, farthest_points
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import vertex_normals
 from igps.mesh.winding import winding_number

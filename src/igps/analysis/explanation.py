@@ -14,7 +14,7 @@ from torch import Tensor
 from igps._arrays import Floats
 from igps.analysis.correspondence import dissimilarity
 from igps.data.batch import SampleBatch, SignatureBatch
-from igps.descriptors.individual import IndividualDescriptor
+from igps.descriptors.size_and_side import SizeAndSide
 from igps.nn.batch_features import WEIGHT, BatchFeatures
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.histograms.base import DescriptionPart, SampleHistogram
@@ -105,9 +105,7 @@ def _place_shares(
 def without_head(descriptor: Descriptor) -> Descriptor:
     """Return the descriptor without its head: it describes the histogram cells, followed by side and size, if any."""
     histograms = _histograms(descriptor)
-    return (
-        descriptor.wrap(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
-    )
+    return descriptor.wrap(histograms) if isinstance(descriptor, SizeAndSide) else histograms
 
 
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:
@@ -121,7 +119,7 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
         (cells,) shares of a unit in the first body, those in the second being the negatives; and the distance.
     """
     n = _n_cells(descriptor)
-    inner = descriptor.descriptor if isinstance(descriptor, IndividualDescriptor) else descriptor
+    inner = descriptor.descriptor if isinstance(descriptor, SizeAndSide) else descriptor
     contents = torch.stack([one, other]).double()
     roots = torch.cat([contents[:, :n].sqrt(), contents[:, n:]], dim=1)
     midpoint, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
@@ -173,7 +171,7 @@ def share_density(shares: Shares, samples: Mapping[SampleKind, Floats], points: 
 
 
 def _histograms(descriptor: Descriptor) -> HistogramDescriptor:
-    inner = descriptor.descriptor if isinstance(descriptor, IndividualDescriptor) else descriptor
+    inner = descriptor.descriptor if isinstance(descriptor, SizeAndSide) else descriptor
     inner = inner.descriptor if isinstance(inner, EmbeddedDescriptor) else inner
     if not isinstance(inner, HistogramDescriptor):
         raise ValueError(
@@ -196,7 +194,7 @@ def _part_shares(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
     for part, values in zip(parts, cells, strict=True):
         sums[part_name(part)] = sums.get(part_name(part), 0.0) + float(values.sum())
     form, side, size = (shares[None], *shares.new_empty(2, 1, 0))
-    if isinstance(descriptor, IndividualDescriptor):
+    if isinstance(descriptor, SizeAndSide):
         form, side, size = descriptor.split(shares[None])
     others = {"side": side, "size": torch.cat([form[:, _n_cells(descriptor) :], size], dim=1)}
     return sums | {name: float(values.sum()) for name, values in others.items() if values.numel()}

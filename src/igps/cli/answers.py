@@ -26,7 +26,7 @@ from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.individual import Size, keeps_size
+from igps.descriptors.size_and_side import Size, keeps_size
 from igps.mesh.mesh import Mesh, millimetres
 from igps.mesh.surface import face_areas
 from igps.nn.description import describe

@@ -22,7 +22,7 @@ from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.individual import SIZE, Size
+from igps.descriptors.size_and_side import SIZE, Size
 from igps.nn.description import fit_centres
 from igps.report.answers import precision_recall
 from igps.report.results import write_sources

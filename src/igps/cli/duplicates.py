@@ -9,7 +9,7 @@ from igps.cli.gallery import gallery_options
 from igps.cli.reading import Folder, check_files, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.individual import Size, keeps_size
+from igps.descriptors.size_and_side import Size, keeps_size
 from igps.gallery.about import is_gallery
 from igps.gallery.calibration import Calibration
 from igps.gallery.duplicates import Duplicates, body_distance

@@ -5,13 +5,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igps.analysis.fitting import Goal, HeadName, check_classes, classifier_of
-from igps.analysis.fitting import classify as classify_bodies
-from igps.analysis.fitting import fit as fit_head
 from igps.cli.reading import Folder, files_or_folder, print_failures, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors import load
+from igps.learning.fitting import Goal, HeadName, check_classes, classifier_of
+from igps.learning.fitting import classify as classify_bodies
+from igps.learning.fitting import fit as fit_head
 from igps.nn.description import check_centres
 from igps.nn.descriptor import Descriptor
 from igps.nn.specification import IN_FOLDER, specification

@@ -17,7 +17,7 @@ from igps.cli.reading import (
 )
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.individual import SIDE, SIZE, Size
+from igps.descriptors.size_and_side import SIDE, SIZE, Size
 from igps.gallery.about import about_of, check_alike, tables
 from igps.gallery.gallery import Gallery
 from igps.gallery.sync import sync as sync_folder

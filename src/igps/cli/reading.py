@@ -20,7 +20,7 @@ from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, ClassRule, file_and_part, file_name_of, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
-from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
+from igps.descriptors.size_and_side import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
 from igps.mesh.formats import is_searched
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES

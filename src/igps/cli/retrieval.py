@@ -28,7 +28,7 @@ from igps.cli.report import check_report_folder
 from igps.cli.report import report as write_report
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.individual import IndividualDescriptor
+from igps.descriptors.size_and_side import SizeAndSide
 from igps.gallery.about import is_gallery
 from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
@@ -118,7 +118,7 @@ def extract(
             f"out: expected a file of a wide table ending in {' or '.join(SUFFIXES)}, got {out}."
         )
     module = descriptor_of(descriptor)
-    inner = module.descriptor if isinstance(module, IndividualDescriptor) else module
+    inner = module.descriptor if isinstance(module, SizeAndSide) else module
     if short and not isinstance(inner, EmbeddedDescriptor):
         raise ValueError(
             f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}."

@@ -11,22 +11,22 @@ from typing import get_args
 import torch
 
 from igps._parameters import check_one_of
-from igps.descriptors.canonical_form import CanonicalForm
-from igps.descriptors.d2 import D2
 from igps.descriptors.from_yaml import load_yaml
-from igps.descriptors.geodesic_spectral import GeodesicSpectral
 from igps.descriptors.gps import gps
-from igps.descriptors.individual import SIDE, SIZE, IndividualDescriptor, Mirror, Size, keeps_size
-from igps.descriptors.inner_distance import InnerDistance
 from igps.descriptors.interior import interior
-from igps.descriptors.local_diameter_centricity import LocalDiameterCentricity
+from igps.descriptors.literature.canonical_form import CanonicalForm
+from igps.descriptors.literature.d2 import D2
+from igps.descriptors.literature.geodesic_spectral import GeodesicSpectral
+from igps.descriptors.literature.inner_distance import InnerDistance
+from igps.descriptors.literature.local_diameter_centricity import LocalDiameterCentricity
+from igps.descriptors.literature.shape_dna import ShapeDNA
+from igps.descriptors.literature.spectral_gw import SpectralGromovWasserstein
+from igps.descriptors.literature.volume_shape_dna import VolumeShapeDNA
 from igps.descriptors.molecular import molecular
 from igps.descriptors.multiscale import multiscale
 from igps.descriptors.pretrained.descriptor import pretrained
 from igps.descriptors.rich import rich
-from igps.descriptors.shape_dna import ShapeDNA
-from igps.descriptors.spectral_gw import SpectralGromovWasserstein
-from igps.descriptors.volume_shape_dna import VolumeShapeDNA
+from igps.descriptors.size_and_side import SIDE, SIZE, Mirror, Size, SizeAndSide, keeps_size
 from igps.descriptors.with_attributes import WithAttributes
 from igps.nn.descriptor import NAME, Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead
@@ -140,7 +140,7 @@ def descriptor(
         which: one of `NAMES`, or "molecular"; or a file, see `load`; or "package.module:NAME", where NAME is a
             descriptor of your own or a function that makes one; or a descriptor. The suffix "+size" of a name compares
             size, "+side" distinguishes mirror images, "+ct" or "+ct=0.5" adds an attribute, see `WithAttributes`.
-        size: "keep" compares size, see `IndividualDescriptor`; "auto" does so if all bodies have a unit of length.
+        size: "keep" compares size, see `SizeAndSide`; "auto" does so if all bodies have a unit of length.
         mirror: "distinct" distinguishes a body from its mirror image.
         units: of the bodies, for size="auto", see `SignatureDataset.units`.
 
@@ -167,10 +167,10 @@ def descriptor(
     if not (with_size or with_side):
         return base
     scale = base.scale
-    if isinstance(base, IndividualDescriptor):  # loaded from a file
+    if isinstance(base, SizeAndSide):  # loaded from a file
         with_size, with_side = with_size or base.keeps_size, with_side or base.twists is not None
         base = base.descriptor
-    return IndividualDescriptor(base, size=with_size, side=with_side, scale=scale).eval()
+    return SizeAndSide(base, size=with_size, side=with_side, scale=scale).eval()
 
 
 def attributes_suffix(attributes: Iterable[str]) -> str:

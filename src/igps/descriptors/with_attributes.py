@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from igps.data.batch import SignatureBatch
-from igps.descriptors.individual import SCALES, scale_of
+from igps.descriptors.size_and_side import SCALES, scale_of
 from igps.nn.axes import Attribute, InteriorDistance
 from igps.nn.descriptor import Descriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding

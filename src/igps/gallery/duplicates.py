@@ -20,7 +20,7 @@ from igps._parallel import on_threads
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.individual import Size, keeps_size
+from igps.descriptors.size_and_side import Size, keeps_size
 from igps.gallery._alignment import surface_distance
 from igps.gallery._moments import distance_bounds
 from igps.gallery._near_pairs import NearPairs, near_in_gallery, near_pairs, of_one_size

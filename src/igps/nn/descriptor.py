@@ -68,7 +68,7 @@ class Descriptor(Specified, ABC):
             histograms. The nearest bodies by `distances` must be among the few hundred nearest bodies by this distance.
             If None, an index compares a query with all bodies.
         card: facts about a fitted descriptor, by name.
-        scale: median distance between bodies of one class, from which `IndividualDescriptor` derives the weights
+        scale: median distance between bodies of one class, from which `SizeAndSide` derives the weights
             of size and side; None if unknown.
         description_shape: shape of one description, as `distances` takes it; (-1,) if it is a vector.
     """

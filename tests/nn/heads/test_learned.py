@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from igps.descriptors.d2 import D2
+from igps.descriptors.literature.d2 import D2
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead

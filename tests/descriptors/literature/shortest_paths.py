@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from igps.descriptors._geodesics import edge_graph
+from igps.descriptors.literature._geodesics import edge_graph
 from igps.mesh.mesh import Mesh
 
 

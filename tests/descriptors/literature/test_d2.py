@@ -10,7 +10,7 @@ import torch
 from one_body import of_points, of_signature
 
 from igps.data.batch import Body
-from igps.descriptors.d2 import D2, _angles
+from igps.descriptors.literature.d2 import D2, _angles
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import SignatureConfig, compute_signature
 

@@ -12,7 +12,7 @@ from igps._arrays import Floats, Integers, Singles
 from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._geodesics import geodesic_samples
+from igps.descriptors.literature._geodesics import geodesic_samples
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 

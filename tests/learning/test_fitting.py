@@ -11,7 +11,7 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 import igps
-from igps.analysis.fitting import HeadName, classify
+from igps.learning.fitting import HeadName, classify
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, KernelHead, WhitenedHead
 from igps.nn.heads.classifier import folds

@@ -18,7 +18,7 @@ from igps._arrays import Floats, Integers, Singles
 from igps._parameters import check_at_least, check_positive
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._linear_histogram import linear_histogram
+from igps.descriptors.literature._linear_histogram import linear_histogram
 from igps.nn.descriptor import BodyDescriptor
 
 METRICATION = 1.0495

@@ -10,7 +10,7 @@ from scipy.stats import special_ortho_group
 from shortest_paths import geodesic_distances
 
 from conftest import as_mesh
-from igps.descriptors.geodesic_spectral import GeodesicSpectral, affinity_eigenvalues
+from igps.descriptors.literature.geodesic_spectral import GeodesicSpectral, affinity_eigenvalues
 from igps.mesh.mesh import Mesh
 
 

@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 from scipy.special import eval_legendre
 from scipy.stats import wasserstein_distance
 
-from igps.descriptors.spectral_gw import (
+from igps.descriptors.literature.spectral_gw import (
     SpectralGromovWasserstein,
     gromov_wasserstein,
     heat_kernels,

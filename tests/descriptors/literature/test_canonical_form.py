@@ -13,8 +13,8 @@ from shortest_paths import geodesic_distances
 from sklearn.manifold import smacof
 
 from conftest import as_mesh
-from igps.descriptors._geodesics import farthest_points
-from igps.descriptors.canonical_form import (
+from igps.descriptors.literature._geodesics import farthest_points
+from igps.descriptors.literature.canonical_form import (
     CanonicalForm,
     classical_scaling,
     exponents,

@@ -8,8 +8,8 @@ import trimesh
 from one_body import of_mesh
 
 from conftest import as_mesh
-from igps.descriptors._linear_histogram import linear_histogram
-from igps.descriptors.local_diameter_centricity import (
+from igps.descriptors.literature._linear_histogram import linear_histogram
+from igps.descriptors.literature.local_diameter_centricity import (
     LocalDiameterCentricity,
     centricity,
     local_diameters,

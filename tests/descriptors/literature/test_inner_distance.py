@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import cdist
 
 from igps.data.batch import Body
-from igps.descriptors.inner_distance import METRICATION, InnerDistance, inner_distances
+from igps.descriptors.literature.inner_distance import METRICATION, InnerDistance, inner_distances
 from igps.signature.signature import Samples, Signature, SignatureConfig
 
 

@@ -16,8 +16,8 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.individual import IndividualDescriptor
 from igps.descriptors.molecular import SizedHistograms
+from igps.descriptors.size_and_side import SizeAndSide
 from igps.nn.description import check_centres, describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, Head, WhitenedHead
@@ -117,7 +117,7 @@ def fit(
         "size": isinstance(module, SizedHistograms),
         "side": False,
     }  # numbers that bypass the head
-    if isinstance(module, IndividualDescriptor):
+    if isinstance(module, SizeAndSide):
         individual = {"size": module.keeps_size, "side": module.twists is not None}
         module = module.descriptor
     base, metric = split_head(module)
@@ -167,7 +167,7 @@ def fit(
     is_measured = first_labels[:, None] != first_labels
     scale = float(model.distances(vectors, vectors)[is_measured].median()) / 5
     if any(individual.values()):
-        model = IndividualDescriptor(model, scale=scale, **individual).eval()
+        model = SizeAndSide(model, scale=scale, **individual).eval()
     model.scale = scale
     model.card = {
         "scale": scale,
@@ -231,7 +231,7 @@ def classify(
 def classifier_of(model: str | Descriptor) -> tuple[Descriptor, ClassifierHead]:
     """Return the descriptor of a model and its classifier; raise a ValueError if it has no classifier."""
     module = descriptor_of(model)
-    module = module.descriptor if isinstance(module, IndividualDescriptor) else module
+    module = module.descriptor if isinstance(module, SizeAndSide) else module
     if not isinstance(module, EmbeddedDescriptor) or not isinstance(module.head, ClassifierHead):
         raise ValueError(
             f"model: expected a classifier, got {module.name}. Fit one with head='classifier'."

@@ -52,7 +52,7 @@ _TYPICAL_TWIST, _TYPICAL_VOLUME = 0.002, 0.0085
 _N_VECTORS, _TIMES = 7, (0.01, 0.04, 0.15)
 
 
-class IndividualDescriptor(Descriptor):
+class SizeAndSide(Descriptor):
     """A descriptor that also compares size, or distinguishes mirror images, or both: `NAME+side+size`.
 
     A description has up to three blocks: the description by the wrapped descriptor, a side block and a size block. The
@@ -150,12 +150,10 @@ class IndividualDescriptor(Descriptor):
         form, *others = self.split(descriptions)
         return torch.cat([self.descriptor.shorten(form), *others], dim=1)
 
-    def wrap(self, descriptor: Descriptor) -> "IndividualDescriptor":
-        """Return an `IndividualDescriptor` of another descriptor with the same options and scales."""
+    def wrap(self, descriptor: Descriptor) -> "SizeAndSide":
+        """Return an `SizeAndSide` of another descriptor with the same options and scales."""
         has_side = self.twists is not None
-        return IndividualDescriptor(
-            descriptor, size=self.keeps_size, side=has_side, scale=self.scale
-        )
+        return SizeAndSide(descriptor, size=self.keeps_size, side=has_side, scale=self.scale)
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Split descriptions (N, D) into the descriptor's own, in its shape, the side block and the size block."""

@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 from shortest_paths import geodesic_distances
 
 from conftest import as_mesh
-from igps.descriptors._geodesics import farthest_points
+from igps.descriptors.literature._geodesics import farthest_points
 from igps.mesh.mesh import Mesh
 
 

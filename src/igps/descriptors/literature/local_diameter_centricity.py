@@ -8,8 +8,8 @@ from igps._arrays import Floats, Integers, Singles
 from igps._parameters import check_at_least, check_positive
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._geodesics import farthest_points
-from igps.descriptors._linear_histogram import linear_histogram
+from igps.descriptors.literature._geodesics import farthest_points
+from igps.descriptors.literature._linear_histogram import linear_histogram
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor

@@ -19,7 +19,7 @@ from igps.cli.duplicates import duplicates as list_duplicates
 from igps.cli.gallery import build
 from igps.cli.retrieval import query, retrieve
 from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.individual import SCALES, IndividualDescriptor, keeps_size, signed_volumes
+from igps.descriptors.size_and_side import SCALES, SizeAndSide, keeps_size, signed_volumes
 from igps.gallery.duplicates import duplicates
 from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import EmbeddedDescriptor
@@ -362,7 +362,7 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
         tmp_path / "shapes", cache_dir=tmp_path / "cache", descriptor="interior+side"
     )
     model = igps.fit(dataset, "interior+side+size", head="whitened", n_workers=1)
-    assert isinstance(model, IndividualDescriptor)
+    assert isinstance(model, SizeAndSide)
     assert isinstance(model.descriptor, EmbeddedDescriptor)
     assert model.scale == pytest.approx(model.card["scale"])
     model.save(tmp_path / "mine.safetensors")

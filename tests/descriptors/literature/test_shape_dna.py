@@ -11,7 +11,7 @@ from one_body import of_points, of_signature
 
 import igps
 from igps.data.batch import Body
-from igps.descriptors.shape_dna import ShapeDNA
+from igps.descriptors.literature.shape_dna import ShapeDNA
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import SignatureConfig, compute_signature
 

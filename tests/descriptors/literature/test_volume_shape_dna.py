@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.special import spherical_jn
 
 from conftest import as_mesh
-from igps.descriptors.volume_shape_dna import Boundary, VolumeShapeDNA, volume_spectrum
+from igps.descriptors.literature.volume_shape_dna import Boundary, VolumeShapeDNA, volume_spectrum
 from igps.mesh.mesh import Mesh, MeshError
 
 BOUNDARIES: tuple[Boundary, ...] = ("dirichlet", "neumann")

@@ -1,0 +1,1 @@
+"""Descriptors of other authors, one file each, as they are compared with those of this library."""
