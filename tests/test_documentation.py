@@ -100,9 +100,7 @@ def histograms_by_loops(dataset: SignatureDataset) -> list[np.ndarray]:
     ]
 
 
-def test_readme_is_short_and_has_its_examples() -> None:
-    text = TEXT["README.md"]
-    assert len(text.splitlines()) <= 150
+def test_readme_has_its_examples() -> None:
     assert len(python("README.md")) == 2
 
 

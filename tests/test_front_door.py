@@ -141,7 +141,7 @@ def test_every_import_is_declared() -> None:
     extras = {
         name: declared(several)
         for name, several in project["optional-dependencies"].items()
-        if name not in ("test", "lint", "campaign", "docs")
+        if name not in ("test", "lint", "docs")
     }
     optional = set().union(*extras.values()) - {"interior-gps"}
     own = {"igps", "training"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 from pathlib import Path
 
 import pytest
@@ -87,10 +86,3 @@ def test_a_wrong_arrow_would_be_seen(tmp_path: Path) -> None:
     source = "from igps.cli.demo import demo\nimport igps.nn.axes as axes\nfrom igps import data\nimport numpy\n"
     (tmp_path / "room.py").write_text(source)
     assert imported_rooms(tmp_path / "room.py") == {"cli", "nn", "data"}
-
-
-def test_the_campaign_names_modules_that_are_there() -> None:
-    text = "".join(path.read_text() for path in (Path(__file__).parent / "campaign").glob("*.py"))
-    named = set(re.findall(r'"(src/igps/[^"{]+\.py)"', text))
-    assert named
-    assert [name for name in named if not (PACKAGE.parents[1] / name).is_file()] == []

@@ -17,7 +17,7 @@ import nibabel
 import numpy as np
 import tifffile
 import trimesh
-from mutator import Generator, broken_bytes
+from damage import Generator, broken_bytes
 from numpy.typing import NDArray
 
 sys.path.append(str(Path(__file__).parents[2]))

@@ -20,7 +20,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from mutator import Broken, broken_mesh
+from damage import Broken, broken_mesh
 from outcome import Row
 from reference import confirm
 

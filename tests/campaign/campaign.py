@@ -1,4 +1,4 @@
-"""The campaign: broken meshes and other bodies, killed processes, faults of the machine, properties, mutants.
+"""The campaign: broken meshes and other bodies, killed processes, faults of the machine, properties.
 
 It prints a table of the results, writes it to a JSON file, and ends with status 1 if a target is missed.
 """
@@ -29,7 +29,6 @@ _AMOUNTS: dict[str, tuple[int, int | None]] = {
     "gallery_kills": (200, 8),
     "machine_faults": (0, None),
     "properties": (12, 1),
-    "mutants": (20, None),
 }
 
 
@@ -39,7 +38,6 @@ _STAGES = (
     (("broken_meshes",),),
     (("broken_bodies",),),
     (("kills",), ("properties", "machine_faults", "gallery_kills")),
-    (("mutants",),),
 )
 
 
