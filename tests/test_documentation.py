@@ -141,7 +141,7 @@ def test_the_classifier_of_the_readme_tells_classes_apart(tmp_path: Path) -> Non
 
 def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path: Path) -> None:
     mine = next(
-        block for block in python("docs/how-to/own-descriptors.md") if block.title == "mine.py"
+        block for block in python("docs/how-to/add-descriptor.md") if block.title == "mine.py"
     )
     (tmp_path / "mine.py").write_text(mine.text)
     ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=600).write(tmp_path / "shapes")

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 from igps.data.batch import SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
-from igps.data.requirements import register_descriptors
 from igps.descriptors import descriptor, load
-from igps.learning.fitting import fit
+from igps.learning import fit
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
@@ -34,10 +33,6 @@ if TYPE_CHECKING:
 
 # Imported on first use, because they import Lightning, which takes seconds.
 _LAZY = {"RetrievalLearner": "igps.nn.learner", "SignatureDataModule": "igps.data.datamodule"}
-
-# `igps.data` may not import `igps.descriptors`, but its Dataset accepts names of descriptors.
-register_descriptors(descriptor)
-del register_descriptors
 
 __all__ = [
     "ArticulatedShapes",

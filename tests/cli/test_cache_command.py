@@ -11,6 +11,7 @@ import pytest
 
 from commands import run
 from igps.data.dataset import SignatureDataset
+from igps.descriptors import descriptor
 from own_descriptors import SMALL, write_egg
 
 INTERIOR = "own_descriptors:small_interior"
@@ -150,7 +151,7 @@ def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_i
         1,
     )
     dataset = SignatureDataset(
-        tmp_path / "eggs", cache_dir=tmp_path, descriptor="pretrained+potential"
+        tmp_path / "eggs", cache_dir=tmp_path, descriptor=descriptor("pretrained+potential")
     )
     assert None not in dataset.cached_keys()
 

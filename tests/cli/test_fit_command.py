@@ -65,7 +65,9 @@ def model(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def dataset(root: Path, model: Path) -> library.SignatureDataset:
     config = library.SignatureConfig(resolution=9, min_samples=0, n_surface_samples=40)
-    return library.SignatureDataset(root / "eggs", config, root / "cache", descriptor=str(model))
+    return library.SignatureDataset(
+        root / "eggs", config, root / "cache", descriptor=library.descriptor(model)
+    )
 
 
 def test_fit_writes_model_and_card(

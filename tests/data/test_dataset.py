@@ -337,22 +337,22 @@ def test_an_item_is_asked_for_by_number_or_name(dataset: SignatureDataset) -> No
 
 
 def test_the_descriptor_says_what_signatures_it_is_for(root: Path, tmp_path: Path) -> None:
-    """By name, itself, or what it requires, as its requirements applied by hand."""
+    """Itself, or what it requires, as its requirements applied by hand."""
     rich = igps.descriptor("rich")
     expected = rich.requirements.apply_to(SignatureConfig()).resolved()
-    for descriptor in ("rich", rich, rich.requirements):
+    for descriptor in (rich, rich.requirements):
         assert SignatureDataset(root, descriptor=descriptor).config == expected
     small = SignatureConfig(n_eigenpairs=20)
     assert (
         SignatureDataset(
-            root, replace(CONFIG, n_eigenpairs=None), descriptor="shape_dna"
+            root, replace(CONFIG, n_eigenpairs=None), descriptor=igps.descriptor("shape_dna")
         ).config.resolution
         == 10
     )
     with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs"):
-        SignatureDataset(root, small, descriptor="rich")
-    with pytest.raises(ValueError, match="descriptor: expected one of"):
-        SignatureDataset(root, descriptor="no such")
+        SignatureDataset(root, small, descriptor=rich)
+    with pytest.raises(TypeError, match=r"got its name. Give igps.descriptor\('rich'\)"):
+        SignatureDataset(root, descriptor="rich")  # type: ignore[arg-type]
 
 
 def test_after_precompute_the_meshes_are_not_needed(

@@ -304,7 +304,9 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(
     assert (
         retrieve(root, "shape_dna", size="ignore", **options)["config"]["descriptor"] == "shape_dna"
     )
-    dataset = igps.SignatureDataset(root, cache_dir=tmp_path / "cache", descriptor="shape_dna")
+    dataset = igps.SignatureDataset(
+        root, cache_dir=tmp_path / "cache", descriptor=igps.descriptor("shape_dna")
+    )
     assert dataset.units() == ["in", "mm", "mm", "cm"]
     Gallery.build(tmp_path / "index", dataset, "shape_dna+size", n_workers=1)
     found = query(root / "1/a.3mf", gallery=tmp_path / "index", top=2, cache_dir=tmp_path / "cache")
@@ -344,7 +346,9 @@ def test_copies_of_another_size_are_no_duplicates_where_size_counts(
         ("c", 30, "millimeter"),
     ):
         write_3mf(tmp_path / f"{name}.3mf", factor, unit, twisted(0.5))
-    dataset = igps.SignatureDataset(tmp_path, cache_dir=tmp_path / "cache", descriptor="pretrained")
+    dataset = igps.SignatureDataset(
+        tmp_path, cache_dir=tmp_path / "cache", descriptor=igps.descriptor("pretrained")
+    )
     assert duplicates(dataset, n_workers=1).groups == (("a.3mf", "b.3mf"),)
     assert [set(group) for group in duplicates(dataset, size="ignore", n_workers=1).groups] == [
         {"a.3mf", "b.3mf", "c.3mf"}
@@ -359,7 +363,9 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
     shapes = igps.ArticulatedShapes(n_classes=2, n_per_class=4, n_vertices=600)
     shapes.write(tmp_path / "shapes")
     dataset = igps.SignatureDataset(
-        tmp_path / "shapes", cache_dir=tmp_path / "cache", descriptor="interior+side"
+        tmp_path / "shapes",
+        cache_dir=tmp_path / "cache",
+        descriptor=igps.descriptor("interior+side"),
     )
     model = igps.fit(dataset, "interior+side+size", head="whitened", n_workers=1)
     assert isinstance(model, SizeAndSide)

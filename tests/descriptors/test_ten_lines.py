@@ -20,7 +20,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("ten_lines")
     igps.ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=1100).write(root / "shapes")
     for name in ("rich", "interior"):
-        dataset = igps.SignatureDataset(root / "shapes", cache_dir=root / "cache", descriptor=name)
+        dataset = igps.SignatureDataset(
+            root / "shapes", cache_dir=root / "cache", descriptor=igps.descriptor(name)
+        )
         assert dataset.precompute(n_workers=1, progress=False) == []
     return root
 

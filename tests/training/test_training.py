@@ -285,7 +285,9 @@ def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
         n_samples=1000,
     )
     module = igps.HistogramDescriptor(histogram)
-    dataset = igps.SignatureDataset(root / "meshes", descriptor="rich", cache_dir=root / "cache")
+    dataset = igps.SignatureDataset(
+        root / "meshes", descriptor=igps.descriptor("rich"), cache_dir=root / "cache"
+    )
     split = split_seen(dataset.labels, 3, seed=100)
     scores = expected(
         igps.describe(dataset, module).flatten(1), dataset.labels, split, module.part_cells

@@ -128,7 +128,9 @@ def fitted(
         first_seed: seed of the first split.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
-    dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=descriptor)
+    dataset = igps.SignatureDataset(
+        root, cache_dir=cache_dir, descriptor=igps.descriptor(descriptor)
+    )
     dataset.precompute(strict=True)
     goals: tuple[Goal, ...] = ("known", "new")
     for goal in goals:

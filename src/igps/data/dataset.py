@@ -50,7 +50,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         cache_dir: directory of the cache; the user's cache directory if None. A cache key consists of the content of
             the file, the load options, all parameters, and the version of the algorithm. A cached Signature with more
             eigenpairs or attributes is used as well.
-        descriptor: a descriptor or its name; the Signatures meet its requirements.
+        descriptor: a descriptor, such as `igps.descriptor(NAME)`; the Signatures meet its requirements.
         labels: class names of the given paths.
         classes: rule for the class of a body, see `ClassRule`; "folder" if None.
         reading: options for reading files.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -103,21 +103,14 @@ class HasRequirements(Protocol):
         """Requirements of the descriptor."""
 
 
-AnyDescriptor = str | HasRequirements | Requirements
-"""A descriptor, its name, or its requirements."""
-
-_find_by_name: list[Callable[[str], HasRequirements]] = []
-
-
-def register_descriptors(find_by_name: Callable[[str], HasRequirements]) -> None:
-    """Set the function that finds a descriptor by its name, because `igps.data` may not import `igps.descriptors`."""
-    _find_by_name[:] = [find_by_name]
+AnyDescriptor = HasRequirements | Requirements
+"""A descriptor, or its requirements."""
 
 
 def requirements_of(descriptor: AnyDescriptor) -> Requirements:
-    """Return the requirements of a descriptor."""
-    if isinstance(descriptor, Requirements):
-        return descriptor
-    return (
-        _find_by_name[0](descriptor) if isinstance(descriptor, str) else descriptor
-    ).requirements
+    """Return the requirements of a descriptor; raise a TypeError for a name."""
+    if isinstance(descriptor, str):
+        raise TypeError(
+            f"descriptor: expected a descriptor, got its name. Give igps.descriptor({descriptor!r})."
+        )
+    return descriptor if isinstance(descriptor, Requirements) else descriptor.requirements

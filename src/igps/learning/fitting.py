@@ -90,8 +90,9 @@ def fit(
         >>> from igps.shapes import ArticulatedShapes
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = ArticulatedShapes(n_classes=2, n_per_class=4, n_vertices=600).write(f"{folder}/shapes")
-        ...     dataset = SignatureDataset(f"{folder}/shapes", cache_dir=f"{folder}/cache", descriptor="interior")
-        ...     model = fit(dataset, "interior", head="whitened", n_workers=1)
+        ...     interior = descriptor_of("interior")
+        ...     dataset = SignatureDataset(f"{folder}/shapes", descriptor=interior, cache_dir=f"{folder}/cache")
+        ...     model = fit(dataset, interior, head="whitened", n_workers=1)
         >>> model.name, sorted(model.card["classes"].values())
         ('interior_whitened', [4, 4])
 

@@ -1,0 +1,76 @@
+"""Descriptors from files and folders. Loading runs no code of a file."""
+
+import math
+import os
+from pathlib import Path
+
+import torch
+
+from igps.descriptors.from_yaml import load_yaml
+from igps.nn.descriptor import NAME, Descriptor, EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.heads import ClassifierHead, Head
+from igps.nn.specification import IN_FOLDER, load_module
+
+_YAML = (".yaml", ".yml")
+
+
+def is_descriptor_file(path: str | Path) -> bool:
+    """Return whether a path is that of a descriptor's file by its suffix, or of its folder."""
+    is_named_so = str(path).lower().endswith((".safetensors", *_YAML))
+    # os.path, as it accepts any text: no descriptor's folder has an invalid path
+    is_folder = bool(path) and os.path.isfile(os.path.join(path, IN_FOLDER))
+    return is_named_so or is_folder
+
+
+def load(path: str | Path) -> Descriptor:
+    """Load a descriptor from a file or folder, in evaluation mode, with its `card`. No code from the file runs.
+
+    The file was written by `Descriptor.save` or `igps fit`, or is a specification in YAML, see
+    `igps.descriptors.from_yaml`.
+
+    Example:
+        >>> import tempfile
+        >>> from igps import descriptor
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     descriptor("interior").save(f"{folder}/mine.safetensors", {"author": "me"})
+        ...     loaded = load(f"{folder}/mine.safetensors")
+        >>> loaded.name, dict(loaded.card)
+        ('interior', {'author': 'me'})
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, or does not hold a descriptor.
+    """
+    if str(path).lower().endswith(_YAML):
+        return load_yaml(path)
+    module, card = load_module(path)
+    if not isinstance(module, Descriptor):
+        raise ValueError(f"{path}: expected a descriptor, got {type(module).__name__}.")
+    if not NAME.fullmatch(module.name):
+        raise ValueError(
+            f"{path}: expected a descriptor's name of letters, digits and _, "
+            f"got {module.name[:80]!r}."
+        )
+    for submodule in module.modules():
+        if isinstance(submodule, EmbeddedDescriptor):
+            _check_head(submodule.descriptor, submodule.head, path)
+    module.card = card
+    scale = card.get("scale")  # cards may come from users: this entry may be anything
+    if isinstance(scale, int | float) and 0 < scale < math.inf:
+        module.scale = scale
+    return module
+
+
+def _check_head(descriptor: Descriptor, head: Head, path: str | Path) -> None:
+    """Raise a ValueError if the sizes of a head's tensors are inconsistent, before any body is described."""
+    if not isinstance(descriptor, HistogramDescriptor):
+        return
+    cells = torch.ones(2, descriptor.n_features)
+    try:
+        head(cells)
+        if isinstance(head, ClassifierHead):
+            head.strangeness(cells)
+    except (ValueError, RuntimeError, TypeError, LookupError, ArithmeticError) as error:
+        raise ValueError(
+            f"{path}: expected a head for {cells.shape[1]} cells ({error}). Save it again."
+        ) from error

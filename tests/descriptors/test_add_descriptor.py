@@ -1,0 +1,69 @@
+"""The example of the page *Add a descriptor*, as another package would install it."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import igps
+from igps.signature.signature import SignatureConfig
+
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "add-descriptor.md"
+
+
+def file_of_the_page(name: str) -> str:
+    """The text of the block whose title is this file."""
+    pattern = rf'^```\w+ title="{re.escape(name)}"\n(.*?)^```'
+    match = re.search(pattern, PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    assert match is not None
+    return match[1]
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The package of the page, laid out on the Python path as pip would do it."""
+    project = tomllib.loads(file_of_the_page("pyproject.toml"))["project"]
+    (tmp_path / "mine.py").write_text(file_of_the_page("mine.py"))
+    info = tmp_path / f"{project['name']}-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
+    lines = []
+    for group, places in project["entry-points"].items():
+        lines.append(f"[{group}]")
+        lines += [f"{name} = {place}" for name, place in places.items()]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def test_the_example_is_short() -> None:
+    text = file_of_the_page("mine.py") + file_of_the_page("pyproject.toml")
+    assert len(text.splitlines()) <= 30
+
+
+def test_an_installed_descriptor_is_known_by_its_name(installed: None, blob: igps.Mesh) -> None:
+    config = SignatureConfig(n_eigenpairs=5, resolution=6, min_samples=0, n_surface_samples=50)
+    batch = igps.collate([igps.compute_signature(blob, config)])
+    roundness = igps.descriptor("roundness")
+    assert not roundness.training
+    assert roundness(batch).item() == pytest.approx(blob.volume / blob.area**1.5)
+
+
+def test_a_wrong_name_lists_installed_descriptors_too(installed: None) -> None:
+    with pytest.raises(ValueError, match=r"expected one of interior, .*, roundness, or package"):
+        igps.descriptor("round")
+
+
+def test_a_name_of_the_library_stays_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "other-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[igps.descriptors]\nd2 = math:pi\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert igps.descriptor("d2").name == "d2"
