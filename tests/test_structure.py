@@ -22,6 +22,7 @@ FLOORS = (
     ("descriptors",),
     ("learning",),
     ("gallery",),
+    ("duplicates",),
     ("analysis",),
     ("report",),
     ("cli", "sklearn"),

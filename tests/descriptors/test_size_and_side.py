@@ -20,7 +20,7 @@ from igps.cli.gallery import build
 from igps.cli.retrieval import query, retrieve
 from igps.descriptors.fingerprint import cache_tag
 from igps.descriptors.size_and_side import SCALES, SizeAndSide, keeps_size, signed_volumes
-from igps.gallery.duplicates import duplicates
+from igps.duplicates.duplicates import duplicates
 from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.signature.signature import Signature

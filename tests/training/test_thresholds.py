@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from training.studies.thresholds import threshold_at, threshold_between
 
-from igps.gallery.calibration import Threshold
+from igps.duplicates.calibration import Threshold
 
 
 def test_a_threshold_lies_between_what_does_not_overlap() -> None:

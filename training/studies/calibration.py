@@ -13,14 +13,14 @@ from igps._arrays import Booleans, Floats
 from igps._parallel import on_threads
 from igps.descriptors.fingerprint import fingerprint
 from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained
-from igps.gallery.calibration import (
+from igps.duplicates.calibration import (
     CALIBRATION,
     FINEST,
     KINDS,
     Calibration,
     calibration_params,
 )
-from igps.gallery.surfaces import Surfaces, distance_if_alike
+from igps.duplicates.surfaces import Surfaces, distance_if_alike
 from igps.mesh.mesh import Mesh
 from igps.nn.description import describe
 from training.graded import GradedShapes, body_of

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from igps.gallery.calibration import LEVELS, Threshold
+from igps.duplicates.calibration import LEVELS, Threshold
 
 
 def quantiles(distances: ArrayLike) -> list[float]:

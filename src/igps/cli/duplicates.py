@@ -10,12 +10,12 @@ from igps.cli.reading import Folder, check_files, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.size_and_side import Size, keeps_size
-from igps.gallery.about import is_gallery
-from igps.gallery.calibration import Calibration
-from igps.gallery.duplicates import Duplicates, body_distance
-from igps.gallery.duplicates import duplicates as find_duplicates
+from igps.duplicates.calibration import Calibration
+from igps.duplicates.duplicates import Duplicates, body_distance
+from igps.duplicates.duplicates import duplicates as find_duplicates
+from igps.duplicates.surfaces import MAX_TOLERANCE
 from igps.gallery.gallery import Gallery
-from igps.gallery.surfaces import MAX_TOLERANCE
+from igps.gallery.opening import is_gallery
 from igps.mesh.mesh import millimetres
 from igps.report.tables import write_rows
 

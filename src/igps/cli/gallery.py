@@ -18,8 +18,9 @@ from igps.cli.reading import (
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.size_and_side import SIDE, SIZE, Size
-from igps.gallery.about import about_of, check_alike, tables
+from igps.gallery.about import about_of, check_alike
 from igps.gallery.gallery import Gallery
+from igps.gallery.opening import tables
 from igps.gallery.sync import sync as sync_folder
 from igps.mesh.options import LoadOptions
 from igps.nn.description import check_centres

@@ -29,8 +29,8 @@ from igps.cli.report import report as write_report
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.size_and_side import SizeAndSide
-from igps.gallery.about import is_gallery
 from igps.gallery.gallery import Gallery
+from igps.gallery.opening import is_gallery
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.report.results import write_sources
 from igps.report.tables import scores_table, write_rows

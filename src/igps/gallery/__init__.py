@@ -1,1 +1,1 @@
-"""Databases of described bodies: storage, search, and detection of duplicates."""
+"""Databases of described bodies: storage and search."""

@@ -6,6 +6,7 @@ Writers wait for each other. Data left by a killed process are part of no versio
 import contextlib
 import io
 import json
+import re
 import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import timedelta
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 
 from igps.gallery._codes import CODE, CodeIndex, Coder
-from igps.gallery.about import KNOWN, Batch, Row, engine_errors_as
+from igps.gallery.columns import KNOWN, Batch, Row
 from igps.retrieval.vectors import SearchDistance
 
 try:
@@ -36,6 +37,23 @@ _INDEX_INTERVAL = 32  # versions after which new rows are added to the indices o
 _MAX_SINGLE = 1024  # numbers; longer descriptions are stored in half precision
 _BATCH_SIZE = 1024  # rows
 _ARROW_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bytes: pa.binary()}
+
+
+_SOURCE_LOCATION = re.compile(r", /\S+\.rs:.*")  # at the end of LanceDB's error messages
+
+
+@contextlib.contextmanager
+def engine_errors_as(sentence: str) -> Iterator[None]:
+    """Raise errors of LanceDB as a ValueError with a sentence, followed by the first line of the original message."""
+    try:
+        yield
+    except (ValueError, RuntimeError, OSError, KeyError, TypeError, IndexError) as error:
+        reason = (
+            _SOURCE_LOCATION.sub("", str(error).splitlines()[0])[:200]
+            if str(error)
+            else type(error).__name__
+        )
+        raise ValueError(f"{sentence} ({reason}).") from error
 
 
 class BodyTable:

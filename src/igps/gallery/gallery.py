@@ -18,7 +18,9 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.registry import is_file
 from igps.gallery._search import nearest_rows
-from igps.gallery.about import KNOWN, Batch, about_of, check_alike, open_table, tables
+from igps.gallery.about import about_of, check_alike
+from igps.gallery.columns import KNOWN, Batch
+from igps.gallery.opening import open_table, tables
 from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
 from igps.nn.description import check_centres, describe

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from igps.data.dataset import Failure, SignatureDataset
-from igps.gallery.about import KNOWN
+from igps.gallery.columns import KNOWN
 from igps.gallery.gallery import Gallery
 from igps.gallery.rows import checksum_of, each_body_once, further_columns, known_rows
 

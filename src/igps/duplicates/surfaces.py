@@ -23,14 +23,14 @@ from tqdm import tqdm
 from igps._arrays import Floats, Integers
 from igps._parallel import on_threads
 from igps.data.dataset import Failure, SignatureDataset
-from igps.gallery._alignment import (
+from igps.duplicates._alignment import (
     SurfaceSamples,
     TriangleSurface,
     offset_in_place,
     surface_distance,
 )
-from igps.gallery._moments import moments
-from igps.gallery.calibration import Calibration
+from igps.duplicates._moments import moments
+from igps.duplicates.calibration import Calibration
 from igps.mesh.loading import load_mesh
 from igps.mesh.mending import Step, repair_steps
 from igps.mesh.mesh import Mesh, MeshError

@@ -12,7 +12,7 @@ from training.studies.thresholds import quantiles
 
 from igps.descriptors import descriptor
 from igps.descriptors.fingerprint import fingerprint
-from igps.gallery.calibration import KINDS, LEVELS, Calibration, Threshold, calibration_params
+from igps.duplicates.calibration import KINDS, LEVELS, Calibration, Threshold, calibration_params
 from igps.signature.signature import SignatureConfig
 from own_descriptors import Same
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from igps._arrays import Floats, Integers
-from igps.gallery._alignment import MAX_LOG_SCALE
+from igps.duplicates._alignment import MAX_LOG_SCALE
 from igps.mesh.surface import area_vectors, directed_edges, face_areas
 
 # Quadrature with six nodes, exact for polynomials of degree four on a triangle (Dunavant 1985)

@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from igps.gallery._alignment import (
+from igps.duplicates._alignment import (
     SurfaceSamples,
     TriangleSurface,
     offset_in_place,

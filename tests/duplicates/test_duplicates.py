@@ -23,11 +23,11 @@ from igps.cli import COMMANDS
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.descriptors.fingerprint import fingerprint
-from igps.gallery._moments import distance_bounds
-from igps.gallery.calibration import Calibration, calibration_params
-from igps.gallery.duplicates import _regroup, body_distance, duplicates
+from igps.duplicates._moments import distance_bounds
+from igps.duplicates.calibration import Calibration, calibration_params
+from igps.duplicates.duplicates import _regroup, body_distance, duplicates
+from igps.duplicates.surfaces import Surfaces
 from igps.gallery.gallery import Gallery
-from igps.gallery.surfaces import Surfaces
 from igps.signature.signature import SignatureConfig
 from own_descriptors import Same
 

@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from igps.gallery._moments import distance_bounds, moments
+from igps.duplicates._moments import distance_bounds, moments
 
 Array = NDArray[np.float64]
 MOST = 0.002

@@ -1,8 +1,8 @@
 """Files that show the same body, whatever its scale, mirror image, triangulation, level of detail or file format.
 
 Two surfaces are aligned. The distance that remains tells the same shape from another pose and from a similar body (see
-`igps.gallery.surfaces`). Only candidate pairs are aligned: those whose moments allow a small distance or, in a gallery,
-those with near descriptions.
+`igps.duplicates.surfaces`). Only candidate pairs are aligned: those whose moments allow a small distance or, in a
+gallery, those with near descriptions.
 """
 
 import math
@@ -21,12 +21,12 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.size_and_side import Size, keeps_size
-from igps.gallery._alignment import surface_distance
-from igps.gallery._moments import distance_bounds
-from igps.gallery._near_pairs import NearPairs, near_in_gallery, near_pairs, of_one_size
-from igps.gallery.calibration import Calibration
+from igps.duplicates._alignment import surface_distance
+from igps.duplicates._moments import distance_bounds
+from igps.duplicates._near_pairs import NearPairs, near_in_gallery, near_pairs, of_one_size
+from igps.duplicates.calibration import Calibration
+from igps.duplicates.surfaces import Grade, Surfaces
 from igps.gallery.gallery import Gallery
-from igps.gallery.surfaces import Grade, Surfaces
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 

@@ -1,0 +1,1 @@
+"""Files that show the same body: copies, graded, and the meaning of distances."""
