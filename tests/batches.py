@@ -50,10 +50,8 @@ def alone(batch: SignatureBatch, i: int) -> SignatureBatch:
     """One shape without its padding."""
 
     def unpadded(samples: SampleBatch) -> SampleBatch:
-        n_points, n_eigenpairs = (
-            int(samples.mask[i].sum()),
-            int(torch.isfinite(batch.eigenvalues[i]).sum()),
-        )
+        n_points = int(samples.mask[i].sum())
+        n_eigenpairs = int(torch.isfinite(batch.eigenvalues[i]).sum())
         return SampleBatch(
             samples.points[i : i + 1, :n_points],
             samples.eigenfunctions[i : i + 1, :n_points, :n_eigenpairs],
@@ -141,7 +139,8 @@ class OfTensors(nn.Module):
 
     def __init__(self, descriptor: nn.Module, like: SignatureBatch) -> None:
         super().__init__()
-        self.descriptor, self.like = descriptor, like
+        self.descriptor = descriptor
+        self.like = like
 
     def forward(
         self, eigenvalues: Tensor, area: Tensor, volume: Tensor, kinds: dict[str, dict[str, Tensor]]
@@ -174,7 +173,8 @@ def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, Tensor, dict[str, di
 
 def exported(descriptor: nn.Module, batch: SignatureBatch) -> nn.Module:
     """The program of `OfTensors` that `torch.export` makes for any number of bodies and samples."""
-    given, some = tensors(batch), {0: torch.export.Dim.AUTO}
+    given = tensors(batch)
+    some = {0: torch.export.Dim.AUTO}
     of_samples = {
         kind: {name: {**some, 1: torch.export.Dim.AUTO} for name in one}
         for kind, one in given[3].items()

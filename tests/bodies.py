@@ -33,7 +33,8 @@ def torus(n_major: int, n_minor: int) -> Mesh:
 
 def interior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
     vertices, faces = mesh
-    low, high = vertices.min(0), vertices.max(0)
+    low = vertices.min(0)
+    high = vertices.max(0)
     points = np.random.default_rng(seed).uniform(low, high, (8 * n, 3))
     return points[igl.winding_number(vertices, faces, points) > 0.5][:n]
 

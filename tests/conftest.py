@@ -39,7 +39,8 @@ def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], list[Figure]]
     """A function from a module to the list of figures that it makes from now on."""
 
     def remembered(module: Any) -> list[Figure]:
-        made, make = list[Figure](), module.new_figure
+        made = list[Figure]()
+        make = module.new_figure
 
         def remember(width: float, height: float) -> Figure:
             made.append(make(width, height))
@@ -83,13 +84,16 @@ def horseshoe(
     ).reshape(-1, 3)
     ends = np.stack([np.cos(u[[0, -1], 0]), np.sin(u[[0, -1], 0]), np.zeros(2)], axis=1)
     i, j = np.mgrid[: n_sections - 1, :n_around]
-    a, b = i * n_around + j, i * n_around + (j + 1) % n_around
+    a = i * n_around + j
+    b = i * n_around + (j + 1) % n_around
     sides = [
         np.stack([a, a + n_around, b], axis=-1),
         np.stack([b, a + n_around, b + n_around], axis=-1),
     ]
     here = np.arange(n_around)
-    there, last, n = (here + 1) % n_around, (n_sections - 1) * n_around, n_sections * n_around
+    there = (here + 1) % n_around
+    last = (n_sections - 1) * n_around
+    n = n_sections * n_around
     caps = [np.stack([here, there, np.full(n_around, n)], axis=1)]
     caps.append(np.stack([last + there, last + here, np.full(n_around, n + 1)], axis=1))
     faces = np.concatenate([part.reshape(-1, 3) for part in (*sides, *caps)])
@@ -102,7 +106,8 @@ def with_slivers(
     """The same surface, with so many random faces cut in three by a vertex hardly off the middle of a side."""
     split = np.random.default_rng(3).choice(len(faces), n_slivers, replace=False)
     inside = np.einsum("i,fij->fj", [0.4995, 0.4995, 0.001], vertices[faces[split]])
-    new, (a, b, c) = len(vertices) + np.arange(n_slivers), faces[split].T
+    new = len(vertices) + np.arange(n_slivers)
+    a, b, c = faces[split].T
     thirds = [np.stack(corners, axis=1) for corners in ((a, b, new), (b, c, new), (c, a, new))]
     return np.concatenate([vertices, inside]), np.concatenate(
         [np.delete(faces, split, axis=0), *thirds]

@@ -57,7 +57,8 @@ def distances(points: Tensor) -> np.ndarray:
 
 def twists(points: Tensor, directions: Tensor) -> np.ndarray:
     """The signed twist of each pair of oriented points, (P, P)."""
-    p, n = points.double().numpy(), directions.double().numpy()
+    p = points.double().numpy()
+    n = directions.double().numpy()
     found = np.zeros((len(p), len(p)))
     for i in range(len(p)):
         for j in range(len(p)):
@@ -68,7 +69,8 @@ def twists(points: Tensor, directions: Tensor) -> np.ndarray:
 
 def cosines(points: Tensor, directions: Tensor) -> list[np.ndarray]:
     """The three cosines of each pair of oriented points (Wahl et al. 2003), each (P, P)."""
-    p, n = points.double().numpy(), directions.double().numpy()
+    p = points.double().numpy()
+    n = directions.double().numpy()
     features = np.zeros((3, len(p), len(p)))
     for i in range(len(p)):
         for j in range(len(p)):

@@ -34,7 +34,8 @@ def main() -> None:
         subprocess.run(
             [sys.executable, "-m", "build", "--outdir", folder / "dist", PROJECT], check=True
         )
-        (wheel,), (source,) = (folder / "dist").glob("*.whl"), (folder / "dist").glob("*.tar.gz")
+        (wheel,) = (folder / "dist").glob("*.whl")
+        (source,) = (folder / "dist").glob("*.tar.gz")
         # Lightning needs a setuptools that still has pkg_resources in its lowest versions
         pins = {"lowest": [*lowest(project["dependencies"]), "setuptools<81"], "newest": []}
         for (which, constraints), archive in zip(pins.items(), (wheel, source), strict=True):

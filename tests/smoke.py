@@ -50,7 +50,8 @@ with tempfile.TemporaryDirectory() as name:
     assert mended.notes
     assert np.isclose(mended.volume, 3.6, rtol=0.01)
     options = ["--cache_dir", str(folder / "cache"), "--n_workers", "1"]
-    boxes, out = str(folder / "boxes"), folder / "out"
+    boxes = str(folder / "boxes")
+    out = folder / "out"
     for words in (
         ["retrieve", boxes, "--out", str(out), "--report"],
         ["query", str(folder / "torn.ply"), "--gallery", boxes, "--top", "1"],
@@ -59,7 +60,8 @@ with tempfile.TemporaryDirectory() as name:
         main()
     assert (out / "report.html").stat().st_size > 100_000
     with np.load(out / "distances.npz") as archive:  # by pretrained
-        distances, labels = archive["distances"], archive["labels"]
+        distances = archive["distances"]
+        labels = archive["labels"]
     assert igps.retrieval_scores(torch.from_numpy(distances), labels.tolist()).mean()["nn"] == 1
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     for number, example in enumerate(

@@ -31,7 +31,8 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     if "ERROR Missing dependencies" in done.stdout + done.stderr:
         pytest.skip("needs the build backend that pyproject.toml asks for")
     assert done.returncode == 0, done.stdout + done.stderr
-    (wheel,), (source,) = out.glob("*.whl"), out.glob("*.tar.gz")
+    (wheel,) = out.glob("*.whl")
+    (source,) = out.glob("*.tar.gz")
     return wheel, source
 
 

@@ -70,7 +70,8 @@ def program(page: str, folder: Path) -> tuple[str, str]:
 
     Output that a page shows, in a text block after the code, must be printed next.
     """
-    code, expected = [], []
+    code = []
+    expected = []
     for i, block in enumerate(blocks(page)):
         if block.language == "python" and block.title:
             (folder / block.title).write_text(block.text)
@@ -84,7 +85,8 @@ def program(page: str, folder: Path) -> tuple[str, str]:
 
 def first_tier(distances: np.ndarray, labels: list[str]) -> tuple[float, float]:
     """NN and FT by hand: of each query, is the nearest of its class, and what share of its class is among as many."""
-    nearest, tiers = [], []
+    nearest = []
+    tiers = []
     for i, row in enumerate(distances):
         others = [j for j in np.argsort(row, kind="stable") if j != i]
         relevant = [labels[j] == labels[i] for j in others]
@@ -159,7 +161,9 @@ def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path: Path) -> None:
         tmp_path, "-m", "igps.cli", "retrieve", "shapes", "--descriptor", "mine:Roundness", *options
     )
     with np.load(tmp_path / "out" / "distances.npz") as archive:
-        distances, names, labels = archive["distances"], archive["names"], archive["labels"]
+        distances = archive["distances"]
+        names = archive["names"]
+        labels = archive["labels"]
     bodies = [trimesh.load(tmp_path / "shapes" / name) for name in names]
     roundness = np.array([abs(body.volume) / body.area**1.5 for body in bodies])
     expected = np.abs(roundness[:, None] - roundness)
@@ -190,7 +194,8 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page: str, tmp_p
 
 def check_retrieval(printed: str, folder: Path) -> None:
     dataset = SignatureDataset(folder / "shapes", cache_dir=folder / "cache")
-    cells, labels = histograms_by_loops(dataset), list(dataset.bodies.labels or ())
+    cells = histograms_by_loops(dataset)
+    labels = list(dataset.bodies.labels or ())
     distances = np.array(
         [[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells]
     )
@@ -268,7 +273,8 @@ def shell_lines(page: str) -> list[str]:
 
 def known_command(words: list[str]) -> list[str]:
     """The command of `igps` that words begin with, in one or two words."""
-    commands, found = COMMANDS, []
+    commands = COMMANDS
+    found = []
     for word in words:
         if callable(commands) or word not in commands:
             break

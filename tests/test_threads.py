@@ -164,7 +164,8 @@ def test_threads_that_overlap_leave_each_other_as_they_were() -> None:
 def test_the_last_context_lifts_a_limit_set_by_another_thread() -> None:
     """Two overlapping contexts: the settings are restored when the later one ends, whichever thread made the limit."""
     before = settings()
-    entered, left = threading.Event(), threading.Event()
+    entered = threading.Event()
+    left = threading.Event()
 
     def other() -> None:
         with one_thread():
@@ -185,7 +186,8 @@ def test_no_thread_is_needed_where_the_system_starts_no_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As in a container with a limit."""
-    before, refused = settings(), []
+    before = settings()
+    refused = []
 
     def refuse(*_: object) -> None:
         refused.append(1)
@@ -435,7 +437,8 @@ def test_the_calling_thread_works_in_its_team(many_cores: None) -> None:
 
 
 def test_a_blocked_thread_of_a_team_does_not_delay_other_callers() -> None:
-    released, held = threading.Event(), threading.Barrier(3, timeout=20)
+    released = threading.Event()
+    held = threading.Barrier(3, timeout=20)
     ended_jobs: list[int] = []
 
     def hold(number: int) -> None:

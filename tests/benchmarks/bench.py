@@ -109,7 +109,8 @@ class Machine:
 
     def steal(self) -> float:
         """Share of the processor time that other virtual machines took."""
-        (total, stolen), (total_now, stolen_now) = self._start, self._ticks()
+        total, stolen = self._start
+        total_now, stolen_now = self._ticks()
         return (stolen_now - stolen) / (total_now - total) if total_now > total else float("nan")
 
     @staticmethod
@@ -147,7 +148,8 @@ def model(data: Path | None, n_vertices: int, subdivisions: int = 0) -> Mesh:
     else:
         shape = igps.ArticulatedShapes(n_classes=2, n_per_class=1, n_vertices=start)[1]
         mesh = Mesh(shape.vertices, shape.faces, name=shape.name)
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    vertices = np.asarray(mesh.vertices)
+    faces = np.asarray(mesh.faces)
     for _ in range(subdivisions):
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)
     return Mesh(vertices, faces, name=mesh.name)
@@ -190,7 +192,8 @@ def eigen_against_lapy(data: Path | None) -> Figure:
     from lapy import Solver, TriaMesh
 
     mesh = model(data, 11_000)
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    vertices = np.array(mesh.vertices)
+    faces = np.array(mesh.faces)
 
     def ours() -> None:
         stiffness, mass = laplacian(mesh)
@@ -208,7 +211,8 @@ def eigen_against_robust(data: Path | None) -> Figure:
     import robust_laplacian
 
     mesh = model(data, 11_000)
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    vertices = np.array(mesh.vertices)
+    faces = np.array(mesh.faces)
 
     def ours() -> None:
         stiffness, mass = laplacian(mesh, "robust")
@@ -248,7 +252,8 @@ def voxels_128(data: Path | None) -> Figure:
     axes = grid_axes(mesh, 128)
     count = int(np.prod([len(axis) for axis in axes]))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)[:: count // 2000]
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    vertices = np.array(mesh.vertices)
+    faces = np.array(mesh.faces)
     seconds, sample = timed(
         lambda: inside_grid(mesh, axes), lambda: igl.winding_number(vertices, faces, points)
     )
@@ -264,7 +269,8 @@ def winding_25k_exact(data: Path | None) -> Figure:
 
     mesh = model(data, 25_273)
     points = interior_samples(mesh)
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    vertices = np.array(mesh.vertices)
+    faces = np.array(mesh.faces)
     return against(
         "libigl winding number",
         lambda: winding_number(mesh.vertices, mesh.faces, points),
@@ -297,7 +303,8 @@ def histogram_pairs(data: Path | None) -> Figure:
 def histogram_backward(data: Path | None) -> Figure:
     embedding = torch.randn(4096, K, generator=torch.Generator().manual_seed(0)) * 0.06
     potential = embedding.norm(dim=1)
-    classes, bins = Potential(4, learnable=True), InteriorDistance(64, learnable=True)
+    classes = Potential(4, learnable=True)
+    bins = InteriorDistance(64, learnable=True)
     upstream = torch.randn(10, 64, generator=torch.Generator().manual_seed(1))
     centres = torch.linspace(0.03, 3.97, 64, requires_grad=True)
     small = embedding[:1024]
@@ -351,7 +358,8 @@ def oriented_pairs(data: Path | None) -> Figure:
     distances = axes.euclidean_distances(points, interval_centres(6, 1.0, "bins"))
     cosines = interval_centres(5, 2.0, "bins") - 1
     oriented = axes.oriented_pairs(points, directions, cosines, cosines)
-    x, n = points.double().numpy(), directions.double().numpy()
+    x = points.double().numpy()
+    n = directions.double().numpy()
     i, j = np.triu_indices(1000, 1)
 
     def ours() -> None:
@@ -469,10 +477,8 @@ def together(data: Path | None) -> dict[str, Figure]:
         bodies = signatures.to_memory(
             FewerSamples(n_interior=n_samples, n_surface=n_samples, seed=0)
         )
-        batch, single_bodies = (
-            bodies.batch(range(len(bodies))),
-            [bodies.batch([i]) for i in range(len(bodies))],
-        )
+        batch = bodies.batch(range(len(bodies)))
+        single_bodies = [bodies.batch([i]) for i in range(len(bodies))]
         for name in ("interior", "pretrained"):
             descriptor = igps.descriptor(name)
 
@@ -670,7 +676,8 @@ def worker(data: Path | None, environment: dict[str, str]) -> Iterator[Callable[
     )
     assert process.stdin is not None
     assert process.stdout is not None
-    write, read = process.stdin, process.stdout
+    write = process.stdin
+    read = process.stdout
 
     def run(task: str) -> float:
         print(task, file=write, flush=True)
@@ -809,7 +816,8 @@ def least_disturbed(name: str, data: Path | None) -> dict[str, dict[str, float |
         spread = max((row["spread"] for row in rows.values()), default=0.0)
         disturbance = max(spread / SPREAD, steal / STEAL)
         if disturbance < min_disturbance or not best:
-            min_disturbance, best = disturbance, rows
+            min_disturbance = disturbance
+            best = rows
             for row in best.values():
                 row.update(load=machine.load(), steal=steal)
         for row in best.values():

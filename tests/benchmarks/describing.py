@@ -61,10 +61,8 @@ def main() -> None:
     signature = load(Path(sys.argv[1]))
     torch.set_num_threads(1)
     if importlib.util.find_spec("igps.descriptors") is not None:
-        make, collate = (
-            importlib.import_module("igps").descriptor,
-            importlib.import_module("igps").collate,
-        )
+        make = importlib.import_module("igps").descriptor
+        collate = importlib.import_module("igps").collate
     else:
         presets = importlib.import_module("igps.nn.presets")
         collate = importlib.import_module("igps.data.dataset").collate

@@ -48,7 +48,8 @@ def families(n_rows: int) -> np.ndarray:
 
 def batch(start: int, n_rows: int, noise: float) -> tuple[torch.Tensor, list[dict[str, Any]]]:
     """Vectors and rows of the table from a position on. Each family has the same share of every batch."""
-    generator, centres = np.random.default_rng([1, start]), families(n_rows)
+    generator = np.random.default_rng([1, start])
+    centres = families(n_rows)
     family = np.arange(start, start + BATCH) % len(centres)
     vectors = members(centres[family], noise, generator)
     area, volume = generator.random((2, BATCH))
@@ -121,10 +122,8 @@ def main() -> None:
             f"built in {time.monotonic() - start:.0f} s, {size / 2**30:.2f} GiB, {memory()}",
             flush=True,
         )
-    table, vectors = (
-        BodyTable(arguments.folder),
-        queries(arguments.n_queries, arguments.n, arguments.noise),
-    )
+    table = BodyTable(arguments.folder)
+    vectors = queries(arguments.n_queries, arguments.n, arguments.noise)
     answers: dict[str, list[list[int]]] = {}
     seconds: dict[str, list[float]] = {}
     for name, where in CONDITIONS.items():

@@ -115,12 +115,14 @@ def _judge_bodies(
         low, high = bounds.get(part, (0.0, np.inf))
         if wanted is not None:
             error = EXACT if given.kind != "volume" else VOLUME
-            low, high = wanted * (1 - error), wanted * (1 + error)
+            low = wanted * (1 - error)
+            high = wanted * (1 + error)
         if not low <= surface.volume <= high:
             return Verdict(
                 "wrong", f"{part}: volume {surface.volume}, between {low} and {high} expected"
             )
-    kind, n_confirmed = "refused" if refusals else "confirmed", len(bodies) - len(refusals)
+    kind = "refused" if refusals else "confirmed"
+    n_confirmed = len(bodies) - len(refusals)
     return Verdict(kind, "; ".join(refusals), ("bodies",) * n_confirmed)
 
 
@@ -131,7 +133,8 @@ def _bounds(path: Path) -> dict[str, tuple[float, float]]:
     """
     if path.name.endswith(("nii", "gz", "mgz")):
         image: Any = nibabel.load(path)
-        values, affine = np.asanyarray(image.dataobj).squeeze(), np.array(image.affine)
+        values = np.asanyarray(image.dataobj).squeeze()
+        affine = np.array(image.affine)
         scale = {"meter": 1e3, "micron": 1e-3}
         cell = abs(np.linalg.det(affine[:3, :3]))
         if path.name.endswith(("nii", "nii.gz")):
@@ -149,7 +152,8 @@ def _bounds(path: Path) -> dict[str, tuple[float, float]]:
         mask = values == value
         label, n_components = ndimage.label(mask, np.ones((3, 3, 3)))
         sizes = np.bincount(label.ravel())[1:] if n_components else np.zeros(1)
-        low, high = sizes[sizes >= 0.02 * sizes.sum()].sum(), ndimage.binary_fill_holes(mask).sum()
+        low = sizes[sizes >= 0.02 * sizes.sum()].sum()
+        high = ndimage.binary_fill_holes(mask).sum()
         # Joining components that share a corner adds voxels.
         bounds[str(int(value))] = (cell * low * (1 - VOLUME), cell * high * 1.05)
     return bounds

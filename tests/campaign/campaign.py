@@ -43,7 +43,8 @@ _STAGES = (
 
 def _run(part: str, amount: int) -> list[Row]:
     run: Callable[..., list[Row]] = importlib.import_module(part).campaign
-    start, before = time.monotonic(), os.times()
+    start = time.monotonic()
+    before = os.times()
     rows = run(amount) if amount else run()
     processors = sum(os.times()[:4]) - sum(before[:4])
     print(

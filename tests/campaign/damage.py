@@ -192,7 +192,8 @@ def _ply(
             + ("\n".join([*points, *(f"3 {a} {b} {c}" for a, b, c in faces)]) + "\n").encode()
         )
     corners = np.empty(len(faces), dtype=[("n", "u1"), ("corners", "<i4", 3)])
-    corners["n"], corners["corners"] = 3, faces
+    corners["n"] = 3
+    corners["corners"] = faces
     return header + np.asarray(vertices, "<f8").tobytes() + corners.tobytes()
 
 

@@ -137,10 +137,13 @@ def _succeeds(pid: int) -> bool:
 
 def campaign(n_kills: int) -> list[Row]:
     """Kill both writers of a round, one after the other, while they add, remove and update rows."""
-    start, missed = time.monotonic(), list[str]()
+    start = time.monotonic()
+    missed = list[str]()
     n_killed = n_changes = n_rounds = 0
     with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
-        path, rows, numbers = Path(folder) / "gallery.igps", [Rows(), Rows()], [0, 0]
+        path = Path(folder) / "gallery.igps"
+        rows = [Rows(), Rows()]
+        numbers = [0, 0]
         if not _succeeds(_fork(_create, path)):
             raise RuntimeError("the gallery could not be made")
         while n_killed < n_kills and not missed:
@@ -162,7 +165,8 @@ def campaign(n_kills: int) -> list[Row]:
                     n_killed += 1
                 else:
                     missed.append(f"round {n_rounds}: writer {writer} ended by itself")
-            out, actual = Path(folder) / "rows", None
+            out = Path(folder) / "rows"
+            actual = None
             if _succeeds(_fork(_read, path, out)):
                 actual, are_nearest = pickle.loads(out.read_bytes())
                 if not are_nearest:

@@ -60,11 +60,9 @@ class _Run:
     """A run with a separate cache and output folder."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        self.shapes, self.cache, self.out = (
-            folder / "shapes",
-            folder / "caches" / name,
-            folder / "out" / name,
-        )
+        self.shapes = folder / "shapes"
+        self.cache = folder / "caches" / name
+        self.out = folder / "out" / name
 
     def command(self, n_workers: int, out: Path | None = None) -> Command:
         return Command(self.shapes, self.cache, out or self.out, n_workers)

@@ -99,7 +99,8 @@ def _read_only(place: Path, expected: Expected) -> tuple[list[str], str]:
 
 def _another_user(place: Path, expected: Expected) -> tuple[list[str], str]:
     """A folder without write permission. Root, which may write everywhere, gives up this capability first."""
-    cache, out = place / "cache", place / "out"
+    cache = place / "cache"
+    out = place / "out"
     cache.mkdir()
     out.mkdir(mode=0o777)
     os.chmod(out, 0o777)

@@ -288,7 +288,8 @@ def _multiplet(describer: Describer, data: st.DataObject) -> Pair:
     signature = describer.signatures[number]
     n_eigenpairs = len(signature.eigenvalues)
     # No descriptor splits one of these multiplets: they use the first 4, 8, 12, 16, 50 and 250 eigenpairs.
-    first, size = int(generator.choice([0, 5, 9, 13, 20, 60, 150])), int(generator.choice([2, 3]))
+    first = int(generator.choice([0, 5, 9, 13, 20, 60, 150]))
+    size = int(generator.choice([2, 3]))
     values = signature.eigenvalues.copy()
     values[first : first + size] = values[first : first + size].mean()
     basis = np.eye(n_eigenpairs)
@@ -418,7 +419,8 @@ def _row(describer: Describer, prop: str, changes: tuple[Change, ...], n_example
         suppress_health_check=list(HealthCheck),
     )(run)
     run()
-    missed, notes = [], []
+    missed = []
+    notes = []
     for name, movement in largest.items():
         limit = bound(prop, name)
         if movement > limit.percent:

@@ -143,7 +143,8 @@ def _check_motion(mesh, signature, histograms, config, check) -> None:  # type: 
     moved_mesh = replace(mesh, vertices=centred @ turn.T + shift)
     moved = compute_signature(moved_mesh, config)
     for name in ("area", "volume"):
-        before, after = getattr(signature, name), getattr(moved, name)
+        before = getattr(signature, name)
+        after = getattr(moved, name)
         check(f"{name} moved", _close(before, after, 1e-6), f"{before!r} and {after!r}")
     error = np.abs(moved.eigenvalues / signature.eigenvalues - 1).max()
     # The cotangents of thin faces are differences of squares, whose rounding errors change with a shift.
@@ -252,7 +253,8 @@ def eigenpairs(
             symmetric, n_eigenpairs + 1, sigma=-0.1 / mass.sum(), v0=start
         )
         order = np.argsort(values)[1:]
-        values, vectors = values[order], vectors[:, order]
+        values = values[order]
+        vectors = vectors[:, order]
     return values, root @ vectors
 
 
@@ -269,7 +271,8 @@ def mean_values(
         angles = 2 * np.arcsin(np.clip(sides / 2, 0, 1))
         half = angles.sum(axis=1, keepdims=True) / 2
         sines = np.sin(angles)
-        sine_after, sine_before = np.roll(sines, -1, axis=1), np.roll(sines, -2, axis=1)
+        sine_after = np.roll(sines, -1, axis=1)
+        sine_before = np.roll(sines, -2, axis=1)
         cosines = 2 * np.sin(half) * np.sin(half - angles) / (sine_after * sine_before) - 1
         signed_sines = np.sign(np.linalg.det(u))[:, None] * np.sqrt(
             np.clip(1 - cosines**2, 0, None)
@@ -291,7 +294,8 @@ def _samples_confirmed(
     mesh: Mesh, signature: Signature, vertices: Floats, faces: NDArray[np.int64], resolution: int
 ) -> tuple[bool, str]:
     """Whether the samples are the cell centres of winding number above one half, except for centres on the surface."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
     cell = (high - low).max() / resolution
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1).astype(int)
     axes = [
@@ -301,10 +305,8 @@ def _samples_confirmed(
     winding = igl.winding_number(vertices, faces, grid)
     squared, *_ = igl.point_mesh_squared_distance(grid, vertices, faces)
     is_off_surface = np.sqrt(squared) > 1e-6 * cell
-    certain, possible = (
-        grid[(winding > 0.5) & is_off_surface],
-        grid[(winding > 0.5) | ~is_off_surface],
-    )
+    certain = grid[(winding > 0.5) & is_off_surface]
+    possible = grid[(winding > 0.5) | ~is_off_surface]
     scale = np.abs(mesh.vertices - _centre(mesh)).max()
     points = (signature.interior.points - _centre(mesh)) / scale
 
@@ -314,7 +316,8 @@ def _samples_confirmed(
             for index in np.rint((centres - [axis[0] for axis in axes]) / cell).astype(int)
         }
 
-    missing, outside = cells(certain) - cells(points), cells(points) - cells(possible)
+    missing = cells(certain) - cells(points)
+    outside = cells(points) - cells(possible)
     return (
         not missing and not outside,
         f"{len(missing)} missing, {len(outside)} not inside, of {len(points)}",

@@ -112,9 +112,11 @@ def test_a_diffusion_net_reads_the_spectrum_of_a_surface() -> None:
         torch.from_numpy(np.asarray(one)).float()
         for one in (spectrum.eigenvalues, spectrum.eigenfunctions, mass)
     )
-    block, x = DiffusionBlock(3), torch.from_numpy(np.array(mesh.vertices)).float()
+    block = DiffusionBlock(3)
+    x = torch.from_numpy(np.array(mesh.vertices)).float()
     found = block.diffused(x, eigenvalues, functions, weights).detach().numpy()
-    time, n_steps = float(block.log_time[0].detach().exp()), 400
+    time = float(block.log_time[0].detach().exp())
+    n_steps = 400
     step = scipy.sparse.linalg.factorized(
         (scipy.sparse.diags(mass) + time / n_steps * stiffness).tocsc()
     )
@@ -124,8 +126,10 @@ def test_a_diffusion_net_reads_the_spectrum_of_a_surface() -> None:
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
     torch.manual_seed(0)
-    block, target = DiffusionBlock(3), x.norm(dim=1, keepdim=True).expand(-1, 3)
-    optimizer, losses = torch.optim.Adam(block.parameters(), lr=0.01), []
+    block = DiffusionBlock(3)
+    target = x.norm(dim=1, keepdim=True).expand(-1, 3)
+    optimizer = torch.optim.Adam(block.parameters(), lr=0.01)
+    losses = []
     for _ in range(100):
         loss = (block(x, eigenvalues, functions, weights) - target).square().mean()
         optimizer.zero_grad()
@@ -172,10 +176,8 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
         igps.describe(dataset, descriptor).flatten(1), dataset.labels
     )
     distance = AsTheirs(head.distances)
-    miner, loss = (
-        BatchHardMiner(distance=distance),
-        TripletMarginLoss(margin=0.2, distance=distance),
-    )
+    miner = BatchHardMiner(distance=distance)
+    loss = TripletMarginLoss(margin=0.2, distance=distance)
     head(torch.ones(1, descriptor.n_features))
     optimizer = torch.optim.Adam([*descriptor.parameters(), *head.parameters()], lr=0.01)
     sampler = MPerClassSampler(dataset.labels, m=4, batch_size=8, length_before_new_iter=160)
@@ -209,7 +211,8 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     assert tested["precision_at_1_level0"] == pytest.approx(ours)
 
     layer = nn.Linear(plain.n_features, 4)
-    before, models = layer.weight.detach().clone(), {"trunk": trunk, "embedder": layer}
+    before = layer.weight.detach().clone()
+    models = {"trunk": trunk, "embedder": layer}
     optimizers = {"embedder_optimizer": torch.optim.Adam(layer.parameters(), lr=0.01)}
     MetricLossOnly(
         models,

@@ -12,10 +12,8 @@ from igps.mesh.formats.molecules import Molecule
 
 
 def molecule(positions: ArrayLike, radii: ArrayLike) -> Molecule:
-    positions, radii = (
-        np.atleast_2d(np.asarray(positions, dtype=float)),
-        np.atleast_1d(np.asarray(radii, dtype=float)),
-    )
+    positions = np.atleast_2d(np.asarray(positions, dtype=float))
+    radii = np.atleast_1d(np.asarray(radii, dtype=float))
     n = len(radii)
     names = tuple("X" * n)
     return Molecule(
@@ -48,10 +46,12 @@ def saddle(r: float, s: float, apart: float, probe: float) -> tuple[float, float
         Its area; the volume within, between the circles in which it leaves the balls; how far these circles lie from
         the balls' centres, towards the other ball. Where the torus crosses itself, two pieces end in a cusp each.
     """
-    a, b = r + probe, s + probe
+    a = r + probe
+    b = s + probe
     x = (apart**2 + a**2 - b**2) / (2 * apart)
     radius = math.sqrt(a**2 - x**2)
-    from_first, from_second = x * r / a, (apart - x) * s / b
+    from_first = x * r / a
+    from_second = (apart - x) * s / b
     ends = -math.asin((x - from_first) / probe), math.asin((apart - x - from_second) / probe)
     cusp = math.acos(radius / probe) if radius < probe else 0.0
     area = volume = 0.0
@@ -76,5 +76,6 @@ def excluded_of_two(r: float, s: float, apart: float, probe: float) -> tuple[flo
 def excluded_of_ring(n: int, r: float, apart: float, probe: float) -> tuple[float, float]:
     """The same of n balls in a ring, each of which the probe touches with its neighbours alone."""
     area, volume, x, _ = saddle(r, r, apart, probe)
-    whole, off = ball(r), cap(r, r - x)
+    whole = ball(r)
+    off = cap(r, r - x)
     return n * (area + whole[0] - 2 * off[0]), n * (volume + whole[1] - 2 * off[1])

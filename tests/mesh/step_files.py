@@ -88,11 +88,14 @@ def _box(add: _Lines, low: tuple[float, float, float], high: tuple[float, float,
             )
     faces = []
     for axis, side in itertools.product(range(3), (0, 1)):
-        u, v = (axis + 1) % 3, (axis + 2) % 3
+        u = (axis + 1) % 3
+        v = (axis + 2) % 3
         ring = []
         for a, b in ((0, 0), (1, 0), (1, 1), (0, 1)) if side else ((0, 0), (0, 1), (1, 1), (1, 0)):
             bits = [0, 0, 0]
-            bits[axis], bits[u], bits[v] = side, a, b
+            bits[axis] = side
+            bits[u] = a
+            bits[v] = b
             ring.append(tuple(bits))
         oriented = []
         for start, end in zip(ring, ring[1:] + ring[:1], strict=True):

@@ -15,7 +15,8 @@ from igps.mesh.loading import each_body, list_bodies, load_bodies, load_mesh, re
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
-OBJECTS, PIECES = LoadOptions(bodies="objects"), LoadOptions(bodies="pieces")
+OBJECTS = LoadOptions(bodies="objects")
+PIECES = LoadOptions(bodies="pieces")
 CORNERS = "".join(
     f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
 )
@@ -113,7 +114,8 @@ def test_places_in_a_scene_are_bodies(tmp_path: Path) -> None:
 
 
 def test_objects_of_an_obj_file_are_bodies_and_without_them_its_groups(tmp_path: Path) -> None:
-    first, second = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 1, 2))
+    first = trimesh.creation.box((1, 1, 1))
+    second = trimesh.creation.box((1, 1, 2))
     text = ""
     for mark, surface in (("o größe", first), ("o same", second), ("o same", second)):
         text += f"{mark}\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in surface.vertices)
@@ -219,7 +221,8 @@ def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path
         nibabel.Nifti1Image(labels, np.diag([1.0, 1.0, 2.0, 1.0])), tmp_path / "organs.nii.gz"
     )
     (tmp_path / "names.csv").write_text("label,name\n1,left\n5,right\n9,speck\n")
-    path, options = tmp_path / "organs.nii.gz", LoadOptions(names=str(tmp_path / "names.csv"))
+    path = tmp_path / "organs.nii.gz"
+    options = LoadOptions(names=str(tmp_path / "names.csv"))
     assert parts(path, options) == ["left", "right", "speck"]
     outcomes = {ref.part: body for ref, body in each_body(path, options)}
     assert isinstance(outcomes["speck"], MeshError)

@@ -172,7 +172,8 @@ def test_a_cavity_behind_a_wall_with_gaps_is_noted() -> None:
     """As of a wall thinner than a voxel. A closed wall, and a cup, get no note."""
     offset = np.indices((40, 40, 40)) - 19.7
     radius = np.linalg.norm(offset, axis=0)
-    thin, closed = np.abs(radius - 14) < 0.45, np.abs(radius - 14) < 0.75
+    thin = np.abs(radius - 14) < 0.45
+    closed = np.abs(radius - 14) < 0.75
     assert ndimage.label(np.pad(~thin, 1, constant_values=True))[1] == 1  # the cavity is open
     assert [
         ("gaps of up to two voxels" in note) for note in voxel_surface(thin, cavities=True)[2]
@@ -225,7 +226,8 @@ def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path: Path) -> None:
 def test_a_piece_of_a_label_in_its_cavity_is_told() -> None:
     """A seed in its shell was left out without a word."""
     radius = np.linalg.norm(np.indices((41, 41, 41)) - 20.0, axis=0)
-    shell, seed = (radius > 14) & (radius < 18), radius < 8
+    shell = (radius > 14) & (radius < 18)
+    seed = radius < 8
     vertices, faces, notes = voxel_surface(shell | seed, cavities=True)
     assert Mesh(vertices, faces, cavities=True).volume == pytest.approx(
         np.count_nonzero(shell), rel=1e-3

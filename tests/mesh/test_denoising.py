@@ -64,7 +64,8 @@ def test_area_and_volume_come_back(sphere: Mesh) -> None:
 def test_passes_follow_the_noise(ratio: float, subdivisions: int) -> None:
     """The area, volume and normals of the clean ball come back from noise of several strengths."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
-    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    vertices = np.asarray(ball.vertices)
+    faces = np.asarray(ball.faces)
     noise_length = ratio * np.sqrt((ball.edges_unique_length**2).mean())
     lengths = np.random.default_rng(0).normal(0, noise_length, len(vertices))
     noisy = vertices * (1 + lengths)[:, None]
@@ -87,7 +88,8 @@ def test_passes_follow_the_noise(ratio: float, subdivisions: int) -> None:
 def test_turned_parts_of_thin_triangles_come_back(steps: int, sections: int) -> None:
     """Rims of many corners, far apart: noise as wide as a triangle crumples them. The clean part is the oracle."""
     random = np.random.default_rng(steps)
-    ends, radii = np.cumsum(random.uniform(0.2, 1, steps)), random.uniform(0.15, 0.5, steps)
+    ends = np.cumsum(random.uniform(0.2, 1, steps))
+    radii = random.uniform(0.15, 0.5, steps)
     corners = [(r, z) for k, r in enumerate(radii) for z in (ends[k - 1] if k else 0, ends[k])]
     profile = [(0, 0), *corners, (0, ends[-1])]
     turned = trimesh.creation.revolve(np.array(profile), sections=sections)

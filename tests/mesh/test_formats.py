@@ -105,7 +105,8 @@ def vtp(form: str) -> bytes:
         "offsets": np.arange(3, 3 * len(FACES) + 1, 3, dtype="<i8"),
     }
     kinds = {"points": "Float32", "connectivity": "Int64", "offsets": "Int64"}
-    appended, written = b"", {}
+    appended = b""
+    written = {}
     for name, array in arrays.items():
         text = " ".join(map(repr, array.ravel().tolist())) if form == "ascii" else ""
         where = "ascii" if form == "ascii" else f'appended" offset="{len(appended)}'
@@ -201,7 +202,8 @@ UNITS = {".glb": "m", ".3mf": "mm", ".gii": "mm", ".pial": "mm"}
 
 
 def numbers(signature: Signature) -> bytes:
-    inside, outside = signature.interior, signature.surface
+    inside = signature.interior
+    outside = signature.surface
     arrays = (
         signature.eigenvalues,
         inside.points,
@@ -456,10 +458,8 @@ def ply_of(vertices: np.ndarray, faces: list[list[int]], order: str = "") -> byt
 def polygon_files() -> dict[str, bytes]:
     vertices, faces = bracket()
     places = "".join(" ".join(map(str, row)) + "\n" for row in vertices.tolist())
-    size, offsets = (
-        sum(len(row) + 1 for row in faces),
-        " ".join(map(str, np.cumsum([len(row) for row in faces]))),
-    )
+    size = sum(len(row) + 1 for row in faces)
+    offsets = " ".join(map(str, np.cumsum([len(row) for row in faces])))
     arrays = (
         f'<Points><DataArray type="Float64" NumberOfComponents="3" format="ascii">{places}</DataArray></Points><Polys>'
         f'<DataArray type="Int64" Name="connectivity" format="ascii">{text_of(faces, False)}</DataArray>'
@@ -512,7 +512,8 @@ def test_triangles_and_squares_are_what_trimesh_makes_of_them(
             ply_of(vertices, faces, order)
         )
     for path in tmp_path.iterdir():
-        found, expected = load_mesh(path), trimesh.load(path, process=False)
+        found = load_mesh(path)
+        expected = trimesh.load(path, process=False)
         np.testing.assert_array_equal(found.vertices, expected.vertices)
         np.testing.assert_array_equal(found.faces, expected.faces)
 

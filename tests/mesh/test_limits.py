@@ -107,7 +107,8 @@ def group(folder: Path, version: int, most: object, used: int, cached: int) -> N
 
 
 def test_the_groups_around_a_process_bound_its_memory(tmp_path: Path) -> None:
-    own, root = tmp_path / "own", tmp_path / "groups"
+    own = tmp_path / "own"
+    root = tmp_path / "groups"
     own.write_text("0::/job/step\n")
     assert limits._memory_in_groups(root, own) is None
     group(root / "job" / "step", 2, "max", 300, 0)
@@ -119,7 +120,8 @@ def test_the_groups_around_a_process_bound_its_memory(tmp_path: Path) -> None:
 
 
 def test_a_container_has_its_group_as_the_root(tmp_path: Path) -> None:
-    own, root = tmp_path / "own", tmp_path / "groups"
+    own = tmp_path / "own"
+    root = tmp_path / "groups"
     own.write_text("9:name=systemd:/\n4:cpu,memory:/docker/0815\n")
     group(root / "memory", 1, 2000, 1500, 100)
     assert limits._memory_in_groups(root, own) == 600

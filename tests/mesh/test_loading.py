@@ -118,7 +118,8 @@ def test_polygons_with_corners_turned_inwards_do_not_fold(start: int, tmp_path: 
     x, y = np.roll(radius * (np.cos(angle), np.sin(angle)), start, axis=1)
     area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
     around = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
-    n, rings = len(x), [np.column_stack([x, y, np.full(len(x), z)]) for z in (0, 2)]
+    n = len(x)
+    rings = [np.column_stack([x, y, np.full(len(x), z)]) for z in (0, 2)]
     faces = [range(n, 0, -1), range(n + 1, 2 * n + 1)]
     faces += [(i + 1, (i + 1) % n + 1, (i + 1) % n + n + 1, i + n + 1) for i in range(n)]
     lines = [f"v {a!r} {b!r} {c!r}" for a, b, c in np.concatenate(rings).tolist()]
@@ -279,7 +280,8 @@ def test_loose_triangles_need_and_get_welding(tmp_path: Path, away: float) -> No
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_each_fault_is_mended_at_any_scale(tmp_path: Path, scale: float) -> None:
     surface = trimesh.creation.icosphere(subdivisions=2)
-    vertices, faces = np.asarray(surface.vertices), np.asarray(surface.faces)
+    vertices = np.asarray(surface.vertices)
+    faces = np.asarray(surface.faces)
     faulty = faces.copy()
     faulty[::3] = faulty[::3, ::-1]
     faulty[5, 0] = len(vertices)
@@ -297,7 +299,8 @@ def test_each_fault_is_mended_at_any_scale(tmp_path: Path, scale: float) -> None
 
 
 def test_largest_component_is_that_of_the_largest_area(tmp_path: Path) -> None:
-    fine, large = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.box((5, 5, 5))
+    fine = trimesh.creation.icosphere(subdivisions=3)
+    large = trimesh.creation.box((5, 5, 5))
     vertices = np.vstack([fine.vertices + 20, large.vertices])
     faces = np.vstack([fine.faces, large.faces + len(fine.vertices)])
     path = write_off(tmp_path / "two.off", vertices, faces)
@@ -320,7 +323,8 @@ def test_open_files_are_read_when_allowed(tmp_path: Path) -> None:
 def test_the_largest_component_of_loose_triangles_is_what_they_make_together(
     tmp_path: Path,
 ) -> None:
-    small, large = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 2, 3))
+    small = trimesh.creation.box((1, 1, 1))
+    large = trimesh.creation.box((1, 2, 3))
     beside = trimesh.creation.box((1, 1, 1)).apply_translation(
         [0, 1.5, 0]
     )  # it touches the large one
@@ -353,7 +357,8 @@ def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(
     rows = np.asarray(surface.vertices) * [1, 0.8, 1.3]
     names = ["x", "y", "z"]
     if normals:
-        rows, names = np.hstack([rows, surface.vertex_normals]), [*names, "nx", "ny", "nz"]
+        rows = np.hstack([rows, surface.vertex_normals])
+        names = [*names, "nx", "ny", "nz"]
     header = [
         "ply",
         "format ascii 1.0",
@@ -375,7 +380,8 @@ def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(
 def test_a_body_is_left_as_it_is_bit_for_bit(tmp_path: Path) -> None:
     surface = trimesh.creation.icosphere(subdivisions=3)
     path = write_off(tmp_path / "body.off", surface.vertices, surface.faces)
-    mended, untouched = load_mesh(path), load_mesh(path, LoadOptions("never"))
+    mended = load_mesh(path)
+    untouched = load_mesh(path, LoadOptions("never"))
     np.testing.assert_array_equal(mended.vertices, untouched.vertices)
     np.testing.assert_array_equal(mended.faces, untouched.faces)
     assert mended.notes == ()

@@ -135,10 +135,8 @@ def test_a_cup_is_not_filled() -> None:
 
 
 def test_a_part_that_sticks_out_is_not_hidden() -> None:
-    surface, knob = (
-        trimesh.creation.icosphere(subdivisions=3),
-        trimesh.creation.icosphere(subdivisions=2, radius=0.3),
-    )
+    surface = trimesh.creation.icosphere(subdivisions=3)
+    knob = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
     knob.apply_translation([1, 0, 0])
     whole = trimesh.util.concatenate([surface, knob])
     mesh = mend(np.asarray(whole.vertices), np.asarray(whole.faces))
@@ -222,7 +220,8 @@ def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertig
 
 def coil(turns: float, pitch: float, radius: float = 0.2) -> Mesh:
     """A tube around a helix of radius 1, with flat ends."""
-    n, around = round(90 * turns), 16
+    n = round(90 * turns)
+    around = 16
     turn = np.linspace(0, turns, n)[:, None]
     angle = 2 * np.pi * turn
     middles = np.hstack([np.cos(angle), np.sin(angle), pitch * turn])
@@ -233,12 +232,15 @@ def coil(turns: float, pitch: float, radius: float = 0.2) -> Mesh:
     rings = np.cos(phase)[:, None] * outward[:, None] + np.sin(phase)[:, None] * upward[:, None]
     vertices = np.vstack([(middles[:, None] + radius * rings).reshape(-1, 3), middles[[0, -1]]])
     i, j = np.meshgrid(np.arange(n - 1), np.arange(around), indexing="ij")
-    a, b = i * around + j, i * around + (j + 1) % around
-    c, d = a + around, b + around
+    a = i * around + j
+    b = i * around + (j + 1) % around
+    c = a + around
+    d = b + around
     walls = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(
         -1, 3
     )
-    ring, following = np.arange(around), (np.arange(around) + 1) % around
+    ring = np.arange(around)
+    following = (np.arange(around) + 1) % around
     last = (n - 1) * around
     start = np.stack([following, ring, np.full(around, n * around)], axis=1)
     end = np.stack([last + ring, last + following, np.full(around, n * around + 1)], axis=1)

@@ -101,10 +101,8 @@ def test_genus_and_diagonal() -> None:
 def test_numbered_by_faces_is_the_same_surface_whatever_the_numbers(blob: Mesh) -> None:
     order = np.random.default_rng(0).permutation(len(blob.vertices))
     rank = np.argsort(order)
-    found, again = (
-        blob.numbered_by_faces(),
-        Mesh(blob.vertices[order], rank[blob.faces]).numbered_by_faces(),
-    )
+    found = blob.numbered_by_faces()
+    again = Mesh(blob.vertices[order], rank[blob.faces]).numbered_by_faces()
     np.testing.assert_array_equal(found.vertices[found.faces], blob.vertices[blob.faces])
     np.testing.assert_array_equal(found.vertices, again.vertices)
     np.testing.assert_array_equal(found.faces, again.faces)

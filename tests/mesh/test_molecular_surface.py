@@ -128,7 +128,8 @@ def test_the_excluded_surface_is_a_probe_away_from_where_a_probe_may_be() -> Non
     at = chain(40)
     mesh = molecular_surface(molecule(at, np.full(40, 1.7)), spacing=0.4, max_vertices=None)
     i = np.arange(6000)
-    up, turn = 1 - (2 * i + 1) / len(i), np.pi * (1 + 5**0.5) * i
+    up = 1 - (2 * i + 1) / len(i)
+    turn = np.pi * (1 + 5**0.5) * i
     sphere = np.stack(
         [np.sqrt(1 - up**2) * np.cos(turn), np.sqrt(1 - up**2) * np.sin(turn), up], axis=1
     )
@@ -160,7 +161,8 @@ def test_swallowed_and_doubled_balls_change_nothing() -> None:
 
 def test_hollows_are_filled() -> None:
     i = np.arange(120)
-    up, turn = 1 - (2 * i + 1) / len(i), np.pi * (1 + 5**0.5) * i
+    up = 1 - (2 * i + 1) / len(i)
+    turn = np.pi * (1 + 5**0.5) * i
     shell = 8 * np.stack(
         [np.sqrt(1 - up**2) * np.cos(turn), np.sqrt(1 - up**2) * np.sin(turn), up], axis=1
     )
@@ -172,10 +174,8 @@ def test_hollows_are_filled() -> None:
 
 def test_a_simplified_surface_keeps_the_volume() -> None:
     body = molecule(chain(200), np.full(200, 1.7))
-    whole, fewer = (
-        molecular_surface(body, max_vertices=None),
-        molecular_surface(body, max_vertices=1500),
-    )
+    whole = molecular_surface(body, max_vertices=None)
+    fewer = molecular_surface(body, max_vertices=1500)
     assert len(whole.vertices) > 2000
     assert len(fewer.vertices) == 1500
     assert fewer.volume == pytest.approx(whole.volume, rel=0.01)

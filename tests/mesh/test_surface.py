@@ -16,7 +16,8 @@ def test_areas_and_normals(blob: Mesh) -> None:
     np.testing.assert_allclose(
         surface.face_areas(blob.vertices, blob.faces), oracle.area_faces, rtol=1e-12
     )
-    of_vertices, sums = np.zeros(len(blob.vertices)), np.zeros_like(blob.vertices)
+    of_vertices = np.zeros(len(blob.vertices))
+    sums = np.zeros_like(blob.vertices)
     for face, area, normal in zip(blob.faces, oracle.area_faces, oracle.face_normals, strict=True):
         of_vertices[face] += area / 3
         sums[face] += area * normal
@@ -41,7 +42,8 @@ def test_the_mean_of_neighbours_is_that_of_a_loop(blob: Mesh) -> None:
 
 
 def test_a_neighbour_in_the_same_place_is_the_mean(blob: Mesh) -> None:
-    vertices, (a, b, _) = blob.vertices.copy(), blob.faces[0]
+    vertices = blob.vertices.copy()
+    a, b, _ = blob.faces[0]
     vertices[a] = vertices[b]
     found = surface.mean_of_neighbours(vertices, blob.faces)
     np.testing.assert_allclose(found[[a, b]], vertices[[b, b]], atol=1e-6)

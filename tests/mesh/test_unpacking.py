@@ -21,7 +21,8 @@ from igps.mesh.options import LoadOptions
 BOX = trimesh.creation.box((1, 2, 3)).export(file_type="off").encode()
 OBJECTS = LoadOptions(bodies="objects")
 # A bomb that would unpack to more than is allowed; the test's own limit keeps it small.
-LIMIT, BOMB = 10**6, b"# " + bytes(2 * 10**6)
+LIMIT = 10**6
+BOMB = b"# " + bytes(2 * 10**6)
 
 
 def tar_of(members: dict[str, bytes], compression: str = "") -> bytes:
@@ -107,7 +108,8 @@ def test_links_in_an_archive_lead_nowhere(tmp_path: Path) -> None:
     (tmp_path / "secret.off").write_bytes(BOX)
     with tarfile.open(tmp_path / "a.tar", "w") as archive:
         link = tarfile.TarInfo("link.off")
-        link.type, link.linkname = tarfile.SYMTYPE, str(tmp_path / "secret.off")
+        link.type = tarfile.SYMTYPE
+        link.linkname = str(tmp_path / "secret.off")
         archive.addfile(link)
     with pytest.raises(MeshError, match=r"a\.tar: not readable as an archive.*no surface"):
         load_mesh(tmp_path / "a.tar")

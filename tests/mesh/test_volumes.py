@@ -85,17 +85,19 @@ def write_segmentation(path: Path, masks: NDArray[Any], names: list[str], *kind:
 
     lps = np.diag([-1, -1, 1, 1]) @ AFFINE
     spacing = np.linalg.norm(lps[:3, :3], axis=0)
-    planes, study, series, frame = [], generate_uid(), generate_uid(), generate_uid()
+    planes = []
+    study = generate_uid()
+    series = generate_uid()
+    frame = generate_uid()
     for k in range(masks.shape[2]):
         plane = Dataset()
         plane.file_meta = FileMetaDataset()
         plane.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-        plane.SOPClassUID, plane.SOPInstanceUID = "1.2.840.10008.5.1.4.1.1.2", generate_uid()
-        plane.StudyInstanceUID, plane.SeriesInstanceUID, plane.FrameOfReferenceUID = (
-            study,
-            series,
-            frame,
-        )
+        plane.SOPClassUID = "1.2.840.10008.5.1.4.1.1.2"
+        plane.SOPInstanceUID = generate_uid()
+        plane.StudyInstanceUID = study
+        plane.SeriesInstanceUID = series
+        plane.FrameOfReferenceUID = frame
         plane.PatientID, plane.PatientName, plane.PatientBirthDate, plane.PatientSex = (
             "1",
             "A^B",
@@ -108,13 +110,12 @@ def write_segmentation(path: Path, masks: NDArray[Any], names: list[str], *kind:
             "1",
             "",
         )
-        plane.ReferringPhysicianName, plane.SeriesNumber, plane.InstanceNumber, plane.Modality = (
-            "",
-            1,
-            k + 1,
-            "CT",
-        )
-        plane.Rows, plane.Columns = masks.shape[1], masks.shape[0]
+        plane.ReferringPhysicianName = ""
+        plane.SeriesNumber = 1
+        plane.InstanceNumber = k + 1
+        plane.Modality = "CT"
+        plane.Rows = masks.shape[1]
+        plane.Columns = masks.shape[0]
         plane.PixelSpacing = [spacing[1], spacing[0]]
         plane.SliceThickness = spacing[2]
         plane.ImageOrientationPatient = [*(lps[:3, 0] / spacing[0]), *(lps[:3, 1] / spacing[1])]
@@ -245,7 +246,8 @@ def test_a_stack_compressed_by_lzw_is_read(tmp_path: Path) -> None:
 
 def write_nrrd(path: Path, *lines: str) -> None:
     """Boxes in voxels of 1 × 1.5 × 2.5, by hand."""
-    sizes, spacing = ["sizes: 14 12 10", "encoding: raw"], ["spacings: 1 1.5 2.5"]
+    sizes = ["sizes: 14 12 10", "encoding: raw"]
+    spacing = ["spacings: 1 1.5 2.5"]
     spacing = [] if any("directions" in line for line in lines) else spacing
     header = "\n".join(["NRRD0005", "type: uint8", "dimension: 3", *sizes, *spacing, *lines])
     path.write_bytes(header.encode() + b"\n\n" + two_boxes().tobytes(order="F"))
@@ -324,7 +326,8 @@ def test_a_list_of_layers_in_a_nrrd_file_may_be_any_axis(
     vectors = [
         f"({','.join(map(str, axis * axes))})" for axis in (*AFFINE[:3, :3].T, AFFINE[:3, 3])
     ]
-    kinds, directions = ["domain"] * 3, vectors[:3]
+    kinds = ["domain"] * 3
+    directions = vectors[:3]
     kinds.insert(3 * last, "list")
     directions.insert(3 * last, "none")
     sizes = (14, 12, 10, 2) if last else (2, 14, 12, 10)
@@ -370,7 +373,8 @@ def test_voxels_beside_their_header(name: str, tmp_path: Path) -> None:
 
 
 def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:
-    one, two = two_boxes() == 3, two_boxes() > 0
+    one = two_boxes() == 3
+    two = two_boxes() > 0
     image = itk_image(np.stack([one, two], axis=-1).astype(np.uint8), vector=True)
     for key, value in {
         "Segment0_Name": "liver",
@@ -388,7 +392,8 @@ def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:
 
 
 def test_groups_of_labels_of_mitk_have_names_and_may_overlap(tmp_path: Path) -> None:
-    liver, others = (two_boxes() == 3) * 1, (two_boxes() > 0) * 2 + (two_boxes() == 7)
+    liver = (two_boxes() == 3) * 1
+    others = (two_boxes() > 0) * 2 + (two_boxes() == 7)
     image = itk_image(np.stack([liver, others], axis=-1).astype(np.uint16), vector=True)
     groups: list[dict[str, Any]] = [
         {"labels": [{"name": "liver", "value": 1, "opacity": 0.6}]},
@@ -895,7 +900,8 @@ def test_a_table_that_names_nothing_is_refused(tmp_path: Path) -> None:
 
 def test_thin_branches_are_not_taken_for_noise() -> None:
     """A tree of vessels two voxels wide, whose corners are as rough as a scanner's noise, has the voxels' volume."""
-    random, mask = np.random.default_rng(3), np.zeros((96, 96, 96), dtype=np.uint8)
+    random = np.random.default_rng(3)
+    mask = np.zeros((96, 96, 96), dtype=np.uint8)
     ends = [np.array([48.0, 48.0, 4.0])]
     for _ in range(60):
         start = ends[random.integers(len(ends))]

@@ -143,7 +143,8 @@ def test_what_is_hidden_is_filled() -> None:
 
 
 def test_overlapping_parts_are_one() -> None:
-    first, second = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 1, 1))
+    first = trimesh.creation.box((1, 1, 1))
+    second = trimesh.creation.box((1, 1, 1))
     second.apply_translation([0.6, 0.3, 0.2])
     body = watertight(*arrays(first, second))
     assert_closed(body)
@@ -172,7 +173,8 @@ def test_parts_are_turned_outward_by_their_winding_numbers(turned: tuple[bool, b
 
 
 def test_faces_between_solids_are_left_out_of_the_winding_numbers() -> None:
-    outer, core = ball(subdivisions=4), ball(0.3)
+    outer = ball(subdivisions=4)
+    core = ball(0.3)
     wall = trimesh.creation.box((1.2, 1.2, 0.02))
     vertices, faces = arrays(outer, core, wall)
     bare = OrientedSurface(20 * vertices, faces, False)._drop_hidden_faces()

@@ -48,7 +48,8 @@ def test_winding_number_is_the_sum_of_solid_angles(kind: str) -> None:
     if kind == "opened":
         faces = faces[vertices[faces].mean(1)[:, 2] < 0.4]
     else:
-        vertices, faces = generator.normal(size=(270, 3)), np.arange(270).reshape(-1, 3)
+        vertices = generator.normal(size=(270, 3))
+        faces = np.arange(270).reshape(-1, 3)
     points = generator.uniform(-2, 2, (83, 3))
     expected = winding_by_loops(vertices, faces, points)
     assert np.ptp(expected) > 0.5

@@ -275,7 +275,8 @@ def swept(solid: Solid) -> NDArray[np.float64]:
             line = np.column_stack([zero, bend * (1 - np.cos(t * angle)), bend * np.sin(t * angle)])
             return nearest_sphere(line, start + t * (end - start))
         case Ring(radius, tube, side):
-            x, z = radius * np.cos(2 * np.pi * t), radius * np.sin(2 * np.pi * t)
+            x = radius * np.cos(2 * np.pi * t)
+            z = radius * np.sin(2 * np.pi * t)
             bows = np.column_stack([x, zero, z + np.sign(z) * side])
             sides = [
                 np.column_stack([zero + s * radius, zero, (2 * t - 1) * side]) for s in (-1, 1)

@@ -15,7 +15,8 @@ _NAME, _, _VALUE = os.environ.get("IGPS_CAMPAIGN_FAULT", "").partition(" ")
 
 
 def _no_rename() -> None:
-    replace, rename = os.replace, os.rename
+    replace = os.replace
+    rename = os.rename
 
     def refusing(move):  # type: ignore[no-untyped-def]
         def moved(source, target, **options):  # type: ignore[no-untyped-def]
@@ -27,7 +28,8 @@ def _no_rename() -> None:
 
         return moved
 
-    os.replace, os.rename = refusing(replace), refusing(rename)
+    os.replace = refusing(replace)
+    os.rename = refusing(rename)
 
 
 def _no_space(limit: int) -> None:
@@ -63,7 +65,8 @@ def _no_space(limit: int) -> None:
 
 
 def _clock_behind(seconds: float) -> None:
-    now, now_ns = time.time, time.time_ns
+    now = time.time
+    now_ns = time.time_ns
     time.time = lambda: now() - seconds
     time.time_ns = lambda: now_ns() - int(seconds * 1e9)
 
