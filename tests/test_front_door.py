@@ -32,7 +32,7 @@ NAMES = [
     "SignatureDataModule",
     "SignatureDataset",
     "SpectralEmbedding",
-    "WhitenedHead",
+    "as_mesh",
     "collate",
     "compute_signature",
     "describe",

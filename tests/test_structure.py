@@ -15,6 +15,7 @@ FLOORS = (
     ("_arrays", "_files", "_parameters", "_threads", "_compiled", "_workers"),
     ("spectra", "retrieval", "_parallel"),
     ("mesh",),
+    ("fields",),
     ("signature",),
     ("shapes",),
     ("data",),

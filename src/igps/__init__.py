@@ -15,13 +15,15 @@ from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor, load
 from igps.learning import fit
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
+from igps.mesh.objects import as_mesh
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import BodyDescriptor, Descriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.heads.closed_form import KernelHead, WhitenedHead
+from igps.nn.heads.closed_form import KernelHead
 from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import retrieval_scores, search
 from igps.shapes import ArticulatedShapes
@@ -50,7 +52,7 @@ __all__ = [
     "SignatureDataModule",
     "SignatureDataset",
     "SpectralEmbedding",
-    "WhitenedHead",
+    "as_mesh",
     "collate",
     "compute_signature",
     "describe",

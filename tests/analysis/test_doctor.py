@@ -24,7 +24,7 @@ from damaged_files import (
 from igps._parallel import Limits
 from igps.analysis.doctor import Finding, examine, expected_cost
 from igps.data.sources import find_bodies
-from igps.mesh._label_measures import VoxelMeasures, _squared_distances, thinnest_part
+from igps.fields.volumes.label_measures import VoxelMeasures, _squared_distances, thinnest_part
 from igps.mesh.options import LoadOptions
 from igps.report.tables import findings_table
 from igps.signature.signature import SignatureConfig

@@ -13,7 +13,7 @@ from igps.analysis.groups import squared_distances
 from igps.analysis.outliers import LIMIT, flat_share, measure_bodies, outliers
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
-from igps.mesh.formats import volumes
+from igps.fields.volumes import label_volume as volumes
 
 LABELS = ["a"] * 12 + ["b"] * 12
 

@@ -21,8 +21,8 @@ from damage import Generator, broken_bytes
 from numpy.typing import NDArray
 
 sys.path.append(str(Path(__file__).parents[2]))
+from tests.fields.cad.step_files import write_step
 from tests.mesh import test_volumes
-from tests.mesh.step_files import write_step
 
 Array = NDArray[Any]
 

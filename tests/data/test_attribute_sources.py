@@ -28,8 +28,8 @@ from igps.data.attribute_sources import (
     fill_missing,
 )
 from igps.data.dataset import SignatureDataset
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import MeshError
 from igps.mesh.options import BodyKind, LoadOptions
 from igps.signature.signature import SignatureConfig
 

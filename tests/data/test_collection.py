@@ -18,7 +18,7 @@ from igps.data.cache import checksum
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.requirements import Requirements
-from igps.mesh.mesh import MeshError
+from igps.mesh.errors import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 

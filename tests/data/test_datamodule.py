@@ -11,7 +11,7 @@ from bodies_on_disk import write_body
 
 from igps.data.batch import SignatureBatch
 from igps.data.datamodule import SignatureDataModule
-from igps.mesh.mesh import MeshError
+from igps.mesh.errors import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 

@@ -20,8 +20,8 @@ from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.transforms import FewerSamples, Scale
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 

@@ -15,8 +15,9 @@ from bodies_on_disk import write_body
 import igps.data.pipeline as pipeline_module
 from igps.data.cache import SignatureCache
 from igps.data.pipeline import SignaturePipeline
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import Signature, SignatureConfig, compute_signature

@@ -14,14 +14,14 @@ from igps.analysis.explanation import explain
 from igps.data.collation import collate
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.molecular import Shares, molecular
+from igps.fields.molecules.molecular_surface import molecular_surface
+from igps.fields.molecules.molecule import Molecule
+from igps.fields.molecules.residue_attributes import residue_attribute
+from igps.fields.molecules.residues import CHARGED_ATOMS, VOLUMES, residue_ball
 from igps.learning.fitting import split_head
-from igps.mesh.formats.molecules import Molecule
-from igps.mesh.molecular_surface import molecular_surface
-from igps.mesh.residues import CHARGED_ATOMS, VOLUMES, residue_ball
 from igps.nn.axes import InteriorDistance
 from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
-from igps.signature.residue_attributes import residue_attribute
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=90, n_surface_samples=100, min_samples=300, resolution=16)

@@ -9,10 +9,10 @@ import nibabel
 import numpy as np
 import pytest
 import trimesh
-from step_files import write_step
+from tests.fields.cad.step_files import write_step
 
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import each_body, list_bodies, load_bodies, load_mesh, read_surface
-from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
 OBJECTS = LoadOptions(bodies="objects")

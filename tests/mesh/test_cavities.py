@@ -21,7 +21,7 @@ from igps import (
     load_mesh,
 )
 from igps.descriptors.interior import interior
-from igps.mesh.label_surface import voxel_surface
+from igps.fields.volumes.label_surface import voxel_surface
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import signed_volume

@@ -16,8 +16,8 @@ import pytest
 import SimpleITK
 import trimesh
 
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh
-from igps.mesh.mesh import MeshError
 
 N_CHANGES = 60
 

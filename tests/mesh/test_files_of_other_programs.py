@@ -13,9 +13,10 @@ import pytest
 import SimpleITK
 import trimesh
 
-from igps.mesh.formats.label_names import read_label_names
+from igps.fields.volumes.label_names import read_label_names
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import each_body, load_mesh
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 
 BOX = trimesh.creation.box((2, 3, 4))

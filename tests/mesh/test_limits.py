@@ -10,8 +10,9 @@ import pytest
 import trimesh
 
 from igps.mesh import limits
+from igps.mesh.errors import MeshError
 from igps.mesh.limits import available_memory, check_memory, expected_faces
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.signature.voxels import interior_samples
 
 

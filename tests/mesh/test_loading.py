@@ -9,9 +9,9 @@ import pytest
 import trimesh
 
 from conftest import FACES, TETRAHEDRON
-from igps.mesh.formats import vertex_values
+from igps.fields.meshes import vertex_values
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh, read_surface
-from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
 

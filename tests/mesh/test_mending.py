@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 from training.studies.damages import DAMAGES, halves, holes
 
 from igps.mesh._tidying import fill_small_holes, weld
+from igps.mesh.errors import MeshError
 from igps.mesh.mending import mend, repair_steps
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import subdivide
 from igps.mesh.surface import area_vectors
 from igps.mesh.watertight import watertight

@@ -11,8 +11,10 @@ import pytest
 import trimesh
 from training.studies.weld import weld_gap
 
-from conftest import FACES, TETRAHEDRON, as_mesh, horseshoe, surface_genus
-from igps.mesh.mesh import Mesh, MeshError
+from conftest import FACES, TETRAHEDRON, horseshoe, surface_genus
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
+from igps.mesh.objects import as_mesh
 
 
 def test_closed_forms_of_area_and_volume() -> None:
@@ -119,21 +121,21 @@ def test_more_notes_and_a_unit_leave_the_surface_as_it_is(blob: Mesh) -> None:
 
 def test_a_trimesh_that_was_read_is_called_by_its_file(tmp_path: Path) -> None:
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.off")
-    assert Mesh.of(trimesh.load(tmp_path / "box.off")).name == "box.off"
+    assert as_mesh(trimesh.load(tmp_path / "box.off")).name == "box.off"
 
 
 def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself() -> None:
     box = trimesh.creation.box((1, 2, 3))
-    mesh = Mesh.of(box)
+    mesh = as_mesh(box)
     np.testing.assert_array_equal(mesh.vertices, box.vertices)
     np.testing.assert_array_equal(mesh.faces, box.faces)
     assert mesh.name == "mesh"
-    assert Mesh.of(mesh) is mesh
+    assert as_mesh(mesh) is mesh
     box.metadata["file_name"] = "box.ply"
-    assert Mesh.of(box).name == "box.ply"
+    assert as_mesh(box).name == "box.ply"
     box.update_faces(np.arange(12) > 0)
     with pytest.raises(MeshError, match=r"box\.ply: open surface"):
-        Mesh.of(box)
+        as_mesh(box)
 
 
 @pytest.mark.parametrize("body", [None, "box.ply", np.zeros((3, 3)), trimesh.Scene()])
@@ -142,7 +144,7 @@ def test_what_is_no_mesh_is_named(body: object) -> None:
         TypeError,
         match=rf"mesh: expected a Mesh, a trimesh.Trimesh, .* got .*{type(body).__name__}\. Read",
     ):
-        Mesh.of(body)  # type: ignore[arg-type]
+        as_mesh(body)
 
 
 def test_meshes_of_other_libraries(blob: Mesh) -> None:
@@ -157,7 +159,7 @@ def test_meshes_of_other_libraries(blob: Mesh) -> None:
         (nibabel.gifti.GiftiImage(darrays=[points, faces]), "mm"),
         (SimpleNamespace(points=blob.vertices, faces=row), None),
     ):
-        mesh = Mesh.of(thing)
+        mesh = as_mesh(thing)
         np.testing.assert_allclose(mesh.vertices, blob.vertices, atol=1e-6)
         np.testing.assert_array_equal(mesh.faces, blob.faces)
         assert (mesh.name, mesh.unit) == ("mesh", unit)
@@ -166,7 +168,7 @@ def test_meshes_of_other_libraries(blob: Mesh) -> None:
         [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float32
     )
     assert (
-        Mesh.of(
+        as_mesh(
             SimpleNamespace(points=corners, faces=np.ravel([[4, *quad] for quad in quads]))
         ).volume
         == 1
@@ -177,18 +179,18 @@ def test_voxels_of_one_label_are_a_mesh() -> None:
     ball = ((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0) < 8**2
     image = nibabel.Nifti1Image(5 * ball.astype(np.uint8), np.diag([-1, 1, 2, 1]))
     for thing, spacing, unit in ((image, None, "mm"), (ball, (1, 1, 2), "mm"), (ball, None, None)):
-        mesh = Mesh.of(thing, spacing)
+        mesh = as_mesh(thing, spacing)
         sides = 1 if unit is None else 2
         assert mesh.volume == pytest.approx(sides * ball.sum(), rel=1e-3)
         assert (mesh.name, mesh.unit) == ("volume", unit)
     with pytest.raises(
         MeshError, match=r"expected one label, got 1, 3\. Select one, such as labels == 1"
     ):
-        Mesh.of(ball + 2 * (ball & (np.arange(20) < 9)))
+        as_mesh(ball + 2 * (ball & (np.arange(20) < 9)))
     with pytest.raises(MeshError, match=r"three sides of a voxel, got .*spacing \(1, 2\)"):
-        Mesh.of(ball, (1, 2))
+        as_mesh(ball, (1, 2))
 
 
 def test_an_image_without_a_surface_is_none() -> None:
     with pytest.raises(TypeError, match="expected a GIFTI image of a surface"):
-        Mesh.of(nibabel.gifti.GiftiImage())
+        as_mesh(nibabel.gifti.GiftiImage())

@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from conftest import as_mesh
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
 
 

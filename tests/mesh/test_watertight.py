@@ -14,8 +14,9 @@ from training.studies.damages import DAMAGES
 from igps.mesh import watertight as module
 from igps.mesh._isosurface import level_surface
 from igps.mesh._outside import OrientedSurface
+from igps.mesh.errors import MeshError
 from igps.mesh.mending import mend
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.watertight import watertight
 from igps.mesh.winding import winding_number
 from igps.shapes import ArticulatedShapes

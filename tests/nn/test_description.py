@@ -16,7 +16,7 @@ import jobs
 from igps.data.batch import Body, SignatureBatch
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
-from igps.mesh.mesh import MeshError
+from igps.mesh.errors import MeshError
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe, evaluation_mode
 from igps.nn.descriptor import BodyDescriptor, HistogramDescriptor

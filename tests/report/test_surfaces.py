@@ -8,7 +8,7 @@ import trimesh
 
 from conftest import as_mesh, horseshoe
 from igps.data.dataset import SignatureDataset
-from igps.mesh.mesh import MeshError
+from igps.mesh.errors import MeshError
 from igps.mesh.surface import components
 from igps.report import surfaces
 from igps.report.surfaces import (

@@ -10,7 +10,8 @@ import trimesh
 from bodies import mean_value_coordinates
 from conftest import as_mesh
 from igps.data.collation import collate
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding
 from igps.nn.histograms.pairs import PairHistogram

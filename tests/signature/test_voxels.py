@@ -8,7 +8,8 @@ from scipy.stats import kstest
 
 import igps.signature.voxels as voxels
 from conftest import as_mesh
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.winding import winding_number
 from igps.signature.voxels import grid_axes, inside_grid, interior_samples
 

@@ -12,9 +12,10 @@ from training.studies.damages import DAMAGES
 import igps
 from conftest import as_trimesh
 from igps.data.dataset import SignatureDataset
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh
 from igps.mesh.mending import mend
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.signature.signature import SignatureConfig
 from own_descriptors import Height, Root, write_egg
 

@@ -10,7 +10,8 @@ from scipy.sparse.csgraph import connected_components
 from training.studies import damages as damage
 from training.studies.damages import DAMAGES
 
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors
 from igps.mesh.winding import winding_number
 

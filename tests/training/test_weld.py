@@ -14,7 +14,8 @@ from training.studies import weld as weld_module
 from training.studies.weld import TUBE_FACES, facing_vertices, weld, weld_gap
 
 from conftest import as_trimesh, horseshoe, surface_genus
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import vertex_normals
 
 

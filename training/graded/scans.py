@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from igps._arrays import Floats
 from igps.mesh import surface
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
 from igps.mesh.watertight import watertight
 

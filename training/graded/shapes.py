@@ -15,7 +15,8 @@ from igps._arrays import Floats, Integers
 from igps._files import atomic_write
 from igps._parallel import Failed, run
 from igps._parameters import check_at_least
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder
 from training.graded.bodies import Body, Pose, draw_body, draw_pose
 from training.graded.individuals import individual

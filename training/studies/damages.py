@@ -13,7 +13,8 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers, Surface
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, compact, diagonal, face_areas, undirected_edges, unit
 from igps.signature.voxels import interior_samples
 from training.studies import disturbances

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from igps._arrays import Floats, Integers
 from igps.descriptors.literature._geodesics import edge_graph
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import components, face_areas, vertex_normals
 from training.studies.weld import weld_gap

@@ -13,7 +13,8 @@ from igps._arrays import Floats
 from igps.analysis.explanation import explain, share_density
 from igps.data.collation import collate
 from igps.descriptors import descriptor as descriptor_of
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors
 from igps.report.answers import write_analysis
 from igps.signature.signature import SAMPLE_KINDS, SignatureConfig, compute_signature

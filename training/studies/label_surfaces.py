@@ -19,7 +19,7 @@ from igps import Mesh, SignatureConfig, collate, compute_signature
 from igps._arrays import Booleans, Floats
 from igps.data.requirements import Requirements
 from igps.descriptors import descriptor
-from igps.mesh.label_surface import voxel_surface
+from igps.fields.volumes.label_surface import voxel_surface
 
 KINDS = ("ball", "ellipsoid", "torus", "capsule", "rod", "plate")
 AXES = np.array([1, 1.3, 2])  # of an ellipsoid

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
 from igps.descriptors.literature._geodesics import edge_graph, farthest_points
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import vertex_normals
 from igps.mesh.winding import winding_number
 

@@ -16,7 +16,7 @@ from igps._arrays import Singles
 from igps._parallel import Failed, run
 from igps._threads import one_thread
 from igps.data.dataset import Failure, SignatureDataset
-from igps.mesh.mesh import MeshError
+from igps.mesh.errors import MeshError
 from igps.nn.description import describe_timed
 from igps.nn.descriptor import Descriptor
 from igps.retrieval.scores import SCORE_NAMES, RetrievalScores, retrieval_scores

@@ -11,11 +11,12 @@ from tqdm import tqdm
 from igps._parallel import Failed, Limits, run
 from igps.data.filling import group_by_file
 from igps.data.sources import Bodies, BodyRef
-from igps.mesh.formats import RawBody, VoxelMeasures
+from igps.fields.volumes.label_measures import VoxelMeasures, measure
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import each_surface, surface_body
 from igps.mesh.mending import Step, repair_steps
-from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
+from igps.mesh.raw_body import RawBody
 from igps.signature.signature import SignatureConfig
 
 # Seconds and bytes of a signature on one core, by vertices and eigenpairs, as fitted by tests/benchmarks/cost.py to 62
@@ -105,7 +106,7 @@ def _examine_file(
 def _finding(
     ref: BodyRef, raw: RawBody, reading: LoadOptions, config: SignatureConfig, start: float
 ) -> Finding:
-    voxels = None if raw.voxels is None else raw.voxels().measures()
+    voxels = None if raw.voxels is None else measure(raw.voxels())
     finding = Finding(str(ref), n_vertices=len(raw.vertices), voxels=voxels)
     if raw.fault is not None:
         return replace(finding, n_vertices=None, fault=str(raw.fault), error=str(raw.fault))

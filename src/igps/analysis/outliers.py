@@ -25,9 +25,10 @@ from igps.analysis.segmentation import (
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import group_by_file
 from igps.data.pipeline import SignaturePipeline
-from igps.mesh.formats import RawBody
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef, each_surface, surface_body
-from igps.mesh.mesh import Mesh, MeshError, millimetres
+from igps.mesh.mesh import Mesh, millimetres
+from igps.mesh.raw_body import RawBody
 from igps.mesh.surface import area_vectors
 
 _MEASURED = ("volume", "spacing", "handles", "flat", "stray", "cavity", "hole", "gap", "cut")

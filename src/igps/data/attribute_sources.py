@@ -24,13 +24,16 @@ from igps._arrays import Booleans, Floats
 from igps._parameters import check_one_of
 from igps.data.attributes import AttributeSource
 from igps.data.cache import content_digest
-from igps.mesh.formats import brains, dependencies_of, images, stat_key, vertex_values
-from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
+from igps.fields.meshes import brains, vertex_values
+from igps.fields.molecules.molecule import Molecule
+from igps.fields.molecules.residue_attributes import RESIDUE_ATTRIBUTES, residue_attribute
+from igps.fields.molecules.structures import MoleculeBodies, is_structure, molecules_by_part
+from igps.fields.volumes import images
+from igps.mesh.errors import MeshError
+from igps.mesh.formats import dependencies_of, stat_key
 from igps.mesh.loading import BodyRef, load_mesh, read_surface
-from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.mean_value import extend
-from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES, residue_attribute
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +44,7 @@ _TOLERANCE = 0.05  # share of its height by which a point may lie outside a tetr
 
 @dataclass(frozen=True)
 class ResidueAttribute:
-    """An attribute of the residues of a molecule, one of `igps.signature.residue_attributes.RESIDUE_ATTRIBUTES`."""
+    """An attribute of the residues of a molecule, one of `RESIDUE_ATTRIBUTES`."""
 
     name: str
 

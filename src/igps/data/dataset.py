@@ -24,8 +24,9 @@ from igps.data.indices import Indices, resolve_indices, scalar_index
 from igps.data.pipeline import CacheHit, PreTransform, SignaturePipeline
 from igps.data.requirements import AnyDescriptor, requirements_of
 from igps.data.sources import Bodies, ClassRule, bodies_of
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SAMPLE_KINDS, Signature, SignatureConfig
 
@@ -45,7 +46,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     Args:
         root_or_paths: a folder (see `find_bodies`), files, or `Bodies`; or a mapping of names to objects in memory,
-            each of which `Mesh.of` accepts. Images and pairs `(labels, spacing)` of an array give a body per label.
+            each of which `as_mesh` accepts. Images and pairs `(labels, spacing)` of an array give a body per label.
         config: parameters of the Signatures. The default is 250 eigenpairs, unless the descriptor sets a number.
         cache_dir: directory of the cache; the user's cache directory if None. A cache key consists of the content of
             the file, the load options, all parameters, and the version of the algorithm. A cached Signature with more

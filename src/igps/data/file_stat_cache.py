@@ -12,10 +12,10 @@ from functools import lru_cache
 
 from igps.data.cache import SignatureCache
 from igps.data.pipeline import CacheHit, SignaturePipeline
+from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of, stat_key
 from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION
-from igps.mesh.mesh import MeshError
 
 logger = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ from igps.data.cache import SignatureCache
 from igps.data.file_stat_cache import FileStatCache
 from igps.data.pipeline import CacheHit, SignaturePipeline, fill_elsewhere, version
 from igps.data.sources import Bodies
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import MeshError
 
 logger = logging.getLogger(__name__)
 

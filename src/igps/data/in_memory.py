@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from igps.data.sources import Bodies
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef, surface_body
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.objects import object_bodies
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig

@@ -17,10 +17,11 @@ from igps._parallel import Failed, MachineError, attempt
 from igps.data.attribute_sources import with_load_options
 from igps.data.attributes import AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache, content_digest
+from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of, stat_key
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, repair_steps
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SAMPLE_KINDS, Signature, SignatureConfig, compute_signature
 

@@ -15,9 +15,9 @@ from typing import Literal, get_args
 
 from igps._files import delimiter_of, table_text
 from igps.data.attributes import AttributeSource, FileSource
+from igps.mesh.errors import MeshError
 from igps.mesh.formats import is_searched, searched_suffixes
 from igps.mesh.loading import BodyRef, list_bodies
-from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
 logger = logging.getLogger(__name__)

@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements
+from igps.fields.molecules.residue_attributes import RESIDUE_KINDS
 from igps.nn.axes import Attribute, InteriorDistance, PointAxis
 from igps.nn.axes.points import attribute_requirements, largest_members
 from igps.nn.batch_features import SampleFeatures
@@ -12,7 +13,6 @@ from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
-from igps.signature.residue_attributes import RESIDUE_KINDS
 
 # Centres of the classes: in elementary charges, in kT/e, and on the scale of Kyte and Doolittle.
 _CENTRES = {

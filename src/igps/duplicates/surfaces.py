@@ -31,9 +31,10 @@ from igps.duplicates._alignment import (
 )
 from igps.duplicates._moments import moments
 from igps.duplicates.calibration import Calibration
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh
 from igps.mesh.mending import Step, repair_steps
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import mean_of_neighbours
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import Signature

@@ -16,8 +16,8 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.data.file_stat_cache import MIN_AGE
 from igps.data.sources import LABELS_FILE, Bodies, is_number
 from igps.gallery.columns import KNOWN, Batch
+from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of, stat_key
-from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor

@@ -4,7 +4,7 @@ import numpy as np
 
 from igps._arrays import Floats, Integers, Singles, Surface
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles
-from igps.mesh.mesh import MeshError
+from igps.mesh.errors import MeshError
 from igps.mesh.surface import (
     directed_edges,
     face_areas,

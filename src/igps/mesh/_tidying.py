@@ -9,7 +9,8 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay, cKDTree
 
 from igps._arrays import Booleans, Floats, Integers, Surface
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import (
     compact,
     diagonal,

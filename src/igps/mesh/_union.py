@@ -4,7 +4,8 @@ import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh._tidying import SPECK, fill_small_holes, orient, tidy, weld
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import (
     area_vectors,
     compact,

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from igps.mesh.mesh import MeshError
+from igps.mesh.errors import MeshError
 
 # Peak memory of reading and mending a triangle, measured on OFF, OBJ, STL and PLY files of 330,000 triangles.
 _BYTES_PER_FACE = 1000
@@ -29,6 +29,14 @@ def check_grid(n_cells: int, name: str) -> None:
     if n_cells * _BYTES_PER_CELL >= _MIN_CHECKED_GRID:
         remedy = "Lower the resolution or min_samples, use fewer workers, or give the process more memory."
         check_fits(n_cells * _BYTES_PER_CELL, f"{name}: a grid of {n_cells:,} cells needs", remedy)
+
+
+def check_unpacked(n_bytes: int, path: Path, limit: int) -> None:
+    """Raise a MeshError if the content of a file unpacks to more than `limit` bytes."""
+    if n_bytes > limit:
+        fault = f"{path}: unpacks to {n_bytes / 1e9:.2g} GB or more, expected at most {limit / 1e9:.2g} GB."
+        remedy = "If you trust the file, raise LoadOptions(max_unpacked=...), on the command line --max_unpacked."
+        raise MeshError(f"{fault} {remedy}")
 
 
 def check_fits(n_bytes: int, subject: str, remedy: str) -> None:

@@ -11,12 +11,13 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps._threads import one_thread
 from igps.mesh._tidying import weld_boundaries
-from igps.mesh.formats import FORMATS, Format, RawBody, format_of
-from igps.mesh.formats._format import faults, joined, pieces
+from igps.mesh.errors import MeshError
+from igps.mesh.formats import Format, all_formats, faults, format_of
 from igps.mesh.limits import check_memory
 from igps.mesh.mending import mend
-from igps.mesh.mesh import Mesh, MeshError, check_arrays
+from igps.mesh.mesh import Mesh, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
+from igps.mesh.raw_body import RawBody, joined, pieces
 from igps.mesh.surface import compact, diagonal, face_parts
 
 logger = logging.getLogger(__name__)
@@ -262,6 +263,6 @@ def _format(path: Path) -> Format:
         raise MeshError(f"{path}: the file is empty (0 bytes). Export it again.")
     file_format = format_of(path)
     if file_format is None:
-        suffixes = ", ".join(suffix for known in FORMATS for suffix in known.suffixes)
+        suffixes = ", ".join(suffix for known in all_formats() for suffix in known.suffixes)
         raise MeshError(f"{path}: unknown file format. Convert the file to one of {suffixes}.")
     return file_format

@@ -24,7 +24,8 @@ from igps.mesh._tidying import (
 )
 from igps.mesh._union import drop_inner_walls, unite_parts
 from igps.mesh.denoising import is_noisy, remove_noise
-from igps.mesh.mesh import Mesh, MeshError, check_arrays, check_coordinates, check_size
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh, check_arrays, check_coordinates, check_size
 from igps.mesh.simplification import subdivide
 from igps.mesh.surface import signed_volume
 from igps.mesh.watertight import crosses_itself, watertight

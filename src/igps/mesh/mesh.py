@@ -2,7 +2,7 @@
 
 import copy
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from igps._arrays import Booleans, Floats, Integers
+from igps.mesh.errors import MeshError
 from igps.mesh.surface import (
     components,
     connected,
@@ -89,19 +90,6 @@ _MIN_DIAGONAL, _MAX_DIAGONAL = 1e-30, 1e30
 _MAX_DISTANCE = 1e6  # from the origin, in diagonals; the mesh keeps nine digits of its coordinates, which suffice
 
 
-class MeshError(ValueError):
-    """A mesh cannot be used; the message names the file, what is wrong, and the remedy.
-
-    Example:
-        >>> try:
-        ...     Mesh(np.zeros((3, 3)), np.array([[0, 1, 5], [0, 2, 5]]))
-        ... except MeshError as error:
-        ...     print(error)  # names the file, if there is one
-        mesh: 2 faces refer to vertices out of range (0 to 2 exist, 0 to 5 are used). The file is damaged; export it
-        again.
-    """
-
-
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangle mesh that bounds a body, checked when it is made.
@@ -158,30 +146,6 @@ class Mesh:
             _check_cavities(vertices, faces, self.name)
         vertices.flags.writeable = faces.flags.writeable = False
         vars(self).update(vertices=vertices, faces=faces)  # the class is frozen
-
-    @classmethod
-    def of(cls, body: Any, spacing: Sequence[float] | None = None) -> Self:
-        """Convert a body of another library to a Mesh; a Mesh is returned unchanged.
-
-        Example:
-            >>> import trimesh
-            >>> Mesh.of(trimesh.creation.box((1, 2, 3)))
-            Mesh('mesh', 8 vertices, 12 faces)
-            >>> ball = ((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0) < 8**2
-            >>> round(float(Mesh.of(ball, spacing=(1, 1, 2)).volume / ball.sum()), 3)
-            2.0
-
-        Args:
-            body: a Mesh; a closed surface as a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, whose
-                polygons are cut into triangles; or voxels of one label, as an array (X, Y, Z) or a nibabel image.
-            spacing: sides of a voxel of an array in millimetres. None for voxels of side 1 without a unit.
-        """
-        if isinstance(body, cls):
-            return body
-        from igps.mesh.objects import raw_body
-
-        name, raw = raw_body(body, spacing)
-        return cls(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
 
     def annotated(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Self:
         """Return the mesh with `notes` before its own, and with `unit` unless None, without checking it again."""

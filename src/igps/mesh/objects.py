@@ -1,42 +1,78 @@
 """Convert bodies of other libraries. They are recognised by their attributes, so that no library is imported."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from igps.mesh.formats._format import RawBody, corners_of_rows
-from igps.mesh.formats._polygons import flat_triangles
-from igps.mesh.formats.volumes import label_bodies, volume_in_memory
-from igps.mesh.mesh import MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.formats import all_formats
+from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
+from igps.mesh.polygons import corners_of_rows, flat_triangles
+from igps.mesh.raw_body import RawBody
 
 
-def object_bodies(thing: Any, name: str, options: LoadOptions = LoadOptions()) -> list[RawBody]:
-    """Return the bodies of a surface (see `raw_body`), or of labels: an array, a pair (array, spacing), or an image."""
-    labels, spacing = thing if isinstance(thing, tuple) and len(thing) == 2 else (thing, None)
-    if not _is_volume(labels):
-        return [raw_body(thing)[1]]
-    bodies = label_bodies(volume_in_memory(labels, spacing, name, options), options)
-    is_mask = [body.part for body in bodies] == ["1"]
-    return [replace(bodies[0], part=None)] if is_mask else bodies
+def as_mesh(body: Any, spacing: Sequence[float] | None = None) -> Mesh:
+    """Convert a body of another library to a Mesh; a Mesh is returned unchanged.
+
+    Example:
+        >>> import trimesh
+        >>> as_mesh(trimesh.creation.box((1, 2, 3)))
+        Mesh('mesh', 8 vertices, 12 faces)
+        >>> ball = ((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0) < 8**2
+        >>> round(float(as_mesh(ball, spacing=(1, 1, 2)).volume / ball.sum()), 3)
+        2.0
+
+    Args:
+        body: a Mesh; a closed surface as a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, whose
+            polygons are cut into triangles; or voxels of one label, as an array (X, Y, Z) or a nibabel image.
+        spacing: sides of a voxel of an array in millimetres. None for voxels of side 1 without a unit.
+
+    Raises:
+        TypeError: the body has none of these types.
+        MeshError: its surface is not usable, or there are several labels.
+    """
+    if isinstance(body, Mesh):
+        return body
+    surface = _surface(body)
+    if surface is not None:
+        name, raw = surface
+    else:
+        name = "volume"
+        raw = _single(object_bodies(body if spacing is None else (body, spacing), name)).made()
+    if raw.fault is not None:
+        raise raw.fault
+    return Mesh(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
 
 
-def raw_body(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, RawBody]:
-    """Return the name and the unchecked surface of a body; a TypeError unless it has a type listed in `Mesh.of`."""
-    if _is_volume(thing):
-        bodies = object_bodies((thing, spacing), "volume")
-        if len(bodies) > 1:
-            several = f"volume: expected one label, got {', '.join(str(body.part) for body in bodies)[:80]}."
-            raise MeshError(
-                f"{several} Select one, such as labels == 1, or make a SignatureDataset of all."
-            )
-        raw = bodies[0].made()
-        if raw.fault is not None:
-            raise raw.fault
-        return "volume", raw
+def object_bodies(thing: Any, name: str, options: LoadOptions = LoadOptions()) -> Sequence[RawBody]:
+    """Return the bodies of a surface (see `as_mesh`), or those that a format makes of an object in memory."""
+    surface = _surface(thing)
+    if surface is not None:
+        return [surface[1]]
+    for kind in all_formats():
+        bodies = None if kind.in_memory is None else kind.in_memory(thing, name, options)
+        if bodies is not None:
+            return bodies
+    expected = "a Mesh, a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage or labels"
+    got = f"{type(thing).__module__}.{type(thing).__qualname__}"
+    raise TypeError(
+        f"mesh: expected {expected}, got {got}. Read a file with igps.load_mesh, or pass Mesh(...)."
+    )
+
+
+def _single(bodies: Sequence[RawBody]) -> RawBody:
+    if len(bodies) == 1:
+        return bodies[0]
+    names = ", ".join(str(body.part) for body in bodies)[:80]
+    remedy = "Select one, such as labels == 1, or make a SignatureDataset of all."
+    raise MeshError(f"volume: expected one label, got {names}. {remedy}")
+
+
+def _surface(thing: Any) -> tuple[str, RawBody] | None:
+    """Return the name and the unchecked surface of an object that has vertices and faces; None if it has none."""
     metadata, source = getattr(thing, "metadata", None), getattr(thing, "source", None)
     file_name = metadata.get("file_name") if isinstance(metadata, dict) else None
     path = getattr(source, "file_path", None)  # trimesh keeps the path of the file here
@@ -64,14 +100,4 @@ def raw_body(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, R
             np.asarray(thing.faces, np.int64),
         )
         return name, RawBody(vertices, triangles, unit=unit, notes=getattr(thing, "notes", ()))
-    expected = "a Mesh, a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage or labels"
-    got = f"{type(thing).__module__}.{type(thing).__qualname__}"
-    raise TypeError(
-        f"mesh: expected {expected}, got {got}. Read a file with igps.load_mesh, or pass Mesh(...)."
-    )
-
-
-def _is_volume(thing: Any) -> bool:
-    """Return whether an object is an array of voxels or a nibabel image."""
-    is_image = hasattr(thing, "dataobj") and hasattr(thing, "affine")
-    return is_image or (isinstance(thing, np.ndarray) and thing.ndim == 3)
+    return None

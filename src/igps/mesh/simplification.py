@@ -6,7 +6,8 @@ import numpy as np
 
 from igps._arrays import Floats, Integers, Surface
 from igps._parameters import check_at_least
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import longest_side, undirected_edges
 
 

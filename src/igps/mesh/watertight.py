@@ -29,7 +29,8 @@ from igps.mesh._level_set import (
     merge_near_vertices,
 )
 from igps.mesh._outside import OrientedSurface, find_outside
-from igps.mesh.mesh import Mesh, MeshError, check_coordinates
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh, check_coordinates
 from igps.mesh.surface import diagonal, face_areas, largest, longest_side, unit
 
 # Groups of triangles of less than this share of the area are specks, if a grid of this many cells per side separates

@@ -18,7 +18,7 @@ from igps._parallel import Failed, on_threads, run
 from igps._threads import n_cores, one_thread
 from igps.data.cache import DescriptionCache
 from igps.data.dataset import Failure, SignatureDataset
-from igps.mesh.mesh import MeshError
+from igps.mesh.errors import MeshError
 from igps.nn.axes import Attribute
 from igps.nn.descriptor import BodyDescriptor, Descriptor
 

@@ -11,8 +11,9 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import area_vectors, unit

@@ -16,8 +16,9 @@ from igps._arrays import Floats, Integers
 from igps._parallel import Failed, Job, Result, run
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
+from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import compact, longest_side
 from igps.report.drawing import axes_of

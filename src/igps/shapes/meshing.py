@@ -7,7 +7,8 @@ from scipy import sparse
 
 from igps._arrays import Floats, Integers
 from igps.mesh import surface
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.shapes.skeleton import Placed
 
 _MIN_ANGLE = 5.0  # degrees; keeps every cotangent below 11.5

@@ -13,7 +13,9 @@ from numpy.typing import ArrayLike
 
 from igps._arrays import Floats, Singles
 from igps._threads import one_thread
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
+from igps.mesh.objects import as_mesh
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import face_areas
 from igps.signature.attributes import interior_attributes, surface_attributes
@@ -176,16 +178,16 @@ def compute_signature(
         [2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
 
     Args:
-        mesh: the body, or an object that `Mesh.of` accepts.
+        mesh: the body, or an object that `as_mesh` accepts.
         config: `SignatureConfig()` if None.
 
     Raises:
-        TypeError: `Mesh.of` does not accept the mesh.
+        TypeError: `as_mesh` does not accept the mesh.
         MeshError: the mesh has too few vertices for the eigenpairs, or no interior sample.
         ConvergenceError: the eigensolver failed.
     """
     config = (config or SignatureConfig()).resolved()
-    mesh = Mesh.of(mesh).numbered_by_faces()  # rounding depends on the numbering
+    mesh = as_mesh(mesh).numbered_by_faces()  # rounding depends on the numbering
     if config.max_vertices is not None:
         mesh = simplify(mesh, config.max_vertices)
     outer, is_outer = mesh.outer()

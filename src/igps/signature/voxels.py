@@ -5,8 +5,9 @@ from numpy.typing import NDArray
 
 from igps._arrays import Booleans, Floats, Integers
 from igps._parameters import check_at_least
+from igps.mesh.errors import MeshError
 from igps.mesh.limits import check_grid
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import box_sides, directed_edges, longest_side
 from igps.mesh.winding import winding_number
 

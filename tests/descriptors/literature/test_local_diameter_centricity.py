@@ -14,7 +14,8 @@ from igps.descriptors.literature.local_diameter_centricity import (
     centricity,
     local_diameters,
 )
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 
 
 def centres(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

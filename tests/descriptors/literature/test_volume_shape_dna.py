@@ -13,7 +13,8 @@ from scipy.special import spherical_jn
 
 from conftest import as_mesh
 from igps.descriptors.literature.volume_shape_dna import Boundary, VolumeShapeDNA, volume_spectrum
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 
 BOUNDARIES: tuple[Boundary, ...] = ("dirichlet", "neumann")
 

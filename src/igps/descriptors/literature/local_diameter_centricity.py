@@ -10,7 +10,8 @@ from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors.literature._geodesics import farthest_points
 from igps.descriptors.literature._linear_histogram import linear_histogram
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
 from igps.signature.ordering import in_canonical_order

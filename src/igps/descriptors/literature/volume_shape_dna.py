@@ -26,7 +26,8 @@ from igps._arrays import Booleans, Floats, Integers, Singles
 from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh
 from igps.mesh.surface import longest_side
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean

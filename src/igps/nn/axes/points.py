@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from igps._parameters import check_at_least, check_one_of
 from igps.data.attribute_sources import ResidueAttribute
 from igps.data.requirements import Requirements, embedding_requirements
+from igps.fields.molecules.residue_attributes import RESIDUE_ATTRIBUTES
 from igps.nn._kernels.intervals import find_intervals
 from igps.nn.axes.centres import OrderedCentres, interval_centres
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import barycentroid_potential
 from igps.nn.specification import Specified
 from igps.signature.attributes import AttributeName
-from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES
 
 Side = Literal["inside", "outside"]
 _SIDES = get_args(Side)

@@ -1,0 +1,140 @@
+"""Surfaces of brains in GIFTI and in FreeSurfer's triangle files (lh.pial, ...), both in millimetres."""
+
+import base64
+import re
+from math import prod
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps._arrays import Floats
+from igps.fields.meshes import _xml
+from igps.mesh.formats import Format
+from igps.mesh.limits import check_unpacked
+from igps.mesh.options import LoadOptions
+from igps.mesh.raw_body import RawBody
+
+_TYPES = {
+    "NIFTI_TYPE_FLOAT32": "f4",
+    "NIFTI_TYPE_FLOAT64": "f8",
+    "NIFTI_TYPE_INT32": "i4",
+    "NIFTI_TYPE_UINT8": "u1",
+}
+_POINTS, _TRIANGLES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
+_MAX_AXES = 6
+_MAGIC = b"\xff\xff\xfe"
+_SCANNER_TAG = np.array(
+    [2, 1], ">i4"
+).tobytes()  # behind the triangles if the points are in the coordinates of images
+# Lines at the end of a FreeSurfer file: axes and centre of the volume from which the surface was made.
+_VOLUME_AXES = re.compile(rb"^[xyzc]ras\s*=\s*(\S+)\s+(\S+)\s+(\S+)", re.MULTILINE)
+# The axes of that volume in the coordinates of the surface.
+_SURFACE_AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_KINDS = ("pial", "white", "inflated", "orig", "smoothwm", "sphere", "sphere.reg")
+_SIDES = ("lh.", "rh.")
+_SUFFIXES = tuple(side + kind for side in _SIDES for kind in _KINDS)
+
+
+def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    root = _xml.parse(path.read_bytes())
+    arrays = {
+        intent: _array(element, path, options)
+        for element in reversed(list(root.iter("DataArray")))  # the first of several wins
+        if (intent := element.get("Intent")) in (_POINTS, _TRIANGLES)
+    }
+    if len(arrays) < 2:
+        raise ValueError(
+            "no surface in it: expected points and triangles, which maps of values on a surface lack"
+        )
+    return [
+        RawBody(arrays[_POINTS].astype(np.float64), arrays[_TRIANGLES].astype(np.int64), unit="mm")
+    ]
+
+
+def gifti_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
+    """Return the arrays of values at vertices of a GIFTI file by name."""
+    arrays = {}
+    for number, element in enumerate(_xml.parse(path.read_bytes()).iter("DataArray"), 1):
+        if element.get("Intent") not in (_POINTS, _TRIANGLES):
+            names = [
+                entry.findtext("Value")
+                for entry in element.iter("MD")
+                if entry.findtext("Name") == "Name"
+            ]
+            arrays[(names or [None])[0] or f"array {number}"] = _array(element, path, options)
+    return arrays
+
+
+def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.generic]:
+    if (n_axes := int(element.get("Dimensionality", "2"))) > _MAX_AXES:
+        raise ValueError(f"an array of {n_axes} axes, expected at most {_MAX_AXES}")
+    shape = [int(element.get(f"Dim{i}", "0")) for i in range(n_axes)]
+    kind = np.dtype(_TYPES[element.get("DataType", "")])
+    n_bytes = prod(shape) * kind.itemsize
+    check_unpacked(n_bytes, path, options.max_unpacked)
+    encoding, text = element.get("Encoding"), element.findtext("Data") or ""
+    if encoding == "ASCII":
+        values = _xml.from_text(text, kind)
+    elif encoding in ("Base64Binary", "GZipBase64Binary"):
+        content = base64.b64decode("".join(text.split()), validate=True)
+        content = _xml.inflated(content, n_bytes) if encoding.startswith("GZip") else content
+        values = np.frombuffer(
+            content, kind.newbyteorder("<" if element.get("Endian") == "LittleEndian" else ">")
+        )
+    else:
+        raise ValueError(f"its numbers are encoded as {encoding}, which is not supported")
+    is_column_major = element.get("ArrayIndexingOrder") == "ColumnMajorOrder"
+    return values.reshape(shape[::-1]).T if is_column_major else values.reshape(shape)
+
+
+def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    content = path.read_bytes()
+    at = content.find(b"\n\n") + 2  # behind a line about the author
+    if not content.startswith(_MAGIC) or at < 2:
+        raise ValueError("not a triangle file of FreeSurfer")
+    n_vertices, n_faces = (int(n) for n in np.frombuffer(content, ">i4", 2, at))
+    n_expected, n_bytes = 12 * (n_vertices + n_faces), len(content) - at - 8
+    if min(n_vertices, n_faces) < 0 or n_bytes < n_expected:
+        raise ValueError(
+            f"expected {n_vertices} vertices, {n_faces} triangles, {n_expected} bytes, got {n_bytes}"
+        )
+    vertices = np.frombuffer(content, ">f4", 3 * n_vertices, at + 8).astype(np.float64)
+    faces = np.frombuffer(content, ">i4", 3 * n_faces, at + 8 + 12 * n_vertices).astype(np.int64)
+    return [RawBody(vertices.reshape(-1, 3), faces.reshape(-1, 3), unit="mm")]
+
+
+def in_scanner(path: Path, points: Floats) -> Floats:
+    """Transform points (P, 3) from the coordinates of a surface file to those of images.
+
+    FreeSurfer's triangle files have their origin in the centre of a volume, whose position and axes stand at the end of
+    the file. The points of other files are returned unchanged: they are in the coordinates of images.
+    """
+    content = path.read_bytes()
+    if not content.startswith(_MAGIC):
+        return points
+    at = content.find(b"\n\n") + 2
+    tail = content[at + 8 + 12 * int(np.frombuffer(content, ">i4", 2, at).sum()) :]
+    axes = np.array(_VOLUME_AXES.findall(tail), dtype=np.float64)  # and the centre, (4, 3)
+    if axes.shape != (4, 3) or not re.search(rb"valid\s*=\s*1", tail) or tail[:8] == _SCANNER_TAG:
+        return points
+    return points @ _SURFACE_AXES.T @ axes[:3] + axes[3]
+
+
+def is_freesurfer(path: Path) -> bool:
+    """Return whether a file is a surface of FreeSurfer: "lh." or "rh.", any ending, and the first bytes of the format.
+
+    FreeSurfer 7 and FastSurfer write many endings, such as lh.pial.T1 and lh.white.preaparc, and also maps of values
+    on the surface (lh.thickness), which begin with other bytes.
+    """
+    if not path.name.lower().startswith(_SIDES) or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
+GIFTI = Format(
+    "GIFTI", (".gii",), read_gifti, ignored=(".func.gii", ".label.gii", ".shape.gii", ".time.gii")
+)
+FREESURFER = Format("FreeSurfer", _SUFFIXES, read_freesurfer, recognises=is_freesurfer)

@@ -1,0 +1,343 @@
+"""VTK: legacy files of polygons or cells (.vtk), and XML files (.vtp, .vtu), as text or bytes.
+
+No library is used: meshio does not read PolyData, and VTK itself takes a hundred megabytes and ends the process if a
+header declares too large a size.
+"""
+
+import base64
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps._arrays import Floats, Integers
+from igps.fields.meshes import _vtk_cells, _xml
+from igps.mesh.formats import Format
+from igps.mesh.limits import check_unpacked
+from igps.mesh.options import LoadOptions
+from igps.mesh.polygons import corners_of_rows
+from igps.mesh.raw_body import ONLY_LINES, RawBody
+
+_LEGACY_TYPES = {  # VTK writes vtkIdType as int
+    "float": "f4",
+    "double": "f8",
+    "int": "i4",
+    "unsigned_int": "u4",
+    "long": "i8",
+    "vtktypeint64": "i8",
+    "vtktypeint32": "i4",
+    "short": "i2",
+    "unsigned_short": "u2",
+    "char": "i1",
+    "unsigned_char": "u1",
+    "vtkidtype": "i4",
+}
+_BLANK_LINE = re.compile(rb"\n\r?\n")
+# Types of cells by the sections of legacy and of XML files.
+_LEGACY_CELLS = {
+    "POLYGONS": _vtk_cells.POLYGON,
+    "TRIANGLE_STRIPS": _vtk_cells.STRIP,
+    "LINES": _vtk_cells.POLY_LINE,
+}
+_XML_CELLS = {
+    "Polys": _vtk_cells.POLYGON,
+    "Strips": _vtk_cells.STRIP,
+    "Lines": _vtk_cells.POLY_LINE,
+}
+_COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
+Cells = tuple[
+    Integers, Integers, Integers
+]  # corners laid end to end; corner counts of cells; types of cells
+
+
+@dataclass(frozen=True, eq=False)
+class PointValues:
+    """Points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) at the points by name."""
+
+    vertices: Floats
+    tetrahedra: Integers
+    values: Mapping[str, NDArray[np.generic]]
+
+
+class _Legacy:
+    """A legacy file, read from start to end."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content, self._at = content, 0
+        header, _, kind = self.line(), self.line(), self.line().upper()
+        if not header.lower().startswith("# vtk datafile") or kind not in ("ASCII", "BINARY"):
+            raise ValueError("not a legacy file of VTK")
+        self._is_text = kind == "ASCII"
+
+    def line(self) -> str:
+        """Return the next line that is not blank; "" at the end."""
+        while self._at < len(self._content):
+            end = self._content.find(b"\n", self._at)
+            end = len(self._content) if end < 0 else end
+            text, self._at = self._content[self._at : end].decode("latin-1").strip(), end + 1
+            if text == "METADATA":  # ends at a blank line
+                blank = _BLANK_LINE.search(self._content, self._at)
+                self._at = len(self._content) if blank is None else blank.start()
+            elif text:
+                return text
+        return ""
+
+    def numbers(self, n: int, type_name: str) -> NDArray[np.generic]:
+        kind = np.dtype(_LEGACY_TYPES[type_name.lower()])
+        n_left = len(self._content) - self._at
+        if not 0 <= n <= n_left // (2 if self._is_text else kind.itemsize) + 1:
+            raise ValueError(f"expected {n} numbers, got {n_left} bytes")
+        if not self._is_text:
+            values = np.frombuffer(self._content, kind.newbyteorder(">"), n, self._at)
+            self._at += values.nbytes
+            return values
+        words = self._content[self._at :].split(None, n)
+        remainder = words.pop() if len(words) > n else b""
+        if len(words) != n:
+            raise ValueError(f"expected {n} numbers, got {len(words)}")
+        self._at = len(self._content) - len(remainder)
+        return np.array(words, dtype=kind)
+
+    def cells(self, n: int, size: int) -> tuple[Integers, Integers]:
+        """Read the corners of n cells, laid end to end, and their counts: two arrays, or rows before VTK 5."""
+        before = self._at
+        words = self.line().split()
+        if words[:1] == ["OFFSETS"]:
+            offsets = self.numbers(n, words[1]).astype(np.int64)
+            kind = self.line().split()[1]
+            return self.numbers(size, kind).astype(np.int64), np.diff(offsets)
+        self._at = before
+        corners, n_corners = corners_of_rows(self.numbers(size, "int").astype(np.int64))
+        if len(n_corners) != n:
+            raise ValueError("the numbers of corners do not add up")
+        return corners, n_corners
+
+    def geometry(self) -> tuple[Floats, list[Cells], str]:
+        """Read points and cells; return also the first line behind them."""
+        vertices = np.zeros((0, 3))
+        cells: list[Cells] = []
+        while (words := self.line().split()) and words[0].upper() not in (
+            "POINT_DATA",
+            "CELL_DATA",
+        ):
+            word = words[0].upper()
+            if word == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
+                raise ValueError(f"expected POLYDATA or UNSTRUCTURED_GRID, got {words[1]}")
+            if word == "POINTS":
+                vertices = (
+                    self.numbers(3 * int(words[1]), words[2]).astype(np.float64).reshape(-1, 3)
+                )
+            elif word in ("POLYGONS", "TRIANGLE_STRIPS", "CELLS", "VERTICES", "LINES"):
+                corners, n_corners = self.cells(int(words[1]), int(words[2]))
+                cells.append(
+                    (corners, n_corners, np.full(len(n_corners), _LEGACY_CELLS.get(word, 0)))
+                )
+            elif word == "CELL_TYPES" and cells:
+                cells[-1] = (*cells[-1][:2], self.numbers(int(words[1]), "int").astype(np.int64))
+        return vertices, cells, " ".join(words).upper()
+
+    def arrays(self, heading: str, n_points: int) -> dict[str, NDArray[np.generic]]:
+        """Read the arrays at points by name; `heading` is the line before."""
+        arrays: dict[str, NDArray[np.generic]] = {}
+        is_of_points, n = heading.startswith("POINT_DATA"), n_points
+        while words := self.line().split():
+            word = words[0].upper()
+            if word in ("POINT_DATA", "CELL_DATA"):
+                is_of_points, n = word == "POINT_DATA", int(words[1])
+                continue
+            n_arrays = (
+                int(words[2]) if word == "FIELD" else word in ("VECTORS", "NORMALS", "SCALARS")
+            )
+            for _ in range(n_arrays):
+                if word == "FIELD":
+                    name, width, length, kind = self.line().split()
+                else:
+                    name, width, length, kind = words[1], "3", str(n), words[2]
+                if word == "SCALARS":
+                    width, before = words[3] if len(words) > 3 else "1", self._at
+                    if not self.line().upper().startswith("LOOKUP_TABLE"):
+                        self._at = before
+                values = self.numbers(int(width) * int(length), kind).reshape(
+                    int(length), int(width)
+                )
+                if is_of_points and int(length) == n_points:
+                    arrays[name] = _squeezed(values)
+        return arrays
+
+
+def read_legacy(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    return [_body(*_Legacy(path.read_bytes()).geometry()[:2])]
+
+
+def point_values(path: Path, options: LoadOptions) -> PointValues:
+    """Read the arrays at the points of a VTK file of one piece."""
+    if path.suffix.lower() == ".vtk":
+        legacy = _Legacy(path.read_bytes())
+        vertices, cells, heading = legacy.geometry()
+        return PointValues(vertices, _tetrahedra(cells), legacy.arrays(heading, len(vertices)))
+    file = _Xml(path, options)
+    pieces = list(file.root.iter("Piece"))
+    if len(pieces) != 1:
+        raise ValueError(f"expected one piece, got {len(pieces)}")
+    vertices, cells = file.geometry(pieces[0])
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for element in pieces[0].findall("PointData/DataArray"):
+        values = file.array(element).reshape(len(vertices), -1)
+        arrays[element.get("Name") or f"array {len(arrays) + 1}"] = _squeezed(values)
+    return PointValues(vertices, _tetrahedra(cells), arrays)
+
+
+def _squeezed(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    return values[:, 0] if values.shape[1] == 1 else values
+
+
+def _tetrahedra(cells: list[Cells]) -> Integers:
+    rows = [np.zeros((0, 4), dtype=np.int64)]
+    for corners, n_corners, kinds in cells:
+        if (
+            len(kinds) == len(n_corners)
+            and (n_corners >= 0).all()
+            and n_corners.sum() == len(corners)
+        ):
+            starts = np.cumsum(n_corners) - n_corners
+            rows.append(
+                corners[
+                    starts[(kinds == _vtk_cells.TETRAHEDRON) & (n_corners == 4), None]
+                    + np.arange(4)
+                ]
+            )
+    return np.concatenate(rows)
+
+
+def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """Read the surfaces of an XML file of polygons or cells; each piece is a body."""
+    file = _Xml(path, options)
+    pieces = list(file.root.iter("Piece"))
+    if len(pieces) == 1:
+        return [_body(*file.geometry(pieces[0]))]
+    return [
+        _body(*file.geometry(piece), f"piece {number}") for number, piece in enumerate(pieces, 1)
+    ]
+
+
+class _Xml:
+    """An XML file, to which raw bytes may be appended."""
+
+    def __init__(self, path: Path, options: LoadOptions) -> None:
+        content = path.read_bytes()
+        self._path, self._options, self._appended = path, options, b""
+        self._n_unpacked = -len(content)  # bytes of all arrays beyond the size of the file
+        start = content.find(b"<AppendedData")
+        self._is_raw = start >= 0 and b'"raw"' in content[start : content.find(b">", start)]
+        if start >= 0:
+            begin = content.find(b"_", content.find(b">", start)) + 1
+            self._appended = content[begin : content.rfind(b"</AppendedData>")]
+            content = content[:start] + b"</VTKFile>"
+        self.root = _xml.parse(content)
+        self._order: Literal["<", ">"] = "<" if self.root.get("byte_order") != "BigEndian" else ">"
+        self._header = np.dtype(
+            f"{self._order}u{8 if self.root.get('header_type') == 'UInt64' else 4}"
+        )
+        name = self.root.get("compressor")
+        if name is not None and name not in _COMPRESSORS:
+            raise ValueError(
+                f"expected compression by zlib, LZMA or none, got {name}; export it anew"
+            )
+        self._compressor = None if name is None else _COMPRESSORS[name]
+
+    def geometry(self, piece: Element) -> tuple[Floats, list[Cells]]:
+        points = piece.find("Points/DataArray")
+        if points is None:
+            raise ValueError("no points in it")
+        vertices = self.array(points).astype(np.float64).reshape(-1, 3)
+        cells: list[Cells] = []
+        for group in (*_XML_CELLS, "Cells"):
+            arrays = {
+                element.get("Name"): self.array(element)
+                for element in piece.findall(f"{group}/DataArray")
+            }
+            if len(arrays) >= 2:
+                n_corners = np.asarray(
+                    np.diff(arrays["offsets"].astype(np.int64), prepend=0), dtype=np.int64
+                )
+                kinds = arrays.get("types", np.full(len(n_corners), _XML_CELLS.get(group, 0)))
+                cells.append(
+                    (arrays["connectivity"].astype(np.int64), n_corners, kinds.astype(np.int64))
+                )
+        return vertices, cells
+
+    def array(self, element: Element) -> NDArray[np.generic]:
+        name = element.get("type", "")
+        kind = np.dtype(
+            f"{'f' if name.startswith('F') else name[0].lower()}{int(name.lstrip('UIntFloa')) // 8}"
+        )
+        kind = kind.newbyteorder(self._order)
+        encoding, text = element.get("format"), element.text or ""
+        if encoding == "ascii":
+            values = _xml.from_text(text, kind)
+        elif encoding == "appended":
+            values = np.frombuffer(
+                self._decode(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind
+            )
+        else:
+            values = np.frombuffer(self._decode("".join(text.split()).encode(), False), kind)
+        self._n_unpacked += (
+            values.nbytes
+        )  # a sum, as thousands of arrays may refer to the same bytes
+        check_unpacked(self._n_unpacked, self._path, self._options.max_unpacked)
+        return values
+
+    def _decode(self, content: bytes, is_raw: bool) -> bytes:
+        """Return the bytes of an array, whose header states their number or the sizes of compressed blocks."""
+        size = self._header.itemsize
+        (n,) = np.frombuffer(_first(size, content, is_raw), self._header).tolist()
+        if self._compressor is None:
+            return _first(size + n, content, is_raw)[size:]
+        header = _first((3 + n) * size, content, is_raw)
+        _, n_bytes, n_last, *packed_sizes = np.frombuffer(header, self._header).tolist()
+        check_unpacked(n * n_bytes, self._path, self._options.max_unpacked)
+        packed = _first(
+            sum(packed_sizes), content[len(header) if is_raw else _n_letters(len(header)) :], is_raw
+        )
+        blocks, at = [], 0
+        for number, n_packed in enumerate(packed_sizes):
+            n_unpacked = n_last if number == n - 1 and n_last else n_bytes
+            blocks.append(_xml.inflated(packed[at : at + n_packed], n_unpacked, self._compressor))
+            at += n_packed
+        return b"".join(blocks)
+
+
+def _first(n: int, content: bytes, is_raw: bool) -> bytes:
+    """Decode the first n bytes of content that is raw or in base64."""
+    decoded = content[:n] if is_raw else base64.b64decode(content[: _n_letters(n)])[:n]
+    if len(decoded) < n:
+        raise ValueError(f"expected an array of {n} bytes, got {len(decoded)}")
+    return decoded
+
+
+def _n_letters(n_bytes: int) -> int:
+    return 4 * -(-n_bytes // 3)  # in base64
+
+
+def _body(vertices: Floats, cells: list[Cells], part: str | None = None) -> RawBody:
+    """Make a body of the surface of cells; a ValueError if the counts do not add up."""
+    faces = [np.zeros((0, 3), dtype=np.int64)]
+    has_lines = False
+    for corners, n_corners, kinds in cells:
+        if len(kinds) != len(n_corners) or (n_corners < 0).any() or n_corners.sum() != len(corners):
+            raise ValueError("the numbers of cells and corners do not agree")
+        faces.append(_vtk_cells.surface(corners, n_corners, kinds, vertices))
+        has_lines |= bool(np.isin(kinds, _vtk_cells.LINES).any())
+    triangles = np.concatenate(faces)
+    if has_lines and not len(triangles):
+        raise ValueError(ONLY_LINES)
+    return RawBody(vertices, triangles, part)
+
+
+LEGACY = Format("VTK", (".vtk",), read_legacy)
+XML = Format("VTK XML", (".vtp", ".vtu"), read_xml, bodies=("whole", "objects"))

@@ -1,0 +1,121 @@
+"""Attributes of samples from the residues of a molecule around them: charge, hydropathy, kinds, ...
+
+All but the screened potential are means over the residues, weighted by a Gaussian of the distance. They are therefore
+defined everywhere inside, and change little when atoms move.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from igps._arrays import Floats
+from igps.fields.molecules.molecule import Molecule
+from igps.fields.molecules.residues import ACCEPTORS, AROMATIC, DONORS, HYDROPATHY, VOLUMES
+
+RESIDUE_KINDS = (*sorted(VOLUMES), "A", "C", "G", "U", "other")
+"""Amino acids, bases of nucleotides (U includes T), and all other residues."""
+
+WIDTH = 4.0
+"""Standard deviation of the Gaussian, Å."""
+
+BJERRUM_LENGTH = 7.14
+"""Distance at which two elementary charges in water have the energy kT, Å, at 25 °C."""
+
+DEBYE_LENGTH = 7.85
+"""Distance over which salt water screens a charge, Å, at 0.15 mol/l."""
+
+# Largest number of entries of a matrix of points by residues
+_BLOCK_SIZE = 2**22
+
+
+def screened_potential(molecule: Molecule, points: Floats) -> Floats:
+    """Return the potential (P,) of all charges in salt water at points (P, 3), kT/e (Debye and Hückel 1923).
+
+    It is the sum of l·q/d·exp(−d/D) over charges q at distances d, with l the Bjerrum length and D the Debye length.
+    Inside the ball of an atom, d is the radius of the ball.
+    """
+    charged = np.nonzero(molecule.charges)[0]
+    positions, radii = molecule.positions[charged], np.maximum(molecule.radii[charged], 1.0)
+    strength = BJERRUM_LENGTH * molecule.charges[charged]
+    potential = np.zeros(len(points))
+    for block in _blocks(len(points), len(charged)):
+        distance = np.maximum(cdist(points[block], positions), radii)
+        potential[block] = (np.exp(-distance / DEBYE_LENGTH) / distance) @ strength
+    return potential
+
+
+def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
+    """Return means (P, D) of the residues' values (R, D) at points (P, 3), Å, weighted by a Gaussian of the distance.
+
+    Unknown values (NaN) are left out; the mean is NaN if no value is known near a point.
+    """
+    known = np.isfinite(values)
+    filled = np.where(known, values, 0)
+    means = np.empty((len(points), values.shape[1]))
+    for block in _blocks(len(points), len(values)):
+        squares = cdist(points[block], molecule.residue_positions, "sqeuclidean")
+        # Relative to the weight of the nearest residue, so that not all weights vanish far outside.
+        weights = np.exp((squares.min(axis=1, keepdims=True) - squares) / (2 * WIDTH**2))
+        total = weights @ known.astype(float)
+        means[block] = np.where(total > 0, weights @ filled / np.where(total > 0, total, 1), np.nan)
+    return means
+
+
+def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
+    """Return a named attribute of points (P, 3), Å: (P,), or (P, 25) for "residue_shares"; a ValueError for others."""
+    if name == "screened_potential":
+        return screened_potential(molecule, points)
+    if name not in _COLUMNS:
+        raise ValueError(
+            f"attributes: expected names among {', '.join(RESIDUE_ATTRIBUTES)}, got {name!r}."
+        )
+    means = residue_means(molecule, points, _COLUMNS[name](molecule))
+    return means[:, 0] if means.shape[1] == 1 else means
+
+
+def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[Molecule], Floats]:
+    """Return a function for values (R, 1) by residue name: the default for amino acids not in the table, else NaN."""
+
+    def column(molecule: Molecule) -> Floats:
+        values = [
+            table.get(name, default if name in VOLUMES else np.nan)
+            for name in molecule.residue_names
+        ]
+        return np.array(values, dtype=float)[:, None]
+
+    return column
+
+
+def _charges(molecule: Molecule) -> Floats:
+    sums = np.bincount(molecule.residue_of, molecule.charges, len(molecule.residue_names))
+    return sums[:, None].astype(np.float64)
+
+
+def _kinds(molecule: Molecule) -> Floats:
+    """Return the kind of each residue as a one-hot row (R, 25)."""
+    index = {name: i for i, name in enumerate(RESIDUE_KINDS)}
+    index |= {f"D{base}": index[base] for base in "ACG"} | {"DT": index["U"], "T": index["U"]}
+    return np.eye(len(RESIDUE_KINDS))[
+        [index.get(name, index["other"]) for name in molecule.residue_names]
+    ]
+
+
+_COLUMNS: Mapping[str, Callable[[Molecule], Floats]] = {
+    "charge": _charges,  # elementary charges
+    "hydropathy": _by_name(HYDROPATHY),  # Kyte and Doolittle 1982
+    "b_factor": lambda molecule: molecule.b_factors[:, None],  # Å², or pLDDT
+    "donors": _by_name(DONORS, 0.0),  # numbers of hydrogen bond donors of the side chain
+    "acceptors": _by_name(ACCEPTORS, 0.0),
+    "aromaticity": _by_name(dict.fromkeys(AROMATIC, 1.0), 0.0),  # 1 for amino acids with a ring
+    "residue_volume": _by_name(VOLUMES),  # Å³, Zamyatnin 1972
+    "residue_shares": _kinds,  # shares of `RESIDUE_KINDS`, which sum to 1
+}
+
+RESIDUE_ATTRIBUTES: tuple[str, ...] = (*_COLUMNS, "screened_potential")
+"""Names of the attributes, see `residue_attribute`."""
+
+
+def _blocks(n_points: int, n_others: int) -> list[slice]:
+    step = max(_BLOCK_SIZE // max(n_others, 1), 1)
+    return [slice(start, start + step) for start in range(0, n_points, step)]

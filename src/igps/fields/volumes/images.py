@@ -1,0 +1,104 @@
+"""Images and grids of values around bodies, as arrays with affines."""
+
+import math
+import re
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps._arrays import Floats
+from igps.fields.volumes import _volume_files
+from igps.mesh.errors import MeshError
+
+_GRIDS = (".dx", ".mrc", ".map", ".ccp4")
+SUFFIXES = (*_volume_files.READERS, *_GRIDS)
+_MODE_BYTES = {
+    0: 1,
+    1: 2,
+    2: 4,
+    4: 8,
+    6: 2,
+    12: 2,
+}  # of a value, by the mode of an MRC map (MRC2014)
+
+
+@lru_cache(maxsize=1)
+def read(path: Path, changed: tuple[int, int, int]) -> tuple[NDArray[Any], Floats]:
+    """Return the values (X, Y, Z) of an image or grid, and the affine (4, 4) from voxels to coordinates.
+
+    NIfTI, MGH, NRRD, MetaImage and TIFF are in world coordinates (RAS, millimetres), OpenDX, MRC and CCP4 in ångström.
+    The last file is cached; `changed`, its `stat_key`, is part of the cache key.
+    """
+    if path.name.lower().endswith(_GRIDS):
+        return (_read_dx if path.suffix.lower() == ".dx" else _read_map)(path)
+    volume = _volume_files.read_raw(path)
+    return volume.layers[0], volume.affine
+
+
+def _read_dx(path: Path) -> tuple[NDArray[Any], Floats]:
+    """Read an OpenDX file as APBS writes it. GridDataFormats is not used: it hangs on truncated files."""
+    text = path.read_bytes()
+    head, _, body = text.partition(b"data follows")
+    triple = rb"\s+(\S+)\s+(\S+)\s+(\S+)"
+    counts, origin = (
+        re.search(rb"gridpositions\s+counts" + triple, head),
+        re.search(rb"origin" + triple, head),
+    )
+    deltas = re.findall(rb"delta" + triple, head)
+    if counts is None or origin is None or len(deltas) != 3:
+        raise MeshError(
+            f"{path}: expected counts, origin and three deltas of an OpenDX grid. Export it again."
+        )
+    sizes = [int(n) for n in counts.groups()]
+    n_values = math.prod(sizes)
+    if min(sizes) < 2 or n_values > len(body):  # a value takes at least a byte
+        raise MeshError(
+            f"{path}: declares {sizes} values, got {len(body)} bytes of values. Export it again."
+        )
+    words = body.split(None, n_values)[:n_values]
+    if len(words) < n_values:
+        raise MeshError(f"{path}: expected {n_values} values, got {len(words)}. Export it again.")
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = (
+        np.array(deltas, dtype=float).T,
+        np.array(origin.groups(), dtype=float),
+    )
+    return np.array(words, dtype=np.float32).reshape(sizes), affine
+
+
+def _read_map(path: Path) -> tuple[NDArray[Any], Floats]:
+    try:
+        import mrcfile
+    except ImportError as error:
+        raise ImportError('Maps need mrcfile: pip install "interior-gps[molecules]".') from error
+    head = np.fromfile(path, "<i4", 4)
+    head = head.byteswap() if len(head) == 4 and not 0 <= head[3] < 256 else head
+    n_expected = 1024 + (
+        math.prod(map(int, head[:3])) * _MODE_BYTES.get(int(head[3]), 1) if len(head) == 4 else 0
+    )
+    if len(head) < 4 or min(head[:3]) < 1 or path.stat().st_size < n_expected:
+        raise MeshError(
+            f"{path}: expected {n_expected} bytes, got {path.stat().st_size}. Export it again."
+        )
+    with mrcfile.open(path) as file:
+        header, values = file.header, file.data
+        if values is None or values.ndim != 3 or not np.allclose(header.cellb.item(), 90):
+            raise MeshError(f"{path}: expected a map of three axes at right angles. Resample it.")
+        # The axes (1 to 3) of columns, rows and sections; the values are (sections, rows, columns)
+        along = [int(header[name]) for name in ("mapc", "mapr", "maps")]
+        sides = np.array(file.voxel_size.item(), dtype=float)
+        if not (sides > 0).all() or values.dtype.kind == "c":
+            kind = "complex numbers" if values.dtype.kind == "c" else f"voxels of {sides} Å"
+            raise MeshError(
+                f"{path}: expected real numbers in voxels of known size, got {kind}. Export it again."
+            )
+        starts = np.array([int(header[name]) for name in ("nxstart", "nystart", "nzstart")])[
+            np.argsort(along)
+        ]
+        # If a file has both origin and starts, they state the same position, and most programs use the origin
+        origin, affine = np.array(header.origin.item(), dtype=float), np.eye(4)
+        affine[:3, :3], affine[:3, 3] = np.diag(sides), origin if origin.any() else starts * sides
+        return np.array(values.transpose(np.argsort(along[::-1]))), affine

@@ -1,0 +1,317 @@
+"""Make a closed triangle mesh without stairs from the voxels of a label, accurate to a fraction of a voxel.
+
+A label with many more voxels than the mesh needs vertices is first put on a coarser grid, unless it is too thin for
+that; the coarse voxels hold shares. Then a smooth function that agrees with every voxel (`_label_field`) is
+interpolated by cubic splines along the long sides of the voxels. Marching cubes extract its zero level, quadrics
+(Garland and Heckbert 1997) reduce the vertices, and the volume is set to that of the voxels.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from igps._arrays import Booleans, Floats, Integers, Singles, Surface
+from igps.fields.volumes._label_field import PAD, filled_volume, smooth_field
+from igps.fields.volumes._label_gaps import TOUCHING, fill_missed_slices
+from igps.mesh._isosurface import level_surface, restore_volume, simplify_surface
+from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles, join_pieces
+from igps.mesh.errors import MeshError
+from igps.mesh.limits import check_grid
+from igps.mesh.surface import connected, signed_volume, stacked
+
+MAX_VERTICES = 5000
+"""Default maximal number of vertices of a label's surface."""
+
+MIN_VOXELS = 8
+"""Minimal number of voxels of a label; fewer have no shape."""
+
+_ISLAND = 0.02  # separate pieces of less than this share of the voxels are dropped
+_MIN_OPEN_CAVITY = 0.1  # share of the voxels from which an open cavity is noted
+_SPECK = 0.005  # pieces of the surface of less than this share of the volume are artefacts between voxels
+_MAX_SURPLUS = 4  # the grid may make this many times `max_vertices`, before simplification
+_MIN_VERTICES = 1500  # the field is interpolated until the grid makes about as many
+_MAX_REFINEMENT = 4
+_N_LEVELS = 3  # iterations for the level that gives the volume
+# Radius of the bars between pieces, over the square root of the area. It exceeds most cells, so that the thickness of
+# bars does not depend on the grid.
+_BAR = 0.02
+_MAX_THIN = 0.005  # maximal share of a label that may be too thin for a coarser grid
+
+
+def voxel_surface(
+    inside: ArrayLike,
+    affine: ArrayLike | None = None,
+    *,
+    max_vertices: int = MAX_VERTICES,
+    cavities: bool = False,
+    joins: bool = False,
+    name: str = "volume",
+) -> tuple[Floats, Integers, tuple[str, ...]]:
+    """Make a closed, outward oriented surface of the voxels of a body.
+
+    The surface encloses the volume of the voxels. The centres of all voxels are on the right side of it, unless the
+    body was put on a coarser grid. A body that reaches the border of the volume is closed there. Voxels that share only
+    a corner are connected. Holes inside are filled.
+
+    Example:
+        >>> ball = ((np.indices((24, 24, 24)) - 11.3) ** 2).sum(axis=0) < 10**2
+        >>> vertices, faces, _ = voxel_surface(ball)
+        >>> bool(abs(np.linalg.norm(vertices - 11.3, axis=1) - 10).max() < 0.4)
+        True
+
+    Args:
+        inside: (X, Y, Z), true at voxels whose centre lies in the body.
+        affine: (4, 4) from voxel indices to world coordinates; may shear and mirror. None for voxels of side 1.
+        max_vertices: approximate maximal number of vertices.
+        cavities: keep hollows of at least `MIN_VOXELS` voxels; they get surfaces that are oriented inward.
+        joins: join separate pieces: up to three missed slices between them are filled, and wider gaps are bridged by
+            bars where they are narrowest.
+        name: name of the body in error messages.
+
+    Returns:
+        Vertices (V, 3) in world coordinates, faces (F, 3) of one or several closed pieces, and notes of what was done.
+
+    Raises:
+        MeshError: the mask has too few voxels, most voxels lie in small pieces, or the affine is singular.
+    """
+    mask = np.asarray(inside, dtype=bool)
+    if mask.ndim != 3:
+        raise MeshError(f"{name}: expected an array of three axes, got shape {mask.shape}.")
+    matrix = np.eye(4) if affine is None else np.asarray(affine, dtype=np.float64)
+    spacing = voxel_spacing(matrix, name)
+    n_voxels = int(np.count_nonzero(mask))
+    if n_voxels < MIN_VOXELS:
+        few = f"expected at least {MIN_VOXELS} voxels, got {n_voxels}, which have no shape"
+        raise MeshError(f"{name}: {few}. Leave out the label, or segment it on a finer grid.")
+    (box,) = ndimage.find_objects(mask.view(np.uint8))
+    low = np.array([side.start for side in box], dtype=np.float64)
+    notes: list[str] = []
+    mask = fill_missed_slices(mask[box], notes) if joins else mask[box]
+    mask, hollows = _clean(mask, notes, MIN_VOXELS if cavities else None, name)
+    if cavities and (n_open := _n_nearly_enclosed(mask)) > _MIN_OPEN_CAVITY * np.count_nonzero(
+        mask
+    ):
+        notes.append(
+            f"a cavity of about {n_open} voxels is open through gaps of up to two voxels in its wall"
+        )
+    share, factor = _coarsen(mask, spacing, max_vertices)
+    mask = _thicken_contacts(share >= 0.5)
+    share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
+    check_grid(share.size, name)
+    sides = spacing * factor / (spacing * factor).min()  # nothing depends on the unit of length
+    field = smooth_field(share, sides)
+    # Each side is divided so that its parts are about equal and give enough vertices.
+    n_vertices = _n_vertices(mask, sides)
+    refinement = min(max(math.ceil(math.sqrt(_MIN_VERTICES / n_vertices)), 1), _MAX_REFINEMENT)
+    n_parts = np.maximum(np.round(refinement * sides / sides.min()), 1).astype(np.int64)
+    field = _refine(field, share, n_parts, sides / n_parts)
+    n_cells = float(share.sum(dtype=np.float64) * n_parts.prod())
+    if joins and ndimage.label(mask)[1] > 1:
+        n_before = np.count_nonzero(field < 0)
+        # A surface has about 1.5 vertices per squared side of a cell.
+        radius = _BAR * math.sqrt(n_vertices / 1.5) * refinement
+        field = join_pieces(field.astype(np.float32, copy=False), notes, radius)
+        n_cells += np.count_nonzero(field < 0) - n_before
+    vertices, faces = _mesh(
+        field, sides / n_parts, n_cells * (sides / n_parts).prod(), max_vertices, name
+    )
+    # The centre of a block of `factor` voxels lies (factor - 1) / 2 beyond that of its first voxel.
+    index = (vertices / sides - PAD) * factor + (factor - 1) / 2 + low
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        faces = np.ascontiguousarray(faces[:, ::-1])
+    surfaces = [(index @ matrix[:3, :3].T + matrix[:3, 3], faces)]
+    matrix = matrix @ np.block([[np.eye(3), low[:, None]], [np.zeros(3), 1]])
+    for hollow in hollows:
+        points, triangles, cavity_notes = voxel_surface(
+            hollow, matrix, max_vertices=max_vertices, name=name
+        )
+        notes += [f"in a cavity: {note}" for note in cavity_notes]
+        surfaces.append((points, triangles[:, ::-1]))
+    return *stacked(surfaces), tuple(notes)
+
+
+def voxel_spacing(affine: Floats, name: str) -> Floats:
+    """Return the sides (3,) of a voxel, or raise a MeshError unless the affine is a finite invertible matrix (4, 4)."""
+    if affine.shape != (4, 4) or not np.isfinite(affine).all():
+        raise MeshError(
+            f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}."
+        )
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    if (
+        not spacing.all()
+        or abs(np.linalg.det(affine[:3, :3] / np.where(spacing, spacing, 1))) < 1e-6
+    ):
+        raise MeshError(
+            f"{name}: the affine is singular. Write the file again with spacing and axes of the voxels."
+        )
+    return spacing
+
+
+def _clean(
+    mask: Booleans, notes: list[str], min_hole: int | None, name: str
+) -> tuple[Booleans, list[Booleans]]:
+    """Drop islands and fill holes. Also return the masks of the holes of at least `min_hole` voxels, none if None."""
+    label, island, size = _islands(mask)
+    if len(island):
+        n_dropped = int(size[island].sum())
+        if 2 * n_dropped >= size.sum():  # such as lesions
+            share = f"{name}: {n_dropped / size.sum():.0%} of the voxels lie in {len(island)} separate pieces"
+            remedy = 'Read each piece as a body: LoadOptions(bodies="pieces"), --bodies pieces; or connect the pieces.'
+            raise MeshError(
+                f"{share}, each below {_ISLAND:.0%} of the label; one body was expected. {remedy}"
+            )
+        mask = mask & ~np.isin(label, island)
+        pieces = "1 small piece" if len(island) == 1 else f"{len(island)} small pieces"
+        notes.append(
+            f"dropped {pieces} apart of {n_dropped} voxels, {n_dropped / size.sum():.1%} of the label"
+        )
+    # Voxels outside are connected only across faces.
+    hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
+    if n_hollow < 2:
+        return mask, []
+    outside, hollow = hollow[0, 0, 0], hollow[1:-1, 1:-1, 1:-1]
+    size = np.bincount(hollow.reshape(-1))
+    size[[0, outside]] = 0
+    cavities = [] if min_hole is None else np.flatnonzero(size >= min_hole).tolist()
+    if n_filled := int(size.sum() - size[cavities].sum()):
+        notes.append(f"filled holes of {n_filled} voxels")
+    return np.asarray(hollow != outside), [hollow == k for k in cavities]
+
+
+def _n_nearly_enclosed(mask: Booleans) -> int:
+    """Count the voxels outside a body that it encloses if it is thickened by one voxel."""
+    label, _ = ndimage.label(~ndimage.binary_dilation(np.pad(mask, 2), TOUCHING))
+    size = np.bincount(label.reshape(-1))
+    return int(size[1:].sum() - size[label[0, 0, 0]])
+
+
+def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
+    """Return the piece of each voxel, from 1; the pieces too small to keep; and the number of voxels of each piece."""
+    label, _ = ndimage.label(mask, TOUCHING)
+    size = np.bincount(label.reshape(-1))
+    size[0] = 0
+    return label, np.nonzero(size < _ISLAND * size.sum())[0][1:], size
+
+
+def _thicken_contacts(mask: Booleans) -> Booleans:
+    """Add voxels where parts touch only at an edge or a corner."""
+    for _ in range(3):
+        label, n_pieces = ndimage.label(mask)
+        if n_pieces < 2:
+            break
+        padded = np.pad(label, 1)
+        added = np.zeros_like(mask)
+        for step in np.ndindex(3, 3, 3):
+            offset = np.array(step) - 1
+            if np.abs(offset).sum() < 2 or tuple(offset) < (0, 0, 0):
+                continue
+            moved = padded[
+                tuple(slice(1 + d, 1 + d + n) for d, n in zip(offset, mask.shape, strict=True))
+            ]
+            at = np.argwhere((label > 0) & (moved > 0) & (label != moved))
+            for axis in np.nonzero(offset)[0][:-1]:
+                at[:, axis] += offset[axis]
+                added[tuple(at.T)] = True
+        if not added.any():
+            break
+        mask = mask | added
+    return mask
+
+
+def _n_vertices(mask: Booleans, sides: Floats) -> float:
+    """Estimate how many vertices marching cubes make on a grid as fine as the shortest side."""
+    masks = [np.moveaxis(mask, axis, 0) for axis in range(3)]
+    n_cuts = np.array(
+        [np.count_nonzero(m[1:] != m[:-1]) + np.count_nonzero(m[[0, -1]]) for m in masks]
+    )
+    return float((n_cuts * sides.prod() / sides).sum() / sides.min() ** 2)
+
+
+def _coarsen(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Singles, Integers]:
+    """Return the shares of larger voxels, and how many voxels of the mask each takes along each axis."""
+    from skimage.measure import block_reduce
+
+    share, factor = mask.astype(np.float32), np.ones(3, dtype=np.int64)
+    n_pieces = ndimage.label(mask, TOUCHING)[1]
+    while _n_vertices(mask, spacing * factor) > _MAX_SURPLUS * max_vertices:
+        sides = spacing * factor
+        is_halved = sides < 1.5 * sides.min()
+        if not _is_thick(mask, is_halved):
+            break
+        coarse = block_reduce(
+            share, tuple(np.where(is_halved, 2, 1)), np.mean
+        )  # exact in single precision
+        # Drop small pieces that were connected only by threads too thin for the coarse grid.
+        label, island, size = _islands(coarse >= 0.5)
+        if np.count_nonzero(size) - len(island) != n_pieces:
+            break
+        coarse[np.isin(label, island) & (label > 0)] = 0
+        share, factor, mask = coarse, factor * np.where(is_halved, 2, 1), np.asarray(coarse >= 0.5)
+    return share, factor
+
+
+def _is_thick(mask: Booleans, axes: Booleans) -> bool:
+    """Return whether nearly all of the body is at least three voxels thick along the axes."""
+    core = ndimage.minimum_filter(mask, tuple(np.where(axes, 3, 1)), mode="constant")
+    is_thick = ndimage.maximum_filter(core, tuple(np.where(axes, 5, 1)), mode="constant")
+    return bool(np.count_nonzero(mask & ~is_thick) <= _MAX_THIN * np.count_nonzero(mask))
+
+
+def _refine(
+    field: Floats | Singles, share: Singles, n_parts: Integers, sides: Floats
+) -> Floats | Singles:
+    """Interpolate the field between the centres of the voxels, and shift it to the level that gives their volume."""
+    from scipy.interpolate import CubicSpline
+
+    inside = share >= 0.5
+    for axis, n in enumerate(n_parts.tolist()):
+        if n > 1:
+            index = np.arange(field.shape[axis])
+            spline = CubicSpline(index, field, axis=axis, bc_type="natural")
+            field = spline(np.linspace(0, index[-1], index[-1] * n + 1))
+    volume, min_abs = (
+        share.sum(dtype=np.float64) * n_parts.prod(),
+        MIN_ABS_VALUE * float(sides.min()),
+    )
+    for _ in range(_N_LEVELS):
+        filled, slope = filled_volume(field, float(sides.sum()))
+        field -= (volume - filled) / max(slope, 1e-9)
+    # Make the field negative between neighbours in the body, so that they stay connected.
+    for axis, n in enumerate(n_parts.tolist()):
+        both = inside & np.roll(inside, -1, axis)
+        for part in range(n):
+            at = tuple(
+                slice(part if k == axis else 0, None, step)
+                for k, step in enumerate(n_parts.tolist())
+            )
+            line = field[at]
+            line[both[tuple(slice(size) for size in line.shape)] & (line > -min_abs)] = -min_abs
+    return field
+
+
+def _mesh(
+    field: Floats | Singles, sides: Floats, volume: float, max_vertices: int, name: str
+) -> Surface:
+    """Mesh the zero level of a field as closed pieces of this volume; the sides of a cell are about equal."""
+    cell = float(sides.min())
+    min_abs = MIN_ABS_VALUE * cell
+    level = np.where(field < 0, np.minimum(field, -min_abs), np.maximum(field, min_abs)) / cell
+    vertices, faces = level_surface(fill_bubbles(level.astype(np.float32, copy=False)), name)
+    vertices = vertices * (sides / cell)
+    pieces = connected(vertices, faces)
+    volumes = np.abs([signed_volume(*piece) for piece in pieces])
+    parts = []
+    for piece in [
+        piece for piece, size in zip(pieces, volumes, strict=True) if size > _SPECK * volumes.sum()
+    ]:
+        if signed_volume(*piece) < 0:
+            piece = piece[0], piece[1][:, ::-1]
+        parts.append(
+            simplify_surface(*piece, max(round(max_vertices * len(piece[0]) / len(vertices)), 50))
+        )
+    points, triangles = stacked(parts)
+    return restore_volume(points, triangles, volume / cell**3) * cell, np.ascontiguousarray(
+        triangles
+    )

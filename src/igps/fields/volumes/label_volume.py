@@ -1,0 +1,391 @@
+"""Label volumes: NIfTI, NRRD, MetaImage, MGH, DICOM SEG and TIFF stacks; each label is a body.
+
+World coordinates are RAS (x to the patient's right, y to the front, z up) in millimetres. No volume is resampled.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
+
+from igps._arrays import Booleans, Floats
+from igps.fields.volumes._volume_files import (
+    READERS,
+    RawVolume,
+    detached,
+    of_nibabel,
+    read_raw,
+    suffix_of,
+)
+from igps.fields.volumes.label_names import cleaned, read_label_names, table_beside
+from igps.fields.volumes.label_surface import MIN_VOXELS, voxel_spacing, voxel_surface
+from igps.mesh.errors import MeshError
+from igps.mesh.formats import Format, faults
+from igps.mesh.mending import Cavities, Mending, mend
+from igps.mesh.mesh import Mesh
+from igps.mesh.options import LoadOptions
+from igps.mesh.raw_body import LabelVoxels, RawBody, deferred
+
+# Volumes with more values than _MAX_LABELS are refused as images. So are those with more than _MAX_UNCHECKED values if
+# less than a share _MIN_EQUAL of adjacent voxels are equal; labels as thin as two voxels have a share of one half.
+_MAX_LABELS, _MAX_UNCHECKED, _MIN_EQUAL = 20_000, 50, 0.3
+_LABEL_TOLERANCE = (
+    0.01  # distance of a label from a whole number: NIfTI may store labels as scaled integers
+)
+
+Box = tuple[slice, slice, slice]
+
+
+@dataclass(frozen=True)
+class LabelBody:
+    """A label of a volume that is a body."""
+
+    label: int
+    name: str
+    n_voxels: int
+    layer: int  # index of the array in `LabelVolume.layers`
+    value: int  # of the label in that array
+    box: Box  # the smallest that contains the label in that array
+
+
+@dataclass(frozen=True, eq=False)
+class LabelVolume:
+    """Labels of voxels, with the affine to the world.
+
+    Example:
+        >>> labels = np.zeros((20, 20, 20), dtype=np.uint8)
+        >>> labels[2:10, 2:18, 2:18], labels[10:18, 2:18, 2:18] = 1, 2
+        >>> volume = LabelVolume((labels,), np.diag([1.0, 1.0, 2.0, 1.0]), names={2: "liver"})
+        >>> [(body.label, body.name, body.n_voxels) for body in volume.bodies]
+        [(1, '1', 2048), (2, 'liver', 2048)]
+
+    Raises:
+        MeshError: no labels, labels other than whole numbers from 0, ambiguous names, or a singular affine.
+    """
+
+    layers: tuple[
+        NDArray[Any], ...
+    ]  # (X, Y, Z) whole numbers, 0 is the background; several if segments overlap
+    affine: Floats  # (4, 4) from voxel indices to the world
+    name: str = "volume"  # used in messages, usually the path
+    names: dict[int, str] | None = None  # of labels
+    # (label, layer, value in the layer), if the file lists its segments; None for one layer of labels
+    segments: tuple[tuple[int, int, int], ...] | None = None
+    unit: str | None = "mm"  # of length, None if unknown
+    notes: tuple[str, ...] = ()  # remarks on how the volume was read
+
+    def __post_init__(self) -> None:
+        voxel_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
+        if not self.bodies:
+            notes = f" ({'; '.join(self.notes)})" if self.notes else ""
+            raise MeshError(
+                f"{self.name}: no voxel has a label, all are 0{notes}. Check the export."
+            )
+        seen: dict[str, int] = {}  # a given name may equal one that was made distinct by its number
+        for body in self.bodies:
+            if (other := seen.setdefault(body.name, body.label)) != body.label:
+                both = f"labels {other} and {body.label} are both named {body.name!r}"
+                raise MeshError(f"{self.name}: {both}. Rename one, or give names by a table.")
+
+    @cached_property
+    def bodies(self) -> tuple[LabelBody, ...]:
+        """The bodies of all labels that occur, in ascending order; names that repeat are followed by the label."""
+        names, bodies = self.names or {}, []
+        for layer, labels in enumerate(self.layers):
+            known = {value: label for label, index, value in self.segments or () if index == layer}
+            for value, n_voxels, box in _count_labels(labels, self.name):
+                label = known.get(value, value if len(self.layers) == 1 else None)
+                if label is not None:
+                    bodies.append(
+                        LabelBody(label, names.get(label, str(label)), n_voxels, layer, value, box)
+                    )
+        uses = Counter(body.name for body in bodies)
+        distinct = (
+            replace(x, name=f"{x.name} ({x.label})") if uses[x.name] > 1 else x for x in bodies
+        )
+        return tuple(sorted(distinct, key=lambda body: body.label))
+
+    def body(self, part: int | str) -> LabelBody:
+        """Return the body of a label or name; if there is none, a MeshError lists the names."""
+        by_key: dict[int | str, LabelBody] = {str(body.label): body for body in self.bodies}
+        # Names win over the numbers of other labels: teeth have numbers as names
+        by_key |= {key: body for body in self.bodies for key in (body.label, body.name)}
+        if part in by_key:
+            return by_key[part]
+        known = ", ".join(body.name for body in self.bodies[:10]) + (
+            ", …" if len(self.bodies) > 10 else ""
+        )
+        raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
+
+    def mask(self, part: int | str) -> Booleans:
+        """Return the mask of a label within its `LabelBody.box`."""
+        body = self.body(part)
+        return np.asarray(self.layers[body.layer][body.box] == body.value)
+
+    def voxels(self, part: int | str) -> LabelVoxels:
+        """Return the mask of a label with its place in the volume."""
+        low = np.array([side.start for side in self.body(part).box])
+        return LabelVoxels(
+            self.mask(part), low, self.layers[0].shape, np.asarray(self.affine, dtype=np.float64)
+        )
+
+
+def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) -> LabelVolume:
+    """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.nhdr`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`.
+
+    Names of labels come from the table `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, NIfTI extensions,
+    MGH tags), else from a table beside it (see `table_beside`). Otherwise labels are named by their numbers, and the
+    only label of a mask, 1 or 255, is named after the file.
+
+    Raises:
+        MeshError: the file is missing, cut short, too large, or holds no labels.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(f"{path}: no such file. Check the path.")
+    with faults(path, FORMAT):
+        raw = read_raw(path)
+    return _labelled(raw, str(path), options, path)
+
+
+def volume_in_memory(
+    labels: Any,
+    spacing: Sequence[float] | None = None,
+    name: str = "volume",
+    options: LoadOptions = LoadOptions(),
+) -> LabelVolume:
+    """Make a volume of an array (X, Y, Z) and the sides of a voxel, in millimetres, or of an image of nibabel."""
+    if hasattr(labels, "dataobj"):
+        raw = of_nibabel(labels, name)
+    else:
+        array = np.asarray(labels)
+        is_volume = array.ndim == 3 and array.size > 0 and array.dtype.kind in "biuf"
+        if not is_volume or (spacing is not None and len(spacing) != 3):
+            got = f"{array.dtype} of shape {array.shape}, spacing {spacing}"
+            raise MeshError(
+                f"{name}: expected labels of shape (X, Y, Z) and three sides of a voxel, got {got}."
+            )
+        raw = RawVolume(
+            [array], np.diag([*(spacing or (1, 1, 1)), 1.0]), unit="mm" if spacing else None
+        )
+    return _labelled(raw, name, options)
+
+
+def label_surface(
+    volume: LabelVolume, part: int | str, *, how: Mending = "auto", cavities: Cavities = "fill"
+) -> Mesh:
+    """Return the surface of a label, by number or name, in world coordinates; see `voxel_surface` and `mend`."""
+    body = volume.body(part)
+    name = f"{volume.name}#{body.name}"
+    affine = np.array(volume.affine, dtype=np.float64)
+    affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
+    mask, affine = _reoriented(volume.mask(part), affine)
+    vertices, faces, notes = voxel_surface(
+        mask, affine, cavities=cavities == "keep", joins=how != "never", name=name
+    )
+    if (volume.names or {}).get(body.label, body.name) != body.name:
+        notes = (
+            *notes,
+            "another label has the same name: the number was appended. Give names by a table",
+        )
+    notes = (*volume.notes, *notes)
+    return mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name, notes=notes)
+
+
+def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
+    """Permute and flip the axes to run as nearly along x, y, z as possible, whatever order a format stores them in."""
+    order = linear_sum_assignment(-np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0))[
+        1
+    ]
+    mask, affine = mask.transpose(order), affine[:, [*order, 3]]
+    for axis in np.nonzero(np.diag(affine)[:3] < 0)[0]:
+        affine[:3, 3] += affine[:3, axis] * (mask.shape[axis] - 1)
+        affine[:3, axis] *= -1
+        mask = np.flip(mask, int(axis))
+    return np.ascontiguousarray(mask), affine
+
+
+def _labelled(
+    raw: RawVolume, name: str, options: LoadOptions, path: Path | None = None
+) -> LabelVolume:
+    """Turn the values of a volume into labels, and find their names; see `read_label_volume`."""
+    notes = list(raw.notes)
+    layers = tuple(_integer_labels(values, name, options.threshold, notes) for values in raw.layers)
+    segments, names = None, raw.names
+    if raw.segments:
+        # The same value may stand for different segments in different layers
+        values = [value for _, _, value in raw.segments]
+        labels = values if len(set(values)) == len(values) else list(range(1, len(values) + 1))
+        segments = tuple(
+            (label, layer, value)
+            for label, (_, layer, value) in zip(labels, raw.segments, strict=True)
+        )
+        names = cleaned(
+            {label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True)}
+        )
+    if options.names is not None:
+        names = read_label_names(options.names)
+    elif not names and path is not None:
+        names = read_label_names(table) if (table := table_beside(path)) else {}
+        label = int(layers[0].max(initial=0))
+        is_mask = label in (1, 255) and bool(((layers[0] == 0) | (layers[0] == label)).all())
+        if not names and not raw.segments and is_mask:
+            names = {label: path.name[: -len(suffix_of(path))]}
+    return LabelVolume(
+        layers, raw.affine, name, names, segments, raw.unit, tuple(dict.fromkeys(notes))
+    )
+
+
+def _integer_labels(
+    values: NDArray[Any], name: str, threshold: float, notes: list[str]
+) -> NDArray[Any]:
+    """Convert values to labels of the smallest unsigned type; probabilities are binarised at the threshold."""
+    if values.dtype.kind == "f":
+        if n_bad := int(np.count_nonzero(~np.isfinite(values))):
+            raise MeshError(
+                f"{name}: {n_bad} voxels are NaN or infinite, expected labels. Set them to 0."
+            )
+        slabs = values.T if values.flags.f_contiguous else values  # a copy of all may be too large
+        odd = np.concatenate(
+            [np.empty(0), *(x[np.abs(x - np.rint(x)) > _LABEL_TOLERANCE] for x in slabs)]
+        )
+        # Probabilities may leave [0, 1]: SPM stores bytes times a rounded 1/255, and resampling overshoots
+        if len(odd) and values.min() >= -_LABEL_TOLERANCE and values.max() <= 1 + _LABEL_TOLERANCE:
+            notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
+            return (values >= threshold).astype(np.uint8)
+        if len(odd):
+            fault = f"{name}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}."
+            raise MeshError(
+                f"{fault} Resample to the nearest neighbour, or give probabilities between 0 and 1."
+            )
+    low, high = (int(np.rint(values.min())), int(np.rint(values.max()))) if values.size else (0, 0)
+    if low < 0:
+        fault = f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}"
+        raise MeshError(
+            f"{fault}; expected 0 and positive numbers. Export the labels if it is an image."
+        )
+    if high >= 2**31:
+        raise MeshError(
+            f"{name}: label {high} is too large, expected less than 2³¹. Renumber the labels."
+        )
+    if values.dtype.kind != "f":
+        return np.asarray(values, dtype=np.min_scalar_type(high))
+    return np.rint(
+        values, out=np.empty_like(values, dtype=np.min_scalar_type(high)), casting="unsafe"
+    )
+
+
+def _count_labels(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]]:
+    """Return the values that occur except 0, ascending, with their counts and bounding boxes."""
+    array = np.asarray(labels)
+    if array.ndim != 3 or array.dtype.kind not in "biu":
+        raise MeshError(
+            f"{name}: expected whole numbers of shape (X, Y, Z), got {array.dtype} of shape {array.shape}."
+        )
+    array = array.view(np.uint8) if array.dtype.kind == "b" else array
+    if array.size and array.min() < 0:
+        raise MeshError(f"{name}: expected labels from 0, got {array.min()}. Renumber them.")
+    if not array.size or array.max() < 2**16:
+        counts = np.zeros(int(array.max(initial=0)) + 1, dtype=np.int64)
+        for plane in array:
+            counts += np.bincount(plane.ravel(), minlength=len(counts))
+        counts[0] = 0
+        values, numbered = np.nonzero(counts)[0], array
+        counts = counts[values]
+    else:
+        values, index, counts = np.unique(array, return_inverse=True, return_counts=True)
+        start = int(values[0] == 0)
+        numbered = index.reshape(array.shape) + (1 - start)
+        values, counts = values[start:], counts[start:]
+    n = len(values)
+    if n > _MAX_LABELS or (n > _MAX_UNCHECKED and _is_speckled(array, values[counts.argmax()])):
+        raise MeshError(
+            f"{name}: {n} values, which look like an image and not like labels. Export the labels."
+        )
+    boxes = [box for box in ndimage.find_objects(numbered) if box is not None]
+    return zip(values.tolist(), counts.tolist(), boxes, strict=True)
+
+
+def _is_speckled(labels: NDArray[Any], most_frequent: int) -> bool:
+    """Return whether few neighbours along x are equal, without the background and the most frequent value."""
+    counted = (labels != 0) & (labels != most_frequent)
+    pairs = counted[1:] & counted[:-1]
+    return bool(
+        np.count_nonzero(pairs & (labels[1:] == labels[:-1])) < _MIN_EQUAL * np.count_nonzero(pairs)
+    )
+
+
+def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    return label_bodies(read_label_volume(path, options), options, part)
+
+
+def in_memory(thing: Any, name: str, options: LoadOptions) -> list[RawBody] | None:
+    """Return the bodies of labels: an array, a pair (array, spacing), or an image of nibabel; None for others."""
+    is_pair = isinstance(thing, tuple) and len(thing) == 2
+    labels, spacing = thing if is_pair else (thing, None)
+    is_image = hasattr(labels, "dataobj") and hasattr(labels, "affine")
+    is_array = isinstance(labels, np.ndarray) and labels.ndim == 3
+    if not (is_image or is_array):
+        return None
+    bodies = label_bodies(volume_in_memory(labels, spacing, name, options), options)
+    is_mask = [body.part for body in bodies] == ["1"]
+    return [replace(bodies[0], part=None)] if is_mask else bodies
+
+
+def label_bodies(
+    volume: LabelVolume, options: LoadOptions, part: str | None = None
+) -> list[RawBody]:
+    """Return deferred bodies of a volume: its labels, or all of them as the whole or in pieces, by `options`."""
+    if options.bodies in ("whole", "pieces"):
+        labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
+        volume = replace(volume, layers=(labelled,), names=None, segments=None)
+        volume = _in_pieces(volume) if options.bodies == "pieces" else volume
+    surface = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
+    if options.bodies == "whole":
+        return [deferred(partial(surface, 1), None, volume.unit, partial(volume.voxels, 1))]
+    names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
+    return [
+        deferred(partial(surface, name), name, volume.unit, partial(volume.voxels, name))
+        for name in names
+    ]
+
+
+def _in_pieces(volume: LabelVolume) -> LabelVolume:
+    """Give each connected component its own label, in the order of the voxels, without those too small for a body."""
+    label, _ = ndimage.label(volume.layers[0], np.ones((3, 3, 3)))
+    is_speck = np.bincount(label.ravel(), minlength=2) < MIN_VOXELS
+    is_speck[0] = False
+    if is_speck[1:].all():  # keep them: their error says that they are too small
+        is_speck[:] = False
+    names = {k: f"piece {i}" for i, k in enumerate((np.flatnonzero(~is_speck[1:]) + 1).tolist(), 1)}
+    notes = (f"left out {is_speck.sum()} specks",) if is_speck.any() else ()
+    return replace(
+        volume,
+        layers=(np.where(is_speck[label], 0, label),),
+        names=names,
+        notes=(*volume.notes, *notes),
+    )
+
+
+def _beside(path: Path, options: LoadOptions) -> list[Path]:
+    """Return the separate files of the voxels, if any, and the table of names."""
+    table = table_beside(path) if options.names is None else Path(options.names)
+    return [*detached(path), *([table] if table else [])]
+
+
+FORMAT = Format(
+    "a label volume",
+    tuple(READERS),
+    read,
+    ("labels", "pieces"),
+    extra="volumes",
+    beside=_beside,
+    in_memory=in_memory,
+)

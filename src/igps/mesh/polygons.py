@@ -1,0 +1,109 @@
+"""Triangulation of the polygons of a file."""
+
+import numpy as np
+
+from igps._arrays import Floats, Integers
+
+_MAX_EAR_CORNERS = (
+    2000  # larger polygons are cut into fans: ear clipping takes quadratic time or worse
+)
+
+
+def triangles(corners: Integers, n_corners: Integers) -> Integers:
+    """Cut polygons, whose corners are laid end to end, into fans of triangles (F, 3) around their first corners.
+
+    Triangles come first, then the first and the second halves of quadrilaterals, then larger polygons.
+    """
+    starts = np.cumsum(n_corners) - n_corners
+    pieces = [corners[starts[n_corners == 3][:, None] + np.arange(3)]]
+    quads = corners[starts[n_corners == 4][:, None] + np.arange(4)]
+    pieces += [quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]]
+    large = np.flatnonzero(n_corners > 4)
+    if len(large):
+        n_triangles = n_corners[large] - 2
+        at = np.arange(n_triangles.sum()) - np.repeat(
+            np.cumsum(n_triangles) - n_triangles, n_triangles
+        )
+        first = np.repeat(starts[large], n_triangles)
+        pieces.append(
+            np.stack([corners[first], corners[first + at + 1], corners[first + at + 2]], axis=1)
+        )
+    return np.concatenate(pieces)
+
+
+def strip_triangles(corners: Integers) -> Integers:
+    """Return the triangles (n − 2, 3) of a strip (n,), all with the orientation of the first."""
+    if len(corners) < 3:
+        return np.zeros((0, 3), dtype=np.int64)
+    faces = np.lib.stride_tricks.sliding_window_view(corners, 3).copy()
+    faces[1::2] = faces[1::2, ::-1]
+    return faces
+
+
+def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> Integers:
+    """Triangulate as `triangles` does, except for polygons whose fans would fold over themselves.
+
+    Those polygons are triangulated by ear clipping (Meisters 1975), and come last. A polygon that crosses itself may
+    run out of ears; what is left of it is cut into a fan. Polygons of fewer than three corners are dropped.
+    """
+    has_area = n_corners >= 3
+    corners, n_corners = corners[np.repeat(has_area, n_corners)], n_corners[has_area]
+    if n_corners.max(initial=0) < 4 or corners.min() < 0 or corners.max() >= len(vertices):
+        return triangles(corners, n_corners)
+    starts = np.cumsum(n_corners) - n_corners
+    owner = np.repeat(np.arange(len(n_corners)), n_corners)
+    first = np.repeat(corners[starts], n_corners)
+    following = np.roll(corners, -1)
+    following[starts + n_corners - 1] = corners[starts]
+    # Doubled area vectors of the triangles in the fans, and of whole polygons
+    in_fan = np.cross(vertices[corners] - vertices[first], vertices[following] - vertices[first])
+    total = np.stack(
+        [np.bincount(owner, in_fan[:, axis], len(n_corners)) for axis in range(3)], axis=1
+    )
+    with np.errstate(invalid="ignore"):  # coordinates that are not finite are refused later
+        is_flipped = (
+            np.einsum("ij,ij->i", in_fan, total[owner])
+            < -1e-9 * np.einsum("ij,ij->i", total, total)[owner]
+        )
+    is_folded = np.zeros(len(n_corners), dtype=bool)
+    is_folded[owner[is_flipped]] = True
+    is_folded &= n_corners <= _MAX_EAR_CORNERS
+    fans = triangles(corners[~is_folded[owner]], n_corners[~is_folded])
+    clipped = [
+        _clip_ears(corners[starts[i] :][: n_corners[i]], vertices, total[i])
+        for i in np.flatnonzero(is_folded)
+    ]
+    return np.concatenate([fans, *clipped])
+
+
+def _clip_ears(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
+    """Triangulate a polygon (n,), which may be concave, into (n − 2, 3) triangles."""
+    remaining, ears, at, n_tried = polygon.tolist(), [], 0, 0
+    while n_tried <= len(remaining) > 3:
+        a, b, c = (remaining[(at + k) % len(remaining)] for k in (-1, 0, 1))
+        triangle = vertices[[a, b, c]]
+        sides = np.roll(triangle, -1, axis=0) - triangle
+        others = vertices[[k for k in remaining if k not in (a, b, c)]]
+        # On which side of each side of the triangle the other corners lie, (n, 3)
+        beside = np.cross(sides, others[:, None] - triangle) @ normal
+        if np.cross(sides[0], sides[1]) @ normal > 0 and not (beside >= 0).all(axis=1).any():
+            ears.append((a, b, c))
+            del remaining[at]
+            at, n_tried = at % len(remaining), 0
+        else:
+            at, n_tried = (at + 1) % len(remaining), n_tried + 1
+    fan = [(remaining[0], remaining[k], remaining[k + 1]) for k in range(1, len(remaining) - 1)]
+    return np.array([*ears, *fan], dtype=np.int64)
+
+
+def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
+    """Return the corners of polygons laid end to end, and their counts, from rows that each begin with the count."""
+    starts, at = [], 0
+    while at < len(rows):
+        starts.append(at)
+        at += max(int(rows[at]), 0) + 1
+    if at != len(rows):
+        raise ValueError("the numbers of corners do not add up")
+    is_corner = np.ones(len(rows), dtype=bool)
+    is_corner[starts] = False
+    return rows[is_corner], rows[starts]

@@ -1,0 +1,143 @@
+"""A body as a reader of files returns it, and what readers share."""
+
+from __future__ import annotations
+
+import codecs
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from igps._arrays import Booleans, Floats, Integers
+from igps.mesh._tidying import are_specks, places
+from igps.mesh.errors import MeshError
+from igps.mesh.mesh import Mesh, check_arrays
+from igps.mesh.surface import compact, face_parts, stacked
+
+
+@dataclass(frozen=True, eq=False)
+class LabelVoxels:
+    """Voxels of a label, and their place in the volume."""
+
+    mask: Booleans  # (X, Y, Z) true at the voxels of the label, in their bounding box
+    low: Integers  # (3,) index of the first voxel of the bounding box
+    grid: tuple[int, ...]  # shape of the whole volume
+    affine: Floats  # (4, 4) from voxel indices of the volume to world coordinates
+
+
+ONLY_LINES = "it holds lines, such as centre lines, which bound no body; export the surface instead"
+
+
+@dataclass(frozen=True, eq=False)
+class RawBody:
+    """A surface as it was read, not yet checked; a point cloud has no faces."""
+
+    vertices: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (V, 3) length
+    faces: Integers = field(
+        default_factory=lambda: np.zeros((0, 3), dtype=np.int64)
+    )  # (F, 3) vertex indices
+    part: str | None = None  # name among the bodies of the file; None if the file is a single body
+    unit: str | None = None  # unit of length, such as "mm"; None if the file does not state it
+    normals: Floats | None = None  # (V, 3), of a point cloud whose file has them
+    notes: tuple[str, ...] = ()  # remarks made while reading, for the user
+    fault: MeshError | None = None  # why this body has no surface, while others of its file may
+    make: Callable[[], RawBody] | None = None  # computes the surface if that takes time; see `made`
+    voxels: Callable[[], LabelVoxels] | None = None  # returns the voxels of a label
+    denoise: bool = (
+        True  # whether the surface may be noisy; False if it was computed from voxels or atoms
+    )
+
+    def made(self) -> RawBody:
+        """Return this body with its surface, or with the fault that left it without one."""
+        return self if self.make is None else self.make()
+
+
+def deferred(
+    make: Callable[[], Mesh],
+    part: str | None,
+    unit: str | None,
+    voxels: Callable[[], LabelVoxels] | None = None,
+) -> RawBody:
+    """Return a body whose surface is computed on demand; if that fails, the file's other bodies can still be read."""
+
+    def compute() -> RawBody:
+        try:
+            mesh = make()
+        except MeshError as fault:
+            return RawBody(part=part, fault=fault, voxels=voxels)
+        return RawBody(
+            mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels, denoise=False
+        )
+
+    return RawBody(part=part, make=compute)
+
+
+def joined(bodies: Sequence[RawBody]) -> RawBody:
+    """Join bodies into one: those with faces, or point clouds if none has faces."""
+    bodies = [body.made() for body in bodies]
+    if len(bodies) == 1:
+        return replace(bodies[0], part=None)
+    meshes = [body for body in bodies if len(body.faces)]
+    joinable = meshes or [body for body in bodies if len(body.vertices)]
+    if not joinable:
+        return RawBody(fault=next((body.fault for body in bodies if body.fault), None))
+    for body in meshes:
+        if body.faces.min() < 0 or body.faces.max() >= len(
+            body.vertices
+        ):  # would refer to another body
+            raise ValueError(f"{body.part} refers to vertices that are not there")
+    units = {body.unit for body in joinable}
+    normals = [body.normals for body in joinable if body.normals is not None]
+    return RawBody(
+        *stacked([(body.vertices, body.faces) for body in joinable]),
+        unit=units.pop() if len(units) == 1 else None,
+        normals=np.concatenate(normals) if len(normals) == len(joinable) else None,
+        notes=tuple(dict.fromkeys(note for body in joinable for note in body.notes)),
+        denoise=any(body.denoise for body in joinable),
+    )
+
+
+def pieces(whole: RawBody) -> list[RawBody]:
+    """Split a body into its connected components, "piece 1" and so on in the order of the file; specks are dropped."""
+    vertices, faces = whole.vertices, whole.faces
+    if not len(faces):
+        return [whole]
+    check_arrays(vertices, faces, "the whole")
+    vertices, faces = compact(
+        vertices, faces
+    )  # unused vertices would widen the bounding box, which scales `places`
+    # Triangles need not share vertices: they are connected by position
+    owner, areas = face_parts(vertices, places(vertices)[faces])
+    small = are_specks(areas)
+    notes = (*whole.notes, f"left out {int(small.sum())} specks") if small.any() else whole.notes
+    order = [k for k in np.argsort(np.unique(owner, return_index=True)[1]) if not small[k]]
+    surfaces = [compact(vertices, faces[owner == k]) for k in order]
+    return [
+        replace(whole, vertices=v, faces=f, part=f"piece {i}", notes=notes)
+        for i, (v, f) in enumerate(surfaces, 1)
+    ]
+
+
+def distinct(names: Iterable[str]) -> list[str]:
+    """Make names distinct by numbers: a second "part" becomes "part (2)"."""
+    counts: dict[str, int] = {}
+    for name in names:
+        new = name
+        while new in counts:
+            counts[name] += 1
+            new = f"{name} ({counts[name]})"
+        counts[new] = 1
+    return list(counts)
+
+
+def text_of(path: Path) -> str:
+    """Read a file as UTF-8, as UTF-16 with its mark, or else as Latin-1; carriage returns become line feeds."""
+    content = path.read_bytes()
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        content = content.decode("utf-16", "replace").encode()
+    content = content.replace(b"\r", b"\n")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")

@@ -1,0 +1,202 @@
+"""Surfaces of molecules against closed forms and brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from tests.fields.molecules.balls_in_contact import (
+    ball,
+    excluded_of_ring,
+    excluded_of_two,
+    molecule,
+    union_of_two,
+)
+
+from igps.fields.molecules.molecular_surface import SurfaceKind, molecular_surface
+from igps.mesh.errors import MeshError
+
+PROBE = 1.4
+# A direction along no axis of the grid.
+ASLANT = np.array([2.0, -1.0, 1.5]) / np.linalg.norm([2.0, -1.0, 1.5])
+
+
+def chain(n: int, seed: int = 0) -> NDArray[np.float64]:
+    """A random walk of steps of 1.5 Å."""
+    steps = np.random.default_rng(seed).normal(size=(n, 3))
+    return np.cumsum(1.5 * steps / np.linalg.norm(steps, axis=1, keepdims=True), axis=0)
+
+
+@pytest.mark.parametrize("radius", [1.5, 1.8, 3.0])
+@pytest.mark.parametrize(
+    ("kind", "added"), [("excluded", 0.0), ("accessible", PROBE), ("van_der_waals", 0.0)]
+)
+def test_a_ball_has_its_area_and_volume(kind: SurfaceKind, added: float, radius: float) -> None:
+    mesh = molecular_surface(molecule([0.1, 0.2, 0.3], radius), kind, spacing=0.5)
+    assert (mesh.area, mesh.volume) == pytest.approx(ball(radius + added), rel=0.01)
+    away = np.linalg.norm(mesh.vertices - [0.1, 0.2, 0.3], axis=1)
+    np.testing.assert_allclose(away, radius + added, rtol=0.02)
+    assert mesh.unit == "Å"
+
+
+@pytest.mark.parametrize("radii", [(1.7, 1.7), (1.9, 1.5)])
+@pytest.mark.parametrize("apart", [0.8, 1.5, 2.5, 3.3, 3.6, 4.2, 4.6])
+def test_the_excluded_surface_of_two_balls_is_two_caps_and_a_saddle(
+    radii: tuple[float, float], apart: float
+) -> None:
+    mesh = molecular_surface(molecule([0.3 * ASLANT, (0.3 + apart) * ASLANT], radii), spacing=0.5)
+    assert (mesh.area, mesh.volume) == pytest.approx(
+        excluded_of_two(*radii, apart, PROBE), rel=0.01
+    )
+    assert mesh.genus == 0
+
+
+@pytest.mark.parametrize("radii", [(1.7, 1.7), (1.9, 1.5)])
+@pytest.mark.parametrize("apart", [5.2, 5.35, 5.5, 5.8, 6.2])
+def test_where_the_neck_is_too_thin_for_the_grid_or_none_a_thread_adds_hardly_any_area(
+    radii: tuple[float, float], apart: float
+) -> None:
+    mesh = molecular_surface(molecule([0.3 * ASLANT, (0.3 + apart) * ASLANT], radii), spacing=0.5)
+    closed_form = (
+        excluded_of_two(*radii, apart, PROBE)
+        if apart < 6
+        else np.add(ball(radii[0]), ball(radii[1]))
+    )
+    assert (mesh.area, mesh.volume) == pytest.approx(tuple(closed_form), rel=0.01)
+    assert mesh.genus == 0
+
+
+def test_far_balls_are_joined_by_threads() -> None:
+    radii = [1.7, 2.5, 2.0]
+    apart = molecule([0 * ASLANT, 9 * ASLANT, [20, 0, 0]], radii)
+    whole = molecular_surface(apart, spacing=0.5, max_vertices=600)
+    assert (whole.area, whole.volume) == pytest.approx(
+        np.sum([ball(r) for r in radii], axis=0).tolist(), rel=0.01
+    )
+    assert whole.genus == 0
+    assert len(whole.vertices) < 620
+    assert any("joined 3 pieces by threads" in note for note in whole.notes)
+
+
+@pytest.mark.parametrize("apart", [2.0, 2.8, 4.0, 5.0])
+def test_the_accessible_surface_of_two_balls_is_that_of_larger_ones(apart: float) -> None:
+    mesh = molecular_surface(
+        molecule([0 * ASLANT, apart * ASLANT], [1.9, 1.5]), "accessible", spacing=0.5
+    )
+    assert (mesh.area, mesh.volume) == pytest.approx(
+        union_of_two(1.9 + PROBE, 1.5 + PROBE, apart), rel=0.01
+    )
+
+
+def test_a_speck_is_left_out_with_a_note_but_not_what_all_is_made_of(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = molecular_surface(molecule([[0, 0, 0], [14, 0, 0]], [8.0, 0.9]))
+    assert "left out 1 specks" in found.notes
+    assert found.volume == pytest.approx(4 / 3 * np.pi * 8**3, rel=0.01)
+    monkeypatch.setattr(
+        "igps.fields.molecules.molecular_surface.SPECK_VOLUME", 0.2
+    )  # as if there were some hundreds
+    found = molecular_surface(molecule([[9.0 * i, 0, 0] for i in range(6)], [1.7] * 6), spacing=0.5)
+    assert found.volume == pytest.approx(6 * 4 / 3 * np.pi * 1.7**3, rel=0.02)
+
+
+def test_a_ring_of_balls_has_a_hole() -> None:
+    n, apart = 8, 4.2
+    mesh = molecular_surface(molecule(_ring(n, apart), np.full(n, 1.7)), spacing=0.5)
+    assert (mesh.area, mesh.volume) == pytest.approx(
+        excluded_of_ring(n, 1.7, apart, PROBE), rel=0.01
+    )
+    assert mesh.genus == 1
+
+
+def _ring(n: int, apart: float) -> NDArray[np.float64]:
+    angle = 2 * np.pi * np.arange(n) / n
+    across = np.cross(ASLANT, [0, 0, 1.0])
+    across /= np.linalg.norm(across)
+    other = np.cross(ASLANT, across)
+    return (
+        apart
+        / (2 * np.sin(np.pi / n))
+        * (np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * other)
+    )
+
+
+def test_the_excluded_surface_is_a_probe_away_from_where_a_probe_may_be() -> None:
+    """By brute force: places of the probe on fine spheres around all atoms."""
+    at = chain(40)
+    mesh = molecular_surface(molecule(at, np.full(40, 1.7)), spacing=0.4, max_vertices=None)
+    i = np.arange(6000)
+    up = 1 - (2 * i + 1) / len(i)
+    turn = np.pi * (1 + 5**0.5) * i
+    sphere = np.stack(
+        [np.sqrt(1 - up**2) * np.cos(turn), np.sqrt(1 - up**2) * np.sin(turn), up], axis=1
+    )
+    places = (at[:, None] + (1.7 + PROBE) * sphere).reshape(-1, 3)
+    free = cKDTree(at).query(places)[0] > 1.7 + PROBE - 1e-6
+    distance = cKDTree(places[free]).query(mesh.vertices)[0]
+    # Places are 0.14 apart; vertices stand out where the surface is bent, so that faces do not cut corners.
+    assert np.quantile(np.abs(distance - PROBE), 0.99) < 0.08
+    assert abs(np.mean(distance) - PROBE) < 0.02
+
+
+def test_no_probe_is_the_surface_of_the_balls() -> None:
+    two = molecule([0 * ASLANT, 2 * ASLANT], [1.7, 1.7])
+    without = molecular_surface(two, probe=0, spacing=0.5)
+    np.testing.assert_array_equal(
+        without.vertices, molecular_surface(two, "van_der_waals", spacing=0.5).vertices
+    )
+    assert without.volume == pytest.approx(union_of_two(1.7, 1.7, 2.0)[1], rel=0.01)
+
+
+def test_swallowed_and_doubled_balls_change_nothing() -> None:
+    at = chain(30)
+    once = molecular_surface(molecule(at, np.full(30, 1.7)))
+    more = molecular_surface(
+        molecule(np.r_[at, at, at], np.r_[np.full(60, 1.7), np.zeros(15), np.full(15, 0.4)])
+    )
+    np.testing.assert_allclose(more.vertices, once.vertices, atol=1e-9)
+
+
+def test_hollows_are_filled() -> None:
+    i = np.arange(120)
+    up = 1 - (2 * i + 1) / len(i)
+    turn = np.pi * (1 + 5**0.5) * i
+    shell = 8 * np.stack(
+        [np.sqrt(1 - up**2) * np.cos(turn), np.sqrt(1 - up**2) * np.sin(turn), up], axis=1
+    )
+    mesh = molecular_surface(molecule(shell, np.full(120, 1.7)))
+    assert mesh.genus == 0
+    assert mesh.volume > ball(8.0)[1]
+    assert any("1 hollows inside were filled" in note for note in mesh.notes)
+
+
+def test_a_simplified_surface_keeps_the_volume() -> None:
+    body = molecule(chain(200), np.full(200, 1.7))
+    whole = molecular_surface(body, max_vertices=None)
+    fewer = molecular_surface(body, max_vertices=1500)
+    assert len(whole.vertices) > 2000
+    assert len(fewer.vertices) == 1500
+    assert fewer.volume == pytest.approx(whole.volume, rel=0.01)
+
+
+def test_stray_atoms_are_named_with_the_remedy() -> None:
+    with pytest.raises(
+        MeshError, match=r"balls: expected a grid of .* Raise the spacing, or remove stray atoms"
+    ):
+        molecular_surface(molecule([[0, 0, 0], [9999, 9999, 9999]], [1.7, 1.7]))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"kind": "solvent"}, "kind: expected one of excluded"),
+        ({"probe": -1.0}, "probe: expected"),
+        ({"probe": float("nan")}, "probe: expected"),
+        ({"spacing": 0.0}, "spacing: expected"),
+    ],
+)
+def test_wrong_parameters_are_named(wrong: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        molecular_surface(molecule([0, 0, 0], 1.7), **wrong)  # type: ignore[arg-type]

@@ -1,0 +1,515 @@
+"""Structure files become molecules: small files written here, and what strangers' files hold."""
+
+from __future__ import annotations
+
+import gzip
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from igps.data.attribute_sources import _molecule
+from igps.fields.molecules.molecular_surface import molecular_surface
+from igps.fields.molecules.molecule import Molecule
+from igps.fields.molecules.residues import VOLUMES
+from igps.fields.molecules.structures import is_structure, read_molecule
+from igps.mesh.errors import MeshError
+from igps.mesh.loading import BodyRef, each_body
+from igps.mesh.mesh import Mesh
+
+pytest.importorskip("gemmi")
+
+ALANINE = [("N", 0.0, 0.0), ("CA", 1.46, 0.0), ("C", 2.0, 1.4), ("O", 1.3, 2.4), ("CB", 2.0, -0.8)]
+
+
+def line(
+    number: int,
+    name: str,
+    x: float,
+    y: float,
+    z: float,
+    *,
+    residue: str = "ALA",
+    chain: str = "A",
+    place: str = "   1 ",
+    record: str = "ATOM",
+    alternative: str = " ",
+    occupancy: float = 1.0,
+    b: float = 20.0,
+    element: str | None = None,
+) -> str:
+    element = name[0] if element is None else element
+    return (
+        f"{record:<6}{number:>5} {name:^4}{alternative}{residue:>3} {chain}{place:>5}   {x:8.3f}{y:8.3f}{z:8.3f}"
+        f"{occupancy:6.2f}{b:6.2f}          {element:>2}\n"
+    )
+
+
+def residue(
+    number: int, name: str = "ALA", atoms: list[tuple[str, float, float]] = ALANINE, **said: object
+) -> str:
+    place = said.pop("place", f"{number:>4} ")
+    return "".join(
+        line(i, atom, x, y, 3.8 * number, residue=name, place=place, **said)  # type: ignore[arg-type]
+        for i, (atom, x, y) in enumerate(atoms, start=1)
+    )
+
+
+def written(folder: Path, text: str, name: str = "made.pdb") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def backbone(atoms: int = 4) -> list[tuple[str, float, float]]:
+    return ALANINE[:atoms]
+
+
+def test_atoms_have_the_radii_of_their_elements(tmp_path: Path) -> None:
+    (molecule,) = read_molecule(
+        written(tmp_path, residue(1) + residue(2, "MET", [*ALANINE, ("SD", 3.0, -2.0)]))
+    )
+    np.testing.assert_allclose(
+        molecule.radii[:5], [1.55, 1.70, 1.70, 1.52, 1.70], atol=1e-6
+    )  # Bondi 1964
+    assert molecule.radii[-1] == pytest.approx(1.80)
+    assert molecule.residue_names == ("ALA", "MET")
+    assert molecule.residue_of.tolist() == [0] * 5 + [1] * 6
+    np.testing.assert_allclose(molecule.residue_positions, [[1.46, 0, 3.8], [1.46, 0, 7.6]])
+    assert molecule.notes == ()
+
+
+def test_pdb_and_mmcif_and_their_gzipped_files_are_one_molecule(tmp_path: Path) -> None:
+    import gemmi
+
+    text = residue(1) + residue(2, "LYS") + "END\n"
+    plain = written(tmp_path, text)
+    structure = gemmi.read_structure(str(plain))
+    structure.setup_entities()
+    cif = written(tmp_path, structure.make_mmcif_document().as_string(), "made.cif")
+    paths = [plain, cif]
+    for path in (plain, cif):
+        paths.append(path.with_name(path.name + ".gz"))
+        paths[-1].write_bytes(gzip.compress(path.read_bytes()))
+    one, *others = (read_molecule(path)[0] for path in paths)
+    assert all(is_structure(path) for path in paths)
+    for other in others:
+        np.testing.assert_allclose(other.positions, one.positions)
+        np.testing.assert_array_equal(other.radii, one.radii)
+        np.testing.assert_array_equal(other.charges, one.charges)
+        assert other.residue_names == one.residue_names
+
+
+def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path: Path) -> None:
+    """As PyMOL writes several objects into one file; the first alone was read. Blocks of ligands have no atoms."""
+    import gemmi
+
+    blocks = []
+    for name, n_residues in (("one", 1), ("chainless", 2)):
+        structure = gemmi.read_pdb_string(
+            "".join(residue(i) for i in range(1, n_residues + 1)) + "END\n"
+        )
+        structure.name = name
+        structure.setup_entities()
+        blocks.append(structure.make_mmcif_document().as_string())
+    path = written(tmp_path, "data_comp_LIG\n_chem_comp.id LIG\n" + "".join(blocks), "made.cif")
+    found = read_molecule(path)
+    assert [one.name for one in found] == [f"{path}#one chain A", f"{path}#chainless chain A"]
+    assert [len(one.radii) for one in found] == [5, 10]
+    assert [one.name for one in read_molecule(path, "models")] == [
+        f"{path}#one",
+        f"{path}#chainless",
+    ]
+    for part, n_residues in (("chainless chain A", 2), ("chainless", 2), ("one", 1)):
+        assert len(_molecule(BodyRef(path, part)).residue_names) == n_residues
+
+
+def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path: Path) -> None:
+    rows = "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\nATOM 2 HN ALA A 1 0.5 0.5 0.0 0.30 0.0\n"
+    rows += "ATOM 3 CA HIE 2A 1.5 0.0 0.0 0.10 2.00\nHETATM 4 O WAT 3 9 9 9 -0.8 1.6\nTER\nEND\n"
+    molecules = read_molecule(written(tmp_path, rows, "made.pqr"), "models")
+    (molecule,) = molecules
+    np.testing.assert_allclose(molecule.charges, [-0.3, 0.3, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(molecule.radii, [1.85, 0, 2], atol=1e-6)
+    assert molecule.residue_names == ("ALA", "HIS")
+    assert np.isnan(molecule.b_factors).all()
+    assert molecule.notes == ("radii and charges are those of the PQR file",)
+
+
+def test_long_numbers_of_a_pqr_file_leave_no_blank_before_them(tmp_path: Path) -> None:
+    rows = "ATOM   9999  N   ALA A1000       1.000   2.000   3.000  0.1000 1.8500\n"
+    rows += "HETATM10000  O   HOH B1001       9.000   2.000   3.000 -0.8000 1.6000\n"
+    rows += "HETATM10001  CA  ALA B1002A     12.000   2.000   3.000  0.2000 1.9000\n"
+    one, other = read_molecule(written(tmp_path, rows, "made.pqr"))
+    assert [one.name[-7:], one.residue_names, one.radii.round(2).tolist()] == [
+        "chain A",
+        ("ALA",),
+        [1.85],
+    ]
+    assert [other.name[-7:], other.residue_names, other.radii.round(2).tolist()] == [
+        "chain B",
+        ("ALA",),
+        [1.9],
+    ]
+    fused = written(tmp_path, "ATOM 1 HG11VAL A 1 0.0 0.0 0.0 -0.30 1.85\n", "fused.pqr")
+    with pytest.raises(
+        MeshError,
+        match=r"fused\.pqr: line 1 is no atom .* Write it again, with blanks between fields",
+    ):
+        read_molecule(fused)
+
+
+def test_charges_are_those_of_residues_at_ph_7(tmp_path: Path) -> None:
+    names = {
+        "ASP": "OD1 OD2",
+        "GLU": "OE1 OE2",
+        "LYS": "NZ",
+        "ARG": "NH1 NH2",
+        "HIS": "ND1 NE2",
+        "SER": "OG",
+        "DA": "OP1",
+    }
+    side = {
+        name: [(atom, 3.0 + i, -2.0) for i, atom in enumerate(atoms.split())]
+        for name, atoms in names.items()
+    }
+    text = "".join(
+        residue(i, name, [*ALANINE, *side[name]]) for i, name in enumerate(names, start=1)
+    )
+    (molecule,) = read_molecule(written(tmp_path, text))
+    sums = np.bincount(molecule.residue_of, molecule.charges)
+    np.testing.assert_allclose(sums, [-1, -1, 1, 1, 0.1, 0, -0.5])
+
+
+def test_models_and_chains_are_bodies_of_their_own(tmp_path: Path) -> None:
+    models = "".join(
+        f"MODEL     {i:>4}\n{residue(1)}{residue(2)}TER\n{residue(1, chain='B')}ENDMDL\n"
+        for i in range(1, 21)
+    )
+    path = written(tmp_path, models)
+    of_models = read_molecule(path, "models")
+    assert [len(molecule.radii) for molecule in of_models] == [15] * 20
+    assert of_models[19].name == f"{path}#model 20"
+    of_chains = read_molecule(path)
+    assert [len(molecule.radii) for molecule in of_chains] == [10, 5] * 20
+    assert of_chains[1].name == f"{path}#model 1 chain B"
+
+
+def test_an_assembly_is_built_by_its_operators(tmp_path: Path) -> None:
+    remark = (
+        "REMARK 350 BIOMOLECULE: 1\n"
+        "REMARK 350 APPLY THE FOLLOWING TO CHAINS: A\n"
+        "REMARK 350   BIOMT1   1  1.000000  0.000000  0.000000        0.00000\n"
+        "REMARK 350   BIOMT2   1  0.000000  1.000000  0.000000        0.00000\n"
+        "REMARK 350   BIOMT3   1  0.000000  0.000000  1.000000        0.00000\n"
+        "REMARK 350   BIOMT1   2 -1.000000  0.000000  0.000000        0.00000\n"
+        "REMARK 350   BIOMT2   2  0.000000 -1.000000  0.000000        0.00000\n"
+        "REMARK 350   BIOMT3   2  0.000000  0.000000  1.000000       50.00000\n"
+    )
+    (molecule,) = read_molecule(written(tmp_path, remark + residue(1)), "assembly")
+    one = molecule.positions[:5]
+    np.testing.assert_allclose(molecule.positions[5:], one * [-1, -1, 1] + [0, 0, 50], atol=1e-4)
+    (alone,) = read_molecule(written(tmp_path, residue(1)), "assembly")
+    assert alone.notes == ("the file defines no assembly: the model was used",)
+
+
+def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_path: Path) -> None:
+    rows = "".join(
+        f"REMARK 350   BIOMT{i}   1 {a:9.6f}{b:10.6f}{c:10.6f}        0.00000\n"
+        for i, (a, b, c) in enumerate(np.eye(3), start=1)
+    )
+    text = f"REMARK 350 BIOMOLECULE: 1\nREMARK 350 APPLY THE FOLLOWING TO CHAINS: A, Q\n{rows}"
+    path = written(tmp_path, text + residue(1))
+    with pytest.raises(
+        MeshError, match=r"made\.pdb: assembly 1 cannot be made .*no chain Q.*bodies"
+    ):
+        read_molecule(path, "assembly")
+
+
+def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
+    water = line(9, "O", 9, 9, 9, residue="HOH", place=" 101 ", record="HETATM")
+    ligand = line(10, "C1", 5, 5, 5, residue="XYZ", place=" 102 ", record="HETATM")
+    changed = residue(2, "MSE", [*ALANINE, ("SE", 3.0, -2.0)], record="HETATM")
+    path = written(tmp_path, residue(1) + changed + water + ligand)
+    (molecule,) = read_molecule(path)
+    assert molecule.residue_names == ("ALA", "MET")
+    assert molecule.notes == ("1 ligands were left out",)
+    (more,) = read_molecule(path, ligands=True)
+    assert more.residue_names == ("ALA", "MET", "XYZ")
+    with pytest.raises(MeshError, match=r"water\.pdb: no atoms .* not of water alone"):
+        read_molecule(written(tmp_path, water, "water.pdb"))
+
+
+def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path: Path) -> None:
+    """A nucleotide whose name gemmi does not know, by the sequence that the file lists; else TER may mean anything."""
+    import gemmi
+
+    sugar = [
+        ("P", 0.0, 0.0),
+        ("O5'", 1.5, 0.0),
+        ("C5'", 2.2, 1.2),
+        ("C1'", 3.0, 2.0),
+        ("N9", 4.0, 2.0),
+    ]
+    chain = (
+        residue(1, "A", sugar)
+        + residue(2, "QQQ", sugar, record="HETATM")
+        + residue(3, "U", sugar)
+        + "TER\n"
+    )
+    atoms = (
+        chain
+        + residue(4, "QQX", sugar, record="HETATM")
+        + residue(5, "NH2", [("N", 9.0, 9.0)], record="HETATM")
+    )
+    listed = written(tmp_path, "SEQRES   1 A    3    A QQQ   U\n" + atoms, "listed.pdb")
+    structure = gemmi.read_structure(str(listed))
+    structure.setup_entities()
+    mmcif = written(tmp_path, structure.make_mmcif_document().as_string(), "listed.cif")
+    for path in (listed, mmcif):
+        assert read_molecule(path)[0].residue_names == ("A", "QQQ", "U")
+    assert read_molecule(written(tmp_path, atoms))[0].residue_names == ("A", "U")
+
+
+def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path: Path) -> None:
+    water = [("OW", 9.0, 9.0), ("HW1", 9.5, 9.0), ("HW2", 9.0, 9.5), ("MW", 9.1, 9.1)]
+    text = (
+        residue(1)
+        + residue(2, "SOL", water)
+        + residue(3, "SOD", [("NA", 9.0, 0.0)])
+        + residue(4, "QQQ")
+    )
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert molecule.residue_names == ("ALA", "QQQ")
+
+
+def test_hydrogens_are_left_out_unless_asked_for(tmp_path: Path) -> None:
+    path = written(tmp_path, residue(1, atoms=[*ALANINE, ("H", 0.0, -1.0)]))
+    assert len(read_molecule(path)[0].radii) == 5
+    assert len(read_molecule(path, hydrogens=True)[0].radii) == 6
+
+
+def test_a_backbone_gets_balls_of_its_side_chains(tmp_path: Path) -> None:
+    text = (
+        residue(1, "LEU", backbone())
+        + residue(2, "GLY", backbone())
+        + residue(3, "LYS", backbone())
+    )
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert molecule.notes == ("2 residues without a side chain: a ball of its volume was used",)
+    assert np.bincount(molecule.residue_of).tolist() == [5, 4, 5]
+    leucine = molecule.positions[0], molecule.radii[0]
+    assert 4 / 3 * np.pi * leucine[1] ** 3 == pytest.approx(VOLUMES["LEU"] - VOLUMES["GLY"])
+    # It touches Cα, on the side of Cβ, which tetrahedral geometry has away from N and C.
+    away = leucine[0] - [1.46, 0, 3.8]
+    assert np.linalg.norm(away) == pytest.approx(leucine[1])
+    for bonded in ([0.0, 0.0, 3.8], [2.0, 1.4, 3.8]):
+        bond = np.array(bonded) - [1.46, 0, 3.8]
+        cosine = away @ bond / np.linalg.norm(away) / np.linalg.norm(bond)
+        assert np.degrees(np.arccos(cosine)) == pytest.approx(109.5, abs=4)
+    assert np.bincount(molecule.residue_of, molecule.charges).tolist() == [0, 0, 1]
+
+
+def test_a_trace_has_balls_of_its_residues(tmp_path: Path) -> None:
+    text = "".join(residue(i, "ASP", ALANINE[1:2]) for i in range(1, 9))
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert molecule.notes == ("8 residues of Cα alone: a ball of the residue's volume was used",)
+    np.testing.assert_allclose(4 / 3 * np.pi * molecule.radii**3, VOLUMES["ASP"])
+    assert molecule.charges.tolist() == [-1.0] * 8
+    assert molecular_surface(molecule).volume > 6 * VOLUMES["ASP"]
+
+
+def test_of_alternatives_the_most_occupied_is_taken(tmp_path: Path) -> None:
+    atoms = [
+        line(5, "CB", 2, -0.8, 3.8, alternative="A", occupancy=0.4),
+        line(6, "CB", 2, -0.9, 3.8, alternative="B", occupancy=0.6),
+    ]
+    kinds = residue(2, "SER", alternative="A", occupancy=0.3) + residue(
+        2, "THR", alternative="B", occupancy=0.7
+    )
+    (molecule,) = read_molecule(
+        written(tmp_path, residue(1, atoms=backbone()) + "".join(atoms) + kinds)
+    )
+    assert molecule.positions[4, 1] == pytest.approx(-0.9)
+    assert molecule.residue_names == ("ALA", "THR")
+    assert molecule.notes == ("2 alternative locations: the one of the highest occupancy was used",)
+
+
+def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path: Path) -> None:
+    text = (
+        residue(1, place="  -5 ")
+        + residue(2, place="  -5A")
+        + residue(3, "GLY")
+        + residue(4, "SER", place="   3 ")
+    )
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert molecule.residue_names == ("ALA", "ALA", "GLY", "SER")
+    assert len(molecule.radii) == 20
+    assert molecule.notes == ("1 residues repeat a number: all were kept",)
+
+
+def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path: Path) -> None:
+    odd = residue(2, atoms=[*ALANINE, ("X1", 3.0, -2.0), ("1HB", 3.0, -3.0)], element="Xx")
+    (molecule,) = read_molecule(written(tmp_path, residue(1, "QQQ") + odd))
+    np.testing.assert_allclose(molecule.radii[5:], [1.55, 1.70, 1.70, 1.52, 1.70, 1.70], atol=1e-6)
+    assert molecule.residue_names == ("QQQ", "ALA")
+    assert molecule.notes == (
+        "5 atoms without an element: it was inferred from their names",
+        "1 atoms of an unknown element: a radius of 1.7 Å was used",
+        "1 residues of an unknown name",
+    )
+
+
+def test_atoms_without_a_position_are_left_out_not_put_at_the_origin(tmp_path: Path) -> None:
+    text = residue(1).replace("   1.300   2.400", "********   2.400")
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert len(molecule.radii) == 4
+    assert "1 atoms without a position were left out" in molecule.notes
+
+
+def test_a_chain_without_atoms_costs_no_other_chain(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lost = line(1, "N", 0, 0, 0, chain="B").replace(
+        "   0.000   0.000   0.000", "     nan     nan     nan"
+    )
+    path = written(tmp_path, residue(1) + lost)
+    with caplog.at_level(logging.WARNING):
+        (molecule,) = read_molecule(path)
+    assert molecule.name == f"{path}#chain A"
+    assert f"{path}#chain B: no atoms of a polymer, left out" in caplog.text
+
+
+def test_a_surface_that_fails_in_any_way_costs_no_other_chain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, residue(1) + residue(1, chain="B") + residue(1, chain="C"))
+
+    def faulty(molecule: Molecule) -> Mesh:
+        if "chain B" in molecule.name:
+            raise ValueError("of any kind")
+        return molecular_surface(molecule)
+
+    monkeypatch.setattr("igps.fields.molecules.molecular_surface.molecular_surface", faulty)
+    found = {body.part: mesh for body, mesh in each_body(path)}
+    assert [name for name, mesh in found.items() if isinstance(mesh, Mesh)] == [
+        "chain A",
+        "chain C",
+    ]
+    assert str(found["chain B"]).startswith(
+        f"{path}#chain B: not readable as a structure (ValueError: "
+    )
+
+
+def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:
+    text = line(1, "N", 0, 0, 0, b=10) + line(2, "CA", 1, 0, 0, b=30) + residue(2, b=70.0)
+    assert read_molecule(written(tmp_path, text))[0].b_factors.tolist() == [20.0, 70.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("cut.pdb", residue(1) + "ATOM      6  N   ALA A   2      11.1", "cut short"),
+        ("cut.cif", "data_x\nloop_\n_atom_site.id\n_atom_site.Cartn_x\n1 2\n3\n", "cut short"),
+        (
+            "cut.pqr",
+            "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\nATOM 2 CA ALA A 1 0.0",
+            "line 2 .*cut short",
+        ),
+        ("negative.pqr", "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 -1.85\n", "radius of at least 0"),
+        ("empty.pdb", "  \n", "the file is empty"),
+        ("words.pdb", "no structure at all\n", "no atoms of a molecule"),
+        ("words.cif", "no structure at all\n", "not readable as a structure"),
+        ("other.xyz", "1\n", "expected a structure"),
+    ],
+)
+def test_bad_files_are_named_with_the_remedy(
+    tmp_path: Path, name: str, text: str, said: str
+) -> None:
+    with pytest.raises(MeshError, match=rf"{name}: .*{said}"):
+        read_molecule(written(tmp_path, text, name))
+
+
+def test_a_gzipped_file_that_is_cut_short_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "cut.pdb.gz"
+    path.write_bytes(gzip.compress((residue(1) * 50).encode())[:-20])
+    with pytest.raises(MeshError, match=r"cut\.pdb\.gz: .*cut short.* Download it again"):
+        read_molecule(path)
+    path.write_bytes(b"no gzip")
+    with pytest.raises(MeshError, match=r"cut\.pdb\.gz: .*damaged"):
+        read_molecule(path)
+    with pytest.raises(MeshError, match="no such file"):
+        read_molecule(tmp_path / "absent.pdb")
+
+
+def test_unknown_bodies_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="bodies: expected one of chains, models, assembly"):
+        read_molecule(written(tmp_path, residue(1)), "residues")  # type: ignore[arg-type]
+
+
+def test_b_factors_that_a_file_lacks_are_unknown(tmp_path: Path) -> None:
+    whole = residue(1)
+    cut = "".join(f"{row[:54]}\n" for row in whole.splitlines())
+    blank = "".join(f"{row[:60]}      {row[66:]}\n" for row in whole.splitlines())
+    columns = [
+        "group_PDB",
+        "type_symbol",
+        "label_atom_id",
+        "label_alt_id",
+        "label_comp_id",
+        "label_asym_id",
+        "label_seq_id",
+    ]
+    columns += ["id", "Cartn_x", "Cartn_y", "Cartn_z"]
+    row = "ATOM C CA . ALA A 1 1 0.0 0.0 0.0"
+    loop = "data_made\nloop_\n" + "".join(f"_atom_site.{name}\n" for name in columns)
+    pairs = "data_made\n" + "".join(
+        f"_atom_site.{name} {value}\n" for name, value in zip(columns, row.split(), strict=True)
+    )
+    known = loop + "_atom_site.B_iso_or_equiv\n" + row
+    texts = {"cut.pdb": cut, "blank.pdb": blank, "loop.cif": f"{loop}{row}\n", "pairs.cif": pairs}
+    texts["asked.cif"] = f"{known} ?\n"
+    for name, text in texts.items():
+        (molecule,) = read_molecule(written(tmp_path, text, name))
+        assert np.isnan(molecule.b_factors).all(), name
+    assert read_molecule(written(tmp_path, f"{known} 7\n", "known.cif"))[0].b_factors.tolist() == [
+        7
+    ]
+    with pytest.raises(MeshError, match="no label_alt_id"):
+        read_molecule(
+            written(tmp_path, pairs.replace("_atom_site.label_alt_id .\n", ""), "lacking.cif")
+        )
+
+
+def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> None:
+    names = ["N", "CA", "C", "O", "CB", "CD", "NE", "HG"]
+    atoms = [(name, float(i), 0.0) for i, name in enumerate(names)]
+    rows = [
+        f"{row[:12]}{row[12:16].strip():<4}{row[16:66]}"
+        for row in residue(1, "GLN", atoms).splitlines()
+    ]
+    (molecule,) = read_molecule(written(tmp_path, "\n".join(rows)))
+    np.testing.assert_allclose(
+        molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.55], atol=1e-6
+    )  # Bondi 1964
+    # And calcium, which some write as an atom of the polymer, is no residue.
+    ion = line(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA")
+    (molecule,) = read_molecule(written(tmp_path, residue(1) + ion))
+    assert molecule.residue_names == ("ALA",)
+    assert molecule.notes == ("1 ligands were left out",)
+
+
+def test_no_line_is_lost_to_marks_of_text_or_to_frames(tmp_path: Path) -> None:
+    text = residue(1) + residue(2)
+    (usual,) = read_molecule(written(tmp_path, text))
+    for number, other in enumerate(
+        (f"\ufeff{text}", text.replace("\n", "\r"), text.replace("\n", "\r\n"))
+    ):
+        path = tmp_path / f"{number}.pdb"
+        path.write_bytes(other.encode())
+        np.testing.assert_array_equal(read_molecule(path)[0].positions, usual.positions)
+    frames = f"CRYST1\n{text}END\n{residue(1)}END\n"
+    found = read_molecule(written(tmp_path, frames), "models")
+    assert [len(molecule.radii) for molecule in found] == [10, 5]
+    assert len(read_molecule(written(tmp_path, f"{text}TER\nEND\n"), "models")) == 1

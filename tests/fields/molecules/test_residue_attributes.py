@@ -1,0 +1,196 @@
+"""What residues around a point are like, against sums written out and closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from igps.fields.molecules import residue_attributes as module
+from igps.fields.molecules.molecule import Molecule
+from igps.fields.molecules.residue_attributes import (
+    RESIDUE_ATTRIBUTES,
+    RESIDUE_KINDS,
+    residue_attribute,
+    residue_means,
+    screened_potential,
+)
+from igps.fields.molecules.residues import HYDROPATHY, VOLUMES
+from igps.mesh.mesh import Mesh
+from igps.signature.signature import SignatureConfig, compute_signature
+
+CHARGES = {"ASP": -1.0, "GLU": -1.0, "LYS": 1.0, "ARG": 1.0, "HIS": 0.1}
+
+
+def peptide(*names: str, seed: int = 0) -> Molecule:
+    """Residues of one ball each, with its charge."""
+    n = len(names)
+    at = 6 * np.random.default_rng(seed).normal(size=(n, 3))
+    charges = np.array([CHARGES.get(name, 0.0) for name in names])
+    return Molecule(
+        "peptide", at, np.full(n, 2.0), charges, np.arange(n), names, at, np.arange(n, dtype=float)
+    )
+
+
+def points(n: int = 7, seed: int = 1) -> NDArray[np.float64]:
+    return 6 * np.random.default_rng(seed).normal(size=(n, 3))
+
+
+def mean_written_out(molecule: Molecule, point: NDArray[np.float64], values: list[float]) -> float:
+    weights = [
+        math.exp(-(math.dist(point, at) ** 2) / (2 * 4.0**2)) for at in molecule.residue_positions
+    ]
+    return sum(w * v for w, v in zip(weights, values, strict=True)) / sum(weights)
+
+
+@pytest.mark.parametrize(
+    ("name", "of_residue"),
+    [
+        ("charge", lambda name: CHARGES.get(name, 0.0)),
+        ("hydropathy", HYDROPATHY.__getitem__),
+        ("residue_volume", VOLUMES.__getitem__),
+        ("aromaticity", lambda name: float(name in ("PHE", "TYR", "TRP", "HIS"))),
+        ("donors", lambda name: {"ARG": 3, "LYS": 1, "HIS": 1, "TRP": 1}.get(name, 0)),
+        ("acceptors", lambda name: {"ASP": 2, "GLU": 2, "HIS": 1}.get(name, 0)),
+    ],
+)
+def test_an_attribute_is_a_gaussian_mean_over_residues(name: str, of_residue) -> None:
+    names = ("ASP", "LYS", "ALA", "TRP", "HIS", "GLU", "ARG", "ILE")
+    molecule = peptide(*names)
+    found = residue_attribute(molecule, points(), name)
+    wanted = [
+        mean_written_out(molecule, point, [of_residue(one) for one in names]) for point in points()
+    ]
+    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_b_factors_are_the_molecules_own() -> None:
+    molecule = peptide("ALA", "GLY", "SER")
+    wanted = [mean_written_out(molecule, point, [0.0, 1.0, 2.0]) for point in points()]
+    np.testing.assert_allclose(residue_attribute(molecule, points(), "b_factor"), wanted, rtol=1e-9)
+
+
+def test_shares_of_kinds_sum_to_one_and_follow_the_names() -> None:
+    molecule = peptide("ALA", "DT", "U", "ZN", "DG")
+    shares = residue_attribute(molecule, points(), "residue_shares")
+    np.testing.assert_allclose(shares.sum(axis=1), 1)
+    weight = [mean_written_out(molecule, point, [0, 1, 1, 0, 0]) for point in points()]
+    np.testing.assert_allclose(shares[:, RESIDUE_KINDS.index("U")], weight)
+    used = shares.max(axis=0) > 0
+    assert {kind for kind, one in zip(RESIDUE_KINDS, used, strict=True) if one} == {
+        "ALA",
+        "U",
+        "G",
+        "other",
+    }
+
+
+def test_what_is_not_known_does_not_count_and_is_never_made_up() -> None:
+    molecule = peptide("ALA", "QQQ", "ILE")
+    known = Molecule(
+        "known",
+        molecule.positions,
+        molecule.radii,
+        molecule.charges,
+        molecule.residue_of,
+        ("ALA", "ILE"),
+        molecule.residue_positions[[0, 2]],
+        molecule.b_factors[[0, 2]],
+    )
+    np.testing.assert_allclose(
+        residue_attribute(molecule, points(), "hydropathy"),
+        residue_attribute(known, points(), "hydropathy"),
+    )
+    assert np.isnan(residue_attribute(peptide("QQQ", "ZN"), points(), "hydropathy")).all()
+
+
+def test_far_outside_the_nearest_residue_counts() -> None:
+    molecule = peptide("ALA", "ILE", "LYS")
+    far = 1e4 * np.eye(3)
+    nearest = np.linalg.norm(far[:, None] - molecule.residue_positions, axis=2).argmin(axis=1)
+    np.testing.assert_allclose(
+        residue_attribute(molecule, far, "hydropathy"),
+        [HYDROPATHY[molecule.residue_names[i]] for i in nearest],
+        rtol=1e-6,
+    )
+
+
+def test_the_potential_of_one_charge_is_that_of_debye_and_hueckel() -> None:
+    ion = Molecule(
+        "ion",
+        np.zeros((1, 3)),
+        np.array([1.5]),
+        np.array([-2.0]),
+        np.zeros(1, int),
+        ("X",),
+        np.zeros((1, 3)),
+        np.zeros(1),
+    )
+    distance = np.array([0.0, 1.0, 1.5, 4.0, 15.0])
+    counted = np.maximum(distance, 1.5)
+    found = screened_potential(ion, distance[:, None] * [[0.6, 0, 0.8]])
+    # e² / (4 π ε₀ ε k T) in Å, of water (ε = 78.4) at 298.15 K; 0.304 nm / √0.15 of salt of one valence.
+    bjerrum = (
+        1.602176634e-19**2 / (4 * np.pi * 8.8541878128e-12 * 78.4 * 1.380649e-23 * 298.15) * 1e10
+    )
+    np.testing.assert_allclose(
+        found, -2 * bjerrum * np.exp(-counted / (3.04 / np.sqrt(0.15))) / counted, rtol=5e-3
+    )
+
+
+def test_potentials_add_up() -> None:
+    molecule = peptide("ASP", "ALA", "LYS")
+    parts = [
+        screened_potential(peptide(*names), points())
+        for names in (("ASP", "ALA", "ALA"), ("ALA", "ALA", "LYS"))
+    ]
+    np.testing.assert_allclose(screened_potential(molecule, points()), parts[0] + parts[1])
+    np.testing.assert_array_equal(screened_potential(peptide("ALA"), points()), 0)
+
+
+def test_many_points_in_blocks_are_as_few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    molecule = peptide("ASP", "ALA", "LYS", "TRP")
+    values = np.arange(8.0).reshape(4, 2)
+    whole = residue_means(molecule, points(50), values), screened_potential(molecule, points(50))
+    monkeypatch.setattr(module, "_BLOCK_SIZE", 12)
+    np.testing.assert_allclose(residue_means(molecule, points(50), values), whole[0])
+    np.testing.assert_allclose(screened_potential(molecule, points(50)), whole[1])
+
+
+def test_each_attribute_is_known_by_its_name() -> None:
+    molecule = peptide("ASP", "ALA", "LYS", "TRP")
+    for name in RESIDUE_ATTRIBUTES:
+        values = residue_attribute(molecule, points(), name)
+        assert values.shape == ((7, len(RESIDUE_KINDS)) if name == "residue_shares" else (7,))
+        assert np.isfinite(values).all()
+    with pytest.raises(
+        ValueError, match=r"attributes: expected names among charge, .*, got 'colour'"
+    ):
+        residue_attribute(molecule, points(), "colour")
+
+
+def test_a_signature_gets_attributes_and_keeps_its_own() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=8)
+    mesh = Mesh(ball.vertices, ball.faces)
+    config = SignatureConfig(
+        n_eigenpairs=10, n_surface_samples=50, min_samples=100, attributes=("surface_direction",)
+    )
+    signature = compute_signature(mesh, config)
+    molecule = peptide("ASP", "LYS")
+    found = signature.map_samples(
+        lambda samples: samples.with_attributes(
+            {"charge": residue_attribute(molecule, samples.points, "charge")}
+        )
+    )
+    for samples in (found.interior, found.surface):
+        assert set(samples.attributes) == {"surface_direction", "charge"}
+        np.testing.assert_allclose(
+            samples.attributes["charge"],
+            residue_attribute(molecule, samples.points, "charge"),
+            rtol=1e-5,
+            atol=1e-6,
+        )
+    assert set(signature.interior.attributes) == {"surface_direction"}
