@@ -10,31 +10,56 @@ N shapes, Q queries, G gallery, D embedding width.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from igps.data.batch import SignatureBatch
-from igps.data.collation import collate
-from igps.data.dataset import SignatureDataset
-from igps.descriptors import descriptor, load
-from igps.learning import fit
-from igps.mesh.errors import MeshError
-from igps.mesh.loading import load_mesh
-from igps.mesh.mesh import Mesh
-from igps.mesh.objects import as_mesh
-from igps.mesh.options import LoadOptions
-from igps.nn.description import describe
-from igps.nn.descriptor import BodyDescriptor, Descriptor, HistogramDescriptor
-from igps.nn.embedding import SpectralEmbedding
-from igps.nn.heads.closed_form import KernelHead
-from igps.nn.histograms.pairs import PairHistogram
-from igps.retrieval import retrieval_scores, search
-from igps.shapes import ArticulatedShapes
-from igps.signature.signature import SignatureConfig, compute_signature
-
 if TYPE_CHECKING:
+    from igps.data.batch import SignatureBatch
+    from igps.data.collation import collate
     from igps.data.datamodule import SignatureDataModule
+    from igps.data.dataset import SignatureDataset
+    from igps.descriptors import descriptor, load
+    from igps.learning import fit
+    from igps.mesh.errors import MeshError
+    from igps.mesh.loading import load_mesh
+    from igps.mesh.mesh import Mesh
+    from igps.mesh.objects import as_mesh
+    from igps.mesh.options import LoadOptions
+    from igps.nn.description import describe
+    from igps.nn.descriptor import BodyDescriptor, Descriptor, HistogramDescriptor
+    from igps.nn.embedding import SpectralEmbedding
+    from igps.nn.heads.closed_form import KernelHead
+    from igps.nn.histograms.pairs import PairHistogram
     from igps.nn.learner import RetrievalLearner
+    from igps.retrieval import retrieval_scores, search
+    from igps.shapes import ArticulatedShapes
+    from igps.signature.signature import SignatureConfig, compute_signature
 
-# Imported on first use, because they import Lightning, which takes seconds.
-_LAZY = {"RetrievalLearner": "igps.nn.learner", "SignatureDataModule": "igps.data.datamodule"}
+# A name is imported when it is first used: `import igps` loads no other package, and the command line starts at once.
+_MODULES = {
+    "ArticulatedShapes": "igps.shapes",
+    "BodyDescriptor": "igps.nn.descriptor",
+    "Descriptor": "igps.nn.descriptor",
+    "HistogramDescriptor": "igps.nn.descriptor",
+    "KernelHead": "igps.nn.heads.closed_form",
+    "LoadOptions": "igps.mesh.options",
+    "Mesh": "igps.mesh.mesh",
+    "MeshError": "igps.mesh.errors",
+    "PairHistogram": "igps.nn.histograms.pairs",
+    "RetrievalLearner": "igps.nn.learner",
+    "SignatureBatch": "igps.data.batch",
+    "SignatureConfig": "igps.signature.config",
+    "SignatureDataModule": "igps.data.datamodule",
+    "SignatureDataset": "igps.data.dataset",
+    "SpectralEmbedding": "igps.nn.embedding",
+    "as_mesh": "igps.mesh.objects",
+    "collate": "igps.data.collation",
+    "compute_signature": "igps.signature.signature",
+    "describe": "igps.nn.description",
+    "descriptor": "igps.descriptors",
+    "fit": "igps.learning",
+    "load": "igps.descriptors",
+    "load_mesh": "igps.mesh.loading",
+    "retrieval_scores": "igps.retrieval",
+    "search": "igps.retrieval",
+}
 
 __all__ = [
     "ArticulatedShapes",
@@ -66,6 +91,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
