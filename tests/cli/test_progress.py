@@ -44,7 +44,6 @@ def bars(text: str) -> dict[str, tuple[int, int]]:
                 "signatures": 4,
                 "descriptions": 4,
                 "distances by interior": 4,
-                "re-ranked": 4,
                 "rankings": 4,
                 "pictures": 4,
             },

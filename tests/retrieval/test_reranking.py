@@ -1,4 +1,4 @@
-"""Re-ranking against the papers' walks, sets and sums, written out shape by shape, and what it promises."""
+"""Re-ranking against the sets and sums of the paper, written out shape by shape, and what it promises."""
 
 from __future__ import annotations
 
@@ -55,53 +55,6 @@ def by_hand(
     return found
 
 
-def diffused_by_hand(
-    distances: list[list[float]], k: int, share: float, fading: float
-) -> list[list[float]]:
-    """All walks of up to 300 steps, step by step, over the graph of the k nearest."""
-    n = len(distances)
-    near = [
-        sorted((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j])[:k]
-        for i in range(n)
-    ]
-    scale = [sum(distances[i][j] for j in near[i]) / k for i in range(n)]
-    weights = [
-        [
-            math.exp(-(distances[i][j] ** 2) / (scale[i] * scale[j]))
-            if j in near[i] or i in near[j]
-            else 0.0
-            for j in range(n)
-        ]
-        for i in range(n)
-    ]
-    degree = [sum(row) for row in weights]
-    alike = []
-    for i in range(n):
-        walks = [float(j == i) for j in range(n)]
-        total = walks
-        for _ in range(300):
-            steps = [
-                [weights[m][j] / math.sqrt(degree[m] * degree[j]) for m in range(n)]
-                for j in range(n)
-            ]
-            walks = [
-                fading * sum(a * b for a, b in zip(step, walks, strict=True)) for step in steps
-            ]
-            total = [a + b for a, b in zip(total, walks, strict=True)]
-        alike.append(total)
-    apart = [
-        [1 - alike[i][j] / math.sqrt(alike[i][i] * alike[j][j]) for j in range(n)] for i in range(n)
-    ]
-    means = [sum(map(sum, matrix)) / (n * (n - 1)) for matrix in (apart, distances)]
-    return [
-        [
-            (1 - share) * apart[i][j] / means[0] + share * distances[i][j] / means[1]
-            for j in range(n)
-        ]
-        for i in range(n)
-    ]
-
-
 @pytest.fixture
 def points() -> Tensor:
     return torch.randn(30, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -113,38 +66,8 @@ def points() -> Tensor:
 def test_sets_and_sums_of_the_paper(k: int, n_expanded: int, share: float, points: Tensor) -> None:
     distances = euclidean(points, points)
     expected = torch.tensor(by_hand(distances.tolist(), k, n_expanded, share), dtype=torch.float64)
-    found = rerank(distances, k, n_expanded, share, 0, keep_nearest=False)
+    found = rerank(distances, k, n_expanded, share, keep_nearest=False)
     torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
-
-
-@pytest.mark.parametrize(("k", "share", "fading"), [(6, 0.3, 0.8), (3, 0.0, 0.5)])
-def test_walks_come_before_the_sets(k: int, share: float, fading: float, points: Tensor) -> None:
-    distances = euclidean(points[:12], points[:12])
-    diffused = diffused_by_hand(distances.tolist(), max(1, round(k / 2)), share, fading)
-    expected = torch.tensor(by_hand(diffused, k, 2, share), dtype=torch.float64)
-    found = rerank(distances, k, 2, share, fading, keep_nearest=False)
-    torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
-
-
-def test_nearest_pairs_are_moved_forward_after_diffusion(points: Tensor) -> None:
-    """Against loops over walks, nearest pairs and reciprocal sets; the second step must see the moved pairs."""
-    k, share, fading, n = 6, 0.3, 0.8, 12
-    distances = euclidean(points[:n], points[:n]).tolist()
-    nearest = [
-        min((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j]) for i in range(n)
-    ]
-    pairs = {pair for i, j in enumerate(nearest) for pair in ((i, j), (j, i))}
-    diffused = diffused_by_hand(distances, k // 2, share, fading)
-    least = min(
-        diffused[i][j] for i in range(n) for j in range(n) if i != j and (i, j) not in pairs
-    )
-    largest = max(distances[i][j] for i, j in pairs)
-    for i, j in pairs:
-        diffused[i][j] = least / 2 * distances[i][j] / largest
-    expected = torch.tensor(by_hand(diffused, k, 2, share), dtype=torch.float64)
-    rest = torch.tensor([[(i, j) not in pairs for j in range(n)] for i in range(n)])
-    found = rerank(torch.tensor(distances, dtype=torch.float64), k, 2, share, fading)
-    torch.testing.assert_close(found[rest], expected[rest], atol=1e-10, rtol=0)
 
 
 def test_a_shape_is_its_own_nearest_among_equals(points: Tensor) -> None:
@@ -154,23 +77,20 @@ def test_a_shape_is_its_own_nearest_among_equals(points: Tensor) -> None:
     distances = (distances + distances.T) / 2
     for k in (3, 5):
         expected = torch.tensor(by_hand(distances.tolist(), k, 1, 0.3), dtype=torch.float64)
-        found = rerank(distances, k, 1, 0.3, 0, keep_nearest=False)
+        found = rerank(distances, k, 1, 0.3, keep_nearest=False)
         torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
 
 
-@pytest.mark.parametrize("diffusion", [0, 0.95])
 @pytest.mark.parametrize("n_copies", [0, 8])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_nearest_stays_the_nearest(n_copies: int, dtype: torch.dtype, diffusion: float) -> None:
+def test_the_nearest_stays_the_nearest(n_copies: int, dtype: torch.dtype) -> None:
     generator = torch.Generator().manual_seed(3)
     points = torch.randn(60, 4, generator=generator, dtype=torch.float64)
     points = torch.cat([points, *[points[:n_copies]] * 2])
     own = euclidean(points, points).to(dtype).fill_diagonal_(0)
     own = torch.minimum(own, own.T)
-    found, moved = (
-        rerank(own, diffusion=diffusion),
-        rerank(own, diffusion=diffusion, keep_nearest=False),
-    )
+    found = rerank(own)
+    moved = rerank(own, keep_nearest=False)
     torch.testing.assert_close(found, found.T, rtol=0, atol=0)
     alone = own.clone().fill_diagonal_(torch.inf)
     for i, row in enumerate(found.clone().fill_diagonal_(torch.inf)):
@@ -180,9 +100,8 @@ def test_the_nearest_stays_the_nearest(n_copies: int, dtype: torch.dtype, diffus
     nearest = torch.zeros_like(own, dtype=torch.bool).scatter_(1, alone.argmin(1)[:, None], True)
     if not n_copies:  # among equals, which is the nearest is not told
         rest = ~(nearest | nearest.T).fill_diagonal_(True)
-        if not diffusion:  # with it, the second step starts from nearer ones
-            alone = rerank(own, diffusion=0, keep_nearest=False)
-            torch.testing.assert_close(found[rest], alone[rest], rtol=0, atol=0)
+        alone = rerank(own, keep_nearest=False)
+        torch.testing.assert_close(found[rest], alone[rest], rtol=0, atol=0)
         assert found[nearest].max() < found[rest].min()
 
 
@@ -203,11 +122,10 @@ def test_classes_that_scatter_are_found_better() -> None:
     scattered = (centres + 1.0 * torch.randn(12, 20, 20, generator=generator)).flatten(0, 1)
     labels = torch.arange(12).repeat_interleave(20)
     plain = euclidean(scattered, scattered)
-    all_three = (plain, rerank(plain, diffusion=0), rerank(plain))
-    before, sets, both = (retrieval_scores(d, labels).mean()["ft"] for d in all_three)
+    before = retrieval_scores(plain, labels).mean()["ft"]
+    after = retrieval_scores(rerank(plain), labels).mean()["ft"]
     assert 0.5 < before < 0.8
-    assert sets > before + 0.1
-    assert both > sets + 0.03
+    assert after > before + 0.1
 
 
 def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points: Tensor) -> None:
@@ -259,16 +177,7 @@ def test_few_shapes_and_equal_ones() -> None:
         (-torch.ones(2, 2), {}, "finite numbers ≥ 0"),
         (torch.full((2, 2), math.nan), {}, "finite numbers ≥ 0"),
         (torch.zeros(2, 2), {"n_neighbours": 0}, "n_neighbours: expected at least 1, got 0"),
-        (
-            torch.zeros(2, 2),
-            {"share": 1.5},
-            "share, diffusion: expected 0 to 1, .* got 1.5 and 0.95",
-        ),
-        (
-            torch.zeros(2, 2),
-            {"diffusion": 1.0},
-            "share, diffusion: .* 0 to less than 1, got 0.3 and 1.0",
-        ),
+        (torch.zeros(2, 2), {"share": 1.5}, "share: expected 0 to 1, got 1.5"),
     ],
 )
 def test_what_it_refuses(distances: Tensor, numbers: dict[str, float], message: str) -> None:

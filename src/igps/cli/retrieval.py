@@ -63,7 +63,7 @@ def retrieve(
             if a mesh could not be used, and descriptor.safetensors, for queries, if the descriptor's centres were
             fitted to the collection.
         report: also write a page of results to the folder of --out, report.html, see igps report
-        rerank: also re-rank the distances by diffusion and k-reciprocal neighbours, without labels, and print their
+        rerank: also re-rank the distances by k-reciprocal neighbours, without labels, and print their
             scores in a second table; distances.npz holds them as "reranked".
     """
     check_report_folder(report, out)
@@ -74,7 +74,7 @@ def retrieve(
     summary = _summary(result, scores)
     tables = scores_table(scores)
     if rerank:
-        distances["reranked"] = reranked_distances(distances["distances"], progress=True)
+        distances["reranked"] = reranked_distances(distances["distances"])
         scores = retrieval_scores(distances["reranked"], labels)
         summary["reranked"] = scores.mean()
         tables += f"\n\nre-ranked by the whole collection, without labels\n{scores_table(scores)}"
@@ -165,7 +165,7 @@ def query(
         where: condition on columns of the gallery that listed bodies must satisfy, such as "class = 'femur' AND volume
             > 2e5".
         exact: compare with all bodies; without it, candidates in a large gallery are selected by short vectors
-        rerank: re-rank the nearest 200 bodies by their common neighbours (diffusion and k-reciprocal, without labels);
+        rerank: re-rank the nearest 200 bodies by their common neighbours (k-reciprocal, without labels);
             the listed distances are the re-ranked ones.
     """
     check_at_least(1, top=top)

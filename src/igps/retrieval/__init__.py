@@ -1,7 +1,6 @@
 """Distances between descriptors, rankings, re-ranking and retrieval scores: functions of tensors alone."""
 
 from igps.retrieval.distances import Distance, chi_square, cosine, euclidean
-from igps.retrieval.graph_reranking import rerank_graph
 from igps.retrieval.ranking import SearchResult, rank, search
 from igps.retrieval.reranking import N_RERANKED, rerank, rerank_candidates
 from igps.retrieval.scores import (
@@ -26,7 +25,6 @@ __all__ = [
     "rank",
     "rerank",
     "rerank_candidates",
-    "rerank_graph",
     "retrieval_scores",
     "search",
 ]

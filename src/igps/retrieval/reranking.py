@@ -2,20 +2,21 @@
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
+from scipy import sparse
 from torch import Tensor
 
+from igps._arrays import Booleans, Floats, Integers
+from igps._compiled import compiled
 from igps._parameters import check_at_least
 from igps.retrieval.distances import Distance, check_tensor
-from igps.retrieval.graph_reranking import MAX_DENSE, rerank_graph
 from igps.retrieval.ranking import SearchResult, rank
 
 N_RERANKED = 200
 """Number of nearest entries of a single query that are re-ranked, by their neighbourhoods among each other."""
 
-# In a collection of more than `MAX_DENSE` shapes, each has a list of nearest neighbours, whose length is within these
-# limits and makes about this many pairs at most. With all pairs, time would grow with the cube of the number of shapes.
-_MAX_PAIRS, _LIST_LIMITS = 3_000_000, (300, 1000)
+_TINY = np.finfo(np.float64).tiny
 
 
 def rerank(
@@ -23,38 +24,29 @@ def rerank(
     n_neighbours: int = 20,
     n_expanded: int = 6,
     share: float = 0.3,
-    diffusion: float = 0.95,
     *,
     keep_nearest: bool = True,
-    progress: bool = False,
 ) -> Tensor:
-    """Re-rank a collection by diffusion, then by k-reciprocal neighbours: shapes with common neighbours become closer.
+    """Re-rank a collection by k-reciprocal neighbours: shapes with common neighbours become closer.
 
-    *Diffusion* (Zhou, Weston, Gretton, Bousquet and Schölkopf 2004): each shape is linked to its k/2 nearest, with
-    weights exp(−d² / σσ′), where σ is the mean distance to them (Zelnik-Manor and Perona 2004). With S = D^−½ W D^−½,
-    the similarity of two shapes is the sum over all walks between them, (I − diffusion · S)⁻¹, with a unit diagonal.
+    The neighbourhood of a shape consists of those of its k nearest shapes that have the shape among
+    their own k nearest. The neighbourhood of a member, for k/2, is added if two thirds of it are in
+    the neighbourhood already. Members have weights exp(−d), with d in units of the mean distance to
+    the k nearest. These weights are averaged over the nearest shapes. The new distance of two shapes
+    is the Jaccard distance of their weighted neighbourhoods, mixed with the distance before.
+    Source: Zhong, Zheng, Cao and Li 2017.
 
-    *k-reciprocal neighbours* (Zhong, Zheng, Cao and Li 2017), by the distances after diffusion: the neighbourhood of a
-    shape consists of those of its k nearest that have the shape among their k nearest. The neighbourhood of a member,
-    for k/2, is added if two thirds of it are in the neighbourhood already. Members have weights exp(−d), with d in
-    units of the mean distance to the k nearest. These weights are averaged over the nearest shapes. The new distance of
-    two shapes is the Jaccard distance of their weighted neighbourhoods.
-
-    The result of each step is mixed with the distances before it. It depends on the whole collection: without one of
-    the shapes, the others may rank differently. Common neighbours indicate the class of a shape rather than its body,
-    so each shape keeps its nearest one. In collections of more than 2,000 shapes, each shape has a list of its nearest
-    shapes, see `rerank_graph`: 1,000, but fewer from 3,000 shapes on, down to 300 from 10,000 on. Two shapes of which
-    neither is in the list of the other count as having no common neighbours.
+    The result depends on the whole collection: without one of the shapes, the others may rank
+    differently. Common neighbours indicate the class of a shape rather than its body, so each shape
+    keeps its nearest one.
 
     Args:
-        distances: (N, N) of a collection to itself, symmetric, ≥ 0.
+        distances: (N, N) of a collection to itself, ≥ 0. The mean of both triangles counts.
         n_neighbours: k, at most N − 1.
         n_expanded: number of nearest shapes, the shape itself included, over which weights are averaged.
-        share: weight of the distances before a step, in units of their mean, in its result.
-        diffusion: factor for each step of a walk, at least 0 and less than 1; 0 leaves diffusion out.
-        keep_nearest: after each step, put all pairs in which one shape is the nearest of the other before all other
-            pairs, in their original order; the papers do not do so.
-        progress: show a progress bar.
+        share: weight of the distances before, in units of their mean, in the result.
+        keep_nearest: put all pairs in which one shape is the nearest of the other before all other
+            pairs, in their original order; the paper does not do so.
 
     Returns:
         (N, N) distances ≥ 0, symmetric, 0 on the diagonal; without unit.
@@ -70,44 +62,33 @@ def rerank(
     if not bool((distances >= 0).all() and torch.isfinite(distances).all()):
         raise ValueError("distances: expected finite numbers ≥ 0, got others.")
     check_at_least(1, n_neighbours=n_neighbours, n_expanded=n_expanded)
-    if not (0 <= share <= 1 and 0 <= diffusion < 1):
-        raise ValueError(
-            f"share, diffusion: expected 0 to 1, and 0 to less than 1, got {share} and {diffusion}."
-        )
+    if not 0 <= share <= 1:
+        raise ValueError(f"share: expected 0 to 1, got {share}.")
     n = len(distances)
     if n < 2:
         return torch.zeros_like(distances)
-    k, n_expanded = min(n_neighbours, n - 1), min(n_expanded, n)
-    low, high = _LIST_LIMITS
-    n_listed = (
-        n - 1 if n <= MAX_DENSE else min(max(low, min(high, _MAX_PAIRS // n), k, n_expanded), n - 1)
+    before = distances.detach().double().cpu().numpy()
+    before = (before + before.T) / 2
+    np.fill_diagonal(before, 0)
+    n_neighbours = min(n_neighbours, n - 1)
+    n_expanded = min(n_expanded, n)
+    order = _nearest_first(before, max(n_neighbours + 1, n_expanded))
+    weights = _neighbourhoods(before, order, n_neighbours, n_expanded)
+    common = np.zeros((n, n))
+    members = weights.tocsc()
+    add_common_weights(
+        (weights.indptr, weights.indices, weights.data),
+        (members.indptr, members.indices, members.data),
+        common,
     )
-    mean = float((distances.sum(dtype=torch.float64) - distances.trace()) / (n * (n - 1)))
-    mean = max(mean, torch.finfo(torch.float64).tiny)
-    others = distances.clone().fill_diagonal_(torch.inf)
-    order = (
-        others.argsort(dim=1, stable=True)
-        if n <= MAX_DENSE
-        else others.topk(n_listed, largest=False).indices
-    )
-    order = order[:, :n_listed]
-    nearest = SearchResult(order.cpu(), distances.gather(1, order).cpu())
-    lists = rerank_graph(
-        nearest, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest, progress=progress
-    )
-    result = (
-        distances / mean
-    )  # for pairs without common neighbours, which each step puts at distance 1
-    for _ in range(2 if diffusion else 1):
-        result = result.mul_(share).add_(1 - share)
-    rows, columns = (
-        torch.arange(n, device=result.device)[:, None].expand(-1, n_listed),
-        lists.indices.to(result.device),
-    )
-    values = lists.distances.to(result)
-    result[rows, columns] = values
-    result[columns, rows] = values
-    return result.fill_diagonal_(0)
+    # Rows of weights sum to 1, so that the larger weights of two rows sum to 2 minus the smaller ones.
+    jaccard = np.maximum(1 - common / (2 - common), 0)
+    mean = max(before.sum() / (n * (n - 1)), _TINY)
+    after = (1 - share) * jaccard + share * before / mean
+    if keep_nearest:
+        _put_first(after, before, _is_nearest(order))
+    np.fill_diagonal(after, 0)
+    return torch.from_numpy(after).to(distances)
 
 
 def rerank_candidates(
@@ -129,14 +110,103 @@ def rerank_candidates(
         distance: of descriptions.
         top: number of entries to return for each query.
     """
-    results = []
+    indices = []
+    distances = []
     for query, entries in zip(queries, found.indices, strict=True):
         members = torch.cat([query[None], descriptions(entries).to(query)])
-        distances = distance(members, members)
-        distances = torch.minimum(distances, distances.T).fill_diagonal_(
-            0
-        )  # the two triangles differ by rounding
-        reranked = rerank(distances)[:1, 1:]
+        reranked = rerank(distance(members, members))[:1, 1:]
         best = rank(reranked)[:, :top]
-        results.append((entries[best[0].to(entries.device)], reranked.gather(1, best)[0]))
-    return SearchResult(*(torch.stack(rows) for rows in zip(*results, strict=True)))
+        indices.append(entries[best[0].to(entries.device)])
+        distances.append(reranked.gather(1, best)[0])
+    return SearchResult(torch.stack(indices), torch.stack(distances))
+
+
+def _nearest_first(distances: Floats, n_listed: int) -> Integers:
+    """Return (N, n_listed) each shape, then its nearest ones; among equals, the first in the collection."""
+    order = np.empty((len(distances), n_listed), dtype=np.int64)
+    for i, row in enumerate(distances):
+        others = row.copy()
+        others[i] = -1  # a shape comes before its copies
+        order[i] = np.argsort(others, kind="stable")[:n_listed]
+    return order
+
+
+def _neighbourhoods(
+    distances: Floats, order: Integers, n_neighbours: int, n_expanded: int
+) -> sparse.csr_array:
+    """Return (N, N) weights of the members of each shape's neighbourhood; rows sum to 1."""
+    n = len(distances)
+    half = max(1, round(n_neighbours / 2))
+    members = _reciprocal(order[:, : n_neighbours + 1])
+    half_members = _reciprocal(order[:, : half + 1])
+    # The neighbourhood of a member joins if two thirds of it are there.
+    n_common = (members @ half_members.T).multiply(members).tocsr()
+    sizes = half_members.sum(axis=1)
+    joins = n_common.copy()
+    joins.data = (3 * n_common.data >= 2 * sizes[n_common.indices]).astype(np.int64)
+    rows, columns = (members + joins @ half_members).nonzero()
+    nearest = np.take_along_axis(distances, order[:, 1 : n_neighbours + 1], axis=1)
+    scale = np.maximum(nearest.mean(axis=1), _TINY)
+    similarity = np.exp(-distances[rows, columns] / scale[rows])
+    weights = sparse.csr_array((similarity, (rows, columns)), shape=(n, n))
+    expansion = _binary(order[:, :n_expanded])
+    factors = sparse.diags_array(1 / (n_expanded * weights.sum(axis=1)))
+    averaged = sparse.csr_array(expansion @ factors @ weights)
+    averaged.sort_indices()
+    return averaged
+
+
+def _binary(neighbours: Integers) -> sparse.csr_array:
+    """Return an (N, N) matrix with 1 for each shape (row) and each of its neighbours (column)."""
+    n, n_listed = neighbours.shape
+    rows = np.repeat(np.arange(n), n_listed)
+    ones = np.ones(n * n_listed, dtype=np.int64)
+    return sparse.csr_array((ones, (rows, neighbours.ravel())), shape=(n, n))
+
+
+def _reciprocal(neighbours: Integers) -> sparse.csr_array:
+    """Return an (N, N) matrix with 1 for shapes that are neighbours of each other."""
+    ones = _binary(neighbours)
+    return ones.multiply(ones.T).tocsr()
+
+
+@compiled()
+def add_common_weights(
+    rows: tuple[Integers, Integers, Floats],
+    columns: tuple[Integers, Integers, Floats],
+    common: Floats,
+) -> None:
+    """Add to `common` (N, N) the sums of the smaller weights of each pair of rows of a sparse matrix.
+
+    Only weights in the same column meet, so that few pairs of rows have to be compared.
+
+    Args:
+        rows, columns: starts, indices and weights of the matrix in CSR and in CSC form.
+        common: the sums.
+    """
+    row_starts, row_indices, row_weights = rows
+    column_starts, column_indices, column_weights = columns
+    for i in range(len(common)):
+        for e in range(row_starts[i], row_starts[i + 1]):
+            column = row_indices[e]
+            for f in range(column_starts[column], column_starts[column + 1]):
+                j = column_indices[f]
+                common[i, j] += min(row_weights[e], column_weights[f])
+
+
+def _is_nearest(order: Integers) -> Booleans:
+    """Return (N, N) whether one of two shapes is the nearest of the other."""
+    n = len(order)
+    is_nearest = np.zeros((n, n), dtype=bool)
+    is_nearest[np.arange(n), order[:, 1]] = True
+    return is_nearest | is_nearest.T
+
+
+def _put_first(after: Floats, before: Floats, is_first: Booleans) -> None:
+    """Change distances in place so that some pairs come before all others, in their order before."""
+    is_other = ~is_first & (after > 0)
+    smallest = after.min(where=is_other, initial=np.inf)
+    limit = smallest if np.isfinite(smallest) else 1.0
+    largest = max(before[is_first].max(), _TINY)
+    # At most half of the smallest other value, so that rounding to single precision makes no ties.
+    after[is_first] = 0.5 * limit * before[is_first] / largest

@@ -43,7 +43,8 @@ def geodesic_samples(mesh: Mesh, n_samples: int, max_vertices: int) -> FarthestP
         ValueError: the mesh has fewer vertices than `n_samples`.
         MeshError: the mesh cannot be simplified.
     """
-    return farthest_points(simplify(in_canonical_order(mesh), max_vertices), n_samples)
+    simplified = simplify(in_canonical_order(mesh), max_vertices)
+    return farthest_points(simplified, n_samples)
 
 
 def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> FarthestPoints:
@@ -68,9 +69,13 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
         return dijkstra(graph, indices=vertex)[:n_vertices]
 
     def farthest(distance: Floats, total: Floats) -> int:
-        tied = np.flatnonzero(distance >= (1 - _TIE_TOLERANCE) * distance.max())
-        tied = tied[total[tied] <= (1 + _TIE_TOLERANCE) * total[tied].min()]
-        return int(tied[np.argmax(keys[tied])])
+        least = (1 - _TIE_TOLERANCE) * distance.max()
+        tied = np.flatnonzero(distance >= least)
+        sums = total[tied]
+        most = (1 + _TIE_TOLERANCE) * sums.min()
+        tied = tied[sums <= most]
+        best = np.argmax(keys[tied])
+        return int(tied[best])
 
     keys = spatial_ordering_keys(mesh)
     first = int(np.argmax(keys))
@@ -80,7 +85,8 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
     samples = [first]
     distances = np.empty((n_samples, n_vertices))
     distances[0] = from_vertex(first)
-    nearest, total = distances[0].copy(), distances[0].copy()
+    nearest = distances[0].copy()
+    total = distances[0].copy()
     for i in range(1, n_samples):
         samples.append(farthest(nearest, total))
         distances[i] = from_vertex(samples[i])
@@ -98,26 +104,37 @@ def edge_graph(mesh: Mesh, points_per_edge: int = 0) -> sparse.csr_array:
     distances (Mitchell, Mount and Papadimitriou 1987) on five SHREC'07 models of 1,000 vertices.
     """
     check_at_least(0, points_per_edge=points_per_edge)
-    n, n_vertices, n_faces = points_per_edge, len(mesh.vertices), len(mesh.faces)
+    n = points_per_edge
+    n_vertices = len(mesh.vertices)
+    n_faces = len(mesh.faces)
     # Side i of a face runs from corner i to corner i + 1.
     edges, edge_of = undirected_edges(mesh.faces, n_vertices)
     share = (np.arange(1, n + 1) / (n + 1))[None, :, None]
-    first, last = mesh.vertices[edges[:, :1]], mesh.vertices[edges[:, 1:]]
-    positions = np.concatenate([mesh.vertices, ((1 - share) * first + share * last).reshape(-1, 3)])
+    first = mesh.vertices[edges[:, :1]]
+    last = mesh.vertices[edges[:, 1:]]
+    between = (1 - share) * first + share * last
+    positions = np.concatenate([mesh.vertices, between.reshape(-1, 3)])
     on_edge = n_vertices + np.arange(len(edges) * n).reshape(len(edges), n)
+    # Along every edge, from vertex to vertex.
     chain = np.concatenate([edges[:, :1], on_edge, edges[:, 1:]], axis=1)
-    tails, heads = [chain[:, :-1].ravel()], [chain[:, 1:].ravel()]
+    tails = [chain[:, :-1].ravel()]
+    heads = [chain[:, 1:].ravel()]
+    # Across every face: from the points of a side to those of the next side, and to the corner opposite.
     on_side = on_edge[edge_of.reshape(n_faces, 3)]
     for i in range(3):
-        side, next_side = on_side[:, i], on_side[:, (i + 1) % 3]
+        side = on_side[:, i]
+        next_side = on_side[:, (i + 1) % 3]
         opposite = mesh.faces[:, (i + 2) % 3]
-        tails += [np.repeat(side, n, axis=1).ravel(), np.repeat(opposite, n)]
-        heads += [np.tile(next_side, (1, n)).ravel(), side.ravel()]
+        tails.append(np.repeat(side, n, axis=1).ravel())
+        heads.append(np.tile(next_side, (1, n)).ravel())
+        tails.append(np.repeat(opposite, n))
+        heads.append(side.ravel())
     # SciPy's shortest paths accept no 64-bit indices up to version 1.14.
-    tail, head = (np.concatenate(ends).astype(np.int32) for ends in (tails, heads))
+    tail = np.concatenate(tails).astype(np.int32)
+    head = np.concatenate(heads).astype(np.int32)
     length = np.linalg.norm(positions[tail] - positions[head], axis=1)
-    entries = (
-        np.concatenate([length, length]),
-        (np.concatenate([tail, head]), np.concatenate([head, tail])),
-    )
-    return sparse.csr_array(sparse.coo_array(entries, shape=(len(positions), len(positions))))
+    rows = np.concatenate([tail, head])
+    columns = np.concatenate([head, tail])
+    lengths = np.concatenate([length, length])
+    shape = (len(positions), len(positions))
+    return sparse.csr_array(sparse.coo_array((lengths, (rows, columns)), shape=shape))

@@ -14,19 +14,21 @@ def linear_histogram(values: Sequence[Floats], n_bins: Sequence[int]) -> Floats:
     A value at the centre of a bin counts for this bin alone. A value between two centres counts for both bins, with
     weights that fall linearly with the distance from the centre. Values above 1 count for the last bin.
     """
-    positions = [np.clip(x * n - 0.5, 0, n - 1) for x, n in zip(values, n_bins, strict=True)]
-    lower = [
-        np.minimum(position.astype(int), n - 2)
-        for position, n in zip(positions, n_bins, strict=True)
-    ]
-    shares = [position - bins for position, bins in zip(positions, lower, strict=True)]
+    lower_bins = []
+    upper_shares = []
+    for variable, n in zip(values, n_bins, strict=True):
+        position = np.clip(variable * n - 0.5, 0, n - 1)
+        lower = np.minimum(position.astype(int), n - 2)
+        lower_bins.append(lower)
+        upper_shares.append(position - lower)
     histogram = np.zeros(int(np.prod(n_bins)))
+    # A corner says for each variable whether the lower bin (0) or the upper bin (1) is filled.
     for corner in product((0, 1), repeat=len(values)):
-        cells = np.ravel_multi_index(
-            [bins + step for bins, step in zip(lower, corner, strict=True)], tuple(n_bins)
-        )
-        weights = np.prod(
-            [x if step else 1 - x for x, step in zip(shares, corner, strict=True)], axis=0
-        )
-        histogram += np.bincount(cells, weights, len(histogram))
-    return (histogram / len(positions[0])).reshape(tuple(n_bins))
+        bins = []
+        weights = []
+        for lower, share, step in zip(lower_bins, upper_shares, corner, strict=True):
+            bins.append(lower + step)
+            weights.append(share if step else 1 - share)
+        cells = np.ravel_multi_index(bins, tuple(n_bins))
+        histogram += np.bincount(cells, np.prod(weights, axis=0), len(histogram))
+    return (histogram / len(values[0])).reshape(tuple(n_bins))

@@ -54,7 +54,8 @@ class CanonicalForm(BodyDescriptor):
         """(M,) moments in units of √area, in the order of `exponents`; raises the errors of `geodesic_samples`."""
         samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
         distances = samples.mutual / np.sqrt(body.mesh.area)
-        form = least_squares_scaling(distances, classical_scaling(distances))
+        start = classical_scaling(distances)
+        form = least_squares_scaling(distances, start)
         return moments(form, self.max_order).astype(np.float32)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
@@ -62,9 +63,12 @@ class CanonicalForm(BodyDescriptor):
         odd = torch.as_tensor(
             exponents(self.max_order) % 2, dtype=queries.dtype, device=queries.device
         )
-        reflections = product((0.0, 1.0), repeat=_DIMENSION)
-        signs = ((1 - 2 * odd * odd.new_tensor(axes)).prod(dim=1) for axes in reflections)
-        return torch.stack([euclidean(queries * sign, gallery) for sign in signs]).amin(dim=0)
+        candidates = []
+        for reflected_axes in product((0.0, 1.0), repeat=_DIMENSION):
+            factors = 1 - 2 * odd * odd.new_tensor(reflected_axes)
+            signs = factors.prod(dim=1)
+            candidates.append(euclidean(queries * signs, gallery))
+        return torch.stack(candidates).amin(dim=0)
 
 
 def classical_scaling(distances: Floats) -> Floats:
@@ -77,8 +81,10 @@ def classical_scaling(distances: Floats) -> Floats:
     row = squared.mean(axis=0)
     gram = -(squared - row - row[:, None] + row.mean()) / 2
     values, vectors = np.linalg.eigh(gram)
-    values, vectors = values[::-1][:_DIMENSION], vectors[:, ::-1][:, :_DIMENSION]
-    return vectors * np.sqrt(np.maximum(values, 0))
+    # The largest eigenvalues come last.
+    largest = values[::-1][:_DIMENSION]
+    axes = vectors[:, ::-1][:, :_DIMENSION]
+    return axes * np.sqrt(np.maximum(largest, 0))
 
 
 def least_squares_scaling(distances: Floats, start: Floats) -> Floats:
@@ -88,24 +94,32 @@ def least_squares_scaling(distances: Floats, start: Floats) -> Floats:
     """
     points = start - start.mean(axis=0)
     lengths = cdist(points, points)
-    stress = float(np.square(lengths - distances).sum())
+    stress = _stress(lengths, distances)
     for _ in range(_MAX_STEPS):
         # Guttman transform with all weights 1. Pairs of coincident points have no direction and are left out.
         ratio = np.divide(distances, lengths, out=np.zeros_like(distances), where=lengths > 0)
-        points = (ratio.sum(axis=1)[:, None] * points - ratio @ points) / len(points)
+        sums = ratio.sum(axis=1)
+        points = (sums[:, None] * points - ratio @ points) / len(points)
         lengths = cdist(points, points)
-        previous, stress = stress, float(np.square(lengths - distances).sum())
+        previous = stress
+        stress = _stress(lengths, distances)
         if previous - stress <= _TOLERANCE * previous:
             break
     return points
 
 
+def _stress(lengths: Floats, distances: Floats) -> float:
+    return float(np.square(lengths - distances).sum())
+
+
 def exponents(max_order: int) -> Integers:
     """(M, 3) exponents of the moments of orders 2 to `max_order` except xy, xz, yz, which vanish in principal axes."""
-    candidates = np.array(list(product(range(max_order + 1), repeat=_DIMENSION)))
+    powers = range(max_order + 1)
+    candidates = np.array(list(product(powers, repeat=_DIMENSION)))
     order = candidates.sum(axis=1)
-    mixed = (order == 2) & (candidates.max(axis=1) == 1)
-    return candidates[(order >= 2) & (order <= max_order) & ~mixed]
+    is_in_range = (order >= 2) & (order <= max_order)
+    is_mixed = (order == 2) & (candidates.max(axis=1) == 1)
+    return candidates[is_in_range & ~is_mixed]
 
 
 def moments(points: Floats, max_order: int) -> Floats:
@@ -115,8 +129,10 @@ def moments(points: Floats, max_order: int) -> Floats:
     root mean square radius. The signs of the axes are arbitrary: a reflection in x changes the sign where p is odd.
     """
     centred = points - points.mean(axis=0)
-    radius = np.sqrt(np.square(centred).sum(axis=1).mean())
-    axes = np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
+    squares = np.square(centred).sum(axis=1)
+    radius = np.sqrt(squares.mean())
+    _, vectors = np.linalg.eigh(centred.T @ centred)
+    axes = vectors[:, ::-1]
     unit = centred @ axes / radius
     powers = unit[:, None, :] ** exponents(max_order)
     return radius * powers.prod(axis=2).mean(axis=0)

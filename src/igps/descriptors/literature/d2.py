@@ -56,8 +56,10 @@ class D2(BodyDescriptor):
                 f"{len(points)}. Raise n_surface_samples."
             )
         values, end = self._values(points)
-        bins = np.minimum((values * (self.n_bins / end)).astype(np.int64), self.n_bins - 1)
-        return (np.bincount(bins, minlength=self.n_bins) / len(bins)).astype(np.float32)
+        bins = (values * (self.n_bins / end)).astype(np.int64)
+        bins = np.minimum(bins, self.n_bins - 1)
+        counts = np.bincount(bins, minlength=self.n_bins)
+        return (counts / len(bins)).astype(np.float32)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) half the L1 distance of the histograms, in [0, 1]."""
@@ -66,10 +68,13 @@ class D2(BodyDescriptor):
     def _values(self, points: Floats) -> tuple[Floats, float]:
         """Values of the shape function, and the upper end of its last bin."""
         if self.function == "d2":
-            return torch.pdist(torch.from_numpy(points)).numpy(), self.reach
+            between = torch.pdist(torch.from_numpy(points))
+            return between.numpy(), self.reach
         if self.function == "d1":
-            return np.linalg.norm(points - points.mean(axis=0), axis=1), self.reach
-        return _angles(points, self.n_triples, np.random.default_rng(self.seed)), math.pi
+            offsets = points - points.mean(axis=0)
+            return np.linalg.norm(offsets, axis=1), self.reach
+        generator = np.random.default_rng(self.seed)
+        return _angles(points, self.n_triples, generator), math.pi
 
 
 def _angles(points: Floats, n_triples: int, generator: np.random.Generator) -> Floats:
@@ -80,5 +85,8 @@ def _angles(points: Floats, n_triples: int, generator: np.random.Generator) -> F
     first = generator.integers(1, n_points, size=n_triples)
     second = generator.integers(1, n_points - 1, size=n_triples)
     second += second >= first
-    a, b = (points[(corner + offset) % n_points] - points[corner] for offset in (first, second))
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ni,ni->n", a, b))
+    a = points[(corner + first) % n_points] - points[corner]
+    b = points[(corner + second) % n_points] - points[corner]
+    sine = np.linalg.norm(np.cross(a, b), axis=1)
+    cosine = np.einsum("ni,ni->n", a, b)
+    return np.arctan2(sine, cosine)

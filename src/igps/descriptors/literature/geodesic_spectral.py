@@ -41,9 +41,8 @@ class GeodesicSpectral(BodyDescriptor):
     def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) √|λₖ|, without unit; raises the errors of `geodesic_samples`."""
         samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
-        return np.sqrt(np.abs(affinity_eigenvalues(samples.mutual, self.n_eigenvalues))).astype(
-            np.float32
-        )
+        values = affinity_eigenvalues(samples.mutual, self.n_eigenvalues)
+        return np.sqrt(np.abs(values)).astype(np.float32)
 
 
 def affinity_eigenvalues(distances: Floats, n_eigenvalues: int) -> Floats:

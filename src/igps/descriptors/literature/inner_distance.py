@@ -8,6 +8,7 @@ inner distance in the union of the cells. Where all cells between two samples ar
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy import sparse
@@ -92,14 +93,15 @@ def _grid_indices(points: Floats) -> tuple[Integers, float]:
         )
     origin = points.min(axis=0)
     relative = points - origin
-    gaps = np.concatenate([np.diff(np.sort(column)) for column in relative.T])
-    gaps = gaps[gaps > 1e-9 * relative.max()]
+    gaps = np.diff(np.sort(relative, axis=0), axis=0).T.ravel()
+    gaps = gaps[gaps > 1e-9 * relative.max()]  # others are rounding
     # Each gap is a multiple of the cell, but the smallest gap may be several cells.
     for divisor in (1, 2, 3, 4, 5):
         cell = float(gaps.min()) / divisor
         position = relative / cell
         cells = np.round(position).astype(np.int64)
-        if np.abs(position - cells).max() < _GRID_TOLERANCE * divisor:
+        error = np.abs(position - cells).max()
+        if error < _GRID_TOLERANCE * divisor:
             return cells, cell
     raise ValueError(
         "points: expected cell centres of a cubic grid along the axes; take those of a Signature."
@@ -110,14 +112,18 @@ def _visible_links(cells: Integers) -> sparse.csr_array:
     """Symmetric (P, P) matrix of the lengths of the links, in cells."""
     # The grid is padded by two cells, so that no offset wraps around.
     shape = tuple(cells.max(axis=0) + 5)
-    flat = np.ravel_multi_index(tuple((cells + 2).T), shape)
+    padded = cells + 2
+    flat = np.ravel_multi_index(tuple(padded.T), shape)
     sample_at = np.full(int(np.prod(shape)), -1)
     sample_at[flat] = np.arange(len(cells))
     strides = np.array([shape[1] * shape[2], shape[2], 1])
-    rows, columns, lengths = [], [], []
+    rows = []
+    columns = []
+    lengths = []
     # Steps of at most two cells along each axis, without multiples of shorter steps: 98 directions.
-    steps = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    for offset in steps[np.gcd.reduce(steps, axis=1) == 1]:
+    steps = np.array(list(product(range(-2, 3), repeat=3)))
+    is_shortest = np.gcd.reduce(steps, axis=1) == 1
+    for offset in steps[is_shortest]:
         target = sample_at[flat + offset @ strides]
         linked = target >= 0
         if np.abs(offset).max() == 2:
@@ -125,11 +131,15 @@ def _visible_links(cells: Integers) -> sparse.csr_array:
             for share in (0.375, 0.625):
                 crossed = np.round(share * offset).astype(int)
                 linked &= sample_at[flat + crossed @ strides] >= 0
-        rows.append(np.nonzero(linked)[0])
+        sources = np.flatnonzero(linked)
+        rows.append(sources)
         columns.append(target[linked])
-        lengths.append(np.full(linked.sum(), np.linalg.norm(offset)))
-    entries = (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.coo_array(entries, shape=(len(cells), len(cells))).tocsr()
+        lengths.append(np.full(len(sources), np.linalg.norm(offset)))
+    row = np.concatenate(rows)
+    column = np.concatenate(columns)
+    length = np.concatenate(lengths)
+    shape = (len(cells), len(cells))
+    return sparse.coo_array((length, (row, column)), shape=shape).tocsr()
 
 
 def _connect(graph: sparse.csr_array, cells: Integers) -> sparse.csr_array:
@@ -138,15 +148,12 @@ def _connect(graph: sparse.csr_array, cells: Integers) -> sparse.csr_array:
         n_components, component = connected_components(graph, directed=False)
         if n_components == 1:
             return graph
-        links = []
         for i in range(n_components):
-            own, others = np.nonzero(component == i)[0], np.nonzero(component != i)[0]
+            own = np.flatnonzero(component == i)
+            others = np.flatnonzero(component != i)
             length, nearest = KDTree(cells[own]).query(cells[others])
             closest = int(np.argmin(length))
-            links.append((own[nearest[closest]], others[closest], length[closest]))
-        a, b, length = (np.array(column) for column in zip(*links, strict=True))
-        # Two components that are nearest to each other give the same link twice, whose lengths must not add up.
-        bridge = sparse.coo_array(
-            (length, (a.astype(int), b.astype(int))), shape=graph.shape
-        ).tocsr()
-        graph = graph.maximum(bridge).maximum(bridge.T).tocsr()
+            link = own[nearest[closest]], others[closest]
+            bridge = sparse.coo_array(([length[closest]], ([link[0]], [link[1]])), graph.shape)
+            # A maximum, as two components that are nearest to each other give the same link twice.
+            graph = graph.maximum(bridge).maximum(bridge.T).tocsr()

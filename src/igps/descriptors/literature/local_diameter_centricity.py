@@ -74,13 +74,11 @@ class LocalDiameterCentricity(BodyDescriptor):
                 f"{mesh.name}: no ray from the surface inwards meets its far side. Close the surface or repair it."
             )
         scale = np.sqrt(mesh.area)
-        ratios = [
-            diameter[valid] / scale / self.max_diameter,
-            central[valid] / scale / self.max_centricity,
-        ]
-        return linear_histogram(ratios, [self.n_diameter_bins, self.n_centricity_bins]).astype(
-            np.float32
-        )
+        diameter_ratio = diameter[valid] / scale / self.max_diameter
+        centricity_ratio = central[valid] / scale / self.max_centricity
+        n_bins = [self.n_diameter_bins, self.n_centricity_bins]
+        histogram = linear_histogram([diameter_ratio, centricity_ratio], n_bins)
+        return histogram.astype(np.float32)
 
 
 def local_diameters(
@@ -95,7 +93,8 @@ def local_diameters(
     """
     import igl
 
-    centre, size = mesh.vertices.mean(axis=0), longest_side(mesh.vertices)
+    centre = mesh.vertices.mean(axis=0)
+    size = longest_side(mesh.vertices)
     vertices = np.asfortranarray((mesh.vertices - centre) / size)
     faces = np.asfortranarray(mesh.faces)
     normals = unit(area_vectors(vertices, mesh.faces))
@@ -109,11 +108,12 @@ def local_diameters(
     tree = igl.AABB()
     tree.init(vertices, faces)
     rays = directions.reshape(-1, 3)
-    hit, length, _ = tree.intersect_ray_first(
-        vertices, faces, np.repeat(origins, n_rays, axis=0), rays
-    )
-    valid = (hit >= 0) & (np.einsum("ij,ij->i", normals[hit], rays) > 0)
-    return size * _robust_mean(np.where(valid, length, np.nan).reshape(-1, n_rays))
+    starts = np.repeat(origins, n_rays, axis=0)
+    hit, length, _ = tree.intersect_ray_first(vertices, faces, starts, rays)
+    is_from_within = np.einsum("ij,ij->i", normals[hit], rays) > 0
+    valid = (hit >= 0) & is_from_within
+    lengths = np.where(valid, length, np.nan)
+    return size * _robust_mean(lengths.reshape(-1, n_rays))
 
 
 def centricity(mesh: Mesh, n_sources: int) -> Floats:
@@ -121,11 +121,11 @@ def centricity(mesh: Mesh, n_sources: int) -> Floats:
 
     The mean is over at most `n_sources` vertices by farthest-point sampling, each weighted by the area nearest to it.
     """
-    distances = farthest_points(
-        mesh, min(n_sources, len(mesh.vertices)), _POINTS_PER_EDGE
-    ).distances
+    n_samples = min(n_sources, len(mesh.vertices))
+    distances = farthest_points(mesh, n_samples, _POINTS_PER_EDGE).distances
     area = vertex_areas(mesh.vertices, mesh.faces)
-    weight = np.bincount(np.argmin(distances, axis=0), area, len(distances))
+    nearest = np.argmin(distances, axis=0)
+    weight = np.bincount(nearest, area, len(distances))
     return weight @ distances / weight.sum()
 
 
@@ -143,14 +143,13 @@ def _robust_mean(lengths: Floats) -> Floats:
     means = np.full(len(lengths), np.nan)
     rows = np.isfinite(lengths).any(axis=1)
     values = lengths[rows]
-    median, deviation = (
-        np.nanmedian(values, axis=1, keepdims=True),
-        np.nanstd(values, axis=1, keepdims=True),
-    )
+    median = np.nanmedian(values, axis=1, keepdims=True)
+    deviation = np.nanstd(values, axis=1, keepdims=True)
     # The tolerance keeps lengths that differ from the median by rounding alone.
     outlier = np.abs(values - median) > deviation + 1e-9 * median
     trimmed = np.where(outlier, np.nan, values)
     # If an even number of lengths forms two distant groups, none may be near the median. Then all are averaged.
     is_empty = np.isnan(trimmed).all(axis=1, keepdims=True)
-    means[rows] = np.nanmean(np.where(is_empty, values, trimmed), axis=1)
+    averaged = np.where(is_empty, values, trimmed)
+    means[rows] = np.nanmean(averaged, axis=1)
     return means

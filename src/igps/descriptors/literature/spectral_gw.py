@@ -72,20 +72,24 @@ class SpectralGromovWasserstein(BodyDescriptor):
         )
         rows = []
         for time, kernel in zip(self.times, kernels, strict=True):
-            if self.bound == "pairs":
-                values = quantiles(kernel, self.n_quantiles)
-            else:
-                norms = np.sqrt(np.square(kernel).mean(axis=1))
-                values = quantiles(norms, self.n_quantiles)
-                if self.bound == "trace":
-                    values = np.sqrt(np.square(norms).mean(keepdims=True))
+            values = self._invariant(kernel)
             rows.append(time_weight(time) * values)
         return np.array(rows, dtype=np.float32)
 
+    def _invariant(self, kernel: Floats) -> Floats:
+        """(n_quantiles,) or (1,) what the bound compares of a kernel (P, P)."""
+        if self.bound == "pairs":
+            return quantiles(kernel, self.n_quantiles)
+        norms = _norms(kernel)
+        if self.bound == "signature":
+            return quantiles(norms, self.n_quantiles)
+        return np.sqrt(np.square(norms).mean(keepdims=True))
+
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) Wasserstein distances of exponent 2, the largest over the times."""
-        at_times = [euclidean(queries[:, i], gallery[:, i]) for i in range(queries.shape[1])]
-        return torch.stack(at_times).amax(dim=0) / queries.shape[2] ** 0.5
+        _, n_times, n_steps = queries.shape
+        at_times = [euclidean(queries[:, i], gallery[:, i]) for i in range(n_times)]
+        return torch.stack(at_times).amax(dim=0) / n_steps**0.5
 
 
 def heat_kernels(
@@ -105,11 +109,21 @@ def heat_kernels(
     # Samples are in a canonical order in which similar samples are neighbours, so that equal steps reach all parts.
     n_chosen = min(n_samples, len(eigenfunctions))
     step = len(eigenfunctions) / n_chosen
-    positions = (np.arange(n_chosen) + np.random.default_rng(seed).random()) * step
+    offset = np.random.default_rng(seed).random()
+    positions = (np.arange(n_chosen) + offset) * step
     chosen = np.minimum(positions.astype(np.int64), len(eigenfunctions) - 1)
     values = np.sqrt(body.area) * eigenfunctions[chosen].astype(np.float64)
     exponents = body.eigenvalues[:n_eigenpairs] * body.area / (8 * np.pi)
-    return [1 + (values * np.exp(-exponents * time)) @ values.T for time in times]
+    kernels = []
+    for time in times:
+        decayed = values * np.exp(-exponents * time)
+        kernels.append(1 + decayed @ values.T)
+    return kernels
+
+
+def _norms(kernel: Floats) -> Floats:
+    """(P,) root mean squares of the rows of a kernel."""
+    return np.sqrt(np.square(kernel).mean(axis=1))
 
 
 def time_weight(time: float) -> float:
@@ -151,17 +165,21 @@ def gromov_wasserstein(
         raise ImportError(
             'gromov_wasserstein needs POT: pip install "interior-gps[transport]".'
         ) from error
-    kernels = (heat_kernels(shape, samples, times, n_samples, seed=seed) for shape in (a, b))
+    kernels_a = heat_kernels(a, samples, times, n_samples, seed=seed)
+    kernels_b = heat_kernels(b, samples, times, n_samples, seed=seed)
     largest = 0.0
-    for time, first, second in zip(times, *kernels, strict=True):
-        p, q = (np.full(len(kernel), 1 / len(kernel)) for kernel in (first, second))
-        norms = (np.sqrt(np.square(kernel).mean(axis=1)) for kernel in (first, second))
-        starts = (np.outer(p, q), ot.emd_1d(*norms, p, q))
-        squared = min(
-            ot.gromov.gromov_wasserstein2(first, second, p, q, loss_fun="square_loss", G0=start)
-            for start in starts
-        )
-        largest = max(largest, time_weight(time) * float(np.sqrt(max(squared, 0.0))))
+    for time, first, second in zip(times, kernels_a, kernels_b, strict=True):
+        p = np.full(len(first), 1 / len(first))
+        q = np.full(len(second), 1 / len(second))
+        uniform = np.outer(p, q)
+        by_norms = ot.emd_1d(_norms(first), _norms(second), p, q)
+        squares = []
+        for start in (uniform, by_norms):
+            squares.append(
+                ot.gromov.gromov_wasserstein2(first, second, p, q, loss_fun="square_loss", G0=start)
+            )
+        distance = float(np.sqrt(max(min(squares), 0.0)))
+        largest = max(largest, time_weight(time) * distance)
     return largest
 
 

@@ -13,6 +13,7 @@ symmetric second-order form of Gibou, Fedkiw, Cheng and Kang 2002. Parts thinner
 only add eigenvalues far above the first ones.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -70,9 +71,8 @@ class VolumeShapeDNA(BodyDescriptor):
 
     def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) normalised eigenvalues, ascending, without unit; raises the errors of `volume_spectrum`."""
-        return volume_spectrum(body.mesh, self.n_eigenvalues, self.boundary, self.n_voxels).astype(
-            np.float32
-        )
+        values = volume_spectrum(body.mesh, self.n_eigenvalues, self.boundary, self.n_voxels)
+        return values.astype(np.float32)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) Euclidean distances."""
@@ -86,8 +86,12 @@ def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels
         MeshError: the body is too thin for the grid, or has too few cells for the eigenvalues.
     """
     inside, cell = _sampled_cells(mesh, n_voxels)
-    stiffness, mass = _dirichlet(inside) if boundary == "dirichlet" else _neumann(inside)
-    n_skipped = int(boundary == "neumann")
+    if boundary == "dirichlet":
+        stiffness, mass = _dirichlet(inside)
+        n_skipped = 0
+    else:
+        stiffness, mass = _neumann(inside)
+        n_skipped = 1
     # ARPACK needs space for its basis, and the search for missed eigenvalues needs a complement of that size.
     min_cells = 2 * (n_eigenvalues + n_skipped + _N_RECHECKED) + 1
     if len(mass) < min_cells:
@@ -103,44 +107,53 @@ def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels
 def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[Booleans, float]:
     """Whether 3³ points per cell are inside, (X, 3, Y, 3, Z, 3), with a margin of empty cells; and the cell side."""
     longest = longest_side(mesh.vertices)
-    resolution = int(
-        np.clip(np.ceil(longest * (n_voxels / abs(mesh.volume)) ** (1 / 3)), 1, _MAX_RESOLUTION)
-    )
+    cells_per_length = (n_voxels / abs(mesh.volume)) ** (1 / 3)
+    n_longest = np.ceil(longest * cells_per_length)
+    resolution = int(np.clip(n_longest, 1, _MAX_RESOLUTION))
     cell = longest / resolution
+    thirds = np.array([-1, 0, 1]) * cell / 3
     axes = []
     for axis in grid_axes(mesh, resolution):
-        centres = np.concatenate([[axis[0] - cell], axis, [axis[-1] + cell]])
-        axes.append((centres[:, None] + np.array([-1, 0, 1]) * cell / 3).ravel())
-    inside = inside_grid(mesh, (axes[0], axes[1], axes[2]))
-    x, y, z = (len(axis) // 3 for axis in axes)
-    return inside.reshape(x, 3, y, 3, z, 3), cell
+        before = axis[0] - cell
+        after = axis[-1] + cell
+        centres = np.concatenate([[before], axis, [after]])
+        points = centres[:, None] + thirds
+        axes.append(points.ravel())
+    x, y, z = axes
+    inside = inside_grid(mesh, (x, y, z))
+    shape = (len(x) // 3, 3, len(y) // 3, 3, len(z) // 3, 3)
+    return inside.reshape(shape), cell
 
 
 def _neumann(inside: Booleans) -> tuple[sparse.csr_array, Floats]:
     """Stiffness and diagonal mass of the non-empty cells, lengths in cells."""
     filled = inside.mean(axis=(1, 3, 5))
-    mass = filled[filled > 0]
+    is_cell = filled > 0
+    mass = filled[is_cell]
     index = np.full(filled.shape, -1)
-    index[filled > 0] = np.arange(len(mass))
-    rows, columns, weights = [], [], []
+    index[is_cell] = np.arange(len(mass))
+    rows = []
+    columns = []
+    weights = []
     for i in range(3):
         # With axis i first, (X, 3, Y, 3, Z, 3) becomes (X, 3, others). The facing layers of two neighbours are sampled
         # at the same 3 × 3 positions.
         layers = np.moveaxis(inside, (2 * i, 2 * i + 1), (0, 1))
-        aperture = (layers[:-1, 2] & layers[1:, 0]).mean(axis=(2, 4))
+        is_open_at = layers[:-1, 2] & layers[1:, 0]
+        aperture = is_open_at.mean(axis=(2, 4))
         is_open = np.nonzero(aperture)
         cell = np.moveaxis(index, i, 0)
         rows.append(cell[:-1][is_open])
         columns.append(cell[1:][is_open])
         weights.append(aperture[is_open])
-    graph = _symmetric(
-        np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), len(mass)
-    )
+    graph = _symmetric(rows, columns, weights, len(mass))
     n_components, component = connected_components(graph, directed=False)
-    share = np.bincount(component, weights=mass, minlength=n_components) / mass.sum()
-    cells = np.nonzero((share >= _MIN_COMPONENT_SHARE)[component])[0]
-    graph, mass = graph[cells][:, cells], mass[cells]
-    return sparse.diags_array(graph.sum(axis=1)) - graph, mass
+    volumes = np.bincount(component, weights=mass, minlength=n_components)
+    is_large = volumes / mass.sum() >= _MIN_COMPONENT_SHARE
+    cells = np.flatnonzero(is_large[component])
+    graph = graph[cells][:, cells]
+    degrees = sparse.diags_array(graph.sum(axis=1))
+    return degrees - graph, mass[cells]
 
 
 def _dirichlet(inside: Booleans) -> tuple[sparse.csr_array, Floats]:
@@ -149,34 +162,46 @@ def _dirichlet(inside: Booleans) -> tuple[sparse.csr_array, Floats]:
     n_cells = int(is_cell.sum())
     index = np.full(is_cell.shape, -1)
     index[is_cell] = np.arange(n_cells)
-    rows, columns = [], []
+    rows = []
+    columns = []
+    weights = []
     diagonal = np.zeros(is_cell.shape)
     for i in range(3):
         # The points on the grid lines through the cell centres along axis i
-        line = np.moveaxis(inside, (2 * i, 2 * i + 1), (0, 1))[:, :, :, 1, :, 1]
+        layers = np.moveaxis(inside, (2 * i, 2 * i + 1), (0, 1))
+        line = layers[:, :, :, 1, :, 1]
+        centre = line[:, 1]
         cell = np.moveaxis(index, i, 0)
         for step in (-1, 1):
             # `np.roll` wraps around only into the margin of empty cells.
-            first, second = line[:, 1 + step], np.roll(line, -step, axis=0)[:, 1 - step]
-            beyond = np.roll(line, -step, axis=0)[:, 1]
-            linked = line[:, 1] & first & second & beyond
+            neighbour = np.roll(line, -step, axis=0)
+            first = line[:, 1 + step]
+            second = neighbour[:, 1 - step]
+            both = first & second
+            linked = centre & both & neighbour[:, 1]
             # The wall lies between the last point inside and the next point, on average half way.
-            wall = (first.astype(int) + (first & second) + 0.5) / 3
-            diagonal += np.moveaxis(np.where(linked, 1.0, 1.0 / wall), 0, i)
+            wall = (first.astype(int) + both + 0.5) / 3
+            coefficient = np.where(linked, 1.0, 1.0 / wall)
+            diagonal += np.moveaxis(coefficient, 0, i)
             if step == 1:
+                next_cell = np.roll(cell, -1, axis=0)
                 rows.append(cell[linked])
-                columns.append(np.roll(cell, -1, axis=0)[linked])
-    row = np.concatenate(rows)
-    graph = _symmetric(row, np.concatenate(columns), np.ones(len(row)), n_cells)
-    return sparse.diags_array(diagonal[is_cell]) - graph, np.ones(n_cells)
+                columns.append(next_cell[linked])
+                weights.append(np.ones(int(linked.sum())))
+    graph = _symmetric(rows, columns, weights, n_cells)
+    stiffness = sparse.diags_array(diagonal[is_cell]) - graph
+    return stiffness, np.ones(n_cells)
 
 
-def _symmetric(rows: Integers, columns: Integers, weights: Floats, size: int) -> sparse.csr_array:
-    entries = (
-        np.concatenate([weights, weights]),
-        (np.concatenate([rows, columns]), np.concatenate([columns, rows])),
-    )
-    return sparse.coo_array(entries, shape=(size, size)).tocsr()
+def _symmetric(
+    rows: Sequence[Integers], columns: Sequence[Integers], weights: Sequence[Floats], size: int
+) -> sparse.csr_array:
+    """Return a symmetric matrix (size, size) of weights that are given on one side of the diagonal."""
+    both_rows = np.concatenate([*rows, *columns])
+    both_columns = np.concatenate([*columns, *rows])
+    both_weights = np.concatenate([*weights, *weights])
+    matrix = sparse.coo_array((both_weights, (both_rows, both_columns)), shape=(size, size))
+    return matrix.tocsr()
 
 
 def _smallest_eigenvalues(
@@ -196,20 +221,24 @@ def _smallest_eigenvalues(
     while True:
         # An iteration from a single vector may find only one copy of a multiple eigenvalue. The missed copies lie in
         # the orthogonal complement of the eigenvectors found so far.
-        complement = LinearOperator(
-            matrix.shape,
-            lambda u, q=vectors: _project(factor.solve(_project(u, q)), q),
-            dtype=np.float64,
-        )
+        def in_complement(vector: Floats, known: Floats = vectors) -> Floats:
+            return _project(factor.solve(_project(vector, known)), known)
+
+        complement = LinearOperator(matrix.shape, in_complement, dtype=np.float64)
+        start_beside = _project(start, vectors)
         inverses, candidates = eigsh(
-            complement, _N_RECHECKED, which="LA", v0=_project(start, vectors), tol=_TOLERANCE
+            complement, _N_RECHECKED, which="LA", v0=start_beside, tol=_TOLERANCE
         )
-        missed = shift + 1 / inverses < values.max() - _TOLERANCE * (values.max() - shift)
-        if not missed.any():
+        found = shift + 1 / inverses
+        largest = values.max()
+        is_missed = found < largest - _TOLERANCE * (largest - shift)
+        if not is_missed.any():
             return np.sort(values)
-        values = np.concatenate([values, shift + 1 / inverses[missed]])
+        values = np.concatenate([values, found[is_missed]])
+        vectors = np.hstack([vectors, candidates[:, is_missed]])
         smallest = np.argsort(values)[:n_values]
-        values, vectors = values[smallest], np.hstack([vectors, candidates[:, missed]])[:, smallest]
+        values = values[smallest]
+        vectors = vectors[:, smallest]
 
 
 def _project(vector: Floats, basis: Floats) -> Floats:
