@@ -7,6 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import nibabel
 import numpy as np
 import pytest
 import trimesh
@@ -16,7 +17,7 @@ from igps._parallel import Limits
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import compute
 from igps.data.sources import Bodies, bodies_of_files, find_bodies
-from igps.mesh.loading import BodyRef
+from igps.mesh.loading import BodyRef, load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig, compute_signature
@@ -381,3 +382,38 @@ def test_a_name_that_is_too_long_for_a_file_costs_no_other(tmp_path: Path) -> No
     (failure,) = dataset.precompute(n_workers=1)
     assert failure.id == f"{'x' * 300}.off"
     assert "File name too long" in failure.error
+
+
+def write_labels(path: Path, *values: int) -> None:
+    """A volume with a cube of 4³ voxels for each label."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    labels = np.zeros((20, 8, 8), np.uint8)
+    for number, value in enumerate(values):
+        labels[1 + 6 * number : 5 + 6 * number, 2:6, 2:6] = value
+    nibabel.Nifti1Image(labels, np.eye(4)).to_filename(path)
+
+
+def test_a_single_label_among_subjects_with_several_is_named_like_theirs(tmp_path: Path) -> None:
+    write_labels(tmp_path / "a.nii.gz", 1, 2)
+    write_labels(tmp_path / "b.nii.gz", 1, 2)
+    write_labels(tmp_path / "c.nii.gz", 1)
+    bodies = find_bodies(tmp_path, classes="body")
+    assert bodies.names == ("a.nii.gz#1", "a.nii.gz#2", "b.nii.gz#1", "b.nii.gz#2", "c.nii.gz#1")
+    assert bodies.labels == ("1", "2", "1", "2", "1")
+    assert load_mesh(tmp_path / "c.nii.gz", part="1").volume == pytest.approx(64, rel=0.01)
+
+
+def test_masks_of_organs_are_named_after_their_files(tmp_path: Path) -> None:
+    for name in ("liver", "spleen"):
+        write_labels(tmp_path / f"{name}.nii.gz", 1)
+    write_labels(tmp_path / "all.nii.gz", 1, 2)
+    names = find_bodies(tmp_path, classes="body").names
+    assert names == ("all.nii.gz#1", "all.nii.gz#2", "liver.nii.gz#liver", "spleen.nii.gz#spleen")
+
+
+def test_a_folder_for_each_subject(tmp_path: Path) -> None:
+    write_labels(tmp_path / "one" / "seg.nii.gz", 1, 2)
+    write_labels(tmp_path / "two" / "seg.nii.gz", 1, 2)
+    write_labels(tmp_path / "three" / "seg.nii.gz", 1)
+    labels = find_bodies(tmp_path, classes="body").labels
+    assert sorted(labels) == ["1", "1", "1", "2", "2"]

@@ -7,7 +7,7 @@ import io
 import logging
 import math
 import os
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -280,12 +280,12 @@ def file_name_of(name: str, part: str | None) -> str:
     return name if part is None else name.removesuffix(f"#{part}")
 
 
-def _parts(path: Path, options: LoadOptions) -> Sequence[str | None]:
-    """Return the parts of a file; [None] if it is one body, or if it is unreadable, which the computation reports."""
+def _listed(path: Path, options: LoadOptions) -> list[BodyRef]:
+    """Return the bodies of a file; the file itself if it is unreadable, which the computation reports."""
     try:
-        return [body.part for body in list_bodies(path, options)] or [None]
+        return list_bodies(path, options) or [BodyRef(path)]
     except MeshError:
-        return [None]
+        return [BodyRef(path)]
 
 
 def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
@@ -357,16 +357,45 @@ def _bodies_in_files(
     columns: Mapping[str, Sequence[str | None]] | None = None,
 ) -> Bodies:
     """Return the bodies of files, given by path, name, label and part; without a part, all bodies of the file."""
-    entries = [
-        (i, path, name if part is None else f"{name}#{part}", label, part)
-        for i, (path, name, label, chosen_part) in enumerate(rows)
-        for part in (_parts(path, options) if chosen_part is None else [chosen_part])
-    ]
+    listed = {path: _listed(path, options) for path, _, _, chosen in rows if chosen is None}
+    _number_lone_labels(listed)
+    entries = []
+    for i, (path, name, label, chosen_part) in enumerate(rows):
+        parts = [chosen_part] if chosen_part is not None else [ref.part for ref in listed[path]]
+        for part in parts:
+            entries.append((i, path, name if part is None else f"{name}#{part}", label, part))
     indices, paths, names, labels, parts = zip(*entries, strict=True)
     body_columns = {
         name: tuple(values[i] for i in indices) for name, values in (columns or {}).items()
     }
     return Bodies(paths, names, None if None in labels else labels, parts, body_columns)
+
+
+def _number_lone_labels(listed: dict[Path, list[BodyRef]]) -> None:
+    """Call the only label of a mask by its number if most files beside it have labels by numbers.
+
+    A mask with the single label 1 is named after its file, as in a folder of organs. Among subjects with the labels 1
+    and 2, that label is the same structure as theirs. Files alone in their folders are compared by their own names.
+    """
+    in_folder = Counter(path.parent for path in listed)
+    groups: dict[object, list[Path]] = defaultdict(list)
+    for path in listed:
+        is_alone = in_folder[path.parent] == 1
+        groups[path.name if is_alone else path.parent].append(path)
+    for paths in groups.values():
+        masks = []
+        n_numbered = 0
+        for path in paths:
+            refs = listed[path]
+            if all(ref.number is not None and ref.part == ref.number for ref in refs):
+                n_numbered += 1
+            elif len(refs) == 1 and path.name.startswith(f"{refs[0].part}."):
+                masks.append(path)
+        if n_numbered <= len(masks):
+            continue
+        for path in masks:
+            number = listed[path][0].number
+            listed[path] = [BodyRef(path, number, number)]
 
 
 def _files_in(folder: Path) -> list[Path]:

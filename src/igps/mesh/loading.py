@@ -3,7 +3,7 @@
 import logging
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,7 @@ class BodyRef:
 
     path: Path
     part: str | None = None  # name of the body in the file; None if the file is one body
+    number: str | None = field(default=None, compare=False)  # another name: the number of a label
 
     def __str__(self) -> str:
         return str(self.path) if self.part is None else f"{self.path}#{self.part}"
@@ -43,7 +44,7 @@ def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[
     path = Path(path)
     if _body_kind(_format(path), options) == "whole":
         return [BodyRef(path)]
-    return [BodyRef(path, body.part) for body in _read(path, options)]
+    return [BodyRef(path, body.part, body.number) for body in _read(path, options)]
 
 
 @one_thread()

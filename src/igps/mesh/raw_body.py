@@ -47,6 +47,7 @@ class RawBody:
     denoise: bool = (
         True  # whether the surface may be noisy; False if it was computed from voxels or atoms
     )
+    number: str | None = None  # of a label, by which it is found like by its name
 
     def made(self) -> RawBody:
         """Return this body with its surface, or with the fault that left it without one."""

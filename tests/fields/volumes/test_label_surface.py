@@ -19,7 +19,7 @@ from igps.fields.volumes.label_volume import LabelVolume, label_bodies
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
-from igps.mesh.surface import components, largest
+from igps.mesh.surface import components, largest, signed_volume
 
 Array = NDArray[np.float64]
 
@@ -345,3 +345,13 @@ def test_what_is_no_body_is_refused_with_its_count() -> None:
         voxel_surface(np.ones((9, 9)))
     with pytest.raises(MeshError, match="finite matrix"):
         voxel_surface(np.ones((9, 9, 9)), np.full((4, 4), np.nan))
+
+
+def test_a_thin_label_has_the_volume_of_its_voxels() -> None:
+    """A slanted sheet one voxel thick touches itself along edges, where voxels are added for the grid."""
+    x, y, z = np.indices((24, 24, 24))
+    height = (0.7 * x + 0.4 * y).astype(int)
+    sheet = (z == height) & (x > 2) & (x < 20) & (y > 2) & (y < 20)
+    vertices, faces, notes = voxel_surface(sheet)
+    assert notes == ()
+    assert signed_volume(vertices, faces) == pytest.approx(sheet.sum(), rel=5e-3)

@@ -97,6 +97,7 @@ def voxel_surface(
             f"a cavity of about {n_open} voxels is open through gaps of up to two voxels in its wall"
         )
     share, factor = _coarsen(mask, spacing, max_vertices)
+    volume = float(share.sum(dtype=np.float64))  # before contacts are thickened, which adds volume
     mask = _thicken_contacts(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
     check_grid(share.size, name)
@@ -107,7 +108,7 @@ def voxel_surface(
     refinement = min(max(math.ceil(math.sqrt(_MIN_VERTICES / n_vertices)), 1), _MAX_REFINEMENT)
     n_parts = np.maximum(np.round(refinement * sides / sides.min()), 1).astype(np.int64)
     field = _refine(field, share, n_parts, sides / n_parts)
-    n_cells = float(share.sum(dtype=np.float64) * n_parts.prod())
+    n_cells = volume * float(n_parts.prod())
     if joins and ndimage.label(mask)[1] > 1:
         n_before = np.count_nonzero(field < 0)
         # A surface has about 1.5 vertices per squared side of a cell.

@@ -39,6 +39,9 @@ _MAX_LABELS, _MAX_UNCHECKED, _MIN_EQUAL = 20_000, 50, 0.3
 _LABEL_TOLERANCE = (
     0.01  # distance of a label from a whole number: NIfTI may store labels as scaled integers
 )
+_VOLUME_TOLERANCE = (
+    0.005  # share of its voxels' volume by which a surface may differ without a note
+)
 
 Box = tuple[slice, slice, slice]
 
@@ -196,7 +199,13 @@ def label_surface(
             "another label has the same name: the number was appended. Give names by a table",
         )
     notes = (*volume.notes, *notes)
-    return mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name, notes=notes)
+    mesh = mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name, notes=notes)
+    of_voxels = body.n_voxels * abs(float(np.linalg.det(affine[:3, :3])))
+    surplus = mesh.volume / of_voxels - 1
+    if abs(surplus) <= _VOLUME_TOLERANCE:
+        return mesh
+    note = f"its volume differs by {surplus:+.1%} from that of its voxels, {of_voxels:.6g}"
+    return mesh.annotated(notes=(note,))
 
 
 def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
@@ -350,11 +359,14 @@ def label_bodies(
     surface = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
     if options.bodies == "whole":
         return [deferred(partial(surface, 1), None, volume.unit, partial(volume.voxels, 1))]
-    names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
-    return [
-        deferred(partial(surface, name), name, volume.unit, partial(volume.voxels, name))
-        for name in names
-    ]
+    chosen = volume.bodies if part is None else (volume.body(part),)
+    raw_bodies = []
+    for body in chosen:
+        name = body.name if part is None else part  # a label is found by its number, too
+        make = partial(surface, body.name)
+        raw = deferred(make, name, volume.unit, partial(volume.voxels, body.name))
+        raw_bodies.append(replace(raw, number=str(body.label)))
+    return raw_bodies
 
 
 def _in_pieces(volume: LabelVolume) -> LabelVolume:
