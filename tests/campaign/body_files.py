@@ -319,30 +319,31 @@ def helices() -> tuple[str, ...]:
                 serial += 1
                 angle = np.radians(100 * i + turn)
                 at = (x + radius * np.cos(angle), radius * np.sin(angle), 1.5 * i + up)
-                lines.append(atom_line(serial, name, residue, chain, i + 1, at))
+                lines.append(Atom(serial, name, residue, chain, i + 1, at).line())
         lines.append("TER")
     return tuple(lines)
 
 
-def atom_line(
-    serial: int,
-    name: str,
-    residue: str,
-    chain: str,
-    number: int,
-    at: Iterable[float],
-    *,
-    element: str | None = None,
-    altloc: str = " ",
-    occupancy: float = 1.0,
-    record: str = "ATOM",
-) -> str:
-    """A line of an atom in a PDB file."""
-    position = "".join(f"{x:8.3f}"[:8] for x in at)
-    return (
-        f"{record:<6}{serial:>5} {f' {name}':<4}{altloc}{residue:>3} {chain}{number:>4}    {position}"
-        f"{occupancy:6.2f}{20:6.2f}          {element or name[0]:>2}"
-    )
+@dataclass(frozen=True)
+class Atom:
+    """An atom of a PDB file, at its place in a chain."""
+
+    serial: int
+    name: str
+    residue: str
+    chain: str
+    number: int
+    at: Iterable[float]
+    record: str = "ATOM"
+
+    def line(self) -> str:
+        """The line of the atom in the file."""
+        position = "".join(f"{x:8.3f}"[:8] for x in self.at)
+        return (
+            f"{self.record:<6}{self.serial:>5} {f' {self.name}':<4} {self.residue:>3} "
+            f"{self.chain}{self.number:>4}    {position}"
+            f"{1:6.2f}{20:6.2f}          {self.name[0]:>2}"
+        )
 
 
 def _molecule(generator: Generator) -> BodyFile:
@@ -434,14 +435,14 @@ _ON_MOLECULES: dict[str, Callable[[Generator, list[str]], Change]] = {
     ),
     "no elements": lambda g, lines: (_each_atom(lines, lambda line, i: line[:76]), {}),
     "hydrogens": lambda g, lines: (
-        [*lines[:3], atom_line(900, "H", "ALA", "A", 1, (0, 0, 30)), *lines[3:]],
+        [*lines[:3], Atom(900, "H", "ALA", "A", 1, (0, 0, 30)).line(), *lines[3:]],
         {},
     ),
     "water": lambda g, lines: (
         [
             *lines,
             *(
-                atom_line(900 + i, "O", "HOH", "C", i, (i, 40, 0), record="HETATM")
+                Atom(900 + i, "O", "HOH", "C", i, (i, 40, 0), record="HETATM").line()
                 for i in range(9)
             ),
         ],
@@ -470,7 +471,7 @@ _ON_MOLECULES: dict[str, Callable[[Generator, list[str]], Change]] = {
     ),
     "no atoms": lambda g, lines: (["HEADER    NONE", "END"], REFUSED),
     "water alone": lambda g, lines: (
-        [atom_line(i, "O", "HOH", "A", i, (3 * i, 0, 0), record="HETATM") for i in range(9)],
+        [Atom(i, "O", "HOH", "A", i, (3 * i, 0, 0), record="HETATM").line() for i in range(9)],
         REFUSED,
     ),
     "all nowhere": lambda g, lines: (

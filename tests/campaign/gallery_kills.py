@@ -7,6 +7,7 @@ import pickle
 import signal
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -135,76 +136,128 @@ def _succeeds(pid: int) -> bool:
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
 
+class _Round:
+    """Two writers that change one gallery until they are killed.
+
+    Args:
+        folder: of the gallery and the journals.
+        number: of the round, from 1.
+        numbers: of each writer, how many changes it finished in earlier rounds.
+    """
+
+    def __init__(self, folder: Path, number: int, numbers: Sequence[int]) -> None:
+        self.number = number
+        self.missed = list[str]()
+        self.n_killed = 0
+        self._gallery = folder / "gallery.igps"
+        self._out = folder / "rows"
+        self._journals = [folder / f"{number}-{writer}" for writer in range(2)]
+        self._writers = [
+            _fork(_write, self._gallery, i, numbers[i], self._journals[i]) for i in range(2)
+        ]
+
+    def wait(self) -> None:
+        """Wait until both writers have finished a change."""
+        start = time.monotonic()
+        while not all(path.exists() and path.stat().st_size for path in self._journals):
+            if time.monotonic() - start > _TIMEOUT:
+                self.miss("a writer waits for ever")
+                return
+            time.sleep(0.005)
+
+    def kill(self, generator: np.random.Generator) -> None:
+        """Kill one writer after the other, at random moments."""
+        for writer in generator.permutation(2):
+            time.sleep(generator.uniform(0, _MAX_DELAY / 2))
+            process = self._writers[writer]
+            if os.waitpid(process, os.WNOHANG) == (0, 0):
+                os.kill(process, signal.SIGKILL)
+                os.waitpid(process, 0)
+                self.n_killed += 1
+            else:
+                self.miss(f"writer {writer} ended by itself")
+
+    def read(self) -> dict[str, Any] | None:
+        """Return the rows of the gallery, or None if it cannot be read."""
+        if not _succeeds(_fork(_read, self._gallery, self._out)):
+            self.miss("the gallery cannot be read")
+            return None
+        rows, are_nearest = pickle.loads(self._out.read_bytes())
+        if not are_nearest:
+            self.miss("a row is not the nearest to itself")
+        return rows
+
+    def n_finished(self, writer: int) -> int:
+        """How many changes the writer finished in this round."""
+        return len(self._journals[writer].read_text().splitlines())
+
+    def miss(self, what: str) -> None:
+        """Record a miss of the target."""
+        self.missed.append(f"round {self.number}: {what}")
+
+
+def _check_rows(
+    played: _Round, actual: dict[str, Any], rows: list[Rows], numbers: list[int]
+) -> int:
+    """Compare the rows with the changes that were finished, bring `rows` and `numbers` up to date, and count them."""
+    n_changes = 0
+    for i in range(2):
+        n_finished = played.n_finished(i)
+        n_changes += n_finished
+        for number in range(numbers[i], numbers[i] + n_finished):
+            rows[i] = changed(rows[i], i, number)
+        numbers[i] += n_finished
+        own = {id_: row for id_, row in actual.items() if id_.startswith(f"{i}/")}
+        if _equal(own, rows[i]):
+            continue
+        # The last change may be finished, but not yet in the journal.
+        after = changed(rows[i], i, numbers[i])
+        if _equal(own, after):
+            rows[i] = after
+            numbers[i] += 1
+        else:
+            played.miss(f"writer {i} had finished {numbers[i]} changes, the rows differ")
+    unchanged = {f"unchanged/{i}": (1.0, 10**9 + i) for i in range(N_UNCHANGED)}
+    untouched = {id_: row for id_, row in actual.items() if id_.startswith("u")}
+    if not _equal(untouched, unchanged):
+        played.miss("rows that nobody touched differ")
+    return n_changes
+
+
 def campaign(n_kills: int) -> list[Row]:
     """Kill both writers of a round, one after the other, while they add, remove and update rows."""
     start = time.monotonic()
     missed = list[str]()
-    n_killed = n_changes = n_rounds = 0
-    with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
-        path = Path(folder) / "gallery.igps"
-        rows = [Rows(), Rows()]
-        numbers = [0, 0]
-        if not _succeeds(_fork(_create, path)):
+    n_killed = 0
+    n_changes = 0
+    n_rounds = 0
+    rows = [Rows(), Rows()]
+    numbers = [0, 0]
+    with tempfile.TemporaryDirectory(prefix="igps-campaign-") as name:
+        folder = Path(name)
+        if not _succeeds(_fork(_create, folder / "gallery.igps")):
             raise RuntimeError("the gallery could not be made")
         while n_killed < n_kills and not missed:
             generator = np.random.default_rng([SEED, n_rounds])
             n_rounds += 1
-            journals = [Path(folder) / f"{n_rounds}-{writer}" for writer in range(2)]
-            writers = [_fork(_write, path, i, numbers[i], journals[i]) for i in range(2)]
-            round_start = time.monotonic()
-            while not all(journal.exists() and journal.stat().st_size for journal in journals):
-                if time.monotonic() - round_start > _TIMEOUT:
-                    missed.append(f"round {n_rounds}: a writer waits for ever")
-                    break
-                time.sleep(0.005)
-            for writer in generator.permutation(2):
-                time.sleep(generator.uniform(0, _MAX_DELAY / 2))
-                if os.waitpid(writers[writer], os.WNOHANG) == (0, 0):
-                    os.kill(writers[writer], signal.SIGKILL)
-                    os.waitpid(writers[writer], 0)
-                    n_killed += 1
-                else:
-                    missed.append(f"round {n_rounds}: writer {writer} ended by itself")
-            out = Path(folder) / "rows"
-            actual = None
-            if _succeeds(_fork(_read, path, out)):
-                actual, are_nearest = pickle.loads(out.read_bytes())
-                if not are_nearest:
-                    missed.append(f"round {n_rounds}: a row is not the nearest to itself")
-            else:
-                missed.append(f"round {n_rounds}: the gallery cannot be read")
-                break
-            for i in range(2):
-                n_finished = len(journals[i].read_text().splitlines())
-                n_changes += n_finished
-                for number in range(numbers[i], numbers[i] + n_finished):
-                    rows[i] = changed(rows[i], i, number)
-                numbers[i] += n_finished
-                own = {id_: row for id_, row in actual.items() if id_.startswith(f"{i}/")}
-                # The last change may be finished, but not yet in the journal.
-                after = changed(rows[i], i, numbers[i])
-                if _equal(own, after) and not _equal(own, rows[i]):
-                    rows[i], numbers[i] = after, numbers[i] + 1
-                elif not _equal(own, rows[i]):
-                    missed.append(
-                        f"round {n_rounds}: writer {i} had finished {numbers[i]} changes, the rows differ"
-                    )
-            unchanged = {f"unchanged/{i}": (1.0, 10**9 + i) for i in range(N_UNCHANGED)}
-            if not _equal(
-                {id_: row for id_, row in actual.items() if id_.startswith("u")}, unchanged
-            ):
-                missed.append(f"round {n_rounds}: rows that nobody touched differ")
-    return [
-        Row(
-            "gallery",
-            "kills of two that write to one gallery",
-            n_killed,
-            "it holds all finished changes, and none in part",
-            f"{n_rounds} rounds, {n_changes} changes: {len(missed)} wrong",
-            missed,
-            seconds=time.monotonic() - start,
-        )
-    ]
+            played = _Round(folder, n_rounds, numbers)
+            played.wait()
+            played.kill(generator)
+            actual = played.read()
+            if actual is not None:
+                n_changes += _check_rows(played, actual, rows, numbers)
+            n_killed += played.n_killed
+            missed += played.missed
+    row = Row(
+        "gallery",
+        "kills of two that write to one gallery",
+        n_killed,
+        "it holds all finished changes, and none in part",
+        f"{n_rounds} rounds, {n_changes} changes: {len(missed)} wrong",
+        missed,
+        seconds=time.monotonic() - start,
+    )
+    return [row]
 
 
 def _equal(actual: dict[str, Any], expected: Rows) -> bool:

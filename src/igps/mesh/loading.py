@@ -189,9 +189,8 @@ def surface_body(
         cavities=options.cavities,
         denoise=raw.denoise,
         name=name,
-        notes=notes,
     )
-    return mesh.annotated(unit=raw.unit)
+    return mesh.annotated(notes=notes, unit=raw.unit)
 
 
 def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:

@@ -66,7 +66,6 @@ def mend(
     cavities: Cavities = "fill",
     denoise: bool = True,
     name: str = "mesh",
-    notes: tuple[str, ...] = (),
 ) -> Mesh:
     """Make a body of a surface in any state, by as few repairs as possible.
 
@@ -86,16 +85,13 @@ def mend(
             is made watertight.
         denoise: smooth a surface that is rough with noise. Thin branches made of voxels look like noise.
         name: name of the surface in error messages, usually its file.
-        notes: earlier notes of the surface.
 
     Raises:
         MeshError: the surface is not a body (with "never"), or no body can be made of it.
     """
     check_one_of(get_args(Mending), how=how)
     if how == "never":
-        return Mesh(
-            vertices, np.asarray(faces), name=name, notes=notes, cavities=cavities == "keep"
-        )
+        return Mesh(vertices, np.asarray(faces), name=name, cavities=cavities == "keep")
     if faces is None or np.size(faces) == 0:
         vertices = np.asarray(vertices, dtype=np.float64)
         if vertices.size == 0:
@@ -129,7 +125,7 @@ def mend(
         mesh = subdivide(mesh, _SUBDIVISION_FACTOR * least_vertices + len(mesh.vertices) - n_outer)
     for note in mesh.notes:
         logger.info("%s: %s", name, note)
-    return mesh.annotated(notes=notes)
+    return mesh
 
 
 def repair_steps(notes: Iterable[str]) -> tuple[Step, ...]:

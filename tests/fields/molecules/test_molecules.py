@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,27 +24,31 @@ pytest.importorskip("gemmi")
 ALANINE = [("N", 0.0, 0.0), ("CA", 1.46, 0.0), ("C", 2.0, 1.4), ("O", 1.3, 2.4), ("CB", 2.0, -0.8)]
 
 
-def line(
-    number: int,
-    name: str,
-    x: float,
-    y: float,
-    z: float,
-    *,
-    residue: str = "ALA",
-    chain: str = "A",
-    place: str = "   1 ",
-    record: str = "ATOM",
-    alternative: str = " ",
-    occupancy: float = 1.0,
-    b: float = 20.0,
-    element: str | None = None,
-) -> str:
-    element = name[0] if element is None else element
-    return (
-        f"{record:<6}{number:>5} {name:^4}{alternative}{residue:>3} {chain}{place:>5}   {x:8.3f}{y:8.3f}{z:8.3f}"
-        f"{occupancy:6.2f}{b:6.2f}          {element:>2}\n"
-    )
+@dataclass(frozen=True)
+class Atom:
+    """An atom of a PDB file."""
+
+    number: int
+    name: str
+    x: float
+    y: float
+    z: float
+    residue: str = "ALA"
+    chain: str = "A"
+    place: str = "   1 "
+    record: str = "ATOM"
+    alternative: str = " "
+    occupancy: float = 1.0
+    b: float = 20.0
+    element: str | None = None
+
+    def line(self) -> str:
+        element = self.name[0] if self.element is None else self.element
+        return (
+            f"{self.record:<6}{self.number:>5} {self.name:^4}{self.alternative}{self.residue:>3} "
+            f"{self.chain}{self.place:>5}   {self.x:8.3f}{self.y:8.3f}{self.z:8.3f}"
+            f"{self.occupancy:6.2f}{self.b:6.2f}          {element:>2}\n"
+        )
 
 
 def residue(
@@ -51,7 +56,7 @@ def residue(
 ) -> str:
     place = said.pop("place", f"{number:>4} ")
     return "".join(
-        line(i, atom, x, y, 3.8 * number, residue=name, place=place, **said)  # type: ignore[arg-type]
+        Atom(i, atom, x, y, 3.8 * number, residue=name, place=place, **said).line()  # type: ignore[arg-type]
         for i, (atom, x, y) in enumerate(atoms, start=1)
     )
 
@@ -228,8 +233,8 @@ def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_pa
 
 
 def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
-    water = line(9, "O", 9, 9, 9, residue="HOH", place=" 101 ", record="HETATM")
-    ligand = line(10, "C1", 5, 5, 5, residue="XYZ", place=" 102 ", record="HETATM")
+    water = Atom(9, "O", 9, 9, 9, residue="HOH", place=" 101 ", record="HETATM").line()
+    ligand = Atom(10, "C1", 5, 5, 5, residue="XYZ", place=" 102 ", record="HETATM").line()
     changed = residue(2, "MSE", [*ALANINE, ("SE", 3.0, -2.0)], record="HETATM")
     path = written(tmp_path, residue(1) + changed + water + ligand)
     (molecule,) = read_molecule(path)
@@ -322,8 +327,8 @@ def test_a_trace_has_balls_of_its_residues(tmp_path: Path) -> None:
 
 def test_of_alternatives_the_most_occupied_is_taken(tmp_path: Path) -> None:
     atoms = [
-        line(5, "CB", 2, -0.8, 3.8, alternative="A", occupancy=0.4),
-        line(6, "CB", 2, -0.9, 3.8, alternative="B", occupancy=0.6),
+        Atom(5, "CB", 2, -0.8, 3.8, alternative="A", occupancy=0.4).line(),
+        Atom(6, "CB", 2, -0.9, 3.8, alternative="B", occupancy=0.6).line(),
     ]
     kinds = residue(2, "SER", alternative="A", occupancy=0.3) + residue(
         2, "THR", alternative="B", occupancy=0.7
@@ -371,8 +376,10 @@ def test_atoms_without_a_position_are_left_out_not_put_at_the_origin(tmp_path: P
 def test_a_chain_without_atoms_costs_no_other_chain(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    lost = line(1, "N", 0, 0, 0, chain="B").replace(
-        "   0.000   0.000   0.000", "     nan     nan     nan"
+    lost = (
+        Atom(1, "N", 0, 0, 0, chain="B")
+        .line()
+        .replace("   0.000   0.000   0.000", "     nan     nan     nan")
     )
     path = written(tmp_path, residue(1) + lost)
     with caplog.at_level(logging.WARNING):
@@ -403,7 +410,11 @@ def test_a_surface_that_fails_in_any_way_costs_no_other_chain(
 
 
 def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:
-    text = line(1, "N", 0, 0, 0, b=10) + line(2, "CA", 1, 0, 0, b=30) + residue(2, b=70.0)
+    text = (
+        Atom(1, "N", 0, 0, 0, b=10).line()
+        + Atom(2, "CA", 1, 0, 0, b=30).line()
+        + residue(2, b=70.0)
+    )
     assert read_molecule(written(tmp_path, text))[0].b_factors.tolist() == [20.0, 70.0]
 
 
@@ -494,7 +505,7 @@ def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> Non
         molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.55], atol=1e-6
     )  # Bondi 1964
     # And calcium, which some write as an atom of the polymer, is no residue.
-    ion = line(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA")
+    ion = Atom(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA").line()
     (molecule,) = read_molecule(written(tmp_path, residue(1) + ion))
     assert molecule.residue_names == ("ALA",)
     assert molecule.notes == ("1 ligands were left out",)

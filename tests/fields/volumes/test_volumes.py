@@ -702,44 +702,50 @@ def nifti(path: Path, values: Any, affine: Any = AFFINE) -> None:
     nibabel.save(nibabel.Nifti1Image(values, affine), path)
 
 
-def broken(path: Path, kind: str) -> None:
+def cut_short(path: Path) -> None:
+    nifti(path, np.random.default_rng(0).integers(0, 3, (40, 40, 40)).astype(np.uint8))
+    path.write_bytes(path.read_bytes()[:3000])
+
+
+def huge(path: Path) -> None:
+    """The header claims more voxels than the file has."""
+    nifti(path, two_boxes())
+    content = bytearray(gzip.decompress(path.read_bytes()))
+    content[40:48] = np.array([3, 32767, 32767, 32767], dtype="<i2").tobytes()
+    path.write_bytes(gzip.compress(content))
+
+
+def singular(path: Path) -> None:
+    """The affine has two equal rows."""
     labels = two_boxes()
-    if kind == "cut short":
-        nifti(path, np.random.default_rng(0).integers(0, 3, (40, 40, 40)).astype(np.uint8))
-        path.write_bytes(path.read_bytes()[:3000])
-    elif kind == "huge":
-        nifti(path, labels)
-        content = bytearray(gzip.decompress(path.read_bytes()))
-        content[40:48] = np.array([3, 32767, 32767, 32767], dtype="<i2").tobytes()
-        path.write_bytes(gzip.compress(content))
-    elif kind == "4D":
-        nifti(path, np.stack([labels, labels], axis=-1))
-    elif kind == "colours":
-        nifti(path, np.zeros((4, 4, 4), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")]))
-    elif kind == "complex":
-        nifti(path, labels.astype(np.complex64))
-    elif kind == "NaN":
-        nifti(path, np.where(labels == 3, np.nan, labels).astype(np.float32))
-    elif kind == "negative":
-        nifti(path, labels.astype(np.int16) - 1)
-    elif kind == "fractional":
-        nifti(path, labels.astype(np.float32) / 2)
-    elif kind == "one slice":
-        nifti(path, labels[:, :, 3:4])
-    elif kind == "no label":
-        nifti(path, labels * np.uint8(0))
-    elif kind == "singular":
-        image = nibabel.Nifti1Image(labels, AFFINE)
-        image.header["sform_code"], image.header["qform_code"] = 1, 0
-        image.header["srow_x"] = image.header["srow_y"]
-        with gzip.open(path, "wb") as file:
-            file.write(image.header.binaryblock + bytes(4) + labels.tobytes(order="F"))
-    elif kind == "bytes":  # of a scanner, with a background that is not 0
-        noise = np.random.default_rng(0).normal(120, 15, (40, 40, 40))
-        noise[:20] = 24
-        nifti(path, noise.astype(np.uint8))
-    elif kind == "image":
-        nifti(path, np.arange(40**3).reshape(40, 40, 40).astype(np.int32))
+    image = nibabel.Nifti1Image(labels, AFFINE)
+    image.header["sform_code"] = 1
+    image.header["qform_code"] = 0
+    image.header["srow_x"] = image.header["srow_y"]
+    with gzip.open(path, "wb") as file:
+        file.write(image.header.binaryblock + bytes(4) + labels.tobytes(order="F"))
+
+
+def unusable_values() -> dict[str, np.ndarray]:
+    """Arrays that are no labels, by what they are."""
+    labels = two_boxes()
+    scan = np.random.default_rng(0).normal(120, 15, (40, 40, 40))
+    scan[:20] = 24  # a background that is not 0
+    return {
+        "4D": np.stack([labels, labels], axis=-1),
+        "colours": np.zeros((4, 4, 4), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")]),
+        "complex": labels.astype(np.complex64),
+        "NaN": np.where(labels == 3, np.nan, labels).astype(np.float32),
+        "negative": labels.astype(np.int16) - 1,
+        "fractional": labels.astype(np.float32) / 2,
+        "one slice": labels[:, :, 3:4],
+        "no label": labels * np.uint8(0),
+        "bytes": scan.astype(np.uint8),
+        "image": np.arange(40**3).reshape(40, 40, 40).astype(np.int32),
+    }
+
+
+UNUSABLE_FILES = {"cut short": cut_short, "huge": huge, "singular": singular}
 
 
 @pytest.mark.parametrize(
@@ -764,7 +770,10 @@ def test_what_is_no_label_volume_is_refused_in_a_sentence(
     kind: str, words: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "x.nii.gz"
-    broken(path, kind)
+    if kind in UNUSABLE_FILES:
+        UNUSABLE_FILES[kind](path)
+    else:
+        nifti(path, unusable_values()[kind])
     with pytest.raises(MeshError, match=f"^{re.escape(str(path))}: .*{words}"):
         read_label_volume(path)
 

@@ -17,6 +17,7 @@ from igps._arrays import Floats, Integers, Singles, Surface
 from igps._parameters import check_one_of, check_positive
 from igps._threads import one_thread
 from igps.fields.molecules._molecular_loops import (
+    Balls,
     cubic_values,
     depths,
     distances_outside,
@@ -134,12 +135,10 @@ def _field(
     margin = _MARGIN * spacing
     depth, owner = depths(centres, radii, shape, spacing, margin)
     if probe > 0:
-        first, neighbours = _neighbours(centres, radii)
-        arcs, exposed = exposed_arcs(centres, radii, first, neighbours)
+        balls = Balls(centres, radii, *_neighbours(centres, radii))
+        arcs, exposed = exposed_arcs(balls)
         reach = probe + margin
-        depth = distances_outside(
-            depth, owner, centres, radii, first, neighbours, exposed, arcs, spacing, reach
-        )
+        depth = distances_outside(depth, owner, balls, exposed, arcs, spacing, reach)
     return ((np.float32(probe) - depth) / np.float32(spacing)).astype(np.float32)
 
 

@@ -10,6 +10,7 @@ The zero level is later shifted as a whole to match the volume of the voxels: lo
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -95,21 +96,18 @@ def _solve(share: Singles, sides: Floats) -> Floats:
     for axis, side in enumerate(sides):
         laplacian += ndimage.correlate1d(field, stencil / side**2, axis)
     steps = np.array(field.strides) // field.itemsize
+    curvatures = sides**-2
+    weighted = _Stencil(
+        np.concatenate([[0], steps, -steps]),
+        np.concatenate([[2 * curvatures.sum()], -curvatures, -curvatures]),
+    )
     certainty = np.abs(2 * share - 1).reshape(-1)[nodes]
 
     def relax(sharpness: Floats) -> None:
         min_abs = certainty * np.interp(sharpness.reshape(-1)[nodes], (0, 1), _MIN_ABS_VALUES)
-        _relax(
-            field.reshape(-1),
-            laplacian.reshape(-1),
-            nodes,
-            np.concatenate([[0], steps, -steps]),
-            np.concatenate([[2 * (sides**-2).sum()], -(sides**-2), -(sides**-2)]),
-            np.interp(sharpness, (0, 1), _STIFFNESS).reshape(-1),
-            target,
-            inside.reshape(-1)[nodes],
-            min_abs,
-        )
+        stiffness = np.interp(sharpness, (0, 1), _STIFFNESS).reshape(-1)
+        bounded = _Nodes(nodes, target, inside.reshape(-1)[nodes], min_abs)
+        _relax(field.reshape(-1), laplacian.reshape(-1), weighted, stiffness, bounded)
 
     relax(np.zeros_like(field))
     # Edges are blunter across long voxels.
@@ -140,35 +138,51 @@ def filled_volume(field: Floats | Singles, reach: float) -> tuple[float, float]:
     return float(np.clip(share, 0, 1).sum()) + n_full, float((1 / width[is_cut]).sum())
 
 
+class _Stencil(NamedTuple):
+    """The negative Laplacian of a grid: offsets in the flat array, and the coefficient of each."""
+
+    steps: Integers
+    weights: Floats
+
+
+class _Nodes(NamedTuple):
+    """The grid points that are changed: where they are, their wanted values, sides, and smallest absolute values."""
+
+    at: Integers
+    target: Floats
+    inside: Booleans
+    min_abs: Floats
+
+
 @compiled(fastmath=REASSOCIATE)
 def _relax(
     field: Floats,
     laplacian: Floats,
-    nodes: Integers,
-    steps: Integers,
-    weights: Floats,
+    stencil: _Stencil,
     stiffness: Floats,
-    target: Floats,
-    inside: Booleans,
-    min_abs: Floats,
+    nodes: _Nodes,
 ) -> None:
     """Minimise the weighted squares of the Laplacian in place, by projected Gauss-Seidel sweeps.
 
-    Sweeps run forwards and backwards in turn. The array `laplacian` holds the negative Laplacian, whose stencil has the
-    offsets `steps` and the coefficients `weights`, and is updated with the field.
+    Sweeps run forwards and backwards in turn. The array `laplacian` holds the negative Laplacian, and is updated with
+    the field.
     """
-    n = len(nodes)
+    steps = stencil.steps
+    weights = stencil.weights
+    min_abs = nodes.min_abs
+    n = len(nodes.at)
     for sweep in range(_N_SWEEPS):
         for count in range(n):
             at = count if sweep % 2 == 0 else n - 1 - count
-            node = nodes[at]
-            total, centre = _DISTANCE_WEIGHT * (target[at] - field[node]), _DISTANCE_WEIGHT
+            node = nodes.at[at]
+            total = _DISTANCE_WEIGHT * (nodes.target[at] - field[node])
+            centre = _DISTANCE_WEIGHT
             for k in range(len(steps)):
                 weight = weights[k] * stiffness[node + steps[k]]
                 total -= weight * laplacian[node + steps[k]]
                 centre += weight * weights[k]
             value = field[node] + _RELAXATION * total / centre
-            value = min(value, -min_abs[at]) if inside[at] else max(value, min_abs[at])
+            value = min(value, -min_abs[at]) if nodes.inside[at] else max(value, min_abs[at])
             change = value - field[node]
             field[node] = value
             for k in range(len(steps)):

@@ -198,8 +198,8 @@ def label_surface(
             *notes,
             "another label has the same name: the number was appended. Give names by a table",
         )
-    notes = (*volume.notes, *notes)
-    mesh = mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name, notes=notes)
+    mesh = mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name)
+    mesh = mesh.annotated(notes=(*volume.notes, *notes))
     of_voxels = body.n_voxels * abs(float(np.linalg.det(affine[:3, :3])))
     surplus = mesh.volume / of_voxels - 1
     if abs(surplus) <= _VOLUME_TOLERANCE:
