@@ -398,7 +398,7 @@ def test_a_surface_that_fails_in_any_way_costs_no_other_chain(
             raise ValueError("of any kind")
         return molecular_surface(molecule)
 
-    monkeypatch.setattr("igps.fields.molecules.molecular_surface.molecular_surface", faulty)
+    monkeypatch.setattr("igps.fields.molecules.structures.molecular_surface", faulty)
     found = {body.part: mesh for body, mesh in each_body(path)}
     assert [name for name, mesh in found.items() if isinstance(mesh, Mesh)] == [
         "chain A",
