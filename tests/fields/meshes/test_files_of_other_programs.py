@@ -11,6 +11,7 @@ import nibabel
 import numpy as np
 import pytest
 import SimpleITK
+import tifffile
 import trimesh
 
 from igps.fields.volumes.label_names import read_label_names
@@ -58,6 +59,17 @@ def test_binary_stl_whose_header_reads_like_text(tmp_path: Path) -> None:
     content[:20] = b"solid facet vertex 1"
     (tmp_path / "box.stl").write_bytes(bytes(content) + b"end")
     assert load_mesh(tmp_path / "box.stl").volume == pytest.approx(VOLUME)
+
+
+# OFF
+
+
+@pytest.mark.parametrize("word", ["OFF\n", "off\n", "Off ", "", "COFF\n", "# a comment\noff\n"])
+def test_off_with_its_word_in_any_case_or_without(word: str, tmp_path: Path) -> None:
+    text = BOX.export(file_type="off")
+    assert text.startswith("OFF\n")
+    (tmp_path / "box.off").write_text(word + text.removeprefix("OFF\n"))
+    assert load_mesh(tmp_path / "box.off").volume == pytest.approx(VOLUME)
 
 
 # PLY with texture coordinates
@@ -432,6 +444,27 @@ def test_geometries_that_agree_are_not_mentioned(tmp_path: Path) -> None:
     image.SetSpacing((0.7, 0.7, 1.3))
     SimpleITK.WriteImage(image, str(tmp_path / "block.nii.gz"))
     assert not any("sform" in note for note in load_mesh(tmp_path / "block.nii.gz").notes)
+
+
+@pytest.mark.parametrize("ome", [True, False])
+@pytest.mark.parametrize("share", [0.001, 0.01, 0.03, 0.2])
+def test_a_tiff_that_is_cut_short_is_refused(ome: bool, share: float, tmp_path: Path) -> None:
+    sides = {f"PhysicalSize{axis}": 0.5 for axis in "XYZ"}
+    imagej = {"axes": "ZYX", "spacing": 0.5, "unit": "um"}
+    metadata = {"axes": "ZYX", **sides} if ome else imagej
+    labels = np.repeat(np.repeat(block(), 4, axis=1), 4, axis=2)
+    path = tmp_path / "block.tif"
+    tifffile.imwrite(path, labels, ome=ome, imagej=not ome, metadata=metadata)
+    whole = load_mesh(path)
+    assert whole.unit == "mm"
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * (1 - share))])
+    try:
+        body = load_mesh(path)
+    except MeshError:
+        return
+    # What was cut holds neither voxels nor their size.
+    assert (body.volume, body.unit) == (whole.volume, whole.unit)
 
 
 # Surfaces of brains, and tables

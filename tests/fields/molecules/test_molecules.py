@@ -524,3 +524,11 @@ def test_no_line_is_lost_to_marks_of_text_or_to_frames(tmp_path: Path) -> None:
     found = read_molecule(written(tmp_path, frames), "models")
     assert [len(molecule.radii) for molecule in found] == [10, 5]
     assert len(read_molecule(written(tmp_path, f"{text}TER\nEND\n"), "models")) == 1
+
+
+def test_models_whose_number_repeats_are_all_read(tmp_path: Path) -> None:
+    model = f"MODEL        1\n{residue(1)}{residue(2)}ENDMDL\n"
+    path = written(tmp_path, 3 * model + "END\n")
+    molecules = read_molecule(path, bodies="models")
+    assert [len(molecule.radii) for molecule in molecules] == [10, 10, 10]
+    assert len({molecule.name for molecule in molecules}) == 3

@@ -12,6 +12,8 @@ from igps.mesh.options import LoadOptions
 from igps.mesh.polygons import flat_triangles
 from igps.mesh.raw_body import RawBody, text_of
 
+# The first word, in any case; kinds such as COFF have more columns. Some programs leave it out.
+_WORD = re.compile(r"\s*([a-z4]*?)off\b", re.IGNORECASE)
 _WHOLE_NUMBERS = re.compile(r"[\d\s]+", re.ASCII)
 
 
@@ -19,7 +21,9 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     text = text_of(path)
     if "#" in text:
         text = "\n".join(line.partition("#")[0] for line in text.split("\n"))
-    kind, _, content = text.partition("OFF")
+    word = _WORD.match(text)
+    kind = word[1].upper() if word else ""
+    content = text[word.end() :] if word else text
     lines = [line for line in content.splitlines() if line and not line.isspace()]
     if not lines:
         raise ValueError("expected OFF, followed by the numbers of vertices and faces")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import gzip
+import itertools
 import re
 import zlib
 from collections.abc import Iterator, Mapping
@@ -31,6 +32,7 @@ _REQUIRED_COLUMNS = (
     "Cartn_y",
     "Cartn_z",
 )
+_MODEL_LINE = re.compile(rb"^MODEL[ \t]+\d+[^\r\n]*", re.MULTILINE)
 _END_LINE = re.compile(rb"^END[ \t]*$", re.MULTILINE)
 # The chain, number and insertion code of a residue in a PQR file, as in "A12B"; chain and code may be missing.
 _RESIDUE_NUMBER = re.compile(r"([A-Za-z]?)(-?\d+)([A-Za-z]?)")
@@ -52,7 +54,8 @@ def read_structures(path: Path) -> dict[str, gemmi.Structure]:
     gemmi = gemmi_module()
     try:
         if suffix_of(path) in (".pdb", ".ent"):
-            return {"": _pdb(_frames_as_models(_ATOM_LINE.sub(_mark_missing, text)))}
+            marked = _ATOM_LINE.sub(_mark_missing, text)
+            return {"": _pdb(_numbered_models(_frames_as_models(marked)))}
         document = gemmi.cif.read_string(text.decode("utf-8", "replace"))
         blocks = [block for block in document if block.find_values("_atom_site.id")] or [
             document[0]
@@ -168,6 +171,15 @@ def _frames_as_models(text: bytes) -> bytes:
     """Turn frames of a simulation, separated by END, into models: gemmi would read the first frame only."""
     frames = [frame for frame in _END_LINE.split(text) if _ATOM_LINE.search(frame)]
     return b"ENDMDL\n".join(frames) if len(frames) > 1 else text
+
+
+def _numbered_models(text: bytes) -> bytes:
+    """Number the models of a PDB file from 1 if a number repeats, as when files were joined: gemmi refuses those."""
+    numbers = _MODEL_LINE.findall(text)
+    if len(set(numbers)) == len(numbers):
+        return text
+    count = itertools.count(1)
+    return _MODEL_LINE.sub(lambda _: b"MODEL     %4d" % next(count), text)
 
 
 def _mark_unknown(block: gemmi.cif.Block) -> None:

@@ -372,6 +372,7 @@ def _tifffile(path: Path) -> RawVolume:
     import tifffile
 
     with tifffile.TiffFile(path) as file:
+        _check_complete(file, path)
         series = file.series[0]
         axes, dtype = series.axes, np.dtype(series.dtype)
         if "S" in axes:
@@ -402,6 +403,26 @@ def _tifffile(path: Path) -> RawVolume:
             values = SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(path)))  # it decodes LZW
         sides, unit = _tiff_sides(file)
     return RawVolume([values.reshape(shape).T], np.diag([*sides, 1.0]), unit=unit)
+
+
+def _check_complete(file: Any, path: Path) -> None:
+    """Raise a MeshError if a TIFF file ends before its voxels, or before an entry of its headers such as the spacing.
+
+    Tifffile leaves out what it cannot read.
+    """
+    n_bytes = path.stat().st_size
+    first = file.pages[0]
+    file.filehandle.seek(first.offset)
+    n_entries = int.from_bytes(
+        file.filehandle.read(file.tiff.tagnosize),
+        "big" if file.byteorder == ">" else "little",
+    )
+    is_complete = len(list(first.tags)) == n_entries
+    for page in file.pages:
+        for start, size in zip(page.dataoffsets, page.databytecounts, strict=True):
+            is_complete &= start + size <= n_bytes
+    if not is_complete:
+        raise MeshError(f"{path}: the file is cut short. Copy it again, or export it again.")
 
 
 def _tiff_sides(file: Any) -> tuple[tuple[float, float, float], str | None]:
