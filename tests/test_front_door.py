@@ -143,8 +143,9 @@ def test_every_import_is_declared() -> None:
         if name not in ("test", "lint", "docs")
     }
     optional = set().union(*extras.values()) - {"interior-gps"}
-    own = {"igps", "training"}
-    for folder in (PACKAGE, PROJECT / "training"):
+    own = {"igps", "training", "docs"}
+    programs = [PACKAGE, PROJECT / "training", PROJECT / "docs" / "benchmarks"]
+    for folder in programs:
         for path in sorted(folder.rglob("*.py")):
             for module in imported(path) - set(sys.stdlib_module_names) - own:
                 distribution = normal(DISTRIBUTIONS.get(module, module))
@@ -152,12 +153,7 @@ def test_every_import_is_declared() -> None:
                     f"{path} imports {module}, which pyproject.toml does not declare"
                 )
     # And nothing is declared that is not used.
-    every = set().union(
-        *(
-            imported(path)
-            for path in [*PACKAGE.rglob("*.py"), *(PROJECT / "training").rglob("*.py")]
-        )
-    )
+    every = set().union(*(imported(path) for folder in programs for path in folder.rglob("*.py")))
     used = {normal(DISTRIBUTIONS.get(module, module)) for module in every}
     # trimesh imports these, where a file asks for them: text that is not UTF-8, or a format
     assert core - {"charset-normalizer"} <= used

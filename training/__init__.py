@@ -1,1 +1,1 @@
-"""Generated shapes, training of the metric of the library, studies of the library, and scripts that run them."""
+"""Training on a folder of labelled meshes, and how the model `pretrained` was made: see README.md."""

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from training.study import main as study
 
 from igps.cli import main
 from own_descriptors import SMALL, write_egg
@@ -65,20 +64,6 @@ def bars(text: str) -> dict[str, tuple[int, int]]:
             "gallery build ROOT --out OUT.igps --descriptor INTERIOR SMALL",
             {"signatures": 4, "descriptions": 4},
         ),
-        ("figure pose ROOT --out OUT.png SMALL", {"signatures": 4, "descriptions": 4}),
-        (
-            "figure topology MESH --weld 0 3 --out OUT.png --n_eigenpairs 20 --resolution 10",
-            {"steps": 6},
-        ),
-        ("figure potential MESH --out OUT.png --n_eigenpairs 20 --resolution 10", {"steps": 7}),
-        (
-            "robustness MESH OTHER --descriptors INTERIOR SMALL",
-            {"signatures": 2, "altered meshes": None},
-        ),
-        (
-            "damage ROOT --descriptors INTERIOR --damages noise SMALL",
-            {"signatures": 4, "altered meshes": 8},
-        ),
         ("doctor ROOT --n_workers 1", {"bodies": 4}),
         ("distance MESH OTHER --n_workers 1", {"signatures": 2, "descriptions": 2}),
         ("duplicates ROOT --n_workers 1", {"signatures": 4, "surfaces": 4, "compared": 4}),
@@ -105,11 +90,10 @@ def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
     line = re.sub(
         r"\b(ROOT|MESH|OTHER|INTERIOR|SMALL|OUT)\b", lambda match: words[match[0]], command
     )
-    reads_signatures = not command.startswith(("figure topology", "figure potential", "doctor"))
+    reads_signatures = not command.startswith("doctor")
     cache = ["--cache_dir", str(tmp_path / "cache")] if reads_signatures else []
     monkeypatch.setattr(sys, "argv", ["igps", *line.split(), *cache])
-    run = study if command.startswith(("figure", "robustness", "damage")) else main
-    run()
+    main()
     printed = capsys.readouterr()
     shown = bars(printed.err)
     assert {name for name in expected if name not in shown} == set(), printed.err
@@ -135,14 +119,3 @@ def test_merging_galleries_shows_a_bar(
     )
     main()
     assert bars(capsys.readouterr().err)["entries"] == (4, 4)
-
-
-def test_the_library_is_silent_unless_asked(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from training.studies.paper import weld_change
-
-    from igps.mesh.loading import load_mesh
-
-    weld_change(load_mesh(root / "egg" / "0.off"), (0, 3), n_eigenpairs=20, resolution=10)
-    assert capsys.readouterr() == ("", "")

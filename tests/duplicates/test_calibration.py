@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from training.studies.thresholds import quantiles
+from training.calibrate import quantiles
 
 from igps.descriptors import descriptor
 from igps.descriptors.fingerprint import fingerprint
@@ -120,7 +120,7 @@ def test_what_is_saved_is_loaded(calibration: Calibration, tmp_path: Path) -> No
 def test_what_is_no_calibration_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "c.json").write_text(text)
     with pytest.raises(
-        ValueError, match=r"c\.json: expected a calibration as training/calibrate\.py writes it"
+        ValueError, match=r"c\.json: expected a calibration as `Calibration\.save` writes it"
     ):
         Calibration.load(tmp_path / "c.json")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from training.studies.disturbances import noise
+from training.disturbances import noise
 
 from igps.mesh import denoising
 from igps.mesh.denoising import Neighbours, is_noisy, noise_and_edge, remove_noise

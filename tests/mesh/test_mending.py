@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
-from training.studies.damages import DAMAGES, halves, holes
+from tests.mesh.damages import DAMAGES, halves, holes
 
 from igps.mesh._tidying import fill_small_holes, weld
 from igps.mesh.errors import MeshError

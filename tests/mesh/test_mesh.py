@@ -9,7 +9,7 @@ import nibabel
 import numpy as np
 import pytest
 import trimesh
-from training.studies.weld import weld_gap
+from docs.benchmarks.weld import weld_gap
 
 from conftest import FACES, TETRAHEDRON, horseshoe, surface_genus
 from igps.mesh.errors import MeshError

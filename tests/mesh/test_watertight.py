@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from training.studies.damages import DAMAGES
+from tests.mesh.damages import DAMAGES
 
 from igps.mesh import watertight as module
 from igps.mesh._isosurface import level_surface

@@ -427,35 +427,26 @@ def test_a_repeated_shape_counts_once(shapes: Path, tmp_path: Path) -> None:
     assert repeated == once
 
 
-def test_smoke_configuration_trains_and_its_checkpoint_loads_without_running_code(
+def test_the_configuration_trains_and_its_checkpoint_loads_without_running_code(
     shapes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arguments = [
-        "fit",
-        "--config",
-        PROJECT / "configs/default.yaml",
-        "--config",
-        PROJECT / "configs/smoke.yaml",
-    ]
-    arguments += [
-        "--data.root",
-        shapes / "meshes",
-        "--data.cache_dir",
-        shapes / "cache",
-        "--data.n_train",
-        "4",
-    ]
-    arguments += [
-        "--data.config.n_eigenpairs",
-        "20",
-        "--data.config.resolution",
-        "12",
-        "--data.config.min_samples",
-        "0",
-    ]
-    arguments += ["--data.config.n_surface_samples", "20", "--data.n_workers", "1"]
-    arguments += ["--trainer.default_root_dir", tmp_path]
-    monkeypatch.setattr(sys, "argv", ["train.py", *map(str, arguments)])
+    values = {
+        "data.root": shapes / "meshes",
+        "data.cache_dir": shapes / "cache",
+        "data.n_train": 4,
+        "data.n_validation": 2,
+        "data.config.n_eigenpairs": 20,
+        "data.config.resolution": 12,
+        "data.config.min_samples": 0,
+        "data.config.n_surface_samples": 20,
+        "data.n_workers": 1,
+        "trainer.max_epochs": 4,
+        "trainer.accelerator": "cpu",
+        "trainer.enable_progress_bar": "false",
+        "trainer.default_root_dir": tmp_path,
+    }
+    arguments = [f"--{name}={value}" for name, value in values.items()]
+    monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
     runpy.run_path(str(PROJECT / "training/train.py"), run_name="__main__")
     checkpoint = tmp_path / "checkpoints" / "last.ckpt"
     state = torch.load(checkpoint, weights_only=True)["state_dict"]

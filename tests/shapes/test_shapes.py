@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from training.graded import GradedShapes
-from training.graded.polygons import Prism
-from training.studies.contact_sheet import contact_sheet
+from training.shapes.polygons import Prism
 
 from igps.shapes import ArticulatedShapes, GeneratedShape
 from igps.shapes.solids import Arc, Box, Cone, Ring, Solid
@@ -216,43 +214,6 @@ def test_write_refuses_a_folder_of_other_shapes(tmp_path: Path) -> None:
     ArticulatedShapes(n_classes=1, n_per_class=1, n_vertices=1000).write(tmp_path)
     with pytest.raises(ValueError, match="root="):
         ArticulatedShapes(n_classes=1, n_per_class=1, n_vertices=1000, seed=1).write(tmp_path)
-
-
-def test_contact_sheet_shows_every_class(tmp_path: Path) -> None:
-    from matplotlib.image import imread
-
-    shapes = ArticulatedShapes(n_classes=4, n_per_class=2, n_vertices=1000)
-    contact_sheet(shapes, tmp_path / "sheet.png")
-    picture = imread(tmp_path / "sheet.png")[:, :, :3]
-    bluish = (picture[:, :, 2] - picture[:, :, 0] > 0.1).sum(axis=0)
-    width = bluish.size // 4
-    assert all(bluish[i * width : (i + 1) * width].sum() > 1000 for i in range(4))
-    with pytest.raises(ValueError, match="n_shown"):
-        contact_sheet(shapes, tmp_path / "sheet.png", n_shown=3)
-
-
-def test_contact_sheet_shows_mirrored_shapes_right_side_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shapes = GradedShapes(n_classes=3, n_bodies=1, n_poses=2, n_vertices=(1500, 1500))
-    assert {np.linalg.det(shapes[i].motion) > 0 for i in range(len(shapes))} == {
-        True,
-        False,
-    }  # some are mirrored
-    drawn: list[trimesh.Trimesh] = []
-    monkeypatch.setattr(
-        "training.studies.contact_sheet.paint",
-        lambda axis, vertices, faces, colour: drawn.append(
-            trimesh.Trimesh(vertices, faces, process=False)
-        ),
-    )
-    contact_sheet(shapes, tmp_path / "sheet.png", n_shown=2)
-    assert len(drawn) == len(shapes)
-    for i, body in enumerate(drawn):
-        shape = shapes[i]
-        volume = trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume
-        assert body.volume == pytest.approx(volume)
-        assert volume > 0
 
 
 POINTS = np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3))

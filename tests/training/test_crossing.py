@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
-from training.graded.crossing import crossing_faces
+from training.shapes.crossing import crossing_faces
 
 
 def passes(p: np.ndarray, q: np.ndarray, triangle: np.ndarray) -> bool:

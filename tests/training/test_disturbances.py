@@ -5,17 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from training.studies.disturbances import (
-    DISTURBANCES,
-    clip,
-    hole,
-    move,
-    noise,
-    remesh,
-    scale,
-    simplified,
-)
-from training.studies.weld import weld_gap
+from docs.benchmarks.robustness import DISTURBANCES
+from docs.benchmarks.weld import weld_gap
+from training.disturbances import clip, hole, move, noise, remesh, scale, simplified
 
 from conftest import as_trimesh, horseshoe, surface_genus
 from igps.mesh.mesh import Mesh

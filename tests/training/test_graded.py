@@ -9,11 +9,11 @@ from typing import NoReturn
 import numpy as np
 import pytest
 import trimesh
-from training.graded import GradedShape, GradedShapes, body_of
-from training.graded.bodies import Pose, draw_body, draw_pose
-from training.graded.kinds import KINDS, LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, body_classes
-from training.graded.plates import MACHINES, SHEETS, Plate, machine, sheet
-from training.graded.springs import Helix
+from training.shapes import GradedShape, GradedShapes, body_of
+from training.shapes.bodies import Pose, draw_body, draw_pose
+from training.shapes.kinds import KINDS, LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, body_classes
+from training.shapes.plates import MACHINES, SHEETS, Plate, machine, sheet
+from training.shapes.springs import Helix
 
 from igps.data.sources import find_bodies
 from igps.mesh.loading import load_mesh
@@ -121,7 +121,7 @@ def test_a_body_that_cannot_be_made_is_tried_once(monkeypatch: pytest.MonkeyPatc
         tried.append(arguments)
         raise ValueError("no sound body")
 
-    monkeypatch.setattr("training.graded.shapes.draw_body", impossible)
+    monkeypatch.setattr("training.shapes.benchmark.draw_body", impossible)
     shapes = GradedShapes(1, 2, 3)
     for pose in range(3):
         with pytest.raises(ValueError, match=rf"biped/00/0{pose} could not be made: no sound body"):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from training.graded import GradedShapes, body_of, individual_of
-from training.graded.individuals import SHARES
+from training.shapes import GradedShapes, body_of, individual_of
+from training.shapes.individuals import SHARES
 
 N_INDIVIDUALS = 3
 

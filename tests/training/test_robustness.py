@@ -1,4 +1,4 @@
-"""`robustness`: its movements against distances worked out by hand, and what it says where there are none."""
+"""Movements of descriptions, against distances worked out by hand."""
 
 from __future__ import annotations
 
@@ -8,151 +8,91 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from training.studies.disturbances import DISTURBANCES
-from training.studies.robustness import POSE, Robustness, robustness
+from docs.benchmarks.robustness import (
+    DISTURBANCES,
+    describe_disturbed,
+    median_between_classes,
+    movements,
+    robustness,
+)
 
 from conftest import horseshoe
 from igps.data.collation import collate
-from igps.data.dataset import SignatureDataset
-from igps.data.sources import Bodies, find_bodies
-from igps.descriptors import descriptor
 from igps.descriptors.interior import interior
 from igps.descriptors.literature.d2 import D2
 from igps.mesh.loading import load_mesh
-from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig, compute_signature
-from own_descriptors import Root, Same, root_area, write_egg
+from own_descriptors import Root, root_area, write_egg
 
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
-
-
-def of(source: Path | list[Path] | Bodies, tmp_path: Path) -> SignatureDataset:
-    return SignatureDataset(source, CONFIG, tmp_path / "cache")
+ROOT = "own_descriptors:Root"
 
 
-def run(
-    tmp_path: Path, meshes: list[Path], *chosen: Descriptor, **options: SignatureDataset
-) -> Robustness:
-    return robustness(of(meshes, tmp_path), chosen, n_workers=1, **options)
-
-
-def test_movements_are_shares_of_the_distance_between_the_meshes(tmp_path: Path) -> None:
+def test_the_table_holds_mean_movements_over_the_distance_between_classes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     meshes = [write_egg(tmp_path / f"{height}.off", height) for height in (1.0, 1.5, 3.0)]
-    found = run(tmp_path, meshes, Root())
-    size = np.array([root_area(path) for path in meshes])
-    unit = np.median([size[1] - size[0], size[2] - size[0], size[2] - size[1]])
-    assert found.units == {"root": pytest.approx(unit)}
-    movements = found.movements["root"]
-    assert list(movements) == list(DISTURBANCES)
-    expected = {str(path): 6 * one / unit for path, one in zip(meshes, size, strict=True)}
-    assert movements["scale"].distances == pytest.approx(expected, rel=1e-5)
-    assert movements["scale"].mean == pytest.approx(np.mean(6 * size / unit), rel=1e-5)
-    assert movements["motion"].mean == pytest.approx(0, abs=1e-5)
-    half = [np.sqrt(DISTURBANCES["half"].apply(load_mesh(path)).area) for path in meshes]
-    moved = [abs(one - other) / unit for one, other in zip(half, size, strict=True)]
-    assert list(movements["half"].distances.values()) == pytest.approx(moved, rel=1e-3)
-    assert movements["hole"].mean is None
-    assert movements["hole"].distances == {}
-    assert movements["hole"].notes == dict.fromkeys(map(str, meshes), "a hole has no area")
-    assert movements["weld"].mean is None  # an egg has no gap
-    written = found.as_dict()
-    assert written["movements"]["root"]["hole"] == {
-        "mean": None,
-        "each": {},
-        "notes": dict.fromkeys(map(str, meshes), "a hole has no area"),
-    }
-    assert written["disturbances"] == {name: one.description for name, one in DISTURBANCES.items()}
+    low = [root_area(write_egg(tmp_path / f"gallery/low/{x}.off", x, 2)) for x in (1.0, 1.3)]
+    high = [root_area(write_egg(tmp_path / f"gallery/high/{x}.off", x, 2)) for x in (2.0, 2.4)]
+    poses = [root_area(write_egg(tmp_path / f"poses/{x}.off", x, 2)) for x in (1.0, 1.1, 1.3)]
+    robustness(meshes, tmp_path / "gallery", tmp_path / "poses", [ROOT], tmp_path / "cache", 1)
+    header, row, *rest = capsys.readouterr().out.splitlines()
+    assert header.split() == [*DISTURBANCES, "pose"]
+    name, *cells = row.split()
+    found = dict(zip(header.split(), map(float, cells), strict=True))
 
-
-def test_gallery_tells_the_distance_between_classes(tmp_path: Path) -> None:
-    heights = {"low": (1.0, 1.3), "high": (2.0, 2.4, 5.0)}
-    size = {
-        label: [
-            root_area(write_egg(tmp_path / "gallery" / label / f"{x}.off", x, 2)) for x in several
-        ]
-        for label, several in heights.items()
-    }
-    mesh = write_egg(tmp_path / "one.off", 1.2)
-    found = run(tmp_path, [mesh], Root(), gallery=of(tmp_path / "gallery", tmp_path))
-    unit = np.median([abs(low - high) for low in size["low"] for high in size["high"]])
-    assert found.units["root"] == pytest.approx(unit, rel=1e-4)
-    assert found.movements["root"]["scale"].mean == pytest.approx(
-        6 * root_area(mesh) / unit, rel=1e-4
-    )
-
-
-def test_poses_are_compared_within_each_body(tmp_path: Path) -> None:
-    meshes = [write_egg(tmp_path / f"{height}.off", height, 2) for height in (1.0, 2.0)]
-    unit = root_area(meshes[1]) - root_area(meshes[0])
-    poses = [write_egg(tmp_path / "poses" / f"{x}.off", x, 2) for x in (1.0, 1.1, 1.3)]
-    size = [root_area(path) for path in poses]
-    files = find_bodies(tmp_path / "poses")
-    one_body = Bodies(files.paths, files.names, ("body",) * 3)
-    movement = run(tmp_path, meshes, Root(), poses=of(one_body, tmp_path)).movements["root"][POSE]
-    expected = {
-        "1.0.off - 1.1.off": (size[1] - size[0]) / unit,
-        "1.0.off - 1.3.off": (size[2] - size[0]) / unit,
-        "1.1.off - 1.3.off": (size[2] - size[1]) / unit,
-    }
-    assert movement.distances == pytest.approx(expected, rel=1e-3)
-
-    for name in ("a/1.off", "b/1.off", "b/2.off"):  # now two bodies, one of them in two poses
-        write_egg(tmp_path / "bodies" / name, 1 + 0.2 * len(name), 2)
-    movement = run(tmp_path, meshes, Root(), poses=of(tmp_path / "bodies", tmp_path)).movements[
-        "root"
-    ][POSE]
-    assert list(movement.distances) == ["b/1.off - b/2.off"]
-
-
-def test_no_distance_between_classes_leaves_no_movement(tmp_path: Path) -> None:
-    meshes = [write_egg(tmp_path / name, 1.0) for name in ("a.off", "b.off", "nan.off")]
-    found = run(tmp_path, meshes, Same())
-    assert np.isnan(found.units["same"]) or found.units["same"] == 0
-    assert found.as_dict()["median_between_classes"] == {"same": None}
-    notes = found.movements["same"]["scale"].notes
-    assert "no distance between classes" in notes[str(meshes[0])]
-    assert "not finite" in notes[str(meshes[2])]
-    assert all(movement.mean is None for movement in found.movements["same"].values())
+    unit = np.median([b - a for a in low for b in high])
+    sizes = [root_area(mesh) for mesh in meshes]
+    assert name == "root" or name == ROOT
+    assert found["scale"] == pytest.approx(100 * 6 * np.mean(sizes) / unit, rel=1e-3)
+    assert found["motion"] == pytest.approx(0, abs=0.1)
+    between_poses = [poses[1] - poses[0], poses[2] - poses[0], poses[2] - poses[1]]
+    assert found["pose"] == pytest.approx(100 * np.mean(between_poses) / unit, rel=1e-2)
+    halves = [np.sqrt(DISTURBANCES["half"].apply(load_mesh(path)).area) for path in meshes]
+    moved = np.mean(np.abs(np.subtract(halves, sizes)))
+    assert found["half"] == pytest.approx(100 * moved / unit, rel=0.02, abs=0.1)
+    # A hole has no area, and an egg has no gap to weld.
+    assert np.isnan(found["hole"])
+    assert np.isnan(found["weld"])
+    assert "root, hole: 3 missing; a hole has no area" in rest
+    assert any(line.startswith("root, weld: 3 missing; ") for line in rest)
+    for column, disturbance in DISTURBANCES.items():
+        assert f"  {column}: {disturbance.description}" in rest
 
 
 def test_real_descriptors_on_a_body_with_a_gap(tmp_path: Path) -> None:
-    paths = [write_egg(tmp_path / "egg.off", 2.0), tmp_path / "ring.off"]
     ring = horseshoe(0.06)
-    trimesh.Trimesh(ring.vertices, ring.faces, process=False).export(paths[1])
+    path = tmp_path / "ring.off"
+    trimesh.Trimesh(ring.vertices, ring.faces, process=False).export(path)
     chosen = [interior(n_eigenpairs=20), D2()]
-    found = run(tmp_path, paths, *chosen)
-    for name in ("interior", "d2"):
-        assert found.movements[name]["scale"].mean is not None
-        assert found.movements[name]["scale"].mean < 1e-3
-        assert set(found.movements[name]["hole"].distances) == set(map(str, paths))
-        assert set(found.movements[name]["weld"].distances) == {str(paths[1])}
+    answers = describe_disturbed([path], chosen, n_workers=1)
+    found = {
+        descriptor.name: {
+            column: movements(descriptor, [answers[0][descriptor.name]], column)[0]
+            for column in DISTURBANCES
+        }
+        for descriptor in chosen
+    }
     # The weld makes the ring whole, which distances along the body notice and straight ones do not.
-    welds = [found.movements[name]["weld"].mean or 0 for name in ("interior", "d2")]
-    assert welds[0] > 2 * welds[1]
-    # What was moved, by the library's parts: the disturbed ring described anew.
-    meshes = [load_mesh(path) for path in paths]
-    for way in ("weld", "noise", "half"):
-        disturbed = DISTURBANCES[way].apply(meshes[1])
-        batches = [collate([compute_signature(one, CONFIG)]) for one in (*meshes, disturbed)]
-        for one in chosen:
+    assert found["interior"]["weld"][0] > 2 * found["d2"]["weld"][0]
+    assert found["interior"]["scale"][0] < 1e-3
+    mesh = load_mesh(path)
+    config = chosen[0].requirements | chosen[1].requirements
+    for column in ("weld", "noise", "half"):
+        disturbed = DISTURBANCES[column].apply(mesh)
+        batches = []
+        for body in (mesh, disturbed):
+            signature = compute_signature(body, config.apply_to(SignatureConfig()))
+            batches.append(collate([signature], [body]))
+        for descriptor in chosen:
             with torch.inference_mode():
-                egg, whole, after = (one(batch) for batch in batches)
-            expected = float(one.distances(whole, after) / one.distances(egg, whole))
-            assert expected > 1e-3
-            assert found.movements[one.name][way].distances[str(paths[1])] == pytest.approx(
-                expected, rel=0.02
-            )
+                before, after = (descriptor(batch) for batch in batches)
+                expected = float(descriptor.distances(before, after))
+            assert expected > 1e-4
+            assert found[descriptor.name][column] == pytest.approx([expected], rel=0.02)
 
 
-def test_too_little_is_refused(tmp_path: Path) -> None:
-    meshes = [write_egg(tmp_path / name, 1.5, 2) for name in ("a.off", "b.off")]
-    with pytest.raises(ValueError, match=r"dataset: expected at least two meshes, .* or a gallery"):
-        run(tmp_path, meshes[:1], Root())
-    with pytest.raises(
-        ValueError, match="descriptors: expected different names, got root more than once"
-    ):
-        run(tmp_path, meshes, Root(), Root())
-    with pytest.raises(
-        ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 20"
-    ):
-        run(tmp_path, meshes, descriptor("interior"))
+def test_a_gallery_of_one_class_is_refused(tmp_path: Path) -> None:
+    for height in (1.0, 2.0):
+        write_egg(tmp_path / f"gallery/one/{height}.off", height, 2)
+    with pytest.raises(ValueError, match=r"gallery: expected two classes in .*, got one"):
+        median_between_classes(tmp_path / "gallery", Root(), tmp_path / "cache", 1)

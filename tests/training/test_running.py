@@ -1,9 +1,11 @@
-"""A run of training/train.py: three values in a file, a curve, an early end, and going on after an interruption."""
+"""Training by a file of values: a curve, an early end, and going on after an interruption."""
 
 from __future__ import annotations
 
 import csv
+import os
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,12 +13,19 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from training.running import Run
+from training.train import CONFIG, train
 
+import igps
+from igps.data.datamodule import SignatureDataModule
+from igps.data.splits import Split
+from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.learner import RetrievalLearner
+from igps.retrieval import chi_square, retrieval_scores
 from igps.shapes import ArticulatedShapes
 
-OWN = Path(__file__).parents[2] / "configs" / "own.yaml"
+PROJECT = CONFIG.parents[1]
+SMALL = {"n_eigenpairs": 40, "resolution": 15, "min_samples": 0}
+COLUMNS = ("ft", "nn", "dcg", "st", "adr", "map")
 
 
 @pytest.fixture(scope="module")
@@ -26,40 +35,34 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def train(root: Path, out: Path, *more: object, epochs: int = 4) -> None:
-    """A run whose file is configs/own.yaml with its three values changed, on small signatures."""
-    own = {
-        **yaml.safe_load(OWN.read_text()),
+def settings(root: Path, out: Path, epochs: int = 4) -> dict[str, Any]:
+    """The values of configs/train.yaml for small signatures and quick epochs."""
+    values = yaml.safe_load(CONFIG.read_text())
+    values["data"] |= {
         "root": str(root / "meshes"),
-        "out": str(out),
-        "epochs": epochs,
+        "cache_dir": str(root / "cache"),
+        "shapes_per_class": 2,
+        "config": SMALL,
+        "n_workers": 1,
     }
-    file = out.with_suffix(".yaml")
-    file.write_text(yaml.safe_dump(own))
-    small = [
-        "--data.config.n_eigenpairs=40",
-        "--data.config.resolution=15",
-        "--data.config.min_samples=0",
-    ]
-    quiet = ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
-    options = [
-        "--data.cache_dir",
-        root / "cache",
-        "--data.n_workers",
-        1,
-        "--trainer.check_val_every_n_epoch",
-        2,
-        "--trainer.accelerator",
-        "cpu",
-        "--data.shapes_per_class",
-        2,
-        *small,
-        *quiet,
-        *more,
-    ]
+    values["trainer"] |= {
+        "default_root_dir": str(out),
+        "max_epochs": epochs,
+        "accelerator": "cpu",
+        "check_val_every_n_epoch": 2,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+    }
+    return values
+
+
+def run(values: dict[str, Any], *more: object) -> None:
+    """Train by a file of these values."""
+    file = Path(values["trainer"]["default_root_dir"]).with_suffix(".yaml")
+    file.write_text(yaml.safe_dump(values))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["train.py", "fit", "--config", str(file), *map(str, options)])
-        Run()
+        patch.setattr(sys, "argv", ["train.py", "--config", str(file), *map(str, more)])
+        train()
 
 
 def curve(out: Path) -> list[dict[str, str]]:
@@ -67,14 +70,14 @@ def curve(out: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def state(out: Path) -> dict[str, Any]:
-    return torch.load(out / "checkpoints" / "last.ckpt", weights_only=True)
+def checkpoint(out: Path, name: str = "last") -> dict[str, Any]:
+    return torch.load(out / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
 def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train(root, tmp_path / "whole")
+    run(settings(root, tmp_path / "whole"))
     step = RetrievalLearner.training_step
 
     def interrupted(self: RetrievalLearner, batch: Any, batch_index: int) -> Any:
@@ -82,88 +85,118 @@ def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(
             raise RuntimeError("the power fails")
         return step(self, batch, batch_index)
 
+    broken = settings(root, tmp_path / "broken")
     with monkeypatch.context() as patch:
         patch.setattr(RetrievalLearner, "training_step", interrupted)
         with pytest.raises(RuntimeError, match="the power fails"):
-            train(root, tmp_path / "broken")
+            run(broken)
     assert len(curve(tmp_path / "broken")) == 2
-    with pytest.raises(FileExistsError, match="--resume last"):
-        train(root, tmp_path / "broken")
-    train(root, tmp_path / "broken", "--resume", "last", "--seed_everything", 7)
+    with pytest.raises(FileExistsError, match="--resume true"):
+        run(broken)
+    run(broken, "--resume", "true", "--seed_everything", 7)
 
-    whole, resumed = state(tmp_path / "whole"), state(tmp_path / "broken")
-    start = RetrievalLearner.load_from_checkpoint(
-        tmp_path / "whole" / "checkpoints" / "last.ckpt"
-    ).descriptor
-    assert not torch.equal(
-        start.histograms[0].axes[1].centres(), start.histograms[0].axes[1].centres.start
-    )
-    assert (whole["epoch"], whole["global_step"]) == (resumed["epoch"], resumed["global_step"])
-    assert whole["lr_schedulers"] == resumed["lr_schedulers"]
+    whole = checkpoint(tmp_path / "whole")
+    resumed = checkpoint(tmp_path / "broken")
+    trained = RetrievalLearner.load_from_checkpoint(tmp_path / "whole/checkpoints/last.ckpt")
+    centres = trained.descriptor.histograms[0].axes[1].centres
+    assert not torch.equal(centres(), centres.start)
+    for name in ("epoch", "global_step", "lr_schedulers"):
+        assert whole[name] == resumed[name]
     assert whole["state_dict"].keys() == resumed["state_dict"].keys()
     for name, values in whole["state_dict"].items():
-        torch.testing.assert_close(
-            resumed["state_dict"][name], values, rtol=1e-6, atol=1e-7, msg=name
-        )
+        again = resumed["state_dict"][name]
+        torch.testing.assert_close(again, values, rtol=1e-6, atol=1e-7, msg=name)
     rows = curve(tmp_path / "whole")
     assert [row["epoch"] for row in rows] == ["0", "1", "2", "3"]
     assert [bool(row["val_ft"]) for row in rows] == [False, True, False, True]
     for row, again in zip(rows, curve(tmp_path / "broken"), strict=True):
-        assert {key: float(value or -1) for key, value in row.items()} == pytest.approx(
-            {key: float(value or -1) for key, value in again.items()}
-        )
+        numbers = {key: float(value or -1) for key, value in row.items()}
+        assert numbers == pytest.approx({key: float(value or -1) for key, value in again.items()})
     assert (tmp_path / "whole" / "curve.svg").read_text().startswith("<?xml")
     assert (tmp_path / "whole" / "config.yaml").is_file()
 
 
 def test_training_stops_when_validation_no_longer_improves(root: Path, tmp_path: Path) -> None:
+    values = settings(root, tmp_path / "still", epochs=30)
     # Nothing is learned at a rate of 0, so that no validation is better than the first.
-    still = ["--model.learning_rate", 0, "--model.bin_rate", 0, "--early_stopping.patience", 2]
-    train(root, tmp_path / "still", *still, "--trainer.check_val_every_n_epoch", 1, epochs=30)
-    rows = curve(tmp_path / "still")
-    assert len(rows) == 3
-    best = torch.load(tmp_path / "still" / "checkpoints" / "best.ckpt", weights_only=True)
-    assert best["epoch"] == 0
+    values["model"] |= {"learning_rate": 0.0, "bin_rate": 0.0}
+    values["trainer"]["check_val_every_n_epoch"] = 1
+    values["trainer"]["callbacks"][-1]["init_args"]["patience"] = 2
+    run(values)
+    assert len(curve(tmp_path / "still")) == 3
+    assert checkpoint(tmp_path / "still", "best")["epoch"] == 0
+
+
+def test_a_missing_checkpoint_to_resume_is_named(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"resume: .*last\.ckpt"):
+        run(settings(root, tmp_path / "none"), "--resume", "true")
+
+
+def test_a_checkpoint_is_scored_as_by_the_librarys_parts(root: Path, tmp_path: Path) -> None:
+    """From a folder to a checkpoint to its scores, in processes of their own."""
+    out = tmp_path / "out"
+    file = tmp_path / "values.yaml"
+    file.write_text(yaml.safe_dump(settings(root, out)))
+    run_apart("training.train", "--config", file)
+    path = out / "checkpoints" / "last.ckpt"
+    table = run_apart("training.evaluate", path)
+    header, *lines = table.splitlines()
+    assert header.split() == ["FT", "NN", "DCG", "ST", "ADR", "mAP"]
+    printed = {line.split()[0]: [float(x) for x in line.split()[1:]] for line in lines}
+    assert list(printed) == ["plain", "learned", "whitened", "kernel"]
+
+    learner = RetrievalLearner.load_from_checkpoint(path).eval()
+    data = SignatureDataModule.load_from_checkpoint(path)
+    labels = data.dataset.labels
+    histograms = igps.describe(data.dataset, learner.descriptor)
+    split = Split(data.split.train + data.split.validation, (), data.split.test)
+    train_part = torch.tensor(split.train)
+    test = torch.tensor(split.test)
+    tested = histograms[test]
+    flat = histograms.flatten(1)
+    with torch.no_grad():
+        embedded = learner.distance.head(tested)
+        plain = chi_square(tested, tested)
+        cosine = 1 - embedded @ embedded.T
+        learned = plain / learner.distance.plain_unit + cosine / learner.distance.learned_unit
+    distances = {"plain": plain, "learned": learned}
+    for name, head in (("whitened", WhitenedHead()), ("kernel", KernelHead())):
+        head.fit(flat[train_part], labels[train_part], learner.part_cells)
+        vectors = head(flat[test])
+        distances[name] = 1 - vectors @ vectors.T
+    for name, matrix in distances.items():
+        scores = retrieval_scores(matrix.clamp_min(0), labels[test]).mean()
+        expected = [100 * scores[column] for column in COLUMNS]
+        assert printed[name] == pytest.approx(expected, abs=0.06), name
+
+
+def run_apart(module: str, *arguments: object) -> str:
+    """What a module prints in a process of its own."""
+    command = [sys.executable, "-m", module, *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": f"{PROJECT / 'src'}{os.pathsep}{PROJECT}"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("name", "message"),
     [
-        ("evaluate checkpoint none.ckpt", "No such file or directory: 'none.ckpt'"),
-        (
-            "evaluate checkpoint text.ckpt",
-            "text.ckpt: expected a checkpoint, got another or a damaged file.",
-        ),
-        (
-            "train test --root ROOT --ckpt_path none.ckpt",
-            "ckpt_path: expected a checkpoint, got none.ckpt, which does not exist.",
-        ),
-        (
-            "train fit --root ROOT --ckpt_path none.ckpt",
-            "ckpt_path: expected a checkpoint, got none.ckpt, which does not exist.",
-        ),
-        ("classify ROOT --checkpoint none.ckpt", "No such file or directory: 'none.ckpt'"),
+        ("none.ckpt", "No such file or directory: 'none.ckpt'"),
+        ("text.ckpt", "text.ckpt: expected a checkpoint, got another or a damaged file."),
     ],
 )
-def test_scripts_tell_what_is_wrong_with_a_checkpoint_in_one_sentence(
-    words: str,
-    told: str,
-    root: Path,
+def test_a_file_that_is_no_checkpoint_is_named_in_one_sentence(
+    name: str,
+    message: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.ckpt").write_text("words")
-    script, *given = words.replace("ROOT", str(root)).split()
-    monkeypatch.setattr(sys, "argv", [script, *given])
+    monkeypatch.setattr(sys, "argv", ["evaluate", name])
     with pytest.raises(SystemExit, match="1"):
-        runpy.run_module(f"training.{script}", run_name="__main__")
+        runpy.run_module("training.evaluate", run_name="__main__")
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith("igps: ")
-    assert last.endswith(told)
-
-
-def test_a_missing_checkpoint_to_resume_is_named(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"resume, ckpt_path: .*last\.ckpt"):
-        train(root, tmp_path / "none", "--resume", "last")
+    assert last == f"igps: {message}" or last.endswith(message)

@@ -7,10 +7,10 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from training.graded.kinds import KINDS
-from training.graded.rigging import bones_at_rest, limb_rig
-from training.graded.rods import Binding, Rig, Rod, bend, bind, rod_motions
-from training.graded.skinning import (
+from training.shapes.kinds import KINDS
+from training.shapes.rigging import bones_at_rest, limb_rig
+from training.shapes.rods import Binding, Rig, Rod, bend, bind, rod_motions
+from training.shapes.skinning import (
     Motions,
     compose,
     motion,

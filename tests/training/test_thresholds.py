@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from training.studies.thresholds import threshold_at, threshold_between
+from training.calibrate import threshold_at, threshold_between
 
 from igps.duplicates.calibration import Threshold
 

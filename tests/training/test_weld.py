@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
+from docs.benchmarks import weld as weld_module
+from docs.benchmarks.weld import TUBE_FACES, facing_vertices, weld, weld_gap
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
-from training.studies import weld as weld_module
-from training.studies.weld import TUBE_FACES, facing_vertices, weld, weld_gap
 
 from conftest import as_trimesh, horseshoe, surface_genus
 from igps.mesh.errors import MeshError

@@ -23,7 +23,7 @@ def report(
     when they are computed has no picture.
 
     Args:
-        results: folder that igps retrieve, igps compare or python -m training.study robustness wrote (--out).
+        results: folder that igps retrieve or igps compare wrote (--out).
         out: the page; default: report.html in the folder of results.
         meshes: folder of the meshes, if they were moved since.
         explain: paint where each body differs from its nearest; takes seconds per body, and writes explanations.npz

@@ -39,10 +39,9 @@ SCALES: Mapping[str, float] = {
     "geodesic_spectral": 0.0014,
     "spectral_gw": 0.0014,
 }
-"""The median distance between generated bodies of one class, by descriptor, as `training.study scales` prints it."""
+"""The median distance between generated bodies of one class, by descriptor: eight classes of four bodies."""
 
-# Typical distance between individuals of one body, over the scale of the descriptor; `training.study scales` measures
-# such distances
+# Typical distance between generated individuals of one body, over the scale of the descriptor
 _INDIVIDUAL_SHARE = 0.25
 # A difference in size, in logarithms, adds at most _MAX_GAIN times the distance, and half of that at _HALF_SIZE.
 _MAX_GAIN, _HALF_SIZE = 2.0, 0.3

@@ -14,7 +14,7 @@ from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
 
 CALIBRATION = PRETRAINED.with_name("pretrained.calibration.json")
-"""The calibration of `pretrained`, written by training/calibrate.py."""
+"""The file of the calibration of `pretrained`."""
 
 KINDS = {
     "copies": "copies of one body",
@@ -111,7 +111,7 @@ class Calibration:
             expected = f"expected {self.descriptor}, whose distances are calibrated, got {name}"
             raise ValueError(f"descriptor: {expected}. For a gallery, build it with --size ignore.")
         if fingerprint(module) != self.model:
-            remedy = "Make a new calibration with training/calibrate.py"
+            remedy = "Make a new calibration for them"
             raise ValueError(
                 f"{self.descriptor}: its calibration was made for other parameters. {remedy}."
             )
@@ -120,7 +120,7 @@ class Calibration:
             if params[name] != value:
                 raise ValueError(
                     f"{name}: expected {value}, for which {self.descriptor} is calibrated, got {params[name]}. Use the "
-                    "default, or make a new calibration with training/calibrate.py."
+                    "default, or make a new calibration."
                 )
 
     def save(self, path: str | Path) -> None:
@@ -139,7 +139,7 @@ class Calibration:
                 raise ValueError("other quantiles")
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"{path}: expected a calibration as training/calibrate.py writes it ({error})."
+                f"{path}: expected a calibration as `Calibration.save` writes it ({error})."
             ) from error
         return calibration
 

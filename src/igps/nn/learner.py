@@ -122,7 +122,7 @@ class RetrievalLearner(LightningModule):
     ) -> Self:
         """Load a learner as `LightningModule.load_from_checkpoint` does, on the CPU by default.
 
-        A checkpoint of training/train.py contains its configuration; for a checkpoint of another script, pass
+        A checkpoint of a run by Lightning's command line contains its configuration; for another one, pass
         `descriptor=` and `distance=`. No code of the file runs: its configuration may only name classes of this
         library, torch, Lightning, pytorch-metric-learning and the packages in `trusted`.
 

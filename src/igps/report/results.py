@@ -89,8 +89,8 @@ def read_results(folder: Path) -> Results:
     times = {name: (folder / name).stat().st_mtime for name in readers if (folder / name).is_file()}
     if not times:
         raise FileNotFoundError(
-            f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve`, `igps compare` and "
-            "`python -m training.study robustness` write with --out."
+            f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve` and "
+            "`igps compare` write with --out."
         )
     sources, notes, unused = (
         _read_json(folder / MESHES_FILE),

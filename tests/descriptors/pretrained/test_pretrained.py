@@ -11,8 +11,8 @@ import trimesh
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn.functional import normalize
-from training.graded import GradedShapes
-from training.studies.pretraining import save_pretrained
+from training.pretrain import save_pretrained
+from training.shapes import GradedShapes
 
 import igps
 from igps import Mesh, collate

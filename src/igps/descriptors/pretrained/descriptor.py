@@ -25,7 +25,7 @@ from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.histograms.points import PointHistogram
 
 PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
-"""The parameters of `pretrained`, written by training/pretrain.py."""
+"""The file of the parameters of `pretrained`."""
 
 # Indices into `pretrained_parts`. Body heads use parts that bending leaves as they are.
 BODY_PARTS, CLASS_PARTS = (0, 8), (1, 2, 3, 4, 5, 6, 7)
@@ -100,7 +100,7 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
     compared. The model card is in the documentation.
 
     Args:
-        path: the file of parameters that training/pretrain.py wrote.
+        path: the file of parameters.
 
     Raises:
         FileNotFoundError: there is no such file.

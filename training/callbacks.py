@@ -1,0 +1,113 @@
+"""What a training run does at each epoch: it draws numbers that a resumed run draws again, and writes its curve."""
+
+import csv
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+from pytorch_lightning import Callback, LightningModule, Trainer, seed_everything
+
+
+class SeededEpochs(Callback):
+    """Seed each epoch by the seed of the run and the epoch, so that a resumed run draws the same random numbers.
+
+    Numbers are seeded before the shapes of an epoch are drawn, and again before its first step, because opening a
+    loader draws numbers, too. The loader must be created for each epoch, as its sampler has a state. Loading processes
+    (`n_loading_workers`) draw in advance: with them, a resumed run continues with other batches.
+    """
+
+    def __init__(self) -> None:
+        self.state = {"seed": -1, "epoch": 0}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the seed of the run and the next epoch."""
+        return self.state
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the seed and the epoch of the resumed run."""
+        self.state = dict(state_dict)
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Store the seed of a new run, and seed the first epoch."""
+        if self.state["seed"] < 0:
+            self.state["seed"] = torch.initial_seed() % 2**31
+        self._seed()
+
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """Seed the steps of an epoch."""
+        if batch_idx == 0:
+            self._seed()
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Seed the shapes of the next epoch."""
+        self.state = {**self.state, "epoch": trainer.current_epoch + 1}
+        self._seed()
+
+    def _seed(self) -> None:
+        seed_everything(sum(self.state.values()), verbose=False)
+
+
+class TrainingCurve(Callback):
+    """Write mean loss and validation scores of each epoch to `curve.csv` and `curve.svg` in the folder of the run."""
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, float]] = []
+        self._losses: list[float] = []
+        self._scores: dict[str, float] = {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the rows of the epochs so far."""
+        return {"rows": self.rows}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the rows of a checkpoint."""
+        self.rows = list(state_dict["rows"])
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Discard the values of an interrupted epoch."""
+        self._losses, self._scores = [], {}
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Collect the loss of a step."""
+        self._losses.append(float(outputs["loss"]))
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Collect the validation scores."""
+        metrics = trainer.callback_metrics.items()
+        self._scores = {name: float(value) for name, value in metrics if name.startswith("val_")}
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Add the row of the epoch, and write the files."""
+        self.rows.append(
+            {"epoch": trainer.current_epoch, "train_loss": mean(self._losses), **self._scores}
+        )
+        if trainer.is_global_zero:
+            self.write(Path(trainer.default_root_dir))
+
+    def write(self, folder: Path) -> None:
+        """Write the table and the plot."""
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "curve.csv").open("w", newline="") as file:
+            names = {name: None for row in self.rows for name in row}
+            table = csv.DictWriter(file, list(names))
+            table.writeheader()
+            table.writerows(self.rows)
+        epochs = [row["epoch"] for row in self.rows]
+        losses = [row["train_loss"] for row in self.rows]
+        scored = [row for row in self.rows if "val_ft" in row]
+        figure = Figure(figsize=(6, 3.5), layout="constrained")
+        loss_axis = figure.subplots()
+        loss_axis.plot(epochs, losses, "C0")
+        loss_axis.set(xlabel="epoch", ylabel="loss of the training part")
+        if scored:
+            score_axis = loss_axis.twinx()
+            scored_epochs = [row["epoch"] for row in scored]
+            score_axis.plot(scored_epochs, [row["val_ft"] for row in scored], "C1o-")
+            score_axis.set(ylabel="FT of the validation part", ylim=(0, 1))
+        figure.savefig(folder / "curve.svg")

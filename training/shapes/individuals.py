@@ -1,0 +1,117 @@
+"""Individuals of a body: small smooth changes of its surface at rest, like those between people of the same build."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from igps._arrays import Floats, Integers
+from igps.mesh.surface import face_areas
+from training.shapes.bodies import Body, Warp
+
+SHARES = (0.01, 0.05)
+"""Range of the largest displacement of a vertex, in units of √area."""
+
+_N_REGIONS = 4  # regions with local changes, in addition to the global change
+_RADII = (0.08, 0.3)  # range of the radii of regions, in units of √area
+_TRIAL_VERTICES = 2400
+
+
+@dataclass(frozen=True)
+class Change:
+    """A smooth deformation of space: a global warp, and regions that swell or in which limbs grow longer.
+
+    The nearest similarity is subtracted, because a motion or a change of scale does not make another individual.
+    """
+
+    waves: Warp  # the global change
+    centres: Floats  # (L,3) of the regions
+    axes: Floats  # (L,3)
+    radii: Floats  # (L,)
+    swells: Floats  # (L,) strength of the growth perpendicular to the axis
+    grows: Floats  # (L,) strength of the growth along the axis, beyond the centre
+    similarity: Floats  # (7,) coefficients of the subtracted similarity, see `_similarity_basis`
+    step: float  # factor of the whole change
+
+    @classmethod
+    def draw(
+        cls,
+        rng: np.random.Generator,
+        vertices: Floats,
+        faces: Integers,
+        shares: tuple[float, float],
+    ) -> Change:
+        """Draw a change of a surface, whose largest displacement in units of √area is within `shares`."""
+        size = float(np.sqrt(face_areas(vertices, faces).sum()))
+        low, high = np.log(_RADII)
+        radii = size * np.exp(rng.uniform(low, high, _N_REGIONS))
+        centres, axes = np.empty((_N_REGIONS, 3)), np.empty((_N_REGIONS, 3))
+        for i, seed_vertex in enumerate(rng.integers(len(vertices), size=_N_REGIONS)):
+            region = vertices[np.linalg.norm(vertices - vertices[seed_vertex], axis=1) < radii[i]]
+            centres[i] = region.mean(axis=0)
+            axis = np.linalg.svd(region - centres[i], full_matrices=False)[2][0]
+            axes[i] = axis * np.where(axis @ (centres[i] - vertices.mean(axis=0)) < 0.0, -1.0, 1.0)
+        swells, grows = rng.normal(size=(2, _N_REGIONS)) * rng.uniform(0.2, 1.0, (2, 1))
+        waves = Warp.draw(rng, 2.0 * size, 0.5 * rng.uniform(0.2, 1.0))
+        change = cls(waves, centres, axes, radii, swells, grows, np.zeros(7), 1.0)
+        basis = _similarity_basis(vertices)
+        steps = change(vertices) - vertices
+        similarity = np.linalg.lstsq(basis.reshape(-1, 7), steps.reshape(-1), rcond=None)[0].astype(
+            np.float64
+        )
+        change = replace(change, similarity=similarity)
+        largest = float(np.linalg.norm(change(vertices) - vertices, axis=1).max())
+        return replace(change, step=size * float(np.exp(rng.uniform(*np.log(shares)))) / largest)
+
+    def __call__(self, points: Floats) -> Floats:
+        steps = self.waves(points) - points
+        for centre, axis, radius, swell, grow in zip(
+            self.centres, self.axes, self.radii, self.swells, self.grows, strict=True
+        ):
+            positions = points - centre
+            along = positions @ axis
+            across = positions - along[:, None] * axis
+            distances = np.linalg.norm(across, axis=1)
+            near = np.exp(-0.5 * (distances**2 + along**2) / radius**2)
+            beyond = (
+                radius
+                * np.logaddexp(0.0, along / radius)
+                * np.exp(-0.5 * (distances / radius) ** 2)
+            )
+            steps = (
+                steps + 0.3 * swell * near[:, None] * across + 0.15 * grow * beyond[:, None] * axis
+            )
+        return points + self.step * (steps - _similarity_basis(points) @ self.similarity)
+
+
+@dataclass(frozen=True)
+class ChangedWarp:
+    """A deformation of space, followed by a change."""
+
+    first: Callable[[Floats], Floats]
+    second: Change
+
+    def __call__(self, points: Floats) -> Floats:
+        return self.second(self.first(points))
+
+
+def individual(body: Body, rng: np.random.Generator, shares: tuple[float, float] = SHARES) -> Body:
+    """Draw an individual of a body: the body with a `Change` of its surface at rest."""
+    vertices, faces = body.surface(_TRIAL_VERTICES, np.eye(3))
+    return replace(
+        body, warp=ChangedWarp(body.warp, Change.draw(rng, body.warp(vertices), faces, shares))
+    )
+
+
+def _similarity_basis(points: Floats) -> Floats:
+    """(P,3,7) displacements of points (P,3) by translations, infinitesimal rotations, and scaling."""
+    x, y, z = points.T
+    zero = np.zeros(len(points))
+    turns = np.stack(
+        [np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], axis=2
+    )
+    return np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(points), 3, 3)), turns, points[:, :, None]], axis=2
+    )

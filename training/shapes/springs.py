@@ -1,0 +1,76 @@
+"""Springs: a wire around a helix, and its builder."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from igps._arrays import Floats
+from igps.shapes.skeleton import Part, Skeleton
+from igps.shapes.solids import Blob, Solid, Vector
+from training.shapes.polygons import Prism
+
+
+@dataclass(frozen=True)
+class Helix(Solid):
+    """A tube of radius `tube` along a helix about z that starts at (radius, 0, 0); turns are `pitch` apart."""
+
+    radius: float
+    pitch: float
+    turns: float
+    tube: float
+
+    def at(self, share: float) -> Vector:
+        """Return the point of the centre line at a share of its length."""
+        angle = 2.0 * np.pi * self.turns * share
+        return (
+            self.radius * float(np.cos(angle)),
+            self.radius * float(np.sin(angle)),
+            self.pitch * self.turns * share,
+        )
+
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        slope = self.pitch / (2.0 * np.pi * self.radius)
+        here = np.arctan2(y, x) / (2.0 * np.pi)
+        squared = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), np.inf)
+        base = np.round(z / self.pitch - here)
+        for step in (-1.0, 0.0, 1.0):  # the nearest turn, and the turns below and above
+            turn = here + base + step
+            # The nearest point of the helix is shifted along the wire from the point at the same angle.
+            turn = turn + (z - turn * self.pitch) * slope / (1.0 + slope**2) / (
+                2.0 * np.pi * self.radius
+            )
+            turn = np.clip(turn, 0.0, self.turns)
+            angle = 2.0 * np.pi * turn
+            gap = (x - self.radius * np.cos(angle)) ** 2 + (y - self.radius * np.sin(angle)) ** 2
+            squared = np.minimum(squared, gap + (z - turn * self.pitch) ** 2)
+        for end in (0.0, 1.0):
+            cx, cy, cz = self.at(end)
+            squared = np.minimum(squared, (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
+        return np.sqrt(squared) - self.tube
+
+    def box(self) -> tuple[Floats, Floats]:
+        wide = self.radius + self.tube
+        return np.array([-wide, -wide, -self.tube]), np.array(
+            [wide, wide, self.pitch * self.turns + self.tube]
+        )
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        return Helix(
+            self.radius * length,
+            self.pitch * length,
+            self.turns,
+            min(self.tube * thick, 0.4 * self.pitch),
+        )
+
+    def factors(self, thick: float, length: float) -> Floats:
+        return np.full(3, length)
+
+
+def coil(g: np.random.Generator, turns: float, end: str) -> Skeleton:
+    """Build a spring: a wire wound around z, with or without parts at its ends."""
+    solid = Helix(g.uniform(0.4, 0.6), g.uniform(0.34, 0.46), turns, g.uniform(0.1, 0.125))
+    children: tuple[Part, ...] = ()
+    if end != "plain":
+        end_solid = {"knob": Blob((0.2, 0.2, 0.2)), "disc": Prism(16, 0.3, 0.2, 0.07)}[end]
+        children = tuple(Part(end_solid, "end", at=solid.at(share)) for share in (0.0, 1.0))
+    return Skeleton(Part(solid, "coil", children=children))

@@ -1,1 +1,0 @@
-"""Studies of the library: what damage and movement do to descriptions, and the figures of the paper."""
