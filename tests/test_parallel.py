@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 import jobs
-from igps._parallel import Failed, Limits, MachineError, run
+from igps._failures import Failed, Limits, MachineError
+from igps._parallel import run
 
 GIB = 2**30
 LINUX = sys.platform == "linux"
@@ -111,20 +112,19 @@ def test_workers_leave_it_to_their_parent_while_they_start(tmp_path: Path) -> No
     script = tmp_path / "script.py"
     script.write_text(
         "import os, signal\n"
-        "from igps._workers import Worker\n"
+        "from igps._failures import Limits\n"
+        "from igps._parallel import run\n"
         "if __name__ == '__mp_main__':\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
         "if __name__ == '__main__':\n"
-        "    worker = Worker(None)\n"
-        "    print(worker.submit(abs, -7).result())\n"
-        "    worker.end()\n"
+        "    print(*run(abs, [-7], limits=Limits(seconds=100)))\n"
         "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in jobs in the background
         "    os.kill(os.getpid(), signal.SIGINT)\n"
     )
     done = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, check=False
     )
-    assert done.stdout == "7\n"
+    assert done.stdout == "(0, 7)\n"
     assert done.stderr.count("Traceback") == 1  # the script's own
     assert "KeyboardInterrupt" in done.stderr
 
@@ -265,7 +265,9 @@ def test_impossible_limits_are_refused(name: str, options: dict[str, int]) -> No
 def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
-        "from igps._parallel import Limits, run\nlist(run(abs, [1], limits=Limits(seconds=9)))\n"
+        "from igps._failures import Limits\n"
+        "from igps._parallel import run\n"
+        "list(run(abs, [1], limits=Limits(seconds=9)))\n"
     )
     told = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False
@@ -291,7 +293,7 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
         "import os, signal, sys\n"
         f"sys.path.append({str(Path(jobs.__file__).parent)!r})\n"
         "import jobs\n"
-        "from igps._parallel import Limits, run\n"
+        "from igps._failures import Limits\nfrom igps._parallel import run\n"
         "if __name__ == '__main__':\n"
         "    for _, (worker, _) in run(jobs.process, [0], limits=Limits(seconds=100)):\n"
         "        print(worker, flush=True)\n"

@@ -12,8 +12,9 @@ import igps
 PACKAGE = Path(igps.__file__).parent
 # From the ground up. A room imports only from the floors below its own, and itself; a new room is one more name here.
 FLOORS = (
-    ("_arrays", "_files", "_parameters", "_threads", "_compiled", "_workers"),
-    ("spectra", "retrieval", "_parallel"),
+    ("_arrays", "_failures", "_files", "_parameters", "_threads", "_compiled"),
+    ("_workers",),
+    ("_parallel", "spectra", "retrieval"),
     ("mesh",),
     ("fields",),
     ("signature",),
@@ -32,6 +33,7 @@ FLOORS = (
 FILES = (
     "_arrays",
     "_compiled",
+    "_failures",
     "_files",
     "_parallel",
     "_parameters",

@@ -91,10 +91,12 @@ def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 def _numba() -> ModuleType:
     """Import Numba. A fork waits until no thread compiles, because a lock that is held stays locked in the child."""
     import numba
-    from numba.core.compiler_lock import global_compiler_lock as lock
+    from numba.core.compiler_lock import global_compiler_lock
 
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(
-            before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release
+            before=global_compiler_lock.acquire,
+            after_in_parent=global_compiler_lock.release,
+            after_in_child=global_compiler_lock.release,
         )
     return numba

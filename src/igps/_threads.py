@@ -8,67 +8,69 @@ while they wait (`igps._parallel.on_threads`).
 """
 
 import contextlib
+import math
 import os
 import sys
 import threading
-from _thread import start_new_thread
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from functools import lru_cache, partial
-from queue import SimpleQueue
+from functools import lru_cache
+from pathlib import Path
 from typing import Any, Self, TypeVar
 
-import joblib
 import threadpoolctl
 import torch
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
+# Where Linux tells a container its share of the processor: microseconds of work in a period, and the period.
+CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+
 
 def n_cores() -> int:
     """Return the number of cores that the CPU affinity of this process and the quota of its container allow."""
-    return joblib.cpu_count()
+    n_visible = os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        n_visible = len(os.sched_getaffinity(0))
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = CPU_QUOTA.read_text().split()
+        if quota != "max":
+            return min(n_visible, math.ceil(int(quota) / int(period)))
+    return n_visible
 
 
 def n_threads() -> int:
     """Return the number of Python threads for a call: the cores, but at most torch's threads outside `one_thread`."""
     if _state.max_threads is not None:
         return _state.max_threads
-    n_torch = _get_torch_threads()
-    return (
-        min(n_cores(), n_torch) if n_torch > 1 else n_torch
-    )  # `n_cores` is slow, as it reads files
+    return min(n_cores(), torch.get_num_threads())
 
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Make torch, NumPy and SciPy use one thread in this thread, and restore their numbers of threads afterwards.
 
-    Other Python threads, also those started meanwhile, keep their number of torch threads. NumPy and SciPy have one
-    setting for the whole process, which the last thread that leaves the context restores.
+    Python threads that use torch for the first time meanwhile have one thread, too. NumPy and SciPy have one setting
+    for the whole process, which the last thread that leaves the context restores.
     """
     outside = _state.max_threads
+    n_torch = torch.get_num_threads()
     _state.max_threads = n_threads()
-    before = _get_torch_threads()
     try:
         with _blas_on_one_thread():
-            if before > 1:
-                _set_torch_threads(1)
+            if n_torch > 1:
+                torch.set_num_threads(1)
             yield
     finally:
-        if (
-            before > 1
-        ):  # do not check what torch reports: it may be MKL's number, while new Python threads get one
-            _set_torch_threads(before)
+        if n_torch > 1:
+            torch.set_num_threads(n_torch)
         _state.max_threads = outside
 
 
 def stay_on_one_thread() -> None:
-    """Make torch use one thread in this Python thread until it ends, and let `n_threads` return 1 there."""
+    """Let `n_threads` return 1 in this Python thread until it ends."""
     _state.max_threads = 1
-    if _get_torch_threads() > 1:
-        _set_torch_threads(1)
 
 
 class Team:
@@ -85,7 +87,7 @@ class Team:
 
     def __enter__(self) -> Self:
         if self.n_threads > 1:
-            self._pool = ThreadPoolExecutor(self.n_threads - 1, initializer=stay_on_one_thread)
+            self._pool = ThreadPoolExecutor(self.n_threads - 1, initializer=_compute_on_one_thread)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -129,83 +131,43 @@ class _ThreadState(threading.local):
 _state = _ThreadState()
 
 
-def _at_fork(**hooks: Callable[[], object]) -> None:
-    if hasattr(os, "register_at_fork"):
-        os.register_at_fork(**hooks)
-
-
-def _fork_safe_lock() -> threading.Lock:
-    """Return a lock for which a fork waits, because a lock that is held during a fork stays locked in the child."""
-    lock = threading.Lock()
-    _at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release)
-    return lock
+def _compute_on_one_thread() -> None:
+    stay_on_one_thread()
+    torch.set_num_threads(1)
 
 
 class ProcessSetting:
     """Context that changes a setting of the whole process, and that many threads can use at the same time.
 
     The first thread that enters calls `change`. The last thread that leaves calls the function that `change` returned,
-    which restores the setting. In a forked child, only the thread that forked exists, and only that thread counts.
+    which restores the setting. A fork waits for the lock, because a lock that is held stays locked in the child.
     """
 
     def __init__(self, change: Callable[[], Callable[[], None]]) -> None:
         self._change = change
-        self._lock = _fork_safe_lock()
-        self._users: list[int] = []
+        self._lock = threading.Lock()
+        self._n_users = 0
         self._restore: Callable[[], None] | None = None
-        _at_fork(after_in_child=lambda: self._forget_others(threading.get_ident()))
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(
+                before=self._lock.acquire,
+                after_in_parent=self._lock.release,
+                after_in_child=self._lock.release,
+            )
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
-        user = threading.get_ident()
         with self._lock:
-            if not self._users:
+            if self._n_users == 0:
                 self._restore = self._change()
-            self._users.append(user)
+            self._n_users += 1
         try:
             yield
         finally:
             with self._lock:
-                self._users.remove(user)
-                self._restore_if_unused()
-
-    def _forget_others(self, user: int) -> None:
-        self._users = [ident for ident in self._users if ident == user]
-        self._restore_if_unused()
-
-    def _restore_if_unused(self) -> None:
-        if not self._users and self._restore is not None:
-            self._restore()
-            self._restore = None
-
-
-_torch_threads = _fork_safe_lock()
-
-
-def _get_torch_threads() -> int:
-    """Return the torch threads of this Python thread, but not while `_set_torch_threads` sets those of another."""
-    with _torch_threads:
-        return torch.get_num_threads()
-
-
-def _set_torch_threads(n: int) -> None:
-    """Set the number of torch threads of this Python thread only.
-
-    `torch.set_num_threads` also sets the default for threads that have not computed yet. A new thread restores it.
-    """
-    with _torch_threads, contextlib.ExitStack() as afterwards:
-        with contextlib.suppress(RuntimeError):  # the system starts no more threads
-            default = _in_new_thread(torch.get_num_threads)
-            afterwards.callback(_in_new_thread, partial(torch.set_num_threads, default))
-        torch.set_num_threads(n)
-
-
-def _in_new_thread(function: Callable[[], Result]) -> Result:
-    results: SimpleQueue[Result] = SimpleQueue()
-    start_new_thread(
-        lambda: results.put(function()), ()
-    )  # `Thread.start` would wait until the thread runs
-    return results.get()
+                self._n_users -= 1
+                if self._n_users == 0 and self._restore is not None:
+                    self._restore()
 
 
 @lru_cache(maxsize=1)

@@ -21,7 +21,7 @@ from damaged_files import (
     write_soup,
     write_unusable,
 )
-from igps._parallel import Limits
+from igps._failures import Limits
 from igps.analysis.doctor import Finding, examine, expected_cost
 from igps.data.sources import find_bodies
 from igps.fields.volumes.label_measures import VoxelMeasures, _squared_distances, thinnest_part

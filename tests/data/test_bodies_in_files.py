@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 import igps.data.pipeline as pipeline_module
-from igps._parallel import Limits
+from igps._failures import Limits
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import compute
 from igps.data.sources import Bodies, bodies_of_files, find_bodies

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from bodies_on_disk import write_body
 
-from igps._parallel import MachineError
+from igps._failures import MachineError
 from igps.cli import main
 from igps.cli.precompute import dask_executor, of_shard
 from igps.data.dataset import SignatureDataset

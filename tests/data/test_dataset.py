@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 
 import igps
 import igps.data.pipeline as pipeline_module
-from igps._parallel import Limits, MachineError
+from igps._failures import Limits, MachineError
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset

@@ -12,8 +12,9 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
+from igps._failures import Failed
 from igps._files import atomic_write
-from igps._parallel import Failed, run
+from igps._parallel import run
 from igps._parameters import check_at_least
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh

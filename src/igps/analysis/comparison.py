@@ -13,7 +13,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps._arrays import Singles
-from igps._parallel import Failed, run
+from igps._failures import Failed
+from igps._parallel import run
 from igps._threads import one_thread
 from igps.data.dataset import Failure, SignatureDataset
 from igps.mesh.errors import MeshError

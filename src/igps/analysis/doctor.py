@@ -8,7 +8,8 @@ from functools import partial
 
 from tqdm import tqdm
 
-from igps._parallel import Failed, Limits, run
+from igps._failures import Failed, Limits
+from igps._parallel import run
 from igps.data.filling import group_by_file
 from igps.data.sources import Bodies, BodyRef
 from igps.fields.volumes.label_measures import VoxelMeasures, measure

@@ -11,7 +11,8 @@ from statistics import NormalDist
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps._parallel import Failed, run
+from igps._failures import Failed
+from igps._parallel import run
 from igps._threads import n_cores
 from igps.analysis.segmentation import (
     Place,

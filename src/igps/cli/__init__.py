@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from docstring_parser import parse
 from jsonargparse import ArgumentParser, Namespace
 
-from igps._parallel import MachineError, is_machine_error, machine_error_text
+from igps._failures import MachineError, is_machine_error, machine_error_text
 from igps._parameters import check_at_least
 from igps._threads import one_thread
 from igps.cli import gallery

@@ -10,7 +10,7 @@ from operator import or_
 from pathlib import Path
 from typing import Any
 
-from igps._parallel import MachineError
+from igps._failures import MachineError
 from igps.cli.reading import Folder, dataset_from_options, limits_of, print_failures, signatures
 from igps.data.pipeline import version
 from igps.data.requirements import Requirements

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from igps._arrays import Floats
-from igps._parallel import Limits
+from igps._failures import Limits
 from igps._parameters import check_positive
 from igps.data.attribute_sources import attribute_sources
 from igps.data.collection import is_collection

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from igps._parallel import Limits
+from igps._failures import Limits
 from igps.data.attributes import AttributeSource, PointFunction, split_attributes, with_attribute
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.cache import SignatureCache, default_cache_dir

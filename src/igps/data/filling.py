@@ -13,7 +13,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from igps._parallel import Failed, Limits, MachineError, run
+from igps._failures import Failed, Limits, MachineError
+from igps._parallel import run
 from igps._threads import n_cores
 from igps.data.cache import SignatureCache
 from igps.data.file_stat_cache import FileStatCache

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from igps._parallel import Failed, MachineError, attempt
+from igps._failures import Failed, MachineError, attempt
 from igps.data.attribute_sources import with_load_options
 from igps.data.attributes import AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache, content_digest

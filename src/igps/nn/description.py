@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from igps._arrays import Singles
-from igps._parallel import Failed, on_threads, run
+from igps._failures import Failed
+from igps._parallel import on_threads, run
 from igps._threads import n_cores, one_thread
 from igps.data.cache import DescriptionCache
 from igps.data.dataset import Failure, SignatureDataset

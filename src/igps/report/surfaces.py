@@ -13,7 +13,9 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
-from igps._parallel import Failed, Job, Result, run
+from igps._failures import Failed
+from igps._parallel import run
+from igps._threads import Job, Result
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
 from igps.mesh.errors import MeshError

@@ -1,0 +1,93 @@
+"""What can go wrong with a job, and whether the job or the machine is at fault."""
+
+import errno
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, CancelledError
+from dataclasses import dataclass
+from typing import TypeVar
+
+Result = TypeVar("Result")
+
+_KILLED_ON_CLUSTER = "several workers that had it were killed. It may need more memory: start workers with more memory."
+_REMEDIES = {
+    "Free disk space": ("ENOSPC", "EDQUOT", "EFBIG"),
+    "Choose a writable folder": ("EROFS", "EACCES", "EPERM"),
+    "Check the disk": ("EIO",),
+    "Raise the limit of open files": ("EMFILE", "ENFILE"),
+    "Free memory": ("ENOMEM",),
+}
+
+
+class MachineError(RuntimeError):
+    """The machine is at fault, not a job: for example, the disk is full. Finished results are kept."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The outcome of a job that failed, with the reason in one sentence."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of one job; None is no limit."""
+
+    seconds: float | None = None  # wall time
+    memory: int | None = None  # bytes of data of the process; enforced only on Linux
+
+    def __post_init__(self) -> None:
+        for name, value in (("time_limit", self.seconds), ("memory_limit", self.memory)):
+            if value is not None and not value > 0:
+                raise ValueError(f"{name}: expected None or a positive number, got {value}.")
+
+
+def is_machine_error(error: OSError) -> bool:
+    """Return whether the machine is at fault, not a single file: a full or broken disk, a missing permission."""
+    return _remedy(error) is not None
+
+
+def machine_error_text(error: OSError) -> str:
+    """Return the message of an error for which `is_machine_error` holds, with a remedy."""
+    return f"{error}. {_remedy(error)} and run again: finished results are kept."
+
+
+def _remedy(error: OSError) -> str | None:
+    name = errno.errorcode.get(error.errno or 0)
+    for remedy, names in _REMEDIES.items():
+        if name in names:
+            return remedy
+    return None
+
+
+def attempt(function: Callable[[], Result], limits: Limits = Limits()) -> Result | Failed:
+    """Return the result or the failure of a job; raise a MachineError if the machine is at fault."""
+    try:
+        return function()
+    except (BrokenExecutor, CancelledError, MachineError):
+        raise
+    except MemoryError as error:
+        if limits.memory is not None:
+            return Failed(
+                f"it needs more than the memory_limit of {limits.memory / 2**20:.0f} MiB."
+            )
+        raise MachineError(
+            "out of memory. Use fewer workers or a memory limit: finished results are kept."
+        ) from error
+    except ImportError as error:
+        raise MachineError(
+            f"{str(error).rstrip('.')}. Install it and run again: finished results are kept."
+        ) from error
+    except OSError as error:
+        if is_machine_error(error):
+            raise MachineError(machine_error_text(error)) from error
+        return Failed(_sentence(error))
+    except Exception as error:
+        # Dask raises KilledWorker after several workers died with the same job.
+        return Failed(
+            _KILLED_ON_CLUSTER if type(error).__name__ == "KilledWorker" else _sentence(error)
+        )
+
+
+def _sentence(error: Exception) -> str:
+    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
