@@ -19,7 +19,7 @@ from sklearn.utils.estimator_checks import check_estimator
 from igps.data.dataset import SignatureDataset
 from igps.descriptors.interior import interior
 from igps.descriptors.literature.d2 import D2
-from igps.descriptors.molecular import SizedHistograms
+from igps.descriptors.sized_histograms import SizedHistograms
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions

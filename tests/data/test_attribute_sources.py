@@ -19,15 +19,14 @@ from bodies_on_disk import write_body
 import igps.data.pipeline as pipeline_module
 from igps.data.attribute_sources import (
     FileAttribute,
-    ImageAttribute,
-    ResidueAttribute,
-    TetAttribute,
-    VertexAttribute,
     attribute_source,
     attribute_sources,
     fill_missing,
 )
 from igps.data.dataset import SignatureDataset
+from igps.fields.meshes.vertex_attributes import TetAttribute, VertexAttribute
+from igps.fields.molecules.residue_attributes import ResidueAttribute
+from igps.fields.volumes.image_attribute import ImageAttribute
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.options import BodyKind, LoadOptions

@@ -10,11 +10,11 @@ import torch
 import trimesh
 
 import igps
-from igps.data.attribute_sources import ImageAttribute
 from igps.data.dataset import SignatureDataset
 from igps.descriptors.pretrained.descriptor import pretrained_parts
 from igps.descriptors.registry import descriptor
 from igps.descriptors.with_attributes import WithAttributes
+from igps.fields.volumes.image_attribute import ImageAttribute
 from igps.nn import fit_centres
 from igps.nn.description import describe
 from igps.retrieval import chi_square, retrieval_scores

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.datamodule import SignatureDataModule
-from igps.descriptors.molecular import molecular
+from igps.fields.molecules.molecular import molecular
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor

@@ -1,4 +1,6 @@
-"""Attribute sources: images and grids, values at vertices or in tetrahedra, residues of a molecule.
+"""Attribute sources that read files, and how a name or a suffix finds its source.
+
+Each field lists its kinds of sources in `ATTRIBUTES` of its package.
 
 A value is missing if the sample lies more than half a voxel outside the image, or if the value is not finite or at
 least 10¹⁵ in size. A missing value is replaced by the value of the nearest sample that has one, and the number of
@@ -9,87 +11,28 @@ import contextlib
 import logging
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from igps._arrays import Booleans, Floats
-from igps._parameters import check_one_of
 from igps.data.attributes import AttributeSource
 from igps.data.cache import content_digest
-from igps.fields.meshes import brains, vertex_values
-from igps.fields.molecules.molecule import Molecule
-from igps.fields.molecules.residue_attributes import RESIDUE_ATTRIBUTES, residue_attribute
-from igps.fields.molecules.structures import MoleculeBodies, is_structure, molecules_by_part
-from igps.fields.volumes import images
 from igps.mesh.errors import MeshError
-from igps.mesh.formats import dependencies_of, stat_key
-from igps.mesh.loading import BodyRef, load_mesh, read_surface
+from igps.mesh.formats import dependencies_of, field_packages, stat_key
+from igps.mesh.loading import BodyRef
 from igps.mesh.options import LoadOptions
-from igps.signature.mean_value import extend
 
 logger = logging.getLogger(__name__)
 
 _MAX_VALUE = 1e15  # larger values are placeholders for missing values, such as 7e18 at the border of some grids
 _MAX_MISSING_SHARE = 0.1
-_TOLERANCE = 0.05  # share of its height by which a point may lie outside a tetrahedron: rounding, curved surfaces
-
-
-@dataclass(frozen=True)
-class ResidueAttribute:
-    """An attribute of the residues of a molecule, one of `RESIDUE_ATTRIBUTES`."""
-
-    name: str
-
-    def __post_init__(self) -> None:
-        check_one_of(RESIDUE_ATTRIBUTES, attribute=self.name)
-
-    def cache_tag(self, body: BodyRef) -> str:
-        """Return the name. The molecule is the body's own file, which is part of the key of its Signature."""
-        return f"residues 1 {self.name}"
-
-    def __call__(self, body: BodyRef, points: Floats) -> Floats:
-        """Return values (P,) or (P, C) at points (P, 3), Å; raise a MeshError if the body has no such values."""
-        if not is_structure(body.path):
-            raise MeshError(
-                f"{body}: expected a PDB, mmCIF or PQR file for {self.name!r}. Choose another descriptor."
-            )
-        values = residue_attribute(_molecule(body), points, self.name)
-        if np.isnan(values).all():
-            raise MeshError(
-                f"{body}: {self.name!r} is defined for none of its residues. Choose another descriptor."
-            )
-        return fill_missing(values, points, f"{body}: {self.name}")
-
-
-def _molecule(body: BodyRef) -> Molecule:
-    """Return the atoms and residues of a body: of a chain, an assembly or a model, or of all models."""
-    part, stamp = body.part or "", stat_key(body.path)
-    words = part.split()  # in a file of several structures, the first is the name of a structure
-    kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
-    for kind in (*(kinds[word] for word in kinds if word in words), "models"):
-        molecules = molecules_by_part(body.path, stamp, kind)
-        if part in molecules:
-            return molecules[part]
-    models = list(molecules.values())
-    fields = ("positions", "radii", "charges", "residue_positions", "b_factors")
-    arrays: dict[str, Any] = {
-        field: np.concatenate([getattr(model, field) for model in models]) for field in fields
-    }
-    starts = np.cumsum([0, *(len(model.residue_names) for model in models)])
-    arrays["residue_of"] = np.concatenate(
-        [model.residue_of + i for model, i in zip(models, starts, strict=False)]
-    )
-    return replace(
-        models[0], residue_names=tuple(name for m in models for name in m.residue_names), **arrays
-    )
 
 
 @dataclass(frozen=True)
@@ -131,6 +74,10 @@ class FileAttribute(ABC):
                 f"{' '.join(str(error).split())}). Check that it is complete and that its suffix fits its format."
             ) from error
         return fill_missing(values, points, f"{body}: {file}")
+
+    def reading_by(self, options: LoadOptions) -> Self:
+        """Return a source that reads the body's own file by these options, if it does read it."""
+        return self
 
     @abstractmethod
     def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
@@ -188,136 +135,45 @@ def _checksum(*files: Path, stamp: tuple[int, int, int]) -> str:
 
 
 @dataclass(frozen=True)
-class ImageAttribute(FileAttribute):
-    """Values of an image or grid, interpolated linearly between the centres of voxels.
+class SourceKind:
+    """A kind of attribute sources."""
 
-    NIfTI, MGH, NRRD and MetaImage are in world coordinates (RAS, millimetres); OpenDX, MRC and CCP4 in ångström.
-    """
-
-    def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
-        grid, affine = images.read(file, stat_key(*dependencies_of(file)))
-        indices = (brains.in_scanner(body.path, points) - affine[:3, 3]) @ np.linalg.inv(
-            affine[:3, :3]
-        ).T
-        size = np.array(grid.shape)
-        inside = ((indices > -0.5) & (indices < size - 0.5)).all(axis=1)
-        values = np.full(len(points), np.nan)
-        if not inside.any():
-            return values
-        # A large image is converted only where it is needed
-        low = np.clip(np.floor(indices[inside].min(axis=0)).astype(int), 0, size - 1)
-        high = np.clip(np.ceil(indices[inside].max(axis=0)).astype(int), 0, size - 1)
-        block = grid[tuple(map(slice, low, high + 1))].astype(np.float64)
-        known = _is_known(block)
-        interpolate = partial(
-            map_coordinates, coordinates=(indices[inside] - low).T, order=1, mode="nearest"
-        )
-        weight, sums = (
-            interpolate(known.astype(np.float64)),
-            interpolate(np.where(known, block, 0.0)),
-        )
-        values[inside] = np.where(weight > 0.5, sums / np.maximum(weight, 0.5), np.nan)
-        return values
-
-
-@dataclass(frozen=True)
-class VertexAttribute(FileAttribute):
-    """Values at the vertices of the body's file, extended to the interior by mean value coordinates.
-
-    Formats are PLY, VTK (.vtk, .vtp), GIFTI (.shape.gii, .func.gii) and FreeSurfer (lh.thickness, lh.curv). The file
-    has one value for each vertex of the body before mending, or of the whole file if bodies are its pieces or objects.
-    A vertex that mending created gets the value at the nearest point of the original surface.
-    """
-
-    reading: LoadOptions = LoadOptions()
-
-    def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
-        import igl
-
-        if file.name.lower().endswith(
-            images.SUFFIXES
-        ):  # if the pattern ends in {file}, the suffix is known only here
-            return ImageAttribute(self.path, self.root).values(body, file, name, points)
-        raw = read_surface(body.path, self.reading, part=body.part)
-        values = vertex_values.chosen(vertex_values.read(file), name, file)
-        if len(values) != (n_own := len(raw.vertices)) and self.reading.bodies in (
-            "pieces",
-            "objects",
-        ):
-            raw = read_surface(body.path, replace(self.reading, bodies="whole"))
-        if len(values) != len(raw.vertices):
-            whole = f" ({len(raw.vertices)} in the whole file)" * (len(raw.vertices) != n_own)
-            raise MeshError(
-                f"{body}: {file} has {len(values)} values for {n_own} vertices{whole}. Give one for each."
-            )
-        columns = fill_missing(values.reshape(len(values), -1), raw.vertices, str(file))
-        mesh = load_mesh(body.path, self.reading, part=body.part)
-        if not np.array_equal(mesh.vertices, raw.vertices):
-            faces = np.ascontiguousarray(raw.faces)
-            _, face, nearest = igl.point_mesh_squared_distance(
-                mesh.vertices, np.ascontiguousarray(raw.vertices), faces
-            )
-            corners = [np.ascontiguousarray(raw.vertices[faces[face, i]]) for i in range(3)]
-            weights = np.nan_to_num(
-                igl.barycentric_coordinates(np.ascontiguousarray(nearest), *corners), nan=1 / 3
-            )
-            columns = np.einsum("vi,vid->vd", weights, columns[faces[face]])
-        return extend(mesh.vertices, mesh.faces, columns, points).reshape(
-            len(points), *values.shape[1:]
-        )
-
-
-@dataclass(frozen=True)
-class TetAttribute(FileAttribute):
-    """Values at the vertices of a tetrahedral mesh (.vtu), interpolated linearly in each tetrahedron."""
-
-    def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
-        vertices, tetrahedra, arrays = vertex_values.read_tetrahedra(file)
-        at_vertices = vertex_values.chosen(arrays, name, file)
-        corners = vertices[tetrahedra]
-        edges = corners[:, 1:] - corners[:, :1]
-        is_solid = np.abs(np.linalg.det(edges)) > 0
-        corners, tetrahedra, edges = corners[is_solid], tetrahedra[is_solid], edges[is_solid]
-        inverse = np.linalg.inv(edges)
-        # Tetrahedron of each point, barycentric coordinates in it, and the smallest of them, which is negative outside
-        n = len(points)
-        owner, weights, smallest = np.zeros(n, int), np.zeros((n, 4)), np.full(n, -np.inf)
-        # No point of a tetrahedron is farther from its centre than a corner
-        centres = corners.mean(axis=1)
-        radius = np.linalg.norm(corners - centres[:, None], axis=2).max()
-        for i, near in enumerate(
-            cKDTree(centres).query_ball_point(points, radius * (1 + _TOLERANCE))
-        ):
-            if near:
-                last_three = np.einsum("td,tde->te", points[i] - corners[near, 0], inverse[near])
-                barycentric = np.column_stack([1 - last_three.sum(axis=1), last_three])
-                best = int(np.argmax(barycentric.min(axis=1)))
-                smallest[i], weights[i], owner[i] = (
-                    barycentric[best].min(),
-                    barycentric[best],
-                    near[best],
-                )
-        values = np.einsum(
-            "pi,pi...->p...", weights, at_vertices[tetrahedra[owner]].astype(np.float64)
-        )
-        values[smallest < -_TOLERANCE] = np.nan
-        return values
+    make: Callable[[str, Path | None], AttributeSource]  # of a name, or of a pattern and its root
+    names: tuple[str, ...] = ()  # attributes that the file of a body itself gives
+    suffixes: tuple[str, ...] = ()  # of files with values, in lower case; "" for all other files
 
 
 def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
-    """Return the source for the name of a residue attribute, or for a pattern of paths by its suffix."""
-    name = path.partition("#")[0].lower()
-    if path in RESIDUE_ATTRIBUTES:
-        return ResidueAttribute(path)
-    if name.endswith(images.SUFFIXES):
-        return ImageAttribute(path, root)
-    return (TetAttribute if name.endswith(".vtu") else VertexAttribute)(path, root)
+    """Return the source for the name of an attribute, or for a pattern of paths by its suffix."""
+    named = named_source(path)
+    if named is not None:
+        return named
+    file = path.partition("#")[0].lower()
+    matches: dict[str, SourceKind] = {}
+    for kind in _source_kinds():
+        matches |= {suffix: kind for suffix in kind.suffixes if file.endswith(suffix)}
+    if not matches:
+        raise ValueError(f"attribute: no installed field reads {path!r}. Check its suffix.")
+    return matches[max(matches, key=len)].make(path, root)
+
+
+def named_source(name: str) -> AttributeSource | None:
+    """Return the source of an attribute that the file of a body itself gives; None if no field has the name."""
+    for kind in _source_kinds():
+        if name in kind.names:
+            return kind.make(name, None)
+    return None
+
+
+def _source_kinds() -> list[SourceKind]:
+    return [kind for field in field_packages() for kind in getattr(field, "ATTRIBUTES", ())]
 
 
 def with_load_options(source: AttributeSource, options: LoadOptions) -> AttributeSource:
-    """Return a `VertexAttribute` with these options, but with open surfaces closed; return others unchanged."""
-    closed = replace(options, allow_open=False, mend="auto")
-    return replace(source, reading=closed) if isinstance(source, VertexAttribute) else source
+    """Return a source that reads the body itself by these options, but with open surfaces closed."""
+    if not isinstance(source, FileAttribute):
+        return source
+    return source.reading_by(replace(options, allow_open=False, mend="auto"))
 
 
 def attribute_sources(definitions: Sequence[str], root: Path | None) -> dict[str, AttributeSource]:
@@ -338,7 +194,7 @@ def fill_missing(values: Floats, points: Floats, label: str) -> Floats:
 
     The number of replaced values is logged. A MeshError is raised if more than a tenth of the values are missing.
     """
-    known = np.asarray(_is_known(values.reshape(len(points), -1)).all(axis=1))
+    known = np.asarray(is_known(values.reshape(len(points), -1)).all(axis=1))
     n_missing = int((~known).sum())
     if n_missing > _MAX_MISSING_SHARE * len(known):
         low, high = (
@@ -359,5 +215,6 @@ def fill_missing(values: Floats, points: Floats, label: str) -> Floats:
     return values
 
 
-def _is_known(values: NDArray[Any]) -> Booleans:
+def is_known(values: NDArray[Any]) -> Booleans:
+    """Return which values are finite and no placeholders for missing values."""
     return np.isfinite(values) & (np.abs(values) < _MAX_VALUE)

@@ -30,7 +30,7 @@ _LIBRARY: Mapping[str, str] = {
     "canonical_form": "igps.descriptors.literature.canonical_form:CanonicalForm",
     "geodesic_spectral": "igps.descriptors.literature.geodesic_spectral:GeodesicSpectral",
     "spectral_gw": "igps.descriptors.literature.spectral_gw:SpectralGromovWasserstein",
-    "molecular": "igps.descriptors.molecular:molecular",
+    "molecular": "igps.fields.molecules.molecular:molecular",
 }
 
 # "molecular" needs attributes that only molecules have

@@ -16,8 +16,8 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.molecular import SizedHistograms
 from igps.descriptors.size_and_side import SizeAndSide
+from igps.descriptors.sized_histograms import SizedHistograms
 from igps.nn.description import check_centres, describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, Head, WhitenedHead

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from igps.mesh.errors import MeshError
@@ -20,7 +21,7 @@ from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.raw_body import RawBody
 
 FIELDS = ("meshes", "cad", "volumes", "molecules")
-"""Packages of `igps.fields`, each with a tuple `FORMATS`."""
+"""Packages of `igps.fields`, each with a tuple `FORMATS`, and perhaps `ATTRIBUTES`."""
 
 # The start of messages of ITK, which names a line of its source and the address of an object.
 _ITK_PREFIX = re.compile(r"^Exception thrown in SimpleITK .*ERROR: (\w+\(0x\w+\): )?")
@@ -53,14 +54,28 @@ class Format:
 
 
 @cache
+def field_packages() -> tuple[ModuleType, ...]:
+    """Return the packages of `igps.fields`, without those that are not installed."""
+    found = []
+    for field in FIELDS:
+        name = f"igps.fields.{field}"
+        try:
+            found.append(importlib.import_module(name))
+        except ModuleNotFoundError as error:
+            if error.name not in ("igps.fields", name):
+                raise
+    return tuple(found)
+
+
+@cache
 def all_formats() -> tuple[Format, ...]:
     """Return the formats of this package, and of the entry points `igps.formats` of others.
 
     An entry point names a `Format` or a tuple of them. Where suffixes are equal, the format that comes last wins.
     """
     known: list[Format] = []
-    for field in FIELDS:
-        known += importlib.import_module(f"igps.fields.{field}").FORMATS
+    for field in field_packages():
+        known += field.FORMATS
     for entry in entry_points(group="igps.formats"):
         added = entry.load()
         known += (added,) if isinstance(added, Format) else added

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from igps.data.attribute_sources import _molecule
 from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.fields.molecules.molecule import Molecule
 from igps.fields.molecules.residues import VOLUMES
-from igps.fields.molecules.structures import is_structure, read_molecule
+from igps.fields.molecules.structures import is_structure, molecule_of, read_molecule
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef, each_body
 from igps.mesh.mesh import Mesh
@@ -127,7 +126,7 @@ def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path: Path) -> None
         f"{path}#chainless",
     ]
     for part, n_residues in (("chainless chain A", 2), ("chainless", 2), ("one", 1)):
-        assert len(_molecule(BodyRef(path, part)).residue_names) == n_residues
+        assert len(molecule_of(BodyRef(path, part)).residue_names) == n_residues
 
 
 def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Surfaces: files of triangles and polygons, scenes, archives, and values at vertices."""
 
+from igps.data.attribute_sources import SourceKind
 from igps.fields.meshes import (
     archives,
     brains,
@@ -10,6 +11,7 @@ from igps.fields.meshes import (
     scenes,
     stl,
     threemf,
+    vertex_attributes,
     vtk,
 )
 
@@ -28,4 +30,8 @@ FORMATS = (
     brains.FREESURFER,
     archives.ARCHIVE,
     archives.COMPRESSED,
+)
+ATTRIBUTES = (
+    SourceKind(vertex_attributes.TetAttribute, suffixes=(".vtu",)),
+    SourceKind(vertex_attributes.VertexAttribute, suffixes=("",)),
 )

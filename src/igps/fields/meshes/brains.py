@@ -111,9 +111,9 @@ def in_scanner(path: Path, points: Floats) -> Floats:
     FreeSurfer's triangle files have their origin in the centre of a volume, whose position and axes stand at the end of
     the file. The points of other files are returned unchanged: they are in the coordinates of images.
     """
-    content = path.read_bytes()
-    if not content.startswith(_MAGIC):
+    if not path.is_file() or not _has_magic(path):
         return points
+    content = path.read_bytes()
     at = content.find(b"\n\n") + 2
     tail = content[at + 8 + 12 * int(np.frombuffer(content, ">i4", 2, at).sum()) :]
     axes = np.array(_VOLUME_AXES.findall(tail), dtype=np.float64)  # and the centre, (4, 3)
@@ -128,8 +128,11 @@ def is_freesurfer(path: Path) -> bool:
     FreeSurfer 7 and FastSurfer write many endings, such as lh.pial.T1 and lh.white.preaparc, and also maps of values
     on the surface (lh.thickness), which begin with other bytes.
     """
-    if not path.name.lower().startswith(_SIDES) or not path.is_file():
-        return False
+    is_named_so = path.name.lower().startswith(_SIDES)
+    return is_named_so and path.is_file() and _has_magic(path)
+
+
+def _has_magic(path: Path) -> bool:
     with path.open("rb") as file:
         return file.read(len(_MAGIC)) == _MAGIC
 

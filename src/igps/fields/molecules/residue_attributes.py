@@ -5,13 +5,19 @@ defined everywhere inside, and change little when atoms move.
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats
+from igps._parameters import check_one_of
+from igps.data.attribute_sources import fill_missing
 from igps.fields.molecules.molecule import Molecule
 from igps.fields.molecules.residues import ACCEPTORS, AROMATIC, DONORS, HYDROPATHY, VOLUMES
+from igps.fields.molecules.structures import is_structure, molecule_of
+from igps.mesh.errors import MeshError
+from igps.mesh.loading import BodyRef
 
 RESIDUE_KINDS = (*sorted(VOLUMES), "A", "C", "G", "U", "other")
 """Amino acids, bases of nucleotides (U includes T), and all other residues."""
@@ -119,3 +125,30 @@ RESIDUE_ATTRIBUTES: tuple[str, ...] = (*_COLUMNS, "screened_potential")
 def _blocks(n_points: int, n_others: int) -> list[slice]:
     step = max(_BLOCK_SIZE // max(n_others, 1), 1)
     return [slice(start, start + step) for start in range(0, n_points, step)]
+
+
+@dataclass(frozen=True)
+class ResidueAttribute:
+    """An attribute of the residues of a molecule, one of `RESIDUE_ATTRIBUTES`."""
+
+    name: str
+
+    def __post_init__(self) -> None:
+        check_one_of(RESIDUE_ATTRIBUTES, attribute=self.name)
+
+    def cache_tag(self, body: BodyRef) -> str:
+        """Return the name. The molecule is the body's own file, which is part of the key of its Signature."""
+        return f"residues 1 {self.name}"
+
+    def __call__(self, body: BodyRef, points: Floats) -> Floats:
+        """Return values (P,) or (P, C) at points (P, 3), Å; raise a MeshError if the body has no such values."""
+        if not is_structure(body.path):
+            raise MeshError(
+                f"{body}: expected a PDB, mmCIF or PQR file for {self.name!r}. Choose another descriptor."
+            )
+        values = residue_attribute(molecule_of(body), points, self.name)
+        if np.isnan(values).all():
+            raise MeshError(
+                f"{body}: {self.name!r} is defined for none of its residues. Choose another descriptor."
+            )
+        return fill_missing(values, points, f"{body}: {self.name}")

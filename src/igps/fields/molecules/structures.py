@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
@@ -34,6 +35,7 @@ from igps.fields.molecules.residues import (
 )
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import Format, stat_key
+from igps.mesh.loading import BodyRef
 from igps.mesh.options import LoadOptions
 from igps.mesh.raw_body import RawBody, deferred
 
@@ -322,6 +324,29 @@ def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
         return name
     gemmi = gemmi_module()
     return gemmi.expand_one_letter(kind.one_letter_code.upper(), gemmi.ResidueKind.AA) or name
+
+
+def molecule_of(body: BodyRef) -> Molecule:
+    """Return the atoms and residues of a body: of a chain, an assembly or a model, or of all models."""
+    part, stamp = body.part or "", stat_key(body.path)
+    words = part.split()  # in a file of several structures, the first is the name of a structure
+    kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
+    for kind in (*(kinds[word] for word in kinds if word in words), "models"):
+        molecules = molecules_by_part(body.path, stamp, kind)
+        if part in molecules:
+            return molecules[part]
+    models = list(molecules.values())
+    fields = ("positions", "radii", "charges", "residue_positions", "b_factors")
+    arrays: dict[str, Any] = {
+        field: np.concatenate([getattr(model, field) for model in models]) for field in fields
+    }
+    starts = np.cumsum([0, *(len(model.residue_names) for model in models)])
+    arrays["residue_of"] = np.concatenate(
+        [model.residue_of + i for model, i in zip(models, starts, strict=False)]
+    )
+    return replace(
+        models[0], residue_names=tuple(name for m in models for name in m.residue_names), **arrays
+    )
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from igps._parameters import check_at_least, check_one_of
-from igps.data.attribute_sources import ResidueAttribute
+from igps.data.attribute_sources import named_source
 from igps.data.requirements import Requirements, embedding_requirements
-from igps.fields.molecules.residue_attributes import RESIDUE_ATTRIBUTES
 from igps.nn._kernels.intervals import find_intervals
 from igps.nn.axes.centres import OrderedCentres, interval_centres
 from igps.nn.batch_features import SampleFeatures
@@ -231,9 +230,10 @@ class Attribute(PointAxis):
 
 def attribute_requirements(name: str) -> Requirements:
     """Return the requirements of an attribute of samples; attributes that users supply have none."""
-    if name in RESIDUE_ATTRIBUTES:
-        return Requirements(sources={name: ResidueAttribute(name)})
-    return Requirements(attributes=tuple(x for x in get_args(AttributeName) if x == name))
+    if name in get_args(AttributeName):
+        return Requirements(attributes=tuple(x for x in get_args(AttributeName) if x == name))
+    source = named_source(name)
+    return Requirements() if source is None else Requirements(sources={name: source})
 
 
 def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:

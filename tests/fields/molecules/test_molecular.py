@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from igps.analysis.explanation import explain
 from igps.data.collation import collate
 from igps.descriptors import NAMES, descriptor
-from igps.descriptors.molecular import Shares, molecular
+from igps.fields.molecules.molecular import Shares, molecular
 from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.fields.molecules.molecule import Molecule
 from igps.fields.molecules.residue_attributes import residue_attribute

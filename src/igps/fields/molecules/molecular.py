@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements
+from igps.descriptors.sized_histograms import SizedHistograms
 from igps.fields.molecules.residue_attributes import RESIDUE_KINDS
 from igps.nn.axes import Attribute, InteriorDistance, PointAxis
 from igps.nn.axes.points import attribute_requirements, largest_members
@@ -12,7 +12,6 @@ from igps.nn.batch_features import SampleFeatures
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
-from igps.retrieval import chi_square
 
 # Centres of the classes: in elementary charges, in kT/e, and on the scale of Kyte and Doolittle.
 _CENTRES = {
@@ -23,7 +22,6 @@ _CENTRES = {
 # Distances change with the conformation, so wide bins retrieve proteins better than narrow bins.
 _N_BINS = 4
 _N_SAMPLES = 2000
-_HALF_SIZE = 0.3  # difference in size, in logarithms, at which half of the χ² distance counts
 
 
 class Shares(PointAxis):
@@ -61,42 +59,6 @@ class Shares(PointAxis):
         """The classes in which the samples have shares, and the shares, see `PointAxis`."""
         self.memberships(values[mask])
         return largest_members(values, mask)
-
-
-class SizedHistograms(HistogramDescriptor):
-    """Histograms and the size of a body.
-
-    The distance of two bodies is d·s / (0.3 + s), where d is the χ² distance of the histograms and s the difference in
-    size, |Δ log area| + |Δ log volume|. The last two numbers of a description are these logarithms.
-    """
-
-    search_distance = None
-
-    @property
-    def n_features(self) -> int:
-        """Number of cells of all parts, plus two for the logarithms."""
-        return super().n_features + 2
-
-    def without_size(self) -> HistogramDescriptor:
-        """Return a descriptor of the histograms alone."""
-        invariant_to = (*self.invariant_to, "scale")
-        return HistogramDescriptor(
-            self.parts, name=self.name, source=self.source, invariant_to=invariant_to
-        )
-
-    def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, cells + 2) descriptions: histograms, log area, log volume."""
-        size = torch.stack([batch.area, batch.volume], dim=1).log()
-        return torch.cat([super().describe(batch), size.float()], dim=1)
-
-    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, G) distances."""
-        size = torch.cdist(queries[:, -2:], gallery[:, -2:], p=1)
-        return chi_square(queries[:, :-2], gallery[:, :-2]) * size / (_HALF_SIZE + size)
-
-    def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
-        """(N, cells) square roots of the histograms, without the logarithms, which would dominate all distances."""
-        return descriptions[:, :-2].sqrt()
 
 
 def molecular(*, size: bool = True) -> HistogramDescriptor:
