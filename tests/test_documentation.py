@@ -65,6 +65,20 @@ def run(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
+def install(pyproject: str, folder: Path) -> None:
+    """Make the entry points of a package known to programs that have the folder on their path."""
+    project = tomllib.loads(pyproject)["project"]
+    information = folder / f"{project['name']}-{project['version']}.dist-info"
+    information.mkdir()
+    head = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    (information / "METADATA").write_text(head)
+    lines = []
+    for group, entries in project["entry-points"].items():
+        lines.append(f"[{group}]")
+        lines += [f"{name} = {place}" for name, place in entries.items()]
+    (information / "entry_points.txt").write_text("\n".join(lines))
+
+
 def program(page: str, folder: Path) -> tuple[str, str]:
     """The blocks of a page as one program, those with a title written as files; and what it has to print.
 
@@ -75,6 +89,8 @@ def program(page: str, folder: Path) -> tuple[str, str]:
     for i, block in enumerate(blocks(page)):
         if block.language == "python" and block.title:
             (folder / block.title).write_text(block.text)
+        elif block.title == "pyproject.toml":
+            install(block.text, folder)
         elif block.language == "python":
             ast.parse(block.text)
             code.append(block.text)

@@ -30,7 +30,7 @@ A descriptor of bodies: `igps.load("FOLDER")`, or `igps retrieve ROOT --descript
 | | |
 |---|---|
 {rows}"""
-_CLASS = re.compile(r"igps\.(?:nn|descriptors)(?:\.[a-z0-9_]+)*\.[A-Z][A-Za-z0-9]*")
+_CLASS = re.compile(r"igps\.(?:nn|descriptors|fields)(?:\.[a-z0-9_]+)*\.[A-Z][A-Za-z0-9]*")
 # Limits on what a hostile file can allocate: the number of modules, the largest argument, and the product of the
 # arguments of a head, whose memory can exceed the size of the file.
 _MAX_MODULES, _MAX_NUMBER, _MAX_PARAMETERS = 200, 100_000, 1_000_000
