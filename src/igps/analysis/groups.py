@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -19,6 +19,8 @@ _BLOCK = 2**24  # entries of permuted designs in memory at once
 _BODIES_PER_DEGREE = 10  # bodies per degree of freedom of the whitening, a usual rule of regression
 _MAX_RANK_SHARE = 0.9  # upper bound of the degrees of freedom of the whitening, over the rank
 _ROUNDING = 1e-9  # relative; smaller values count as zero
+_MIN_ADDED = 1e-6  # smaller parts of group indicators count as explained by strata and covariates
+_TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
@@ -29,9 +31,8 @@ class GroupTest:
     sizes: Mapping[str, int]  # sizes of the groups by name
     permanova_f: float | None = None  # pseudo-F (Anderson 2001)
     permanova_p: float | None = None  # p-value of the pseudo-F, by permutation
-    permanova_q: float | None = (
-        None  # q-value: smallest false discovery rate at which it is significant
-    )
+    # q-value: smallest false discovery rate at which it is significant
+    permanova_q: float | None = None
     # Kernel two-sample statistic (Gretton et al. 2012) of the whitened vectors: the squared distance between the kernel
     # means of two groups; for more groups, the weighted mean squared distance of their means from the overall mean
     kernel: float | None = None
@@ -42,15 +43,15 @@ class GroupTest:
     effect: float | None = None
     effect_low: float | None = None
     effect_high: float | None = None
-    auc: float | None = (
-        None  # area under the curve of a ridge classifier, cross-validated, group mean; 0.5 for chance
-    )
+    # Area under the curve of a ridge classifier, cross-validated, group mean; 0.5 for chance
+    auc: float | None = None
     refused: str | None = None  # reason for no test
 
 
 def squared_distances(rows: Floats) -> Floats:
     """Return the squared Euclidean distances (N, N) of rows (N, D)."""
-    return _squares((centred := rows - rows.mean(axis=0)) @ centred.T)
+    centred = rows - rows.mean(axis=0)
+    return _squares(centred @ centred.T)
 
 
 def group_test(
@@ -94,104 +95,177 @@ def group_test(
     check_at_least(1, n_permutations=n_permutations)
     n = len(vectors)
     strata = ["all"] * n if strata is None else strata
-    group, stratum = (
-        np.unique(np.asarray(names), return_inverse=True)[1] for names in (groups, strata)
-    )
-    design = (
-        np.ones((n, 0))
-        if covariates is None
-        else np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
-    )
-    for name, count in (
-        ("groups", len(groups)),
-        ("strata", len(stratum)),
-        ("covariates", len(design)),
-    ):
-        if count != n:
-            raise ValueError(f"{name}: expected one for each of {n} bodies, got {count}.")
-    for name, numbers in (("vectors", vectors), ("covariates", design)):
-        if not np.isfinite(numbers).all():
-            raise ValueError(f"{name}: expected finite numbers. Leave out bodies that have none.")
+    group = _codes(groups)
+    stratum = _codes(strata)
+    numbers = np.ones((n, 0))
+    if covariates is not None:
+        numbers = np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
+    _check_numbers_of_bodies(n, groups=groups, strata=strata, covariates=numbers)
+    _check_finite(vectors=vectors, covariates=numbers)
     untested = GroupTest(body, dict(sorted(Counter(groups).items())))
-    if reason := _obstacle(untested.sizes, group, stratum):
+    reason = _obstacle(untested.sizes, group, stratum)
+    if reason is not None:
         return replace(untested, refused=reason)
-    # Orthonormal bases of the means of strata, of what covariates add to these, and of what groups add to both. A
-    # permutation within strata changes the covariates, but not the means of strata
-    stratum_basis = _orthonormal(_indicators(stratum), _ROUNDING)
-    design = design / np.maximum(
-        np.abs(design).max(axis=0, initial=0), np.finfo(float).tiny
-    )  # whatever the units
-    design = _orthonormal(design - design.mean(axis=0), _ROUNDING)
-    covariate_basis = _orthonormal(design - stratum_basis @ (stratum_basis.T @ design), _ROUNDING)
-    nuisance = np.column_stack([stratum_basis, covariate_basis])
-    indicators = _indicators(group)
-    added = _orthonormal(indicators - nuisance @ (nuisance.T @ indicators), 1e-6)
-    if added.shape[1] < len(untested.sizes) - 1:
+    design = _design(group, stratum, numbers)
+    n_added = design.added.shape[1]
+    if n_added < len(untested.sizes) - 1:
         return replace(untested, refused="covariates or strata determine the groups.")
-    freedom = n - nuisance.shape[1] - added.shape[1]
+    nuisance = design.nuisance
+    freedom = n - nuisance.shape[1] - n_added
     if freedom < 3:
-        return replace(
-            untested, refused=f"{n} bodies are too few for so many strata and covariates."
-        )
+        reason = f"{n} bodies are too few for so many strata and covariates."
+        return replace(untested, refused=reason)
     residual = np.eye(n) - nuisance @ nuisance.T  # projection
     centred = vectors - vectors.mean(axis=0)
     total = centred @ centred.T
     gram = residual @ total @ residual
     if np.trace(gram) <= _ROUNDING * np.square(vectors).sum():
-        return replace(
-            untested, refused="the vectors do not differ beyond what covariates and strata explain."
-        )
-    whitened = _squares(_whitened(gram))
-    pairs = whitened[np.triu_indices(n, 1)]
-    width = np.median(pairs[pairs > _ROUNDING * pairs.max()])  # most of the pairs may be duplicates
-    kernel = residual @ np.exp(-whitened / (2 * width)) @ residual
-
+        reason = "the vectors do not differ beyond what covariates and strata explain."
+        return replace(untested, refused=reason)
+    kernel = residual @ _gaussian_kernel(gram) @ residual
     random = np.random.default_rng(seed)
-    group_traces, covariate_traces, kernel_traces, overlap = np.empty((4, n_permutations + 1))
-    block = max(1, _BLOCK // (n * (nuisance.shape[1] + added.shape[1])))
-    for first in range(0, n_permutations + 1, block):
-        orders = _permutations(stratum, min(block, n_permutations + 1 - first), random)
-        if first == 0:
-            orders[0] = np.arange(n)
-        part = slice(first, first + len(orders))
-        group_traces[part] = _traces(gram, added, orders)
-        covariate_traces[part] = _traces(gram, covariate_basis, orders)
-        kernel_traces[part] = _traces(kernel, added, orders)
-        overlap[part] = _traces(covariate_basis @ covariate_basis.T, added, orders)
-    share = group_traces / np.maximum(
-        np.trace(gram) - covariate_traces, np.finfo(float).tiny
-    )  # grows with pseudo-F
+    traces = _permuted_traces(gram, kernel, design, stratum, n_permutations, random)
+    unexplained = np.trace(gram) - traces.of_covariates
+    share = traces.of_groups / np.maximum(unexplained, _TINY)  # grows with pseudo-F
+    odds = share[0] / max(1 - share[0], np.finfo(float).eps)
     # Covariates explain a share of the permuted groups, which the kernel of the residuals cannot contain
-    unexplained = np.maximum(1 - overlap / added.shape[1], _ROUNDING)
-    # For the effect, the part that groups add is rotated to the group means, and the remainder is scaled up to the
-    # variance before strata and covariates took their degrees of freedom: matched pairs keep half of it
+    kernel_share = np.maximum(1 - traces.overlap / n_added, _ROUNDING)
     sizes = np.bincount(group)
-    at_means = _orthonormal(indicators - indicators.mean(axis=0), 1e-6)
-    left, _, right = np.linalg.svd(at_means.T @ added)
-    inflation = (n - len(sizes)) / freedom
-    adjustment = at_means @ left @ right @ added.T + np.sqrt(inflation) * (
-        residual - added @ added.T
-    )
-    squares = _squares(adjustment @ gram @ adjustment.T)
-    weights = [random.multinomial(k, np.full(k, 1 / k), n_bootstraps) for k in sizes]
-    with np.errstate(
-        invalid="ignore"
-    ):  # NaN if a group is drawn as copies of one body, which have no variance
-        effects = _effects(squares, group, weights)
-    low, high = np.nanquantile(effects, (0.025, 0.975)) if n_bootstraps else (None, None)
+    squares = _squares_for_effect(gram, residual, design, group, freedom)
+    effect = _effects(squares, group, [np.ones((1, size)) for size in sizes])
+    low, high = _interval(squares, group, n_bootstraps, random)
+    factor = n / np.prod(sizes) if len(sizes) == 2 else 1 / n
+    auc = None
+    if n_repeats:
+        auc = _auc(total, nuisance, group, n_repeats, seed)
     return replace(
         untested,
-        permanova_f=float(
-            share[0] / max(1 - share[0], np.finfo(float).eps) * freedom / added.shape[1]
-        ),
+        permanova_f=float(odds * freedom / n_added),
         permanova_p=_p_value(share),
-        kernel=float(kernel_traces[0] * (n / np.prod(sizes) if len(sizes) == 2 else 1 / n)),
-        kernel_p=_p_value(kernel_traces / unexplained),
-        effect=float(_effects(squares, group, [np.ones((1, k)) for k in sizes])[0]),
-        effect_low=None if low is None else float(low),
-        effect_high=None if high is None else float(high),
-        auc=_auc(total, nuisance, group, n_repeats, seed) if n_repeats else None,
+        kernel=float(traces.of_kernel[0] * factor),
+        kernel_p=_p_value(traces.of_kernel / kernel_share),
+        effect=float(effect[0]),
+        effect_low=low,
+        effect_high=high,
+        auc=auc,
     )
+
+
+def _codes(names: Sequence[str]) -> Integers:
+    """Return the number of each name in the order of the alphabet."""
+    _, codes = np.unique(np.asarray(names), return_inverse=True)
+    return codes
+
+
+def _check_numbers_of_bodies(n: int, **values: Sized) -> None:
+    for name, value in values.items():
+        if len(value) != n:
+            raise ValueError(f"{name}: expected one for each of {n} bodies, got {len(value)}.")
+
+
+def _check_finite(**values: Floats) -> None:
+    for name, numbers in values.items():
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"{name}: expected finite numbers. Leave out bodies that have none.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Design:
+    """Orthonormal bases (N, k). A permutation within strata changes the covariates, but not the means of strata."""
+
+    nuisance: Floats  # the means of strata, and what covariates add to these
+    covariates: Floats  # what covariates add to the means of strata
+    added: Floats  # what groups add to both
+
+
+def _design(group: Integers, stratum: Integers, covariates: Floats) -> _Design:
+    strata = _orthonormal(_indicators(stratum), _ROUNDING)
+    largest = np.abs(covariates).max(axis=0, initial=0)
+    scaled = covariates / np.maximum(largest, _TINY)  # whatever the units
+    centred = _orthonormal(scaled - scaled.mean(axis=0), _ROUNDING)
+    beyond_strata = centred - strata @ (strata.T @ centred)
+    basis = _orthonormal(beyond_strata, _ROUNDING)
+    nuisance = np.column_stack([strata, basis])
+    indicators = _indicators(group)
+    beyond_both = indicators - nuisance @ (nuisance.T @ indicators)
+    return _Design(nuisance, basis, _orthonormal(beyond_both, _MIN_ADDED))
+
+
+def _gaussian_kernel(gram: Floats) -> Floats:
+    """Return the kernel (N, N) of the whitened vectors that belong to a Gram matrix."""
+    whitened = _squares(_whitened(gram))
+    pairs = whitened[np.triu_indices(len(gram), 1)]
+    is_apart = pairs > _ROUNDING * pairs.max()  # most of the pairs may be duplicates
+    width = np.median(pairs[is_apart])
+    return np.asarray(np.exp(-whitened / (2 * width)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Traces:
+    """Traces for each permutation; the first is the identity."""
+
+    of_groups: Floats  # of the Gram matrix in what groups add
+    of_covariates: Floats  # of the Gram matrix in the covariates
+    of_kernel: Floats  # of the kernel in what groups add
+    overlap: Floats  # of what groups add with the covariates
+
+
+def _permuted_traces(
+    gram: Floats,
+    kernel: Floats,
+    design: _Design,
+    stratum: Integers,
+    n_permutations: int,
+    random: np.random.Generator,
+) -> _Traces:
+    count = n_permutations + 1
+    result = _Traces(np.empty(count), np.empty(count), np.empty(count), np.empty(count))
+    covariates = design.covariates @ design.covariates.T
+    n_columns = design.nuisance.shape[1] + design.added.shape[1]
+    block = max(1, _BLOCK // (len(gram) * n_columns))
+    for first in range(0, count, block):
+        orders = _permutations(stratum, min(block, count - first), random)
+        if first == 0:
+            orders[0] = np.arange(len(gram))
+        part = slice(first, first + len(orders))
+        result.of_groups[part] = _traces(gram, design.added, orders)
+        result.of_covariates[part] = _traces(gram, design.covariates, orders)
+        result.of_kernel[part] = _traces(kernel, design.added, orders)
+        result.overlap[part] = _traces(covariates, design.added, orders)
+    return result
+
+
+def _squares_for_effect(
+    gram: Floats, residual: Floats, design: _Design, group: Integers, freedom: int
+) -> Floats:
+    """Return squared distances (N, N) as if there were no strata and covariates.
+
+    The part that groups add is rotated to the group means. The remainder is scaled up to the variance before strata
+    and covariates took their degrees of freedom: matched pairs keep half of it.
+    """
+    indicators = _indicators(group)
+    at_means = _orthonormal(indicators - indicators.mean(axis=0), _MIN_ADDED)
+    left, _, right = np.linalg.svd(at_means.T @ design.added)
+    inflation = (len(group) - indicators.shape[1]) / freedom
+    remainder = residual - design.added @ design.added.T
+    adjustment = at_means @ left @ right @ design.added.T + np.sqrt(inflation) * remainder
+    return _squares(adjustment @ gram @ adjustment.T)
+
+
+def _interval(
+    squares: Floats, group: Integers, n_bootstraps: int, random: np.random.Generator
+) -> tuple[float | None, float | None]:
+    """Return the 95 % interval of the effect, by bootstrap samples of each group; None without samples."""
+    if n_bootstraps == 0:
+        return None, None
+    weights = []
+    for size in np.bincount(group):
+        weights.append(random.multinomial(size, np.full(size, 1 / size), n_bootstraps))
+    # NaN if a group is drawn as copies of one body, which have no variance
+    with np.errstate(invalid="ignore"):
+        effects = _effects(squares, group, weights)
+    low, high = np.nanquantile(effects, (0.025, 0.975))
+    return float(low), float(high)
 
 
 def with_q_values(tests: Sequence[GroupTest]) -> list[GroupTest]:
@@ -216,9 +290,10 @@ def _obstacle(sizes: Mapping[str, int], group: Integers, stratum: Integers) -> s
         return f"{smallest} has {sizes[smallest]} bodies, a test needs at least {_MIN_GROUP_SIZE} in each group."
     counts = np.zeros((stratum.max() + 1, group.max() + 1), dtype=int)
     np.add.at(counts, (stratum, group), 1)
-    log_ways = sum(
-        math.lgamma(row.sum() + 1) - sum(math.lgamma(k + 1) for k in row) for row in counts
-    )
+    log_ways = 0.0
+    for row in counts:
+        log_ways += math.lgamma(row.sum() + 1)
+        log_ways -= sum(math.lgamma(k + 1) for k in row)
     if log_ways < math.log(_MIN_ARRANGEMENTS):
         return f"within strata the groups can be arranged in only {math.exp(log_ways):.0f} ways, too few for a test."
     return None
@@ -240,16 +315,19 @@ def _whitened(gram: Floats) -> Floats:
     """Return G (G + ρ)⁻¹ of a Gram matrix G; the ridge ρ makes the trace the degrees of freedom, see `group_test`."""
     values, axes = np.linalg.eigh(gram)
     is_positive = values > _ROUNDING * values[-1]
-    values, axes = values[is_positive], axes[:, is_positive]
+    values = values[is_positive]
+    axes = axes[:, is_positive]
     freedom = min(len(gram) / _BODIES_PER_DEGREE, _MAX_RANK_SHARE * len(values))
 
     def excess(log_ridge: float) -> float:
         return float((values / (values + np.exp(log_ridge))).sum()) - freedom
 
     # Bracket of the root: at the first every term exceeds the share of the rank, at the second the sum is below freedom
-    ridges = values[0] * (1 / _MAX_RANK_SHARE - 1) / 2, 2 * values.sum() / freedom
-    ridge = np.exp(brentq(excess, *np.log(ridges)))
-    return np.asarray((axes * (values / (values + ridge))) @ axes.T)
+    smallest = values[0] * (1 / _MAX_RANK_SHARE - 1) / 2
+    largest = 2 * values.sum() / freedom
+    ridge = np.exp(brentq(excess, np.log(smallest), np.log(largest)))
+    shares = values / (values + ridge)
+    return np.asarray((axes * shares) @ axes.T)
 
 
 def _squares(gram: Floats) -> Floats:
@@ -287,24 +365,20 @@ def _effects(squares: Floats, group: Integers, weights: Sequence[Any]) -> Floats
     shares = [len(own) / len(group) for own in members]
 
     def mean(a: int, b: int) -> Floats:
-        total = np.einsum(
-            "ni,ij,nj->n",
-            weights[a],
-            squares[np.ix_(members[a], members[b])],
-            weights[b],
-            optimize=True,
-        )
+        block = squares[np.ix_(members[a], members[b])]
+        total = np.einsum("ni,ij,nj->n", weights[a], block, weights[b], optimize=True)
         n_pairs = weights[a].sum(axis=1) * weights[b].sum(axis=1)
-        return np.asarray(
-            total / (n_pairs - np.square(weights[a]).sum(axis=1) if a == b else n_pairs)
-        )
+        if a == b:
+            n_pairs = n_pairs - np.square(weights[a]).sum(axis=1)
+        return np.asarray(total / n_pairs)
 
     variances = [mean(a, a) / 2 for a in range(len(members))]
-    pairs = combinations(range(len(members)), 2)
-    between: Any = sum(
-        shares[a] * shares[b] * (mean(a, b) - variances[a] - variances[b]) for a, b in pairs
-    )
-    within: Any = sum(share * variance for share, variance in zip(shares, variances, strict=True))
+    between: Any = 0
+    for a, b in combinations(range(len(members)), 2):
+        between = between + shares[a] * shares[b] * (mean(a, b) - variances[a] - variances[b])
+    within: Any = 0
+    for share, variance in zip(shares, variances, strict=True):
+        within = within + share * variance
     return np.asarray(between / (between + within))
 
 
@@ -325,20 +399,15 @@ def _auc(gram: Floats, nuisance: Floats, group: Integers, n_repeats: int, seed: 
     areas = []
     folds = RepeatedStratifiedKFold(n_splits=5, n_repeats=n_repeats, random_state=seed)
     for training, test in folds.split(gram, group):
-        residuals = (
-            coordinates
-            - nuisance @ np.linalg.lstsq(nuisance[training], coordinates[training], rcond=1e-9)[0]
-        )
-        scores = (
-            RidgeClassifierCV(alphas)
-            .fit(residuals[training], group[training])
-            .decision_function(residuals[test])
-        )
+        fit = np.linalg.lstsq(nuisance[training], coordinates[training], rcond=1e-9)
+        residuals = coordinates - nuisance @ fit[0]
+        classifier = RidgeClassifierCV(alphas)
+        classifier.fit(residuals[training], group[training])
+        scores = classifier.decision_function(residuals[test])
         if scores.ndim == 1:  # for two groups, scikit-learn returns the score of the second
             scores = np.stack([-scores, scores], axis=1)
-        areas.append(
-            np.mean(
-                [roc_auc_score(group[test] == code, column) for code, column in enumerate(scores.T)]
-            )
-        )
+        by_group = []
+        for code, column in enumerate(scores.T):
+            by_group.append(roc_auc_score(group[test] == code, column))
+        areas.append(np.mean(by_group))
     return float(np.mean(areas))

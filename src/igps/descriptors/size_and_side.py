@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from igps._parameters import check_one_of
-from igps.data.batch import SignatureBatch
+from igps.data.batch import SampleBatch, SignatureBatch
 from igps.mesh.mesh import MILLIMETRES, millimetres
 from igps.nn.axes import InteriorDistance, PairTwist
 from igps.nn.batch_features import BatchFeatures
@@ -47,8 +47,11 @@ _INDIVIDUAL_SHARE = 0.25
 _MAX_GAIN, _HALF_SIZE = 2.0, 0.3
 # Typical differences in twist and in signed volumes between individuals of one body.
 _TYPICAL_TWIST, _TYPICAL_VOLUME = 0.002, 0.0085
+# Eigenpairs for the heat in `signed_volumes`: at its shortest time, later ones have decayed on most bodies
+_N_HEAT_EIGENPAIRS = 16
 # Vectors in `signed_volumes`, and their diffusion times over area
-_N_VECTORS, _TIMES = 7, (0.01, 0.04, 0.15)
+_N_VECTORS = 7
+_TIMES = (0.01, 0.04, 0.15)
 
 
 class SizeAndSide(Descriptor):
@@ -94,15 +97,22 @@ class SizeAndSide(Descriptor):
                 f"size, mirror: expected a descriptor of known scale, got {descriptor.name!r}. Set its attribute "
                 "`scale` to the median of its distances between bodies of one class."
             )
-        self.descriptor, self.scale, self.keeps_size = descriptor, scale, size
+        self.descriptor = descriptor
+        self.scale = scale
+        self.keeps_size = size
         self._unit = _INDIVIDUAL_SHARE * scale
-        axes, embedding = (
-            [InteriorDistance(6, 3.0), PairTwist()],
-            SpectralEmbedding(n_eigenpairs=16),
-        )
-        self.twists = PairHistogram(axes, embedding) if side else None
-        self.name, self.source = descriptor.name + SIDE * side + SIZE * size, descriptor.source
-        compared = ["scale"] * size + ["motion"] * side  # "motion" includes reflections
+        self.twists = None
+        self.name = descriptor.name
+        self.source = descriptor.source
+        compared = set()
+        if side:
+            axes = [InteriorDistance(6, 3.0), PairTwist()]
+            self.twists = PairHistogram(axes, SpectralEmbedding(n_eigenpairs=16))
+            self.name += SIDE
+            compared.add("motion")  # which includes reflections
+        if size:
+            self.name += SIZE
+            compared.add("scale")
         self.invariant_to = tuple(name for name in descriptor.invariant_to if name not in compared)
         self.requirements = descriptor.requirements
         if self.twists is not None:
@@ -113,41 +123,40 @@ class SizeAndSide(Descriptor):
         parts = [self.descriptor(batch).flatten(1)]
         if self.twists is not None:
             counts = self.twists(BatchFeatures(batch, self.training))
-            odd = (counts - counts.flip(-1))[..., counts.shape[-1] // 2 :] / 2
+            n_twists = counts.shape[-1]
+            differences = counts - counts.flip(-1)
+            odd = differences[..., n_twists // 2 :] / 2
             volumes = signed_volumes(batch).to(odd)
-            parts += [
-                self._unit / _TYPICAL_VOLUME * volumes,
-                self._unit / _TYPICAL_TWIST * odd.flatten(1),
-            ]
+            parts.append(self._unit / _TYPICAL_VOLUME * volumes)
+            parts.append(self._unit / _TYPICAL_TWIST * odd.flatten(1))
         if self.keeps_size:
-            factors = [millimetres(unit) for unit in batch.units or [None] * len(batch)]
-            size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
-            size = size + torch.tensor(factors, dtype=size.dtype, device=size.device).log()[:, None]
-            parts.append(self._unit * _MAX_GAIN / _HALF_SIZE * size.to(parts[0].dtype))
+            sizes = _log_sizes(batch).to(parts[0].dtype)
+            parts.append(self._unit * _MAX_GAIN / _HALF_SIZE * sizes)
         return torch.cat(parts, dim=1)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, D) and (G, D) descriptions to (Q, G) distances."""
-        (form, side, size), (forms, sides, sizes) = self.split(queries), self.split(gallery)
+        form, side, size = self.split(queries)
+        forms, sides, sizes = self.split(gallery)
         distances = self.descriptor.distances(form, forms)
         if self.twists is not None:
             distances = distances + euclidean(side, sides)
         if self.keeps_size:
             ratio = torch.cdist(size, sizes, p=1) / (self._unit * _MAX_GAIN)  # s / 0.3
-            distances = distances + _MAX_GAIN * (distances + self._unit) * ratio / (1 + ratio)
+            gain = _MAX_GAIN * (distances + self._unit) * ratio / (1 + ratio)
+            distances = distances + gain
         return distances
 
     def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, D) descriptions to the coordinates of the descriptor, then the side and size blocks."""
-        form, *others = self.split(descriptions)
-        return torch.cat(
-            [self.descriptor.coordinates(form, within_class=within_class), *others], dim=1
-        )
+        form, side, size = self.split(descriptions)
+        coordinates = self.descriptor.coordinates(form, within_class=within_class)
+        return torch.cat([coordinates, side, size], dim=1)
 
     def shorten(self, descriptions: Tensor) -> Tensor:
         """(N, D) descriptions to (N, ≤ 256 + 55): `shorten` of the descriptor (or its ValueError), then others."""
-        form, *others = self.split(descriptions)
-        return torch.cat([self.descriptor.shorten(form), *others], dim=1)
+        form, side, size = self.split(descriptions)
+        return torch.cat([self.descriptor.shorten(form), side, size], dim=1)
 
     def wrap(self, descriptor: Descriptor) -> "SizeAndSide":
         """Return an `SizeAndSide` of another descriptor with the same options and scales."""
@@ -156,11 +165,12 @@ class SizeAndSide(Descriptor):
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Split descriptions (N, D) into the descriptor's own, in its shape, the side block and the size block."""
-        n_side = 0 if self.twists is None else math.comb(_N_VECTORS, 3) + self.twists.n_cells // 2
-        n_size = 2 * self.keeps_size
-        form, side, size = descriptions.split(
-            [descriptions.shape[1] - n_side - n_size, n_side, n_size], dim=1
-        )
+        n_side = 0
+        if self.twists is not None:
+            n_side = math.comb(_N_VECTORS, 3) + self.twists.n_cells // 2
+        n_size = 2 if self.keeps_size else 0
+        n_form = descriptions.shape[1] - n_side - n_size
+        form, side, size = descriptions.split([n_form, n_side, n_size], dim=1)
         return form.unflatten(1, self.descriptor.description_shape), side, size
 
 
@@ -175,29 +185,45 @@ def signed_volumes(batch: SignatureBatch) -> Tensor:
     volumes.
     """
     root = batch.area.sqrt()[:, None, None]
-    (interior, interior_weights), (surface, surface_weights) = (
-        (
-            samples.points / root,
-            (samples.mask / samples.mask.sum(dim=1, keepdim=True))[..., None].to(root),
-        )
-        for samples in (batch.interior, batch.surface)
-    )
-    interior = interior - (interior * interior_weights).sum(dim=1)[:, None]
-    surface = surface - (surface * surface_weights).sum(dim=1)[:, None]
+    interior, interior_weights = _centred(batch.interior, root)
+    surface, surface_weights = _centred(batch.surface, root)
     moments = (interior * interior_weights).mT @ interior
     moments = moments / moments.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None]
-    k = min(16, batch.eigenvalues.shape[1])
+    k = min(_N_HEAT_EIGENPAIRS, batch.eigenvalues.shape[1])
     eigenvalues = batch.eigenvalues[:, None, :k] * batch.area[:, None, None]
-    decay = torch.exp(-root.new_tensor(_TIMES)[:, None] * eigenvalues)
-    heat = batch.surface.eigenfunctions[..., :k].to(root).square() @ decay.mT
+    times = root.new_tensor(_TIMES)
+    decay = torch.exp(-times[:, None] * eigenvalues)
+    eigenfunctions = batch.surface.eigenfunctions[..., :k].to(root)
+    heat = eigenfunctions.square() @ decay.mT
     heat = heat / (heat * surface_weights).sum(dim=1, keepdim=True)
-    weights = torch.cat([surface.norm(dim=2, keepdim=True), heat], dim=2) * surface_weights
-    mean = (interior.norm(dim=2, keepdim=True) * interior_weights).mT @ interior
-    vectors = torch.cat([mean, weights.mT @ surface], dim=1)
+    functions = torch.cat([surface.norm(dim=2, keepdim=True), heat], dim=2)
+    on_surface = (functions * surface_weights).mT @ surface
+    depths = interior.norm(dim=2, keepdim=True)
+    inside = (depths * interior_weights).mT @ interior
+    vectors = torch.cat([inside, on_surface], dim=1)
     vectors = torch.cat([vectors, vectors[:, 1:3] @ moments], dim=1)
-    triples = vectors[:, torch.tensor([*combinations(range(_N_VECTORS), 3)], device=vectors.device)]
+    indices = list(combinations(range(_N_VECTORS), 3))
+    triples = vectors[:, torch.tensor(indices, device=vectors.device)]
     lengths = triples.norm(dim=3).prod(dim=2).clamp_min(torch.finfo(triples.dtype).tiny)
     return torch.linalg.det(triples) / lengths.pow(2 / 3)
+
+
+def _centred(samples: SampleBatch, root: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions (N, P, 3) relative to their centroid, in units of √area, and weights (N, P, 1) of sum 1."""
+    shares = samples.mask / samples.mask.sum(dim=1, keepdim=True)
+    weights = shares[..., None].to(root)
+    points = samples.points / root
+    centroid = (points * weights).sum(dim=1)
+    return points - centroid[:, None], weights
+
+
+def _log_sizes(batch: SignatureBatch) -> Tensor:
+    """(N, 2) log √area and log ∛volume, in millimetres where the unit is known."""
+    units = batch.units or [None] * len(batch)
+    size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
+    factors = [millimetres(unit) for unit in units]
+    shifts = torch.tensor(factors, dtype=size.dtype, device=size.device).log()
+    return size + shifts[:, None]
 
 
 def scale_of(descriptor: Descriptor) -> float | None:
@@ -214,17 +240,12 @@ def keeps_size(size: Size, units: Sequence[str | None]) -> tuple[bool, str]:
     """
     check_one_of(get_args(Size), size=size)
     n_known = sum(unit in MILLIMETRES for unit in units)
-    if size == "ignore" or n_known == len(units) or (n_known == 0 and size == "auto"):
-        return size == "keep" or (size == "auto" and n_known > 0), ""
-    reason = f"{len(units) - n_known} of {len(units)} bodies have no unit of length"
-    if size == "keep":
-        return (
-            True,
-            f"size is kept: {reason}; their coordinates are taken as millimetres"
-            if n_known
-            else "",
-        )
-    return (
-        False,
-        f"size is ignored: {reason}; if their coordinates are millimetres, give --size keep",
-    )
+    n_unknown = len(units) - n_known
+    keeps = size == "keep" or (size == "auto" and n_known > 0 and n_unknown == 0)
+    if size == "ignore" or n_known == 0 or n_unknown == 0:
+        return keeps, ""
+    reason = f"{n_unknown} of {len(units)} bodies have no unit of length"
+    if keeps:
+        return True, f"size is kept: {reason}; their coordinates are taken as millimetres"
+    remedy = "if their coordinates are millimetres, give --size keep"
+    return False, f"size is ignored: {reason}; {remedy}"

@@ -16,7 +16,8 @@ from igps.retrieval import chi_square
 _N_SAMPLES = 2000
 # Number of distance bins, and how many of them are merged at each level of the comparison. Fine textures need narrow
 # bins, conformations of a molecule change distances, and for some bodies only the mixture of attributes counts.
-_N_BINS, _N_MERGED_BINS = 32, (1, 4, 32)
+_N_BINS = 32
+_N_MERGED_BINS = (1, 4, 32)
 
 
 class WithAttributes(Descriptor):
@@ -46,7 +47,8 @@ class WithAttributes(Descriptor):
                 f"with: expected positive weights and a descriptor of known scale, got {weights} and "
                 f"{descriptor.name!r}. Set its attribute `scale` to the median of its distances within a class."
             )
-        self.descriptor, self.scale = descriptor, scale
+        self.descriptor = descriptor
+        self.scale = scale
         self.weights = tuple(weight * scale / SCALES["interior"] for weight in weights)
         embedding = SpectralEmbedding(n_eigenpairs=50)
 
@@ -55,13 +57,10 @@ class WithAttributes(Descriptor):
             return PairHistogram(axes, embedding, n_samples=_N_SAMPLES)
 
         self.inside = HistogramDescriptor([histogram(name) for name in attributes])
-        suffixes = (
-            f"+{name}" + f"={w:g}" * (w != 1) for name, w in zip(attributes, weights, strict=True)
-        )
-        self.name, self.source = (
-            descriptor.name + "".join(suffixes),
-            f"{descriptor.source}; Rustamov 2010, section 4",
-        )
+        self.name = descriptor.name
+        for name, weight in zip(attributes, weights, strict=True):
+            self.name += f"+{name}" if weight == 1 else f"+{name}={weight:g}"
+        self.source = f"{descriptor.source}; Rustamov 2010, section 4"
         self.invariant_to = descriptor.invariant_to
         self.requirements = descriptor.requirements | self.inside.requirements
 
@@ -72,31 +71,31 @@ class WithAttributes(Descriptor):
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) distances."""
-        (form, *histograms), (forms, *gallery_histograms) = (
-            self._split(queries),
-            self._split(gallery),
-        )
+        form, *histograms = self._split(queries)
+        forms, *gallery_histograms = self._split(gallery)
         distances = self.descriptor.distances(form, forms)
-        for weight, *pair in zip(self.weights, histograms, gallery_histograms, strict=True):
+        for weight, own, others in zip(self.weights, histograms, gallery_histograms, strict=True):
             for n_merged in _N_MERGED_BINS:
-                merged = (cells.unflatten(1, (-1, n_merged)).sum(dim=2) for cells in pair)
-                distances = distances + weight / len(_N_MERGED_BINS) * chi_square(*merged)
+                difference = chi_square(_merged(own, n_merged), _merged(others, n_merged))
+                distances = distances + weight / len(_N_MERGED_BINS) * difference
         return distances
 
     def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, ≤ D + cells) coordinates of the descriptor, then square roots of the weighted histograms."""
         form, *histograms = self._split(descriptions)
-        roots = [
-            (weight * cells).sqrt() for weight, cells in zip(self.weights, histograms, strict=True)
-        ]
-        return torch.cat(
-            [self.descriptor.coordinates(form, within_class=within_class), *roots], dim=1
-        )
+        blocks = [self.descriptor.coordinates(form, within_class=within_class)]
+        for weight, cells in zip(self.weights, histograms, strict=True):
+            blocks.append((weight * cells).sqrt())
+        return torch.cat(blocks, dim=1)
 
     def _split(self, descriptions: Tensor) -> list[Tensor]:
         """Split descriptions (N, D + cells) into the descriptor's own, in its shape, and each attribute's histogram."""
         sizes = list(self.inside.part_cells)
-        form, *histograms = torch.split(
-            descriptions, [descriptions.shape[1] - sum(sizes), *sizes], dim=1
-        )
+        n_form = descriptions.shape[1] - sum(sizes)
+        form, *histograms = torch.split(descriptions, [n_form, *sizes], dim=1)
         return [form.unflatten(1, self.descriptor.description_shape), *histograms]
+
+
+def _merged(cells: Tensor, n_merged: int) -> Tensor:
+    """Sum each run of `n_merged` neighbouring distance bins."""
+    return cells.unflatten(1, (-1, n_merged)).sum(dim=2)

@@ -25,7 +25,8 @@ def fill(
 @compiled(fastmath=REASSOCIATE)
 def chi_square(a: NDArray[Real], b: NDArray[Real]) -> Real:
     """Return the sum of (a−b)² / (a+b) over the cells."""
-    total, one = a.dtype.type(0), a.dtype.type(1)
+    total = a.dtype.type(0)
+    one = a.dtype.type(1)
     for cell in range(np.uint64(len(a))):
         total += term(a[cell], b[cell], one)
     return total
@@ -35,8 +36,10 @@ def chi_square(a: NDArray[Real], b: NDArray[Real]) -> Real:
 @compiled(fastmath=False)
 def term(a: Real, b: Real, one: Real) -> Real:
     """Return (a−b)² / (a+b), with the division before the multiplication; 0 if both are 0."""
-    difference, total = a - b, a + b
-    return difference / (total if total > 0 else one) * difference
+    difference = a - b
+    total = a + b
+    divisor = total if total > 0 else one
+    return difference / divisor * difference
 
 
 @compiled(fastmath=REASSOCIATE)

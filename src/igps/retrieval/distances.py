@@ -55,12 +55,15 @@ def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
         (Q, G) distances, without unit.
     """
     a, b = _as_rows(queries, gallery, non_negative=True)
-    return _chi_square_by_torch(a, b) if in_transforms() else _ChiSquare.apply(a, b)
+    if in_transforms():
+        return _chi_square_by_torch(a, b)
+    return _ChiSquare.apply(a, b)
 
 
 def euclidean(queries: Tensor, gallery: Tensor) -> Tensor:
     """Euclidean distance √(Σ (a−b)²), in the unit of the descriptors; the gradient at distance 0 is set to 0."""
-    return _row_distance(*_as_rows(queries, gallery, non_negative=False))
+    a, b = _as_rows(queries, gallery, non_negative=False)
+    return _row_distance(a, b)
 
 
 def cosine(queries: Tensor, gallery: Tensor) -> Tensor:
@@ -69,7 +72,8 @@ def cosine(queries: Tensor, gallery: Tensor) -> Tensor:
     A descriptor of length zero has no direction and raises a ValueError.
     """
     a, b = _as_rows(queries, gallery, non_negative=False)
-    return _row_distance(_unit("queries", a), _unit("gallery", b)).square() / 2.0
+    distance = _row_distance(_unit("queries", a), _unit("gallery", b))
+    return distance.square() / 2.0
 
 
 class _ChiSquare(torch.autograd.Function):
@@ -90,18 +94,16 @@ class _ChiSquare(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         a, b = ctx.saved_tensors
         if torch.is_grad_enabled():  # derivatives of the gradient are needed, too
-            leaves = [
-                leaf
-                for leaf, is_needed in zip((a, b), ctx.needs_input_grad, strict=True)
-                if is_needed
-            ]
-            gradients = iter(
-                torch.autograd.grad(_chi_square_by_torch(a, b), leaves, grad, create_graph=True)
-            )
-            return tuple(
-                next(gradients) if is_needed else None for is_needed in ctx.needs_input_grad
-            )
-        grad_a, grad_b = torch.zeros_like(a), torch.zeros_like(b)
+            distances = _chi_square_by_torch(a, b)
+            first_is_needed, second_is_needed = ctx.needs_input_grad
+            gradients: list[Tensor | None] = [None, None]
+            for i, is_needed in enumerate((first_is_needed, second_is_needed)):
+                if is_needed:
+                    leaf = (a, b)[i]
+                    (gradients[i],) = torch.autograd.grad(distances, leaf, grad, create_graph=True)
+            return tuple(gradients)
+        grad_a = torch.zeros_like(a)
+        grad_b = torch.zeros_like(b)
         for q, g, c in _tiles(a, b):
             # With u = (a−b)/(a+b): ∂/∂a (a−b)²/(a+b) = 2u − u², and ∂/∂b = −2u − u².
             ratio, _ = _ratio(a[q, c], b[g, c])
@@ -133,7 +135,9 @@ def in_transforms() -> bool:
 def _sums_by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
     """Sums (Q, G) of `distance_loops.fill`; the longer one of queries and gallery is divided among threads."""
     sums = a.new_empty(len(a), len(b))
-    queries, gallery, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, sums))
+    queries = a.detach().contiguous().numpy()
+    gallery = b.detach().contiguous().numpy()
+    result = sums.numpy()
 
     def write(part: slice) -> None:
         if len(a) >= len(b):
@@ -144,27 +148,33 @@ def _sums_by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
     is_large = sums.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
     with Team(None if is_large else 1) as team:
         length = max(len(a), len(b))
-        step = max(1, math.ceil(length / (4 * team.n_threads))) if is_large else length
-        team.each(write, [slice(begin, begin + step) for begin in range(0, length, step)])
+        step = length
+        if is_large:
+            step = max(1, math.ceil(length / (4 * team.n_threads)))
+        parts = [slice(begin, begin + step) for begin in range(0, length, step)]
+        team.each(write, parts)
     return sums
 
 
 def _ratio(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """(a−b)/(a+b), 0 where both are 0, and a−b for all pairs of rows, each (Q, G, cells)."""
     difference = a[:, None] - b
-    total = (a[:, None] + b).clamp_min_(
-        torch.finfo(a.dtype).tiny
-    )  # 0/tiny = 0: an empty cell needs no mask
-    return torch.div(difference, total, out=total), difference
+    total = a[:, None] + b
+    total.clamp_min_(torch.finfo(a.dtype).tiny)  # 0/tiny = 0: an empty cell needs no mask
+    ratio = torch.div(difference, total, out=total)
+    return ratio, difference
 
 
 def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
     """Slices (queries, gallery, cells) of tiles of bounded size that cover all triples."""
-    (n_queries, n_cells), n_gallery = a.shape, len(b)
+    n_queries, n_cells = a.shape
+    n_gallery = len(b)
     n_bytes = _CPU_TILE_BYTES if a.device.type == "cpu" else _DEVICE_TILE_BYTES
     cells = min(n_cells, _CELLS_PER_TILE)
     pairs = max(1, n_bytes // (cells * a.element_size()))
-    rows = max(1, min(n_queries, max(math.isqrt(pairs), pairs // max(1, n_gallery))))
+    # As many rows as columns, or more if the gallery is short.
+    rows = max(math.isqrt(pairs), pairs // max(1, n_gallery))
+    rows = max(1, min(n_queries, rows))
     columns = max(1, min(n_gallery, pairs // rows))
     for q in range(0, n_queries, rows):
         for g in range(0, n_gallery, columns):
@@ -173,7 +183,8 @@ def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
 
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
-    if _can_use_loops(a) and not (torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)):
+    needs_gradients = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
+    if _can_use_loops(a) and not needs_gradients:
         return _sums_by_loops(a, b, chi_square=False).sqrt_()
     return row_distances(a, b)
 
@@ -187,25 +198,32 @@ def row_distances(
         return torch.cdist(a, b, compute_mode=compute_mode)
     # `torch.cdist` has no forward-mode and no second derivatives. Double precision reduces the product's cancellation.
     centre = a.detach().mean(dim=-2, keepdim=True)
-    x, y = (a - centre).double(), (b - centre).double()
-    sums = x.square().sum(dim=-1).unsqueeze(-1) + y.square().sum(dim=-1).unsqueeze(-2)
+    x = (a - centre).double()
+    y = (b - centre).double()
+    x_squares = x.square().sum(dim=-1)
+    y_squares = y.square().sum(dim=-1)
+    sums = x_squares.unsqueeze(-1) + y_squares.unsqueeze(-2)
     squares = sums - 2 * x @ y.mT
     is_positive = squares > _CANCELLATION * sums
-    return torch.where(is_positive, torch.where(is_positive, squares, 1).sqrt(), 0).to(a.dtype)
+    roots = torch.where(is_positive, squares, 1).sqrt()
+    return torch.where(is_positive, roots, 0).to(a.dtype)
 
 
 def square_root(values: Tensor) -> Tensor:
     """Square root of non-negative values, whose gradient at 0 is 0 in place of infinity."""
     is_positive = values > 0
-    return torch.where(is_positive, torch.where(is_positive, values, 1.0).sqrt(), 0.0)
+    roots = torch.where(is_positive, values, 1.0).sqrt()
+    return torch.where(is_positive, roots, 0.0)
 
 
 def _unit(name: str, rows: Tensor) -> Tensor:
     lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
     limits = torch.finfo(rows.dtype)
     is_traced = torch.compiler.is_compiling()  # traced code cannot depend on values of tensors
-    if not is_traced and bool(((lengths > limits.tiny**0.25) & (lengths < limits.max**0.25)).all()):
-        return rows / lengths
+    if not is_traced:
+        is_usual = (lengths > limits.tiny**0.25) & (lengths < limits.max**0.25)
+        if bool(is_usual.all()):
+            return rows / lengths
     # Divide by the largest entry first: the sum of squares of tiny or huge entries leaves the range of the dtype.
     largest = rows.detach().abs().amax(dim=1, keepdim=True)
     n_empty = 0 if is_traced else (largest == 0).sum().item()
@@ -256,9 +274,8 @@ def _check_entries(name: str, tensor: Tensor, *, non_negative: bool) -> None:
         )
     if torch.compiler.is_compiling() or tensor.numel() == 0:
         return
-    low, high = torch.stack(
-        torch.aminmax(tensor.detach())
-    ).tolist()  # both are NaN if any entry is NaN
+    extremes = torch.aminmax(tensor.detach())  # both are NaN if any entry is NaN
+    low, high = torch.stack(extremes).tolist()
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ValueError(
             f"{name}: expected finite entries, got NaN or infinity; look for the descriptor with them"

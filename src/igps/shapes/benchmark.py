@@ -63,12 +63,10 @@ class ArticulatedShapes:
         check_at_least(500, n_vertices=n_vertices)
         if n_classes > len(TEMPLATES):
             raise ValueError(f"n_classes must be at most {len(TEMPLATES)}, got {n_classes}")
-        self.n_classes, self.n_per_class, self.seed, self.n_vertices = (
-            n_classes,
-            n_per_class,
-            seed,
-            n_vertices,
-        )
+        self.n_classes = n_classes
+        self.n_per_class = n_per_class
+        self.seed = seed
+        self.n_vertices = n_vertices
 
     def __len__(self) -> int:
         return self.n_classes * self.n_per_class
@@ -101,7 +99,8 @@ class ArticulatedShapes:
         position = operator.index(index)
         if not -len(self) <= position < len(self):
             raise IndexError(f"index must lie in [{-len(self)}, {len(self)}), got {index}")
-        return self._generate(*divmod(position % len(self), self.n_per_class))
+        class_index, number = divmod(position % len(self), self.n_per_class)
+        return self._generate(class_index, number)
 
     def _generate(self, class_index: int, number: int) -> GeneratedShape:
         label = list(TEMPLATES)[class_index]
@@ -157,13 +156,16 @@ class ArticulatedShapes:
 
 def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
     """Return the folder of shapes with these settings, made if absent; a ValueError if it holds shapes of others."""
-    folder, expected = Path(root), json.dumps(settings)
+    folder = Path(root)
+    expected = json.dumps(settings)
     manifest = folder / "shapes.json"
     if not manifest.exists():
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(manifest) as file:
             file.write(expected.encode())
-    elif (recorded := manifest.read_text(encoding="utf-8")) != expected:
+        return folder
+    recorded = manifest.read_text(encoding="utf-8")
+    if recorded != expected:
         raise ValueError(
             f"root={str(root)!r} holds shapes of {recorded}, not of {expected}. Choose another folder."
         )

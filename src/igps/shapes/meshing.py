@@ -27,8 +27,9 @@ def mesh(body: Sequence[Placed], target: int) -> tuple[Floats, Integers, float]:
     for _ in range(3):
         low, grid = _sample(body, spacing)
         # Keep vertices away from grid points: otherwise they may coincide, and faces degenerate.
-        near = np.abs(grid) < _SNAP * spacing
-        grid[near] = np.where(grid[near] < 0.0, -_SNAP * spacing, _SNAP * spacing)
+        least = _SNAP * spacing
+        near = np.abs(grid) < least
+        grid[near] = np.where(grid[near] < 0.0, -least, least)
         points, faces, _, _ = marching_cubes(grid, 0.0, gradient_direction="descent")
         ratio = len(points) / target
         if abs(ratio - 1.0) < 0.1:
@@ -46,14 +47,13 @@ def roughen(
     waves = rng.normal(size=(12, 3)) * (2.0 * np.pi / wavelength / np.sqrt(3.0))
     phases = rng.uniform(0.0, 2.0 * np.pi, 12)
     noise = np.zeros(len(vertices))
-    for wave, phase in zip(waves, phases, strict=True):
-        noise += np.sin(
-            vertices[:, 0] * wave[0] + vertices[:, 1] * wave[1] + vertices[:, 2] * wave[2] + phase
-        )
-    return (
-        vertices
-        + surface.vertex_normals(vertices, faces) * (amplitude * noise / np.sqrt(6.0))[:, None]
-    )
+    x, y, z = vertices.T
+    for (a, b, c), phase in zip(waves, phases, strict=True):
+        noise += np.sin(x * a + y * b + z * c + phase)
+    # The sum of twelve waves has the standard deviation √6.
+    heights = amplitude * noise / np.sqrt(6.0)
+    normals = surface.vertex_normals(vertices, faces)
+    return vertices + normals * heights[:, None]
 
 
 def defect(
@@ -95,7 +95,9 @@ def _smooth_minimum(a: Floats, b: Floats, blend: float) -> Floats:
 
 def _bounds(body: Sequence[Placed]) -> tuple[Floats, Floats]:
     corners = np.array([part.bounds() for part in body])
-    return corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    low = corners[:, 0].min(axis=0)
+    high = corners[:, 1].max(axis=0)
+    return low, high
 
 
 def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
@@ -103,15 +105,19 @@ def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
     margin = max(part.blend for part in body) + 2.5 * spacing
     low, high = _bounds(body)
     low = low - margin
-    shape = np.ceil((high + margin - low) / spacing).astype(int) + 1
+    n_steps = np.ceil((high + margin - low) / spacing)
+    shape = n_steps.astype(int) + 1
     axes = [low[i] + spacing * np.arange(shape[i]) for i in range(3)]
-    grid = np.full(shape, 1e3)
+    grid = np.full(shape, 1e3)  # far outside
     for part in body:
         first, last = part.bounds()
-        start = np.maximum(np.floor((first - margin - low) / spacing).astype(int), 0)
-        stop = np.minimum(np.ceil((last + margin - low) / spacing).astype(int) + 1, shape)
-        window = tuple(slice(a, b) for a, b in zip(start, stop, strict=True))
-        distance = part.distance(*np.ix_(*(axis[w] for axis, w in zip(axes, window, strict=True))))
+        first_step = np.floor((first - margin - low) / spacing)
+        last_step = np.ceil((last + margin - low) / spacing)
+        start = np.maximum(first_step.astype(int), 0)
+        stop = np.minimum(last_step.astype(int) + 1, shape)
+        window = tuple(slice(start[i], stop[i]) for i in range(3))
+        x, y, z = (axes[i][window[i]] for i in range(3))
+        distance = part.distance(*np.ix_(x, y, z))
         grid[window] = _smooth_minimum(grid[window], distance, part.blend)
     return low, grid
 
@@ -119,22 +125,24 @@ def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
 def _rough_area(body: Sequence[Placed]) -> float:
     """Estimate the surface area from the volume of a band that reaches one coarse cell to both sides of the surface."""
     low, high = _bounds(body)
-    spacing = float((np.prod(high - low) / _COARSE_CELLS) ** (1.0 / 3.0))
+    volume = np.prod(high - low)
+    spacing = float((volume / _COARSE_CELLS) ** (1.0 / 3.0))
     _, grid = _sample(body, spacing)
-    return float(np.count_nonzero(np.abs(grid) < spacing)) * spacing**2 / 2.0
+    n_near = float(np.count_nonzero(np.abs(grid) < spacing))
+    return n_near * spacing**2 / 2.0
 
 
 def _relax(body: Sequence[Placed], vertices: Floats, faces: Integers, spacing: float) -> Floats:
     """Slide vertices (V,3) towards their neighbours' mean along the surface, and back onto the zero level set."""
     start, end = surface.directed_edges(faces)
-    adjacency = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(len(vertices),) * 2)
+    n = len(vertices)
+    adjacency = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(n, n))
     degree = np.bincount(start, minlength=len(vertices))[:, None]
     for _ in range(_RELAXATION_STEPS):
         normals = surface.vertex_normals(vertices, faces)
         step = (adjacency @ vertices) / degree - vertices
         step -= normals * (step * normals).sum(axis=1, keepdims=True)
         vertices = vertices + 0.7 * step
-        vertices -= (
-            normals * np.clip(_distance(body, vertices), -0.5 * spacing, 0.5 * spacing)[:, None]
-        )
+        heights = np.clip(_distance(body, vertices), -0.5 * spacing, 0.5 * spacing)
+        vertices -= normals * heights[:, None]
     return vertices

@@ -19,6 +19,9 @@ ORIGIN: Vector = (0.0, 0.0, 0.0)
 UP: Vector = (0.0, 0.0, 1.0)
 DOWN: Vector = (0.0, 0.0, -1.0)
 
+# Largest differences of thickness and of length between bodies of a class, in logarithms
+_PROPORTIONS = (0.1, 0.13)
+
 
 @dataclass(frozen=True)
 class Part:
@@ -71,36 +74,47 @@ class Placed:
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         """Return the signed distance of the solid at world coordinates."""
         # Not a matrix product, which may sum in another order on another number of threads.
-        r, (a, b, c) = self.rotation, self.offset
-        x, y, z = x - a, y - b, z - c
-        return self.solid.distance(*(r[0, i] * x + r[1, i] * y + r[2, i] * z for i in range(3)))
+        a, b, c = self.offset
+        x = x - a
+        y = y - b
+        z = z - c
+        local = []
+        for across, back, up in self.rotation.T:
+            local.append(across * x + back * y + up * z)
+        return self.solid.distance(*local)
 
     def bounds(self) -> tuple[Floats, Floats]:
         """Return the lower and upper corner of a box around the solid, along the axes of the world."""
         low, high = self.solid.box()
-        centre = (self.rotation * (0.5 * (low + high))).sum(axis=1) + self.offset
-        half = (np.abs(self.rotation) * (0.5 * (high - low))).sum(axis=1)
+        local_centre = 0.5 * (low + high)
+        local_half = 0.5 * (high - low)
+        centre = (self.rotation * local_centre).sum(axis=1) + self.offset
+        half = (np.abs(self.rotation) * local_half).sum(axis=1)
         return centre - half, centre + half
 
 
 def aim(heading: Vector, roll: float = 0.0) -> Floats:
     """Return a rotation of +z to ``heading``; before the roll, x is level, or close to x if the heading is steep."""
     z = np.array(heading) / np.linalg.norm(heading)
-    x = np.array([1.0, 0.0, 0.0]) - z[0] * z if abs(z[2]) > 0.9 else np.array([-z[1], z[0], 0.0])
+    x = np.array([-z[1], z[0], 0.0])
+    if abs(z[2]) > 0.9:
+        x = np.array([1.0, 0.0, 0.0]) - z[0] * z
     x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z]) @ Rotation.from_euler("z", roll).as_matrix()
+    y = np.cross(z, x)
+    rolled = Rotation.from_euler("z", roll)
+    return np.column_stack([x, y, z]) @ rolled.as_matrix()
 
 
 def turned(axes: str, *degrees: float) -> Floats:
     """Return a rotation by Euler angles, see `scipy.spatial.transform.Rotation.from_euler`."""
-    return np.asarray(Rotation.from_euler(axes, degrees, degrees=True).as_matrix()).reshape(3, 3)
+    rotation = Rotation.from_euler(axes, degrees, degrees=True)
+    return np.asarray(rotation.as_matrix()).reshape(3, 3)
 
 
 def circle(count: int, phase: float = 0.0) -> list[tuple[float, float]]:
     """Return equally spaced points (cos, sin) of the unit circle."""
-    return [
-        (float(np.cos(a)), float(np.sin(a))) for a in phase + 2.0 * np.pi * np.arange(count) / count
-    ]
+    angles = phase + 2.0 * np.pi * np.arange(count) / count
+    return [(float(np.cos(angle)), float(np.sin(angle))) for angle in angles]
 
 
 def limb(
@@ -121,15 +135,17 @@ def limb(
     """
     children = tuple(tip)
     for i in reversed(range(len(lengths))):
-        cone = Cone(lengths[i], radii[i], radii[i + 1])
+        raising, swinging = bends[min(i, len(bends) - 1)]
         part = Part(
-            cone,
+            Cone(lengths[i], radii[i], radii[i + 1]),
             group,
-            (*bends[min(i, len(bends) - 1)], 0.0),
+            bend=(raising, swinging, 0.0),
             blend=0.5 * radii[i],
             children=children,
         )
-        children = (part.joined((0.0, 0.0, lengths[i - 1]), knee) if i else part,)
+        if i > 0:
+            part = part.joined((0.0, 0.0, lengths[i - 1]), knee)
+        children = (part,)
     return children[0]
 
 
@@ -142,19 +158,18 @@ def pose(
 
     def place(part: Part, frame: Floats, origin: Floats) -> None:
         if part.group not in proportions:
-            thick, length = np.exp(rng.uniform(-1.0, 1.0, 2) * (0.1, 0.13))
-            proportions[part.group] = (float(thick), float(length))
+            thickness, length = np.exp(rng.uniform(-1.0, 1.0, 2) * _PROPORTIONS)
+            proportions[part.group] = (float(thickness), float(length))
+        own = proportions[part.group]
         angles = flex * np.array(part.bend) * rng.uniform(-1.0, 1.0, 3)
         frame = frame @ part.turn @ turned("xyz", *angles)
-        solid, factors = (
-            part.solid.stretched(*proportions[part.group]),
-            part.solid.factors(*proportions[part.group]),
-        )
-        placed.append(
-            Placed(solid, frame, origin + frame[:, 2] * (part.lift * factors[2]), part.blend)
-        )
+        solid = part.solid.stretched(*own)
+        factors = part.solid.factors(*own)
+        lift = frame[:, 2] * (part.lift * factors[2])
+        placed.append(Placed(solid, frame, origin + lift, part.blend))
         for child in part.children:
-            place(child, frame, origin + frame @ (factors * np.array(child.at)))
+            joint = frame @ (factors * np.array(child.at))
+            place(child, frame, origin + joint)
 
     place(skeleton.root, rotation, np.zeros(3))
     return placed

@@ -50,15 +50,23 @@ class Cone(Solid):
         radial = np.hypot(x, y)
         slope = (self.start - self.end) / self.length
         # The taper shifts the nearest sphere along the axis from the foot of the perpendicular.
-        along = np.clip(z - radial * (slope / np.sqrt(1.0 - slope * slope)), 0.0, self.length)
-        return np.hypot(radial, z - along) - (self.start - slope * along)
+        shift = radial * (slope / np.sqrt(1.0 - slope * slope))
+        along = np.clip(z - shift, 0.0, self.length)
+        radius = self.start - slope * along
+        return np.hypot(radial, z - along) - radius
 
     def box(self) -> tuple[Floats, Floats]:
         wide = max(self.start, self.end)
-        return np.array([-wide, -wide, -self.start]), np.array([wide, wide, self.length + self.end])
+        lower = np.array([-wide, -wide, -self.start])
+        upper = np.array([wide, wide, self.length + self.end])
+        return lower, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Cone(self.length * length, self.start * thick, self.end * thick)
+        return Cone(
+            length=self.length * length,
+            start=self.start * thick,
+            end=self.end * thick,
+        )
 
 
 @dataclass(frozen=True)
@@ -71,31 +79,44 @@ class Arc(Solid):
     end: float
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        turned = np.arctan2(z, self.bend - y) - 0.5 * self.angle
+        half = 0.5 * self.angle
+        # The angle along the arc, from the middle of the arc, between −π and π.
+        turned = np.arctan2(z, self.bend - y) - half
         turned = np.mod(turned + np.pi, 2.0 * np.pi) - np.pi
-        turned = np.clip(turned, -0.5 * self.angle, 0.5 * self.angle) + 0.5 * self.angle
-        centre_y, centre_z = self.bend * (1.0 - np.cos(turned)), self.bend * np.sin(turned)
-        tube = self.start + (self.end - self.start) / self.angle * turned
-        return np.sqrt(x * x + (y - centre_y) ** 2 + (z - centre_z) ** 2) - tube
+        turned = np.clip(turned, -half, half) + half
+        centre_y = self.bend * (1.0 - np.cos(turned))
+        centre_z = self.bend * np.sin(turned)
+        growth = (self.end - self.start) / self.angle
+        tube = self.start + growth * turned
+        squared = x * x + (y - centre_y) ** 2 + (z - centre_z) ** 2
+        return np.sqrt(squared) - tube
 
     def box(self) -> tuple[Floats, Floats]:
         wide = max(self.start, self.end)
         turned = np.linspace(0.0, self.angle, 33)
-        y, z = self.bend * (1.0 - np.cos(turned)), self.bend * np.sin(turned)
-        slack = wide + 0.01 * self.bend
-        return np.array([-wide, y.min() - slack, z.min() - slack]), np.array(
-            [wide, y.max() + slack, z.max() + slack]
-        )
+        y = self.bend * (1.0 - np.cos(turned))
+        z = self.bend * np.sin(turned)
+        slack = wide + 0.01 * self.bend  # as the points may miss the ends of the arc's extent
+        lower = np.array([-wide, y.min() - slack, z.min() - slack])
+        upper = np.array([wide, y.max() + slack, z.max() + slack])
+        return lower, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Arc(self.bend * length, self.angle, self.start * thick, self.end * thick)
+        return Arc(
+            bend=self.bend * length,
+            angle=self.angle,
+            start=self.start * thick,
+            end=self.end * thick,
+        )
 
     def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)
 
     def tip(self) -> Vector:
         """Return the far end of the centre line."""
-        return (0.0, self.bend * (1.0 - np.cos(self.angle)), self.bend * np.sin(self.angle))
+        y = self.bend * (1.0 - np.cos(self.angle))
+        z = self.bend * np.sin(self.angle)
+        return (0.0, y, z)
 
 
 @dataclass(frozen=True)
@@ -111,10 +132,9 @@ class Ring(Solid):
         return 1
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        return (
-            np.hypot(np.hypot(x, np.maximum(np.abs(z) - self.side, 0.0)) - self.radius, y)
-            - self.tube
-        )
+        beyond_side = np.maximum(np.abs(z) - self.side, 0.0)
+        from_ring = np.hypot(x, beyond_side) - self.radius
+        return np.hypot(from_ring, y) - self.tube
 
     def box(self) -> tuple[Floats, Floats]:
         wide = self.radius + self.tube
@@ -122,7 +142,11 @@ class Ring(Solid):
         return -upper, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Ring(self.radius * length, self.tube * thick, self.side * length)
+        return Ring(
+            radius=self.radius * length,
+            tube=self.tube * thick,
+            side=self.side * length,
+        )
 
     def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)
@@ -136,13 +160,16 @@ class Blob(Solid):
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         a, b, c = self.radii
-        unit = np.sqrt((x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2)
-        gradient = np.sqrt((x / a**2) ** 2 + (y / b**2) ** 2 + (z / c**2) ** 2)
+        squared = (x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2
+        squared_gradient = (x / a**2) ** 2 + (y / b**2) ** 2 + (z / c**2) ** 2
+        unit = np.sqrt(squared)
         # Exact to first order at the surface; the bound on the gradient keeps the centre finite and inside.
-        return unit * (unit - 1.0) / np.maximum(gradient, 1e-9) - 1e-12
+        gradient = np.maximum(np.sqrt(squared_gradient), 1e-9)
+        return unit * (unit - 1.0) / gradient - 1e-12
 
     def box(self) -> tuple[Floats, Floats]:
-        return -np.array(self.radii), np.array(self.radii)
+        upper = np.array(self.radii)
+        return -upper, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
         a, b, c = self.radii
@@ -157,20 +184,23 @@ class Box(Solid):
     rounding: float
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        a, b, c = (
-            np.abs(q) - (0.5 * s - self.rounding) for q, s in zip((x, y, z), self.size, strict=True)
-        )
-        outside = np.sqrt(
-            np.maximum(a, 0.0) ** 2 + np.maximum(b, 0.0) ** 2 + np.maximum(c, 0.0) ** 2
-        )
-        return outside + np.minimum(np.maximum(np.maximum(a, b), c), 0.0) - self.rounding
+        beyond = []  # each side of the box without its rounding
+        for coordinate, size in zip((x, y, z), self.size, strict=True):
+            beyond.append(np.abs(coordinate) - (0.5 * size - self.rounding))
+        a, b, c = beyond
+        squared = np.maximum(a, 0.0) ** 2 + np.maximum(b, 0.0) ** 2 + np.maximum(c, 0.0) ** 2
+        outside = np.sqrt(squared)
+        inside = np.minimum(np.maximum(np.maximum(a, b), c), 0.0)
+        return outside + inside - self.rounding
 
     def box(self) -> tuple[Floats, Floats]:
-        return -0.5 * np.array(self.size), 0.5 * np.array(self.size)
+        upper = 0.5 * np.array(self.size)
+        return -upper, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
         a, b, c = self.size
-        return Box((a * thick, b * thick, c * length), self.rounding * min(thick, length))
+        size = (a * thick, b * thick, c * length)
+        return Box(size, self.rounding * min(thick, length))
 
 
 @dataclass(frozen=True)
@@ -182,26 +212,29 @@ class Shell(Solid):
 
     @property
     def genus(self) -> int:
-        return (
-            0 if self.profile[0][0] == 0.0 else 1
-        )  # a profile that starts off the axis is a tube, open at both ends
+        first_radius, _ = self.profile[0]
+        # a profile that starts off the axis is a tube, open at both ends
+        return 0 if first_radius == 0.0 else 1
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         radial = np.hypot(x, y)
         squared = np.full(radial.shape, np.inf)
         for (r0, z0), (r1, z1) in itertools.pairwise(self.profile):
-            dr, dz = r1 - r0, z1 - z0
-            along = np.clip(((radial - r0) * dr + (z - z0) * dz) / (dr * dr + dz * dz), 0.0, 1.0)
-            np.minimum(
-                squared, (radial - r0 - along * dr) ** 2 + (z - z0 - along * dz) ** 2, out=squared
-            )
+            dr = r1 - r0
+            dz = z1 - z0
+            projected = (radial - r0) * dr + (z - z0) * dz
+            along = np.clip(projected / (dr * dr + dz * dz), 0.0, 1.0)
+            to_segment = (radial - r0 - along * dr) ** 2 + (z - z0 - along * dz) ** 2
+            squared = np.minimum(squared, to_segment)
         return np.sqrt(squared) - 0.5 * self.wall
 
     def box(self) -> tuple[Floats, Floats]:
         radii, heights = np.array(self.profile).T
         wide = radii.max() + 0.5 * self.wall
-        low, high = heights.min() - 0.5 * self.wall, heights.max() + 0.5 * self.wall
+        low = heights.min() - 0.5 * self.wall
+        high = heights.max() + 0.5 * self.wall
         return np.array([-wide, -wide, low]), np.array([wide, wide, high])
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Shell(tuple((r * thick, z * length) for r, z in self.profile), self.wall * thick)
+        profile = tuple((r * thick, z * length) for r, z in self.profile)
+        return Shell(profile, self.wall * thick)

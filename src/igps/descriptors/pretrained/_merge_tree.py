@@ -36,10 +36,10 @@ def merge_trees(
     Raises:
         ValueError: a potential is not finite, or a body has no samples.
     """
-    values, neighbours = features.log_potential(embedding).detach(), features.neighbours(embedding)
-    saddles_and_pieces: tuple[Tensor, Tensor] = _operator(
-        values, neighbours, features.samples.mask, list(levels)
-    )
+    values = features.log_potential(embedding).detach()
+    neighbours = features.neighbours(embedding)
+    mask = features.samples.mask
+    saddles_and_pieces: tuple[Tensor, Tensor] = _operator(values, neighbours, mask, list(levels))
     return saddles_and_pieces
 
 
@@ -51,19 +51,23 @@ def merge_trees(
 def _operator(
     values: Tensor, neighbours: Tensor, mask: Tensor, levels: list[float]
 ) -> tuple[Tensor, Tensor]:
+    device = values.device
     saddles, pieces = _empty_outputs(values, neighbours, mask, levels)
-    saddles, pieces = saddles.cpu(), pieces.cpu()
-    for i, (heights, nearest, is_sample) in enumerate(
-        zip(values.cpu(), neighbours.cpu(), mask.cpu(), strict=True)
-    ):
-        if not (n := int(is_sample.sum())):
+    saddles = saddles.cpu()
+    pieces = pieces.cpu()
+    values = values.cpu()
+    neighbours = neighbours.cpu()
+    mask = mask.cpu()
+    own = torch.arange(values.shape[1], device="cpu")
+    for i in range(len(values)):
+        n = int(mask[i].sum())
+        if n == 0:
             raise ValueError("samples: expected at least one of each body, got none.")
-        tree = merge_tree(
-            heights, nearest, [max(1, round(share * n)) for share in levels], is_sample
-        )
-        saddles[i] = torch.arange(len(heights), device="cpu").scatter(0, tree.peaks, tree.saddles)
+        counts = [max(1, round(share * n)) for share in levels]
+        tree = merge_tree(values[i], neighbours[i], counts, mask[i])
+        saddles[i] = own.scatter(0, tree.peaks, tree.saddles)
         pieces[i] = tree.pieces
-    return saddles.to(values.device), pieces.to(values.device)
+    return saddles.to(device), pieces.to(device)
 
 
 @_operator.register_fake
@@ -97,12 +101,17 @@ def merge_tree(
     points = torch.arange(len(values), device="cpu") if mask is None else mask.nonzero()[:, 0]
     if not torch.isfinite(values[points]).all():
         raise ValueError("values: expected finite numbers, got NaN or infinity.")
-    order = points[torch.argsort(values[points], descending=True, stable=True)].numpy()
+    descending = torch.argsort(values[points], descending=True, stable=True)
+    order = points[descending].numpy()
     rank = np.full(len(values), -1)
     rank[order] = np.arange(len(order))
-    pairs = np.stack([rank.repeat(neighbours.shape[1]), rank[neighbours.numpy().ravel()]])
-    pairs = pairs[:, (pairs >= 0).all(axis=0)]
-    higher, lower = pairs.min(axis=0), pairs.max(axis=0)
+    own_rank = rank.repeat(neighbours.shape[1])
+    neighbour_rank = rank[neighbours.numpy().ravel()]
+    pairs = np.stack([own_rank, neighbour_rank])
+    exists = (pairs >= 0).all(axis=0)
+    pairs = pairs[:, exists]
+    higher = pairs.min(axis=0)
+    lower = pairs.max(axis=0)
     by_lower = np.argsort(lower)  # the order of pairs with the same lower point does not matter
     branches = np.empty((len(order), 2), np.int64)
     pieces = np.full((len(counts), len(values)), -1, np.int64)
@@ -135,14 +144,16 @@ def _merge(
     n_branches = level = pair = 0
     for point in range(len(order)):
         while pair < len(lower) and lower[pair] == point:
-            a, b = _root(parent, point), _root(parent, higher[pair])
+            a = _root(parent, point)
+            b = _root(parent, higher[pair])
             pair += 1
             if a == b:
                 continue
             ending = max(a, b)  # the branch with the higher peak continues
             parent[ending] = min(a, b)
             if ending != point:
-                branches[n_branches, 0], branches[n_branches, 1] = order[ending], order[point]
+                branches[n_branches, 0] = order[ending]
+                branches[n_branches, 1] = order[point]
                 n_branches += 1
         while level < len(counts) and counts[level] == point + 1:
             for k in range(point + 1):
@@ -150,7 +161,8 @@ def _merge(
             level += 1
     for k in range(len(order)):
         if parent[k] == k:
-            branches[n_branches, 0], branches[n_branches, 1] = order[k], order[-1]
+            branches[n_branches, 0] = order[k]
+            branches[n_branches, 1] = order[-1]
             n_branches += 1
     return n_branches
 

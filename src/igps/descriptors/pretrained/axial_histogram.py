@@ -84,40 +84,37 @@ class AxialHistogram(SampleHistogram):
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, 3, ...) histograms of the samples of N shapes."""
-        mask, potential = (
-            features.samples.mask,
-            barycentroid_potential(features.embedded(self.embedding)),
-        )
+        mask = features.samples.mask
+        potential = barycentroid_potential(features.embedded(self.embedding))
+        sample_weights = features.weights_or_ones(potential)
         # Padding may hold any value, and must not count.
-        points, directions, potential, sample_weights = (
-            values.masked_fill(~mask.view(*mask.shape, *[1] * (values.ndim - 2)), 0)
-            for values in (
-                features.positions(),
-                features.attribute("surface_direction"),
-                potential,
-                features.weights_or_ones(potential),
-            )
-        )
-        if not torch.compiler.is_compiling() and not torch.isfinite(
-            points.sum() + directions.sum() + potential.sum()
-        ):
+        is_padding = ~mask
+        points = features.positions().masked_fill(is_padding[:, :, None], 0)
+        directions = features.attribute("surface_direction")
+        directions = directions.masked_fill(is_padding[:, :, None], 0)
+        potential = potential.masked_fill(is_padding, 0)
+        sample_weights = sample_weights.masked_fill(is_padding, 0)
+        total = points.sum() + directions.sum() + potential.sum()
+        if not torch.compiler.is_compiling() and not torch.isfinite(total):
             raise ValueError("AxialHistogram: expected finite values, got NaN or infinity.")
         with (
             torch.no_grad(),
             forward_ad._set_fwd_grad_enabled(False) if in_transforms() else nullcontext(),
         ):
             weights = potential.double().clamp_min(torch.finfo().tiny).pow(_POWER) * mask
-            centre, axes = (values.to(points.dtype) for values in principal_axes(points, weights))
+            centre, axes = principal_axes(points, weights)
+        centre = centre.to(points.dtype)
+        axes = axes.to(points.dtype)
         n_points = mask.sum(dim=1)
-        positions, directions = (points - centre) @ axes * mask[:, :, None], directions @ axes
-        positions = (
-            positions / (positions.square().sum(dim=(1, 2)) / n_points).sqrt()[:, None, None]
-        )
+        positions = (points - centre) @ axes * mask[:, :, None]
+        directions = directions @ axes
+        radius = (positions.square().sum(dim=(1, 2)) / n_points).sqrt()
+        positions = positions / radius[:, None, None]
         # Components along each axis, (N, 3, P), and along the two other axes, (N, 3, P, 2)
-        height, axial = positions.mT, directions.mT
-        across, radial = (
-            torch.stack([values.roll(n, 1) for n in (1, 2)], dim=3) for values in (height, axial)
-        )
+        height = positions.mT
+        axial = directions.mT
+        across = _along_others(height)
+        radial = _along_others(axial)
         outward = (radial * normalize(across, dim=3)).sum(dim=3)
         place = [
             soft_memberships(height, self.along),
@@ -133,6 +130,11 @@ class AxialHistogram(SampleHistogram):
             joint(place) * sample_weights[:, None, :, None], joint(direction), n_points[:, None]
         )
         return counts.view(-1, *self.shape) / 3
+
+
+def _along_others(components: Tensor) -> Tensor:
+    """(N, 3, P) components along each axis to those along the two other axes, (N, 3, P, 2)."""
+    return torch.stack([components.roll(1, 1), components.roll(2, 1)], dim=3)
 
 
 def principal_axes(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

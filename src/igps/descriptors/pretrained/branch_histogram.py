@@ -54,22 +54,33 @@ class BranchHistogram(SampleHistogram):
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, B) histograms of the samples of N shapes."""
-        (saddles, _), mask = merge_trees(features, self.embedding), features.samples.mask
+        mask = features.samples.mask
+        saddles, _ = merge_trees(features, self.embedding)
         heights = features.log_potential(self.embedding).masked_fill(~mask, 0)
-        lengths, longest = (heights - heights.gather(1, saddles)).sort(dim=1, descending=True)
-        lengths, longest = lengths[:, : self.n_branches], longest[:, : self.n_branches]
+        above_saddle = heights - heights.gather(1, saddles)
+        lengths, longest = above_saddle.sort(dim=1, descending=True)
+        lengths = lengths[:, : self.n_branches]
+        longest = longest[:, : self.n_branches]
         total = lengths.sum(dim=1, keepdim=True)
         shares = lengths / torch.where(total > 0, total, 1)
-        if (weights := features.weights()) is not None:
-            inputs = saddles, longest, heights.detach(), features.neighbours(self.embedding), mask
-            bodies = zip(*(values.cpu() for values in inputs), strict=True)
+        weights = features.weights()
+        if weights is not None:
+            bodies = zip(
+                saddles.cpu(),
+                longest.cpu(),
+                heights.detach().cpu(),
+                features.neighbours(self.embedding).cpu(),
+                mask.cpu(),
+                strict=True,
+            )
             limbs = torch.stack([_limbs(*body) for body in bodies]).to(weights)
-            shares = shares * (limbs @ weights[:, :, None])[:, :, 0] / limbs.sum(dim=2).clamp_min(1)
+            limb_weights = (limbs @ weights[:, :, None])[:, :, 0]
+            limb_sizes = limbs.sum(dim=2).clamp_min(1)
+            shares = shares * limb_weights / limb_sizes
         histogram = functional.pad(shares, (0, self.n_branches - shares.shape[1]))
         # If the potential is constant, the only branch has length 0.
-        return torch.where(
-            total > 0, histogram, functional.pad(torch.ones_like(total), (0, self.n_branches - 1))
-        )
+        single = functional.pad(torch.ones_like(total), (0, self.n_branches - 1))
+        return torch.where(total > 0, histogram, single)
 
 
 def _limbs(
@@ -79,4 +90,5 @@ def _limbs(
     order = heights.masked_fill(~mask, -torch.inf).argsort(descending=True, stable=True)
     n_above = order.argsort()[saddles[longest]].clamp_min(1)
     counts, level = n_above.unique(return_inverse=True)
-    return merge_tree(heights, neighbours, counts.tolist(), mask).pieces[level] == longest[:, None]
+    pieces = merge_tree(heights, neighbours, counts.tolist(), mask).pieces
+    return pieces[level] == longest[:, None]

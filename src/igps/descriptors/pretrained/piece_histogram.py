@@ -14,8 +14,10 @@ from igps.signature.signature import SampleKind
 
 # Centres of the first and last bins, as logarithms to base 2. Sizes start at one sample in 64. The length of a ball is
 # −0.8, and that of a rod a hundred times as long as it is thick is 2.5.
-_MIN_SIZE, _MAX_SIZE = -6.0, -0.5
-_MIN_LENGTH, _MAX_LENGTH = -1.0, 2.5
+_MIN_SIZE = -6.0
+_MAX_SIZE = -0.5
+_MIN_LENGTH = -1.0
+_MAX_LENGTH = 2.5
 _MIN_SAMPLES = 4  # fewer samples do not determine a length
 
 
@@ -56,16 +58,19 @@ class PieceHistogram(SampleHistogram):
         n_training_samples: int | None = None,
     ) -> None:
         super().__init__(samples, n_samples, n_training_samples)
-        if not levels or list(levels) != sorted(levels) or not 0 < levels[0] <= levels[-1] <= 1:
+        is_ascending = list(levels) == sorted(levels)
+        if not levels or not is_ascending or not 0 < levels[0] <= levels[-1] <= 1:
             raise ValueError(
                 f"levels: expected shares above 0 and up to 1, ascending, got {tuple(levels)}."
             )
         if len(n_bins) != 2 or min(n_bins) < 2:
             raise ValueError(f"n_bins: expected two numbers, each at least 2, got {n_bins}.")
-        self.levels, self.n_bins = tuple(levels), n_bins
+        self.levels = tuple(levels)
+        self.n_bins = n_bins
         self.embedding = embedding or SpectralEmbedding()
-        self.register_buffer("sizes", torch.linspace(_MIN_SIZE, _MAX_SIZE, n_bins[0]))
-        self.register_buffer("lengths", torch.linspace(_MIN_LENGTH, _MAX_LENGTH, n_bins[1]))
+        n_sizes, n_lengths = n_bins
+        self.register_buffer("sizes", torch.linspace(_MIN_SIZE, _MAX_SIZE, n_sizes))
+        self.register_buffer("lengths", torch.linspace(_MIN_LENGTH, _MAX_LENGTH, n_lengths))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -74,45 +79,51 @@ class PieceHistogram(SampleHistogram):
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, L, ...) histograms of the samples of N shapes."""
-        mask, points = features.samples.mask, features.positions()
-        points, weights = (
-            points.masked_fill(~mask[:, :, None], 0),
-            features.weights_or_ones(points[..., 0]),
-        )
+        mask = features.samples.mask
+        points = features.positions()
+        weights = features.weights_or_ones(points[..., 0])
+        points = points.masked_fill(~mask[:, :, None], 0)
         is_traced = torch.compiler.is_compiling()  # traced code cannot depend on values of tensors
         if not is_traced and not torch.isfinite(points).all():
             raise ValueError("PieceHistogram: expected finite positions, got NaN or infinity.")
         _, peaks = merge_trees(features, self.embedding, self.levels)
-        remains, n_samples = peaks >= 0, mask.shape[1]
+        remains = peaks >= 0
+        n_samples = mask.shape[1]
         # The pieces of a level are numbered in the order of their peaks. Samples that do not remain get a piece, too,
         # but are left out of all sums.
-        numbers = (peaks == torch.arange(n_samples, device=peaks.device)).cumsum(dim=2) - 1
-        piece = numbers.gather(2, peaks.clamp_min(0)).masked_fill(~remains, 0)
+        is_peak = peaks == torch.arange(n_samples, device=peaks.device)
+        numbers = is_peak.cumsum(dim=2) - 1
+        piece = numbers.gather(2, peaks.clamp_min(0))
+        piece = piece.masked_fill(~remains, 0)
         n_pieces = n_samples if is_traced else int(piece.max()) + 1
 
         def sums(values: Tensor) -> Tensor:
             """Sum values (N, P, k) or (N, L, P, k) of the samples over each piece: (N, L, pieces, k)."""
-            values = torch.where(
-                remains[..., None], values if values.ndim == 4 else values[:, None], 0
-            )
+            if values.ndim == 3:
+                values = values[:, None]
+            values = torch.where(remains[..., None], values, 0)
             zeros = values.new_zeros(*remains.shape[:2], n_pieces, values.shape[-1])
-            return zeros.scatter_add(2, piece[..., None].expand_as(values), values)
+            index = piece[..., None].expand_as(values)
+            return zeros.scatter_add(2, index, values)
 
         n_points = sums(torch.ones_like(points[..., :1])).clamp_min(1)
         means = sums(points) / n_points
-        centred = points[:, None] - means.gather(2, piece[..., None].expand(*remains.shape, 3))
-        covariance = sums((centred[..., :, None] * centred[..., None, :]).flatten(3)) / n_points
+        index = piece[..., None].expand(*remains.shape, 3)
+        centred = points[:, None] - means.gather(2, index)
+        products = centred[..., :, None] * centred[..., None, :]
+        covariance = sums(products.flatten(3)) / n_points
         # Small pieces get distinct eigenvalues: equal ones have no second derivatives.
         is_small = n_points < _MIN_SAMPLES
-        covariance = torch.where(
-            is_small, covariance.new_tensor([1, 0, 0, 0, 2, 0, 0, 0, 3]), covariance
-        )
+        distinct = covariance.new_tensor([1, 0, 0, 0, 2, 0, 0, 0, 3])
+        covariance = torch.where(is_small, distinct, covariance)
         largest = torch.linalg.eigvalsh(covariance.unflatten(3, (3, 3)))[..., -1]
         sizes = n_points[..., 0] / mask.sum(dim=1)[:, None, None]
         squared_lengths = 12 * torch.where(is_small[..., 0], 0, largest) / sizes
-        lengths = squared_lengths.clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
-        size_memberships = soft_memberships(sizes.log2(), self.sizes) * sums(
-            weights[..., None].to(points.dtype)
-        )
-        counts = size_memberships.mT @ soft_memberships(lengths, self.lengths)
-        return counts / remains.sum(dim=(1, 2))[:, None, None, None]
+        tiny = torch.finfo(points.dtype).tiny
+        log_lengths = squared_lengths.clamp_min(tiny).log2() / 2
+        piece_weights = sums(weights[..., None].to(points.dtype))
+        by_size = soft_memberships(sizes.log2(), self.sizes) * piece_weights
+        by_length = soft_memberships(log_lengths, self.lengths)
+        counts = by_size.mT @ by_length
+        n_counted = remains.sum(dim=(1, 2))
+        return counts / n_counted[:, None, None, None]

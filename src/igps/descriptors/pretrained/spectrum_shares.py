@@ -58,23 +58,21 @@ class SpectrumShares(DescriptionPart):
         """(N, K + 1) shares of N shapes."""
         batch = features.batch
         k = torch.arange(1, self.n_eigenpairs + 1, device=batch.eigenvalues.device)
-        smallest_area = (36 * math.pi) ** (1 / 3) * batch.volume.to(batch.eigenvalues)[:, None].pow(
-            2 / 3
-        )
-        ratios = (
-            batch.eigenvalues[:, : self.n_eigenpairs]
-            * smallest_area
-            / (8 * math.pi * self.n_eigenpairs * k)
-        )
-        shares = (ratios / ratios.sum(dim=1, keepdim=True).clamp_min(1)).to(
-            batch.surface.eigenfunctions.dtype
-        )
-        cells = torch.cat([shares, (1 - shares.sum(dim=1, keepdim=True)).clamp_min(0)], dim=1)
+        volume = batch.volume.to(batch.eigenvalues)
+        smallest_area = (36 * math.pi) ** (1 / 3) * volume[:, None].pow(2 / 3)
+        eigenvalues = batch.eigenvalues[:, : self.n_eigenpairs]
+        ratios = eigenvalues * smallest_area / (8 * math.pi * self.n_eigenpairs * k)
+        shares = ratios / ratios.sum(dim=1, keepdim=True).clamp_min(1)
+        shares = shares.to(batch.surface.eigenfunctions.dtype)
+        remainder = 1 - shares.sum(dim=1, keepdim=True)
+        cells = torch.cat([shares, remainder.clamp_min(0)], dim=1)
         weights = batch.surface.attributes.get(WEIGHT)
         if weights is None:
             return cells
         # An eigenvalue depends on the surface most where its eigenfunction is large (Hadamard 1908), the remainder
         # everywhere alike.
         squares = batch.surface.eigenfunctions[:, :, : self.n_eigenpairs].square()
-        densities = torch.cat([squares, batch.surface.mask[:, :, None].to(squares)], dim=2)
-        return cells * (densities * weights[:, :, None]).sum(dim=1) / densities.sum(dim=1)
+        everywhere = batch.surface.mask[:, :, None].to(squares)
+        densities = torch.cat([squares, everywhere], dim=2)
+        weighted = densities * weights[:, :, None]
+        return cells * weighted.sum(dim=1) / densities.sum(dim=1)
