@@ -4,6 +4,7 @@ Points x are (3, n), and close together. The tables of the surface are those of 
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
@@ -151,6 +152,13 @@ def fill_clusters(
             )
 
 
+class Touched(NamedTuple):
+    """The faces on which points lie: their numbers (n,), or -1, and the barycentric coordinates (n, 3) there."""
+
+    face_at: Integers
+    barycentric: Floats
+
+
 @compiled()
 def add_near_faces(
     x: Floats, chosen: Integers, near: Booleans, surface: SurfaceArrays, weights: Floats
@@ -168,14 +176,11 @@ def add_near_faces(
     for k in range(n_chosen):
         row_of[chosen[k]] = k
     pairs = np.empty((2, n + _N_PAIRS), np.int64)
-    face_at, barycentric = np.empty(n, np.int64), np.empty((n, 3))
-    face_at[:] = -1
+    touched = Touched(np.full(n, -1, np.int64), np.empty((n, 3)))
     n_pairs = 0
     for k in range(n_chosen):
-        hat, any_near = chosen[k], False
-        for i in range(n):
-            any_near |= near[k, i]
-        if not any_near:
+        hat = chosen[k]
+        if not near[k].any():
             continue
         for j in range(face_starts[hat], face_starts[hat + 1]):
             face = incident_faces[j]
@@ -189,25 +194,23 @@ def add_near_faces(
                     pairs[0, n_pairs], pairs[1, n_pairs] = face, i
                     n_pairs += 1
             if n_pairs >= _N_PAIRS:
-                add_faces(
-                    x,
-                    pairs[:, :n_pairs],
-                    faces,
-                    table,
-                    row_of,
-                    near,
-                    hat_weights,
-                    face_at,
-                    barycentric,
-                )
+                add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, touched)
                 n_pairs = 0
-    add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, face_at, barycentric)
-    for i in range(n):
-        if face_at[i] >= 0:
-            for k in range(len(weights)):
-                weights[k, i] = 0
+    add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, touched)
+    _interpolate_on_faces(touched, faces, row_of, weights, hat_weights)
+
+
+@compiled()
+def _interpolate_on_faces(
+    touched: Touched, faces: Integers, row_of: Integers, weights: Floats, hat_weights: Floats
+) -> None:
+    """Replace all weights of the points on faces by their barycentric coordinates."""
+    for i in range(len(touched.face_at)):
+        if touched.face_at[i] >= 0:
+            weights[:, i] = 0
             for corner in range(3):
-                hat_weights[row_of[faces[face_at[i], corner]], i] = barycentric[i, corner]
+                row = row_of[faces[touched.face_at[i], corner]]
+                hat_weights[row, i] = touched.barycentric[i, corner]
 
 
 @compiled()
@@ -219,13 +222,11 @@ def add_faces(
     row_of: Integers,
     near: Booleans,
     weights: Floats,
-    face_at: Integers,
-    barycentric: Floats,
+    touched: Touched,
 ) -> None:
     """Add the closed form for pairs (2, m) of a face and a point, accurate up to the surface.
 
-    If a point is on the surface, the first face that contains it is written to face_at (n,), and its barycentric
-    coordinates there to barycentric (n, 3).
+    If a point is on the surface, the first face that contains it is written to `touched`.
 
     Let λ be the barycentric coordinates of the projection of x, h its distance to the plane, e_l the sides, N_l the
     cross product of the vectors from x to the ends of side l, and θ_l the angle between these. The published
@@ -269,7 +270,8 @@ def add_faces(
         s = g[0] * areas[0] + g[1] * areas[1] + g[2] * areas[2]
         # In the plane of a face but outside the face, s vanishes like h² and s/h like h: only rounding errors are left.
         s_over_h = 0.0 if abs(height) < _ON_SURFACE and s < 1e-2 else s / height
-        on_face, total_area = abs(height) <= _ON_SURFACE and face_at[i] < 0, 0.0
+        on_face = abs(height) <= _ON_SURFACE and touched.face_at[i] < 0
+        total_area = 0.0
         for corner in range(3):
             left, right, k = (corner + 2) % 3, (corner + 1) % 3, row_of[faces[face, corner]]
             if near[k, i]:
@@ -282,9 +284,9 @@ def add_faces(
             on_face &= areas[corner] >= -_ON_SURFACE * math.sqrt(sides[corner])
             total_area += max(areas[corner], 0.0)
         if on_face:
-            face_at[i] = face
+            touched.face_at[i] = face
             for corner in range(3):
-                barycentric[i, corner] = max(areas[corner], 0.0) / total_area
+                touched.barycentric[i, corner] = max(areas[corner], 0.0) / total_area
 
 
 @compiled(fastmath=FUSE)

@@ -3,6 +3,8 @@
 This is the first step of a factorization, see `_multifrontal`. Only the pattern of the matrix is read.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
@@ -77,98 +79,161 @@ def nested_dissection(
     return _dissect(np.stack(orders), indptr, indices, depth, CUT_WINDOW), depth + 1
 
 
+class _Scratch(NamedTuple):
+    """Arrays that every part uses again.
+
+    Args:
+        rank: (V,) position of each vertex in the order of the part, or -1 outside the part, which is the largest
+            unsigned number. The highest (signed) and the lowest (unsigned) rank among neighbours are therefore found
+            without checking whether these are in the part.
+        low: (V,) lowest rank among a vertex and its neighbours, by the vertex's rank.
+        high: (V,) highest such rank.
+        n_lowest: (V + 1,) number of vertices whose lowest rank is one less than the index.
+        n_highest: (V + 1,) the same of the highest rank.
+        side: (V,) of each vertex: 0 left, 1 right, 2 separator.
+        right: (V,) vertices of the right side, in order.
+    """
+
+    rank: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    n_lowest: np.ndarray
+    n_highest: np.ndarray
+    side: np.ndarray
+    right: np.ndarray
+
+
+class _Cut(NamedTuple):
+    """A cut before position `at` of an order, with a separator of `size` vertices on one of its sides."""
+
+    at: int
+    size: int
+    is_left: bool
+
+
 @compiled()
 def _dissect(
     orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth: int, window: float
 ) -> np.ndarray:
-    """Return the node of each vertex. The orders (d, V), vertices sorted by each coordinate, are overwritten.
-
-    Vertices outside the current part have rank −1, which is the largest unsigned number. The highest (signed) and the
-    lowest (unsigned) rank among neighbours are therefore found without checking whether these are in the part.
-    """
+    """Return the node of each vertex. The orders (d, V), vertices sorted by each coordinate, are overwritten."""
     n_coordinates, n_vertices = orders.shape
     node = np.empty(n_vertices, np.int64)
-    rank = np.full(n_vertices, -1, np.int32)
-    low, high = np.empty(n_vertices, np.int32), np.empty(n_vertices, np.int32)
-    n_highest, n_lowest = np.empty(n_vertices + 1, np.int32), np.empty(n_vertices + 1, np.int32)
-    side = np.empty(n_vertices, np.int8)  # 0 left, 1 right, 2 separator
-    right = np.empty(n_vertices, orders.dtype)
-    begin, end = np.zeros(1, np.int64), np.full(1, n_vertices, np.int64)
+    scratch = _Scratch(
+        np.full(n_vertices, -1, np.int32),
+        np.empty(n_vertices, np.int32),
+        np.empty(n_vertices, np.int32),
+        np.empty(n_vertices + 1, np.int32),
+        np.empty(n_vertices + 1, np.int32),
+        np.empty(n_vertices, np.int8),
+        np.empty(n_vertices, orders.dtype),
+    )
+    begin = np.zeros(1, np.int64)
+    end = np.full(1, n_vertices, np.int64)
     for level in range(depth):
-        next_begin, next_end = (
-            np.zeros(2 ** (level + 1), np.int64),
-            np.zeros(2 ** (level + 1), np.int64),
-        )
+        next_begin = np.zeros(2 ** (level + 1), np.int64)
+        next_end = np.zeros(2 ** (level + 1), np.int64)
         for part in range(2**level):
-            first, size = begin[part], end[part] - begin[part]
-            if size == 0:
+            first = begin[part]
+            last = end[part]
+            if last == first:
                 continue
-            separator = 2**level - 1 + part
             min_size = n_vertices + 1
             for c in range(n_coordinates):
-                order = orders[c, first : first + size]
-                for i in range(size):
-                    rank[order[i]] = i
-                n_highest[: size + 1] = 0
-                n_lowest[: size + 1] = 0
-                for i in range(size):
-                    lowest, highest = np.uint32(i), np.int32(i)
-                    for k in range(np.uint64(indptr[order[i]]), np.uint64(indptr[order[i] + 1])):
-                        neighbour_rank = rank[np.uint32(indices[k])]
-                        lowest, highest = (
-                            min(lowest, np.uint32(neighbour_rank)),
-                            max(highest, neighbour_rank),
-                        )
-                    low[i], high[i] = lowest, highest
-                    n_highest[highest + 1] += 1
-                    n_lowest[lowest + 1] += 1
-                cut, cut_size, is_left = 0, n_vertices, True
-                # Vertices with all neighbours before the cut, and with at least one; a vertex is its own neighbour.
-                n_closed = n_opened = 0
-                for i in range(size):
-                    n_closed += n_highest[i]
-                    n_opened += n_lowest[i]
-                    if i > 0 and abs(i - size / 2) <= max(window * size, 1.0):
-                        left_size, right_size = i - n_closed, n_opened - i
-                        if min(left_size, right_size) < cut_size:
-                            cut, cut_size, is_left = (
-                                i,
-                                min(left_size, right_size),
-                                left_size <= right_size,
-                            )
-                if cut_size >= min_size:
-                    continue
-                min_size = cut_size
-                for i in range(size):
-                    if i < cut:
-                        side[order[i]] = 2 if is_left and high[i] >= cut else 0
-                    else:
-                        side[order[i]] = 2 if not is_left and low[i] < cut else 1
-            for i in range(first, first + size):
-                rank[orders[0, i]] = -1
+                order = orders[c, first:last]
+                _rank_neighbours(order, indptr, indices, scratch)
+                cut = _smallest_cut(scratch, len(order), n_vertices, window)
+                if cut.size < min_size:
+                    min_size = cut.size
+                    _mark_sides(order, cut, scratch)
+            for i in range(first, last):
+                scratch.rank[orders[0, i]] = -1
+                if scratch.side[orders[0, i]] == 2:
+                    node[orders[0, i]] = 2**level - 1 + part
+            n_left = 0
+            n_right = 0
             for c in range(n_coordinates):
-                order = orders[c, first : first + size]
-                n_left = n_right = 0
-                for i in range(size):
-                    vertex = order[i]
-                    if side[vertex] == 0:
-                        order[n_left] = vertex
-                        n_left += 1
-                    elif side[vertex] == 1:
-                        right[n_right] = vertex
-                        n_right += 1
-                    elif c == 0:
-                        node[vertex] = separator
-                for i in range(n_right):
-                    order[n_left + i] = right[i]
-                if c == 0:
-                    next_begin[2 * part], next_end[2 * part] = first, first + n_left
-                    next_begin[2 * part + 1], next_end[2 * part + 1] = (
-                        first + n_left,
-                        first + n_left + n_right,
-                    )
-        begin, end = next_begin, next_end
+                n_left, n_right = _separate(orders[c, first:last], scratch)
+            next_begin[2 * part] = first
+            next_end[2 * part] = first + n_left
+            next_begin[2 * part + 1] = first + n_left
+            next_end[2 * part + 1] = first + n_left + n_right
+        begin = next_begin
+        end = next_end
     for part in range(2**depth):
         for i in range(begin[part], end[part]):
             node[orders[0, i]] = 2**depth - 1 + part
     return node
+
+
+@compiled()
+def _rank_neighbours(
+    order: np.ndarray, indptr: np.ndarray, indices: np.ndarray, scratch: _Scratch
+) -> None:
+    """Fill the ranks of the vertices of a part, and the lowest and highest among their neighbours."""
+    size = len(order)
+    for i in range(size):
+        scratch.rank[order[i]] = i
+    scratch.n_highest[: size + 1] = 0
+    scratch.n_lowest[: size + 1] = 0
+    for i in range(size):
+        lowest = np.uint32(i)
+        highest = np.int32(i)
+        for k in range(np.uint64(indptr[order[i]]), np.uint64(indptr[order[i] + 1])):
+            neighbour_rank = scratch.rank[np.uint32(indices[k])]
+            lowest = min(lowest, np.uint32(neighbour_rank))
+            highest = max(highest, neighbour_rank)
+        scratch.low[i] = lowest
+        scratch.high[i] = highest
+        scratch.n_highest[highest + 1] += 1
+        scratch.n_lowest[lowest + 1] += 1
+
+
+@compiled()
+def _smallest_cut(scratch: _Scratch, size: int, n_vertices: int, window: float) -> _Cut:
+    """Return the cut with the smallest separator in a window around the median of a part."""
+    at = 0
+    cut_size = n_vertices
+    is_left = True
+    # Vertices with all neighbours before the cut, and with at least one; a vertex is its own neighbour.
+    n_closed = 0
+    n_opened = 0
+    for i in range(size):
+        n_closed += scratch.n_highest[i]
+        n_opened += scratch.n_lowest[i]
+        if i == 0 or abs(i - size / 2) > max(window * size, 1.0):
+            continue
+        left_size = i - n_closed
+        right_size = n_opened - i
+        if min(left_size, right_size) < cut_size:
+            at = i
+            cut_size = min(left_size, right_size)
+            is_left = left_size <= right_size
+    return _Cut(at, cut_size, is_left)
+
+
+@compiled()
+def _mark_sides(order: np.ndarray, cut: _Cut, scratch: _Scratch) -> None:
+    """Write the side of each vertex of a part."""
+    for i in range(len(order)):
+        if i < cut.at:
+            scratch.side[order[i]] = 2 if cut.is_left and scratch.high[i] >= cut.at else 0
+        else:
+            scratch.side[order[i]] = 2 if not cut.is_left and scratch.low[i] < cut.at else 1
+
+
+@compiled()
+def _separate(order: np.ndarray, scratch: _Scratch) -> tuple[int, int]:
+    """Move the vertices of the left side to the front and those of the right side behind them; return their numbers."""
+    n_left = 0
+    n_right = 0
+    for i in range(len(order)):
+        vertex = order[i]
+        if scratch.side[vertex] == 0:
+            order[n_left] = vertex
+            n_left += 1
+        elif scratch.side[vertex] == 1:
+            scratch.right[n_right] = vertex
+            n_right += 1
+    for i in range(n_right):
+        order[n_left + i] = scratch.right[i]
+    return n_left, n_right
