@@ -77,7 +77,7 @@ class GradedShapes:
         ValueError: an argument is out of range; or, on access, a shape cannot be made at this resolution.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (settings of the generator, all with a default)
         self,
         n_classes: int = 24,
         n_bodies: int = 3,

@@ -116,7 +116,7 @@ def sheet(g: np.random.Generator, outline: str, n_holes: int) -> Skeleton:
     return Skeleton(Part(Plate(tuple(bars), _holes(g, bars[0], n_holes), thick, loops), "sheet"))
 
 
-def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:
+def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:  # noqa: C901 (one case for each outline)
     """The bars of a sheet, of which the first is wide enough for holes, and the number of handles that bars form."""
 
     def disc(x: float, y: float, r: float) -> Bar:

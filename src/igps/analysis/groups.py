@@ -54,7 +54,7 @@ def squared_distances(rows: Floats) -> Floats:
     return _squares(centred @ centred.T)
 
 
-def group_test(
+def group_test(  # noqa: PLR0913 (two arrays, and settings that all have a default)
     vectors: Floats,
     groups: Sequence[str],
     *,

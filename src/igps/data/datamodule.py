@@ -61,7 +61,7 @@ class SignatureDataModule(LightningDataModule):
         evaluation_batch_size: number of shapes in a batch of validation and test.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (Lightning reads the settings of a YAML from it)
         self,
         root: Path,
         protocol: SplitProtocol = "seen",

@@ -72,7 +72,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         ValueError: the configuration does not meet the requirements of the descriptor.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (a folder, and settings that all have a default)
         self,
         root_or_paths: str | Path | Sequence[str | Path] | Bodies | Mapping[str, Any],
         config: SignatureConfig | None = None,

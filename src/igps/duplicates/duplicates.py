@@ -69,7 +69,7 @@ class BodyDistance:
     same: bool  # whether the bodies have the same shape
 
 
-def duplicates(
+def duplicates(  # noqa: PLR0913 (a source, and settings that all have a default)
     source: SignatureDataset | Gallery,
     descriptor: str | Descriptor = "pretrained",
     *,

@@ -1,6 +1,7 @@
 """Compiled loops for `igps.signature.surface_potential`: potentials of its tree of patches at blocks of points."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,23 +13,10 @@ _TINY = (
 )  # keeps the logarithm of a side finite at points on the side, where its factor is 0
 
 
-@compiled()
-def fill_potentials(
-    points: Floats,
-    block: int,
-    patches: Floats,
-    min_distances: Floats,
-    level_starts: Integers,
-    branching: int,
-    squared_limits: Floats,
-    faces: Floats,
-    out: Floats,
-) -> None:
-    """Fill `out` (n,) with the potentials at points, one block of neighbouring points at a time.
+class PatchTree(NamedTuple):
+    """The faces of a surface, and the patches of neighbouring faces, level by level.
 
     Args:
-        points: (n, 3) in spatial order.
-        block: number of points for which the same patches are far.
         patches: (N, 10) of all levels, beginning with the faces: centre c, area A, and the quadratic form
             A·(3/2 C − ½ tr C·1) with C the covariance, as xx, yy, zz, 2xy, 2xz, 2yz.
         min_distances: (N,) smallest distance from the centre of each patch at which its series is used.
@@ -37,6 +25,30 @@ def fill_potentials(
         squared_limits: (F,) squared distance from the centre of each face beyond which its quarters' series are used.
         faces: (F, 25), see `near_potential`.
     """
+
+    patches: Floats
+    min_distances: Floats
+    level_starts: Integers
+    branching: int
+    squared_limits: Floats
+    faces: Floats
+
+
+@compiled()
+def fill_potentials(
+    points: Floats,
+    block: int,
+    tree: PatchTree,
+    out: Floats,
+) -> None:
+    """Fill `out` (n,) with the potentials at points, one block of neighbouring points at a time.
+
+    Args:
+        points: (n, 3) in spatial order.
+        block: number of points for which the same patches are far.
+        tree: the patches of the surface.
+    """
+    patches, min_distances, level_starts, branching, squared_limits, faces = tree
     n_levels = len(level_starts) - 1
     x, is_far = np.empty((3, block)), np.empty(block)
     # The stack holds at most all patches of the coarsest level, and the children of one patch for each level below.

@@ -17,7 +17,7 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 from igps.mesh.surface import longest_side
-from igps.signature._potential_loops import fill_potentials
+from igps.signature._potential_loops import PatchTree, fill_potentials
 from igps.signature.ordering import spatial_order
 
 _BLOCK_SIZE = 32  # points for which the same patches are far
@@ -62,17 +62,15 @@ def surface_potential(
     squared_limits = np.square(quarters.min_distances(accuracy) + whole_faces.radii / 2)
     order = spatial_order(x, _BLOCK_SIZE)
     potentials = np.empty(len(x))
-    fill_potentials(
-        x[order],
-        _BLOCK_SIZE,
+    tree = PatchTree(
         np.concatenate([level.table for level in levels]),
         np.concatenate([level.min_distances(accuracy) for level in levels]),
         np.cumsum([0, *(len(level.areas) for level in levels)]),
         _BRANCHING,
         squared_limits,
         _face_table(corners),
-        potentials,
     )
+    fill_potentials(x[order], _BLOCK_SIZE, tree, potentials)
     out[order] = potentials * scale
     return out
 

@@ -79,7 +79,7 @@ def _tile(n_columns: int) -> Any:
     vector = ir.VectorType(real, n_columns) if n_columns > 1 else real
     fused = ("contract",)
 
-    def tile(
+    def tile(  # noqa: PLR0913 (the operands of a hand-made tile)
         context: Any,
         a: Any,
         a_at: Any,

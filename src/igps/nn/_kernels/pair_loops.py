@@ -131,7 +131,7 @@ def count_block(
 
 
 @compiled()
-def gradient_block(
+def gradient_block(  # noqa: PLR0913 (the arguments of count_block, and the arrays to fill)
     values: Numbers,
     axes: Axes,
     row: int,
