@@ -38,7 +38,6 @@ def render_page(
 ) -> str:
     """Return the page of results as HTML text, with surfaces and explanations by the name of the mesh."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
 
     # Autoescape, because names and notes come from files
     environment = Environment(
@@ -66,9 +65,9 @@ def render_page(
         title=_title(results, data),
         data=data,
         members=members,
-        surfaces=Markup("\n".join(base64_text(surface.packed()) for surface in packed)),
-        scripts=[Markup(source) for source in scripts],
-        style=Markup(style),
+        surfaces="\n".join(base64_text(surface.packed()) for surface in packed),
+        scripts=scripts,
+        style=style,
         policy=policy,
         licence=(_TEMPLATE / "three.LICENSE").read_text(encoding="utf-8"),
         titles=TITLES,
