@@ -42,6 +42,7 @@ _LABEL_TOLERANCE = (
 _VOLUME_TOLERANCE = (
     0.005  # share of its voxels' volume by which a surface may differ without a note
 )
+_SIDES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))  # RAS
 
 Box = tuple[slice, slice, slice]
 
@@ -200,12 +201,49 @@ def label_surface(
         )
     mesh = mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name)
     mesh = mesh.annotated(notes=(*volume.notes, *notes))
+    mesh = mesh.annotated(notes=_border_notes(volume, body, mesh.area))
     of_voxels = body.n_voxels * abs(float(np.linalg.det(affine[:3, :3])))
     surplus = mesh.volume / of_voxels - 1
     if abs(surplus) <= _VOLUME_TOLERANCE:
         return mesh
     note = f"its volume differs by {surplus:+.1%} from that of its voxels, {of_voxels:.6g}"
     return mesh.annotated(notes=(note,))
+
+
+def _border_notes(volume: LabelVolume, body: LabelBody, area: float) -> tuple[str, ...]:
+    """Return a note if a label reaches the border of the image, where a scan may have cut it: sides, and share of area.
+
+    Sides are named in the frame of the patient (RAS), by the direction in which the axis of the image leaves it.
+    """
+    mask = volume.mask(body.label)
+    axes = np.asarray(volume.affine, dtype=np.float64)[:3, :3]
+    sides = []
+    cut_area = 0.0
+    for axis in range(3):
+        others = [k for k in range(3) if k != axis]
+        face_area = np.linalg.norm(np.cross(axes[:, others[0]], axes[:, others[1]]))
+        ends = ((0, body.box[axis].start == 0, -1), (-1, _is_last(volume, body, axis), 1))
+        for index, is_at_border, direction in ends:
+            if not is_at_border:
+                continue
+            cut_area += float(np.count_nonzero(mask.take(index, axis=axis)) * face_area)
+            sides.append(_side_of(direction * axes[:, axis]))
+    if not sides:
+        return ()
+    names = ", ".join(sorted(sides))
+    share = min(cut_area / area, 1.0)
+    return (f"at the border of the image ({names}): {share:.1%} of the surface may be a cut",)
+
+
+def _is_last(volume: LabelVolume, body: LabelBody, axis: int) -> bool:
+    return body.box[axis].stop == volume.layers[body.layer].shape[axis]
+
+
+def _side_of(direction: Floats) -> str:
+    """Return the side of the patient to which a vector in RAS points, such as "left"."""
+    axis = int(np.argmax(np.abs(direction)))
+    negative, positive = _SIDES[axis]
+    return positive if direction[axis] > 0 else negative
 
 
 def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
