@@ -22,9 +22,8 @@ class Clusters:
     """Clusters of N bodies, cut from a hierarchical clustering."""
 
     labels: Integers  # (N,) cluster of each body, 0 for the largest cluster
-    medoids: tuple[
-        int, ...
-    ]  # body of each cluster with the smallest sum of distances to the others
+    # Body of each cluster with the smallest sum of distances to the others
+    medoids: tuple[int, ...]
     # Largest Jaccard index of each cluster with the clusters of a random half of the bodies, averaged over the halves
     # with at least two bodies of the cluster; NaN if there is no such half
     stability: tuple[float, ...]
@@ -53,48 +52,74 @@ def clusters_of(
     Raises:
         ValueError: invalid distances, or a number of clusters that is not between 1 and N.
     """
-    from sklearn.metrics import silhouette_score
-
     check_one_of(get_args(Linkage), linkage=linkage)
     check_at_least(0, n_resamples=n_resamples)
     check_at_least(1, n_clusters=n_clusters)
-    square, n = checked_distances(distances), len(distances)
+    square = checked_distances(distances)
+    n = len(distances)
     tree = _tree(square, linkage)
     if n_clusters is None:
-        cuts = {k: _cut(tree, k) for k in range(2, min(_MAX_CLUSTERS, n - 1) + 1)}
-        scores = {
-            k: silhouette_score(square, cut, metric="precomputed")
-            for k, cut in cuts.items()
-            if cut.max()
-        }
-        n_clusters = max(
-            (k for k, score in scores.items() if score > 0), key=lambda k: scores[k], default=1
-        )
+        n_clusters = _best_number(square, tree)
     if not 1 <= n_clusters <= n:
         raise ValueError(f"n_clusters: expected 1 to {n}, got {n_clusters}.")
-    labels = _cut(tree, n_clusters)
-    _, labels = np.unique(
-        np.argsort(np.argsort(-np.bincount(labels), kind="stable"))[labels], return_inverse=True
-    )
-    members = [np.flatnonzero(labels == number) for number in range(labels.max() + 1)]
-    medoids = tuple(int(own[square[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members)
-    random, jaccard = np.random.default_rng(seed), np.full((n_resamples, len(members)), np.nan)
-    for row in (
-        jaccard if n > max(3, 2 * len(members)) else ()
-    ):  # half of three bodies cannot be clustered
-        half = np.sort(random.choice(n, n // 2, replace=False))
-        resampled = np.eye(n, dtype=np.int64)[
-            _cut(_tree(square[np.ix_(half, half)], linkage), len(members))
-        ]
-        original = np.eye(len(members), dtype=np.int64)[labels[half]]
-        n_drawn = original.sum(axis=0)
-        intersection = original.T @ resampled
-        union = n_drawn[:, None] + resampled.sum(axis=0) - intersection
-        # A single body does not count: it would be found again in any clustering
-        row[:] = np.where(n_drawn > 1, (intersection / np.maximum(union, 1)).max(axis=1), np.nan)
+    labels = _by_size(_cut(tree, n_clusters))
+    n_found = int(labels.max()) + 1
+    medoids = []
+    for number in range(n_found):
+        own = np.flatnonzero(labels == number)
+        sums = square[np.ix_(own, own)].sum(axis=1)
+        medoids.append(int(own[sums.argmin()]))
+    jaccard = np.full((n_resamples, n_found), np.nan)
+    if n > max(3, 2 * n_found):  # half of three bodies cannot be clustered
+        random = np.random.default_rng(seed)
+        for row in jaccard:
+            half = np.sort(random.choice(n, n // 2, replace=False))
+            resampled = _cut(_tree(square[np.ix_(half, half)], linkage), n_found)
+            row[:] = _jaccard(labels[half], resampled, n_found)
     n_halves = np.isfinite(jaccard).sum(axis=0)
-    stability = np.where(n_halves, np.nansum(jaccard, axis=0) / np.maximum(n_halves, 1), np.nan)
-    return Clusters(labels, medoids, tuple(stability.tolist()), tree)
+    sums = np.nansum(jaccard, axis=0)
+    stability = np.where(n_halves, sums / np.maximum(n_halves, 1), np.nan)
+    return Clusters(labels, tuple(medoids), tuple(stability.tolist()), tree)
+
+
+def _best_number(distances: Floats, tree: Floats) -> int:
+    """Return the number of clusters with the largest mean silhouette; 1 if none is positive."""
+    from sklearn.metrics import silhouette_score
+
+    best = 1
+    largest = 0.0
+    for n_clusters in range(2, min(_MAX_CLUSTERS, len(distances) - 1) + 1):
+        labels = _cut(tree, n_clusters)
+        if labels.max() == 0:
+            continue
+        score = silhouette_score(distances, labels, metric="precomputed")
+        if score > largest:
+            best = n_clusters
+            largest = score
+    return best
+
+
+def _by_size(labels: Integers) -> Integers:
+    """Number clusters anew from 0 on, the largest first."""
+    largest_first = np.argsort(-np.bincount(labels), kind="stable")
+    rank = np.argsort(largest_first)
+    _, numbers = np.unique(rank[labels], return_inverse=True)
+    return numbers
+
+
+def _jaccard(original: Integers, resampled: Integers, n_clusters: int) -> Floats:
+    """Return the largest Jaccard index of each original cluster with the resampled ones, among drawn bodies (n,).
+
+    It is NaN for a cluster of at most one drawn body, which would be found again in any clustering.
+    """
+    original_sets = np.eye(n_clusters, dtype=np.int64)[original]
+    resampled_sets = np.eye(len(resampled), dtype=np.int64)[resampled]
+    n_drawn = original_sets.sum(axis=0)
+    n_resampled = resampled_sets.sum(axis=0)
+    intersection = original_sets.T @ resampled_sets
+    union = n_drawn[:, None] + n_resampled - intersection
+    largest = (intersection / np.maximum(union, 1)).max(axis=1)
+    return np.where(n_drawn > 1, largest, np.nan)
 
 
 def _tree(distances: Floats, linkage: Linkage) -> Floats:

@@ -12,22 +12,24 @@ from igps.mesh.surface import unit
 
 # Times of the heat kernel over the area. The kernel of large times identifies the place on the body, the kernel of
 # small times depends on the surface around it
-_LARGE_TIMES, _SMALL_TIMES = 0.01 * 2.0 ** np.arange(6), 0.0008 * 2.0 ** np.arange(5)
+_LARGE_TIMES = 0.01 * 2.0 ** np.arange(6)
+_SMALL_TIMES = 0.0008 * 2.0 ** np.arange(5)
 _N_CORRESPONDING = 10  # samples of the other body that correspond to a sample
-_MIN_DEVIATION = (
-    0.1  # smallest standard deviation at a place, as a fraction of that of the whole body
-)
-_SMOOTHING = 0.06  # standard deviation of the smoothing kernel, over the square root of the area
-_PATCH = 0.04  # radius of the patches of surface whose curvature is measured, over the square root of the area
-_N_PLANE, _N_INSIDE = (
-    12,
-    6,
-)  # nearest surface samples that determine a tangent plane, and interior ones its side
-_MAX_BALL = 0.5  # largest radius of a ball, over the square root of the area
-_NEAR, _MIN_SINE = (
-    0.03,
-    0.2,
-)  # a ball may contain samples nearer than this (over √area), or nearer the tangent plane
+# Smallest standard deviation at a place, as a fraction of that of the whole body
+_MIN_DEVIATION = 0.1
+# Lengths below are in units of the square root of the area.
+_SMOOTHING = 0.06  # standard deviation of the smoothing kernel
+_PATCH = 0.04  # radius of the patches of surface whose curvature is measured
+_MAX_BALL = 0.5  # largest radius of a ball
+_N_PLANE = 12  # nearest surface samples that determine a tangent plane
+_N_INSIDE = 6  # nearest interior samples that determine its side
+# A ball may contain samples that are nearer to its touching point than _NEAR, or whose direction from there has a
+# smaller sine to the tangent plane than _MIN_SINE
+_NEAR = 0.03
+_MIN_SINE = 0.2
+# Smallest cosine between the normals of a patch and that of its centre; the other side of a thin part has less
+_MIN_COSINE = 0.2
+_BLOCK_ROWS = 256  # samples whose distances from all samples are in memory at once
 
 
 def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
@@ -45,36 +47,48 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     Returns:
         (P,) the exponential of the sum of both, positive.
     """
-    (large, small), (other_large, other_small) = _heat_kernels(body), _heat_kernels(other)
-    nearest, points = _nearest(large, other_large), _points(body.surface, body)
-    total = np.zeros(len(points))
-    for own, others in ((local_shape(body), local_shape(other)), (small, other_small)):
-        smoothed = _smoothed(np.log1p(squared_deviations(own, others, nearest)), points)
-        total += (smoothed - smoothed.mean()) / (smoothed.std() + 1e-12)
-    return np.exp(total)
+    nearest = _nearest(_heat_kernels(body, _LARGE_TIMES), _heat_kernels(other, _LARGE_TIMES))
+    points = _points(body.surface, body)
+    by_shape = squared_deviations(local_shape(body), local_shape(other), nearest)
+    small = _heat_kernels(body, _SMALL_TIMES)
+    other_small = _heat_kernels(other, _SMALL_TIMES)
+    by_heat = squared_deviations(small, other_small, nearest)
+    return np.exp(_standardised(by_shape, points) + _standardised(by_heat, points))
+
+
+def _standardised(deviations: Floats, points: Floats) -> Floats:
+    """Return the logarithms of squared deviations, smoothed on the surface, with mean 0 and scatter 1."""
+    smoothed = _smoothed(np.log1p(deviations), points)
+    return (smoothed - smoothed.mean()) / (smoothed.std() + 1e-12)
 
 
 def _points(samples: SampleBatch, body: SignatureBatch) -> Floats:
     """Return the positions of samples (P, 3), over √area."""
-    return samples.points[0][samples.mask[0]].double().numpy() / float(body.area[0]) ** 0.5
+    points = samples.points[0][samples.mask[0]]
+    return points.double().numpy() / float(body.area[0]) ** 0.5
 
 
-def _heat_kernels(body: SignatureBatch) -> tuple[Floats, Floats]:
-    """Return log(heat kernel · area) at each surface sample, (P, times), for large and for small times."""
-    area, is_sample = float(body.area[0]), body.surface.mask[0]
-    squares = body.surface.eigenfunctions[0][is_sample].double().square().numpy() * area
+def _heat_kernels(body: SignatureBatch, times: Floats) -> Floats:
+    """Return log(heat kernel · area) at each surface sample, (P, times)."""
+    area = float(body.area[0])
+    eigenfunctions = body.surface.eigenfunctions[0][body.surface.mask[0]]
+    squares = eigenfunctions.double().square().numpy() * area
     values = body.eigenvalues[0].double().numpy() * area
-    large, small = (
-        np.log1p(squares @ np.exp(-np.outer(values, times)))
-        for times in (_LARGE_TIMES, _SMALL_TIMES)
-    )
-    return large, small
+    decay = np.exp(-np.outer(values, times))
+    return np.log1p(squares @ decay)
 
 
 def _nearest(one: Floats, other: Floats) -> Integers:
     """Return indices (P, n) of the nearest rows of the other array, each column standardised by it."""
-    scale, n = other.std(axis=0) + 1e-9, min(_N_CORRESPONDING, len(other))
-    return cKDTree(other / scale).query(one / scale, list(range(1, n + 1)))[1]
+    scale = other.std(axis=0) + 1e-9
+    tree = cKDTree(other / scale)
+    _, nearest = tree.query(one / scale, _ranks(_N_CORRESPONDING, len(other)))
+    return nearest
+
+
+def _ranks(count: int, n_points: int) -> list[int]:
+    """Return the ranks 1 to count, or to the number of points; as a list, a tree answers in two dimensions."""
+    return list(range(1, min(count, n_points) + 1))
 
 
 def squared_deviations(own: Floats, others: Floats, nearest: Integers) -> Floats:
@@ -89,12 +103,13 @@ def squared_deviations(own: Floats, others: Floats, nearest: Integers) -> Floats
     """
     corresponding = others[nearest]
     means = corresponding.mean(axis=1)
-    offsets, steps = corresponding - means[:, None], (own - means)[:, :, None]
-    least = np.square(_MIN_DEVIATION) * np.cov(others.T, bias=True) + 1e-12 * np.eye(
-        others.shape[1]
-    )
+    offsets = corresponding - means[:, None]
+    steps = (own - means)[:, :, None]
+    overall = np.cov(others.T, bias=True)
+    least = np.square(_MIN_DEVIATION) * overall + 1e-12 * np.eye(others.shape[1])
     covariances = offsets.transpose(0, 2, 1) @ offsets / nearest.shape[1] + least
-    return (steps * np.linalg.solve(covariances, steps)).sum(axis=(1, 2))
+    solved = np.linalg.solve(covariances, steps)
+    return (steps * solved).sum(axis=(1, 2))
 
 
 def local_shape(body: SignatureBatch) -> Floats:
@@ -103,41 +118,62 @@ def local_shape(body: SignatureBatch) -> Floats:
     The curvatures, ascending and over the radius of a patch, are those of the linear function of the position that fits
     the normals of the patch (least squares). Normals are outward, and estimated if the samples have none.
     """
-    points, directions = (
-        _points(body.surface, body),
-        body.surface.attributes.get("surface_direction"),
-    )
+    points = _points(body.surface, body)
+    directions = body.surface.attributes.get("surface_direction")
     if directions is None:
         normals = _estimated_normals(points, _points(body.interior, body))
     else:
         normals = unit(directions[0][body.surface.mask[0]].double().numpy())
-    tangent = unit(np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)]))
-    axes, tree = np.stack([tangent, np.cross(normals, tangent)], axis=2), cKDTree(points)
-    # A disc of this radius has a share π r² of all samples; the curved surface, and another one near it, have more
-    n = max(_N_PLANE, math.ceil(1.5 * math.pi * _PATCH**2 * len(points)))
-    distances, patch = tree.query(points, list(range(1, min(n, len(points)) + 1)))
-    weights = np.clip(1 - np.square(distances / _PATCH), 0, 1)
-    weights *= (
-        np.einsum("pkc,pc->pk", normals[patch], normals) > 0.2
-    )  # not the other side of a thin part
-    steps = (points[patch] - points[:, None]) @ axes / _PATCH
-    terms = np.concatenate([np.ones_like(steps[:, :, :1]), steps], axis=2)
-    weighted = (terms * weights[:, :, None]).transpose(0, 2, 1)
-    fits = np.linalg.solve(weighted @ terms + 1e-3 * np.eye(3), weighted @ (normals[patch] @ axes))
-    curvatures = np.linalg.eigvalsh((fits[:, 1:] + fits[:, 1:].transpose(0, 2, 1)) / 2)
+    axes = _tangents(normals)
+    fits = _fitted_normals(points, normals, axes)
+    slopes = fits[:, 1:]
+    curvatures = np.linalg.eigvalsh((slopes + slopes.transpose(0, 2, 1)) / 2)
     if directions is None:
-        normals = unit(normals + (axes @ fits[:, 0, :, None])[:, :, 0])
-    return np.column_stack([curvatures, np.log(_inner_balls(points, normals))])
+        corrections = axes @ fits[:, 0, :, None]
+        normals = unit(normals + corrections[:, :, 0])
+    radii = _inner_balls(points, normals)
+    return np.column_stack([curvatures, np.log(radii)])
+
+
+def _tangents(normals: Floats) -> Floats:
+    """Return two orthonormal tangents at each normal, (P, 3, 2)."""
+    smallest = np.abs(normals).argmin(axis=1)
+    first = unit(np.cross(normals, np.eye(3)[smallest]))
+    second = np.cross(normals, first)
+    return np.stack([first, second], axis=2)
+
+
+def _fitted_normals(points: Floats, normals: Floats, axes: Floats) -> Floats:
+    """Return the linear functions that fit the normals of the patch around each point by least squares.
+
+    Returns:
+        (P, 3, 2) for both tangents the value at the point and the slopes along both tangents, over _PATCH.
+    """
+    # A disc of this radius has a share π r² of all samples; the curved surface, and another one near it, have more
+    n_patch = max(_N_PLANE, math.ceil(1.5 * math.pi * _PATCH**2 * len(points)))
+    distances, patch = cKDTree(points).query(points, _ranks(n_patch, len(points)))
+    weights = np.clip(1 - np.square(distances / _PATCH), 0, 1)
+    cosines = np.einsum("pkc,pc->pk", normals[patch], normals)
+    weights *= cosines > _MIN_COSINE
+    steps = (points[patch] - points[:, None]) @ axes / _PATCH
+    ones = np.ones_like(steps[:, :, :1])
+    terms = np.concatenate([ones, steps], axis=2)
+    weighted = (terms * weights[:, :, None]).transpose(0, 2, 1)
+    matrix = weighted @ terms + 1e-3 * np.eye(3)  # solvable if all weights but one are 0
+    return np.linalg.solve(matrix, weighted @ (normals[patch] @ axes))
 
 
 def _estimated_normals(points: Floats, inside: Floats) -> Floats:
     """Return outward normals (P, 3) of planes through the nearest points, by the nearest samples of the interior."""
-    _, plane = cKDTree(points).query(points, list(range(1, min(_N_PLANE, len(points)) + 1)))
+    _, plane = cKDTree(points).query(points, _ranks(_N_PLANE, len(points)))
     offsets = points[plane] - points[plane].mean(axis=1, keepdims=True)
-    normals = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets).eigenvectors[:, :, 0]
-    _, deep = cKDTree(inside).query(points, list(range(1, min(_N_INSIDE, len(inside)) + 1)))
-    is_inward = ((points - inside[deep].mean(axis=1)) * normals).sum(axis=1) < 0
-    return np.where(is_inward, -1, 1)[:, None] * normals
+    scatter = offsets.transpose(0, 2, 1) @ offsets
+    normals = np.linalg.eigh(scatter).eigenvectors[:, :, 0]
+    _, deep = cKDTree(inside).query(points, _ranks(_N_INSIDE, len(inside)))
+    outward = points - inside[deep].mean(axis=1)
+    is_inward = (outward * normals).sum(axis=1) < 0
+    signs = np.where(is_inward, -1, 1)
+    return signs[:, None] * normals
 
 
 def _inner_balls(points: Floats, normals: Floats) -> Floats:
@@ -146,13 +182,16 @@ def _inner_balls(points: Floats, normals: Floats) -> Floats:
     Points near the touching point are left out, as the error of the normal decides whether the ball contains them.
     """
     radii = np.empty(len(points))
-    for rows in np.array_split(np.arange(len(points)), math.ceil(len(points) / 256)):
-        squares = cdist(points[rows], points, "sqeuclidean")
-        depths = (normals[rows] * points[rows]).sum(axis=1, keepdims=True) - normals[
-            rows
-        ] @ points.T
+    n_blocks = math.ceil(len(points) / _BLOCK_ROWS)
+    for rows in np.array_split(np.arange(len(points)), n_blocks):
+        own = points[rows]
+        inward = normals[rows]
+        squares = cdist(own, points, "sqeuclidean")
+        depths = (inward * own).sum(axis=1, keepdims=True) - inward @ points.T
         counts = (squares > _NEAR**2) & (depths > _MIN_SINE * np.sqrt(squares))
-        through = np.where(counts, squares / np.where(counts, 2 * depths, 1), _MAX_BALL)
+        diameters = np.where(counts, 2 * depths, 1)
+        # Radius of the ball that touches here and runs through each other point
+        through = np.where(counts, squares / diameters, _MAX_BALL)
         radii[rows] = np.partition(through, 2, axis=1)[:, 2]
     return np.minimum(radii, _MAX_BALL)
 
@@ -163,4 +202,5 @@ def _smoothed(values: Floats, points: Floats) -> Floats:
     pairs = tree.sparse_distance_matrix(tree, 2 * _SMOOTHING, output_type="coo_matrix")
     weights = np.exp(-np.square(pairs.data / _SMOOTHING) / 2)
     sums = np.bincount(pairs.row, weights * values[pairs.col], len(points))
-    return sums / np.bincount(pairs.row, weights, len(points))
+    totals = np.bincount(pairs.row, weights, len(points))
+    return sums / totals

@@ -21,7 +21,9 @@ from igps.nn.histograms.base import DescriptionPart, SampleHistogram
 from igps.signature.signature import SAMPLE_KINDS, SampleKind
 
 # Nodes of the quadrature along the line between two descriptions, tried in order until its relative error is small
-_N_NODES, _TOLERANCE = (16, 64, 256, 1024), 1e-8
+_N_NODES = (16, 64, 256, 1024)
+_TOLERANCE = 1e-8
+_BLOCK_NODES = 16  # nodes whose gradients are in memory at once
 _MIN_DISTANCE = 1e-12  # smaller distances are 0 up to rounding
 _N_NEIGHBOURS = 12  # samples whose mean is the value of a point of the surface
 
@@ -33,9 +35,8 @@ class Explanation:
     """Shares of a distance. A negative share comes from a property that makes the bodies more similar."""
 
     distance: float  # by the descriptor
-    parts: Mapping[
-        str, float
-    ]  # share of each histogram, by the quantity that it counts; they sum to the distance
+    # Share of each histogram, by the quantity that it counts; they sum to the distance
+    parts: Mapping[str, float]
     # Shares (P,) of the samples of each kind in the first and in the second body; all together sum to the distance
     samples: tuple[Shares, Shares]
     # As `samples`, but non-negative and by local dissimilarity, see `igps.analysis.correspondence`; None for groups
@@ -45,7 +46,8 @@ class Explanation:
         """Return the three largest shares of histograms as text."""
         if not self.distance:
             return "no difference"
-        largest = sorted(self.parts.items(), key=lambda item: -abs(item[1]))[:3]
+        by_size = sorted(self.parts.items(), key=lambda item: -abs(item[1]))
+        largest = by_size[:3]
         return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)
 
 
@@ -79,16 +81,18 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
             f"one, other: expected batches of one body, got {len(one)} and {len(other)} bodies."
         )
     descriptor = copy.deepcopy(descriptor).double().eval()
-    headless, pair = without_head(descriptor), (_with_weights(one), _with_weights(other))
-    first, second = torch.cat([headless(batch).detach().flatten(1) for batch in pair])
+    headless = without_head(descriptor)
+    pair = (_with_weights(one), _with_weights(other))
+    first, second = (headless(batch).detach().flatten() for batch in pair)
     units, distance = unit_shares(descriptor, first, second)
     shares = units * (first - second)
+    parts = _part_shares(descriptor, shares)
     samples = _sample_shares(descriptor, pair, units, shares)
     places = (
         _place_shares(one, other, samples[0], distance),
         _place_shares(other, one, samples[1], distance),
     )
-    return Explanation(distance, _part_shares(descriptor, shares), samples, places)
+    return Explanation(distance, parts, samples, places)
 
 
 def _place_shares(
@@ -119,36 +123,62 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
         (cells,) shares of a unit in the first body, those in the second being the negatives; and the distance.
     """
     n = _n_cells(descriptor)
-    inner = descriptor.descriptor if isinstance(descriptor, SizeAndSide) else descriptor
     contents = torch.stack([one, other]).double()
-    roots = torch.cat([contents[:, :n].sqrt(), contents[:, n:]], dim=1)
-    midpoint, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
-
-    def distances(ends: Tensor) -> Tensor:
-        cells = (end[:, :n].square() for end in ends)
-        if isinstance(inner, EmbeddedDescriptor):
-            cells = (inner.head(histograms) for histograms in cells)
-        rows = (torch.cat([own, end[:, n:]], dim=1) for own, end in zip(cells, ends, strict=True))
-        return descriptor.distances(*rows).diagonal()
-
-    distance = float(distances(roots[:, None]).detach())
-    distance = distance if distance > _MIN_DISTANCE else 0.0
-    gradient = torch.zeros_like(midpoint)
-    for n_nodes in _N_NODES if distance else ():
-        gradient.zero_()
-        nodes, weights = np.polynomial.legendre.leggauss(n_nodes)
-        for x, w in zip(
-            torch.tensor(nodes).split(16), torch.tensor(weights).split(16), strict=True
-        ):
-            step = (x[:, None] + 1) / 2 * half
-            ends = torch.stack([midpoint + step, midpoint - step]).requires_grad_()
-            (derivative,) = torch.autograd.grad(distances(ends) @ (w / 2), ends)
-            gradient += (derivative[0] - derivative[1]).sum(dim=0) / 2
-        if abs(float(gradient @ half) * 2 - distance) <= _TOLERANCE * distance:
+    roots = _with_roots(contents, n)
+    midpoint = roots.mean(dim=0)
+    half = (roots[0] - roots[1]) / 2
+    distance = float(_distances_of_roots(descriptor, roots[:, None]).detach())
+    if distance <= _MIN_DISTANCE:
+        return torch.zeros_like(midpoint), 0.0
+    for n_nodes in _N_NODES:
+        gradient = _mean_gradient(descriptor, midpoint, half, n_nodes)
+        error = abs(float(gradient @ half) * 2 - distance)
+        if error <= _TOLERANCE * distance:
             break
     total = roots[:, :n].sum(dim=0)
-    units = torch.where(total > 0, gradient[:n] / total.clamp_min(torch.finfo(total.dtype).tiny), 0)
+    tiny = torch.finfo(total.dtype).tiny
+    units = torch.where(total > 0, gradient[:n] / total.clamp_min(tiny), 0)
     return torch.cat([units, gradient[n:]]), distance
+
+
+def _with_roots(contents: Tensor, n_cells: int) -> Tensor:
+    """Return contents (N, cells + others) with square roots of the cells."""
+    return torch.cat([contents[:, :n_cells].sqrt(), contents[:, n_cells:]], dim=1)
+
+
+def _distances_of_roots(descriptor: Descriptor, pairs: Tensor) -> Tensor:
+    """Return the distances (M,) of M pairs of bodies, given (2, M, cells + others) with roots of the cells."""
+    n = _n_cells(descriptor)
+    inner = descriptor.descriptor if isinstance(descriptor, SizeAndSide) else descriptor
+    descriptions = []
+    for roots in pairs:
+        form = roots[:, :n].square()
+        if isinstance(inner, EmbeddedDescriptor):
+            form = inner.head(form)
+        descriptions.append(torch.cat([form, roots[:, n:]], dim=1))
+    return descriptor.distances(*descriptions).diagonal()
+
+
+def _mean_gradient(descriptor: Descriptor, midpoint: Tensor, half: Tensor, n_nodes: int) -> Tensor:
+    """Return the derivative of the distance by the first body's roots, averaged along the line of `explain`.
+
+    Args:
+        descriptor: see `explain`.
+        midpoint, half: (cells,) mean of the roots of both bodies, and half of their difference.
+        n_nodes: number of nodes of the Gauss-Legendre quadrature.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(n_nodes)
+    gradient = torch.zeros_like(midpoint)
+    for first in range(0, n_nodes, _BLOCK_NODES):
+        block = slice(first, first + _BLOCK_NODES)
+        x = torch.tensor(nodes[block])
+        w = torch.tensor(weights[block])
+        step = (x[:, None] + 1) / 2 * half
+        ends = torch.stack([midpoint + step, midpoint - step]).requires_grad_()
+        mean = _distances_of_roots(descriptor, ends) @ (w / 2)
+        (derivative,) = torch.autograd.grad(mean, ends)
+        gradient += (derivative[0] - derivative[1]).sum(dim=0) / 2
+    return gradient
 
 
 def share_density(shares: Shares, samples: Mapping[SampleKind, Floats], points: Floats) -> Any:
@@ -165,8 +195,10 @@ def share_density(shares: Shares, samples: Mapping[SampleKind, Floats], points: 
     density = np.zeros(len(points))
     for kind, values in shares.items():
         if np.any(values):
-            _, nearest = cKDTree(samples[kind]).query(points, min(_N_NEIGHBOURS, len(values)))
-            density += len(values) * values[nearest].reshape(len(points), -1).mean(axis=1)
+            n_nearest = min(_N_NEIGHBOURS, len(values))
+            _, nearest = cKDTree(samples[kind]).query(points, n_nearest)
+            nearby = values[nearest].reshape(len(points), -1)
+            density += len(values) * nearby.mean(axis=1)
     return density
 
 
@@ -186,18 +218,25 @@ def _n_cells(descriptor: Descriptor) -> int:
 
 def _part_shares(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
     """Sum the shares of cells for each histogram, and those of side and of size if the descriptor keeps these."""
-    parts = [part for group in _histograms(descriptor).parts for part in group]
-    cells, sums = (
-        shares[: _n_cells(descriptor)].split([part.n_cells for part in parts]),
-        dict[str, float](),
-    )
-    for part, values in zip(parts, cells, strict=True):
-        sums[part_name(part)] = sums.get(part_name(part), 0.0) + float(values.sum())
-    form, side, size = (shares[None], *shares.new_empty(2, 1, 0))
+    n_cells = _n_cells(descriptor)
+    sums: dict[str, float] = {}
+    first = 0
+    for group in _histograms(descriptor).parts:
+        for part in group:
+            values = shares[first : first + part.n_cells]
+            first += part.n_cells
+            name = part_name(part)
+            sums[name] = sums.get(name, 0.0) + float(values.sum())
+    form = shares[None]
+    side = size = shares.new_empty(1, 0)
     if isinstance(descriptor, SizeAndSide):
-        form, side, size = descriptor.split(shares[None])
-    others = {"side": side, "size": torch.cat([form[:, _n_cells(descriptor) :], size], dim=1)}
-    return sums | {name: float(values.sum()) for name, values in others.items() if values.numel()}
+        form, side, size = descriptor.split(form)
+    size = torch.cat([form[:, n_cells:], size], dim=1)
+    if side.numel():
+        sums["side"] = float(side.sum())
+    if size.numel():
+        sums["size"] = float(size.sum())
+    return sums
 
 
 def _with_weights(batch: SignatureBatch) -> SignatureBatch:
@@ -217,25 +256,40 @@ def _sample_shares(
     """Divide the distance among the samples of two bodies, given the unit shares and the shares of all contents."""
     # Side and size are divided equally among both bodies and both kinds of samples
     uniform = float(shares[_n_cells(descriptor) :].sum()) / 4
-    histograms, shares_of_bodies = _histograms(descriptor), list[Shares]()
-    for batch, signed in zip(pair, (units, -units), strict=True):
-        weights = [getattr(batch, kind).attributes[WEIGHT] for kind in SAMPLE_KINDS]
-        features, total, first = BatchFeatures(batch, False), units.new_zeros(()), 0
-        for group in histograms.parts:
-            for part in group:
-                cells = part.of_features(features).flatten() / (len(histograms.parts) * len(group))
-                value = cells @ signed[first : first + part.n_cells]
-                first += part.n_cells
-                if not value.requires_grad:
-                    name = type(part).__name__
-                    raise ValueError(
-                        f"descriptor: {name} does not use the weights of samples, see DescriptionPart."
-                    )
-                total = total + value / part.degree
-        gradients = torch.autograd.grad(total, weights, allow_unused=True, materialize_grads=True)
-        by_kind = zip(SAMPLE_KINDS, (gradient[0].numpy() for gradient in gradients), strict=True)
-        shares_of_bodies.append({kind: values + uniform / len(values) for kind, values in by_kind})
-    return shares_of_bodies[0], shares_of_bodies[1]
+    histograms = _histograms(descriptor)
+    first, second = pair
+    return (
+        _shares_of_body(histograms, first, units, uniform),
+        _shares_of_body(histograms, second, -units, uniform),
+    )
+
+
+def _shares_of_body(
+    histograms: HistogramDescriptor, batch: SignatureBatch, units: Tensor, uniform: float
+) -> Shares:
+    """Return the shares of the samples of a body, given the shares of units; each kind shares `uniform` equally."""
+    weights = [getattr(batch, kind).attributes[WEIGHT] for kind in SAMPLE_KINDS]
+    features = BatchFeatures(batch, False)
+    total = units.new_zeros(())
+    first = 0
+    for group in histograms.parts:
+        n_histograms = len(histograms.parts) * len(group)
+        for part in group:
+            cells = part.of_features(features).flatten() / n_histograms
+            value = cells @ units[first : first + part.n_cells]
+            first += part.n_cells
+            if not value.requires_grad:
+                name = type(part).__name__
+                raise ValueError(
+                    f"descriptor: {name} does not use the weights of samples, see DescriptionPart."
+                )
+            total = total + value / part.degree
+    gradients = torch.autograd.grad(total, weights, allow_unused=True, materialize_grads=True)
+    shares = {}
+    for kind, gradient in zip(SAMPLE_KINDS, gradients, strict=True):
+        values = gradient[0].numpy()
+        shares[kind] = values + uniform / len(values)
+    return shares
 
 
 _AXES = {
@@ -256,11 +310,12 @@ _AXES = {
 def part_name(part: DescriptionPart) -> str:
     """Return what a part of a description counts, as text."""
     axes = [type(axis).__name__ for axis in getattr(part, "axes", [part])]
-    words = list(
-        dict.fromkeys(
-            _AXES.get(name, name) for name in axes if name != "Potential" or len(axes) == 1
-        )
-    )
+    words = []
+    for name in axes:
+        word = _AXES.get(name, name)
+        is_only_position = name == "Potential" and len(axes) > 1
+        if word not in words and not is_only_position:
+            words.append(word)
     samples = f" ({part.samples})" if isinstance(part, SampleHistogram) else ""
     return " and ".join(words) + samples
 
@@ -281,18 +336,21 @@ def significant_cells(
     Returns:
         (cells,) whether the means differ significantly.
     """
-    rows, n = torch.cat([one, other]).double(), len(one)
+    n = len(one)
+    rows = torch.cat([one, other]).double()
     rows = rows - rows.mean(dim=0)
     scale = rows.std(dim=0)
     rows = torch.where(scale > 1e-12, rows / scale.clamp_min(1e-12), 0)
+    # Each row of contrasts is an assignment to the groups; the first is the given one.
     contrasts = torch.full((n_permutations + 1, len(rows)), -1 / len(other), dtype=torch.float64)
+    contrasts[0, :n] = 1 / n
     random = torch.Generator().manual_seed(seed)
-    for i in range(n_permutations + 1):
-        contrasts[
-            i, torch.arange(n) if i == 0 else torch.randperm(len(rows), generator=random)[:n]
-        ] = 1 / n
+    for contrast in contrasts[1:]:
+        chosen = torch.randperm(len(rows), generator=random)[:n]
+        contrast[chosen] = 1 / n
     differences = (contrasts @ rows).abs()
-    return differences[0] > differences.max(dim=1).values.quantile(1 - level)
+    largest = differences.max(dim=1).values
+    return differences[0] > largest.quantile(1 - level)
 
 
 def explain_groups(
@@ -319,23 +377,30 @@ def explain_groups(
     Raises:
         ValueError: too few bodies for a test.
     """
-    level, (n, m) = test.get("level", 0.05), (len(one), len(other))
-    n_ways = math.comb(n + m, n) // (
-        1 + (n == m)
-    )  # exchanging groups of equal size changes no difference
+    level = test.get("level", 0.05)
+    n = len(one)
+    m = len(other)
+    n_ways = math.comb(n + m, n)
+    if n == m:
+        n_ways //= 2  # exchanging groups of equal size changes no difference
     if n_ways * level <= 1:
         raise ValueError(
             f"one, other: {n} and {m} bodies can be arranged in only {n_ways} ways, too few for a test at the level "
             f"{level}. Add bodies, or explain one of each."
         )
     descriptor = copy.deepcopy(descriptor).double().eval()
-    rows, n = [group.double().flatten(1) for group in (one, other)], _n_cells(descriptor)
+    one = one.double().flatten(1)
+    other = other.double().flatten(1)
+    n_cells = _n_cells(descriptor)
     is_significant = significant_cells(
-        *(torch.cat([x[:, :n].sqrt(), x[:, n:]], dim=1) for x in rows), **test
+        _with_roots(one, n_cells), _with_roots(other, n_cells), **test
     )
-    means = [group.mean(dim=0) for group in rows]
-    units = torch.where(is_significant, unit_shares(descriptor, *means)[0], 0)
-    shares = units * (means[0] - means[1])
+    mean = one.mean(dim=0)
+    other_mean = other.mean(dim=0)
+    all_units, _ = unit_shares(descriptor, mean, other_mean)
+    units = torch.where(is_significant, all_units, 0)
+    shares = units * (mean - other_mean)
     parts = _part_shares(descriptor, shares)
-    samples = _sample_shares(descriptor, [_with_weights(batch) for batch in batches], units, shares)
+    weighted = [_with_weights(batch) for batch in batches]
+    samples = _sample_shares(descriptor, weighted, units, shares)
     return Explanation(sum(parts.values()), parts, samples), is_significant

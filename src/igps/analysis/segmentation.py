@@ -24,28 +24,37 @@ _MAX_VOXELS = 1 << 20
 def stray_root(mask: Booleans) -> float:
     """Return the root of the share of voxels that no face, edge or corner connects to the largest piece."""
     pieces, _ = ndimage.label(mask, np.ones((3, 3, 3)))
-    return float(np.sqrt(1 - np.bincount(pieces[mask]).max() / np.count_nonzero(mask)))
+    largest = np.bincount(pieces[mask]).max()
+    return float(np.sqrt(1 - largest / np.count_nonzero(mask)))
 
 
 def cavity_root(mask: Booleans) -> float:
     """Return the root of the number of voxels in enclosed cavities, over that of the body."""
     filled = ndimage.binary_fill_holes(np.pad(mask, 1))
-    return float(np.sqrt(np.count_nonzero(filled) / np.count_nonzero(mask) - 1))
+    ratio = np.count_nonzero(filled) / np.count_nonzero(mask)
+    return float(np.sqrt(ratio - 1))
 
 
 def hole_root(mask: Booleans) -> float:
     """Return the root of the number of voxels in holes of slices across any axis of the grid, over that of the body."""
-    padded, holes = np.pad(mask, 1), np.zeros_like(mask)
+    padded = np.pad(mask, 1)
+    holes = np.zeros_like(mask)
     for axis in range(3):
         neighbours = ndimage.generate_binary_structure(3, 1)
-        np.moveaxis(neighbours, axis, 0)[[0, 2]] = False
+        by_slice = np.moveaxis(neighbours, axis, 0)
+        by_slice[[0, 2]] = False  # voxels of other slices are no neighbours
         pieces, n_pieces = ndimage.label(~padded, neighbours)
         is_hole = np.arange(n_pieces + 1) > 0
-        is_hole[np.take(pieces, 0, axis=axis - 1)] = (
-            False  # the outside, which contains the padding of the slice
-        )
+        # The outside contains the padding of the slice.
+        outside = np.take(pieces, 0, axis=axis - 1)
+        is_hole[outside] = False
         holes |= is_hole[pieces][1:-1, 1:-1, 1:-1]
-    return float(np.sqrt(np.count_nonzero(holes) / np.count_nonzero(mask)))
+    return _root_of_share(holes, mask)
+
+
+def _root_of_share(defect: Booleans, mask: Booleans) -> float:
+    """Return the root of the number of voxels of a defect, over that of the body."""
+    return float(np.sqrt(np.count_nonzero(defect) / np.count_nonzero(mask)))
 
 
 def gap_root(mask: Booleans, sides: Floats) -> float:
@@ -55,15 +64,23 @@ def gap_root(mask: Booleans, sides: Floats) -> float:
     radius of the ball is 0.8 times that of the largest ball inside the body. Voxels have side lengths `sides` (3,).
     """
     while mask.size > _MAX_VOXELS:
-        mask = np.pad(mask, [(0, n % 2) for n in mask.shape])
-        halved = mask.reshape(*(m for n in mask.shape for m in (n // 2, 2))).mean(axis=(1, 3, 5))
-        mask, sides = halved >= 0.5, 2 * sides
+        mask = _halved(mask)
+        sides = 2 * sides
     depth = ndimage.distance_transform_edt(np.pad(mask, 1), sides).max()
     radius = max(_CLOSING_RADIUS * depth, 1.01 * sides.min())
-    padded = np.pad(mask, [2 * (int(radius / side) + 2,) for side in sides])
+    margins = [int(radius / side) + 2 for side in sides]
+    padded = np.pad(mask, [(margin, margin) for margin in margins])
     dilated = ndimage.distance_transform_edt(~padded, sides) <= radius
     outside = ndimage.distance_transform_edt(dilated, sides) <= radius
-    return float(np.sqrt(np.count_nonzero(~outside & ~padded) / np.count_nonzero(mask)))
+    return _root_of_share(~outside & ~padded, mask)
+
+
+def _halved(mask: Booleans) -> Booleans:
+    """Return a mask on a grid twice as coarse: voxels of which at least half was filled."""
+    even = np.pad(mask, [(0, n % 2) for n in mask.shape])
+    x, y, z = even.shape
+    blocks = even.reshape(x // 2, 2, y // 2, 2, z // 2, 2)
+    return blocks.mean(axis=(1, 3, 5)) >= 0.5
 
 
 def cut_end(mask: Booleans, at_border: Booleans) -> float:
@@ -78,9 +95,13 @@ def cut_end(mask: Booleans, at_border: Booleans) -> float:
     """
     flattest = 0.0
     for axis, end in np.argwhere(~at_border):
-        counts = np.moveaxis(mask, axis, 0)[:: -1 if end else 1][:3].sum(axis=(1, 2))
+        slices = np.moveaxis(mask, axis, 0)
+        if end:
+            slices = slices[::-1]
+        counts = slices[:3].sum(axis=(1, 2))
         if len(counts) == 3:
-            flattest = max(flattest, np.sqrt(counts[0]) - np.sqrt(0.4 * counts[1:].mean()))
+            round_end = 0.4 * counts[1:].mean()
+            flattest = max(flattest, np.sqrt(counts[0]) - np.sqrt(round_end))
     return flattest
 
 
@@ -96,7 +117,8 @@ class Place:
 
     def mask(self, low: Integers, high: Integers) -> NDArray[np.uint8]:
         """Return the voxels between two corners of the grid."""
-        box = np.unpackbits(self.bits, count=int(np.prod(self.shape))).reshape(self.shape)
+        voxels = np.unpackbits(self.bits, count=int(np.prod(self.shape)))
+        box = voxels.reshape(self.shape)
         return box[tuple(map(slice, low - self.low, high - self.low))]
 
 
@@ -112,8 +134,12 @@ def overlaps(places: Sequence[Place | None], labels: Sequence[str] | None = None
             grids[place.grid].append((i, place))
     for same_grid in grids.values():
         for (i, a), (j, b) in combinations(same_grid, 2):
-            low, high = np.maximum(a.low, b.low), np.minimum(a.low + a.shape, b.low + b.shape)
-            if (low < high).all() and (labels is None or labels[i] != labels[j]):
+            if labels is not None and labels[i] == labels[j]:
+                continue
+            low = np.maximum(a.low, b.low)
+            high = np.minimum(a.low + a.shape, b.low + b.shape)
+            if (low < high).all():
                 n_shared = np.count_nonzero(a.mask(low, high) & b.mask(low, high))
-                shares[i, j], shares[j, i] = n_shared / a.n_voxels, n_shared / b.n_voxels
+                shares[i, j] = n_shared / a.n_voxels
+                shares[j, i] = n_shared / b.n_voxels
     return shares
