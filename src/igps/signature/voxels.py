@@ -92,20 +92,20 @@ def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
     """
     shape = tuple(len(axis) for axis in axes)
     votes = np.zeros(shape, dtype=np.int8)
-    share_density = np.zeros(shape, dtype=bool)
+    on_surface = np.zeros(shape, dtype=bool)
     for i in range(3):
         order = (i, (i + 1) % 3, (i + 2) % 3)
         line = tuple(axes[k] for k in order)
         after, before, touching = _scan(mesh.vertices[:, order], mesh.faces, line)
         inverse = np.argsort(order)
         votes += ((after > 0).astype(np.int8) + (before > 0)).transpose(inverse)
-        share_density |= touching.transpose(inverse)
+        on_surface |= touching.transpose(inverse)
     inside = votes >= 5
-    doubtful = np.nonzero((votes > 1) & (votes < 5) & ~share_density)
+    doubtful = np.nonzero((votes > 1) & (votes < 5) & ~on_surface)
     if len(doubtful[0]):
         points = np.stack([axis[i] for axis, i in zip(axes, doubtful, strict=True)], axis=1)
         inside[doubtful] = winding_number(mesh.vertices, mesh.faces, points) > 0.5
-    return inside & ~share_density
+    return inside & ~on_surface
 
 
 def _scan(
@@ -159,7 +159,7 @@ def _scan(
     after = np.cumsum(crossings[::-1], axis=0)[::-1][1:]
     before = -np.cumsum(crossings, axis=0)[:-1]
 
-    share_density = np.zeros(size, dtype=bool)
+    on_surface = np.zeros(size, dtype=bool)
     # Use the first axis with several points: an axis across a flat body may have only one.
     cell = next(
         (float(axis[1] - axis[0]) for axis in axes if len(axis) > 1), longest_side(vertices)
@@ -167,8 +167,8 @@ def _scan(
     for neighbour in (position - 1, position):
         clipped = np.clip(neighbour, 0, len(x_axis) - 1)
         is_close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell
-        share_density[clipped[is_close], column[is_close], row[segment][is_close]] = True
-    return after, before, share_density[:-1]
+        on_surface[clipped[is_close], column[is_close], row[segment][is_close]] = True
+    return after, before, on_surface[:-1]
 
 
 def _ranges(first: Integers, last: Integers) -> tuple[Integers, Integers]:
