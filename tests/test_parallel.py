@@ -168,7 +168,7 @@ def test_a_job_that_needs_too_much_memory_is_named(limited: dict[int, object]) -
 @pytest.mark.skipif(not LINUX, reason="Linux alone enforces a memory limit")
 def test_a_limit_below_what_python_itself_takes_is_to_be_raised() -> None:
     with pytest.raises(MachineError, match="raise the memory_limit"):
-        all_of(jobs.call, [len], n_workers=1, limits=Limits(memory=GIB // 20))
+        all_of(jobs.call, [len], n_workers=1, limits=Limits(memory=2**20))
 
 
 def test_a_worker_keeps_the_memory_of_one_body_for_the_next(limited: dict[int, int]) -> None:

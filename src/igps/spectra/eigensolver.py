@@ -7,7 +7,7 @@ The algorithm is block Lanczos with a shift inside the wanted part of the spectr
    units of √area, so that nothing depends on the scale of the coordinates.
 2. Weyl's law N(λ) ≈ λ · area / 4π gives a shift σ with about SHIFT_RANK of the wanted eigenvalues below it.
    (A − σI)⁻¹ is applied by `_multifrontal`. It maps λ to θ = 1/(λ − σ): the wanted eigenvalues are at both ends of the
-   spectrum, and those below σ have no unwanted ones at their end. The basis is a third smaller than with a shift below
+   spectrum, and every eigenvalue below σ is wanted. The basis is a third smaller than with a shift below
    the spectrum. Several bands with a shift each (manifold harmonics, Vallet & Lévy 2008) would reduce it further, but
    each costs a factorization, and the vectors of neighbouring bands would have to be orthogonalised.
 3. The block Krylov basis Q is computed by the three-term recurrence, with a full reorthogonalisation of two blocks at a
