@@ -2,45 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
+import argparse
 import os
-import sys
 from typing import Any
 from unittest import mock
 
-from igps.cli import COMMANDS, Commands, main
+from igps.cli.commands import COMMANDS, load_command
+from igps.cli.parsing import command_parser, shared_parser
 
 PLACEHOLDER = "<!-- commands -->"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace the placeholder of a page by the help of every command."""
-    return (
-        markdown.replace(PLACEHOLDER, "\n".join(_sections(COMMANDS)))
-        if PLACEHOLDER in markdown
-        else markdown
-    )
+    """Replace the placeholder of a page by the help of every command, and of the options that they share."""
+    if PLACEHOLDER not in markdown:
+        return markdown
+    sections = [_section(f"igps {name}", command_parser(load_command(name))) for name in COMMANDS]
+    sections.append(_section("igps help options", shared_parser()))
+    return markdown.replace(PLACEHOLDER, "\n".join(sections))
 
 
-def _sections(commands: Commands, *group: str) -> list[str]:
-    sections = []
-    for name, command in commands.items():
-        words = (*group, name)
-        if callable(command):
-            sections.append(f"## igps {' '.join(words)}\n\n```text\n{_help(words)}\n```\n")
-        else:
-            sections += _sections(command, *words)
-    return sections
-
-
-def _help(words: tuple[str, ...]) -> str:
-    text = io.StringIO()
-    with (
-        mock.patch.object(sys, "argv", ["igps", *words, "--help"]),
-        mock.patch.dict(os.environ, {"COLUMNS": "100"}),
-        contextlib.redirect_stdout(text),
-        contextlib.suppress(SystemExit),
-    ):
-        main()
-    return text.getvalue().strip()
+def _section(title: str, parser: argparse.ArgumentParser) -> str:
+    with mock.patch.dict(os.environ, {"COLUMNS": "100"}):
+        text = parser.format_help().strip()
+    return f"## {title}\n\n```text\n{text}\n```\n"

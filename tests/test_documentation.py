@@ -20,7 +20,8 @@ import pytest
 import trimesh
 from sklearn.svm import SVC
 
-from igps.cli import COMMANDS, main
+from igps.cli import main
+from igps.cli.commands import command_of, load_command
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES
 from igps.shapes import ArticulatedShapes
@@ -173,9 +174,7 @@ def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path: Path) -> None:
         "--out",
         "out",
     ]
-    run(
-        tmp_path, "-m", "igps.cli", "retrieve", "shapes", "--descriptor", "mine:Roundness", *options
-    )
+    run(tmp_path, "-m", "igps", "retrieve", "shapes", "--descriptor", "mine:Roundness", *options)
     with np.load(tmp_path / "out" / "distances.npz") as archive:
         distances = archive["distances"]
         names = archive["names"]
@@ -289,16 +288,9 @@ def shell_lines(page: str) -> list[str]:
 
 def known_command(words: list[str]) -> list[str]:
     """The command of `igps` that words begin with, in one or two words."""
-    commands = COMMANDS
-    found = []
-    for word in words:
-        if callable(commands) or word not in commands:
-            break
-        found.append(word)
-        commands = commands[word]
-    assert found, f"no command {words[:1]}"
-    assert callable(commands) or len(words) == len(found), f"{found} has no {words[len(found) :]}"
-    return found
+    name = command_of(words)
+    assert name is not None, f"no command {words[:2]}"
+    return name.split()
 
 
 def told(page: str) -> list[tuple[str, list[str]]]:
@@ -330,9 +322,11 @@ def test_what_igps_is_told_exists(
     with pytest.raises(SystemExit, match="0"):
         main()
     text = capsys.readouterr().out
+    shared = load_command(command).shared_options()
     for line, words in lines:
         for option in [word for word in words if word.startswith("--")]:
-            assert re.search(rf"{option}\b", text), f"{line}: no option {option}"
+            is_known = re.search(rf"{option}\b", text) or option.removeprefix("--") in shared
+            assert is_known, f"{line}: no option {option}"
 
 
 @pytest.mark.parametrize("page", [page for page in TEXT if shell_lines(page)])

@@ -753,7 +753,7 @@ def starting(data: Path | None) -> dict[str, Figure]:
         return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
 
     ours, torch_alone = timed(run("-c", "import igps"), run("-c", "import torch"), 5)
-    help_seconds, _ = timed(run("-m", "igps.cli", "--help"), run("-c", ""), 5)
+    help_seconds, _ = timed(run("-m", "igps", "--help"), run("-c", ""), 5)
     difference = max(ours - torch_alone, 1e-3)
     note = f"beyond the {torch_alone:.2f} s of `import torch`"
     return {"import_igps": within(1.5, difference, note), "igps_help": within(3, help_seconds)}

@@ -78,7 +78,7 @@ def retrieve(
     under: Sequence[str] = (),
 ) -> subprocess.CompletedProcess[str]:
     """Run the command to its end, with a fault of the machine, or under another command."""
-    command = [*under, sys.executable, "-m", "igps.cli", *arguments(shapes, cache, out, n_workers)]
+    command = [*under, sys.executable, "-m", "igps", *arguments(shapes, cache, out, n_workers)]
     return subprocess.run(
         command, env=environment(fault), capture_output=True, text=True, timeout=300, check=False
     )

@@ -164,7 +164,7 @@ def test_volumes_are_compared_in_one_unit(
         in capsys.readouterr().out
     )
     assert float(table(tmp_path / "groups.csv")[1]["effect"]) > 0.9
-    igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", "volume", "--out", tmp_path)
+    igps(monkeypatch, root, "map", root, *OWN, "--colour", "volume", "--out", tmp_path)
     found = {row["name"][:-4]: float(row["volume"]) for row in table(tmp_path / "map.csv")}
     for label, of_each in heights.items():
         for i, height in enumerate(of_each):
@@ -332,7 +332,7 @@ def test_explain_tells_how_much_of_the_surface_differs(
     areas = trimesh.load(root / "long3.off", process=False).area_faces
     told = told.format(f"{100 * areas[-1] / areas.sum():.2g}")
     monkeypatch.setattr(
-        "igps.cli.answers.share_density", lambda *_: np.append(np.full(319, -1.0), largest)
+        "igps.analysis.explanation.share_density", lambda *_: np.append(np.full(319, -1.0), largest)
     )
     igps(monkeypatch, root, "explain", root / "short0.off", root / "long3.off", *OWN)
     assert capsys.readouterr().out.splitlines()[-1] == f"{root}/long3.off: {told}"
@@ -391,17 +391,15 @@ def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are(
         assert percent == pytest.approx(12.5, abs=0.6)  # of two digits
 
 
-@pytest.mark.parametrize("words", [["clusters"], ["figure", "clusters"]])
 def test_clusters_are_the_two_kinds_of_eggs(
-    words: list[str],
     root: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    out = [] if words[0] == "figure" else ["--out", "figures"]
-    igps(monkeypatch, root, *words, root, *OWN, "--n_clusters", "2", *out)
+    out = ["--out", "figures"]
+    igps(monkeypatch, root, "clusters", root, *OWN, "--n_clusters", "2", *out)
     printed = capsys.readouterr().out
     rows = table(tmp_path / "figures" / "clusters.csv")
     clusters = {row["name"]: row["cluster"] for row in rows}
@@ -428,7 +426,7 @@ def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", colour, "--out", tmp_path)
+    igps(monkeypatch, root, "map", root, *OWN, "--colour", colour, "--out", tmp_path)
     rows = table(tmp_path / "map.csv")
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
     found = body_map(chi_square(*2 * [describe(dataset, small_interior())]).numpy())
@@ -456,7 +454,7 @@ def test_a_column_called_as_the_coordinates_leaves_them_alone(
     (tmp_path / "labels.csv").write_text(
         "file,x\n" + "".join(f"{root / row['file']},7\n" for row in rows)
     )
-    igps(monkeypatch, root, "figure", "map", tmp_path, *OWN, "--colour", "x", "--out", tmp_path)
+    igps(monkeypatch, root, "map", tmp_path, *OWN, "--colour", "x", "--out", tmp_path)
     found = table(tmp_path / "map.csv")
     assert {row["x of labels.csv"] for row in found} == {"7.0"}
     assert len({row["x"] for row in found}) == len(rows)
@@ -502,7 +500,7 @@ def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path: P
     ("command", "message"),
     [
         (
-            ["figure", "map", "--colour", "weight"],
+            ["map", "--colour", "weight"],
             "weight: no such column of labels.csv; further columns: scanner, age",
         ),
         (

@@ -37,8 +37,7 @@ def test_the_file_stands_for_the_folder(
     expected = json.loads(capsys.readouterr().out)
     run(
         monkeypatch,
-        "cache",
-        "export",
+        "precompute",
         tmp_path / "eggs",
         "--out",
         out,
@@ -94,8 +93,7 @@ def test_lists_of_files_may_be_one_file_of_signatures_and_what_needs_meshes_says
     rich, model, small = ["--descriptor", "rich"], tmp_path / "mine.safetensors", SMALL[2:]
     run(
         monkeypatch,
-        "cache",
-        "export",
+        "precompute",
         tmp_path / "eggs",
         "--out",
         out,

@@ -18,7 +18,7 @@ import trimesh
 from safetensors import safe_open
 
 from commands import run
-from igps import cli
+from igps.cli.commands import COMMANDS, ENDINGS, load_command
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.literature.d2 import D2
@@ -373,8 +373,7 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
     file, cache = tmp_path / "signatures.igps", ["--cache_dir", tmp_path / "cache"]
     run(
         monkeypatch,
-        "cache",
-        "export",
+        "precompute",
         root,
         "--out",
         file,
@@ -524,72 +523,10 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
         logging.disable(logging.NOTSET)
 
 
-@pytest.mark.parametrize(
-    "command", ["retrieve", "extract", "query", "precompute", "demo", "compare", "report"]
-)
-def test_help_explains_every_option(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
-    with pytest.raises(SystemExit, match="0"):
-        run(monkeypatch, command, "--help")
-    text = capsys.readouterr().out
-    assert "--n_workers" in text
-    assert "--workers" not in text
-    if command not in ("demo", "report"):
-        for word in (
-            "--cache_dir",
-            "--strict",
-            "--mend",
-            "--signature.min_samples",
-            "refined until",
-        ):
-            assert word in text, word
-
-
-def test_help_is_in_the_words_that_are_typed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit, match="0"):
-        run(monkeypatch, "gallery", "build", "--help")
-    text = " ".join(capsys.readouterr().out.split())
-    assert text.startswith("usage: igps gallery build root --out OUT [options] ")
-    for word in ("None", "`", "see ", "type:", "Literal", "null)", "False)"):
-        assert word not in text, word
-    for words in (
-        "--bodies {whole,labels,objects,pieces,chains,models,assembly}",
-        "null evaluates them exactly",
-        "start vectors (default: 0)",
-        "or 250 without a descriptor",
-    ):
-        assert words in text, words
-
-
-def test_a_repeated_list_is_collected_in_place_of_its_default() -> None:
-    parser = cli.command_parser()
-    for command in ("compare", "precompute"):
-        default = parser.parse_args([command, "root"])[command].descriptors
-        assert "pretrained" in default
-        words = ["--descriptors", "pretrained", "--descriptors", "d2", "rich"]
-        for _ in range(2):
-            assert parser.parse_args([command, "root", *words])[command].descriptors == [
-                "pretrained",
-                "d2",
-                "rich",
-            ]
-    assert parser.parse_args(["groups", "root", "--with", "a", "--with", "b=2"]).groups["with"] == [
-        "a",
-        "b=2",
-    ]
-
-
 def test_an_interruption_is_told_in_a_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def wait() -> None:
-        """Wait."""
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "COMMANDS", {"wait": wait})
+    monkeypatch.setitem(COMMANDS, "wait", "own_commands:wait")
     with pytest.raises(SystemExit, match="130"):
         run(monkeypatch, "wait")
     assert (
@@ -601,11 +538,7 @@ def test_an_interruption_is_told_in_a_line(
 def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def ask() -> None:
-        """Ask for a pebibyte."""
-        np.empty(2**47)
-
-    monkeypatch.setattr(cli, "COMMANDS", {"ask": ask})
+    monkeypatch.setitem(COMMANDS, "ask", "own_commands:ask")
     with pytest.raises(SystemExit, match="2"):
         run(monkeypatch, "ask")
     assert re.fullmatch(
@@ -621,38 +554,6 @@ def test_the_version_is_that_of_the_distribution(
     assert capsys.readouterr().out.startswith(
         f"igps {importlib.metadata.version('interior-gps')}, signatures "
     )
-
-
-def test_commands_may_be_grouped(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def pose(
-        mesh: Path, classes: list[int] | None = None, exact: bool = False, size: float = 2.0
-    ) -> None:
-        """Draw a pose.
-
-        Args:
-            mesh: what to draw.
-            classes: which to show.
-            exact: without a tolerance
-            size: in inches.
-        """
-        print(mesh, classes, exact, size)
-
-    monkeypatch.setattr(
-        cli, "COMMANDS", {"figure": {"pose": pose, "demo": cli.demo}, "query": cli.query}
-    )
-    run(monkeypatch, "figure", "pose", "a.off", "--classes", "1", "2", "--exact")
-    run(monkeypatch, "figure", "pose", "a.off", "--size", "3")
-    assert capsys.readouterr().out.splitlines() == ["a.off [1, 2] True 2.0", "a.off None False 3.0"]
-    for arguments, words in (
-        (["figure"], ("pose", "demo")),
-        (["figure", "pose"], ("what to draw", "which to show")),
-    ):
-        with pytest.raises(SystemExit, match="0"):
-            run(monkeypatch, *arguments, "--help")
-        text = capsys.readouterr().out
-        assert all(word in text for word in words)
 
 
 def test_json_is_what_the_table_tells(
@@ -727,12 +628,6 @@ def test_json_has_no_numbers_that_json_does_not_know(
     assert found["n_queries"] == 3
 
 
-def test_every_command_that_prints_a_table_has_json() -> None:
-    told = ("retrieve", "query", "compare", "doctor", "demo", "duplicates", "distance")
-    for command in (cli.COMMANDS[name] for name in told):
-        assert get_type_hints(command)["return"] is not type(None), command
-
-
 def test_json_of_two_bodies_and_of_copies(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -749,43 +644,29 @@ def test_json_of_two_bodies_and_of_copies(
     assert (found["n_files"], found["n_skipped"]) == (3, 0)
     (pair,) = found["pairs"]
     assert pair["files"] == ["egg/0.off", "egg/1.off"]
-    same = {}
     for other in (larger, ball):
-        run(monkeypatch, "distance", egg, other, *options)
+        run(monkeypatch, "explain", egg, other, *options)
         printed = capsys.readouterr()
         told = json.loads(printed.out)
         assert told["meaning"] in printed.err  # the sentence, where progress goes
-        same[other] = told["same"]
-        assert (told["surfaces"] == pytest.approx(pair["distance"], abs=1e-6)) is (other == larger)
-    assert same == {larger: True, ball: False}
 
 
-def _writing(
-    commands: cli.Commands, words: tuple[str, ...] = ()
-) -> dict[tuple[str, ...], cli.Command]:
-    """The commands that have `out`, by the words that name them."""
-    found: dict[tuple[str, ...], cli.Command] = {}
-    for name, one in commands.items():
-        if not callable(one):
-            found |= _writing(one, (*words, name))
-        elif "out" in get_type_hints(one):
-            found[*words, name] = one
-    return found
+WRITING = [name for name in COMMANDS if "out" in get_type_hints(load_command(name).function)]
 
 
-@pytest.mark.parametrize("words", _writing(cli.COMMANDS))
+@pytest.mark.parametrize("command", WRITING)
 def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
-    words: tuple[str, ...],
+    command: str,
     root: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    endings = cli.ENDINGS.get(_writing(cli.COMMANDS)[words])
+    endings = ENDINGS.get(command)
     given = [
-        *words,
-        *([] if words == ("demo",) else [root]),
-        *(["--model", "none"] if words == ("classify",) else []),
+        *command.split(),
+        *([] if command == "demo" else [root]),
+        *(["--model", "none"] if command == "classify" else []),
     ]
     name = f"there{(endings or ['.csv'])[0]}"
 
@@ -859,7 +740,6 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
             "meshes: expected two files, or a folder of two classes, got 3 files.",
         ),
         (["explain", "ROOT", "ROOT"], "ROOT: expected a file, got a folder."),
-        (["distance", "BALL", "none.off"], "none.off: no such file."),
         (["query", "none.off", "--gallery", "ROOT"], "none.off: no such file."),
         (
             ["clusters", "ROOT", "--n_clusters", "7"],
@@ -871,13 +751,13 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         ),
         (["clusters", "ROOT", "--n_resamples", "-1"], "n_resamples: expected at least 0, got -1."),
         (["clusters", "TWO"], "root: expected three bodies or more, TWO has 2."),
-        (["figure", "map", "TWO"], "root: expected three bodies or more, TWO has 2."),
-        (["figure", "map", "ROOT", "--seed", "-1"], "seed: expected 0 to 4294967295, got -1."),
+        (["map", "TWO"], "root: expected three bodies or more, TWO has 2."),
+        (["map", "ROOT", "--seed", "-1"], "seed: expected 0 to 4294967295, got -1."),
         (
             ["groups", "ROOT", "--seed", "4294967296"],
             "seed: expected 0 to 4294967295, got 4294967296.",
         ),
-        (["figure", "map", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
+        (["map", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
         (
             ["retrieve", "ROOT", "--with", "ct=-1"],
             "with: expected NAME or NAME=WEIGHT with a weight above 0, such as",
@@ -945,7 +825,7 @@ def test_completion_knows_commands_and_options(
     subprocess.run([program, "-n", str(path)], check=True)
     typed = {
         "igps comp": ["compare", "completion"],
-        "igps gallery m": ["merge"],
+        "igps gallery r": ["remove"],
         "igps gallery build --des": ["--descriptor"],
         "igps doctor --js": ["--json"],
         "igps retrieve --mend a": ["auto", "always"],

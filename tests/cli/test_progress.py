@@ -65,7 +65,7 @@ def bars(text: str) -> dict[str, tuple[int, int]]:
             {"signatures": 4, "descriptions": 4},
         ),
         ("doctor ROOT --n_workers 1", {"bodies": 4}),
-        ("distance MESH OTHER --n_workers 1", {"signatures": 2, "descriptions": 2}),
+        ("explain MESH OTHER --n_workers 1", {"signatures": 2, "descriptions": 2}),
         ("duplicates ROOT --n_workers 1", {"signatures": 4, "surfaces": 4, "compared": 4}),
     ],
     ids=lambda value: value.split(" ROOT")[0].split(" MESH")[0] if isinstance(value, str) else "",
@@ -102,20 +102,3 @@ def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
         name: total for name, total in expected.items() if total is not None
     }
     assert not bars(printed.out)
-
-
-def test_merging_galleries_shows_a_bar(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    small = ["--cache_dir", str(tmp_path / "cache"), *SMALL]
-    for name in ("ball", "egg"):
-        build = ["gallery", "build", str(root / name), "--out", str(tmp_path / f"{name}.igps")]
-        monkeypatch.setattr(sys, "argv", ["igps", *build, "--descriptor", INTERIOR, *small])
-        main()
-    capsys.readouterr()
-    both = [str(tmp_path / f"{name}.igps") for name in ("ball", "egg")]
-    monkeypatch.setattr(
-        sys, "argv", ["igps", "gallery", "merge", *both, "--out", str(tmp_path / "all.igps")]
-    )
-    main()
-    assert bars(capsys.readouterr().err)["entries"] == (4, 4)

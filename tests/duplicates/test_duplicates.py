@@ -19,7 +19,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from commands import error_of, run
-from igps.cli import COMMANDS
+from igps.cli.commands import COMMANDS
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.descriptors.fingerprint import fingerprint
@@ -395,14 +395,6 @@ def test_the_commands(
     rows = (tmp_path / "out" / "groups.csv").read_text().splitlines()
     assert rows[0] == "group,name,path"
     assert rows[5] == f"2,lump.stl,{root / 'lump.stl'}"
-    run(monkeypatch, "distance", root / "bar.off", root / "bar.ply", *options)
-    *_, by_descriptor, by_surfaces, by_lengths = capsys.readouterr().out.splitlines()
-    assert float(by_lengths.split()[5]) == pytest.approx(0.2, rel=0.01)
-    assert "pairs of different classes" in by_descriptor
-    assert ", the same shape (at their level of detail, distances up to " in by_surfaces
-    run(monkeypatch, "distance", root / "bar.off", root / "bent.off", *options)
-    # Neither has a handle; their vertices are numbered alike
-    assert "not the same shape (their handles or vertices differ)" in capsys.readouterr().out
 
 
 def test_the_page_runs(tmp_path: Path) -> None:
@@ -434,14 +426,6 @@ def test_what_is_wrong_is_one_sentence(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     options = ["--cache_dir", cache, "--n_workers", 1]
-    assert "meshes: expected two files, got 1" in error_of(
-        monkeypatch, capsys, "distance", root / "bar.off", *options
-    )
-    fewer = ["--signature.n_surface_samples", "300"]
-    words = error_of(
-        monkeypatch, capsys, "distance", root / "bar.off", root / "bar.off", *options, *fewer
-    )
-    assert "n_surface_samples: expected 2000, for which pretrained is calibrated, got 300" in words
     pytest.importorskip("lancedb")
     dataset = SignatureDataset([root / "bar.off", root / "lump.off"], None, cache)
     Gallery.build(tmp_path / "g.igps", dataset, "gps", n_workers=1)

@@ -189,9 +189,6 @@ def test_commands(
         *SMALL,
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 3 bodies by {INTERIOR}"
-    run(monkeypatch, "gallery", "add", root, "--gallery", index, *cache, "--n_workers", 1)
-    # Those of the folder of one class have no class: they are known already.
-    assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 6 bodies by {INTERIOR}"
     run(
         monkeypatch,
         "gallery",
@@ -204,11 +201,7 @@ def test_commands(
         *cache,
         *SMALL,
     )
-    run(monkeypatch, "gallery", "merge", index, "--out", tmp_path / "copy.igps")
-    assert (
-        capsys.readouterr().out.splitlines()[-1]
-        == f"{tmp_path / 'copy.igps'}: 6 bodies by {INTERIOR}"
-    )
+    assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 6 bodies by {INTERIOR}"
 
     wanted = root / "egg" / "1.off"
     run(
@@ -292,9 +285,9 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
     assert "version" in error_of(monkeypatch, capsys, *query)
     monkeypatch.undo()
     with pytest.raises(SystemExit, match="2"):
-        run(monkeypatch, "gallery", "update", index, "--where", "volume > 3")
-    assert "required: gallery.update.to" in capsys.readouterr().err
-    gone = error_of(monkeypatch, capsys, "gallery", "add", tmp_path / "gone", "--gallery", index)
+        run(monkeypatch, "gallery", "remove", index)
+    assert "the following arguments are required: --where" in capsys.readouterr().err
+    gone = error_of(monkeypatch, capsys, "gallery", "sync", tmp_path / "gone", "--gallery", index)
     assert "gone: no such folder" in gone
     changed = small_interior()
     next(changed.buffers()).add_(1e-3)
@@ -441,71 +434,12 @@ def test_commands_that_change_a_gallery(
         return capsys.readouterr().out.splitlines()
 
     lines("build", root, "--out", gallery, "--descriptor", INTERIOR, *cache, *SMALL)
-    assert lines(
-        "update", gallery, "--where", "name LIKE 'ball/%'", "--to", "class=round", "unit=mm"
-    ) == ["3 bodies updated"]
     assert lines("remove", gallery, "--where", "name = 'egg/0.off'")[0] == "1 bodies removed"
     (root / "egg" / "1.off").unlink()
     synced = lines("sync", root, "--gallery", gallery, *cache)
     assert synced[-2:] == ["1 bodies described, 1 removed", f"{gallery}: 5 bodies by {INTERIOR}"]
     told = json.loads("\n".join(lines("info", gallery, "--json")))
     assert (told["bodies"], told["descriptor"], told["columns"]["volume"]) == (5, INTERIOR, "float")
-    found = lines(
-        "query",
-        root / "egg" / "2.off",
-        "--gallery",
-        gallery,
-        "--where",
-        "class = 'ball'",
-        "--exact",
-        *cache,
-    )
-    assert len(found) == 1 + 3  # what update told was overridden by the folder
-    versions = json.loads("\n".join(lines("versions", gallery, "--json")))
-    assert [one["bodies"] for one in versions][:2] == [6, 6]
-    assert lines("restore", gallery, "--version", versions[0]["version"]) == [
-        f"{gallery}: 6 bodies by {INTERIOR}"
-    ]
-    assert "version: expected one that" in error_of(
-        monkeypatch, capsys, "gallery", "restore", gallery, "--version", 999
-    )
-    wrong = error_of(
-        monkeypatch,
-        capsys,
-        "gallery",
-        "update",
-        gallery,
-        "--where",
-        "area > 0",
-        "--to",
-        "volume=much",
-    )
-    assert "values: expected numbers" in wrong
-    wrong = error_of(
-        monkeypatch,
-        capsys,
-        "gallery",
-        "update",
-        gallery,
-        "--where",
-        "area > 0",
-        "--to",
-        "colour=red",
-    )
-    assert "colour: expected one of the columns name, class" in wrong
-    for column in ("name", "file"):
-        wrong = error_of(
-            monkeypatch,
-            capsys,
-            "gallery",
-            "update",
-            gallery,
-            "--where",
-            "area > 0",
-            "--to",
-            f"{column}=",
-        )
-        assert f"{column}: expected a value, got none" in wrong
 
 
 def test_sync_notices_a_table_of_names_that_was_edited(

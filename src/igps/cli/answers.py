@@ -1,38 +1,24 @@
 """The commands `igps groups`, `igps outliers` and `igps explain`."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from tqdm import tqdm
+from typing import TYPE_CHECKING, Any
 
 from igps._parameters import check_at_least, check_fraction, check_seed
-from igps.analysis.explanation import Explanation, explain_groups, share_density, without_head
-from igps.analysis.explanation import explain as explain_pair
-from igps.analysis.groups import group_test, squared_distances, with_q_values
-from igps.analysis.outliers import LIMIT, measure_bodies
-from igps.analysis.outliers import outliers as find_outliers
-from igps.cli.reading import (
-    Folder,
-    check_files,
-    described,
-    files_or_folder,
-    is_named_after_file,
-    print_failures,
-)
-from igps.data.dataset import SignatureDataset
-from igps.data.sources import Bodies
-from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.size_and_side import Size, keeps_size
-from igps.mesh.mesh import Mesh, millimetres
-from igps.mesh.surface import face_areas
-from igps.nn.description import describe
-from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_analysis
-from igps.report.tables import groups_table
-from igps.signature.signature import SAMPLE_KINDS
+from igps.cli.options import Size
+
+if TYPE_CHECKING:
+    from igps.analysis.explanation import Explanation
+    from igps.data.dataset import SignatureDataset
+    from igps.data.sources import Bodies
+    from igps.mesh.mesh import Mesh
+
+
+CALIBRATED = "pretrained"
+"""The only descriptor whose distances are calibrated, see `igps.duplicates.calibration`."""
 
 
 def groups(
@@ -62,6 +48,17 @@ def groups(
         n_permutations: number of random permutations.
         seed: seed of the permutations, bootstraps and folds.
     """
+    import numpy as np
+    from tqdm import tqdm
+
+    from igps.analysis.groups import group_test, with_q_values
+    from igps.cli.reading import Folder, described, is_named_after_file, print_failures
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.descriptors.size_and_side import keeps_size
+    from igps.mesh.mesh import millimetres
+    from igps.report.answers import groups_figure, write_analysis
+    from igps.report.tables import groups_table
+
     check_at_least(1, n_permutations=n_permutations)
     check_seed(seed)
 
@@ -130,6 +127,8 @@ def groups(
 
 def _design(bodies: Bodies, name: str) -> Any:
     """Return a column as numbers (N, k): as they are, or one indicator per category where no value is a number."""
+    import numpy as np
+
     words = bodies.column(name)
     if any(re.match(r"[-+.\d]|inf(inity)?$", word, re.IGNORECASE) for word in words):
         return np.array(bodies.numbers(name))[:, None]
@@ -143,7 +142,7 @@ def outliers(
     descriptor: str = "pretrained",
     top: int = 20,
     out: Path | None = None,
-    **reading: Any,
+    **describing: Any,
 ) -> list[dict[str, Any]]:
     """List the bodies that are most unlike their class, to review before the collection is used.
 
@@ -158,11 +157,17 @@ def outliers(
         out: folder for outliers.csv and outliers.json with all bodies, and outliers.svg and outliers.png with pictures
             of the highest-scoring bodies.
     """
+    from igps.analysis.groups import squared_distances
+    from igps.analysis.outliers import LIMIT, measure_bodies
+    from igps.analysis.outliers import outliers as find_outliers
+    from igps.cli.reading import Folder, described, print_failures
+    from igps.report.answers import outliers_figure, write_analysis
+
     check_at_least(0, top=top)
-    result = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **reading)
+    result = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **describing)
     dataset = result.dataset
     distances = squared_distances(result.coordinates()) ** 0.5
-    measures = measure_bodies(dataset, n_workers=reading.get("n_workers"))
+    measures = measure_bodies(dataset, n_workers=describing.get("n_workers"))
     files = dataset.bodies.paths
     # Where each file holds one mask, a folder holds the organs of one subject
     subjects = files if len(set(files)) < len(files) else [file.parent for file in files]
@@ -201,7 +206,7 @@ def explain(
     descriptor: str = "pretrained",
     level: float = 0.05,
     out: Path | None = None,
-    **reading: Any,
+    **describing: Any,
 ) -> dict[str, Any]:
     """Show where two bodies or two groups of bodies differ, by the share of each part in their distance.
 
@@ -212,6 +217,18 @@ def explain(
         out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and both
             bodies painted with their shares, from the front and from behind, as explain.svg and explain.png.
     """
+    import numpy as np
+
+    from igps.analysis.explanation import explain as explain_pair
+    from igps.analysis.explanation import explain_groups, without_head
+    from igps.analysis.groups import squared_distances
+    from igps.cli.reading import Folder, check_files, described, files_or_folder
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.descriptors.fingerprint import cache_tag
+    from igps.mesh.surface import face_areas
+    from igps.nn.description import describe
+    from igps.report.answers import explanation_figure, write_analysis
+
     check_fraction(level=level)
     source = files_or_folder(meshes)
     if not isinstance(source, Folder):
@@ -225,14 +242,14 @@ def explain(
     )  # raises for other descriptors before anything is computed
     if isinstance(source, Folder):
         folder = Folder(source.root, labelled=True, needs_meshes=True, check=_check_two_classes)
-        result = described(folder, descriptor, **reading)
+        result = described(folder, descriptor, **describing)
         _check_two_classes(result.dataset.bodies)  # without the bodies that could not be used
         dataset, module, labels = (
             result.dataset,
             result.descriptor,
             np.array(result.dataset.bodies.labels),
         )
-        inner, n_workers = without_head(module), reading.get("n_workers")
+        inner, n_workers = without_head(module), describing.get("n_workers")
         descriptions = describe(
             dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True
         )
@@ -247,7 +264,7 @@ def explain(
         n_cells = f"{int(is_significant.sum())} of {len(is_significant)}"
         print(f"{n_cells} cells differ significantly; painted: the medoid of each group")
     else:
-        result, pair = described(source, descriptor, **{**reading, "strict": True}), [0, 1]
+        result, pair = described(source, descriptor, **{**describing, "strict": True}), [0, 1]
         dataset, module = result.dataset, result.descriptor
         if len(dataset) != 2:
             listed = ", ".join(dataset.bodies.names[:4])
@@ -259,6 +276,10 @@ def explain(
     print(
         f"{' and '.join(names)}: {explanation.distance:.4g} by {module.name}: {explanation.summary()}"
     )
+    meaning = None
+    if not isinstance(source, Folder):
+        meaning = _meaning(descriptor, dataset, explanation.distance)
+        print(meaning or f"what this distance means is known for {CALIBRATED} alone")
     painted = [_painted(dataset, i, explanation, side) for side, i in enumerate(pair)]
     for name, mesh, values in painted:
         print(f"{name}: {_extent(values, face_areas(mesh.vertices, mesh.faces))}")
@@ -267,7 +288,25 @@ def explain(
         write_analysis(out, "explain_samples", _sample_rows(dataset, pair, explanation))
         write_analysis(out, "explain", parts, explanation_figure(painted))
         print(f"written to {out}")
-    return {"bodies": names, "distance": explanation.distance, "shares": parts}
+    return {
+        "bodies": names,
+        "distance": explanation.distance,
+        "meaning": meaning,
+        "shares": parts,
+    }
+
+
+def _meaning(descriptor: str, dataset: SignatureDataset, distance: float) -> str | None:
+    """Return in words what a distance means; None if the descriptor or its signatures are not calibrated."""
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.duplicates.calibration import Calibration
+
+    calibration = Calibration.load()
+    try:
+        calibration.check(descriptor, descriptor_of(descriptor), dataset.config)
+    except ValueError:
+        return None
+    return calibration.words(distance)
 
 
 def _check_two_classes(bodies: Bodies) -> None:
@@ -279,6 +318,9 @@ def _painted(
     dataset: SignatureDataset, i: int, explanation: Explanation, side: int
 ) -> tuple[str, Mesh, Any]:
     """Return the name and mesh of a body, and the shares of its faces (F,) in the distance; `side` is 0 or 1."""
+    from igps.analysis.explanation import share_density
+    from igps.signature.signature import SAMPLE_KINDS
+
     mesh, signature = dataset.mesh(i), dataset[i].signature
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     samples = {kind: getattr(signature, kind).points for kind in SAMPLE_KINDS}
@@ -288,6 +330,8 @@ def _painted(
 
 def _extent(values: Any, areas: Any) -> str:
     """Return as text how much of the surface holds half of the positive shares, from shares and areas (F,) of faces."""
+    import numpy as np
+
     order = np.argsort(-values)
     cumulative = np.cumsum(np.maximum(values, 0)[order] * areas[order])
     if not cumulative[-1]:
@@ -299,6 +343,8 @@ def _extent(values: Any, areas: Any) -> str:
 def _sample_rows(
     dataset: SignatureDataset, pair: list[int], explanation: Explanation
 ) -> list[dict[str, Any]]:
+    from igps.signature.signature import SAMPLE_KINDS
+
     by_place = explanation.places or explanation.samples
     return [
         {

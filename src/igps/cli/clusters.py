@@ -1,33 +1,29 @@
-"""The commands `igps clusters` and `igps figure map`."""
+"""The commands `igps clusters` and `igps map`."""
+
+from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
-from igps._arrays import Floats
 from igps._parameters import check_at_least, check_seed
-from igps.analysis.clusters import STABLE, Linkage, clusters_of
-from igps.analysis.comparison import pair_distances
-from igps.analysis.map import Layout, body_map, import_umap
-from igps.cli.reading import Folder, described, print_failures
-from igps.data.dataset import SignatureDataset
-from igps.data.sources import LABELS_FILE, Bodies
-from igps.mesh.mesh import millimetres
-from igps.report.answers import clusters_figure, map_figure, write_analysis
+
+if TYPE_CHECKING:
+    from igps._arrays import Floats
+    from igps.data.dataset import SignatureDataset
+    from igps.data.sources import Bodies
 
 
 def clusters(
     root: Path,
     descriptor: str = "pretrained",
     n_clusters: int | None = None,
-    linkage: Linkage = "average",
+    linkage: Literal["average", "complete", "single"] = "average",
     n_resamples: int = 100,
     seed: int = 0,
     out: Path | None = None,
-    **reading: Any,
+    **describing: Any,
 ) -> list[dict[str, Any]]:
     """Find clusters of similar bodies without using classes, and measure how stable each cluster is.
 
@@ -43,6 +39,11 @@ def clusters(
         seed: seed of the random halves.
         out: folder for clusters.csv and clusters.json, and the tree as clusters.svg and clusters.png.
     """
+    import numpy as np
+
+    from igps.analysis.clusters import STABLE, clusters_of
+    from igps.report.answers import clusters_figure, write_analysis
+
     check_at_least(0, n_resamples=n_resamples)
     check_seed(seed)
 
@@ -52,7 +53,7 @@ def clusters(
                 f"n_clusters: expected 1 to {len(bodies)}, the bodies of the folder, got {n_clusters}."
             )
 
-    dataset, distances, labels = _distances(root, check_number, descriptor, **reading)
+    dataset, distances, labels = _distances(root, check_number, descriptor, **describing)
     result = clusters_of(distances, n_clusters, linkage=linkage, n_resamples=n_resamples, seed=seed)
     names, table = dataset.bodies.names, list[dict[str, Any]]()
     print(f"{'cluster':>7}{'bodies':>8}{'stability':>11}  medoid (classes)")
@@ -101,10 +102,10 @@ def map_bodies(
     root: Path,
     descriptor: str = "pretrained",
     colour: str = "class",
-    layout: Layout = "mds",
+    layout: Literal["mds", "umap"] = "mds",
     seed: int = 0,
     out: Path | None = None,
-    **reading: Any,
+    **describing: Any,
 ) -> list[dict[str, Any]]:
     """Draw a map of bodies as points in the plane, in which similar bodies lie close together.
 
@@ -114,6 +115,11 @@ def map_bodies(
         seed: seed of umap.
         out: folder for map.csv, map.json, map.svg and map.png.
     """
+    from igps.analysis.clusters import clusters_of
+    from igps.analysis.map import body_map, import_umap
+    from igps.data.sources import LABELS_FILE
+    from igps.mesh.mesh import millimetres
+    from igps.report.answers import map_figure, write_analysis
 
     def column_values(bodies: Bodies) -> list[str] | list[float]:
         """Return the column of labels.csv with the name `colour`; an empty list if the colour is not a column."""
@@ -127,7 +133,7 @@ def map_bodies(
     check_seed(seed)
     if layout == "umap":
         import_umap()
-    dataset, distances, labels = _distances(root, column_values, descriptor, **reading)
+    dataset, distances, labels = _distances(root, column_values, descriptor, **describing)
     result, bodies = body_map(distances, layout, seed=seed), dataset.bodies
     values: list[str] | list[float]
     if colour == "class":
@@ -160,9 +166,11 @@ def map_bodies(
 
 
 def _distances(
-    root: Path, check: Callable[[Bodies], object], descriptor: str, **reading: Any
+    root: Path, check: Callable[[Bodies], object], descriptor: str, **describing: Any
 ) -> tuple[SignatureDataset, Floats, list[str]]:
     """Return the bodies, their distances (N, N) and their classes, "" where unknown; for `check` see `Folder`."""
+    from igps.analysis.comparison import pair_distances
+    from igps.cli.reading import Folder, described, print_failures
 
     def check_all(bodies: Bodies) -> None:
         if len(bodies) < 3:
@@ -171,7 +179,7 @@ def _distances(
             )
         check(bodies)
 
-    result = described(Folder(root, check=check_all), descriptor, **reading)
+    result = described(Folder(root, check=check_all), descriptor, **describing)
     print_failures(result.failures, len(result.dataset))
     distances = (
         pair_distances(result.descriptor, result.descriptions, progress=True).double().numpy()

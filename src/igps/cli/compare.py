@@ -1,42 +1,26 @@
 """The command `igps compare`."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from igps.cli.options import Mirror, Size
 
-from igps.analysis.comparison import Result, check_names
-from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import (
-    Folder,
-    MirrorOption,
-    signatures,
-    with_side,
-    with_size,
-    write_mending_notes,
-)
-from igps.cli.report import check_report_folder
-from igps.cli.report import report as write_report
-from igps.data.dataset import Failure
-from igps.descriptors import NAMES
-from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.size_and_side import SIZE, Size
-from igps.nn.description import fit_centres
-from igps.report.answers import precision_recall
-from igps.report.results import write_sources
-from igps.report.tables import comparison_table, write_rows
-from igps.retrieval import precision_recall_curve
+if TYPE_CHECKING:
+    from igps.analysis.comparison import Result
+    from igps.data.dataset import Failure
 
 
 def compare(
     root: Path,
-    descriptors: list[str] = [*NAMES],  # noqa: B006 (only read)
+    descriptors: list[str] | None = None,
     out: Path | None = None,
     report: bool = False,
     size: Size = "auto",
-    mirror: MirrorOption = "auto",
+    mirror: Mirror = "auto",
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
@@ -48,14 +32,28 @@ def compare(
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
-        descriptors: names, or package.module:NAME of your own descriptors; if a name ends in +size, --size auto adds
-            +size to no other name.
+        descriptors: names, or package.module:NAME of your own descriptors; by default all of the library, as in
+            igps help descriptors. If a name ends in +size, --size auto adds +size to no other name.
         out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json with the paths of the
             meshes, and failures.csv if there are failures.
         report: also write a page of results to the folder of --out, report.html, see igps report
     """
+    from igps.analysis.comparison import check_names
+    from igps.analysis.comparison import compare as compare_descriptors
+    from igps.cli.reading import Folder, signatures, with_side, with_size, write_mending_notes
+    from igps.cli.report import check_report_folder
+    from igps.cli.report import report as write_report
+    from igps.descriptors import NAMES
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.descriptors.size_and_side import SIZE
+    from igps.nn.description import fit_centres
+    from igps.report.answers import precision_recall
+    from igps.report.results import write_sources
+    from igps.report.tables import comparison_table
+    from igps.retrieval import precision_recall_curve
+
     check_report_folder(report, out)
-    names = [with_side(name, mirror, size) for name in descriptors]
+    names = [with_side(name, mirror, size) for name in descriptors or NAMES]
     modules = [descriptor_of(name) for name in names]
     if size == "auto" and any(SIZE in module.name for module in modules):
         size = "ignore"
@@ -96,6 +94,10 @@ def compare(
 
 def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) -> None:
     """Write the rows and failures of all results, and the distances of the last one."""
+    import numpy as np
+
+    from igps.report.tables import write_rows
+
     (out / "distances").mkdir(parents=True, exist_ok=True)
     (out / "compare.json").write_text(
         json.dumps([result.row() for result in results], indent=2) + "\n"

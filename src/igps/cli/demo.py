@@ -1,11 +1,9 @@
 """The command `igps demo`."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
-
-from igps.cli.report import report
-from igps.cli.retrieval import retrieve
-from igps.shapes import ArticulatedShapes
 
 
 def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[str, Any]:
@@ -13,8 +11,12 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[s
 
     Args:
         out: folder for the meshes, the results of igps retrieve, ranked.png and report.html.
+        n_workers: number of worker processes; by default one for each core.
     """
+    from igps.cli.report import report
+    from igps.cli.retrieval import retrieve
     from igps.report.drawing import ranked_results
+    from igps.shapes import ArticulatedShapes
 
     shapes = ArticulatedShapes(n_classes=8, n_per_class=10)
     shapes.write(out / "shapes", progress=True)

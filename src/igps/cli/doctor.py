@@ -1,28 +1,28 @@
 """The command `igps doctor`."""
 
+from __future__ import annotations
+
 from dataclasses import asdict, astuple
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from igps.analysis.doctor import Finding, examine
-from igps.cli.reading import Verdict, limits_of
-from igps.data.attribute_sources import attribute_sources
-from igps.data.sources import find_bodies
+from igps.cli.options import Verdict
 from igps.mesh.options import LoadOptions
-from igps.report.tables import findings_table, write_rows
-from igps.signature.signature import SignatureConfig
+from igps.signature.config import SignatureConfig
+
+if TYPE_CHECKING:
+    from igps.analysis.doctor import Finding
 
 
 def doctor(
     root: Path,
     out: Path | None = None,
     signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
-    allow_open: bool = False,
     n_workers: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
     attribute: list[str] | None = None,
-    **options: Any,
+    **load: Any,
 ) -> Verdict:
     """Check each body of a folder: list its defects, how they are repaired, and the expected cost of its signature.
 
@@ -31,16 +31,17 @@ def doctor(
 
     Args:
         out: CSV file for the findings, with all notes.
-        signature: parameters of the signatures, for the expected cost.
-        attribute: values inside the bodies, such as ct=images/{stem}.nii.gz; these files do not count as bodies.
     """
-    reading, limits = (
-        LoadOptions(allow_open=allow_open, **options),
-        limits_of(time_limit, memory_limit),
-    )
-    bodies = find_bodies(
-        root, reading, attributes=attribute_sources(attribute or (), root).values()
-    )
+    from igps.analysis.doctor import examine
+    from igps.cli.reading import limits_of
+    from igps.data.attribute_sources import attribute_sources
+    from igps.data.sources import find_bodies
+    from igps.report.tables import findings_table, write_rows
+
+    reading = LoadOptions(**load)
+    limits = limits_of(time_limit, memory_limit)
+    attributes = attribute_sources(attribute or (), root)
+    bodies = find_bodies(root, reading, attributes=attributes.values())
     findings = examine(bodies, reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(findings))
     if out is not None:

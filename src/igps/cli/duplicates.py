@@ -1,23 +1,17 @@
-"""The commands `igps duplicates` and `igps distance`."""
+"""The command `igps duplicates`."""
+
+from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from igps.cli.gallery import gallery_options
-from igps.cli.reading import Folder, check_files, signatures
-from igps.data.dataset import Failure
-from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.size_and_side import Size, keeps_size
-from igps.duplicates.calibration import Calibration
-from igps.duplicates.duplicates import Duplicates, body_distance
-from igps.duplicates.duplicates import duplicates as find_duplicates
-from igps.duplicates.surfaces import MAX_TOLERANCE
-from igps.gallery.gallery import Gallery
-from igps.gallery.opening import is_gallery
-from igps.mesh.mesh import millimetres
-from igps.report.tables import write_rows
+from igps.cli.options import Size
+
+if TYPE_CHECKING:
+    from igps.data.dataset import Failure
+    from igps.duplicates.duplicates import Duplicates
+
 
 DESCRIPTOR = "pretrained"
 """The only descriptor whose distances are calibrated."""
@@ -42,6 +36,16 @@ def duplicates(
             the area, at most 0.02.
         out: CSV file for the groups.
     """
+    from igps.cli.gallery import gallery_options
+    from igps.cli.reading import Folder, signatures
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.descriptors.size_and_side import keeps_size
+    from igps.duplicates.duplicates import duplicates as find_duplicates
+    from igps.duplicates.surfaces import MAX_TOLERANCE
+    from igps.gallery.gallery import Gallery
+    from igps.gallery.opening import is_gallery
+    from igps.report.tables import write_rows
+
     if not 0 <= tolerance <= (0 if poses else MAX_TOLERANCE):
         expected = "0 with poses" if poses else f"0 to {MAX_TOLERANCE}"
         raise ValueError(f"tolerance: expected {expected}, got {tolerance}.")
@@ -94,38 +98,9 @@ def duplicates(
     }
 
 
-def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
-    """Print the distance between two bodies by the pretrained descriptor, and explain what it means.
-
-    Args:
-        meshes: two files.
-    """
-    if len(meshes) != 2:
-        raise ValueError(f"meshes: expected two files, got {len(meshes)}.")
-    check_files(meshes)
-    reading["strict"] = (
-        True  # not in the call, where the parser looks for plain `**reading` to find the options
-    )
-    dataset, _ = signatures(meshes, [descriptor_of(DESCRIPTOR)], **reading)
-    result = body_distance(dataset, DESCRIPTOR, progress=True)
-    print(f"{result.distance:.4g} by {DESCRIPTOR}: {result.meaning}")
-    verdict = "the same shape" if result.same else "not the same shape"
-    reason = "their handles or vertices differ"
-    if result.limit:
-        reason = (
-            f"at their level of detail, distances up to {result.limit:.3%} count as the same shape"
-        )
-    print(
-        f"aligned surfaces: {result.surfaces:.3%} of the square root of the area apart, {verdict} ({reason})"
-    )
-    first, second = (
-        signature.area**0.5 * millimetres(signature.unit) for signature in dataset.signatures()
-    )
-    print(f"lengths of the second are {second / first:.4g} times those of the first")
-    return {"descriptor": DESCRIPTOR, **asdict(result), "lengths": second / first}
-
-
 def _print_groups(result: Duplicates, poses: bool) -> None:
+    from igps.duplicates.calibration import Calibration
+
     for number, group in enumerate(result.groups, 1):
         print(f"group {number}: " + "  ".join(group))
     for pair, distance in result.nearly.items():

@@ -1,21 +1,16 @@
 """The commands `igps fit` and `igps classify`."""
 
+from __future__ import annotations
+
 import json
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from igps.cli.reading import Folder, files_or_folder, print_failures, signatures
-from igps.data.dataset import Failure
-from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors import load
-from igps.learning.fitting import Goal, HeadName, check_classes, classifier_of
-from igps.learning.fitting import classify as classify_bodies
-from igps.learning.fitting import fit as fit_head
-from igps.nn.description import check_centres
-from igps.nn.descriptor import Descriptor
-from igps.nn.specification import IN_FOLDER, specification
-from igps.report.tables import write_rows
+if TYPE_CHECKING:
+    from igps.data.dataset import Failure
+    from igps.nn.descriptor import Descriptor
+
 
 _TITLES = {
     "nn": "NN",
@@ -31,8 +26,8 @@ def fit(
     root: Path,
     out: Path,
     descriptor: str = "pretrained",
-    goal: Goal = "known",
-    head: HeadName = "auto",
+    goal: Literal["known", "new"] = "known",
+    head: Literal["auto", "classifier", "whitened", "as_is"] = "auto",
     no_prior: bool = False,
     n_workers: int | None = None,
     strict: bool = False,
@@ -46,11 +41,18 @@ def fit(
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
         out: file for the model, ending in .safetensors, or a folder to share.
-        descriptor: a name (a wrong name lists all), a file, or package.module:NAME of your own descriptor.
+        descriptor: a name, as in igps help descriptors, a file, or package.module:NAME of your own descriptor.
         goal: known to recognise the classes of the folder; new for a metric that also serves other classes.
         head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
         no_prior: ignore the descriptor's own metric, and fit to its histograms alone
     """
+    from igps.cli.reading import Folder, print_failures, signatures
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.learning.fitting import check_classes
+    from igps.learning.fitting import fit as fit_head
+    from igps.nn.description import check_centres
+    from igps.nn.specification import IN_FOLDER, specification
+
     if out.is_dir() and not (out / IN_FOLDER).is_file() and (file := next(out.iterdir(), None)):
         raise ValueError(
             f"out: expected a new or empty folder, or a model's, {out} holds {file.name}. Choose another."
@@ -92,6 +94,12 @@ def classify(
         model: file or folder that igps fit wrote.
         out: CSV file for the probabilities of all classes; the column class is empty for a mesh that fits no class.
     """
+    from igps.cli.reading import files_or_folder, print_failures, signatures
+    from igps.descriptors import load
+    from igps.learning.fitting import classifier_of
+    from igps.learning.fitting import classify as classify_bodies
+    from igps.report.tables import write_rows
+
     module = load(model)
     classifier_of(module)  # raises for other models before anything is computed
     dataset, failures = signatures(files_or_folder(meshes), [module], **reading)

@@ -1,30 +1,20 @@
 """The commands of `igps gallery`."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from igps.cli.reading import (
-    Folder,
-    MirrorOption,
-    dataset_from_options,
-    print_unit_warning,
-    signatures,
-    with_side,
-    with_size,
-)
-from igps.data.dataset import Failure
-from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.size_and_side import SIDE, SIZE, Size
-from igps.gallery.about import about_of, check_alike
-from igps.gallery.gallery import Gallery
-from igps.gallery.opening import tables
-from igps.gallery.sync import sync as sync_folder
+from igps.cli.options import Mirror, Size
 from igps.mesh.options import LoadOptions
-from igps.nn.description import check_centres
-from igps.signature.signature import SignatureConfig
+from igps.signature.config import SignatureConfig
+
+if TYPE_CHECKING:
+    from igps.data.dataset import Failure
+    from igps.gallery.gallery import Gallery
 
 
 def build(
@@ -32,7 +22,7 @@ def build(
     out: Path,
     descriptor: str = "pretrained",
     size: Size = "auto",
-    mirror: MirrorOption = "auto",
+    mirror: Mirror = "auto",
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
@@ -44,6 +34,12 @@ def build(
     Args:
         out: folder of the gallery, such as gallery.igps; created if missing.
     """
+    from igps.cli.reading import Folder, signatures, with_side, with_size
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.gallery.gallery import Gallery
+    from igps.gallery.opening import tables
+    from igps.nn.description import check_centres
+
     descriptor = with_side(descriptor, mirror, size)
     module = descriptor_of(descriptor)
     check_centres(module)
@@ -58,46 +54,26 @@ def build(
     _print_state(gallery, [*unread, *undescribed])
 
 
-def add(
-    root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any
-) -> None:
-    """Add the bodies of a folder to a gallery, with the gallery's descriptor; bodies already in it are skipped."""
-    opened = Gallery(gallery)
-    reading = gallery_options(opened, reading)
-    dataset, unread = signatures(
-        Folder(root), [opened.descriptor], n_workers=n_workers, strict=strict, **reading
-    )
-    print_unit_warning(opened.descriptor, dataset)
-    undescribed = opened.add(dataset, n_workers=n_workers, strict=strict, progress=True)
-    _print_state(opened, [*unread, *undescribed])
-
-
 def sync(
-    root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any
+    root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **collection: Any
 ) -> None:
     """Update a gallery from a folder: describe new and changed files, update labels, remove bodies of deleted files.
 
     Args:
         root: folder of meshes, with or without classes; the gallery keeps bodies that come from other folders.
     """
+    from igps.cli.reading import Folder, dataset_from_options
+    from igps.gallery.gallery import Gallery
+    from igps.gallery.sync import sync as sync_folder
+
     opened = Gallery(gallery)
-    reading = gallery_options(opened, reading)
-    dataset = dataset_from_options(Folder(root), opened.descriptor.requirements, **reading)
+    collection = gallery_options(opened, collection)
+    dataset = dataset_from_options(Folder(root), opened.descriptor.requirements, **collection)
     n_new, n_gone, failures = sync_folder(
         opened, dataset, root, n_workers=n_workers, strict=strict, progress=True
     )
     print(f"{n_new} bodies described, {n_gone} removed")
     _print_state(opened, failures)
-
-
-def merge(others: list[Path], out: Path) -> None:
-    """Merge several galleries into one; the originals stay unchanged.
-
-    Args:
-        others: the galleries to merge, all of the same descriptor.
-        out: the merged gallery; if it exists, the others are added to it.
-    """
-    _print_state(Gallery.merge(out, others, progress=True), [])
 
 
 def remove(gallery: Path, where: str) -> None:
@@ -106,33 +82,18 @@ def remove(gallery: Path, where: str) -> None:
     Args:
         where: condition on columns of the gallery, such as "class = 'femur' AND volume > 2e5".
     """
+    from igps.gallery.gallery import Gallery
+
     opened = Gallery(gallery)
     print(f"{opened.remove(where)} bodies removed")
     _print_state(opened, [])
 
 
-def update(gallery: Path, where: str, to: list[str]) -> None:
-    """Set columns of bodies in a gallery.
+def info(gallery: Path) -> dict[str, Any]:
+    """Show the number of bodies of a gallery, its columns, and its descriptor."""
+    from igps.gallery.gallery import Gallery
 
-    Args:
-        where: condition on columns of the gallery, such as "name LIKE 'left/%'".
-        to: values by column, such as class=femur age=41; COLUMN= clears the value.
-    """
-    if wrong := [assignment for assignment in to if "=" not in assignment]:
-        raise ValueError(f"to: expected COLUMN=VALUE, got {wrong[0]!r}.")
-    values = {
-        name: value or None for name, _, value in (assignment.partition("=") for assignment in to)
-    }
-    print(f"{Gallery(gallery).update(where, values)} bodies updated")
-
-
-def info(gallery: Path, version: int | None = None) -> dict[str, Any]:
-    """Show the number of bodies of a gallery, its columns, and its descriptor.
-
-    Args:
-        version: number of an earlier version, see igps gallery versions.
-    """
-    opened = Gallery(gallery, version=version)
+    opened = Gallery(gallery)
     contents = {
         "bodies": len(opened),
         "columns": {name: kind.__name__ for name, kind in opened.columns.items()},
@@ -143,27 +104,12 @@ def info(gallery: Path, version: int | None = None) -> dict[str, Any]:
     return {**contents, **opened.about}
 
 
-def versions(gallery: Path) -> list[dict[str, Any]]:
-    """List the versions of a gallery; every change of a gallery creates a version."""
-    versions = Gallery(gallery).versions()
-    for row in versions:
-        print(f"{row['version']:>6}  {row['time']}  {row['bodies']} bodies")
-    return versions
-
-
-def restore(gallery: Path, version: int) -> None:
-    """Return a gallery to an earlier version; later versions remain available.
-
-    Args:
-        version: number of the version, see igps gallery versions.
-    """
-    opened = Gallery(gallery)
-    opened.restore(version)
-    _print_state(opened, [])
-
-
 def gallery_options(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
     """Return reading options with those of the gallery filled in; raise a ValueError if an option contradicts them."""
+    from igps.cli.reading import with_side
+    from igps.descriptors.size_and_side import SIDE, SIZE
+    from igps.gallery.about import about_of, check_alike
+
     options, check = dict(reading), partial(check_alike, gallery.path, gallery.about)
     size, mirror, name = (
         options.pop("size", "auto"),

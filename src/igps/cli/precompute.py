@@ -1,4 +1,6 @@
-"""The commands `igps precompute` and `igps cache export`."""
+"""The command `igps precompute`."""
+
+from __future__ import annotations
 
 import contextlib
 import logging
@@ -10,13 +12,6 @@ from operator import or_
 from pathlib import Path
 from typing import Any
 
-from igps._failures import MachineError
-from igps.cli.reading import Folder, dataset_from_options, limits_of, print_failures, signatures
-from igps.data.pipeline import version
-from igps.data.requirements import Requirements
-from igps.descriptors import descriptor as descriptor_of
-from igps.report.tables import write_rows
-
 _SCHEDULER_TIMEOUT = 15  # seconds
 
 
@@ -26,11 +21,12 @@ def precompute(
     cluster: str | None = None,
     shard: str | None = None,
     failures: Path | None = None,
+    out: Path | None = None,
     strict: bool = False,
     n_workers: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
-    **reading: Any,
+    **collection: Any,
 ) -> None:
     """Compute the signatures of a folder of meshes and store them in the cache, on this machine or on a cluster.
 
@@ -42,11 +38,19 @@ def precompute(
             cache under the same paths as this machine.
         shard: part of the meshes for one job of a batch system, such as 3/64, the third of 64 parts.
         failures: CSV file for the meshes that cannot be used.
+        out: a file ending in .igps for all signatures, which other commands accept in place of the folder. It is
+            memory-mapped when read, and holds no code and no paths. The commands doctor, duplicates, explain and
+            outliers need the meshes themselves, and thus the folder.
     """
+    from igps.cli.reading import Folder, dataset_from_options, limits_of, print_failures
+    from igps.data.requirements import Requirements
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.report.tables import write_rows
+
     requirements = reduce(
         or_, (descriptor_of(name).requirements for name in descriptors), Requirements()
     )
-    dataset = dataset_from_options(Folder(root), requirements, **reading)
+    dataset = dataset_from_options(Folder(root), requirements, **collection)
     dataset = dataset.subset(of_shard(len(dataset), shard))
     if not len(dataset):
         print(f"{root}: no mesh in shard {shard}")
@@ -59,33 +63,16 @@ def precompute(
             failed = dataset.precompute(executor, strict=strict, limits=limits)
     if failures is not None:
         write_rows(failures, ("name", "error"), [(failure.id, failure.error) for failure in failed])
+    if out is not None and len(failed) < len(dataset):
+        usable = dataset.usable(failed)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        usable.to_file(out)
+        print(f"{len(usable)} signatures written to {out}")
+        print_failures(failed, len(usable))
     part = "" if shard is None else f" in shard {shard}"
     print(
         f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed"
     )
-
-
-def cache_export(
-    root: Path,
-    out: Path,
-    descriptors: list[str] = ["pretrained"],  # noqa: B006 (only read)
-    **reading: Any,
-) -> None:
-    """Write the signatures of a folder to a single file, which other commands accept in place of the folder.
-
-    The file is memory-mapped when read, contains no code and no paths, and leaves out meshes that cannot be used. The
-    commands doctor, duplicates, explain and outliers need the meshes themselves, and thus the folder.
-
-    Args:
-        out: the file, ending in .igps.
-        descriptors: descriptors whose requirements the signatures must meet.
-    """
-    modules = [descriptor_of(name) for name in descriptors]
-    dataset, failures = signatures(Folder(root), modules, **reading)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    dataset.to_file(out)
-    print(f"{len(dataset)} signatures written to {out}")
-    print_failures(failures, len(dataset))
 
 
 def of_shard(n_bodies: int, shard: str | None) -> range:
@@ -105,6 +92,9 @@ def dask_executor(address: str) -> Iterator[Executor]:
     Raises:
         MachineError: no scheduler answers, or a worker has another version of the library.
     """
+    from igps._failures import MachineError
+    from igps.data.pipeline import version
+
     try:
         from distributed import Client
     except ImportError as error:

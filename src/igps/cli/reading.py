@@ -6,21 +6,22 @@ from dataclasses import asdict, dataclass
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from torch import Tensor
 
 from igps._arrays import Floats
 from igps._failures import Limits
 from igps._parameters import check_positive
+from igps.cli.options import ClassRule, Mirror, Size
 from igps.data.attribute_sources import attribute_sources
 from igps.data.collection import is_collection
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies, ClassRule, file_and_part, file_name_of, find_bodies
+from igps.data.sources import Bodies, file_and_part, file_name_of, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
-from igps.descriptors.size_and_side import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
+from igps.descriptors.size_and_side import SIDE, SIZE, keeps_size, scale_of
 from igps.mesh.formats import is_searched
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES
@@ -30,40 +31,10 @@ from igps.nn.descriptor import Descriptor
 from igps.report.tables import write_rows
 from igps.signature.signature import SignatureConfig
 
-MirrorOption = Literal["auto", Mirror]
-
-FLAGS = {
-    "paper": "use the parameters of Rustamov 2010: the defaults, except that the grid is never refined",
-    "allow_open": "accept surfaces with holes",
-    "strict": "stop at the first mesh that cannot be used instead of skipping it",
-}
-"""Help of the switches of every command that takes `**reading`."""
-
-LISTS = {
-    "attribute": "values inside the bodies, such as ct=images/{stem}.nii.gz: a file below the folder with an image, a "
-    "grid, or values at vertices or in tetrahedra; {stem}, {file} and {part} are replaced by those of each body",
-    "with": "attributes to combine with the descriptor, such as ct, or ct=0.5 for half the weight of shape",
-}
-"""Help of further options of the same commands, which take several values."""
-
-MEANINGS = {
-    **FLAGS,
-    "root": "folder of meshes, with or without classes",
-    "descriptor": "a name (a wrong name lists all), or package.module:NAME of your own descriptor",
-    "gallery": "folder of the gallery",
-    "size": "keep or ignore differences in size; auto keeps them if all files have a unit of length",
-    "mirror": "treat mirror images as distinct or the same; auto is the same, unless the descriptor's name has +side",
-    "n_workers": "number of worker processes; default: all cores",
-    "time_limit": "seconds that one body may take; default: no limit",
-    "memory_limit": "gigabytes of memory that one body may take; default: no limit",
-    "cache_dir": "folder of the cache of signatures; default: the user's cache directory",
-}
-"""Help of options that are not in the docstring of their command."""
-
 
 @dataclass(frozen=True)
 class Folder:
-    """Source of bodies: a folder, searched according to the options, or a file that `igps cache export` wrote."""
+    """Source of bodies: a folder, searched according to the options, or a file that `igps precompute --out` wrote."""
 
     root: Path
     labelled: bool = False  # whether classes are required
@@ -71,14 +42,6 @@ class Folder:
     check: Callable[[Bodies], object] | None = (
         None  # called before any computation; raises for unsuitable bodies
     )
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The result of a command, and whether its exit status is 0."""
-
-    result: Any
-    is_good: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,15 +72,15 @@ def signatures(
     n_workers: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
-    **reading: Any,
+    **collection: Any,
 ) -> tuple[SignatureDataset, list[Failure]]:
     """Compute the signatures that are missing in the cache.
 
     Args:
         source: bodies.
         descriptors: descriptors whose requirements the signatures must meet.
-        strict, n_workers, time_limit, memory_limit, reading: options of every command that reads bodies, see
-            `MEANINGS` and `dataset_from_options`.
+        strict, n_workers, time_limit, memory_limit, collection: options of every command that reads bodies, see
+            `igps.cli.options.GROUPS`.
 
     Returns:
         The bodies whose signatures are in the cache, and the failures of the others.
@@ -128,7 +91,7 @@ def signatures(
     requirements = (
         reduce(or_, (d.requirements for d in descriptors), Requirements()) if descriptors else None
     )
-    dataset = dataset_from_options(source, requirements, **reading)
+    dataset = dataset_from_options(source, requirements, **collection)
     is_file = (
         isinstance(source, Folder) and not source.root.is_dir()
     )  # `from_file` has checked its attributes
@@ -155,7 +118,7 @@ def described(
     strict: bool = False,
     n_workers: int | None = None,
     size: Size = "auto",
-    mirror: MirrorOption = "auto",
+    mirror: Mirror = "auto",
     **reading: Any,
 ) -> Described:
     """Describe bodies, after computing the signatures that are missing in the cache; see `signatures`.
@@ -223,7 +186,7 @@ def print_failures(failures: Sequence[Failure], n_used: int) -> None:
         print(f"{n} of {n_used + n} meshes could not be used. The first: {failures[0].error}")
 
 
-def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
+def with_side(descriptor: str, mirror: Mirror, size: Size) -> str:
     """Return the name, with +side if `mirror` is "distinct"; raise a ValueError if an option contradicts the name."""
     for option, value, excluded, suffix in (
         ("size", size, "ignore", SIZE),
@@ -293,7 +256,7 @@ def dataset_from_options(
     paper: bool = False,
     classes: ClassRule | None = None,
     attribute: list[str] | None = None,
-    **options: Any,
+    **load: Any,
 ) -> SignatureDataset:
     """Return the dataset that the options select, without computing anything.
 
@@ -309,7 +272,7 @@ def dataset_from_options(
         raise ValueError(
             "paper: expected no other parameters of the signatures with it. Leave one of them out."
         )
-    config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**options)
+    config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**load)
     if isinstance(source, Folder) and source.root.is_file() and not is_searched(source.root.name):
         if (
             config != SignatureConfig()

@@ -1,12 +1,8 @@
 """The command `igps report`, and the option `--report` of other commands."""
 
-from pathlib import Path
+from __future__ import annotations
 
-from igps.descriptors import descriptor as descriptor_of
-from igps.report.explanations import keep_explanations, read_explanations
-from igps.report.page import render_page
-from igps.report.results import read_results, read_sources
-from igps.report.surfaces import keep_surfaces, read_surfaces
+from pathlib import Path
 
 
 def report(
@@ -24,11 +20,17 @@ def report(
 
     Args:
         results: folder that igps retrieve or igps compare wrote (--out).
-        out: the page; default: report.html in the folder of results.
+        out: the page; by default report.html in the folder of results.
         meshes: folder of the meshes, if they were moved since.
         explain: paint where each body differs from its nearest; takes seconds per body, and writes explanations.npz
-        n_workers: number of processes that make the pictures; default: all cores.
+        n_workers: number of processes that make the pictures; by default one for each core.
     """
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.report.explanations import keep_explanations, read_explanations
+    from igps.report.page import render_page
+    from igps.report.results import read_results, read_sources
+    from igps.report.surfaces import keep_surfaces, read_surfaces
+
     if meshes is not None and not meshes.is_dir():
         raise FileNotFoundError(f"meshes: {meshes}: no such folder. Check the path.")
     dataset, contents = read_sources(results, meshes), read_results(results)

@@ -1,48 +1,22 @@
 """The commands `igps retrieve`, `igps extract` and `igps query`."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from torch import Tensor
-from tqdm import tqdm
+from typing import TYPE_CHECKING, Any
 
 from igps._parameters import check_at_least
-from igps.analysis.comparison import pair_distances
-from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
-from igps.cli.gallery import gallery_options
-from igps.cli.reading import (
-    Described,
-    Folder,
-    check_files,
-    described,
-    files_or_folder,
-    print_failures,
-    print_unit_warning,
-    write_mending_notes,
-)
-from igps.cli.report import check_report_folder
-from igps.cli.report import report as write_report
-from igps.data.sources import Bodies
-from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.size_and_side import SizeAndSide
-from igps.gallery.gallery import Gallery
-from igps.gallery.opening import is_gallery
-from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
-from igps.report.results import write_sources
-from igps.report.tables import scores_table, write_rows
-from igps.retrieval import (
-    N_RERANKED,
-    RetrievalScores,
-    rank,
-    rerank_candidates,
-    retrieval_scores,
-    search,
-)
-from igps.retrieval import rerank as reranked_distances
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from igps.cli.reading import Described
+    from igps.data.sources import Bodies
+    from igps.nn.descriptor import Descriptor
+    from igps.retrieval import RetrievalScores
 
 
 def retrieve(
@@ -51,7 +25,7 @@ def retrieve(
     out: Path | None = None,
     report: bool = False,
     rerank: bool = False,
-    **reading: Any,
+    **describing: Any,
 ) -> dict[str, Any]:
     """Query a labelled collection with each of its meshes and print the retrieval scores.
 
@@ -66,8 +40,16 @@ def retrieve(
         rerank: also re-rank the distances by k-reciprocal neighbours, without labels, and print their
             scores in a second table; distances.npz holds them as "reranked".
     """
+    from igps.analysis.comparison import pair_distances
+    from igps.cli.reading import Folder, described, print_failures
+    from igps.cli.report import check_report_folder
+    from igps.cli.report import report as write_report
+    from igps.report.tables import scores_table
+    from igps.retrieval import rerank as reranked_distances
+    from igps.retrieval import retrieval_scores
+
     check_report_folder(report, out)
-    result = described(Folder(root, labelled=True, check=_check_scored), descriptor, **reading)
+    result = described(Folder(root, labelled=True, check=_check_scored), descriptor, **describing)
     labels = result.dataset.bodies.labels or ()
     distances = {"distances": pair_distances(result.descriptor, result.descriptions, progress=True)}
     scores = retrieval_scores(distances["distances"], labels)
@@ -85,7 +67,7 @@ def retrieve(
     if out is not None:
         print(f"written to {out}")
         if report:
-            write_report(out, n_workers=reading.get("n_workers"))
+            write_report(out, n_workers=describing.get("n_workers"))
     return summary
 
 
@@ -95,7 +77,7 @@ def extract(
     descriptor: str = "pretrained",
     short: bool = False,
     wide: bool = False,
-    **reading: Any,
+    **describing: Any,
 ) -> None:
     """Write the descriptions of meshes to a file, for use in any classifier, statistics package or vector database.
 
@@ -112,6 +94,14 @@ def extract(
         wide: write one row per file, or per folder with one mask file per organ, and columns such as PART.volume and
             PART.v0 for each of its bodies.
     """
+    import numpy as np
+
+    from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
+    from igps.cli.reading import described, files_or_folder, print_failures, write_mending_notes
+    from igps.descriptors import descriptor as descriptor_of
+    from igps.descriptors.size_and_side import SizeAndSide
+    from igps.nn.descriptor import EmbeddedDescriptor
+
     suffix = out.suffix.lower()
     if wide and suffix == ".npz":
         raise ValueError(
@@ -123,7 +113,7 @@ def extract(
         raise ValueError(
             f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}."
         )
-    result = described(files_or_folder(meshes), descriptor, **reading)
+    result = described(files_or_folder(meshes), descriptor, **describing)
     features = (
         result.descriptor.shorten(result.descriptions) if short else result.descriptions
     ).numpy()
@@ -152,7 +142,7 @@ def query(
     where: str | None = None,
     exact: bool = False,
     rerank: bool = False,
-    **reading: Any,
+    **describing: Any,
 ) -> list[dict[str, Any]]:
     """List the bodies of a gallery that are most similar to one mesh.
 
@@ -160,19 +150,25 @@ def query(
         mesh: the mesh file, or FILE#PART for one of several bodies in a file.
         gallery: gallery from igps gallery build, or a folder of meshes, with or without classes.
         top: number of bodies to list.
-        descriptor: a name (a wrong name lists all), or package.module:NAME of your own descriptor; default: that of the
-            gallery, or pretrained for a folder.
+        descriptor: a name, as in igps help descriptors, or a file, or package.module:NAME of your own; by
+            default that of the gallery, or pretrained for a folder.
         where: condition on columns of the gallery that listed bodies must satisfy, such as "class = 'femur' AND volume
             > 2e5".
         exact: compare with all bodies; without it, candidates in a large gallery are selected by short vectors
         rerank: re-rank the nearest 200 bodies by their common neighbours (k-reciprocal, without labels);
             the listed distances are the re-ranked ones.
     """
+    from igps.cli.gallery import gallery_options
+    from igps.cli.reading import Folder, check_files, described
+    from igps.gallery.gallery import Gallery
+    from igps.gallery.opening import is_gallery
+    from igps.retrieval import N_RERANKED, rerank_candidates, search
+
     check_at_least(1, top=top)
     check_files([mesh])
     if is_gallery(gallery):
         opened = Gallery(gallery, descriptor)
-        description = _describe_body(mesh, opened.descriptor, **gallery_options(opened, reading))
+        description = _describe_body(mesh, opened.descriptor, **gallery_options(opened, describing))
         matches = opened.nearest(description, top=top, rerank=rerank, where=where, exact=exact)[0]
         n_missing = sum(not match.path.exists() for match in matches)
         nearest = [(match.name, match.label, match.distance) for match in matches]
@@ -181,14 +177,14 @@ def query(
             f"where: expected a gallery, {gallery} is a folder of meshes. See igps gallery build."
         )
     else:
-        known, n_missing = described(Folder(gallery), descriptor or "pretrained", **reading), 0
+        known, n_missing = described(Folder(gallery), descriptor or "pretrained", **describing), 0
         # The query is described with the options of the folder, which may be a file of signatures
         options = {
             "paper": False,
             "signature": known.dataset.config,
             **asdict(known.dataset.reading),
         }
-        description = _describe_body(mesh, known.descriptor, **{**reading, **options})
+        description = _describe_body(mesh, known.descriptor, **{**describing, **options})
         bodies, distance = known.dataset.bodies, known.descriptor.distances
         n_listed = min(top, len(bodies))
         n_candidates = min(max(top, N_RERANKED), len(bodies)) if rerank else n_listed
@@ -217,9 +213,11 @@ def query(
     return rows
 
 
-def _describe_body(mesh: Path, descriptor: Descriptor, **reading: Any) -> Tensor:
+def _describe_body(mesh: Path, descriptor: Descriptor, **describing: Any) -> Tensor:
     """Return the description (1, ...) of a file with one body, or of one FILE#PART."""
-    result = described([mesh], descriptor, **{**reading, "n_workers": 1})
+    from igps.cli.reading import described, print_unit_warning
+
+    result = described([mesh], descriptor, **{**describing, "n_workers": 1})
     print_unit_warning(descriptor, result.dataset)
     if len(result.dataset) > 1:
         names = ", ".join(result.dataset.bodies.names[:5])
@@ -256,6 +254,14 @@ def _summary(result: Described, scores: RetrievalScores) -> dict[str, Any]:
 def _write_retrieval(
     out: Path, result: Described, summary: dict[str, Any], distances: dict[str, Tensor]
 ) -> None:
+    import numpy as np
+    from tqdm import tqdm
+
+    from igps.cli.reading import write_mending_notes
+    from igps.report.results import write_sources
+    from igps.report.tables import write_rows
+    from igps.retrieval import rank
+
     out.mkdir(parents=True, exist_ok=True)
     names, labels = result.dataset.bodies.names, result.dataset.bodies.labels or ()
     (out / "scores.json").write_text(json.dumps(summary, indent=2) + "\n")

@@ -26,14 +26,13 @@ from igps.mesh._union import drop_inner_walls, unite_parts
 from igps.mesh.denoising import is_noisy, remove_noise
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh, check_arrays, check_coordinates, check_size
+from igps.mesh.options import Cavities, Mending
 from igps.mesh.simplification import subdivide
 from igps.mesh.surface import signed_volume
 from igps.mesh.watertight import crosses_itself, watertight
 
 logger = logging.getLogger(__name__)
 
-Mending = Literal["auto", "never", "always"]
-Cavities = Literal["fill", "keep"]
 Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
 MENDING_VERSION = 9

@@ -4,8 +4,9 @@ from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
 from igps._parameters import check_at_least, check_one_of
-from igps.mesh.mending import Cavities, Mending
 
+Mending = Literal["auto", "never", "always"]
+Cavities = Literal["fill", "keep"]
 Component = Literal["largest"]
 BodyKind = Literal["whole", "labels", "objects", "pieces", "chains", "models", "assembly"]
 
@@ -60,6 +61,11 @@ class LoadOptions:
         check_one_of((*get_args(Component), None), component=self.component)
         check_one_of((*get_args(BodyKind), None), bodies=self.bodies)
         check_at_least(1, max_unpacked=self.max_unpacked)
+        if self.allow_open and self.mend == "always":
+            raise ValueError(
+                'allow_open: expected False with mend="always", which closes every surface. '
+                "Leave one of them out."
+            )
         if not 0 < self.threshold <= 1:
             raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
 

@@ -1,16 +1,14 @@
 """Attributes of samples: scalars and directions that a histogram may use as axes, beside the potential."""
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 
 from igps._arrays import Floats, Integers, Singles
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, unit
+from igps.signature.config import AttributeName
 from igps.signature.surface_potential import surface_potential
-
-AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 
 def interior_attributes(

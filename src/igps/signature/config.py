@@ -3,11 +3,12 @@
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Self, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 from igps._parameters import check_at_least, check_fraction, check_one_of
-from igps.signature.attributes import AttributeName
-from igps.signature.laplacian import Backend
+
+AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
+Backend = Literal["cotangent", "robust"]
 
 # Number of eigenpairs on which the order of the samples depends, see `ordering_keys`. All configurations with at least
 # as many give the samples of a body the same order, up to rounding.

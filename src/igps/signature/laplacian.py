@@ -1,6 +1,6 @@
 """The Laplace–Beltrami operator of a triangle mesh: positive semi-definite stiffness and lumped mass."""
 
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from scipy import sparse
@@ -9,8 +9,7 @@ from igps._arrays import Floats, Integers
 from igps._parameters import check_one_of
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import longest_side
-
-Backend = Literal["cotangent", "robust"]
+from igps.signature.config import Backend
 
 # Smallest thickness, twice the area over the squared longest edge, of a face without mollified edge lengths.
 _MIN_THICKNESS = 1e-8

@@ -1,0 +1,79 @@
+"""The example of the page *Add a command*, as another package would install it."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from commands import error_of, run
+from igps.mesh.loading import load_mesh
+from own_descriptors import write_egg
+
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "add-command.md"
+
+
+def file_of_the_page(name: str) -> str:
+    """The text of the block whose title is this file."""
+    pattern = rf'^```\w+ title="{re.escape(name)}"\n(.*?)^```'
+    match = re.search(pattern, PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    assert match is not None
+    return match[1]
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The package of the page, laid out on the Python path as pip would do it."""
+    project = tomllib.loads(file_of_the_page("pyproject.toml"))["project"]
+    folder = tmp_path / "site"
+    info = folder / f"{project['name']}-{project['version']}.dist-info"
+    info.mkdir(parents=True)
+    (folder / "volumes.py").write_text(file_of_the_page("volumes.py"))
+    metadata = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    (info / "METADATA").write_text(metadata)
+    lines = []
+    for group, places in project["entry-points"].items():
+        lines.append(f"[{group}]")
+        lines += [f"{name} = {place}" for name, place in places.items()]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(folder)
+
+
+def test_the_example_is_short() -> None:
+    text = file_of_the_page("volumes.py") + file_of_the_page("pyproject.toml")
+    assert len(text.splitlines()) <= 30
+
+
+def test_an_installed_command_runs_with_the_options_of_reading(
+    installed: None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name, height in (("flat", 0.5), ("long", 2.0)):
+        write_egg(tmp_path / "eggs" / f"{name}.off", height, subdivisions=2)
+    options = ["--least", 3, "--cache_dir", tmp_path / "cache", "--n_workers", 1]
+    options += ["--signature.n_eigenpairs", 20, "--signature.resolution", 8, "--json"]
+    run(monkeypatch, "volumes", tmp_path / "eggs", *options)
+    printed = capsys.readouterr()
+    expected = load_mesh(tmp_path / "eggs" / "long.off").volume
+    assert json.loads(printed.out) == {"long.off": pytest.approx(expected, rel=1e-6)}
+    assert "long.off" in printed.err
+    words = error_of(monkeypatch, capsys, "volumes", tmp_path / "none", *options)
+    assert "no such folder" in words
+
+
+def test_help_lists_an_installed_command(
+    installed: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        run(monkeypatch, "--help")
+    assert re.search(r"volumes +from volumes", capsys.readouterr().out)
+    with pytest.raises(SystemExit, match="0"):
+        run(monkeypatch, "volumes", "--help")
+    text = " ".join(capsys.readouterr().out.split())
+    assert "leave out smaller bodies (default: 0.0)" in text
+    assert "--mend {auto,never,always}" in text
