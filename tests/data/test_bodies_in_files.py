@@ -279,7 +279,7 @@ def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path: Path) -> None:
 def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two subjects whose headers are alike, a table of names that is put right, and numbers of a scene beside it."""
     sitk, nibabel = pytest.importorskip("SimpleITK"), pytest.importorskip("nibabel")
-    monkeypatch.setattr("igps.data.file_stat_cache.MIN_AGE", 0)
+    monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
     labels = np.zeros((20, 20, 20), dtype=np.uint8)
     labels[2:8, 4:16, 4:16], labels[10:18, 4:16, 4:16] = 1, 2
 

@@ -11,7 +11,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from igps.data.cache import SignatureCache, default_cache_dir
+from igps.data.cache import Cache, decode, default_cache_dir, encode
 from igps.signature.signature import Samples, Signature, SignatureConfig
 
 KEY = "0123456789abcdef"
@@ -39,12 +39,12 @@ def signature() -> Signature:
 
 
 def test_round_trip_is_exact(tmp_path: Path, signature: Signature) -> None:
-    cache = SignatureCache(tmp_path)
+    cache = Cache(tmp_path, "signature")
     assert KEY not in cache
-    assert cache.get(KEY) is None
-    cache.put(KEY, signature)
+    assert cache.get(KEY, decode) is None
+    cache.put(KEY, encode(signature))
     assert KEY in cache
-    restored = cache.get(KEY)
+    restored = cache.get(KEY, decode)
     assert restored is not None
     assert restored.config == signature.config
     assert (restored.area, restored.volume) == (signature.area, signature.volume)
@@ -84,15 +84,15 @@ def belongs_to_another_key(path: Path) -> None:
 def test_damaged_or_foreign_file_is_noticed(
     tmp_path: Path, signature: Signature, damage, caplog: pytest.LogCaptureFixture
 ) -> None:  # type: ignore[no-untyped-def]
-    cache = SignatureCache(tmp_path)
-    cache.put(KEY, signature)
+    cache = Cache(tmp_path, "signature")
+    cache.put(KEY, encode(signature))
     damage(cache.path(KEY))
     with caplog.at_level(logging.WARNING):
         assert KEY not in cache
-        assert cache.get(KEY) is None
+        assert cache.get(KEY, decode) is None
     assert str(cache.path(KEY)) in caplog.text
-    cache.put(KEY, signature)
-    assert cache.get(KEY) is not None
+    cache.put(KEY, encode(signature))
+    assert cache.get(KEY, decode) is not None
 
 
 @pytest.mark.parametrize(
@@ -102,8 +102,8 @@ def test_damaged_payload_is_noticed(
     tmp_path: Path, signature: Signature, what: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """One bit or digit of what has no structure that could show it."""
-    cache = SignatureCache(tmp_path)
-    cache.put(KEY, signature)
+    cache = Cache(tmp_path, "signature")
+    cache.put(KEY, encode(signature))
     path = cache.path(KEY)
     content = bytearray(path.read_bytes())
     payload = b"3.25" if what == "area" else load_file(path)[what].tobytes()
@@ -111,21 +111,21 @@ def test_damaged_payload_is_noticed(
     content[content.index(payload) + len(payload) - 1] ^= 1
     path.write_bytes(content)
     with caplog.at_level(logging.WARNING):
-        assert cache.get(KEY) is None
+        assert cache.get(KEY, decode) is None
     assert f"{path}: cached signature is not usable (its content is damaged" in caplog.text
-    cache.put(KEY, signature)
-    assert cache.get(KEY) is not None
+    cache.put(KEY, encode(signature))
+    assert cache.get(KEY, decode) is not None
 
 
 def test_file_without_a_checksum_is_not_trusted(tmp_path: Path, signature: Signature) -> None:
-    cache = SignatureCache(tmp_path)
-    cache.put(KEY, signature)
+    cache = Cache(tmp_path, "signature")
+    cache.put(KEY, encode(signature))
     path = cache.path(KEY)
     with safe_open(path, framework="numpy") as file:
         metadata = file.metadata()
     del metadata["checksum"]
     save_file(load_file(path), path, metadata=metadata)
-    assert cache.get(KEY) is None
+    assert cache.get(KEY, decode) is None
 
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions are those of POSIX")
@@ -135,24 +135,24 @@ def test_umask_says_who_may_read(
 ) -> None:
     before = os.umask(umask)
     try:
-        SignatureCache(tmp_path / "cache").put(KEY, signature)
+        Cache(tmp_path / "cache", "signature").put(KEY, encode(signature))
     finally:
         os.umask(before)
-    path = SignatureCache(tmp_path / "cache").path(KEY)
+    path = Cache(tmp_path / "cache", "signature").path(KEY)
     assert stat.S_IMODE(path.stat().st_mode) == expected
     for folder in (path.parent, path.parent.parent):
         assert stat.S_IMODE(folder.stat().st_mode) == 0o777 & ~umask
 
 
 def test_what_a_killed_run_left_is_removed_later(tmp_path: Path, signature: Signature) -> None:
-    cache = SignatureCache(tmp_path)
+    cache = Cache(tmp_path, "signature")
     folder = cache.path(KEY).parent
     folder.mkdir(parents=True)
     old, fresh = folder / "old.partial", folder / "fresh.partial"
     for path in (old, fresh):
         path.write_bytes(b"half of a file")
     os.utime(old, (time.time() - 2 * 24 * 3600,) * 2)
-    cache.put(KEY, signature)
+    cache.put(KEY, encode(signature))
     cache.remove_abandoned()
     assert sorted(folder.iterdir()) == sorted(
         [cache.path(KEY), fresh]
@@ -162,10 +162,10 @@ def test_what_a_killed_run_left_is_removed_later(tmp_path: Path, signature: Sign
 def test_older_algorithm_is_not_trusted(
     tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cache = SignatureCache(tmp_path)
-    cache.put(KEY, signature)
+    cache = Cache(tmp_path, "signature")
+    cache.put(KEY, encode(signature))
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
-    assert cache.get(KEY) is None
+    assert cache.get(KEY, decode) is None
 
 
 def test_failed_write_leaves_nothing(
@@ -175,9 +175,9 @@ def test_failed_write_leaves_nothing(
         raise OSError("disk full")
 
     monkeypatch.setattr("igps.data.cache.os.replace", fail)
-    cache = SignatureCache(tmp_path)
+    cache = Cache(tmp_path, "signature")
     with pytest.raises(OSError, match="disk full"):
-        cache.put(KEY, signature)
+        cache.put(KEY, encode(signature))
     assert not list(tmp_path.rglob("*.*"))
 
 

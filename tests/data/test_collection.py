@@ -14,7 +14,7 @@ from bodies_on_disk import write_body
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from igps.data.cache import checksum
+from igps.data.cache import Record, checksum
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.requirements import Requirements
@@ -164,7 +164,7 @@ def told(path: Path, target: Path, **changes: object) -> Path:
     about.update({name: value for name, value in changes.items() if name != "format"})
     metadata["about"] = json.dumps(about)
     metadata["format"] = str(changes.get("format", metadata["format"]))
-    metadata["checksum"] = checksum({}, {"about": metadata["about"]})
+    metadata["checksum"] = checksum(Record({}, {"about": metadata["about"]}))
     save_file(load_file(path), target, metadata=metadata)
     return target
 

@@ -5,7 +5,6 @@ import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,13 +12,15 @@ import trimesh
 from bodies_on_disk import write_body
 
 import igps.data.pipeline as pipeline_module
-from igps.data.cache import SignatureCache
+from igps._failures import Failed
+from igps.data import keys
+from igps.data.cache_hit import CacheHit
 from igps.data.pipeline import SignaturePipeline
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
+from igps.mesh.mending import MENDING_VERSION
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
-from igps.signature.attributes import AttributeName
 from igps.signature.signature import Signature, SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
@@ -36,9 +37,13 @@ def pipeline(tmp_path: Path) -> SignaturePipeline:
     return SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
 
 
+def found(pipeline: SignaturePipeline, body: BodyRef) -> CacheHit | Failed | None:
+    return pipeline.find(body, pipeline.content(body))
+
+
 def is_cached(pipeline: SignaturePipeline, body: BodyRef) -> bool:
     try:
-        return pipeline.lookup([body]) != [None]
+        return isinstance(found(pipeline, body), CacheHit)
     except MeshError:
         return False
 
@@ -55,18 +60,16 @@ def test_a_signature_is_computed_once_and_is_that_of_the_mesh(
         pytest.fail("computed again")
 
     monkeypatch.setattr(pipeline_module, "compute_signature", no_more)
-    for found in (first, pipeline.signature(BodyRef(path))):
-        np.testing.assert_array_equal(
-            found.interior.eigenfunctions, expected.interior.eigenfunctions
-        )
-        np.testing.assert_array_equal(found.eigenvalues, expected.eigenvalues)
+    for one in (first, pipeline.signature(BodyRef(path))):
+        np.testing.assert_array_equal(one.interior.eigenfunctions, expected.interior.eigenfunctions)
+        np.testing.assert_array_equal(one.eigenvalues, expected.eigenvalues)
 
 
 def test_fill_caches_and_returns_only_what_serves(pipeline: SignaturePipeline, path: Path) -> None:
     filled = pipeline.fill([BodyRef(path)])
     assert len(pickle.dumps(filled)) < 1000
     assert is_cached(pipeline, BodyRef(path))
-    assert pipeline.lookup([BodyRef(path)]) == filled == pipeline.fill([BodyRef(path)])
+    assert [found(pipeline, BodyRef(path))] == filled == pipeline.fill([BodyRef(path)])
 
 
 def test_a_worker_gets_a_small_copy(pipeline: SignaturePipeline, path: Path) -> None:
@@ -120,52 +123,46 @@ def test_the_key_tells_pdb_from_pqr_also_when_compressed(
 def test_keys_are_those_of_the_caches_that_exist(
     pipeline: SignaturePipeline, tmp_path: Path
 ) -> None:
-    """Frozen: another key leaves all caches useless. It changes with ALGORITHM_VERSION alone."""
+    """Frozen: another key leaves all caches useless. It changes with the two versions alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
-    assert SignatureConfig.ALGORITHM_VERSION == 5
-    found = pipeline.key(BodyRef(tmp_path / "frozen.off"))
-    assert found == "d82439dea1136b1e190e78f8f86b4e00542f18578196ad9a829b06e017b0eb6d"
+    assert (SignatureConfig.ALGORITHM_VERSION, MENDING_VERSION) == (5, 9)
+    key = pipeline.key(BodyRef(tmp_path / "frozen.off"))
+    assert key == "cf214e8c36d0119b57672cdf33e347dc37fdb9ee7dec32c2ab84c98816bedfb7"
 
 
-def test_a_new_version_of_the_mending_leaves_bodies_that_are_read_as_they_are(
-    tmp_path: Path, computed: list[int], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["igps.data.keys.MENDING_VERSION", "ALGORITHM_VERSION"])
+def test_another_version_makes_other_keys(
+    pipeline: SignaturePipeline, path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    body = trimesh.creation.icosphere(subdivisions=2)
-    body.export(tmp_path / "body.off")
-    open_body = trimesh.Trimesh(body.vertices, body.faces[1:], process=False)
-    open_body.export(tmp_path / "open.off")
-    pipeline = SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
-
-    def fill() -> int:
-        """How many had to be computed."""
-        before = len(computed)
-        for name in ("body.off", "open.off"):
-            pipeline.fill([BodyRef(tmp_path / name)])
-            assert is_cached(pipeline, BodyRef(tmp_path / name))
-        return len(computed) - before
-
-    assert [fill(), fill()] == [2, 0]
-    assert pipeline.hit(BodyRef(tmp_path / "open.off")).notes
-    monkeypatch.setattr(pipeline_module, "MENDING_VERSION", pipeline_module.MENDING_VERSION + 1)
-    assert not is_cached(pipeline, BodyRef(tmp_path / "open.off"))
-    assert [fill(), fill()] == [1, 0]
-
-
-def test_a_mended_body_cached_without_a_mending_version_is_computed_again(
-    tmp_path: Path, computed: list[int]
-) -> None:
-    """Its entry has the key of a body that needs no mending, but its notes say that it was mended."""
-    body = trimesh.creation.icosphere(subdivisions=2)
-    path = tmp_path / "open.off"
-    trimesh.Trimesh(body.vertices, body.faces[1:], process=False).export(path)
-    pipeline = SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
-    SignatureCache(tmp_path / "cache").put(
-        pipeline.key(BodyRef(path)), compute_signature(pipeline.mesh(BodyRef(path)), CONFIG)
-    )
-    assert not is_cached(pipeline, BodyRef(path))
     pipeline.fill([BodyRef(path)])
-    assert computed == [CONFIG.n_kept]
+    before = pipeline.key(BodyRef(path))
+    if name == "ALGORITHM_VERSION":
+        monkeypatch.setattr(SignatureConfig, name, SignatureConfig.ALGORITHM_VERSION + 1)
+    else:
+        monkeypatch.setattr(name, MENDING_VERSION + 1)
+    keys._parameters.cache_clear()
+    assert pipeline.key(BodyRef(path)) != before
+    assert not is_cached(pipeline, BodyRef(path))
+    monkeypatch.undo()
+    keys._parameters.cache_clear()
     assert is_cached(pipeline, BodyRef(path))
+
+
+def test_a_body_that_cannot_be_used_is_not_read_again_until_it_changes(
+    pipeline: SignaturePipeline, tmp_path: Path
+) -> None:
+    path, copy = tmp_path / "thin.off", tmp_path / "copy.off"
+    path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    shutil.copy(path, copy)
+    with pytest.raises(MeshError) as first:
+        pipeline.fill([BodyRef(path)])
+    assert found(pipeline, BodyRef(path)) == Failed(str(first.value))
+    assert found(pipeline, BodyRef(copy)) is None  # its message would name the other file
+    with pytest.raises(MeshError) as second:
+        pipeline.fill([BodyRef(path)])
+    assert str(second.value) == str(first.value)
+    write_body(path, 1.1, 1.5)
+    assert isinstance(pipeline.fill([BodyRef(path)])[0], CacheHit)
 
 
 USUAL = replace(CONFIG, n_eigenpairs=None)
@@ -186,42 +183,39 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("subdivisions", [2, 3])
-def test_a_larger_signature_serves(tmp_path: Path, computed: list[int], subdivisions: int) -> None:
-    """Of 642 vertices, and of 162, which are too few for the usual number: both are subdivided alike.
+def test_fewer_eigenpairs_are_the_beginning_of_the_default_number(
+    tmp_path: Path, computed: list[int], subdivisions: int
+) -> None:
+    """Of 642 vertices, and of 162, which are too few for the default number: both are subdivided alike.
 
     A body without symmetry: in one that has some, rounding decides which of like points comes first.
     """
     body = trimesh.creation.icosphere(subdivisions=subdivisions)
-    body.vertices *= (1 + 0.2 * np.sin(2 * body.vertices @ [1.0, 0.7, 0.4]))[:, None] * [
-        1.0,
-        1.3,
-        1.9,
-    ]
+    waves = 1 + 0.2 * np.sin(2 * body.vertices @ [1.0, 0.7, 0.4])
+    body.vertices *= waves[:, None] * [1.0, 1.3, 1.9]
     path = tmp_path / "egg.off"
     body.export(path)
-    full = SignaturePipeline(
-        replace(USUAL, attributes=get_args(AttributeName)), LoadOptions(), tmp_path / "cache"
-    )
+    full = SignaturePipeline(USUAL, LoadOptions(), tmp_path / "cache")
     full.signature(BodyRef(path))
-    needed = replace(full, config=replace(NEEDED, attributes=("surface_direction",)))
-    assert is_cached(needed, BodyRef(path))
-    found = needed.signature(BodyRef(path))
+    needed = replace(full, config=NEEDED)
+    assert not is_cached(needed, BodyRef(path))
+    signature = needed.signature(BodyRef(path))
     assert computed == [250]
-    assert needed.hit(BodyRef(path)).notes == full.hit(BodyRef(path)).notes
-    assert bool(full.hit(BodyRef(path)).notes) == (subdivisions == 2)
+    assert is_cached(needed, BodyRef(path))
+    assert bool(signature.notes) == (subdivisions == 2)
     expected = compute_signature(needed.mesh(BodyRef(path)), needed.config)
-    assert found.config == expected.config
-    np.testing.assert_allclose(found.eigenvalues, expected.eigenvalues, rtol=1e-9)
-    for one, other in ((found.interior, expected.interior), (found.surface, expected.surface)):
+    assert signature.config == expected.config
+    assert signature.notes == expected.notes
+    np.testing.assert_allclose(signature.eigenvalues, expected.eigenvalues, rtol=1e-9)
+    for kind in ("interior", "surface"):
+        one, other = getattr(signature, kind), getattr(expected, kind)
         np.testing.assert_allclose(one.points, other.points, atol=1e-12)
-        np.testing.assert_allclose(
-            np.abs(one.eigenfunctions), np.abs(other.eigenfunctions), atol=1e-3
-        )
-        assert set(one.attributes) == set(other.attributes) == {"surface_direction"}
+        sizes = np.abs(one.eigenfunctions), np.abs(other.eigenfunctions)
+        np.testing.assert_allclose(*sizes, atol=1e-3)
     # And never the other way round.
     replace(needed, cache_dir=tmp_path / "other").signature(BodyRef(path))
-    assert not is_cached(replace(full, cache_dir=tmp_path / "other"), BodyRef(path))
-    assert computed == [250, 64]
+    replace(full, cache_dir=tmp_path / "other").signature(BodyRef(path))
+    assert computed == [250, 64, 250]
 
 
 def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(
@@ -237,7 +231,7 @@ def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(
     assert computed == [250, 64, 20, 64]
 
 
-def test_a_damaged_larger_signature_is_passed_over(
+def test_a_damaged_longer_signature_is_passed_over(
     path: Path, tmp_path: Path, computed: list[int]
 ) -> None:
     pipeline = SignaturePipeline(USUAL, LoadOptions(), tmp_path / "cache")
@@ -247,10 +241,9 @@ def test_a_damaged_larger_signature_is_passed_over(
     content[-1] ^= 1  # of an eigenfunction: the header does not tell
     file.write_bytes(content)
     needed = replace(pipeline, config=NEEDED)
-    assert len(needed.signature(BodyRef(path)).eigenvalues) == 64
-    assert computed == [250, 64]
-    assert len(needed.signature(BodyRef(path)).eigenvalues) == 64
-    assert computed == [250, 64]
+    for _ in range(2):
+        assert len(needed.signature(BodyRef(path)).eigenvalues) == 64
+        assert computed == [250, 64]
 
 
 def test_a_missing_file_is_named(pipeline: SignaturePipeline, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +22,6 @@ from igps.nn.description import describe, evaluation_mode
 from igps.nn.descriptor import BodyDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
-from igps.signature.attributes import AttributeName
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
@@ -256,14 +255,9 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
     _, values = asked(fresh)
     assert asked(fresh, cache_tag="other words")[0] == ["0", "1", "2"]
     assert asked(fresh, cache_tag=None)[0] == ["0", "1", "2"]
-    # Made of the same Signatures: another descriptor under the same words would get the histograms otherwise.
-    cache = fresh.pipeline.cache_dir.with_name("other")
-    more = SignatureDataset(paths, replace(CONFIG, attributes=get_args(AttributeName)), cache)
+    more = SignatureDataset(paths, replace(CONFIG, seed=1), fresh.pipeline.cache_dir)
     more.precompute(n_workers=1, progress=False)
-    plain = SignatureDataset(paths, CONFIG, cache)
-    asked(more)
-    assert plain.cached_keys() == more.cached_keys()
-    assert describe_usable(plain, Area(), cache_tag="one", n_workers=1)[0].shape == (3, 2)
+    assert asked(more)[0] == ["0", "1", "2"]
     with_own = SignatureDataset(
         paths, CONFIG, fresh.pipeline.cache_dir, attributes={"height": lambda x: x[:, 2]}
     )

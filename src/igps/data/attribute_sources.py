@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from igps._arrays import Booleans, Floats
 from igps.data.attributes import AttributeSource
-from igps.data.cache import content_digest
+from igps.data.keys import content_digest
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of, field_packages, stat_key
 from igps.mesh.loading import BodyRef

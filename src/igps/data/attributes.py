@@ -92,10 +92,11 @@ def split_attributes(
                 "library are set by SignatureConfig(attributes=...)."
             )
         tag = getattr(value, "cache_tag", None)
+        given: Any = value
         if callable(tag):
-            sources[name] = value
+            sources[name] = given
             continue
-        function = value if _takes_body(value) else OfPoints(value)
+        function = given if _takes_body(given) else OfPoints(given)
         if tag is None:
             functions[name] = function
         elif isinstance(tag, str) and tag:

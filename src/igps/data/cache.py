@@ -1,33 +1,34 @@
-"""Content-addressed cache of Signatures and descriptions on disk, with one safetensors file for each."""
+"""Cache of Signatures, attributes, descriptions and failures on disk, with one safetensors file for each key."""
 
-import hashlib
 import json
 import logging
 import os
 import time
 import zlib
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from igps._arrays import Singles
 from igps._files import PARTIAL, atomic_write, sort_metadata
-from igps.signature.signature import SAMPLE_KINDS, SampleKind, Samples, Signature, SignatureConfig
+from igps.signature.signature import SAMPLE_KINDS, Samples, Signature, SignatureConfig
 
 logger = logging.getLogger(__name__)
 
+Kind = Literal["signature", "attribute", "description", "failure"]
+
+_FORMAT = "igps-cache-3"
 # Fields of a Signature besides arrays and configuration
 _SCALAR_FIELDS = ("area", "volume", "name", "notes", "residual", "unit")
-_ABANDONED_AGE = (
-    24 * 3600
-)  # seconds until a partial file is removed; writing a file takes well below one second
-_CHECKSUM_ROW = 4096  # bytes
+# Seconds until a partial file is removed; writing a file takes well below one second
+_ABANDONED_AGE = 24 * 3600
+_CHECKSUM_ROW = 4096  # bytes of a row of the matrix whose column sums enter a checksum
 T = TypeVar("T")
-Result = TypeVar("Result")
 
 
 def default_cache_dir() -> Path:
@@ -36,39 +37,30 @@ def default_cache_dir() -> Path:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "igps"
     except RuntimeError as error:
         raise ValueError(
-            "cache_dir: expected a folder, because this user has no home folder. Give cache_dir, on the command line "
-            "--cache_dir, or set XDG_CACHE_HOME."
+            "cache_dir: expected a folder, because this user has no home folder. Give cache_dir, "
+            "on the command line --cache_dir, or set XDG_CACHE_HOME."
         ) from error
 
 
-def content_digest(path: Path, *companions: Path) -> bytes:
-    """Return a digest of the content of a file and of the companion files that are read with it."""
-    with open(path, "rb") as file:
-        digest = hashlib.file_digest(file, "sha256").digest()
-    return (
-        hashlib.sha256(digest + b"".join(map(content_digest, companions))).digest()
-        if companions
-        else digest
-    )
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Arrays and texts by name, as they are written to a file."""
+
+    arrays: Mapping[str, NDArray[Any]]
+    texts: Mapping[str, str] = field(default_factory=dict)
 
 
-class FileCache(Generic[T]):
-    """Cache of values by key, which any number of processes can share.
+class Cache:
+    """Cache of records by key, which any number of processes can share.
 
     Files are written atomically, so a reader sees a whole file or none. Partial files of killed processes are removed
     after a day, see `remove_abandoned`. Processes that compute the same value write the same bytes. Permissions follow
     the umask. The directory is created if it is missing.
     """
 
-    value_name: ClassVar[str]  # in messages and in the format
-    folder: ClassVar[str] = ""  # subfolder of the directory
-    # Convert a value to arrays and metadata, and back. Decoding raises ValueError, KeyError or TypeError on bad input
-    _encode: Callable[[T], tuple[dict[str, np.ndarray], dict[str, str]]]
-    _decode: Callable[[Mapping[str, np.ndarray], Mapping[str, str]], T]
-
-    def __init__(self, directory: str | Path) -> None:
-        self.directory = Path(directory) / self.folder
-        self._format = f"igps-{self.value_name}-2"
+    def __init__(self, directory: str | Path, kind: Kind) -> None:
+        self.kind = kind
+        self.directory = Path(directory) / f"{kind}s"
 
     def path(self, key: str) -> Path:
         """Return the file of a key, in one of 256 folders."""
@@ -76,48 +68,53 @@ class FileCache(Generic[T]):
 
     def __contains__(self, key: str) -> bool:
         """Return whether a value is stored under `key`, judged by the header and the length of the file."""
-        return self._read(key, lambda file, metadata: True) is not None
+        return self.texts(key) is not None
 
-    def get(self, key: str) -> T | None:
-        """Return the value of a key, in views of the memory-mapped file; None if missing, or damaged (logged)."""
-        return self._read(key, self._decode_checked)
+    def texts(self, key: str) -> Mapping[str, str] | None:
+        """Return the texts of a record without its arrays; None if it is missing, or not usable (logged)."""
+        return self._read(key, lambda file, texts: texts)
 
-    def _decode_checked(self, file: Any, metadata: Mapping[str, str]) -> T:
-        tensors = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118 (no Mapping)
-        check_checksum(tensors, metadata)
-        return self._decode(tensors, metadata)
+    def get(self, key: str, decode: Callable[[Record], T]) -> T | None:
+        """Return the value of a key, in views of the memory-mapped file; None if missing, or damaged (logged).
 
-    def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], Result]) -> Result | None:
+        `decode` converts the record to the value, and raises a ValueError, KeyError or TypeError if that fails.
+        """
+
+        def value(file: Any, texts: Mapping[str, str]) -> T:
+            names = file.keys()
+            record = Record({name: file.get_tensor(name).numpy() for name in names}, texts)
+            check_checksum(record)
+            return decode(record)
+
+        return self._read(key, value)
+
+    def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], T]) -> T | None:
         path = self.path(key)
         try:
-            with safe_open(
-                path, framework="pt"
-            ) as file:  # framework="numpy" would copy every array
-                metadata = file.metadata() or {}
-                if metadata.get("format") != self._format or metadata.get("key") != key:
-                    raise ValueError(f"not a {self._format} file of this key")
-                return read(file, metadata)
+            # framework="numpy" would copy every array
+            with safe_open(path, framework="pt") as file:
+                texts = file.metadata() or {}
+                if texts.get("format") != _FORMAT or texts.get("key") != key:
+                    raise ValueError(f"not a {_FORMAT} file of this key")
+                return read(file, texts)
         except FileNotFoundError:
             return None
         except (SafetensorError, ValueError, KeyError, TypeError, OSError) as error:
-            logger.warning(
-                "%s: cached %s is not usable (%s), and is computed again",
-                path,
-                self.value_name,
-                error,
-            )
+            message = "%s: cached %s is not usable (%s), and is computed again"
+            logger.warning(message, path, self.kind, error)
             return None
 
-    def put(self, key: str, value: T) -> None:
-        """Store a value under `key`."""
+    def put(self, key: str, record: Record) -> None:
+        """Store a record under `key`."""
         path = self.path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
-        tensors, metadata = self._encode(value)
-        metadata |= {"format": self._format, "key": key, "checksum": checksum(tensors, metadata)}
+        texts = {**record.texts, "format": _FORMAT, "key": key, "checksum": checksum(record)}
         _remove_abandoned(path.parent.glob(f"*{PARTIAL}"))
+        # safetensors writes the memory of arrays, so they must be contiguous
+        arrays = {name: np.ascontiguousarray(values) for name, values in record.arrays.items()}
         try:
             with atomic_write(path) as file:
-                file.write(sort_metadata(save(tensors, metadata=metadata)))
+                file.write(sort_metadata(save(arrays, metadata=texts)))
         except PermissionError:
             # Some file systems cannot replace a file that another process has open, which holds the same value
             if key not in self:
@@ -133,98 +130,56 @@ class FileCache(Generic[T]):
         _remove_abandoned(self.directory.glob(f"*/*{PARTIAL}"))
 
 
-def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def encode(signature: Signature) -> Record:
     """Return the arrays of a Signature by name, and its other fields as JSON."""
-    # safetensors writes the memory of arrays, so they must be contiguous
-    tensors: dict[str, np.ndarray] = {
-        "eigenvalues": np.ascontiguousarray(signature.eigenvalues, np.float64)
+    arrays: dict[str, NDArray[Any]] = {
+        "eigenvalues": np.asarray(signature.eigenvalues, np.float64, "C")
     }
     for kind in SAMPLE_KINDS:
         samples: Samples = getattr(signature, kind)
-        tensors[f"{kind}.points"] = np.ascontiguousarray(samples.points, np.float64)
-        tensors[f"{kind}.eigenfunctions"] = np.ascontiguousarray(samples.eigenfunctions, np.float32)
+        arrays[f"{kind}.points"] = np.asarray(samples.points, np.float64, "C")
+        arrays[f"{kind}.eigenfunctions"] = np.asarray(samples.eigenfunctions, np.float32, "C")
         for name, values in samples.attributes.items():
-            tensors[f"{kind}.attributes.{name}"] = np.ascontiguousarray(values, np.float32)
-    fields = {
-        **{name: getattr(signature, name) for name in _SCALAR_FIELDS},
-        "config": signature.config.as_dict(),
-    }
-    return tensors, {name: json.dumps(value) for name, value in fields.items()}
+            arrays[f"{kind}.attributes.{name}"] = np.asarray(values, np.float32, "C")
+    fields = {name: getattr(signature, name) for name in _SCALAR_FIELDS}
+    fields["config"] = signature.config.as_dict()
+    return Record(arrays, {name: json.dumps(value) for name, value in fields.items()})
 
 
-def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Signature:
+def decode(record: Record) -> Signature:
     """Return the Signature that `encode` converted; raise a ValueError, KeyError or TypeError on bad input."""
-    config: dict[str, Any] = json.loads(metadata["config"])
+    config: dict[str, Any] = json.loads(record.texts["config"])
     if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
         raise ValueError("computed by another version of the algorithm")
-    eigenvalues, samples_of = tensors["eigenvalues"], dict[str, Any]()
+    eigenvalues = record.arrays["eigenvalues"]
     _check_array("eigenvalues", eigenvalues, np.float64, (len(eigenvalues),))
-    for kind in SAMPLE_KINDS:
-        prefix = f"{kind}.attributes."
-        attributes = {
-            name.removeprefix(prefix): values
-            for name, values in tensors.items()
-            if name.startswith(prefix)
-        }
-        points, eigenfunctions = tensors[f"{kind}.points"], tensors[f"{kind}.eigenfunctions"]
-        _check_array(f"{kind}.points", points, np.float64, (len(points), 3))
-        _check_array(
-            f"{kind}.eigenfunctions", eigenfunctions, np.float32, (len(points), len(eigenvalues))
-        )
-        for name, values in attributes.items():
-            _check_array(
-                f"{kind}.attributes.{name}", values, np.float32, (len(points), *values.shape[1:])
-            )
-        samples_of[kind] = Samples(points, eigenfunctions, attributes)
-    fields: dict[str, Any] = {name: json.loads(metadata[name]) for name in _SCALAR_FIELDS}
+    fields: dict[str, Any] = {name: json.loads(record.texts[name]) for name in _SCALAR_FIELDS}
     fields["notes"] = tuple(fields["notes"])
-    return Signature(eigenvalues, **samples_of, config=SignatureConfig(**config), **fields)
+    for kind in SAMPLE_KINDS:
+        fields[kind] = _decode_samples(record.arrays, kind, len(eigenvalues))
+    return Signature(eigenvalues, config=SignatureConfig(**config), **fields)
+
+
+def _decode_samples(arrays: Mapping[str, NDArray[Any]], kind: str, n_eigenpairs: int) -> Samples:
+    points = arrays[f"{kind}.points"]
+    _check_array(f"{kind}.points", points, np.float64, (len(points), 3))
+    functions = arrays[f"{kind}.eigenfunctions"]
+    _check_array(f"{kind}.eigenfunctions", functions, np.float32, (len(points), n_eigenpairs))
+    prefix = f"{kind}.attributes."
+    attributes = {}
+    for name, values in arrays.items():
+        if name.startswith(prefix):
+            _check_array(name, values, np.float32, (len(points), *values.shape[1:]))
+            attributes[name.removeprefix(prefix)] = values
+    return Samples(points, functions, attributes)
 
 
 def _check_array(
-    name: str, values: np.ndarray, dtype: type[np.floating[Any]], shape: tuple[int, ...]
+    name: str, values: NDArray[Any], dtype: type[np.floating[Any]], shape: tuple[int, ...]
 ) -> None:
     if values.dtype != dtype or values.shape != shape:
-        raise ValueError(
-            f"{name}: expected {dtype.__name__} {shape}, got {values.dtype} {values.shape}"
-        )
-
-
-class SignatureCache(FileCache[Signature]):
-    """Cache of Signatures."""
-
-    value_name = "signature"
-    _encode, _decode = staticmethod(encode), staticmethod(decode)
-
-    def notes(self, key: str) -> tuple[str, ...]:
-        """Return the notes on how the mesh of a Signature was changed; empty if there is no such Signature."""
-        return self._read(key, lambda file, metadata: tuple(json.loads(metadata["notes"]))) or ()
-
-    def unit(self, key: str) -> str | None:
-        """Return the unit of length of a Signature; None if it is unknown, or there is no such Signature."""
-        return self._read(key, lambda file, metadata: json.loads(metadata["unit"]))
-
-
-def _without_metadata(
-    arrays: Mapping[Any, Singles],
-) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    return {name: np.ascontiguousarray(values) for name, values in arrays.items()}, {}
-
-
-class AttributeCache(FileCache[dict[SampleKind, Singles]]):
-    """Cache of attributes; a value holds one attribute of one Signature by kind of sample."""
-
-    value_name, folder = "attribute", "attributes"
-    _encode = staticmethod(_without_metadata)
-    _decode = staticmethod(lambda tensors, metadata: {kind: tensors[kind] for kind in SAMPLE_KINDS})
-
-
-class DescriptionCache(FileCache[Singles]):
-    """Cache of descriptions."""
-
-    value_name, folder = "description", "descriptions"
-    _encode = staticmethod(lambda value: _without_metadata({"values": value}))
-    _decode = staticmethod(lambda tensors, metadata: tensors["values"])
+        expected = f"{dtype.__name__} {shape}"
+        raise ValueError(f"{name}: expected {expected}, got {values.dtype} {values.shape}")
 
 
 def _remove_abandoned(partials: Iterable[Path]) -> None:
@@ -236,29 +191,28 @@ def _remove_abandoned(partials: Iterable[Path]) -> None:
             continue
 
 
-def checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
-    """Return the hexadecimal CRC-32 of tensors and metadata.
+def checksum(record: Record) -> str:
+    """Return the hexadecimal CRC-32 of arrays and texts.
 
-    For speed, a tensor enters the CRC by its column sums, as a matrix with 512 columns of 8 bytes.
+    For speed, an array enters the CRC by its column sums, as a matrix with 512 columns of 8 bytes.
     """
     crc = 0
-    for name, value in sorted(metadata.items()):
+    for name, value in sorted(record.texts.items()):
         if name not in ("format", "key", "checksum"):
             crc = zlib.crc32(f"{name}\0{value}\0".encode(), crc)
-    for name, tensor in sorted(tensors.items()):
-        crc = zlib.crc32(f"{name} {tensor.dtype.str} {tensor.shape}\0".encode(), crc)
-        raw = tensor.reshape(-1).view(np.uint8)
+    for name, array in sorted(record.arrays.items()):
+        crc = zlib.crc32(f"{name} {array.dtype.str} {array.shape}\0".encode(), crc)
+        raw = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
         end = raw.size // _CHECKSUM_ROW * _CHECKSUM_ROW
-        crc = zlib.crc32(
-            raw[:end].view(np.uint64).reshape(-1, _CHECKSUM_ROW // 8).sum(axis=0).data, crc
-        )
+        rows = raw[:end].view(np.uint64).reshape(-1, _CHECKSUM_ROW // 8)
+        crc = zlib.crc32(rows.sum(axis=0).data, crc)
         crc = zlib.crc32(raw[end:].data, crc)
     return f"{crc:08x}"
 
 
-def check_checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Raise a ValueError if tensors and metadata do not match the checksum in the metadata."""
-    if metadata.get("checksum") != checksum(tensors, metadata):
+def check_checksum(record: Record) -> None:
+    """Raise a ValueError if arrays and texts do not match the checksum in the texts."""
+    if record.texts.get("checksum") != checksum(record):
         raise ValueError(
             "its content is damaged: the checksum differs from the one that was written"
         )

@@ -13,7 +13,8 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from igps._files import atomic_write
-from igps.data.cache import check_checksum, checksum, decode, encode
+from igps.data.cache import Record, check_checksum, checksum, decode, encode
+from igps.data.cache_hit import CacheHit
 from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, file_name_of
 from igps.mesh.options import LoadOptions
@@ -99,12 +100,12 @@ def write_collection(path: Path, about: Contents, signature: Callable[[int], Sig
     ] = []  # dtype, shape, bytes of each Signature's arrays
     all_metadata = []
     for i in range(n):
-        tensors, metadata = encode(signature(i))
-        all_metadata.append({**metadata, "checksum": checksum(tensors, metadata)})
+        record = encode(signature(i))
+        all_metadata.append({**record.texts, "checksum": checksum(record)})
         arrays.append(
             {
                 name: (values.dtype.name, values.shape, values.nbytes)
-                for name, values in tensors.items()
+                for name, values in record.arrays.items()
             }
         )
     # Doubles come before singles, so that all arrays are aligned: the format allows no gaps
@@ -130,7 +131,7 @@ def write_collection(path: Path, about: Contents, signature: Callable[[int], Sig
         "about": about.to_json(),
         "signatures": json.dumps(all_metadata),
     }
-    file_metadata["checksum"] = checksum({}, {"about": file_metadata["about"]})
+    file_metadata["checksum"] = checksum(Record({}, {"about": file_metadata["about"]}))
     text = json.dumps({"__metadata__": file_metadata, **header}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > _MAX_HEADER_BYTES:
@@ -140,9 +141,9 @@ def write_collection(path: Path, about: Contents, signature: Callable[[int], Sig
     with atomic_write(path) as file:
         file.write(len(text).to_bytes(8, "little") + text)
         for (i, _), group in groupby(order, key=lambda key: (key[0], arrays[key[0]][key[1]][0])):
-            tensors, _ = encode(signature(i))
+            record = encode(signature(i))
             for _, name in group:
-                file.write(tensors[name].data)
+                file.write(record.arrays[name].data)
 
 
 def is_collection(path: Path) -> bool:
@@ -169,7 +170,8 @@ class CollectionFile:
             metadata = self._file.metadata() or {}
             if metadata.get("format") != _FORMAT:
                 raise ValueError(f"its format is {metadata.get('format')!r}")
-            check_checksum({}, {"about": metadata["about"], "checksum": metadata["checksum"]})
+            about = {"about": metadata["about"], "checksum": metadata["checksum"]}
+            check_checksum(Record({}, about))
             self.about = Contents.from_json(metadata["about"])
             self._metadata: list[dict[str, str]] = json.loads(metadata["signatures"])
             if len(self._metadata) != len(self.about.bodies):
@@ -194,12 +196,13 @@ class CollectionFile:
         """Return a Signature with views of the file; raise a ValueError if it is damaged or of another version."""
         metadata = self._metadata[index]
         try:
-            tensors = {
+            arrays = {
                 name: self._file.get_tensor(f"{index}.{name}").numpy()
                 for name in self._arrays[index]
             }
-            check_checksum(tensors, metadata)
-            return decode(tensors, metadata)
+            record = Record(arrays, metadata)
+            check_checksum(record)
+            return decode(record)
         except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
             name = self.about.bodies.names[index]
             raise ValueError(
@@ -215,9 +218,10 @@ class CollectionFile:
                 f"{self.path}: {error} Or export the collection again for this descriptor."
             ) from error
 
-    def notes(self, index: int) -> tuple[str, ...]:
-        """Return the notes on how the mesh of a Signature was changed."""
-        return tuple(json.loads(self._metadata[index]["notes"]))
+    def hits(self) -> tuple[CacheHit, ...]:
+        """Return the key of each Signature, with notes and unit."""
+        pairs = zip(self.about.keys, self._metadata, strict=True)
+        return tuple(CacheHit(key).with_header(texts) for key, texts in pairs)
 
 
 def _strings(values: Sequence[object]) -> tuple[str, ...]:

@@ -12,16 +12,17 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from igps._failures import Limits
+from igps._failures import Failed, Limits
 from igps.data.attributes import AttributeSource, PointFunction, split_attributes, with_attribute
 from igps.data.batch import LabelledSignature, SignatureBatch
-from igps.data.cache import SignatureCache, default_cache_dir
+from igps.data.cache import default_cache_dir
+from igps.data.cache_hit import CacheHit
 from igps.data.collation import collate
 from igps.data.collection import CollectionFile, Contents, write_collection
 from igps.data.filling import Failure, fill, find_cached
 from igps.data.in_memory import bodies_in_memory
 from igps.data.indices import Indices, resolve_indices, scalar_index
-from igps.data.pipeline import CacheHit, PreTransform, SignaturePipeline
+from igps.data.pipeline import PreTransform, SignaturePipeline
 from igps.data.requirements import AnyDescriptor, requirements_of
 from igps.data.sources import Bodies, ClassRule, bodies_of
 from igps.mesh.errors import MeshError
@@ -48,9 +49,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         root_or_paths: a folder (see `find_bodies`), files, or `Bodies`; or a mapping of names to objects in memory,
             each of which `as_mesh` accepts. Images and pairs `(labels, spacing)` of an array give a body per label.
         config: parameters of the Signatures. The default is 250 eigenpairs, unless the descriptor sets a number.
-        cache_dir: directory of the cache; the user's cache directory if None. A cache key consists of the content of
-            the file, the load options, all parameters, and the version of the algorithm. A cached Signature with more
-            eigenpairs or attributes is used as well.
+        cache_dir: directory of the cache; the user's cache directory if None. A cache key is the hash of the content
+            of the file, the load options, all parameters, and the version of the algorithm. The 64 or more eigenpairs
+            that a descriptor needs are taken from a cached Signature of the default 250, if there is one.
         descriptor: a descriptor, such as `igps.descriptor(NAME)`; the Signatures meet its requirements.
         labels: class names of the given paths.
         classes: rule for the class of a body, see `ClassRule`; "folder" if None.
@@ -214,10 +215,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def units(self) -> list[str | None]:
         """Return the unit of length of each body; None if it is unknown, or there is no cached Signature."""
-        if self._loaded is not None:
-            return [self._loaded[i].unit for i in self._loaded_indices]
-        cache = SignatureCache(self.pipeline.cache_dir)
-        return [None if hit is None else cache.unit(hit.key) for hit in self._find_hits()]
+        if isinstance(self._loaded, list):
+            return [signature.unit for signature in self._loaded]
+        return [None if hit is None else hit.unit for hit in self._find_hits()]
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Return a batch of some of the items, optionally with their meshes."""
@@ -263,7 +263,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         dataset = copy.copy(self)
         hits = [
-            hit or self.pipeline.hit(body)
+            hit or self.pipeline.hit(body, self.pipeline.content(body))
             for hit, body in zip(self._hits, self.bodies, strict=True)
         ]
         dataset._hits = tuple(hits)
@@ -303,9 +303,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
             dataset, about.bodies, about.config, cache_dir, reading=about.reading
         )
         dataset.classes, dataset._loaded = about.classes, file
-        dataset._hits = tuple(
-            CacheHit(key, 0, file.notes(i), (0, 0, 0)) for i, key in enumerate(about.keys)
-        )
+        dataset._hits = file.hits()
         return dataset
 
     def precompute(
@@ -345,5 +343,6 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """Return the cache entry of each body, None if there is none."""
         if self._loaded is not None or None not in self._hits:
             return list(self._hits)
-        current = find_cached(self.pipeline, self.bodies)
+        found = find_cached(self.pipeline, self.bodies)
+        current = [None if isinstance(hit, Failed) else hit for hit in found]
         return [known or hit for known, hit in zip(self._hits, current, strict=True)]

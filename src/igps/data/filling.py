@@ -16,16 +16,18 @@ from tqdm import tqdm
 from igps._failures import Failed, Limits, MachineError
 from igps._parallel import run
 from igps._threads import n_cores
-from igps.data.cache import SignatureCache
-from igps.data.file_stat_cache import FileStatCache
-from igps.data.pipeline import CacheHit, SignaturePipeline, fill_elsewhere, version
+from igps.data.cache_hit import CacheHit
+from igps.data.keys import FileDigest
+from igps.data.known_files import KnownFiles
+from igps.data.pipeline import SignaturePipeline, fill_elsewhere, version
 from igps.data.sources import Bodies
 from igps.mesh.errors import MeshError
+from igps.mesh.formats import dependencies_of
 from igps.mesh.loading import BodyRef
 
 logger = logging.getLogger(__name__)
 
-_RECORDS_PER_WRITE = 1000  # to the database of `FileStatCache`
+_RECORDS_PER_WRITE = 1000  # to the database of `KnownFiles`
 _MAX_BODIES_PER_JOB = 64  # each job reads the file again, and its results arrive together
 _MAX_DELAY = 60.0  # seconds until a shared file system shows a file that another machine wrote
 
@@ -64,58 +66,83 @@ def fill(
     except OSError as error:
         cause = f"cache_dir: {pipeline.cache_dir} cannot be created ({error.strerror})"
         raise MachineError(f"{cause}. Choose a writable folder and run again.") from error
-    SignatureCache(pipeline.cache_dir).remove_abandoned()
-    records = FileStatCache(pipeline)
-    hits = find_cached(pipeline, bodies, read_files=executor is None)
+    pipeline.cache("signature").remove_abandoned()
+    known = KnownFiles(pipeline.cache_dir)
+    found = find_cached(pipeline, bodies, read_files=executor is None)
+    hits = [None if isinstance(outcome, Failed) else outcome for outcome in found]
     failures: dict[int, Failure] = {}
-    new: dict[BodyRef, CacheHit] = {}
-    missing = [i for i, hit in enumerate(hits) if hit is None]
+    missing = [i for i, outcome in enumerate(found) if outcome is None]
+
+    def fail(i: int, reason: str) -> None:
+        failures[i] = Failure.of(bodies, i, reason)
+        if strict:
+            raise MeshError(failures[i].error)
+        logger.warning("skipped: %s", failures[i].error)
+
+    for i, outcome in enumerate(found):
+        if isinstance(outcome, Failed):
+            fail(i, outcome.reason)
     outcomes = compute(
         pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits()
     )
-    bar = tqdm(
-        total=len(bodies),
-        initial=len(bodies) - len(missing),
-        desc="signatures",
-        disable=not progress,
-    )
+    n_found = len(bodies) - len(missing)
+    bar = tqdm(total=len(bodies), initial=n_found, desc="signatures", disable=not progress)
+    new: list[FileDigest] = []
+    is_visible = False
     with bar, contextlib.closing(outcomes):
         try:
             for i, outcome in outcomes:
                 bar.update()
                 if isinstance(outcome, Failed):
-                    failures[i] = Failure.of(bodies, i, outcome.reason)
-                    if strict:
-                        raise MeshError(failures[i].error)
-                    logger.warning("skipped: %s", failures[i].error)
+                    fail(i, outcome.reason)
                     continue
-                if not new:
+                if not is_visible:
                     wait_until_visible(pipeline, outcome)
-                new[bodies[i]] = hits[i] = outcome
+                    is_visible = True
+                hits[i] = outcome
+                new += outcome.files
                 if len(new) >= _RECORDS_PER_WRITE:
-                    records.remember(new)
+                    known.remember(new)
                     new.clear()
         finally:
-            records.remember(new)
+            known.remember(new)
     return hits, [failures[i] for i in sorted(failures)]
 
 
 def find_cached(
     pipeline: SignaturePipeline, bodies: Bodies, read_files: bool = True
-) -> list[CacheHit | None]:
-    """Return the cache entry of each body, or None. Files that are new or changed are read only if `read_files`."""
-    records = FileStatCache(pipeline)
-    hits = list(map(records.ready(bodies).get, bodies))
-    new: dict[BodyRef, CacheHit] = {}
-    for group in group_by_file(
-        bodies, (i for i, hit in enumerate(hits) if hit is None and read_files)
-    ):
+) -> list[CacheHit | Failed | None]:
+    """Return the cache entry of each body, or why it could not be used before; None if neither is known.
+
+    Files that are new or changed are read only if `read_files`.
+    """
+    found: list[CacheHit | Failed | None] = [None] * len(bodies)
+    for i, body in enumerate(bodies):
+        if body in pipeline.meshes:
+            with contextlib.suppress(MeshError):  # which the computation reports
+                found[i] = pipeline.find(body, pipeline.content(body))
+    on_disk = [i for i, body in enumerate(bodies) if body not in pipeline.meshes]
+    groups = group_by_file(bodies, on_disk)
+    files: dict[Path, list[Path]] = {}
+    for group in groups:
+        path = bodies.paths[group[0]]
         with contextlib.suppress(MeshError):  # which the computation reports
-            for i, hit in zip(group, pipeline.lookup([bodies[i] for i in group]), strict=True):
-                if hit is not None:
-                    hits[i] = new[bodies[i]] = hit
-    records.remember(new)
-    return hits
+            files[path] = dependencies_of(path, pipeline.reading)
+    database = KnownFiles(pipeline.cache_dir)
+    known = database.unchanged(file for paths in files.values() for file in paths)
+    new: list[FileDigest] = []
+    for group in groups:
+        path = bodies.paths[group[0]]
+        is_known = path in files and all(file in known for file in files[path])
+        if not (is_known or read_files):
+            continue
+        with contextlib.suppress(MeshError):  # which the computation reports
+            content = pipeline.content(bodies[group[0]], known)
+            new += [file for file in content.files if file.path not in known]
+            for i in group:
+                found[i] = pipeline.find(bodies[i], content)
+    database.remember(new)
+    return found
 
 
 def compute(
@@ -176,7 +203,7 @@ def compute(
 
 def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
     """Wait until the file that a worker wrote appears in the cache; raise a MachineError if it does not."""
-    path = SignatureCache(pipeline.cache_dir).path(hit.key)
+    path = pipeline.cache("signature").path(hit.key)
     deadline = time.monotonic() + _MAX_DELAY
     while not path.exists():
         if time.monotonic() > deadline:

@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.file_stat_cache import MIN_AGE
+from igps.data.known_files import MIN_AGE
 from igps.data.sources import LABELS_FILE, Bodies, is_number
 from igps.gallery.columns import KNOWN, Batch
 from igps.mesh.errors import MeshError

@@ -1,8 +1,6 @@
 """Descriptions of a whole dataset."""
 
 import contextlib
-import hashlib
-import json
 import logging
 import time
 from collections.abc import Collection, Generator, Iterator, Sequence
@@ -17,8 +15,9 @@ from igps._arrays import Singles
 from igps._failures import Failed
 from igps._parallel import on_threads, run
 from igps._threads import n_cores, one_thread
-from igps.data.cache import DescriptionCache
+from igps.data.cache import Record
 from igps.data.dataset import Failure, SignatureDataset
+from igps.data.keys import derived_key
 from igps.mesh.errors import MeshError
 from igps.nn.axes import Attribute
 from igps.nn.descriptor import BodyDescriptor, Descriptor
@@ -225,14 +224,14 @@ class _DescriptionStore:
     def __init__(self, dataset: SignatureDataset, cache_tag: str) -> None:
         self._dataset, self._tag = dataset, cache_tag
         self._keys = dataset.cached_keys()
-        self._cache = DescriptionCache(dataset.pipeline.cache_dir)
+        self._cache = dataset.pipeline.cache("description")
         self._cache.remove_abandoned()
         self._is_writable = True
 
     def read(self) -> dict[int, Singles]:
         """Return the cached descriptions by the index of the mesh."""
         values = {
-            i: self._cache.get(self._key(key))
+            i: self._cache.get(self._key(key), lambda record: record.arrays["values"])
             for i, key in enumerate(self._keys)
             if key is not None
         }
@@ -244,11 +243,10 @@ class _DescriptionStore:
         if key is None or not self._is_writable or self._dataset.subset([i]).cached_keys() != [key]:
             return
         try:
-            self._cache.put(self._key(key), values)
+            self._cache.put(self._key(key), Record({"values": values}))
         except OSError as error:
             logger.warning("%s: descriptions are not cached (%s)", self._cache.directory, error)
             self._is_writable = False
 
     def _key(self, key: str) -> str:
-        config = json.dumps(self._dataset.config.as_dict(), sort_keys=True)
-        return hashlib.sha256(f"{self._tag}\0{key}\0{config}".encode()).hexdigest()
+        return derived_key("description", key, self._tag)

@@ -1,7 +1,5 @@
 """Configuration of a Signature."""
 
-import math
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Literal, Self, get_args
 
@@ -20,7 +18,7 @@ class SignatureConfig:
     """Every parameter that a Signature depends on.
 
     With 64 eigenpairs or more, the samples of a Signature and their first eigenfunctions do not depend on the number of
-    eigenpairs. A Signature is then the beginning of one with more eigenpairs, see `larger` and `Signature.truncated`.
+    eigenpairs. A Signature is then the beginning of one with more eigenpairs, see `longer` and `Signature.truncated`.
     This requires the same mesh for both: a mesh with fewer vertices than `least_vertices` is subdivided.
 
     Example:
@@ -49,8 +47,6 @@ class SignatureConfig:
     ALGORITHM_VERSION: ClassVar[int] = 5
 
     DEFAULT_EIGENPAIRS: ClassVar[int] = 250
-    # Numbers of eigenpairs that descriptors of the library require, and that caches may therefore hold.
-    SIZES: ClassVar[tuple[int, ...]] = (64, 90, 100, 250)
 
     n_eigenpairs: int | None = None
     resolution: int = 32
@@ -114,27 +110,18 @@ class SignatureConfig:
             return replace(self, n_eigenpairs=n_computed)
         return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
 
-    def larger(self) -> Iterator[Self]:
-        """Yield the configurations, smallest first, that caches may hold and whose Signatures begin with this one's.
+    def longer(self) -> Self | None:
+        """Return the configuration with the default number of eigenpairs, if its Signatures begin with this one's.
 
-        If a mesh is subdivided, only Signatures with the same `n_vertices_read` begin with this one's.
+        They do if the mesh and the order of the samples are the same; otherwise None is returned.
         """
-        all_attributes: tuple[AttributeName, ...] = get_args(AttributeName)
-        sizes, n_vertices = [self.n_kept], self.n_vertices_read
-        if self.n_kept >= _N_ORDERING_EIGENPAIRS:
-            max_eigenpairs = math.inf if self.max_vertices is None else self.max_vertices - 2
-            sizes += [size for size in self.SIZES if self.n_kept < size <= max_eigenpairs]
-            n_vertices = max(n_vertices, self.DEFAULT_EIGENPAIRS + 2)
-        for n_eigenpairs in sizes:
-            for attributes in dict.fromkeys((self.attributes, all_attributes)):
-                candidate = replace(
-                    self,
-                    n_eigenpairs=n_eigenpairs,
-                    attributes=attributes,
-                    least_vertices=n_vertices,
-                )
-                if candidate.as_dict() != self.as_dict():
-                    yield candidate
+        default = self.DEFAULT_EIGENPAIRS
+        has_same_order = _N_ORDERING_EIGENPAIRS <= self.n_kept < default
+        has_same_mesh = self.n_vertices_read == default + 2
+        is_possible = self.max_vertices is None or self.max_vertices > default + 1
+        if not (has_same_order and has_same_mesh and is_possible):
+            return None
+        return replace(self, n_eigenpairs=default, least_vertices=None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the parameters and the algorithm's version by name, without `least_vertices` if it has its default."""

@@ -143,15 +143,11 @@ class Signature:
         return replace(self, interior=change(self.interior), surface=change(self.surface))
 
     def truncated(self, config: SignatureConfig) -> Signature:
-        """Return the Signature of a smaller configuration, whose `larger` ones must include the present `config`."""
+        """Return the Signature of a configuration with fewer eigenpairs, whose `longer` one is the present `config`."""
 
         def cut(samples: Samples) -> Samples:
-            items = samples.attributes.items()
-            attributes: dict[str, Singles] = {
-                name: values for name, values in items if name in config.attributes
-            }
             functions = np.ascontiguousarray(samples.eigenfunctions[:, : config.n_kept])
-            return replace(samples, eigenfunctions=functions, attributes=attributes)
+            return replace(samples, eigenfunctions=functions)
 
         eigenvalues = self.eigenvalues[: config.n_kept].copy()
         return replace(self.map_samples(cut), eigenvalues=eigenvalues, config=config)

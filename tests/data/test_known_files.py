@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from bodies_on_disk import write_body
 
-from igps.data.cache import content_digest
 from igps.data.dataset import SignatureDataset
+from igps.data.keys import FileDigest
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
@@ -28,19 +28,20 @@ def dataset(tmp_path: Path) -> SignatureDataset:
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trust recent files, too, because tests cannot set the time of the last change of a file's metadata (ctime)."""
-    monkeypatch.setattr("igps.data.file_stat_cache.MIN_AGE", 0)
+    monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
 
 
 @pytest.fixture
 def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the mesh files that are read for their key."""
     names: list[str] = []
+    read_file = FileDigest.of
 
-    def reading(path: Path) -> bytes:
+    def reading(path: Path) -> FileDigest:
         names.append(path.name)
-        return content_digest(path)
+        return read_file(path)
 
-    monkeypatch.setattr("igps.data.pipeline.content_digest", reading)
+    monkeypatch.setattr("igps.data.keys.FileDigest.of", reading)
     return names
 
 
@@ -80,7 +81,7 @@ def test_a_changed_file_is_read_again(
 def test_a_file_that_changed_a_moment_ago_is_not_remembered(
     dataset: SignatureDataset, read: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("igps.data.file_stat_cache.MIN_AGE", 1000 * 10**9)
+    monkeypatch.setattr("igps.data.known_files.MIN_AGE", 1000 * 10**9)
     dataset.precompute(n_workers=1, progress=False)
     read.clear()
     dataset.precompute(n_workers=1, progress=False)
@@ -127,7 +128,7 @@ def test_without_the_memory_all_goes_on(
         memory.mkdir()
     else:
         with sqlite3.connect(memory) as database:
-            database.execute("CREATE TABLE body (x)")
+            database.execute("CREATE TABLE file (x)")
         database.close()
     read.clear()
     with caplog.at_level(logging.WARNING):

@@ -1,0 +1,101 @@
+"""Identities: the content of files, the key of a Signature, and the keys of all that is made from it.
+
+The key of a Signature is the hash of everything that it depends on: the content of its files, the load options, the
+configuration, and the versions of mending and of the algorithm. Whatever is made from a Signature (an attribute, a
+transformed Signature, a description) has the hash of that key and of its own parameters as key, see `derived_key`.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from igps.mesh.formats import stat_key
+from igps.mesh.loading import BodyRef
+from igps.mesh.mending import MENDING_VERSION
+from igps.mesh.mesh import Mesh
+from igps.mesh.options import LoadOptions
+from igps.signature.config import SignatureConfig
+
+Stamp = tuple[int, int, int]
+"""Size in bytes, and times of the last change of the content and of the metadata in nanoseconds, see `stat_key`."""
+
+
+@dataclass(frozen=True)
+class FileDigest:
+    """The content of a file at one time."""
+
+    path: Path
+    stamp: Stamp
+    digest: bytes  # SHA-256
+
+    @staticmethod
+    def of(path: Path) -> "FileDigest":
+        """Read a file; raise an OSError if that fails."""
+        stamp = stat_key(path)  # before the content: a later change gives the file another stamp
+        with open(path, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").digest()
+        return FileDigest(path, stamp, digest)
+
+
+@dataclass(frozen=True)
+class Content:
+    """The content of a body: of its file and of the files that are read with it, or of its mesh in memory."""
+
+    digest: bytes
+    files: tuple[FileDigest, ...] = ()  # none if the body is in memory
+
+    @staticmethod
+    def of_files(files: Sequence[FileDigest]) -> "Content":
+        """Return the content of a file and its companions."""
+        if len(files) == 1:
+            return Content(files[0].digest, tuple(files))
+        return Content(_hash(b"".join(file.digest for file in files)), tuple(files))
+
+    @staticmethod
+    def of_mesh(mesh: Mesh) -> "Content":
+        """Return the content of a mesh in memory."""
+        facts = repr((mesh.unit, mesh.notes)).encode()
+        arrays = (mesh.vertices.tobytes(), mesh.faces.tobytes())
+        return Content(b"".join(_hash(part) for part in (*arrays, facts)))
+
+
+def content_digest(*files: Path) -> bytes:
+    """Return a digest of the content of a file and of the companion files that are read with it."""
+    return Content.of_files([FileDigest.of(file) for file in files]).digest
+
+
+def signature_key(
+    content: Content, body: BodyRef, reading: LoadOptions, config: SignatureConfig
+) -> str:
+    """Return the key of the Signature of a body."""
+    # The suffix selects the reader: the same lines in .pdb.gz and .pqr.gz are different molecules
+    name = body.path.name.lower()
+    suffix = ".pqr.gz" if name.endswith(".pqr.gz") else Path(name).suffix
+    return _hash(_parameters(suffix, body.part, reading, config) + content.digest).hex()
+
+
+def derived_key(kind: str, key: str, *parameters: object) -> str:
+    """Return the key of what is made from a Signature: of the kind, the Signature's key, and the parameters."""
+    return _hash(json.dumps([kind, key, *parameters]).encode()).hex()
+
+
+@lru_cache
+def _parameters(
+    suffix: str, part: str | None, reading: LoadOptions, config: SignatureConfig
+) -> bytes:
+    """Return the part of a key that is not the content; remembered, because thousands of files share it."""
+    fields = {
+        "suffix": suffix,
+        "part": part,
+        "reading": reading.as_dict(),
+        "mending": MENDING_VERSION,
+        "config": config.as_dict(),  # with the version of the algorithm
+    }
+    return json.dumps(fields, sort_keys=True).encode()
+
+
+def _hash(content: bytes) -> bytes:
+    return hashlib.sha256(content).digest()
