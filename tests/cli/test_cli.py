@@ -169,9 +169,7 @@ def test_gps_is_another_descriptor_on_the_same_cache(
     ]
     assert np.abs(archives[0] - archives[1]).max() > 1e-3
     kept = [
-        path
-        for path in (tmp_path / "cache").rglob("*.safetensors")
-        if "descriptions" not in path.parts
+        path for path in (tmp_path / "cache").rglob("*.safetensors") if "signatures" in path.parts
     ]
     assert len(kept) == 6
 
