@@ -21,7 +21,11 @@ from training import disturbances
 
 # Shares of the area that is missing, of faces that are turned, and of faces that are doubled; relative to the diagonal,
 # the overlap of halves and the standard deviation of noise
-_MISSING, _TURNED, _DOUBLED, _OVERLAP, _NOISE = 0.02, 1 / 3, 0.01, 0.02, 0.002
+_MISSING = 0.02
+_TURNED = 1 / 3
+_DOUBLED = 0.01
+_OVERLAP = 0.02
+_NOISE = 0.002
 _N_PATCHES, _N_FINS = 3, 30
 
 
@@ -155,7 +159,8 @@ def _with_turned(faces: Integers, generator: np.random.Generator) -> Integers:
 def _with_fins(vertices: Floats, faces: Integers, generator: np.random.Generator) -> Surface:
     face = generator.integers(len(faces), size=_N_FINS)
     corner = generator.integers(3, size=_N_FINS)
-    a, b = faces[face, corner], faces[face, (corner + 1) % 3]
+    a = faces[face, corner]
+    b = faces[face, (corner + 1) % 3]
     normals = unit(area_vectors(vertices, faces)[face])
     tips = (vertices[a] + vertices[b]) / 2 + 0.01 * diagonal(vertices) * normals
     stands = np.stack([a, b, len(vertices) + np.arange(_N_FINS)], axis=1)
@@ -169,10 +174,12 @@ def _with_parts(
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=2)
-    ball, triangles = np.asarray(sphere.vertices), np.asarray(sphere.faces, dtype=np.int64)
+    ball = np.asarray(sphere.vertices)
+    triangles = np.asarray(sphere.faces, dtype=np.int64)
     centre, radius = _deepest_ball(mesh)
     direction = generator.standard_normal(3)
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    low = mesh.vertices.min(axis=0)
+    high = mesh.vertices.max(axis=0)
     place = (low + high) / 2 + 0.6 * diagonal(mesh.vertices) * direction / np.linalg.norm(direction)
     speck = np.sqrt(1e-3 * mesh.area / (4 * np.pi))
     n = len(vertices)

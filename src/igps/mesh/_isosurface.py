@@ -33,10 +33,8 @@ def level_surface(field: Singles, name: str) -> Surface:
             return vertices.astype(np.float64), faces
         # Fill the four or eight grid points around each vertex at which the surface meets itself.
         for vertex in np.unique(bad_edges):
-            low, high = (
-                np.floor(vertices[vertex]).astype(int),
-                np.ceil(vertices[vertex]).astype(int),
-            )
+            low = np.floor(vertices[vertex]).astype(int)
+            high = np.ceil(vertices[vertex]).astype(int)
             box = tuple(
                 slice(max(low[d], 1), min(high[d] + 1, field.shape[d] - 1)) for d in range(3)
             )
@@ -54,7 +52,8 @@ def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Su
     import igl
 
     scale = longest_side(vertices)
-    points, triangles = vertices / scale, faces
+    points = vertices / scale
+    triangles = faces
     # First collapse the many short edges that marching cubes leave: they need no quadrics, so this is much faster.
     for collapse, n_vertices in ((igl.decimate, 3 * max_vertices), (igl.qslim, max_vertices)):
         target = len(triangles) - 2 * (len(points) - n_vertices)
@@ -87,7 +86,8 @@ def restore_volume(vertices: Floats, faces: Integers, volume: float) -> Floats:
 def _non_manifold_edges(faces: Integers, n_vertices: int) -> Integers:
     """Return the edges (E, 2) that are not traversed exactly once in each direction."""
     start, end = directed_edges(faces)
-    forward, backward = np.sort(start * n_vertices + end), np.sort(end * n_vertices + start)
+    forward = np.sort(start * n_vertices + end)
+    backward = np.sort(end * n_vertices + start)
     if (forward[1:] > forward[:-1]).all() and np.array_equal(forward, backward):
         return np.zeros((0, 2), dtype=np.int64)
     forward, n_forward = np.unique(forward, return_counts=True)
@@ -110,8 +110,14 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
         # Each edge once: its side in one face, and the opposite side in the face beyond.
         side = np.nonzero(start < end)[0]
         other = order[np.searchsorted(forward[order], end[side] * n + start[side])]
-        a, b, c, d = start[side], end[side], opposite[side], opposite[other]
-        pa, pb, pc, pd = vertices[a], vertices[b], vertices[c], vertices[d]
+        a = start[side]
+        b = end[side]
+        c = opposite[side]
+        d = opposite[other]
+        pa = vertices[a]
+        pb = vertices[b]
+        pc = vertices[c]
+        pd = vertices[d]
         gain = _angle(pc, pa, pb) + _angle(pd, pb, pa) - np.pi
         old = [np.cross(pb - pa, pc - pa), np.cross(pa - pb, pd - pb)]
         new = [np.cross(pd - pc, pb - pc), np.cross(pc - pd, pa - pd)]
@@ -131,7 +137,9 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
         )
         flips = np.nonzero((gain > 1e-3) & is_flat & ~exists & (c != d))[0]
         # Each face takes part only in its best flip, and no two flips create the same edge.
-        left, right, gain = side[flips] // 3, other[flips] // 3, gain[flips]
+        left = side[flips] // 3
+        right = other[flips] // 3
+        gain = gain[flips]
         best = np.full(len(faces), -np.inf)
         for face in (left, right):
             np.maximum.at(best, face, gain)
@@ -147,13 +155,12 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
             break
         a, b, c, d = (corner[flips[chosen]] for corner in (a, b, c, d))
         faces = faces.copy()
-        faces[left[chosen]], faces[right[chosen]] = (
-            np.stack([c, d, b], axis=1),
-            np.stack([d, c, a], axis=1),
-        )
+        faces[left[chosen]] = np.stack([c, d, b], axis=1)
+        faces[right[chosen]] = np.stack([d, c, a], axis=1)
     return faces
 
 
 def _angle(apex: Floats, a: Floats, b: Floats) -> Floats:
-    u, v = a - apex, b - apex
+    u = a - apex
+    v = b - apex
     return np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v))

@@ -31,7 +31,8 @@ class Grid:
 
     @classmethod
     def around(cls, vertices: Floats, faces: Integers, cell: float) -> Self:
-        low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
+        low = vertices[faces].min(axis=(0, 1))
+        high = vertices[faces].max(axis=(0, 1))
         shape = np.ceil((high - low) / cell).astype(int) + 1 + 2 * MARGIN
         # The grid is centred on the body, so that it moves with the body.
         origin = (low + high) / 2 - (shape - 1) / 2 * cell
@@ -54,7 +55,8 @@ def cell_sizes(
     """
     corners = vertices[faces]
     sides = np.ptp(corners.reshape(-1, 3), axis=0)
-    longest, area = float(sides.max()), float(face_areas(vertices, faces).sum())
+    longest = float(sides.max())
+    area = float(face_areas(vertices, faces).sum())
     by_volume = float(np.prod(np.maximum(sides, longest / 1000)) ** (1 / 3)) / resolution
     by_area = float(np.sqrt(area / (6 * resolution**2)))
     min_size = max(min(max(by_volume, by_area), longest / (0.8 * resolution)), spacing)
@@ -78,7 +80,8 @@ def distances(
     """Return the distances (X, Y, Z), infinite beyond the band, and the nearest surface points (X, Y, Z, 3)."""
     import igl
 
-    vertices, faces = np.asfortranarray(vertices), np.asfortranarray(faces)
+    vertices = np.asfortranarray(vertices)
+    faces = np.asfortranarray(faces)
     size = 8  # blocks that may be near the surface are halved until they are single grid points
     blocks = np.stack(
         np.meshgrid(*(np.arange(0, n, size) for n in shape), indexing="ij"), axis=-1
@@ -98,7 +101,8 @@ def distances(
     nearest = np.zeros((*shape, 3), dtype=np.float32)
     in_band = squared <= _BAND**2
     at = tuple(blocks[in_band].T)
-    distance[at], nearest[at] = np.sqrt(squared[in_band]), point[in_band]
+    distance[at] = np.sqrt(squared[in_band])
+    nearest[at] = point[in_band]
     return distance, nearest
 
 
@@ -111,7 +115,8 @@ def level_set(
     band = np.isfinite(distance)
     wall = distance <= WALL
     at = np.nonzero(band)
-    foot, height = nearest[at], distance[at]
+    foot = nearest[at]
+    height = distance[at]
     normal = (np.stack(at, axis=1) - foot) / np.maximum(height, 1e-6)[:, None]
     # A wall point belongs to the side beyond it, away from the surface; if only wall lies beyond, to the side of its
     # deepest neighbours.

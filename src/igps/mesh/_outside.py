@@ -52,7 +52,8 @@ class OrientedSurface:
         _, first, index = np.unique(
             np.round(vertices, 4), axis=0, return_index=True, return_inverse=True
         )
-        vertices, faces = vertices[first], index.ravel()[faces]
+        vertices = vertices[first]
+        faces = index.ravel()[faces]
         faces = faces[(np.diff(np.sort(faces, axis=1), axis=1) > 0).all(axis=1)]
         if not len(faces):
             return cls(vertices, faces, False)
@@ -76,7 +77,8 @@ class OrientedSurface:
             best = min(range(len(large)), key=lambda i: _defect(reversed_totals[i]))
             if _defect(reversed_totals[best]) >= _defect(total) - 1e-3:
                 break
-            total, shares[best] = reversed_totals[best], -shares[best]
+            total = reversed_totals[best]
+            shares[best] = -shares[best]
             faces = np.where((part == large[best])[:, None], faces[:, ::-1], faces)
         if signed_volume(vertices, faces) < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
@@ -111,10 +113,8 @@ class OrientedSurface:
 
     def _drop_hidden_faces(self) -> Self:
         """Drop the faces with the inside on both sides, such as walls between solids that were put together."""
-        normals, middle = (
-            unit(area_vectors(self.vertices, self.faces)),
-            self.vertices[self.faces].mean(axis=1),
-        )
+        normals = unit(area_vectors(self.vertices, self.faces))
+        middle = self.vertices[self.faces].mean(axis=1)
         lower = np.minimum(*(self.winding(middle + side * normals) for side in (0.25, -0.25)))
         faces = self.faces[lower <= 0.5]
         if not len(faces):
@@ -131,7 +131,8 @@ def _probe_points(vertices: Floats, faces: Integers) -> Floats:
     at = (np.arange(_N_PROBES) + 0.5) / _N_PROBES * area.sum()
     face = np.minimum(np.searchsorted(np.cumsum(area), at), len(area) - 1)
     face = face[area[face] > 0]
-    middle, step = vertices[faces[face]].mean(axis=1), 0.25 * (normals[face] / area[face, None])
+    middle = vertices[faces[face]].mean(axis=1)
+    step = 0.25 * (normals[face] / area[face, None])
     return np.concatenate([middle + step, middle - step])
 
 
@@ -169,10 +170,8 @@ def _outside_by_winding(
     if not len(leaked):
         return outside, 0
     # Check every flooded point near the leaks.
-    low, high = (
-        np.maximum(leaked.min(axis=0) - 4, 0),
-        np.minimum(leaked.max(axis=0) + 5, outside.shape),
-    )
+    low = np.maximum(leaked.min(axis=0) - 4, 0)
+    high = np.minimum(leaked.max(axis=0) + 5, outside.shape)
     box = tuple(map(slice, low, high))
     points = np.argwhere(outside[box]) + low
     inside = np.zeros_like(outside)
@@ -192,7 +191,8 @@ def _cavities(outside: Booleans, surface: OrientedSurface) -> Booleans:
         # Everything around the grid is outside.
         label, count = ndimage.label(np.pad(depth > radius, 1, constant_values=True))
         if count > 1:
-            open_label, label = label[0, 0, 0], label[1:-1, 1:-1, 1:-1]
+            open_label = label[0, 0, 0]
+            label = label[1:-1, 1:-1, 1:-1]
             peak = ndimage.maximum(depth, label, np.arange(count + 1))
             for k in np.nonzero(peak * _MOUTH >= radius)[0]:
                 if k not in (0, open_label):

@@ -79,7 +79,8 @@ def places(vertices: Floats) -> Integers:
 
 def weld_boundaries(vertices: Floats, faces: Integers) -> Integers:
     """Return the faces (F, 3) with coincident boundary vertices merged."""
-    boundary, index = _boundary_vertices(vertices, faces), np.arange(len(vertices))
+    boundary = _boundary_vertices(vertices, faces)
+    index = np.arange(len(vertices))
     if len(boundary):
         index[boundary] = boundary[places(vertices[boundary])]
     return index[faces]
@@ -87,8 +88,10 @@ def weld_boundaries(vertices: Floats, faces: Integers) -> Integers:
 
 def _close_cracks(vertices: Floats, faces: Integers) -> Integers:
     """Return, for each vertex (V,), the vertex into which it is merged to close cracks between boundaries."""
-    boundary, index = _boundary_vertices(vertices, faces), np.arange(len(vertices))
-    tree, width = cKDTree(vertices[boundary]), _CRACK * diagonal(vertices)
+    boundary = _boundary_vertices(vertices, faces)
+    index = np.arange(len(vertices))
+    tree = cKDTree(vertices[boundary])
+    width = _CRACK * diagonal(vertices)
     if tree.count_neighbors(tree, width) > _MAX_CRACK_NEIGHBOURS * len(boundary):
         return index
     pairs = tree.query_pairs(width, output_type="ndarray")
@@ -237,14 +240,16 @@ def _boundary_loops(faces: Integers) -> list[Integers]:
     end, start = directed_edges(faces)
     _, edge_of_side = undirected_edges(faces, int(faces.max(initial=-1)) + 1)
     free = np.nonzero(np.bincount(edge_of_side)[edge_of_side] == 1)[0]
-    forward, backward = defaultdict(list), defaultdict(list)
+    forward = defaultdict(list)
+    backward = defaultdict(list)
     for edge, a, b in zip(free.tolist(), start[free].tolist(), end[free].tolist(), strict=True):
         forward[a].append((edge, b))
         backward[b].append((edge, a))
     visited: set[int] = set()
     loops = []
     for first in start[free].tolist():
-        path, position = [first], {first: 0}
+        path = [first]
+        position = {first: 0}
         while path:
             steps = [*forward[path[-1]], *backward[path[-1]]]
             edge, vertex = next((step for step in steps if step[0] not in visited), (-1, -1))
@@ -302,7 +307,8 @@ def _circle(turns: Floats, radius: float) -> Floats:
 def _solve_umbrella(points: Floats, faces: Integers, n_fixed: int, order: int) -> Floats:
     """Return the points after the first `n_fixed`, placed so that the umbrella operator to the power `order` is 0."""
     edges, _ = undirected_edges(faces, len(points))
-    size, ends = len(points), (edges.T.ravel(), edges[:, ::-1].T.ravel())
+    size = len(points)
+    ends = (edges.T.ravel(), edges[:, ::-1].T.ravel())
     graph = sparse.coo_array((np.ones(2 * len(edges)), ends), shape=(size, size)).tocsr()
     umbrella = sparse.eye_array(size) - sparse.diags_array(1 / graph.sum(axis=1)) @ graph
     operator = (umbrella @ umbrella if order == 2 else umbrella).tocsr()[n_fixed:]

@@ -60,7 +60,8 @@ def _superfluous_patch(
     """Return the next patch to drop, or -1; dropped faces have the patch -1."""
     import igl
 
-    patch_of_sample, is_left = patch[face_of_sample], patch >= 0
+    patch_of_sample = patch[face_of_sample]
+    is_left = patch >= 0
     size = np.bincount(patch[is_left], face_areas(points, faces[is_left]))
     in_patch = patch_of_sample >= 0
     n_samples = np.maximum(np.bincount(patch_of_sample[in_patch], minlength=len(size)), 1)

@@ -30,7 +30,8 @@ _MIN_ROUGHNESS = 0.035
 _MAX_SAME_SIGN = 0.43
 # Share of edges whose triangles are parallel to a tenth of a degree: up to 0.5 % with noise (5 %); 14 % and more on
 # drawn houses and bicycles, whose ornaments are as rough as noise.
-_MAX_FLAT, _FLAT_ANGLE = 0.1, np.radians(0.1)
+_MAX_FLAT = 0.1
+_FLAT_ANGLE = np.radians(0.1)
 # Median stretch (see `Neighbours`) above which triangles are thin: 1.02 to 1.11 on generated bodies, 4.2 to 300 on
 # parts of thin triangles, the same with noise.
 _THIN = 2.0
@@ -52,7 +53,8 @@ _MAX_DISPLACEMENT = 5
 _WIDTH, _N_RUNS, _N_STEPS = 0.35, 3, 10
 # Faces filtered at a time, and the maximal number of faces at a vertex that count as neighbours of each other: those
 # around a hub of thousands would be millions of pairs.
-_FACES_AT_ONCE, _MAX_FACES_AT_VERTEX = 2**15, 64
+_FACES_AT_ONCE = 2**15
+_MAX_FACES_AT_VERTEX = 64
 _QUARTILE = 0.3186  # lower quartile of the absolute value of a standard normal variable
 
 
@@ -64,7 +66,8 @@ def is_noisy(vertices: Floats, faces: Integers) -> bool:
     around = Neighbours.of(vertices, faces)
     if (around.faces_at_sides == 2).mean() < _MIN_REGULAR:
         return False
-    edges, averaging = around.edges, around.averaging
+    edges = around.edges
+    averaging = around.averaging
     # Normals of the averaged surface, because noise larger than the triangles makes their own normals useless.
     normals = vertex_normals(averaging @ (averaging @ vertices), faces)
     height = np.einsum("ij,ij->i", vertices - averaging @ vertices, normals)
@@ -89,20 +92,20 @@ class Neighbours:
     def of(cls, vertices: Floats, faces: Integers) -> Self:
         n = len(vertices)
         edges, edge_of = undirected_edges(faces, n)
-        rows, columns = edges.T.ravel(), edges[:, ::-1].T.ravel()
+        rows = edges.T.ravel()
+        columns = edges[:, ::-1].T.ravel()
         degree = np.maximum(np.bincount(rows, minlength=n), 1)
         length = np.tile(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 2)
-        weights, mean_length = (
-            np.ones(len(rows)),
-            np.bincount(rows, weights=length, minlength=n) / degree,
-        )
+        weights = np.ones(len(rows))
+        mean_length = np.bincount(rows, weights=length, minlength=n) / degree
         inverse_squares = np.maximum(length, _MIN_LENGTH) ** -2.0
         total = np.bincount(rows, weights=inverse_squares, minlength=n)
         # Zero at a vertex without neighbours, like the arithmetic mean.
         near_length = np.sqrt(np.divide(degree, total, out=np.zeros(n), where=total > 0))
         stretch = np.divide(mean_length, near_length, out=np.zeros(n), where=near_length > 0)
         if np.median(stretch) > _THIN:
-            weights, mean_length = inverse_squares, near_length
+            weights = inverse_squares
+            mean_length = near_length
         total = np.bincount(rows, weights=weights, minlength=n)
         averaging = sparse.csr_array((weights / total[rows], (rows, columns)), shape=(n, n))
         return cls(edges, edge_of, averaging, mean_length, stretch)
@@ -147,7 +150,8 @@ def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats
     n_around = np.bincount(faces.ravel(), minlength=len(vertices))
     incidence = _incidence(faces, len(vertices))[:, n_around <= _MAX_FACES_AT_VERTEX]
     areas = area_vectors(smooth, faces)
-    normals, guide = unit(area_vectors(vertices, faces)), unit(areas)
+    normals = unit(area_vectors(vertices, faces))
+    guide = unit(areas)
     size = np.linalg.norm(areas, axis=1)
     for _ in range(_N_RUNS):
         means = np.empty_like(normals)

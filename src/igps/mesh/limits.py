@@ -10,10 +10,9 @@ _BYTES_PER_FACE = 1000
 # File size of a triangle in formats whose header has no number of triangles: OBJ, and text STL.
 _OBJ_BYTES, _TEXT_STL_BYTES = 35, 200
 _BYTES_PER_CELL = 40  # memory per grid cell while the cells inside a body are found
-_MIN_CHECKED_FILE, _MIN_CHECKED_GRID = (
-    1 << 20,
-    1 << 26,
-)  # bytes; smaller files and grids are not checked
+# bytes; smaller files and grids are not checked
+_MIN_CHECKED_FILE = 1 << 20
+_MIN_CHECKED_GRID = 1 << 26
 
 
 def check_memory(path: Path) -> None:
@@ -49,7 +48,8 @@ def check_fits(n_bytes: int, subject: str, remedy: str) -> None:
 
 def expected_faces(path: Path) -> int:
     """Return the number of triangles in a mesh file: from its header, or estimated from its size."""
-    size, suffix = path.stat().st_size, path.suffix.lower()
+    size = path.stat().st_size
+    suffix = path.suffix.lower()
     with path.open("rb") as file:
         head = file.read(4096)
     match = None
@@ -120,7 +120,8 @@ def _memory_in_groups(
         for folder in {
             folder for path in ["", *paths] for folder in (mount / path, *(mount / path).parents)
         }:
-            max_bytes, current = _number(folder / limit), _number(folder / usage)
+            max_bytes = _number(folder / limit)
+            current = _number(folder / usage)
             if max_bytes is not None and current is not None:
                 # The kernel frees cached files when memory is needed.
                 available.append(

@@ -82,7 +82,8 @@ def load_mesh(
 
 def load_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[Mesh]:
     """Return all usable bodies of a file, and log the errors of the others; a MeshError if no body is usable."""
-    bodies, errors = [], []
+    bodies = []
+    errors = []
     for _, body in each_body(path, options):
         if isinstance(body, MeshError):
             logger.warning("%s", body)
@@ -161,7 +162,9 @@ def surface_body(
     if raw.fault is not None:
         raise raw.fault
     name = str(ref)
-    vertices, faces, notes = raw.vertices, raw.faces, raw.notes
+    vertices = raw.vertices
+    faces = raw.faces
+    notes = raw.notes
     if options.mend != "never":
         vertices, faces, dropped = _with_coordinates(vertices, faces)
         notes = (*notes, *dropped)

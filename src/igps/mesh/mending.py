@@ -102,10 +102,8 @@ def mend(
         mesh = watertight(vertices, normals=normals, name=name)
     else:
         check_arrays(vertices, faces, name)
-        vertices, triangles = (
-            np.asarray(vertices, dtype=np.float64),
-            np.asarray(faces, dtype=np.int64),
-        )
+        vertices = np.asarray(vertices, dtype=np.float64)
+        triangles = np.asarray(faces, dtype=np.int64)
         if len(triangles) == 1:
             raise MeshError(
                 f"{name}: expected a closed surface, got a single triangle. Export it again."

@@ -190,7 +190,8 @@ class Mesh:
     @property
     def genus(self) -> int:
         """Number of handles of all surfaces together; a MeshError for an open mesh."""
-        n_vertices, n_faces = len(self.vertices), len(self.faces)
+        n_vertices = len(self.vertices)
+        n_faces = len(self.faces)
         if len(undirected_edges(self.faces, n_vertices)[0]) * 2 != n_faces * 3:
             raise MeshError(
                 f"{self.name}: an open surface has no genus; a closed one was expected. Close the holes."
@@ -204,7 +205,8 @@ class Mesh:
 
 def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
     """Raise a MeshError unless the arrays are finite coordinates (V, 3), and faces (F, 3) with indices in range."""
-    v, f = np.asarray(vertices), np.asarray(faces)
+    v = np.asarray(vertices)
+    f = np.asarray(faces)
     check_coordinates(v, name)
     if f.size == 0:
         raise MeshError(
@@ -237,7 +239,8 @@ def check_coordinates(vertices: NDArray[Any], name: str) -> None:
 def check_size(vertices: Floats, name: str) -> None:
     """Raise a MeshError if a surface is too small, too large or too far from the origin to compute with."""
     with np.errstate(over="ignore"):
-        length, distance = diagonal(vertices), float(np.abs(vertices).max())
+        length = diagonal(vertices)
+        distance = float(np.abs(vertices).max())
     if not _MIN_DIAGONAL <= length <= _MAX_DIAGONAL:
         fault = (
             f"{name}: expected a bounding box diagonal from {_MIN_DIAGONAL:g} to {_MAX_DIAGONAL:g}"
@@ -257,7 +260,8 @@ def _check_topology(
     start, end = directed_edges(faces)
     edge_of = undirected_edges(faces, n_vertices)[1]
     count = np.bincount(edge_of)
-    n_non_manifold, n_boundary = int((count > 2).sum()), int((count == 1).sum())
+    n_non_manifold = int((count > 2).sum())
+    n_boundary = int((count == 1).sum())
     balance = np.bincount(edge_of, weights=np.where(start < end, 1.0, -1.0), minlength=len(count))
     n_inconsistent = int(((count == 2) & (balance != 0)).sum())
     n_components, _ = components(faces, n_vertices)

@@ -73,7 +73,8 @@ def _single(bodies: Sequence[RawBody]) -> RawBody:
 
 def _surface(thing: Any) -> tuple[str, RawBody] | None:
     """Return the name and the unchecked surface of an object that has vertices and faces; None if it has none."""
-    metadata, source = getattr(thing, "metadata", None), getattr(thing, "source", None)
+    metadata = getattr(thing, "metadata", None)
+    source = getattr(thing, "source", None)
     file_name = metadata.get("file_name") if isinstance(metadata, dict) else None
     path = getattr(source, "file_path", None)  # trimesh keeps the path of the file here
     name = str(file_name or (Path(path).name if path else "mesh"))
@@ -95,9 +96,7 @@ def _surface(thing: Any) -> tuple[str, RawBody] | None:
         return name, RawBody(vertices, flat_triangles(corners, n_corners, vertices))
     if hasattr(thing, "vertices") and hasattr(thing, "faces"):
         unit = getattr(thing, "units", None) or getattr(thing, "unit", None)
-        vertices, triangles = (
-            np.asarray(thing.vertices, np.float64),
-            np.asarray(thing.faces, np.int64),
-        )
+        vertices = np.asarray(thing.vertices, np.float64)
+        triangles = np.asarray(thing.faces, np.int64)
         return name, RawBody(vertices, triangles, unit=unit, notes=getattr(thing, "notes", ()))
     return None

@@ -47,7 +47,8 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
     run out of ears; what is left of it is cut into a fan. Polygons of fewer than three corners are dropped.
     """
     has_area = n_corners >= 3
-    corners, n_corners = corners[np.repeat(has_area, n_corners)], n_corners[has_area]
+    corners = corners[np.repeat(has_area, n_corners)]
+    n_corners = n_corners[has_area]
     if n_corners.max(initial=0) < 4 or corners.min() < 0 or corners.max() >= len(vertices):
         return triangles(corners, n_corners)
     starts = np.cumsum(n_corners) - n_corners
@@ -78,7 +79,10 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
 
 def _clip_ears(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
     """Triangulate a polygon (n,), which may be concave, into (n − 2, 3) triangles."""
-    remaining, ears, at, n_tried = polygon.tolist(), [], 0, 0
+    remaining = polygon.tolist()
+    ears = []
+    at = 0
+    n_tried = 0
     while n_tried <= len(remaining) > 3:
         a, b, c = (remaining[(at + k) % len(remaining)] for k in (-1, 0, 1))
         triangle = vertices[[a, b, c]]
@@ -89,16 +93,19 @@ def _clip_ears(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
         if np.cross(sides[0], sides[1]) @ normal > 0 and not (beside >= 0).all(axis=1).any():
             ears.append((a, b, c))
             del remaining[at]
-            at, n_tried = at % len(remaining), 0
+            at = at % len(remaining)
+            n_tried = 0
         else:
-            at, n_tried = (at + 1) % len(remaining), n_tried + 1
+            at = (at + 1) % len(remaining)
+            n_tried = n_tried + 1
     fan = [(remaining[0], remaining[k], remaining[k + 1]) for k in range(1, len(remaining) - 1)]
     return np.array([*ears, *fan], dtype=np.int64)
 
 
 def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
     """Return the corners of polygons laid end to end, and their counts, from rows that each begin with the count."""
-    starts, at = [], 0
+    starts = []
+    at = 0
     while at < len(rows):
         starts.append(at)
         at += max(int(rows[at]), 0) + 1

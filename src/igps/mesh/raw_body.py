@@ -101,7 +101,8 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
 
 def pieces(whole: RawBody) -> list[RawBody]:
     """Split a body into its connected components, "piece 1" and so on in the order of the file; specks are dropped."""
-    vertices, faces = whole.vertices, whole.faces
+    vertices = whole.vertices
+    faces = whole.faces
     if not len(faces):
         return [whole]
     check_arrays(vertices, faces, "the whole")

@@ -27,7 +27,8 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     import igl
 
     # In unit size, because quadrics are sums of squares. A collapse on a closed surface removes a vertex and two faces.
-    centre, scale = mesh.vertices.mean(axis=0), longest_side(mesh.vertices)
+    centre = mesh.vertices.mean(axis=0)
+    scale = longest_side(mesh.vertices)
     points = np.asfortranarray((mesh.vertices - centre) / scale)
     points, faces, *_ = igl.qslim(
         points, np.asfortranarray(mesh.faces), max(len(mesh.faces) - 2 * surplus, 4)
@@ -51,7 +52,8 @@ def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
     n_before = len(mesh.vertices)
     if n_before >= n_vertices:
         return mesh
-    vertices, faces = mesh.vertices, mesh.faces
+    vertices = mesh.vertices
+    faces = mesh.faces
     while len(vertices) < n_vertices:
         edges, edge_of_side = undirected_edges(faces, len(vertices))
         length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
@@ -75,7 +77,8 @@ def _cut(
     n_cut = (middle_of_side >= 0).sum(axis=1)
     pieces = [faces[n_cut == 0]]
     for n in (1, 2, 3):
-        f, k = faces[n_cut == n], middle_of_side[n_cut == n]
+        f = faces[n_cut == n]
+        k = middle_of_side[n_cut == n]
         # The corners are rotated so that the cut sides come first.
         turn = (
             np.argmax(k >= 0, axis=1)

@@ -47,7 +47,8 @@ def mean_of_neighbours(vertices: Floats, faces: Integers) -> Floats:
     squares = np.square(vertices[ends[:, 0]] - vertices[ends[:, 1]]).sum(axis=1)
     # Coincident vertices get a large weight, without a division by zero.
     weights = 1 / np.maximum(squares, 1e-12 * squares.mean())
-    total, mean = np.zeros(len(vertices)), np.zeros_like(vertices)
+    total = np.zeros(len(vertices))
+    mean = np.zeros_like(vertices)
     for here, there in (ends.T, ends.T[::-1]):
         total += np.bincount(here, weights, len(vertices))
         mean += sums(here, weights[:, None] * vertices[there], len(vertices))
@@ -117,7 +118,8 @@ def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
     by_edge = np.argsort(edge_of_side, kind="stable")
     count = np.bincount(edge_of_side)
     at = (np.cumsum(count) - count)[count == 2]
-    a, b = by_edge[at] // 3, by_edge[at + 1] // 3
+    a = by_edge[at] // 3
+    b = by_edge[at + 1] // 3
     graph = sparse.coo_array(
         (np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(faces), len(faces))
     )
@@ -126,7 +128,8 @@ def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
     pairs, n_own = np.unique(
         np.stack([np.repeat(patch, 3), edge_of_side]), axis=1, return_counts=True
     )
-    patch_at, n_at = pairs[0], count[pairs[1]]
+    patch_at = pairs[0]
+    n_at = count[pairs[1]]
     n_free = np.bincount(patch_at, (n_at - n_own < 2) & (n_at != 2), n_patches)
     return patch.astype(np.int64), (n_free == 0) & (np.bincount(patch_at, n_at > 2, n_patches) > 0)
 

@@ -98,7 +98,8 @@ def watertight(
     if thickness < _COARSE * cell:
         notes.append(f"coarse: about {4 * thickness / cell:.1f} cells thick")
     if cell > min_size:
-        finest, grid = grid, Grid.around(grid.from_cells(vertices), faces, cell)
+        finest = grid
+        grid = Grid.around(grid.from_cells(vertices), faces, cell)
         vertices, oriented = (
             grid.to_cells(finest.from_cells(points)) for points in (vertices, surface.vertices)
         )
@@ -126,7 +127,8 @@ def crosses_itself(vertices: Floats, faces: Integers) -> bool:
 def _drop_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Integers:
     """Drop groups of faces that are separate from all others and have next to no area."""
     corners = vertices[faces]
-    low, side = corners.min(axis=(0, 1)), longest_side(corners.reshape(-1, 3))
+    low = corners.min(axis=(0, 1))
+    side = longest_side(corners.reshape(-1, 3))
     cell = side / _SPECK_CELLS
     points, face = _sample_triangles(corners, cell)
     index = np.floor((points - low) / cell).astype(np.int64) + 1
@@ -149,7 +151,8 @@ def _sample_triangles(corners: Floats, spacing: float) -> tuple[Floats, Integers
     """Return points on triangles, at most about `spacing` apart, and the triangle of each point."""
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     n_parts = np.clip(np.ceil(longest / spacing), 1, 4 * _SPECK_CELLS).astype(np.int64)
-    points, owner = [], []
+    points = []
+    owner = []
     for n in np.unique(n_parts):
         i, j = np.nonzero(np.add.outer(np.arange(n + 1), np.arange(n + 1)) <= n)
         weights = np.stack([i, j, n - i - j], axis=1) / n
@@ -182,7 +185,8 @@ def splats(
             np.int64
         )
         _, first = np.unique(lattice, axis=0, return_index=True)
-        points, normals = points[first], None if normals is None else normals[first]
+        points = points[first]
+        normals = None if normals is None else normals[first]
     distance, neighbours = cKDTree(points).query(points, k=min(13, len(points)))
     # In an even cloud, a disc reaches about the third ring of neighbours; its radius is bounded where points are rare.
     reach = distance[:, min(6, distance.shape[1] - 1)]

@@ -32,7 +32,9 @@ def check_mesh_and_points(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
 ) -> tuple[Floats, Integers, Floats]:
     """Return the vertices and faces of a mesh, and points, as float64 and int64; a ValueError for invalid arrays."""
-    v, f, p = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
+    v = np.asarray(vertices, np.float64)
+    f = np.asarray(faces)
+    p = np.asarray(points, np.float64)
     for name, array in (("vertices", v), ("faces", f), ("points", p)):
         if array.ndim != 2 or array.shape[1] != 3:
             raise ValueError(f"{name}: expected shape (n, 3), got {array.shape}")

@@ -79,7 +79,8 @@ def polygons() -> list[list[int]]:
     """The box as ten triangles and a quadrilateral."""
     faces = [list(map(int, face)) for face in BOX.faces]
     beside = next(k for k in range(1, 12) if np.allclose(BOX.face_normals[k], BOX.face_normals[0]))
-    first, second = faces[0], faces[beside]
+    first = faces[0]
+    second = faces[beside]
     opposite = next(corner for corner in second if corner not in first)
     at = next(k for k in range(3) if first[k] not in second)
     quad = [first[at], first[(at + 1) % 3], opposite, first[(at + 2) % 3]]

@@ -34,7 +34,8 @@ def trace(seed: int, bend: float, n: int = 60) -> Molecule:
     t = np.arange(n)
     coil = np.stack([1.5 * t, 5 * np.cos(1.3 * t), 5 * np.sin(1.3 * t)], axis=1)
     if bend:
-        radius, angle = 1.5 * n / bend, coil[:, 0] * bend / (1.5 * n)
+        radius = 1.5 * n / bend
+        angle = coil[:, 0] * bend / (1.5 * n)
         coil = np.stack(
             [
                 (radius + coil[:, 1]) * np.sin(angle),
@@ -118,9 +119,11 @@ def test_motion_changes_little() -> None:
 
 
 def test_size_is_a_factor_of_the_distance() -> None:
-    one, other = signature(0, 0.0), signature(1, 2.0)
+    one = signature(0, 0.0)
+    other = signature(1, 2.0)
     larger = replace(other, area=1.5 * one.area, volume=one.volume / 2)
-    found, without = described(one, larger), described(one, larger, size=False)
+    found = described(one, larger)
+    without = described(one, larger, size=False)
     np.testing.assert_allclose(found[:, :-2], without)
     s = np.log(1.5) + np.log(2)
     wanted = chi_square(without[:1], without[1:]) * s / (0.3 + s)
@@ -130,7 +133,8 @@ def test_size_is_a_factor_of_the_distance() -> None:
 
 def test_statistics_compare_the_histograms_and_not_the_size() -> None:
     """By Hellinger's distance; size alone would be all that counts, as its logarithms are no shares."""
-    one, other = signature(0, 0.0), signature(1, 2.0)
+    one = signature(0, 0.0)
+    other = signature(1, 2.0)
     found = described(one, replace(one, area=2 * one.area), other)
     rows = molecular().coordinates(found)
     cells = described(one, other, size=False)

@@ -24,7 +24,8 @@ _CONVERT = (
 
 def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """Read the solids of a STEP file, in millimetres, each named after its part."""
-    solids, names = [], []
+    solids = []
+    names = []
     for body in objects(path, options, _converted(path), file_type="glb", merge_primitives=True):
         components = pieces(body)
         if any(
@@ -45,7 +46,8 @@ def _converted(path: Path) -> bytes:
     import cascadio  # noqa: F401  # raises ImportError in this process if missing
 
     with tempfile.TemporaryDirectory() as folder:
-        step, scene = Path(folder) / "x.step", Path(folder) / "x.glb"
+        step = Path(folder) / "x.step"
+        scene = Path(folder) / "x.glb"
         shutil.copyfile(path, step)
         subprocess.run(
             [sys.executable, "-c", _CONVERT, str(step), str(scene)],

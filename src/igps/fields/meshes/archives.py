@@ -117,7 +117,10 @@ class _LimitedStream(io.RawIOBase):
     """A stream that raises a MeshError once more bytes than allowed are read."""
 
     def __init__(self, stream: Any, path: Path, options: LoadOptions) -> None:
-        self._stream, self._path, self._limit, self._n_read = stream, path, options.max_unpacked, 0
+        self._stream = stream
+        self._path = path
+        self._limit = options.max_unpacked
+        self._n_read = 0
 
     def read(self, size: int = -1) -> bytes:
         content = bytes(

@@ -74,7 +74,8 @@ def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.gen
     kind = np.dtype(_TYPES[element.get("DataType", "")])
     n_bytes = prod(shape) * kind.itemsize
     check_unpacked(n_bytes, path, options.max_unpacked)
-    encoding, text = element.get("Encoding"), element.findtext("Data") or ""
+    encoding = element.get("Encoding")
+    text = element.findtext("Data") or ""
     if encoding == "ASCII":
         values = _xml.from_text(text, kind)
     elif encoding in ("Base64Binary", "GZipBase64Binary"):
@@ -95,7 +96,8 @@ def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[
     if not content.startswith(_MAGIC) or at < 2:
         raise ValueError("not a triangle file of FreeSurfer")
     n_vertices, n_faces = (int(n) for n in np.frombuffer(content, ">i4", 2, at))
-    n_expected, n_bytes = 12 * (n_vertices + n_faces), len(content) - at - 8
+    n_expected = 12 * (n_vertices + n_faces)
+    n_bytes = len(content) - at - 8
     if min(n_vertices, n_faces) < 0 or n_bytes < n_expected:
         raise ValueError(
             f"expected {n_vertices} vertices, {n_faces} triangles, {n_expected} bytes, got {n_bytes}"

@@ -34,7 +34,8 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     if "4" in kind:
         raise ValueError("expected three coordinates for each vertex, got four (4OFF)")
     n_vertices, n_faces, *_ = map(int, lines[0].split())
-    coordinates, rows = lines[1 : n_vertices + 1], lines[n_vertices + 1 :][:n_faces]
+    coordinates = lines[1 : n_vertices + 1]
+    rows = lines[n_vertices + 1 :][:n_faces]
     if min(n_vertices, n_faces) < 0 or len(rows) < n_faces or len(coordinates) < n_vertices:
         raise ValueError(
             f"expected {n_vertices} vertices and {n_faces} faces, got {len(lines) - 1} lines"

@@ -79,11 +79,15 @@ class TetAttribute(FileAttribute):
         corners = vertices[tetrahedra]
         edges = corners[:, 1:] - corners[:, :1]
         is_solid = np.abs(np.linalg.det(edges)) > 0
-        corners, tetrahedra, edges = corners[is_solid], tetrahedra[is_solid], edges[is_solid]
+        corners = corners[is_solid]
+        tetrahedra = tetrahedra[is_solid]
+        edges = edges[is_solid]
         inverse = np.linalg.inv(edges)
         # Tetrahedron of each point, barycentric coordinates in it, and the smallest of them, which is negative outside
         n = len(points)
-        owner, weights, smallest = np.zeros(n, int), np.zeros((n, 4)), np.full(n, -np.inf)
+        owner = np.zeros(n, int)
+        weights = np.zeros((n, 4))
+        smallest = np.full(n, -np.inf)
         # No point of a tetrahedron is farther from its centre than a corner
         centres = corners.mean(axis=1)
         radius = np.linalg.norm(corners - centres[:, None], axis=2).max()
@@ -94,11 +98,9 @@ class TetAttribute(FileAttribute):
                 last_three = np.einsum("td,tde->te", points[i] - corners[near, 0], inverse[near])
                 barycentric = np.column_stack([1 - last_three.sum(axis=1), last_three])
                 best = int(np.argmax(barycentric.min(axis=1)))
-                smallest[i], weights[i], owner[i] = (
-                    barycentric[best].min(),
-                    barycentric[best],
-                    near[best],
-                )
+                smallest[i] = barycentric[best].min()
+                weights[i] = barycentric[best]
+                owner[i] = near[best]
         values = np.einsum(
             "pi,pi...->p...", weights, at_vertices[tetrahedra[owner]].astype(np.float64)
         )

@@ -68,8 +68,11 @@ class _Legacy:
     """A legacy file, read from start to end."""
 
     def __init__(self, content: bytes) -> None:
-        self._content, self._at = content, 0
-        header, _, kind = self.line(), self.line(), self.line().upper()
+        self._content = content
+        self._at = 0
+        header = self.line()
+        self.line()  # the title
+        kind = self.line().upper()
         if not header.lower().startswith("# vtk datafile") or kind not in ("ASCII", "BINARY"):
             raise ValueError("not a legacy file of VTK")
         self._is_text = kind == "ASCII"
@@ -79,7 +82,8 @@ class _Legacy:
         while self._at < len(self._content):
             end = self._content.find(b"\n", self._at)
             end = len(self._content) if end < 0 else end
-            text, self._at = self._content[self._at : end].decode("latin-1").strip(), end + 1
+            text = self._content[self._at : end].decode("latin-1").strip()
+            self._at = end + 1
             if text == "METADATA":  # ends at a blank line
                 blank = _BLANK_LINE.search(self._content, self._at)
                 self._at = len(self._content) if blank is None else blank.start()
@@ -144,11 +148,13 @@ class _Legacy:
     def arrays(self, heading: str, n_points: int) -> dict[str, NDArray[np.generic]]:
         """Read the arrays at points by name; `heading` is the line before."""
         arrays: dict[str, NDArray[np.generic]] = {}
-        is_of_points, n = heading.startswith("POINT_DATA"), n_points
+        is_of_points = heading.startswith("POINT_DATA")
+        n = n_points
         while words := self.line().split():
             word = words[0].upper()
             if word in ("POINT_DATA", "CELL_DATA"):
-                is_of_points, n = word == "POINT_DATA", int(words[1])
+                is_of_points = word == "POINT_DATA"
+                n = int(words[1])
                 continue
             n_arrays = (
                 int(words[2]) if word == "FIELD" else word in ("VECTORS", "NORMALS", "SCALARS")
@@ -157,9 +163,13 @@ class _Legacy:
                 if word == "FIELD":
                     name, width, length, kind = self.line().split()
                 else:
-                    name, width, length, kind = words[1], "3", str(n), words[2]
+                    name = words[1]
+                    width = "3"
+                    length = str(n)
+                    kind = words[2]
                 if word == "SCALARS":
-                    width, before = words[3] if len(words) > 3 else "1", self._at
+                    width = words[3] if len(words) > 3 else "1"
+                    before = self._at
                     if not self.line().upper().startswith("LOOKUP_TABLE"):
                         self._at = before
                 values = self.numbers(int(width) * int(length), kind).reshape(
@@ -230,7 +240,9 @@ class _Xml:
 
     def __init__(self, path: Path, options: LoadOptions) -> None:
         content = path.read_bytes()
-        self._path, self._options, self._appended = path, options, b""
+        self._path = path
+        self._options = options
+        self._appended = b""
         self._n_unpacked = -len(content)  # bytes of all arrays beyond the size of the file
         start = content.find(b"<AppendedData")
         self._is_raw = start >= 0 and b'"raw"' in content[start : content.find(b">", start)]
@@ -277,7 +289,8 @@ class _Xml:
             f"{'f' if name.startswith('F') else name[0].lower()}{int(name.lstrip('UIntFloa')) // 8}"
         )
         kind = kind.newbyteorder(self._order)
-        encoding, text = element.get("format"), element.text or ""
+        encoding = element.get("format")
+        text = element.text or ""
         if encoding == "ascii":
             values = _xml.from_text(text, kind)
         elif encoding == "appended":
@@ -304,7 +317,8 @@ class _Xml:
         packed = _first(
             sum(packed_sizes), content[len(header) if is_raw else _n_letters(len(header)) :], is_raw
         )
-        blocks, at = [], 0
+        blocks = []
+        at = 0
         for number, n_packed in enumerate(packed_sizes):
             n_unpacked = n_last if number == n - 1 and n_last else n_bytes
             blocks.append(_xml.inflated(packed[at : at + n_packed], n_unpacked, self._compressor))

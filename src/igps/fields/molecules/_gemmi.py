@@ -222,10 +222,15 @@ def _pqr(text: bytes, path: Path) -> gemmi.Structure:
         key = gemmi.SeqId(int(match[2]), match[3] or " ")
         if not residues or residues[-1].seqid != key or residues[-1].name != residue:
             new = gemmi.Residue()
-            new.name, new.seqid, new.het_flag = residue, key, line[0]
+            new.name = residue
+            new.seqid = key
+            new.het_flag = line[0]
             residues.append(new)
         atom = gemmi.Atom()
-        atom.name, atom.pos, atom.occ, atom.b_iso = name, gemmi.Position(x, y, z), charge, radius
+        atom.name = name
+        atom.pos = gemmi.Position(x, y, z)
+        atom.occ = charge
+        atom.b_iso = radius
         residues[-1].add_atom(atom)
     _add_model(structure, chains)
     return structure

@@ -29,7 +29,8 @@ class Shares(PointAxis):
 
     def __init__(self, name: str, n_classes: int) -> None:
         nn.Module.__init__(self)
-        self.name, self._n_classes = name, n_classes
+        self.name = name
+        self._n_classes = n_classes
 
     @property
     def n_classes(self) -> int:

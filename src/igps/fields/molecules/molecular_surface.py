@@ -118,7 +118,8 @@ def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
     """Return the balls of positive radius that lie in no other ball, largest first; of equal balls, the first one."""
     order = np.argsort(-radii, kind="stable")
     order = order[radii[order] > 0]
-    centres, radii = centres[order], radii[order]
+    centres = centres[order]
+    radii = radii[order]
     pairs = cKDTree(centres).query_pairs(radii[0] - radii[-1] + 1e-6, output_type="ndarray")
     small = pairs.max(axis=1)
     distance = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
@@ -148,7 +149,9 @@ def _neighbours(centres: Floats, radii: Floats) -> tuple[Integers, Integers]:
     distance = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
     meets = distance < radii[pairs].sum(axis=1)
     a, b = pairs[meets].T
-    ball, neighbour, distance = np.r_[a, b], np.r_[b, a], distance[meets]
+    ball = np.r_[a, b]
+    neighbour = np.r_[b, a]
+    distance = distance[meets]
     first = np.zeros(len(radii) + 1, dtype=np.int64)
     np.cumsum(np.bincount(ball, minlength=len(radii)), out=first[1:])
     return first, neighbour[np.lexsort((np.r_[distance, distance], ball))].astype(np.int64)
@@ -231,7 +234,8 @@ def _join(parts: Sequence[Surface]) -> Surface:
 
 def _shortest_links(parts: Sequence[Floats]) -> list[tuple[int, int]]:
     """Return the minimum spanning tree of the parts (Prim) as pairs of vertices, numbered through all parts."""
-    trees, links = [cKDTree(points) for points in parts], []
+    trees = [cKDTree(points) for points in parts]
+    links = []
     starts = np.cumsum([0, *map(len, parts)]).tolist()
     best = dict.fromkeys(
         range(1, len(parts)), (np.inf, 0, 0)
@@ -259,19 +263,21 @@ def _add_thread(vertices: Floats, faces: Integers, a: int, b: int, girth: float)
         int(at[areas[at].argmax()])
         for at in (np.flatnonzero((faces == v).any(axis=1)) for v in (a, b))
     ]
-    rims, new = [], []
+    rims = []
+    new = []
     for end, face in enumerate(ends):
         corners = vertices[faces[face]]
-        centre, perimeter = (
-            corners.mean(axis=0),
-            np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum(),
-        )
+        centre = corners.mean(axis=0)
+        perimeter = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
         vertices = np.concatenate(
             [vertices, centre + min(girth / perimeter, _MAX_THREAD_WIDTH) * (corners - centre)]
         )
         rims.append(len(vertices) - 3 + np.arange(3))
         for i, k in ((0, 1), (1, 2), (2, 0)):
-            c, d, e, f = faces[face][i], faces[face][k], rims[end][k], rims[end][i]
+            c = faces[face][i]
+            d = faces[face][k]
+            e = rims[end][k]
+            f = rims[end][i]
             new += [(c, d, e), (c, e, f)]
     # The rims face each other, so they run in opposite directions.
     rotations = [np.roll(rims[1][::-1], k) for k in range(3)]

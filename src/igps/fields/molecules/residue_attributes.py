@@ -42,7 +42,8 @@ def screened_potential(molecule: Molecule, points: Floats) -> Floats:
     Inside the ball of an atom, d is the radius of the ball.
     """
     charged = np.nonzero(molecule.charges)[0]
-    positions, radii = molecule.positions[charged], np.maximum(molecule.radii[charged], 1.0)
+    positions = molecule.positions[charged]
+    radii = np.maximum(molecule.radii[charged], 1.0)
     strength = BJERRUM_LENGTH * molecule.charges[charged]
     potential = np.zeros(len(points))
     for block in _blocks(len(points), len(charged)):

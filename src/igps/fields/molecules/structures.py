@@ -145,7 +145,8 @@ def _molecules(
     is_pqr: bool,
 ) -> tuple[list[Molecule], list[str]]:
     """Build the molecules of parts; return also the names of parts without usable atoms."""
-    molecules, left_out = [], []
+    molecules = []
+    left_out = []
     for name, chains, notes in parts:
         builder = _Builder(ligands, hydrogens or is_pqr, is_pqr)
         for chain in chains:
@@ -159,7 +160,9 @@ def _molecules(
 
 class _Builder:
     def __init__(self, ligands: bool, hydrogens: bool, is_pqr: bool) -> None:
-        self.ligands, self.hydrogens, self.is_pqr = ligands, hydrogens, is_pqr
+        self.ligands = ligands
+        self.hydrogens = hydrogens
+        self.is_pqr = is_pqr
         self.balls: list[tuple[Floats, float, float, int]] = []  # position, radius, charge, residue
         self._residues: list[tuple[str, Floats, float]] = []  # name, position, B-factor
         self._count: Counter[str] = Counter()
@@ -262,10 +265,12 @@ class _Builder:
             self._add_ball(position_of["CA"], residue_ball(name), charge)
             return
         self._count["side chain"] += 1
-        radius, centre = side_chain_ball(name), position_of["CA"]
+        radius = side_chain_ball(name)
+        centre = position_of["CA"]
         if {"N", "C"} <= position_of.keys():
             # The direction of Cβ in ideal tetrahedral geometry
-            b, c = centre - position_of["N"], position_of["C"] - centre
+            b = centre - position_of["N"]
+            c = position_of["C"] - centre
             direction = -0.58273431 * np.cross(b, c) + 0.56802827 * b - 0.54067466 * c
             centre = centre + radius * direction / max(float(np.linalg.norm(direction)), 1e-9)
         self._add_ball(centre, radius, charge)
@@ -328,7 +333,8 @@ def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
 
 def molecule_of(body: BodyRef) -> Molecule:
     """Return the atoms and residues of a body: of a chain, an assembly or a model, or of all models."""
-    part, stamp = body.part or "", stat_key(body.path)
+    part = body.part or ""
+    stamp = stat_key(body.path)
     words = part.split()  # in a file of several structures, the first is the name of a structure
     kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
     for kind in (*(kinds[word] for word in kinds if word in words), "models"):

@@ -21,7 +21,8 @@ from igps._compiled import REASSOCIATE, compiled
 # Minimal absolute value of the function at voxels wholly inside or outside, in shortest sides (0.5 is the largest that
 # all bodies allow), and weight of the second derivatives; each in smooth places and at edges. The values for smooth
 # places keep round bodies smooth, those for edges let faces run on to their edges.
-_MIN_ABS_VALUES, _STIFFNESS = (0.05, 0.3), (1.0, 0.1)
+_MIN_ABS_VALUES = (0.05, 0.3)
+_STIFFNESS = (1.0, 0.1)
 # Excess of the first solution's Laplacian over its surroundings: up to the first value a place is smooth, from the
 # second on it is an edge. An edge bends more than the faces beside it; a thin round body bends everywhere.
 _BEND_LIMITS = (0.05, 0.2)
@@ -39,7 +40,9 @@ PAD = _BAND + 2
 """Empty voxels that the grid must have on every side."""
 
 # Larger grids, such as those of thin vessels, are solved in blocks of this side, each with an overlap, in voxels.
-_MAX_VOXELS_AT_ONCE, _BLOCK, _OVERLAP = 1 << 22, 48, 12
+_MAX_VOXELS_AT_ONCE = 1 << 22
+_BLOCK = 48
+_OVERLAP = 12
 
 
 def smooth_field(share: Singles, sides: Floats) -> Floats | Singles:
@@ -66,14 +69,13 @@ def smooth_field(share: Singles, sides: Floats) -> Floats | Singles:
             continue
         (box,) = ndimage.find_objects(inside.view(np.uint8))
         first, last = (start + [getattr(side, end) for side in box] for end in ("start", "stop"))
-        box_low, box_high = (
-            np.maximum(first - margin, start),
-            np.minimum(last + margin, start + inside.shape),
-        )
+        box_low = np.maximum(first - margin, start)
+        box_high = np.minimum(last + margin, start + inside.shape)
         padding = list(zip(margin - (first - box_low), margin - (box_high - last), strict=True))
         solution = _solve(np.pad(share[tuple(map(slice, box_low, box_high))], padding), sides)
         origin = first - margin  # of the solution, in the grid
-        a, b = np.maximum(low, box_low), np.minimum(high, box_high)
+        a = np.maximum(low, box_low)
+        b = np.minimum(high, box_high)
         if (a < b).all():
             block = solution[tuple(map(slice, a - origin, b - origin))]
             field[tuple(map(slice, a, b))] = np.clip(block, -far, far)
@@ -127,7 +129,8 @@ def filled_volume(field: Floats | Singles, reach: float) -> tuple[float, float]:
     """
     near = np.nonzero(np.abs(field[1:-1, 1:-1, 1:-1]) < reach)
     at = np.ravel_multi_index(tuple(index + 1 for index in near), field.shape)
-    values, width = field.reshape(-1), np.full(len(at), 1e-3)
+    values = field.reshape(-1)
+    width = np.full(len(at), 1e-3)
     for step in np.cumprod(
         [1, *field.shape[:0:-1]]
     ).tolist():  # not its strides: splines permute the axes in memory

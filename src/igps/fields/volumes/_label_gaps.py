@@ -25,10 +25,12 @@ def fill_missed_slices(mask: Booleans, notes: list[str]) -> Booleans:
     label[(size < SPECK_VOLUME * np.count_nonzero(mask))[label]] = 0
     filled = mask.copy()
     for axis in range(3):
-        slices, filled_slices = np.moveaxis(label, axis, 0), np.moveaxis(filled, axis, 0)
+        slices = np.moveaxis(label, axis, 0)
+        filled_slices = np.moveaxis(filled, axis, 0)
         lines = []  # rows: the two pieces, the slice below the gap, the width of the gap, row and column in the slice
         for width in range(1, min(_MAX_MISSED_SLICES, len(slices) - 2) + 1):
-            below, above = slices[: -width - 1], slices[width + 1 :]
+            below = slices[: -width - 1]
+            above = slices[width + 1 :]
             start, row, column = np.nonzero((below > 0) & (above > 0) & (below != above))
             pieces = np.sort([below[start, row, column], above[start, row, column]], axis=0)
             lines.append(

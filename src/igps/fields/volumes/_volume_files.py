@@ -23,7 +23,8 @@ from igps.mesh.mesh import unit_of_length
 _WORK_BYTES = 4  # bytes a voxel to hold and count labels, beyond those of the file
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # DICOM and ITK use LPS
 _EXPORT = "Export the labels."
-_NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")
+_NRRD = (".nrrd", ".nhdr")
+_META = (".mha", ".mhd")
 _MITK = "org.mitk.multilabel.segmentation.labelgroups"
 _MAX_HEADER = 1 << 24  # bytes
 _MGH_FOOTER = 20  # bytes between voxels and tags
@@ -374,7 +375,8 @@ def _tifffile(path: Path) -> RawVolume:
     with tifffile.TiffFile(path) as file:
         _check_complete(file, path)
         series = file.series[0]
-        axes, dtype = series.axes, np.dtype(series.dtype)
+        axes = series.axes
+        dtype = np.dtype(series.dtype)
         if "S" in axes:
             check_voxels(path, series.shape[:3], dtype.itemsize, series.shape[axes.index("S")])
         if dtype.kind not in "biuf":
@@ -440,7 +442,8 @@ def _tiff_sides(file: Any) -> tuple[tuple[float, float, float], str | None]:
             if len(known) == 3
             else ((1.0, 1.0, 1.0), None)
         )
-    metadata, tags = file.imagej_metadata, file.pages[0].tags
+    metadata = file.imagej_metadata
+    tags = file.pages[0].tags
     if metadata is None:
         return (1.0, 1.0, 1.0), None
     # ImageJ omits resolutions of 1. Without a unit the ratios of the sides still hold

@@ -40,9 +40,7 @@ class ImageAttribute(FileAttribute):
         interpolate = partial(
             map_coordinates, coordinates=(indices[inside] - low).T, order=1, mode="nearest"
         )
-        weight, sums = (
-            interpolate(known.astype(np.float64)),
-            interpolate(np.where(known, block, 0.0)),
-        )
+        weight = interpolate(known.astype(np.float64))
+        sums = interpolate(np.where(known, block, 0.0))
         values[inside] = np.where(weight > 0.5, sums / np.maximum(weight, 0.5), np.nan)
         return values

@@ -43,10 +43,8 @@ def _read_dx(path: Path) -> tuple[NDArray[Any], Floats]:
     text = path.read_bytes()
     head, _, body = text.partition(b"data follows")
     triple = rb"\s+(\S+)\s+(\S+)\s+(\S+)"
-    counts, origin = (
-        re.search(rb"gridpositions\s+counts" + triple, head),
-        re.search(rb"origin" + triple, head),
-    )
+    counts = re.search(rb"gridpositions\s+counts" + triple, head)
+    origin = re.search(rb"origin" + triple, head)
     deltas = re.findall(rb"delta" + triple, head)
     if counts is None or origin is None or len(deltas) != 3:
         raise MeshError(
@@ -62,10 +60,8 @@ def _read_dx(path: Path) -> tuple[NDArray[Any], Floats]:
     if len(words) < n_values:
         raise MeshError(f"{path}: expected {n_values} values, got {len(words)}. Export it again.")
     affine = np.eye(4)
-    affine[:3, :3], affine[:3, 3] = (
-        np.array(deltas, dtype=float).T,
-        np.array(origin.groups(), dtype=float),
-    )
+    affine[:3, :3] = np.array(deltas, dtype=float).T
+    affine[:3, 3] = np.array(origin.groups(), dtype=float)
     return np.array(words, dtype=np.float32).reshape(sizes), affine
 
 
@@ -84,7 +80,8 @@ def _read_map(path: Path) -> tuple[NDArray[Any], Floats]:
             f"{path}: expected {n_expected} bytes, got {path.stat().st_size}. Export it again."
         )
     with mrcfile.open(path) as file:
-        header, values = file.header, file.data
+        header = file.header
+        values = file.data
         if values is None or values.ndim != 3 or not np.allclose(header.cellb.item(), 90):
             raise MeshError(f"{path}: expected a map of three axes at right angles. Resample it.")
         # The axes (1 to 3) of columns, rows and sections; the values are (sections, rows, columns)
@@ -99,6 +96,8 @@ def _read_map(path: Path) -> tuple[NDArray[Any], Floats]:
             np.argsort(along)
         ]
         # If a file has both origin and starts, they state the same position, and most programs use the origin
-        origin, affine = np.array(header.origin.item(), dtype=float), np.eye(4)
-        affine[:3, :3], affine[:3, 3] = np.diag(sides), origin if origin.any() else starts * sides
+        origin = np.array(header.origin.item(), dtype=float)
+        affine = np.eye(4)
+        affine[:3, :3] = np.diag(sides)
+        affine[:3, 3] = origin if origin.any() else starts * sides
         return np.array(values.transpose(np.argsort(along[::-1]))), affine

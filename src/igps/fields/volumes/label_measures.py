@@ -39,7 +39,8 @@ def measure(voxels: LabelVoxels) -> VoxelMeasures:
 def thinnest_part(mask: Booleans) -> int:
     """Return the diameter of the largest balls that fit into the mask nearly everywhere, 1 to 10 voxels."""
     mask = np.pad(mask, 1)
-    n_voxels, cube = np.count_nonzero(mask), _MAX_DIAMETER + 1
+    n_voxels = np.count_nonzero(mask)
+    cube = _MAX_DIAMETER + 1
     # Where cubes fit, balls do; cubes are found much faster.
     cubes = ndimage.maximum_filter(ndimage.minimum_filter(mask, cube), cube)
     if np.count_nonzero(cubes) >= _MIN_COVERED * n_voxels:

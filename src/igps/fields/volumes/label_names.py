@@ -116,7 +116,8 @@ def names_in_tags(content: bytes) -> dict[int, str]:
     if tag and read_number() == _NEW_LAYOUT:
         read_number(), read_bytes()  # the largest label, the path of the table
         for _ in range(min(read_number(), len(content) // 24)):  # an entry takes at least 24 bytes
-            label, name = read_number(), read_bytes()
+            label = read_number()
+            name = read_bytes()
             names[label] = name.rstrip(b"\0").decode("utf-8", "replace")
             stream.read(16)  # red, green, blue and transparency
     return cleaned(names)

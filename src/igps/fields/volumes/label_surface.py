@@ -172,7 +172,8 @@ def _clean(
     hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
     if n_hollow < 2:
         return mask, []
-    outside, hollow = hollow[0, 0, 0], hollow[1:-1, 1:-1, 1:-1]
+    outside = hollow[0, 0, 0]
+    hollow = hollow[1:-1, 1:-1, 1:-1]
     size = np.bincount(hollow.reshape(-1))
     size[[0, outside]] = 0
     cavities = [] if min_hole is None else np.flatnonzero(size >= min_hole).tolist()
@@ -234,7 +235,8 @@ def _coarsen(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Single
     """Return the shares of larger voxels, and how many voxels of the mask each takes along each axis."""
     from skimage.measure import block_reduce
 
-    share, factor = mask.astype(np.float32), np.ones(3, dtype=np.int64)
+    share = mask.astype(np.float32)
+    factor = np.ones(3, dtype=np.int64)
     n_pieces = ndimage.label(mask, TOUCHING)[1]
     while _n_vertices(mask, spacing * factor) > _MAX_SURPLUS * max_vertices:
         sides = spacing * factor
@@ -249,7 +251,9 @@ def _coarsen(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Single
         if np.count_nonzero(size) - len(island) != n_pieces:
             break
         coarse[np.isin(label, island) & (label > 0)] = 0
-        share, factor, mask = coarse, factor * np.where(is_halved, 2, 1), np.asarray(coarse >= 0.5)
+        share = coarse
+        factor = factor * np.where(is_halved, 2, 1)
+        mask = np.asarray(coarse >= 0.5)
     return share, factor
 
 
@@ -272,10 +276,8 @@ def _refine(
             index = np.arange(field.shape[axis])
             spline = CubicSpline(index, field, axis=axis, bc_type="natural")
             field = spline(np.linspace(0, index[-1], index[-1] * n + 1))
-    volume, min_abs = (
-        share.sum(dtype=np.float64) * n_parts.prod(),
-        MIN_ABS_VALUE * float(sides.min()),
-    )
+    volume = share.sum(dtype=np.float64) * n_parts.prod()
+    min_abs = MIN_ABS_VALUE * float(sides.min())
     for _ in range(_N_LEVELS):
         filled, slope = filled_volume(field, float(sides.sum()))
         field -= (volume - filled) / max(slope, 1e-9)

@@ -101,7 +101,8 @@ class LabelVolume:
     @cached_property
     def bodies(self) -> tuple[LabelBody, ...]:
         """The bodies of all labels that occur, in ascending order; names that repeat are followed by the label."""
-        names, bodies = self.names or {}, []
+        names = self.names or {}
+        bodies = []
         for layer, labels in enumerate(self.layers):
             known = {value: label for label, index, value in self.segments or () if index == layer}
             for value, n_voxels, box in _count_labels(labels, self.name):
@@ -251,7 +252,8 @@ def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
     order = linear_sum_assignment(-np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0))[
         1
     ]
-    mask, affine = mask.transpose(order), affine[:, [*order, 3]]
+    mask = mask.transpose(order)
+    affine = affine[:, [*order, 3]]
     for axis in np.nonzero(np.diag(affine)[:3] < 0)[0]:
         affine[:3, 3] += affine[:3, axis] * (mask.shape[axis] - 1)
         affine[:3, axis] *= -1
@@ -265,7 +267,8 @@ def _labelled(
     """Turn the values of a volume into labels, and find their names; see `read_label_volume`."""
     notes = list(raw.notes)
     layers = tuple(_integer_labels(values, name, options.threshold, notes) for values in raw.layers)
-    segments, names = None, raw.names
+    segments = None
+    names = raw.names
     if raw.segments:
         # The same value may stand for different segments in different layers
         values = [value for _, _, value in raw.segments]
@@ -344,13 +347,15 @@ def _count_labels(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]
         for plane in array:
             counts += np.bincount(plane.ravel(), minlength=len(counts))
         counts[0] = 0
-        values, numbered = np.nonzero(counts)[0], array
+        values = np.nonzero(counts)[0]
+        numbered = array
         counts = counts[values]
     else:
         values, index, counts = np.unique(array, return_inverse=True, return_counts=True)
         start = int(values[0] == 0)
         numbered = index.reshape(array.shape) + (1 - start)
-        values, counts = values[start:], counts[start:]
+        values = values[start:]
+        counts = counts[start:]
     n = len(values)
     if n > _MAX_LABELS or (n > _MAX_UNCHECKED and _is_speckled(array, values[counts.argmax()])):
         raise MeshError(
