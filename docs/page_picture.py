@@ -14,7 +14,9 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-page_path, name, out = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3])
+page_path = Path(sys.argv[1])
+name = sys.argv[2]
+out = Path(sys.argv[3])
 flags = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",

@@ -172,7 +172,8 @@ def movements(
     lengths = []
     missing = []
     for answer in answers:
-        before, after = answer[""], answer[column]
+        before = answer[""]
+        after = answer[column]
         if isinstance(before, str):
             missing.append(before)
         elif isinstance(after, str):

@@ -136,7 +136,9 @@ class _GapSearch:
         # A path over a landmark is an upper bound of the shortest path, so that few exact paths are needed
         upper = (self._landmarks[:, pair[:, 0]] + self._landmarks[:, pair[:, 1]]).min(axis=0)
         far = upper >= (least_path or 0)
-        pair, gap, upper = pair[far], gap[far], upper[far]
+        pair = pair[far]
+        gap = gap[far]
+        upper = upper[far]
         unit = np.ones(len(pair)) if least_path is None else gap
         queue = [(-bound, i, False) for i, bound in enumerate((upper / unit).tolist())]
         heapq.heapify(queue)
