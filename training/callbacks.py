@@ -69,7 +69,8 @@ class TrainingCurve(Callback):
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Discard the values of an interrupted epoch."""
-        self._losses, self._scores = [], {}
+        self._losses = []
+        self._scores = {}
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int

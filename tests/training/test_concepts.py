@@ -106,7 +106,8 @@ def test_pose_draws_the_histogram_of_every_mesh(
     for line, curve in zip(lines, expected, strict=True):
         np.testing.assert_allclose(line.get_xdata(), (np.arange(64) + 0.5) / 16, rtol=1e-6)
         np.testing.assert_allclose(line.get_ydata(), 100 * curve, atol=0.02)
-    eggs, balls = expected[:3], expected[3:]
+    eggs = expected[:3]
+    balls = expected[3:]
     within = np.median([chi_square(eggs[i], eggs[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
     others = np.median([chi_square(egg, ball) for egg in eggs for ball in balls])
     (row,) = re.findall(r"^egg 3 (\S+) (\S+)$", printed, re.MULTILINE)

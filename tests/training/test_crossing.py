@@ -25,7 +25,8 @@ def tried_one_by_one(vertices: np.ndarray, faces: np.ndarray) -> set[tuple[int, 
     for i, j in itertools.combinations(range(len(faces)), 2):
         if set(faces[i]) & set(faces[j]):
             continue
-        a, b = vertices[faces[i]], vertices[faces[j]]
+        a = vertices[faces[i]]
+        b = vertices[faces[j]]
         sides = [(x[k], x[(k + 1) % 3], y) for x, y in ((a, b), (b, a)) for k in range(3)]
         if any(passes(*side) for side in sides):
             found.add((i, j))

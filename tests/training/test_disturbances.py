@@ -109,7 +109,8 @@ def test_clip_keeps_the_largest_piece() -> None:
 
 
 def test_scale_and_motion_keep_the_form(blob: Mesh) -> None:
-    larger, moved = scale(blob, 7), move(blob, seed=1)
+    larger = scale(blob, 7)
+    moved = move(blob, seed=1)
     np.testing.assert_allclose(larger.vertices, 7 * blob.vertices)
     for mesh in (larger, moved):
         np.testing.assert_array_equal(mesh.faces, blob.faces)

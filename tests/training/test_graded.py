@@ -25,7 +25,8 @@ from igps.shapes.templates import TEMPLATES
 CLASSES = body_classes(0)
 # The named classes that bend, and one class of each kind.
 FIRST = {one.name.split("-")[0]: i for i, one in reversed(list(enumerate(CLASSES)))}
-COUNTS, SUM = [(3614, 7224), (2924, 5844)], 6960.694254095106
+COUNTS = [(3614, 7224), (2924, 5844)]
+SUM = 6960.694254095106
 N_VERTICES = (1500, 2500)
 BENDING = [
     "biped",
@@ -72,7 +73,8 @@ def test_every_family_gives_bodies_and_poses(poses: dict[str, Pose]) -> None:
 
 
 def test_a_pose_is_nearly_isometric_to_the_surface_at_rest(poses: dict[str, Pose]) -> None:
-    area, volume = [], []
+    area = []
+    volume = []
     for pose in poses.values():
         rest, bent = (trimesh.Trimesh(v, pose.faces, process=False) for v in (pose.rest, pose.bent))
         area.append(abs(bent.area / rest.area - 1))
@@ -194,7 +196,8 @@ def test_both_levels_are_labels(shapes: GradedShapes, made: list[GradedShape]) -
 def test_the_look_alikes_can_be_left_out() -> None:
     assert set(LOOK_ALIKE_TEMPLATES) == set(TEMPLATES)
     assert set(LOOK_ALIKE_FAMILIES) < set(KINDS)
-    with_them, without = GradedShapes(200), GradedShapes(200, look_alikes=False)
+    with_them = GradedShapes(200)
+    without = GradedShapes(200, look_alikes=False)
     assert with_them.class_names[:12] == list(TEMPLATES)
     assert len(set(with_them.class_names)) == len(set(without.class_names)) == 200
     left = {name.split("-")[0] for name in without.class_names}
@@ -267,7 +270,8 @@ def test_arguments_out_of_range_are_named(arguments: dict[str, int]) -> None:
 def counted_volume(solid: Plate | Helix) -> float:
     """By counting random points of the solid's box, made somewhat larger."""
     low, high = solid.box()
-    low, high = low - 0.05, high + 0.05
+    low = low - 0.05
+    high = high + 0.05
     points = np.random.default_rng(0).uniform(low, high, (300_000, 3))
     inside = solid.distance(*points.T) < 0.0
     assert (points[inside] >= solid.box()[0] - 1e-6).all()

@@ -67,29 +67,3 @@ def test_without_individuals_names_are_class_body_and_pose() -> None:
     plain = GradedShapes(1, 1, 1, seed=3, n_vertices=(1500, 1800))
     assert plain.names == [f"{plain.class_names[0]}/00/00"]
     assert individual_of(plain.names[0]) == body_of(plain.names[0]) == f"{plain.class_names[0]}/00"
-
-
-def test_sides_differ_by_the_asymmetry_and_rigid_bodies_only_by_a_motion() -> None:
-    """The grid of a pose follows from its number alone, so that vertices correspond in both sets of shapes."""
-    arguments = {"seed": 3, "n_vertices": (1500, 1800), "n_individuals": 2}
-    rigid = GradedShapes(2, 1, 2, rigid=True, **arguments)
-    sides = GradedShapes(2, 1, 2, rigid=True, asymmetry=(0.003, 0.012), **arguments)
-    bends, growths = [], []
-    for index in range(len(rigid)):
-        before, after = rigid.pose(index), sides.pose(index)
-        assert np.array_equal(before.rest, before.bent)
-        assert np.array_equal(before.faces, after.faces)
-        size = trimesh.Trimesh(before.rest, before.faces, process=False).area ** 0.5
-        volumes = (
-            trimesh.Trimesh(one.rest, one.faces, process=False).volume for one in (after, before)
-        )
-        growths.append(next(volumes) / next(volumes))
-        step = np.linalg.norm(after.rest - before.rest, axis=1).max() / size
-        assert 0.003 * 0.9 < step < 0.012 * 1.1
-        posed = GradedShapes(2, 1, 2, **arguments).pose(index)
-        bends.append(not np.array_equal(posed.rest, posed.bent))
-    assert any(bends)
-    with pytest.raises(ValueError, match=r"asymmetry: expected two positive numbers"):
-        GradedShapes(asymmetry=(0.01, -0.01))
-    # Both sides of an individual have asymmetries of their own, of which some change the volume
-    assert np.abs(np.subtract(growths[::2], growths[1::2])).min() > 0.002

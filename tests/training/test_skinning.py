@@ -34,7 +34,8 @@ def scalar_first(rotation: Rotation) -> Array:
 
 
 def test_products_are_those_of_rotations() -> None:
-    a, b = Rotation.random(20, rng=1), Rotation.random(20, rng=2)
+    a = Rotation.random(20, rng=1)
+    b = Rotation.random(20, rng=2)
     found = product(scalar_first(a), scalar_first(b))
     expected = scalar_first(a * b)
     expected *= np.sign((found * expected).sum(axis=1, keepdims=True))
@@ -42,13 +43,15 @@ def test_products_are_those_of_rotations() -> None:
 
 
 def test_a_motion_turns_and_then_moves() -> None:
-    turns, steps = Rotation.random(50, rng=3), g.normal(size=(50, 3))
+    turns = Rotation.random(50, rng=3)
+    steps = g.normal(size=(50, 3))
     found = transform(motion(scalar_first(turns), steps), POINTS)
     np.testing.assert_allclose(found, turns.apply(POINTS) + steps, atol=1e-13)
 
 
 def test_a_turn_about_a_point_leaves_it_where_it_is() -> None:
-    vectors, centres = g.normal(size=(50, 3)), g.normal(size=(50, 3))
+    vectors = g.normal(size=(50, 3))
+    centres = g.normal(size=(50, 3))
     turns = rotations_about(centres, vectors)
     np.testing.assert_allclose(transform(turns, centres), centres, atol=1e-13)
     expected = Rotation.from_rotvec(vectors).apply(POINTS - centres) + centres
@@ -72,7 +75,8 @@ def test_a_blend_is_rigid_and_half_way_between() -> None:
     """Of a rotation and no motion about the same point: half the angle."""
     axis = np.array([0.0, 0.0, 1.0])
     centre = np.array([1.0, 2.0, 3.0])
-    a, b = rotations_about(centre, 0.0 * axis), rotations_about(centre, 1.6 * axis)
+    a = rotations_about(centre, 0.0 * axis)
+    b = rotations_about(centre, 1.6 * axis)
     half = normalized(Motions(0.5 * (a.real + b.real), 0.5 * (a.dual + b.dual)))
     expected = Rotation.from_rotvec(0.8 * axis).apply(POINTS - centre) + centre
     np.testing.assert_allclose(transform(half, POINTS), expected, atol=1e-13)
@@ -85,10 +89,12 @@ def cylinder(length: float, radius: float) -> trimesh.Trimesh:
     )
     side = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(48), np.arange(120), indexing="ij")
-    a, b = (i * 121 + j).ravel(), ((i + 1) % 48 * 121 + j).ravel()
+    a = (i * 121 + j).ravel()
+    b = ((i + 1) % 48 * 121 + j).ravel()
     walls = np.concatenate([np.stack([a, b, b + 1], axis=1), np.stack([a, b + 1, a + 1], axis=1)])
     ring = np.arange(48) * 121
-    low, high = len(side), len(side) + 1
+    low = len(side)
+    high = len(side) + 1
     caps = [[low, b, a] for a, b in zip(ring, np.roll(ring, -1), strict=True)]
     caps += [[high, a + 120, b + 120] for a, b in zip(ring, np.roll(ring, -1), strict=True)]
     return trimesh.Trimesh(
@@ -104,7 +110,8 @@ def straight_rod(length: float, radius: float, n: int = 61) -> Rod:
 
 
 def bent_bar(turns: Array) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    bar, rod = cylinder(3.0, 0.2), straight_rod(3.0, 0.2, len(turns))
+    bar = cylinder(3.0, 0.2)
+    rod = straight_rod(3.0, 0.2, len(turns))
     rig = Rig((rod,), np.zeros(1, dtype=np.int64))
     binding = Binding(np.ones((len(bar.vertices), 1)), bar.vertices[:, 2:3])
     vertices = bend(bar.vertices, rig, binding, rod_motions(rig, [turns]))

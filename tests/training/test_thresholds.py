@@ -16,7 +16,8 @@ def test_a_threshold_lies_between_what_does_not_overlap() -> None:
 
 def test_where_they_overlap_the_rate_decides() -> None:
     generator = np.random.default_rng(1)
-    same, other = generator.normal(1, 0.3, 400), generator.normal(2, 0.3, 3000)
+    same = generator.normal(1, 0.3, 400)
+    other = generator.normal(2, 0.3, 3000)
     found = threshold_between(same, other, 0.01)
     assert found.n_false == sum(one <= found.distance for one in other) == 30
     assert found.n_found == sum(one <= found.distance for one in same)

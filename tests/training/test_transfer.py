@@ -70,7 +70,8 @@ def _rod() -> tuple[np.ndarray, np.ndarray]:
 
 def _bend(points: np.ndarray) -> np.ndarray:
     """Bend the z axis into an arc of radius 4, perpendicular slices staying flat."""
-    angles, radii = points[:, 2] / 4.0, 4.0 + points[:, 0]
+    angles = points[:, 2] / 4.0
+    radii = 4.0 + points[:, 0]
     return np.stack([radii * np.cos(angles), points[:, 1], radii * np.sin(angles)], axis=1)
 
 

@@ -42,14 +42,17 @@ def paths(mesh: Mesh) -> NDArray[np.float64]:
 
 def test_weld_adds_a_handle_and_nothing_else() -> None:
     mesh = horseshoe()
-    a, b = len(mesh.vertices) - 2, len(mesh.vertices) - 1  # the middles of the two ends
+    # the middles of the two ends
+    a = len(mesh.vertices) - 2
+    b = len(mesh.vertices) - 1
     welded = weld(mesh, a, b)
     assert surface_genus(mesh) == 0
     assert surface_genus(welded) == 1
     np.testing.assert_array_equal(welded.vertices, mesh.vertices)
     assert len(welded.faces) == len(mesh.faces) - 2 + TUBE_FACES
     old = {tuple(face) for face in mesh.faces.tolist()}
-    kept, tube = welded.faces[:-TUBE_FACES].tolist(), welded.faces[-TUBE_FACES:]
+    kept = welded.faces[:-TUBE_FACES].tolist()
+    tube = welded.faces[-TUBE_FACES:]
     removed = old - {tuple(face) for face in kept}
     assert {tuple(face) for face in kept} < old
     assert len(removed) == 2
@@ -65,7 +68,8 @@ def test_weld_adds_a_handle_and_nothing_else() -> None:
 
 def test_weld_takes_the_shortest_tube() -> None:
     mesh = horseshoe(0.15)
-    a, b = 3, len(mesh.vertices) - 10
+    a = 3
+    b = len(mesh.vertices) - 10
     at = [[face for face in mesh.faces.tolist() if vertex in face] for vertex in (a, b)]
     lengths = [
         sum(

@@ -16,7 +16,9 @@ from training.shapes.polygons import Frame, Prism
 
 def vessel(g: np.random.Generator, body: str, handles: int, foot: str, extra: str) -> Skeleton:
     """Build a hollow body of revolution with handles, a foot, and a spout or knobs."""
-    wide, high, wall = g.uniform(0.4, 0.6), g.uniform(0.95, 1.4), g.uniform(0.17, 0.21)
+    wide = g.uniform(0.4, 0.6)
+    high = g.uniform(0.95, 1.4)
+    wall = g.uniform(0.17, 0.21)
     profile = [(float(r), float(z)) for r, z in _profile(g, body, wide, high)]
     radii, heights = np.array(profile).T
     rising = slice(1, None) if radii[0] == 0.0 and heights[1] == 0.0 else slice(0, None)
@@ -113,22 +115,36 @@ def wheel(g: np.random.Generator, n: int, spokes: int, limbs: str, end: str) -> 
 
 def table(g: np.random.Generator, top: str, legs: int, back: str) -> Skeleton:
     """Build a plate on legs, with or without a back."""
-    wide, thick = g.uniform(0.5, 0.75), g.uniform(0.17, 0.24)
-    hoop, long = top == "hoop", top == "long"
+    wide = g.uniform(0.5, 0.75)
+    thick = g.uniform(0.17, 0.24)
+    hoop = top == "hoop"
+    long = top == "long"
     solid: Solid
     match top:  # the plate, and the distances of legs and back from its centre
         case "round":
-            solid, reach, rear = Prism(24, wide, thick, 0.07), 0.72 * wide, 0.8 * wide
+            solid = Prism(24, wide, thick, 0.07)
+            reach = 0.72 * wide
+            rear = 0.8 * wide
         case "square":
-            solid, reach, rear = Prism(4, 1.25 * wide, thick, 0.07), 0.95 * wide, 0.75 * wide
+            solid = Prism(4, 1.25 * wide, thick, 0.07)
+            reach = 0.95 * wide
+            rear = 0.75 * wide
         case "long":
-            solid, reach, rear = Box((1.5 * wide, 2.9 * wide, thick), 0.07), 0.72 * wide, 1.3 * wide
+            solid = Box((1.5 * wide, 2.9 * wide, thick), 0.07)
+            reach = 0.72 * wide
+            rear = 1.3 * wide
         case "triangle":
-            solid, reach, rear = Prism(3, 1.4 * wide, thick, 0.07), 0.9 * wide, 0.5 * wide
+            solid = Prism(3, 1.4 * wide, thick, 0.07)
+            reach = 0.9 * wide
+            rear = 0.5 * wide
         case _:
-            solid, reach, rear = Frame(20, wide, 0.13), wide, wide
-    splay, high = g.uniform(0.0, 0.5), g.uniform(0.5, 1.1)
-    kind, end = str(g.choice(["straight", "bent", "jointed"])), str(g.choice(["plain", "knob"]))
+            solid = Frame(20, wide, 0.13)
+            reach = wide
+            rear = wide
+    splay = g.uniform(0.0, 0.5)
+    high = g.uniform(0.5, 1.1)
+    kind = str(g.choice(["straight", "bent", "jointed"]))
+    end = str(g.choice(["plain", "knob"]))
     style = LimbStyle.draw(g, kind, end, high, 0.11, 8.0)
     leg = replace(style, curl=g.uniform(0.4, 0.9)).grow()
     if legs == 1:
@@ -136,7 +152,8 @@ def table(g: np.random.Generator, top: str, legs: int, back: str) -> Skeleton:
         stem = limb("stem", [high], [0.15, 0.15], [(4, 4)], [plate])
         parts = [stem.joined((reach if hoop else 0.0, 0, 0), DOWN)]
     else:
-        corners, stretch = circle(legs, np.pi / 4 if long else 0.0), 1.9 if long else 1.0
+        corners = circle(legs, np.pi / 4 if long else 0.0)
+        stretch = 1.9 if long else 1.0
         parts = [
             leg.joined((reach * c, stretch * reach * s, 0), (splay * c, splay * s, -1))
             for c, s in corners
@@ -177,7 +194,8 @@ def tool(g: np.random.Generator, shaft: str, head: str, pommel: str) -> Skeleton
 
 def tongs(g: np.random.Generator, jaw: str, grip: str, arms: int) -> Skeleton:
     """Build two or three arms that cross at a pivot."""
-    front, rear = g.uniform(0.6 if jaw in ("plain", "hook") else 0.85, 1.1), g.uniform(0.85, 1.3)
+    front = g.uniform(0.6 if jaw in ("plain", "hook") else 0.85, 1.1)
+    rear = g.uniform(0.85, 1.3)
     opening = g.uniform(26.0, 38.0) if arms == 2 else g.uniform(38.0, 48.0)
     r = g.uniform(0.11, 0.14)
     tip = ending(jaw, 0.8 * r, "jaw", (0, 0, front))
@@ -199,18 +217,20 @@ def stack(g: np.random.Generator, layers: tuple[str, ...], side: str) -> Skeleto
         solid: Solid
         match layer:
             case "ball":
-                solid, high = Blob((size, size, size * g.uniform(0.7, 1.2))), 1.6 * size
+                solid = Blob((size, size, size * g.uniform(0.7, 1.2)))
+                high = 1.6 * size
             case "block":
-                solid, high = (
-                    Box((1.7 * size, 1.7 * size * g.uniform(0.6, 1.0), 1.8 * size), 0.06),
-                    1.7 * size,
-                )
+                solid = Box((1.7 * size, 1.7 * size * g.uniform(0.6, 1.0), 1.8 * size), 0.06)
+                high = 1.7 * size
             case "plate":
-                solid, high = Prism(int(g.choice([3, 4, 6, 24])), 1.6 * size, 0.22, 0.08), 0.18
+                solid = Prism(int(g.choice([3, 4, 6, 24])), 1.6 * size, 0.22, 0.08)
+                high = 0.18
             case "post":
-                solid, high = Prism(24, 0.2, 1.2 * size, 0.06), 1.15 * size
+                solid = Prism(24, 0.2, 1.2 * size, 0.06)
+                high = 1.15 * size
             case _:
-                solid, high = Ring(size, 0.13), 2.0 * size + 0.1
+                solid = Ring(size, 0.13)
+                high = 2.0 * size + 0.1
         children = tuple(replace(child, at=(0, 0, high)) for child in children)
         if i == 0:
             # A hoop has its limbs on the left and right, where it has its tube. Posts are thin whatever their height.

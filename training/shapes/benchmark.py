@@ -4,7 +4,7 @@ import contextlib
 import logging
 import operator
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -26,9 +26,8 @@ from training.shapes.scans import Scan
 
 _VERSION = 2  # raised when the same arguments give other meshes
 _MAX_ATTEMPTS = 6
-_KIN, _BODY, _POSE, _INDIVIDUAL, _SIDE = range(
-    10, 15
-)  # parts of seeds that make random streams independent
+# Parts of seeds that make random streams independent.
+_KIN, _BODY, _POSE, _INDIVIDUAL = range(10, 14)
 _N_SIBLINGS = 2  # successive bodies with the same skeleton, which are hard to tell apart
 
 _log = logging.getLogger(__name__)
@@ -69,9 +68,6 @@ class GradedShapes:
             if not, other classes take their places.
         n_individuals: number of similar individuals of each body, each in `n_poses` poses (see `individuals`); 0 for
             the body itself.
-        asymmetry: smallest and largest displacement by which each pose of a body or individual differs from it, as a
-            left bone differs from a right one, in units of √area; None for no difference.
-        rigid: whether bodies that could bend keep their shape at rest.
 
     Raises:
         ValueError: an argument is out of range; or, on access, a shape cannot be made at this resolution.
@@ -87,8 +83,6 @@ class GradedShapes:
         n_vertices: tuple[int, int] = (2400, 5000),
         look_alikes: bool = True,
         n_individuals: int = 0,
-        asymmetry: tuple[float, float] | None = None,
-        rigid: bool = False,
     ) -> None:
         check_at_least(1, n_classes=n_classes, n_bodies=n_bodies, n_poses=n_poses)
         check_at_least(0, seed=seed, n_individuals=n_individuals)
@@ -97,13 +91,13 @@ class GradedShapes:
                 f"n_vertices: expected two numbers, the first at least 1500 and no more than the second, "
                 f"got {n_vertices}."
             )
-        if asymmetry is not None and not 0 < asymmetry[0] <= asymmetry[1]:
-            raise ValueError(
-                f"asymmetry: expected two positive numbers, the first not larger, got {asymmetry}."
-            )
-        self.n_classes, self.n_bodies, self.n_poses = n_classes, n_bodies, n_poses
-        self.seed, self.n_vertices, self.look_alikes = seed, n_vertices, look_alikes
-        self.n_individuals, self.asymmetry, self.rigid = n_individuals, asymmetry, rigid
+        self.n_classes = n_classes
+        self.n_bodies = n_bodies
+        self.n_poses = n_poses
+        self.seed = seed
+        self.n_vertices = n_vertices
+        self.look_alikes = look_alikes
+        self.n_individuals = n_individuals
         classes = body_classes(seed, look_alikes)
         if n_classes > len(classes):
             raise ValueError(
@@ -150,7 +144,7 @@ class GradedShapes:
         body_class, number, individual_number, pose = self._numbers(index)
         name = self.names[operator.index(index)]
         try:
-            body = self._side(body_class, number, individual_number, pose)
+            body = self._individual(body_class, number, individual_number)
         except ValueError as error:
             raise self._failure(name, str(error)) from error
         reason = ""
@@ -165,7 +159,8 @@ class GradedShapes:
                 _log.debug("%s: attempt %d: %s", name, attempt + 1, reason)
                 continue
             label = self._classes[body_class].name
-            vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+            vertices = np.array(mesh.vertices)
+            faces = np.array(mesh.faces)
             return GradedShape(
                 vertices, faces, label, body_of(name), name, mesh.genus, scan.motion, mesh.notes
             )
@@ -179,7 +174,7 @@ class GradedShapes:
         body_class, number, individual_number, pose = self._numbers(index)
         rng = self._pose_generator(body_class, number, individual_number, pose, 0)
         scan = Scan.draw(rng, self.n_vertices)
-        return draw_pose(self._side(body_class, number, individual_number, pose), rng, scan.target)
+        return draw_pose(self._individual(body_class, number, individual_number), rng, scan.target)
 
     def write(
         self, root: str | os.PathLike[str], progress: bool = False, n_workers: int | None = 1
@@ -206,8 +201,6 @@ class GradedShapes:
             n_vertices=list(self.n_vertices),
             look_alikes=self.look_alikes,
             **({"individuals": True} if self.n_individuals else {}),
-            **({"asymmetry": list(self.asymmetry)} if self.asymmetry else {}),
-            **({"rigid": True} if self.rigid else {}),
         )
         names = self.names
         missing = [i for i, name in enumerate(names) if not is_whole_off(folder / f"{name}.off")]
@@ -265,14 +258,6 @@ class GradedShapes:
             )
         return self._last_individual[1]
 
-    def _side(self, body_class: int, number: int, individual_number: int, pose: int) -> Body:
-        """Return the body or individual that takes a pose, with the asymmetry of this pose."""
-        body = self._individual(body_class, number, individual_number)
-        if self.asymmetry is not None:
-            seed = [self.seed, _SIDE, body_class, number, individual_number, pose]
-            body = individual(body, np.random.default_rng(seed), self.asymmetry)
-        return replace(body, motion="rigid") if self.rigid else body
-
     def _body(self, body_class: int, number: int) -> Body:
         if self._last is None or self._last[0] != (body_class, number):
             kin = [self.seed, _KIN, body_class, number // _N_SIBLINGS]
@@ -311,8 +296,6 @@ _ARGUMENTS = (
     "n_vertices",
     "look_alikes",
     "n_individuals",
-    "asymmetry",
-    "rigid",
 )
 
 

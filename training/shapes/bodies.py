@@ -28,7 +28,8 @@ _MIN_ANGLE = 1.0  # smallest angle of a face at rest, degrees
 _SPREAD = (0.3, 1.0)
 _ROLL = 230.0  # largest rolling of a sheet, degrees
 # Share of the poses in which limbs nearly touch: each is the closest of this number of poses.
-_CLOSE_SHARE, _N_CLOSE_DRAWS = 0.3, 5
+_CLOSE_SHARE = 0.3
+_N_CLOSE_DRAWS = 5
 
 
 @dataclass(frozen=True)

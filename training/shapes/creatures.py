@@ -23,15 +23,21 @@ def star(g: np.random.Generator, core: str, n: int, kind: str, end: str) -> Skel
     solid: Solid
     match core:
         case "orb":
-            solid, seat = Blob((radius, radius, radius * g.uniform(0.7, 1.3))), 0.75 * radius
+            solid = Blob((radius, radius, radius * g.uniform(0.7, 1.3)))
+            seat = 0.75 * radius
         case "disc":
-            solid, seat = Prism(24, radius, 0.3, 0.1), 0.85 * radius
+            solid = Prism(24, radius, 0.3, 0.1)
+            seat = 0.85 * radius
         case "hoop":
-            solid, seat, rise = Frame(24, radius * 1.15, 0.14), 1.15 * radius, max(rise, -0.3)
+            solid = Frame(24, radius * 1.15, 0.14)
+            seat = 1.15 * radius
+            rise = max(rise, -0.3)
         case "drum":
-            solid, seat = Shell(((radius, -0.4), (radius, 0.4)), 0.2), radius
+            solid = Shell(((radius, -0.4), (radius, 0.4)), 0.2)
+            seat = radius
         case _:
-            solid, seat = Prism(n, radius * 1.2, 0.35 * g.uniform(0.9, 2.0), 0.08), 0.95 * radius
+            solid = Prism(n, radius * 1.2, 0.35 * g.uniform(0.9, 2.0), 0.08)
+            seat = 0.95 * radius
     arm = style.grow()
     return Skeleton(
         Part(
@@ -46,7 +52,8 @@ def star(g: np.random.Generator, core: str, n: int, kind: str, end: str) -> Skel
 def tree(g: np.random.Generator, branches: int, twigs: int, end: str, base: str) -> Skeleton:
     """Build a trunk that branches once or twice."""
     style = LimbStyle.draw(g, "straight", end, 0.42 if twigs else 0.3, 0.1, 10.0)
-    rise, spread = g.uniform(0.2, 1.3), g.uniform(0.6, 1.0)
+    rise = g.uniform(0.2, 1.3)
+    spread = g.uniform(0.6, 1.0)
     length = g.uniform(0.4, 0.75)
     directions = circle(branches, g.uniform(0, np.pi))
     height = g.uniform(0.6, 1.3)
@@ -155,7 +162,8 @@ def comb(g: np.random.Generator, n: int, sides: str, end: str) -> Skeleton:
     step = g.uniform(0.34, 0.44) + {"knob": 0.15, "disc": 0.35}.get(end, 0.0)
     reach = g.uniform(0.4, 0.7)
     if sides == "ladder":
-        rail, across = Cone(step * (n - 1), 0.12, 0.12), turned("y", 90.0)
+        rail = Cone(step * (n - 1), 0.12, 0.12)
+        across = turned("y", 90.0)
         second = Part(rail, at=(0, 0, reach), turn=across.T)
         rung = Part(Cone(reach, 0.1, 0.1), turn=across)
         rungs = [
@@ -179,7 +187,8 @@ def comb(g: np.random.Generator, n: int, sides: str, end: str) -> Skeleton:
 
 def serpent(g: np.random.Generator, n: int, ornament: str, head: str) -> Skeleton:
     """Build a long flexible body of `n` segments with ornaments: on every second segment, or on all if `n` < 5."""
-    step, girth = g.uniform(0.3, 0.42), g.uniform(0.13, 0.2)
+    step = g.uniform(0.3, 0.42)
+    girth = g.uniform(0.13, 0.2)
     radii = girth * np.interp(range(n + 1), [0, 0.5 * n, n], [g.uniform(0.6, 0.9), 1.0, 0.9])
     middle = (0, 0, 0.5 * step)
     match ornament:

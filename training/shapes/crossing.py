@@ -13,15 +13,19 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Integers:
     that lie in one plane, are not reported.
     """
     corners = vertices[faces]
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    low = corners.min(axis=1)
+    high = corners.max(axis=1)
     i, j = _candidates(corners).T
     # Each test leaves fewer pairs for the next, more expensive one.
     for axis in range(3):
         boxes = (low[i, axis] <= high[j, axis]) & (low[j, axis] <= high[i, axis])
-        i, j = i[boxes], j[boxes]
+        i = i[boxes]
+        j = j[boxes]
     apart = ~(faces[i][:, :, None] == faces[j][:, None]).any(axis=(1, 2))
-    i, j = i[apart], j[apart]
-    a, b = corners[i], corners[j]
+    i = i[apart]
+    j = j[apart]
+    a = corners[i]
+    b = corners[j]
     crossed = np.zeros(len(i), dtype=bool)
     for first, second in ((a, b), (b, a)):
         for k in range(3):
@@ -34,7 +38,8 @@ def _candidates(corners: Floats) -> Integers:
     centres = corners.mean(axis=1)
     radii = np.sqrt(((corners - centres[:, None]) ** 2).sum(axis=2).max(axis=1))
     max_small = float(np.quantile(radii, 0.9))
-    small, large = np.nonzero(radii <= max_small)[0], np.nonzero(radii > max_small)[0]
+    small = np.nonzero(radii <= max_small)[0]
+    large = np.nonzero(radii > max_small)[0]
     candidates = [
         small[cKDTree(centres[small]).query_pairs(2.0 * max_small, output_type="ndarray")]
     ]
@@ -50,7 +55,9 @@ def _candidates(corners: Floats) -> Integers:
 
 def _passes(start: Floats, end: Floats, triangle: Floats) -> Booleans:
     """Whether segments (N,3) to (N,3) pass through triangles (N,3,3), by the signed volumes of five tetrahedra."""
-    a, b, c = triangle[:, 0], triangle[:, 1], triangle[:, 2]
+    a = triangle[:, 0]
+    b = triangle[:, 1]
+    c = triangle[:, 2]
     normal = np.cross(b - a, c - a)
     above = ((start - a) * normal).sum(axis=1)
     below = ((end - a) * normal).sum(axis=1)
@@ -59,6 +66,8 @@ def _passes(start: Floats, end: Floats, triangle: Floats) -> Booleans:
     def side(p: Floats, q: Floats) -> Floats:
         return (np.cross(p - start, q - start) * direction).sum(axis=1)
 
-    u, v, w = side(a, b), side(b, c), side(c, a)
+    u = side(a, b)
+    v = side(b, c)
+    w = side(c, a)
     inside = ((u > 0.0) & (v > 0.0) & (w > 0.0)) | ((u < 0.0) & (v < 0.0) & (w < 0.0))
     return (above * below < 0.0) & inside

@@ -47,7 +47,8 @@ class Change:
         size = float(np.sqrt(face_areas(vertices, faces).sum()))
         low, high = np.log(_RADII)
         radii = size * np.exp(rng.uniform(low, high, _N_REGIONS))
-        centres, axes = np.empty((_N_REGIONS, 3)), np.empty((_N_REGIONS, 3))
+        centres = np.empty((_N_REGIONS, 3))
+        axes = np.empty((_N_REGIONS, 3))
         for i, seed_vertex in enumerate(rng.integers(len(vertices), size=_N_REGIONS)):
             region = vertices[np.linalg.norm(vertices - vertices[seed_vertex], axis=1) < radii[i]]
             centres[i] = region.mean(axis=0)

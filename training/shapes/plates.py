@@ -36,7 +36,8 @@ class Plate(Solid):
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         flat: Floats | None = None
         for x0, y0, x1, y1, start, end in self.bars:
-            dx, dy = x1 - x0, y1 - y0
+            dx = x1 - x0
+            dy = y1 - y0
             share = np.clip(
                 ((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-12), 0.0, 1.0
             )
@@ -52,7 +53,8 @@ class Plate(Solid):
         for cx, cy, radius in self.holes:
             flat = np.maximum(flat, radius - np.hypot(x - cx, y - cy))
         rounding = 0.35 * self.thick
-        a, b = flat + rounding, np.abs(z) - (0.5 * self.thick - rounding)
+        a = flat + rounding
+        b = np.abs(z) - (0.5 * self.thick - rounding)
         return (
             np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0))
             + np.minimum(np.maximum(a, b), 0.0)
@@ -66,10 +68,8 @@ class Plate(Solid):
             for x, y, r in ((x0, y0, r0), (x1, y1, r1))
         ]
         x, y, r = np.array(ends).T
-        low, high = (
-            np.array([(x - r).min(), (y - r).min()]),
-            np.array([(x + r).max(), (y + r).max()]),
-        )
+        low = np.array([(x - r).min(), (y - r).min()])
+        high = np.array([(x + r).max(), (y + r).max()])
         half = 0.5 * self.thick
         return np.array([*low, -half]), np.array([*high, half])
 
@@ -118,10 +118,6 @@ def sheet(g: np.random.Generator, outline: str, n_holes: int) -> Skeleton:
 
 def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:  # noqa: C901 (one case for each outline)
     """The bars of a sheet, of which the first is wide enough for holes, and the number of handles that bars form."""
-
-    def disc(x: float, y: float, r: float) -> Bar:
-        return (x, y, x, y, r, r)
-
     match outline:
         case "ribbon":
             half = g.uniform(1.1, 1.7)
@@ -132,22 +128,33 @@ def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:  # 
             ], 0
         case "leaf":
             half = g.uniform(0.7, 0.9)
-            tip, stem = g.uniform(0.9, 1.3), g.uniform(0.6, 1.0)
+            tip = g.uniform(0.9, 1.3)
+            stem = g.uniform(0.6, 1.0)
             return [
                 (-0.2, 0, 0.25, 0, 0.5 * half, 0.72 * half),
                 (0.25, 0, tip, 0, 0.6 * half, 0.1),
                 (-0.2 - stem, 0, 0, 0, 0.1, 0.12),
             ], 0
         case "cross":
-            a, b, w = g.uniform(0.8, 1.2), g.uniform(0.6, 1.0), g.uniform(0.24, 0.34)
+            a = g.uniform(0.8, 1.2)
+            b = g.uniform(0.6, 1.0)
+            w = g.uniform(0.24, 0.34)
             return [(-a, 0, a, 0, w, w), (0, -b, 0, b, 0.9 * w, 0.9 * w)], 0
+    return _outline_with_limbs(g, outline)
+
+
+def _outline_with_limbs(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:
+    """The bars and handles of the other sheets, which have limbs or are made of thin bars."""
+    match outline:
         case "star":
-            reach, w = g.uniform(0.8, 1.1), g.uniform(0.3, 0.4)
-            return [disc(0, 0, w)] + [
+            reach = g.uniform(0.8, 1.1)
+            w = g.uniform(0.3, 0.4)
+            return [(0, 0, 0, 0, w, w)] + [
                 (0, 0, reach * c, reach * s, 0.7 * w, 0.12) for c, s in circle(5)
             ], 0
         case "pelt":
-            half, w = g.uniform(0.6, 0.9), g.uniform(0.34, 0.45)
+            half = g.uniform(0.6, 0.9)
+            w = g.uniform(0.34, 0.45)
             legs = [
                 (s * 0.8 * half, 0.2 * t, s * (half + 0.25), t * g.uniform(0.65, 0.95), 0.2, 0.13)
                 for s in (-1, 1)
@@ -159,25 +166,34 @@ def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:  # 
             ]
             return [(-half, 0, half, 0, w, w), *legs, *tail], 0
         case "shirt":
-            w, half, arm = g.uniform(0.42, 0.52), g.uniform(0.5, 0.75), g.uniform(0.35, 0.8)
+            w = g.uniform(0.42, 0.52)
+            half = g.uniform(0.5, 0.75)
+            arm = g.uniform(0.35, 0.8)
             sleeves = [(half, s * 0.8 * w, half - 0.35, s * (w + arm), 0.24, 0.18) for s in (-1, 1)]
             return [(-half, 0, half, 0, w, 0.95 * w), *sleeves], 0
         case "frame":
-            a, b, w = g.uniform(0.7, 1.2), g.uniform(0.6, 0.8), g.uniform(0.16, 0.24)
+            a = g.uniform(0.7, 1.2)
+            b = g.uniform(0.6, 0.8)
+            w = g.uniform(0.16, 0.24)
             corners = [(-a, -b), (a, -b), (a, b), (-a, b)]
             return [(*corners[i], *corners[(i + 1) % 4], w, w) for i in range(4)], 1
         case "grid":
-            a, b, w = g.uniform(0.8, 1.1), g.uniform(0.65, 0.85), g.uniform(0.12, 0.15)
+            a = g.uniform(0.8, 1.1)
+            b = g.uniform(0.65, 0.85)
+            w = g.uniform(0.12, 0.15)
             rows = [(-a, y, a, y, w, w) for y in (-b, 0.0, b)]
             return rows + [(x, -b, x, b, w, w) for x in (-a, 0.0, a)], 4
         case "comb":
-            half, w, reach = g.uniform(0.9, 1.2), g.uniform(0.26, 0.32), g.uniform(0.6, 0.9)
+            half = g.uniform(0.9, 1.2)
+            w = g.uniform(0.26, 0.32)
+            reach = g.uniform(0.6, 0.9)
             teeth = [
                 (x, 0, x, reach, 0.12, 0.1) for x in np.linspace(-half, half, int(g.integers(4, 6)))
             ]
             return [(-half, 0.0, half, 0.0, w, w), *teeth], 0
         case "fork":
-            half, w = g.uniform(0.5, 0.8), g.uniform(0.26, 0.34)
+            half = g.uniform(0.5, 0.8)
+            w = g.uniform(0.26, 0.34)
             return [
                 (-half, 0, half, 0, w, w),
                 (half, 0, half + 0.7, 0.5, 0.2, 0.14),
@@ -220,10 +236,12 @@ def machine(g: np.random.Generator, kind: str, extra: str, n: int) -> Skeleton:
     thick = g.uniform(0.18, 0.34)
     bars: list[Bar]
     holes: list[Hole]
-    loops, middle = 0, (0.0, 0.0)
+    loops = 0
+    middle = (0.0, 0.0)
     match kind:
         case "gear":
-            r, bore = g.uniform(0.55, 0.7), g.uniform(0.16, 0.24)
+            r = g.uniform(0.55, 0.7)
+            bore = g.uniform(0.16, 0.24)
             teeth = 4 + 2 * n
             w = min(0.11, 1.1 * r / teeth)
             bars = [
@@ -242,7 +260,9 @@ def machine(g: np.random.Generator, kind: str, extra: str, n: int) -> Skeleton:
                 *((0.72 * r * c, 0.72 * r * s, 0.13 * r) for c, s in circle(n + 1, 0.3)),
             ]
         case "lever":
-            half, r0, r1 = g.uniform(0.7, 1.1), g.uniform(0.36, 0.48), g.uniform(0.24, 0.36)
+            half = g.uniform(0.7, 1.1)
+            r0 = g.uniform(0.36, 0.48)
+            r1 = g.uniform(0.24, 0.36)
             bars = [
                 (-half, 0, -half, 0, r0, r0),
                 (half, 0, half, 0, r1, r1),
@@ -251,32 +271,34 @@ def machine(g: np.random.Generator, kind: str, extra: str, n: int) -> Skeleton:
             holes = [(-half, 0.0, 0.5 * r0), (half, 0.0, 0.5 * r1)][: max(n - 1, 1)]
             middle = (-half, 0.0)
         case "triangle":
-            r, w = g.uniform(0.75, 0.95), g.uniform(0.24, 0.3)
+            r = g.uniform(0.75, 0.95)
+            w = g.uniform(0.24, 0.3)
             corners = [(r * c, r * s * g.uniform(0.85, 1.2)) for c, s in circle(3)]
             bars = [(*corners[i], *corners[(i + 1) % 3], w, w) for i in range(3)]
             holes = [(x, y, 0.45 * w) for x, y in corners][:n]
             loops = 1
             middle = corners[0]
         case "bracket":
-            half, w = g.uniform(0.55, 0.8), g.uniform(0.4, 0.55)
+            half = g.uniform(0.55, 0.8)
+            w = g.uniform(0.4, 0.55)
             bars = [(-half, 0.0, half, 0.0, w, w)]
             holes = [(half, 0.0, 0.35 * w), (-half, 0.0, 0.35 * w), (0.0, 0.0, 0.35 * w)][
                 : max(n - 1, 1)
             ]
         case "cam":
-            r, throw = g.uniform(0.5, 0.62), g.uniform(0.5, 0.8)
+            r = g.uniform(0.5, 0.62)
+            throw = g.uniform(0.5, 0.8)
             bars = [(0, 0, throw, 0, r, 0.4 * r)]
             holes = [(0.0, 0.0, 0.4 * r), (throw, 0.0, 0.16 * r)][: 1 + (n > 2)]
         case _:
-            r, w = g.uniform(0.6, 0.75), g.uniform(0.17, 0.22)
+            r = g.uniform(0.6, 0.75)
+            w = g.uniform(0.17, 0.22)
             angles = np.linspace(0.35, 2.0 * np.pi - 0.35, 13)
             arc = [(r * float(np.cos(a)), r * float(np.sin(a))) for a in angles]
             bars = [(*arc[i], *arc[i + 1], w, w) for i in range(12)]
             ears = [(*arc[i], arc[i][0] + 0.55, arc[i][1] * 1.1, 0.15, 0.2) for i in (0, 12)]
-            bars, holes = (
-                bars + ears,
-                [(x + 0.55, y * 1.1, 0.09) for x, y in (arc[0], arc[12])][: max(n - 2, 0)],
-            )
+            bars = bars + ears
+            holes = [(x + 0.55, y * 1.1, 0.09) for x, y in (arc[0], arc[12])][: max(n - 2, 0)]
             middle = arc[6]
     plate = Plate(tuple(bars), tuple(holes), thick, loops)
     return Skeleton(

@@ -18,8 +18,10 @@ from training.shapes.springs import Helix
 _MAX_SHEAR = 0.22
 # Limits of joints: factors of those of the skeleton, which are meant for joints without creases, and largest angles in
 # degrees. A root joint is the first joint of a limb, and inner joints are the others.
-_ROOT_FACTOR, _ROOT_LIMIT = 2.6, 80.0
-_INNER_FACTOR, _INNER_LIMIT = 4.5, 135.0
+_ROOT_FACTOR = 2.6
+_ROOT_LIMIT = 80.0
+_INNER_FACTOR = 4.5
+_INNER_LIMIT = 135.0
 _SPINE_LIMIT = 30.0
 _TWIST_LIMIT = 55.0
 _CURL_LIMIT = 320.0
@@ -75,7 +77,8 @@ def bones_at_rest(skeleton: Skeleton, proportions: dict[str, tuple[float, float]
 
     def place(part: Part, parent: int, frame: Floats, origin: Floats) -> None:
         thick, length = proportions.get(part.group, (1.0, 1.0))
-        solid, factors = part.solid.stretched(thick, length), part.solid.factors(thick, length)
+        solid = part.solid.stretched(thick, length)
+        factors = part.solid.factors(thick, length)
         placed = Placed(solid, frame, origin + frame[:, 2] * (part.lift * factors[2]), part.blend)
         bones.append(Bone(part, placed, parent, origin, frame))
         number = len(bones) - 1
@@ -104,7 +107,8 @@ def limb_rig(bones: Sequence[Bone], hinged: bool = False) -> Rig:
         while not hinged and (successor := successors[chain[-1]]) is not None:
             chain.append(successor)
         rod_of_bone[chain] = len(rods)
-        parent, attachment = -1, 0.0
+        parent = -1
+        attachment = 0.0
         if bone.parent >= 0:
             parent = int(rod_of_bone[bone.parent])
             attachment = projected(rods[parent], bone.origin[None])[0]
@@ -140,8 +144,10 @@ def strip_rig(
         curl: largest curl over the whole length, radians.
     """
     corners = np.concatenate([np.stack(bone.placed.bounds()) for bone in bones])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    centre, half = 0.5 * (low + high), 0.5 * float((np.abs(direction) * (high - low)).sum())
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
+    centre = 0.5 * (low + high)
+    half = 0.5 * float((np.abs(direction) * (high - low)).sum())
     arc_lengths = np.linspace(0.0, 2.0 * half, MAX_ELEMENTS)
     points = centre + (arc_lengths - half)[:, None] * direction
     sides = np.tile(np.stack([axis, np.cross(direction, axis)], axis=1), (len(arc_lengths), 1, 1))
@@ -184,7 +190,8 @@ def _rod(
             parent, attachment, line[:1], np.zeros(1), radii[:1], radii[:1], frames[:1, :, :2]
         )
     line_lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    length, radius = float(line_lengths[-1]), float(radii.mean())
+    length = float(line_lengths[-1])
+    radius = float(radii.mean())
     n = int(np.clip(np.ceil(length / (0.3 * radius)), 8, MAX_ELEMENTS))
     arc_lengths = np.linspace(0.0, length, n)
     points = np.stack([np.interp(arc_lengths, line_lengths, line[:, i]) for i in range(3)], axis=1)

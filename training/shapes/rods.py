@@ -104,7 +104,8 @@ def rod_motions(rig: Rig, turns: Sequence[Floats]) -> list[Motions]:
                 rig.rods[rod.parent], motions_of_rods[rod.parent], np.array(rod.attachment)
             )
         steps = rotations_about(rod.points, turn)
-        real, dual = np.empty((len(turn), 4)), np.empty((len(turn), 4))
+        real = np.empty((len(turn), 4))
+        dual = np.empty((len(turn), 4))
         for j in range(len(turn)):
             motion = compose(motion, Motions(steps.real[j], steps.dual[j]))
             real[j], dual[j] = motion
@@ -143,7 +144,8 @@ def bend(
     vertices: Floats, rig: Rig, binding: Binding, motions_of_rods: Sequence[Motions]
 ) -> Floats:
     """Return the vertices (V,3) after the motions of the rods."""
-    real, dual = np.zeros((len(vertices), 4)), np.zeros((len(vertices), 4))
+    real = np.zeros((len(vertices), 4))
+    dual = np.zeros((len(vertices), 4))
     for number, rod in enumerate(rig.rods):
         own = np.nonzero(binding.weights[:, number])[0]
         motions = _interpolated(rod, motions_of_rods[number], binding.arc_lengths[own, number])
@@ -220,7 +222,8 @@ def _diffused(vertices: Floats, faces: Integers, values: Floats, width: Floats) 
     )
     # Weights of edges must be positive, so that no weight of a vertex becomes negative.
     conductance = np.maximum(cotangents, 0.02) * 0.25 * (width[faces] ** 2).mean(axis=1)[:, None]
-    i, j = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel()
+    i = np.roll(faces, -1, axis=1).ravel()
+    j = np.roll(faces, -2, axis=1).ravel()
     n = len(vertices)
     off_diagonal = coo_array((conductance.ravel(), (i, j)), shape=(n, n)).tocsc()
     off_diagonal = off_diagonal + off_diagonal.T

@@ -15,7 +15,10 @@ from igps.mesh.simplification import simplify
 from igps.mesh.watertight import watertight
 
 # Probability of each change.
-_SIMPLIFIED, _NOISY, _MIRRORED, _WATERTIGHT = 0.4, 0.35, 0.25, 0.15
+_SIMPLIFIED = 0.4
+_NOISY = 0.35
+_MIRRORED = 0.25
+_WATERTIGHT = 0.15
 # Ratio of the numbers of vertices before and after simplification.
 _SURPLUS = 1.6
 # Largest standard deviation of the noise, over the root of the mean area of a face; too small to flip triangles.
