@@ -73,7 +73,7 @@ class GradedShapes:
         ValueError: an argument is out of range; or, on access, a shape cannot be made at this resolution.
     """
 
-    def __init__(  # noqa: PLR0913 (settings of the generator, all with a default)
+    def __init__(
         self,
         n_classes: int = 24,
         n_bodies: int = 3,

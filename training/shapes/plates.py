@@ -116,7 +116,7 @@ def sheet(g: np.random.Generator, outline: str, n_holes: int) -> Skeleton:
     return Skeleton(Part(Plate(tuple(bars), _holes(g, bars[0], n_holes), thick, loops), "sheet"))
 
 
-def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:  # noqa: C901 (one case for each outline)
+def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:
     """The bars of a sheet, of which the first is wide enough for holes, and the number of handles that bars form."""
     match outline:
         case "ribbon":
