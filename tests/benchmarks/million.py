@@ -1,9 +1,9 @@
-"""A gallery of a million random vectors: `python tests/benchmarks/million.py [--n N] [--folder FOLDER]`.
+"""A gallery of a million bodies: `python tests/benchmarks/million.py [--n N] [--folder FOLDER] [--seed SEED]`.
 
-The vectors form families of 250, whose members differ by noise of a tenth of their length and are in random order, as
-in a gallery. With `--noise 0.7`, the nearest vectors of a query belong to several families and are spread over many
-clusters of the index. The script prints the cost of building the gallery, the time of queries with and without
-conditions, and the recall of the ten nearest vectors.
+600 generated bodies of 12 classes are described by `pretrained`. A row is a mixture of four bodies of a class with a
+little of any other body and noise. The script prints the cost of building the gallery, and the time and the recall at
+10 of queries with and without conditions, against the comparison with all rows by the descriptor's own distance.
+Another seed gives other rows and other queries.
 """
 
 from __future__ import annotations
@@ -11,137 +11,156 @@ from __future__ import annotations
 import argparse
 import resource
 import time
-from functools import cache
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+import igps
 from igps.gallery import _table
-from igps.gallery._search import nearest_rows
 from igps.gallery._table import BodyTable
 from igps.gallery.gallery import CANDIDATES
-from igps.retrieval import cosine
+from igps.nn.description import describe
 
-WIDTH, FAMILY, BATCH, TOP = 256, 250, 10_000, 10
-AMPLITUDES = (1 + np.arange(WIDTH, dtype=np.float32)) ** -0.5
+BATCH, TOP = 10_000, 10
+NOISE = 0.05  # length, beside descriptions of length 1
 CONDITIONS = {
-    "all": "",
+    "all": None,
     "1 % at random": "volume < 0.01",
-    "1 % by class": "class IN ('3', '4', '5', '6', '7')",
+    "a class of twelve": "class = '3'",
 }
 
 
-def members(centres: np.ndarray, noise: float, generator: np.random.Generator) -> np.ndarray:
-    vectors = (
-        centres + noise * generator.standard_normal(centres.shape, dtype=np.float32)
-    ) * AMPLITUDES
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+class Rows:
+    """Descriptions that vary those of generated bodies."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        described = folder / "described.npz"
+        if not described.exists():
+            _describe_bodies(folder, described)
+        with np.load(described) as arrays:
+            self.bodies = arrays["descriptions"]
+            labels = arrays["labels"]
+        self.members = [np.flatnonzero(labels == label) for label in np.unique(labels)]
+        self.seed = seed
+
+    def descriptions(self, n: int, *keys: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return n descriptions of length 1 and their classes."""
+        generator = np.random.default_rng([self.seed, *keys])
+        classes = generator.integers(len(self.members), size=n)
+        mixed = np.empty((n, self.bodies.shape[1]), np.float32)
+        for number, members in enumerate(self.members):
+            chosen = np.flatnonzero(classes == number)
+            weights = generator.dirichlet(np.full(4, 0.5), size=len(chosen))
+            parts = members[generator.integers(len(members), size=(len(chosen), 4))]
+            mixed[chosen] = np.einsum("nk,nkd->nd", weights, self.bodies[parts])
+        other = self.bodies[generator.integers(len(self.bodies), size=n)]
+        share = generator.uniform(0, 0.3, (n, 1)).astype(np.float32)
+        noise = generator.standard_normal(mixed.shape, dtype=np.float32)
+        mixed = (1 - share) * mixed + share * other
+        mixed += NOISE / np.sqrt(mixed.shape[1]) * noise
+        return mixed / np.linalg.norm(mixed, axis=1, keepdims=True), classes
+
+    def batch(self, start: int) -> tuple[torch.Tensor, list[dict[str, Any]]]:
+        """Return the rows of the table from a position on."""
+        descriptions, classes = self.descriptions(BATCH, 1, start)
+        generator = np.random.default_rng([self.seed, 2, start])
+        volumes = generator.random(BATCH)
+        rows = []
+        for i, number in enumerate(range(start, start + BATCH)):
+            file = f"/meshes/{number:07}.off"
+            row = {"id": file, "name": str(number), "class": str(classes[i]), "file": file}
+            row |= {"checksum": f"{number:064x}", "bytes": number, "modified": number}
+            row |= {"volume": volumes[i], "thumbnail": generator.bytes(900)}
+            rows.append(row)
+        return torch.from_numpy(descriptions), rows
 
 
-@cache
-def families(n_rows: int) -> np.ndarray:
-    """(n_rows / 250, 256) centres of the families."""
-    return np.random.default_rng(0).standard_normal((n_rows // FAMILY, WIDTH), dtype=np.float32)
+def _describe_bodies(folder: Path, out: Path) -> None:
+    shapes = igps.ArticulatedShapes(n_classes=12, n_per_class=50, n_vertices=700)
+    shapes.write(folder / "meshes")
+    descriptor = igps.descriptor("pretrained")
+    dataset = igps.SignatureDataset(
+        folder / "meshes", descriptor=descriptor, cache_dir=folder / "cache"
+    )
+    dataset.precompute()
+    descriptions = describe(dataset, descriptor).numpy()
+    np.savez(out, descriptions=descriptions, labels=np.array(dataset.bodies.labels))
 
 
-def batch(start: int, n_rows: int, noise: float) -> tuple[torch.Tensor, list[dict[str, Any]]]:
-    """Vectors and rows of the table from a position on. Each family has the same share of every batch."""
-    generator = np.random.default_rng([1, start])
-    centres = families(n_rows)
-    family = np.arange(start, start + BATCH) % len(centres)
-    vectors = members(centres[family], noise, generator)
-    area, volume = generator.random((2, BATCH))
-    rows = [
-        {
-            "id": f"/meshes/{n:07}.off",
-            "name": f"{n:07}",
-            "class": str(family[i] % 500),
-            "file": f"/meshes/{n:07}.off",
-            "checksum": f"{n:064x}",
-            "bytes": n,
-            "modified": n,
-            "area": area[i],
-            "volume": volume[i],
-            "thumbnail": generator.bytes(900),
-        }
-        for i, n in enumerate(range(start, start + BATCH))
-    ]
-    return torch.from_numpy(vectors), rows
-
-
-def queries(n: int, n_rows: int, noise: float) -> np.ndarray:
-    """(n, 256) further members of random families."""
-    generator = np.random.default_rng(2)
-    centres = families(n_rows)
-    return members(centres[generator.integers(0, len(centres), n)], noise, generator)
-
-
-def exact_nearest(vectors: np.ndarray, n_rows: int, noise: float) -> dict[str, np.ndarray]:
-    """Indices (Q, 10) of the nearest rows under each condition, by comparison with all rows."""
-    distances = {name: np.full((len(vectors), TOP), np.inf) for name in CONDITIONS}
-    indices = {name: np.zeros((len(vectors), TOP), dtype=np.int64) for name in CONDITIONS}
-    for start in range(0, n_rows, BATCH):
-        batch_vectors, rows = batch(start, n_rows, noise)
-        batch_distances = 1 - vectors @ batch_vectors.numpy().T
-        label = np.array([int(row["class"]) for row in rows])
+def exact_nearest(table: BodyTable, queries: torch.Tensor, distance: Any) -> dict[str, np.ndarray]:
+    """Return the names (Q, 10) of the nearest rows under each condition, by comparison with all rows."""
+    distances = {name: np.full((len(queries), TOP), np.inf) for name in CONDITIONS}
+    names = {name: np.zeros((len(queries), TOP), np.int64) for name in CONDITIONS}
+    for batch in table.batches():
+        descriptions, rows = table.decoded(batch)
+        with torch.inference_mode():
+            to_batch = distance(queries, descriptions).numpy()
+        numbers = np.array([int(row["name"]) for row in rows])
         masks = {
-            "all": np.ones(BATCH, bool),
+            "all": np.ones(len(rows), bool),
             "1 % at random": np.array([row["volume"] < 0.01 for row in rows]),
-            "1 % by class": (label >= 3) & (label <= 7),
+            "a class of twelve": np.array([row["class"] == "3" for row in rows]),
         }
         for name, mask in masks.items():
-            batch_indices = np.broadcast_to(
-                start + np.flatnonzero(mask), (len(vectors), int(mask.sum()))
-            )
-            candidates = np.hstack([distances[name], batch_distances[:, mask]])
-            candidate_indices = np.hstack([indices[name], batch_indices])
+            others = np.broadcast_to(numbers[mask], (len(queries), int(mask.sum())))
+            candidates = np.hstack([distances[name], to_batch[:, mask]])
             best = np.argsort(candidates, axis=1)[:, :TOP]
             distances[name] = np.take_along_axis(candidates, best, axis=1)
-            indices[name] = np.take_along_axis(candidate_indices, best, axis=1)
-    return indices
+            names[name] = np.take_along_axis(np.hstack([names[name], others]), best, axis=1)
+    return names
 
 
 def main() -> None:
     """Build the gallery if it does not exist, and search it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--n", type=int, default=1_000_000)
-    parser.add_argument("--noise", type=float, default=0.1)
-    parser.add_argument("--n_queries", type=int, default=200)
-    parser.add_argument("--folder", type=Path, default=Path("build/million.igps"))
+    parser.add_argument("--n_queries", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--candidates", type=int, default=CANDIDATES)
+    parser.add_argument("--folder", type=Path, default=Path("build/million"))
     arguments = parser.parse_args()
-    if not arguments.folder.exists():
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    rows = Rows(arguments.folder, arguments.seed)
+    descriptor = igps.descriptor("pretrained")
+    path = arguments.folder / f"{arguments.n}-{arguments.seed}.igps"
+    if not path.exists():
         start = time.monotonic()
-        batches = (
-            batch(start, arguments.n, arguments.noise) for start in range(0, arguments.n, BATCH)
-        )
-        _table.write(arguments.folder, {"descriptor": "made"}, "cosine", batches, {})
-        size = sum(path.stat().st_size for path in arguments.folder.rglob("*") if path.is_file())
-        print(
-            f"built in {time.monotonic() - start:.0f} s, {size / 2**30:.2f} GiB, {memory()}",
-            flush=True,
-        )
-    table = BodyTable(arguments.folder)
-    vectors = queries(arguments.n_queries, arguments.n, arguments.noise)
-    answers: dict[str, list[list[int]]] = {}
-    seconds: dict[str, list[float]] = {}
+
+        def batches() -> Iterator[Any]:
+            for first in range(0, arguments.n, BATCH):
+                yield rows.batch(first)
+
+        about = {"descriptor": "pretrained"}
+        _table.write(path, about, "cosine", batches(), {}, weights=descriptor.search_weights)
+        size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+        seconds = time.monotonic() - start
+        print(f"built in {seconds:.0f} s, {size / 2**30:.2f} GiB, {memory()}", flush=True)
+    table = BodyTable(path)
+    queries = torch.from_numpy(rows.descriptions(arguments.n_queries, 3)[0])
+    found: dict[str, list[list[int]]] = {name: [] for name in CONDITIONS}
+    seconds_of: dict[str, list[float]] = {name: [] for name in CONDITIONS}
     for name, where in CONDITIONS.items():
-        for query in torch.from_numpy(vectors):
+        for query in queries:
             start = time.perf_counter()
-            rows, _, _ = nearest_rows(
-                table, query[None], cosine, top=TOP, candidates=CANDIDATES, where=where or None
-            )
-            seconds.setdefault(name, []).append(time.perf_counter() - start)
-            answers.setdefault(name, []).append([int(row["name"]) for row in rows])
-    search_memory = memory()
-    for name, expected in exact_nearest(vectors, arguments.n, arguments.noise).items():
-        pairs = zip(answers[name], expected.tolist(), strict=True)
-        recall = np.mean([len(set(answer) & set(exact)) / TOP for answer, exact in pairs])
-        median, slow = (1e3 * np.quantile(seconds[name], share) for share in (0.5, 0.99))
-        print(
-            f"{name}: {median:.1f} ms (median), {slow:.1f} ms (99 %), recall {recall:.4f} at {TOP}; {search_memory}"
-        )
+            with torch.inference_mode():
+                nearest, _, _ = table.nearest(
+                    query[None],
+                    descriptor.distances,
+                    top=TOP,
+                    candidates=arguments.candidates,
+                    where=where,
+                )
+            seconds_of[name].append(time.perf_counter() - start)
+            found[name].append([int(row["name"]) for row in nearest])
+        median, slow = (1e3 * np.quantile(seconds_of[name], share) for share in (0.5, 0.99))
+        print(f"{name}: {median:.0f} ms (median), {slow:.0f} ms (99 %); {memory()}", flush=True)
+    for name, expected in exact_nearest(table, queries, descriptor.distances).items():
+        pairs = zip(found[name], expected.tolist(), strict=True)
+        shares = [len(set(one) & set(other)) / TOP for one, other in pairs]
+        print(f"{name}: recall {np.mean(shares):.4f} at {TOP}", flush=True)
 
 
 def memory() -> str:

@@ -16,7 +16,6 @@ import torch
 from outcome import Row
 
 import igps.gallery.gallery  # before the forks; this does not import LanceDB, whose threads do not survive a fork
-from igps.gallery._search import nearest_rows
 from igps.gallery.about import about_of
 from igps.mesh.options import LoadOptions
 from igps.retrieval import cosine
@@ -61,7 +60,7 @@ def _tables() -> Any:
     torch.set_num_threads(1)
     from igps.gallery import _table
 
-    for name, value in {"_MIN_ROWS_FOR_CODES": N_UNCHANGED // 2, "_INDEX_INTERVAL": 8}.items():
+    for name, value in {"_MIN_ROWS_FOR_INDEX": N_UNCHANGED // 2, "_INDEX_INTERVAL": 8}.items():
         assert hasattr(_table, name)
         setattr(_table, name, value)
     return _table
@@ -93,7 +92,8 @@ def _write(path: Path, writer: int, number: int, journal: Path) -> None:
             elif kind == "remove":
                 gallery.remove(where)
             else:
-                gallery.update(where, {"volume": float(value)})
+                with gallery.table.changing(where) as table:
+                    table.update(where=where, values={"volume": float(value)})
             file.write(f"{number}\n")
             number += 1
 
@@ -108,7 +108,7 @@ def _read(path: Path, out: Path) -> None:
     }
     ids = sorted(rows)[:: max(len(rows) // 10, 1)]
     are_nearest = all(
-        nearest_rows(table, rows[id_][1][None], cosine, top=1)[0][0]["id"] == id_ for id_ in ids
+        table.nearest(rows[id_][1][None], cosine, top=1)[0][0]["id"] == id_ for id_ in ids
     )
     arrays = {id_: (volume, values.numpy()) for id_, (volume, values) in rows.items()}
     out.write_bytes(pickle.dumps((arrays, are_nearest)))

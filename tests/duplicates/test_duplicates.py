@@ -25,7 +25,8 @@ from igps.descriptors import descriptor
 from igps.descriptors.fingerprint import fingerprint
 from igps.duplicates._moments import distance_bounds
 from igps.duplicates.calibration import Calibration, calibration_params
-from igps.duplicates.duplicates import _regroup, body_distance, duplicates
+from igps.duplicates.duplicates import body_distance, duplicates, pose_duplicates
+from igps.duplicates.grouping import assigned
 from igps.duplicates.surfaces import Surfaces
 from igps.gallery.gallery import Gallery
 from igps.signature.signature import SignatureConfig
@@ -243,16 +244,13 @@ def test_each_file_of_a_group_has_one_finer_file_beside_it() -> None:
         def distance(self, i: int, j: int, calibration: Calibration) -> float:
             return apart.get((min(i, j), max(i, j)), math.inf)
 
-    calibration, joined = (
-        Calibration.load(),
-        {(0, 1): 0.1, (1, 2): 0.05, (2, 3): 0.3, (3, 4): 0.1, (5, 6): 0.4},
-    )
-    found = _regroup(joined, Table(), calibration, 1, progress=False)  # type: ignore[arg-type]
+    calibration = Calibration.load()
+    found = assigned([0, 1, 2, 3, 4], Table(), calibration)
     # 3 is as fine as 0 and leads; 2 is the same as 3, which leads, and as 1, which does not.
-    assert found == {(5, 6): 0.4, (0, 1): 0.1, (3, 2): 0.3, (3, 4): 0.1}
+    assert found == {(0, 1): 0.1, (3, 2): 0.3, (3, 4): 0.1}
     del apart[2, 3]
-    found = _regroup(joined, Table(), calibration, 1, progress=False)  # type: ignore[arg-type]
-    assert found == {(5, 6): 0.4, (0, 1): 0.1, (1, 2): 0.05, (3, 4): 0.1}
+    found = assigned([0, 1, 2, 3, 4], Table(), calibration)
+    assert found == {(0, 1): 0.1, (1, 2): 0.05, (3, 4): 0.1}
 
 
 def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None:
@@ -331,10 +329,10 @@ def test_poses_are_grouped_by_the_descriptor_alone(dataset: SignatureDataset) ->
     calibration = replace(
         shipped, descriptor="same", model=fingerprint(Same()), signatures=calibration_params(CONFIG)
     )
-    all_of_them = duplicates(dataset, Same(), poses=True, calibration=calibration, n_workers=1)
+    all_of_them = pose_duplicates(dataset, Same(), calibration=calibration, n_workers=1)
     assert grouped(all_of_them.groups) == {frozenset(dataset.bodies.names)}
     assert set(all_of_them.pairs.values()) == {0.0}
-    assert grouped(duplicates(dataset, Same(), calibration=calibration, n_workers=1).groups) == SAME
+    assert grouped(duplicates(dataset, calibration=calibration, n_workers=1).groups) == SAME
 
 
 def test_a_gallery_gives_the_same_groups_and_tells_of_files_that_are_gone(

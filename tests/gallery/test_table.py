@@ -24,10 +24,10 @@ import lancedb
 import pyarrow as pa
 
 from igps.gallery import _table
-from igps.gallery._search import nearest_rows
 from igps.gallery._table import BodyTable
 from igps.gallery.about import check_alike
 from igps.gallery.opening import is_gallery, open_table
+from igps.gallery.place import address
 from igps.retrieval import chi_square, cosine, search
 
 ABOUT = {"descriptor": "test", "signature": {"resolution": 32}}
@@ -80,17 +80,10 @@ def recall(
     table: BodyTable, asked: torch.Tensor, rows: torch.Tensor, distance: Any, **options: Any
 ) -> float:
     exact = search(asked, rows, top=10, distance=distance).indices.tolist()
-    found = [numbers(nearest_rows(table, one[None], distance, top=10, **options)) for one in asked]
+    found = [numbers(table.nearest(one[None], distance, top=10, **options)) for one in asked]
     return float(
         np.mean([len(set(one) & set(other)) / 10 for one, other in zip(found, exact, strict=True)])
     )
-
-
-@pytest.fixture
-def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Codes, and indices of columns, for a thousand rows."""
-    monkeypatch.setattr(_table, "_MIN_ROWS_FOR_CODES", 1000)
-    monkeypatch.setattr(_table, "_INDEX_INTERVAL", 1)
 
 
 @pytest.mark.parametrize("searched_by", ["chi_square", None])
@@ -99,7 +92,7 @@ def test_few_are_compared_one_by_one(tmp_path: Path, searched_by: str | None) ->
     table = written(tmp_path / "g.igps", rows, searched_by)
     expected = search(rows[:5], rows, top=7)
     for i in range(5):
-        found = nearest_rows(table, rows[i : i + 1], chi_square, top=7)
+        found = table.nearest(rows[i : i + 1], chi_square, top=7)
         assert numbers(found) == expected.indices[i].tolist()
         torch.testing.assert_close(found[1], expected.distances[i], rtol=1e-6, atol=1e-7)
         assert torch.equal(found[2], rows[expected.indices[i]])
@@ -107,23 +100,23 @@ def test_few_are_compared_one_by_one(tmp_path: Path, searched_by: str | None) ->
     assert len(table) == 90
 
 
-@pytest.mark.usefixtures("few_are_many")
 def test_the_nearest_of_many_are_those_of_all(tmp_path: Path) -> None:
-    rows, asked = histograms(3000), histograms(3000)[::75]
+    rows = histograms(4500)
+    asked = rows[::150]
     table = written(tmp_path / "g.igps", rows, "chi_square")
     assert recall(table, asked, rows, chi_square, candidates=200) >= 0.98
     exact = search(asked[:3], rows, top=10)
-    found = [nearest_rows(table, one[None], chi_square, top=10, exact=True) for one in asked[:3]]
+    found = [table.nearest(one[None], chi_square, top=10, exact=True) for one in asked[:3]]
     assert [numbers(one) for one in found] == exact.indices.tolist()
     torch.testing.assert_close(
         torch.stack([one[1] for one in found]), exact.distances, rtol=1e-5, atol=1e-6
     )
 
 
-@pytest.mark.usefixtures("few_are_many")
 def test_a_condition_keeps_what_numpy_keeps(tmp_path: Path) -> None:
     """The nearest among those that satisfy it, where it keeps many, one in a hundred, few and none."""
-    rows, every = units(3000), np.arange(3000)
+    rows = units(4500)
+    every = np.arange(4500)
     table = written(tmp_path / "g.igps", rows, "cosine")
     for where, kept in (
         ("class = 'odd' AND volume > 3000", (every % 2 == 1) & (2 * every > 3000)),
@@ -140,11 +133,11 @@ def test_a_condition_keeps_what_numpy_keeps(tmp_path: Path) -> None:
             expected = left[
                 torch.sort(1 - rows[left] @ query, stable=True).indices[:10].numpy()
             ].tolist()
+            assert numbers(table.nearest(query[None], cosine, top=10, where=where)) == expected, (
+                where
+            )
             assert (
-                numbers(nearest_rows(table, query[None], cosine, top=10, where=where)) == expected
-            ), where
-            assert (
-                numbers(nearest_rows(table, query[None], cosine, top=10, where=where, exact=True))
+                numbers(table.nearest(query[None], cosine, top=10, where=where, exact=True))
                 == expected
             ), where
     for wrong in ("weight > 3", "volume >", "volume > 'much' AND"):
@@ -153,17 +146,16 @@ def test_a_condition_keeps_what_numpy_keeps(tmp_path: Path) -> None:
                 ValueError,
                 match=r"where: expected a condition on the columns id, name, .* age, got",
             ):
-                nearest_rows(table, rows[:1], cosine, top=1, where=wrong, exact=exact)
+                table.nearest(rows[:1], cosine, top=1, where=wrong, exact=exact)
 
 
-@pytest.mark.usefixtures("few_are_many")
 def test_vectors_of_any_length_are_searched(tmp_path: Path) -> None:
     """More may be wanted than are near."""
-    rows = units(2000, width=21)
+    rows = units(4500, width=21)
     table = written(tmp_path / "g.igps", rows, "cosine")
     assert recall(table, rows[:40], rows, cosine) == 1
     (expected,) = search(rows[:1], rows, top=1500, distance=cosine).indices.tolist()
-    assert numbers(nearest_rows(table, rows[:1], cosine, top=1500)) == expected
+    assert numbers(table.nearest(rows[:1], cosine, top=1500)) == expected
 
 
 def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
@@ -175,85 +167,86 @@ def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
     assert str(table.table.schema.field("vector").type) == "fixed_size_list<item: halffloat>[1501]"
     kept = torch.cat([table.decoded(some)[0] for some in table.batches()])
     torch.testing.assert_close(kept, rows, rtol=2**-11, atol=1e-11)
-    found = nearest_rows(table, rows[:1], chi_square, top=5)
+    found = table.nearest(rows[:1], chi_square, top=5)
     torch.testing.assert_close(
         found[1], search(rows[:1], rows, top=5).distances[0], rtol=2e-3, atol=1e-6
     )
 
 
-@pytest.mark.usefixtures("few_are_many")
-def test_long_unit_vectors_are_reduced(tmp_path: Path) -> None:
-    rows = torch.nn.functional.normalize(histograms(1500, 700).sqrt(), dim=1)
-    table = written(tmp_path / "g.igps", rows, "cosine")
-    assert table.coder is not None
-    assert table.coder.short(rows[:1].numpy()).shape == (1, 256)
-    assert recall(table, rows[:40], rows, cosine, candidates=200) >= 0.98
-
-
-@pytest.mark.usefixtures("few_are_many")
-def test_codes_are_fitted_again_when_a_gallery_has_grown(tmp_path: Path) -> None:
-    """Recall of later families is below 0.9 by the first codes, and at least 0.98 after the codes are fitted again."""
-    generator = torch.Generator().manual_seed(5)
-    families = units(16, seed=6).repeat_interleave(500, dim=0)
-    rows = torch.nn.functional.normalize(
-        families + 0.02 * torch.randn(8000, 16, generator=generator), dim=1
-    )
-    table = written(tmp_path / "g.igps", rows[:1000], "cosine")
-    table.add(rows[1000:7900], [told(i) for i in range(1000, 7900)], {})
-    asked = rows[1100:7900:250]
-    before = recall(table, asked, rows[:7900], cosine, candidates=50)
-    table.add(rows[7900:], [told(i) for i in range(7900, 8000)], {})
-    assert before < 0.9 < 0.98 <= recall(table, asked, rows, cosine, candidates=50)
-
-
-@pytest.mark.usefixtures("few_are_many")
 def test_rows_are_added_replaced_and_removed(tmp_path: Path) -> None:
-    """Whatever the way they came, the answers are those of all at once; a new column is empty before."""
-    rows = units(2100)
-    table = written(tmp_path / "g.igps", rows[:600], "cosine")
-    assert table.coder is None
-    for start in range(600, 1800, 600):
-        table.add(*next(batches(rows[start : start + 600], start)), {"site": str})
-    assert table.coder is not None
+    """However the rows came, the answers are those of all rows at once; a new column is empty before."""
+    rows = units(5000)
+    table = written(tmp_path / "g.igps", rows[:2400], "cosine")
+    assert "short" not in table.table.schema.names
+    # The second addition makes the table large enough for short vectors and an index
+    for start in (2400, 3600):
+        table.add(rows[start : start + 1200], [told(start + i) for i in range(1200)], {"site": str})
+    assert {"id", "site", "short"} <= {index.columns[0] for index in table.table.list_indices()}
     assert table.columns["site"] is str
-    changed, few = rows[1800:2000], [{**told(i, "b"), "site": "A"} for i in range(200)]
-    table.add(changed, few, {"site": str})
-    assert (len(table), len(list(table.table.search().where("site = 'A'").to_list()))) == (
-        1800,
-        200,
-    )
+    changed = rows[4800:]
+    table.add(changed, [{**told(i, "b"), "site": "A"} for i in range(200)], {"site": str})
+    assert len(table) == 4800
+    assert len(table.table.search().where("site = 'A'").to_list()) == 200
     with table.changing() as engine:
         engine.delete("id < '00100'")
-    now = torch.cat([changed[100:], rows[200:1800]])
-    for query in now[::300]:
-        expected = (search(query[None], now, top=6, distance=cosine).indices[0] + 100).tolist()
-        assert numbers(nearest_rows(BodyTable(table.path), query[None], cosine, top=6)) == expected
+    now = torch.cat([changed[100:], rows[200:4800]])
+    for query in now[::600]:
+        expected = search(query[None], now, top=6, distance=cosine).indices[0] + 100
+        found = BodyTable(table.path).nearest(query[None], cosine, top=6)
+        assert numbers(found) == expected.tolist()
     with pytest.raises(ValueError, match=r"age: expected numbers as in .*g\.igps, got text"):
         table.add(rows[:1], [{**told(0), "age": "old"}], {"age": str})
 
 
-@pytest.mark.usefixtures("few_are_many")
-def test_a_column_that_comes_later_is_indexed_too(tmp_path: Path) -> None:
-    table = written(tmp_path / "g.igps", units(1100), "cosine")
-    table.add(units(10), [{**told(i), "site": "A"} for i in range(10)], {"site": str})
-    assert {"id", "site"} <= {one.columns[0] for one in table.table.list_indices()}
+def test_weighted_numbers_decide_which_rows_are_candidates(tmp_path: Path) -> None:
+    """By a distance of the last two numbers alone, the nearest rows are not those by the cosine of all."""
+    rows = units(4500, 40)
 
+    def distance(queries: torch.Tensor, gallery: torch.Tensor) -> torch.Tensor:
+        return torch.cdist(queries[:, 38:], gallery[:, 38:])
 
-def test_each_change_is_a_version_to_return_to(tmp_path: Path) -> None:
-    rows = units(40)
-    table = written(tmp_path / "g.igps", rows[:30], "cosine")
-    first = table.table.version
-    table.add(rows[30:], [told(i) for i in range(30, 40)], {})
-    written(tmp_path / "g.igps", rows[:3], "cosine")
-    assert [
-        len(BodyTable(table.path, version)) for version in (first, table.table.version, None)
-    ] == [30, 40, 3]
-    before = BodyTable(table.path, first)
-    assert numbers(nearest_rows(before, rows[29:30], cosine, top=1)) == [29]
-    with pytest.raises(
-        ValueError, match=r"version: expected one that `igps gallery versions` lists, got 99"
+    found = []
+    for name, weights in (
+        ("plain", None),
+        ("weighted", lambda width: [0.1] * (width - 2) + [9.0] * 2),
     ):
-        BodyTable(table.path, 99)
+        path = tmp_path / f"{name}.igps"
+        _table.write(path, ABOUT, "cosine", batches(rows), FURTHER, weights=weights)
+        found.append(recall(BodyTable(path), rows[:20], rows, distance, candidates=60))
+    plain, weighted = found
+    assert plain < 0.5 < 0.98 <= weighted
+
+
+def test_versions_are_those_of_the_engine(tmp_path: Path) -> None:
+    """An earlier version, also one with another map to short vectors, is restored and searched."""
+    rows = units(4500)
+    table = written(tmp_path / "g.igps", rows, "cosine")
+    first = table.table.version
+    written(tmp_path / "g.igps", histograms(4200, 300), "chi_square")
+    assert len(BodyTable(table.path)) == 4200
+    lancedb.connect(table.path).open_table("bodies").restore(first)
+    restored = BodyTable(table.path)
+    assert len(restored) == 4500
+    assert numbers(restored.nearest(rows[29:30], cosine, top=1)) == [29]
+
+
+def test_a_gallery_lies_in_an_object_store(tmp_path: Path) -> None:
+    """By the protocol that object stores share; here the store is a folder."""
+    place = f"file-object-store://{tmp_path}/store/g.igps"
+    assert not is_gallery(place)
+    rows = units(4500)
+    _table.write(place, ABOUT, "cosine", batches(rows), FURTHER)
+    assert is_gallery(place)
+    table = open_table(place)
+    table.add(rows[:10], [told(i, "b") for i in range(10)], {})
+    assert len(BodyTable(place)) == 4500
+    assert numbers(BodyTable(place).nearest(rows[7:8], cosine, top=1)) == [7]
+
+
+def test_a_path_keeps_the_place_in_a_bucket() -> None:
+    assert address(Path("s3://bucket/all/g.igps")) == "s3://bucket/all/g.igps"
+    assert address("gs://bucket/g.igps") == "gs://bucket/g.igps"
+    assert address(Path("C:/meshes/g.igps")) == "C:/meshes/g.igps"
 
 
 def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
@@ -266,7 +259,7 @@ def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(5,\)"
     ):
-        nearest_rows(table, units(1, 5), cosine, top=1)
+        table.nearest(units(1, 5), cosine, top=1)
     with pytest.raises(
         ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(4, 4\)"
     ):
@@ -303,43 +296,38 @@ def test_a_strangers_gallery_runs_nothing(tmp_path: Path) -> None:
         BodyTable(table.path)
 
 
-@pytest.mark.usefixtures("few_are_many")
 @pytest.mark.parametrize("how", ["truncated", "gone", "empty"])
 def test_no_damaged_file_gives_a_wrong_answer(tmp_path: Path, how: str) -> None:
-    """It is told in a sentence, or the answers are right without it."""
-    rows = histograms(1100, 1100)
-
-    def answers() -> list[list[int]]:
-        table = BodyTable(tmp_path / "g.igps")
-        return [numbers(nearest_rows(table, one[None], chi_square, top=3)) for one in rows[:3]]
-
-    written(tmp_path / "g.igps", rows, "chi_square")
-    right = answers()
-    files = [
-        path for path in (tmp_path / "g.igps").rglob("*") if path.is_file() and path.name != "lock"
-    ]
-    n_told = 0
-    for path in files:
-        content = path.read_bytes()
-        path.unlink()
+    """The damage is an error in a sentence, or the answer is right without the file."""
+    rows = units(4500)
+    path = tmp_path / "g.igps"
+    written(path, rows, "cosine")
+    right = numbers(BodyTable(path).nearest(rows[:1], cosine, top=3))
+    files = [file for file in path.rglob("*") if file.is_file() and file.name != "lock"]
+    # One file of each kind in each folder
+    chosen = {(file.parent, file.suffix): file for file in files}
+    n_refused = 0
+    for file in chosen.values():
+        content = file.read_bytes()
+        file.unlink()
         if how != "gone":
-            path.write_bytes(content[: len(content) // 2 if how == "truncated" else 0])
-        words = "g.igps"
+            file.write_bytes(content[: len(content) // 2 if how == "truncated" else 0])
+        error = ""
         try:
-            assert answers() == right, path
-        except (ValueError, FileNotFoundError) as error:
-            n_told, words = n_told + 1, str(error)
-        assert "g.igps" in words
-        assert "\n" not in words
-        path.write_bytes(content)
-    assert n_told >= 3
-    assert answers() == right
+            assert numbers(BodyTable(path).nearest(rows[:1], cosine, top=3)) == right, file
+        except (ValueError, FileNotFoundError) as refusal:
+            error = str(refusal)
+            n_refused += 1
+        assert not error or "g.igps" in error
+        assert "\n" not in error
+        file.write_bytes(content)
+    assert n_refused >= 3
+    assert numbers(BodyTable(path).nearest(rows[:1], cosine, top=3)) == right
 
 
 def _answers(path: Path) -> list[list[int]]:
     return [
-        numbers(nearest_rows(BodyTable(path), one[None], cosine, top=3))
-        for one in units(1500)[::150]
+        numbers(BodyTable(path).nearest(one[None], cosine, top=3)) for one in units(1500)[::150]
     ]
 
 
@@ -354,7 +342,7 @@ def test_several_processes_read_while_one_adds(tmp_path: Path) -> None:
         assert all(future.result() in (before, after) for future in futures)
     # What was opened before stays what it was.
     assert (
-        [numbers(nearest_rows(opened, one[None], cosine, top=3)) for one in rows[::150]]
+        [numbers(opened.nearest(one[None], cosine, top=3)) for one in rows[::150]]
         == before
         != after
     )

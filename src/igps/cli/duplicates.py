@@ -41,6 +41,7 @@ def duplicates(
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import keeps_size
     from igps.duplicates.duplicates import duplicates as find_duplicates
+    from igps.duplicates.duplicates import pose_duplicates
     from igps.duplicates.surfaces import MAX_TOLERANCE
     from igps.gallery.gallery import Gallery
     from igps.gallery.opening import is_gallery
@@ -66,9 +67,10 @@ def duplicates(
     if warning := keeps_size(size, units)[1]:
         print(warning)
     shared = {name: reading.get(name) for name in ("cache_dir", "n_workers")}
-    result = find_duplicates(
-        source, DESCRIPTOR, poses=poses, size=size, tolerance=tolerance, progress=True, **shared
-    )
+    if poses:
+        result = pose_duplicates(source, DESCRIPTOR, size=size, progress=True, **shared)
+    else:
+        result = find_duplicates(source, size=size, tolerance=tolerance, progress=True, **shared)
     _print_groups(result, poses)
     if failures := [*result.failures, *unread]:
         print(f"{len(failures)} files could not be compared. The first: {failures[0].error}")

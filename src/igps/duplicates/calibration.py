@@ -115,6 +115,10 @@ class Calibration:
             raise ValueError(
                 f"{self.descriptor}: its calibration was made for other parameters. {remedy}."
             )
+        self.check_signatures(config)
+
+    def check_signatures(self, config: SignatureConfig) -> None:
+        """Raise a ValueError unless the calibration belongs to Signatures of a configuration."""
         params = calibration_params(config)
         for name, value in self.signatures.items():
             if params[name] != value:

@@ -6,12 +6,11 @@ gallery, those with near descriptions.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
 
-import numpy as np
 import torch
 from scipy.cluster.hierarchy import DisjointSet
 from tqdm import tqdm
@@ -25,6 +24,7 @@ from igps.duplicates._alignment import surface_distance
 from igps.duplicates._moments import distance_bounds
 from igps.duplicates._near_pairs import NearPairs, near_in_gallery, near_pairs, of_one_size
 from igps.duplicates.calibration import Calibration
+from igps.duplicates.grouping import Pairs, assigned, groups_of
 from igps.duplicates.surfaces import Grade, Surfaces
 from igps.gallery.gallery import Gallery
 from igps.nn.description import describe
@@ -34,8 +34,6 @@ _BATCH_SIZE = 256  # pairs that are aligned at once
 # Candidates are pairs whose `distance_bounds` are below this many times the limit. The bounds hold to first order only,
 # and details that cancel in a distance of surfaces do not cancel in moments: copies reached 1.3 times the limit.
 _CANDIDATE_FACTOR = 2.0
-
-_Pairs = dict[tuple[int, int], float]
 
 
 @dataclass(frozen=True)
@@ -69,11 +67,18 @@ class BodyDistance:
     same: bool  # whether the bodies have the same shape
 
 
-def duplicates(  # noqa: PLR0913 (a source, and settings that all have a default)
+@dataclass(frozen=True)
+class _Work:
+    """How pairs are compared."""
+
+    calibration: Calibration
+    n_workers: int | None
+    progress: bool
+
+
+def duplicates(
     source: SignatureDataset | Gallery,
-    descriptor: str | Descriptor = "pretrained",
     *,
-    poses: bool = False,
     size: Size = "auto",
     tolerance: float = 0.0,
     cache_dir: str | Path | None = None,
@@ -86,9 +91,6 @@ def duplicates(  # noqa: PLR0913 (a source, and settings that all have a default
     Args:
         source: the files, or a gallery of them. A gallery finds candidate pairs without comparing all pairs, and only
             the files of candidates are read again, unless their Signatures are cached.
-        descriptor: a calibrated descriptor; ignored for a gallery, which has its own.
-        poses: whether other poses of a body count as the same body. Then only descriptions are compared, which finds
-            more false pairs.
         size: whether bodies of different size are different, see `keeps_size`.
         tolerance: distance over √area, up to 0.02. Pairs of different bodies within it are returned as `nearly`; in a
             gallery only those with near descriptions.
@@ -101,149 +103,147 @@ def duplicates(  # noqa: PLR0913 (a source, and settings that all have a default
         ValueError: the calibration belongs to another descriptor, or the tolerance is out of range.
         MeshError: none of the meshes can be described.
     """
-    calibration = calibration or Calibration.load()
+    work = _Work(calibration or Calibration.load(), n_workers, progress)
     failures: list[Failure] = []
     if isinstance(source, Gallery):
-        calibration.check(source.about["descriptor"], source.descriptor, source.config)
-        chosen, dataset = source.descriptor, _files_of(source, cache_dir)
-        near = near_in_gallery(
-            source, calibration.pose.distance if poses else calibration.near, progress
-        )
+        _check_gallery(source, work.calibration)
+        dataset = _files_of(source, cache_dir)
+        near = near_in_gallery(source, work.calibration.near, progress)
     else:
-        chosen = descriptor_of(descriptor)
-        calibration.check(descriptor, chosen, source.config)
-        if poses:
-            descriptions = describe(
-                source, chosen, failures=failures, n_workers=n_workers, progress=progress
-            )
-            near = near_pairs(descriptions, chosen.distances, calibration.pose.distance, progress)
-        else:
-            limit = max(calibration.same.distance, tolerance)
-            moments, failures = Surfaces(source).moments(limit, n_workers, progress)
-            near = near_pairs(moments, distance_bounds, _CANDIDATE_FACTOR * limit, progress)
+        work.calibration.check_signatures(source.config)
+        limit = max(work.calibration.same.distance, tolerance)
+        moments, failures = Surfaces(source).moments(limit, n_workers, progress)
+        near = near_pairs(moments, distance_bounds, _CANDIDATE_FACTOR * limit, progress)
         dataset = source.usable(failures)
     if keeps_size(size, dataset.units())[0]:
         near = of_one_size(near, dataset)
-    surfaces = None if poses else Surfaces(dataset, tolerance)
-    joined = _join(near, surfaces, calibration, n_workers, progress)
-    if surfaces is not None:
-        joined = _regroup(joined, surfaces, calibration, n_workers, progress)
-        failures = [*failures, *surfaces.failures.values()]
-    names, groups = dataset.bodies.names, _groups(joined)
-    grades: dict[tuple[str, str], Grade] = {}
-    largest: dict[tuple[str, str], tuple[float, float, str | None]] = {}
-    nearly: dict[tuple[str, str], float] = {}
-    if surfaces is not None:
-        graded = on_threads(lambda pair: surfaces.grade(*pair), list(joined), n_workers)
-        for (i, j), (grade, deviation) in zip(joined, graded, strict=True):
-            length, unit = surfaces.length(i)
-            grades[names[i], names[j]], largest[names[i], names[j]] = (
-                grade,
-                (deviation, deviation * length, unit),
-            )
-        group_of = {i: number for number, group in enumerate(groups) for i in group}
-        for (i, j), distance in sorted(surfaces.nearly.items()):
-            if group_of.get(i, -1 - i) != group_of.get(j, -1 - j):
-                nearly[names[i], names[j]] = distance
+    surfaces = Surfaces(dataset, tolerance)
+    joined = _regroup(_join(near, surfaces, work), surfaces, work)
+    found = _found(dataset, joined, [*failures, *surfaces.failures.values()])
+    return _with_grades(found, joined, surfaces, work)
+
+
+def pose_duplicates(
+    source: SignatureDataset | Gallery,
+    descriptor: str | Descriptor = "pretrained",
+    *,
+    size: Size = "auto",
+    cache_dir: str | Path | None = None,
+    calibration: Calibration | None = None,
+    n_workers: int | None = None,
+    progress: bool = False,
+) -> Duplicates:
+    """Find groups of files that show the same body in the same or another pose.
+
+    Only descriptions are compared, which finds more false pairs than `duplicates`. The descriptor is calibrated; that
+    of a gallery is its own. For the other arguments and the errors see `duplicates`.
+    """
+    work = _Work(calibration or Calibration.load(), n_workers, progress)
+    limit = work.calibration.pose.distance
+    failures: list[Failure] = []
+    if isinstance(source, Gallery):
+        _check_gallery(source, work.calibration)
+        dataset = _files_of(source, cache_dir)
+        near = near_in_gallery(source, limit, progress)
+    else:
+        chosen = descriptor_of(descriptor)
+        work.calibration.check(descriptor, chosen, source.config)
+        descriptions = describe(
+            source, chosen, failures=failures, n_workers=n_workers, progress=progress
+        )
+        near = near_pairs(descriptions, chosen.distances, limit, progress)
+        dataset = source.usable(failures)
+    if keeps_size(size, dataset.units())[0]:
+        near = of_one_size(near, dataset)
+    return _found(dataset, _join(near, None, work), failures)
+
+
+def _check_gallery(gallery: Gallery, calibration: Calibration) -> None:
+    calibration.check(gallery.about["descriptor"], gallery.descriptor, gallery.config)
+
+
+def _found(dataset: SignatureDataset, joined: Pairs, failures: list[Failure]) -> Duplicates:
+    """Return the groups that the pairs form, by the names of the bodies."""
+    names = dataset.bodies.names
+    groups = groups_of(joined)
     return Duplicates(
-        tuple(tuple(names[i] for i in group) for group in groups),
-        {names[i]: dataset.bodies.paths[i] for group in groups for i in group},
-        {(names[i], names[j]): distance for (i, j), distance in joined.items()},
-        grades,
-        largest,
-        nearly,
-        len(dataset),
-        tuple(failures),
+        groups=tuple(tuple(names[i] for i in group) for group in groups),
+        paths={names[i]: dataset.bodies.paths[i] for group in groups for i in group},
+        pairs={(names[i], names[j]): distance for (i, j), distance in joined.items()},
+        grades={},
+        largest={},
+        nearly={},
+        n_files=len(dataset),
+        failures=tuple(failures),
     )
 
 
-def _join(
-    near: NearPairs,
-    surfaces: Surfaces | None,
-    calibration: Calibration,
-    n_workers: int | None,
-    progress: bool,
-) -> _Pairs:
+def _with_grades(found: Duplicates, joined: Pairs, surfaces: Surfaces, work: _Work) -> Duplicates:
+    """Return the groups with the grades of their pairs, and the pairs that are nearly the same."""
+    names = surfaces.names
+    grades: dict[tuple[str, str], Grade] = {}
+    largest: dict[tuple[str, str], tuple[float, float, str | None]] = {}
+    graded = on_threads(lambda pair: surfaces.grade(*pair), list(joined), work.n_workers)
+    for (i, j), (grade, deviation) in zip(joined, graded, strict=True):
+        pair = names[i], names[j]
+        length, unit = surfaces.length(i)
+        grades[pair] = grade
+        largest[pair] = (deviation, deviation * length, unit)
+    group_of = {name: group for group in found.groups for name in group}
+    nearly: dict[tuple[str, str], float] = {}
+    for (i, j), distance in sorted(surfaces.nearly.items()):
+        one = group_of.get(names[i])
+        other = group_of.get(names[j])
+        if one is None or one != other:
+            nearly[names[i], names[j]] = distance
+    return replace(found, grades=grades, largest=largest, nearly=nearly)
+
+
+def _join(near: NearPairs, surfaces: Surfaces | None, work: _Work) -> Pairs:
     """Return the candidate pairs that are the same, as a spanning forest: pairs that a group has already are skipped.
 
     Pairs are compared by their surfaces; if `surfaces` is None, all candidates count as the same.
     """
     group = DisjointSet()
-    joined: _Pairs = {}
+    joined: Pairs = {}
     while batch := list(islice(near, _BATCH_SIZE)):
         for i, j, _ in batch:
             group.add(i)
             group.add(j)
-        open_pairs = [(i, j, distance) for i, j, distance in batch if not group.connected(i, j)]
-        if surfaces is None:
-            distances = iter([distance for _, _, distance in open_pairs])
-        else:
-            aligned = on_threads(
-                lambda pair: surfaces.distance(*pair[:2], calibration), open_pairs, n_workers
-            )
-            distances = iter(
-                tqdm(
-                    aligned,
-                    desc="aligned",
-                    total=len(open_pairs),
-                    leave=False,
-                    disable=not progress,
-                )
-            )
-        for (i, j, _), distance in zip(open_pairs, distances, strict=True):
+        pairs = [(i, j, distance) for i, j, distance in batch if not group.connected(i, j)]
+        distances = [distance for _, _, distance in pairs]
+        if surfaces is not None:
+            distances = _aligned(pairs, surfaces, work)
+        for (i, j, _), distance in zip(pairs, distances, strict=True):
             if distance < math.inf and group.merge(i, j):
                 joined[i, j] = distance
     return joined
 
 
-def _regroup(
-    joined: _Pairs,
-    surfaces: Surfaces,
-    calibration: Calibration,
-    n_workers: int | None,
-    progress: bool,
-) -> _Pairs:
+def _aligned(pairs: list[tuple[int, int, float]], surfaces: Surfaces, work: _Work) -> list[float]:
+    """Return the distances of the aligned surfaces of the pairs."""
+    distances = on_threads(
+        lambda pair: surfaces.distance(*pair[:2], work.calibration), pairs, work.n_workers
+    )
+    bar = tqdm(distances, desc="aligned", total=len(pairs), leave=False, disable=not work.progress)
+    return list(bar)
+
+
+def _regroup(joined: Pairs, surfaces: Surfaces, work: _Work) -> Pairs:
     """Split groups that a coarse file has merged, and return the pairs that form the new groups, with distances.
 
     A file that is too coarse to show a detail is the same as two bodies that differ in the detail. So the files of a
-    group are assigned again, finest first: each joins the nearest leader of a group that is the same; otherwise the
-    nearest other file that is the same; otherwise it is the leader of a new group. No file joins two groups.
+    group are assigned again, see `assigned`. No file joins two groups.
     """
-
-    def pairs_of(members: list[int]) -> _Pairs:
-        leaders: list[int] = []
-        followers: list[int] = []
-        pairs: _Pairs = {}
-        for i in sorted(members, key=lambda member: (surfaces.coarseness(member), member)):
-            for finer in (leaders, followers):
-                distances = [surfaces.distance(j, i, calibration) for j in finer]
-                if min(distances, default=math.inf) < math.inf:
-                    pairs[finer[int(np.argmin(distances))], i] = min(distances)
-                    followers.append(i)
-                    break
-            else:
-                leaders.append(i)
-        return pairs
-
-    large = [members for members in _groups(joined) if len(members) > 2]
+    large = [members for members in groups_of(joined) if len(members) > 2]
     reassigned = {i for members in large for i in members}
     final = {pair: distance for pair, distance in joined.items() if reassigned.isdisjoint(pair)}
-    for pairs in tqdm(
-        on_threads(pairs_of, large, n_workers),
-        desc="groups",
-        total=len(large),
-        disable=not progress,
-    ):
+    regrouped = on_threads(
+        lambda members: assigned(members, surfaces, work.calibration), large, work.n_workers
+    )
+    for pairs in tqdm(regrouped, desc="groups", total=len(large), disable=not work.progress):
         final |= pairs
     return final
-
-
-def _groups(joined: _Pairs) -> list[list[int]]:
-    """Return the sorted connected components of the pairs."""
-    group = DisjointSet({i for pair in joined for i in pair})
-    for i, j in joined:
-        group.merge(i, j)
-    return sorted(sorted(members) for members in group.subsets())
 
 
 def body_distance(
@@ -264,16 +264,15 @@ def body_distance(
         raise ValueError(
             f"dataset: expected two meshes to compare, got {len(dataset)}: {names}. Name a part of a file as FILE#PART."
         )
-    calibration, chosen = calibration or Calibration.load(), descriptor_of(descriptor)
+    calibration = calibration or Calibration.load()
+    chosen = descriptor_of(descriptor)
     calibration.check(descriptor, chosen, dataset.config)
     descriptions = describe(dataset, chosen, n_workers=1, progress=progress)
     with torch.inference_mode():
         distance = float(chosen.distances(descriptions[:1], descriptions[1:]))
     surfaces = Surfaces(dataset)
-    between, limit = (
-        surface_distance(*map(surfaces.samples, range(2))),
-        surfaces.limit(0, 1, calibration),
-    )
+    between = surface_distance(surfaces.samples(0), surfaces.samples(1))
+    limit = surfaces.limit(0, 1, calibration)
     return BodyDistance(distance, between, limit, calibration.words(distance), between <= limit)
 
 

@@ -104,6 +104,11 @@ class Surfaces:
         self._cached_vertices = lru_cache(_N_CACHED_MESHES)(self._vertices_and_faces)
         self._cached_coarseness = lru_cache(None)(self._coarseness_and_handles)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the bodies."""
+        return self._dataset.bodies.names
+
     def samples(self, i: int) -> SurfaceSamples:
         """Return the surface samples of a body; raise a MeshError if it is unusable, a ValueError without normals."""
         signature = self._signature(i)

@@ -24,3 +24,6 @@ KNOWN: dict[str, type] = {
 Row = Mapping[str, Any]
 Batch = tuple[Tensor, Sequence[Row]]
 """Descriptions (N, ...) and their rows: the columns `KNOWN`, and further ones of text or numbers."""
+
+Found = tuple[list[dict[str, Any]], Tensor, Tensor]
+"""Rows with their distances (M,) and descriptions (M, ...), closest first."""

@@ -1,7 +1,6 @@
 """A gallery: a database of described bodies, with the descriptor that described them."""
 
-import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -9,28 +8,22 @@ from typing import Any, Self
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from igps._parameters import check_at_least
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import is_number
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.registry import is_file
-from igps.gallery._search import nearest_rows
 from igps.gallery.about import about_of, check_alike
-from igps.gallery.columns import KNOWN, Batch
+from igps.gallery.columns import Found
 from igps.gallery.opening import open_table, tables
 from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
 from igps.nn.description import check_centres, describe
-from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
+from igps.nn.descriptor import Descriptor
 from igps.retrieval.ranking import SearchResult
 from igps.retrieval.reranking import N_RERANKED, rerank_candidates
 from igps.signature.signature import SignatureConfig
-
-Found = tuple[list[dict[str, Any]], Tensor, Tensor]
-"""Rows with their distances (M,) and descriptions (M, ...), closest first."""
 
 CANDIDATES = 640
 """Number of bodies, nearest by their short vectors, that are ranked by the descriptor's own distance."""
@@ -54,9 +47,8 @@ class Gallery:
     """A database of described bodies. Queries need neither the files of the bodies nor their Signatures.
 
     Args:
-        path: folder of the gallery.
+        path: folder of the gallery, or its place in an object store, such as s3://bucket/gallery.
         descriptor: the descriptor that the gallery was built with; not needed if that is a named one.
-        version: number of an earlier version, see `versions`; the last version if None.
 
     Raises:
         FileNotFoundError: there is no gallery in the folder.
@@ -69,9 +61,9 @@ class Gallery:
         self,
         path: str | Path,
         descriptor: str | Descriptor | None = None,
-        version: int | None = None,
     ) -> None:
-        self.path, self.table = Path(path), open_table(path, version)
+        self.path = path
+        self.table = open_table(path)
         about = self.about
         descriptor = about["descriptor"] if descriptor is None else descriptor
         if isinstance(descriptor, Descriptor) or not is_file(descriptor):  # a file may have moved
@@ -79,14 +71,14 @@ class Gallery:
         self.descriptor = descriptor_of(descriptor)
         check_alike(path, about, {"model": fingerprint(self.descriptor)})
         parameters = dict(about["signature"])
-        version, current = parameters.pop("algorithm_version"), SignatureConfig.ALGORITHM_VERSION
+        version = parameters.pop("algorithm_version")
+        current = SignatureConfig.ALGORITHM_VERSION
         if version != current:
             raise ValueError(
                 f"{path}: expected signatures of version {current}, got {version}. Build it again."
             )
-        self.config = SignatureConfig(
-            **{**parameters, "attributes": tuple(parameters["attributes"])}
-        )
+        parameters["attributes"] = tuple(parameters["attributes"])
+        self.config = SignatureConfig(**parameters)
         self.reading = LoadOptions(**about["reading"], names=about.get("names"))
 
     @property
@@ -146,39 +138,45 @@ class Gallery:
         matches = []
         for query in descriptions:
             n_near = max(top, N_RERANKED) if rerank else top
-            rows, distances, near = self.search(query[None], top=n_near, exact=exact, where=where)
-            order = list(range(len(rows)))
-            if rerank and rows:
-                ranking, n = (
-                    SearchResult(torch.arange(len(rows))[None], distances[None]),
-                    min(top, len(rows)),
-                )
-                with torch.inference_mode():
-                    reranked = rerank_candidates(
-                        query[None], ranking, near.__getitem__, self.descriptor.distances, top=n
-                    )
-                order, distances = reranked.indices[0].tolist(), reranked.distances[0]
-            matches.append(
-                [
-                    Match(
-                        rows[i]["name"], rows[i]["class"], Path(rows[i]["file"]), distance, rows[i]
-                    )
-                    for i, distance in zip(order, distances.tolist(), strict=True)
-                ]
-            )
+            found = self.search(query[None], top=n_near, exact=exact, where=where)
+            if rerank:
+                found = self._reranked(query[None], found, top)
+            rows, distances, _ = found
+            pairs = zip(rows, distances.tolist(), strict=True)
+            matches.append([_match(row, distance) for row, distance in pairs])
         return matches
 
     def search(
         self, query: Tensor, *, top: int, exact: bool = False, where: str | None = None
     ) -> Found:
         """Return the rows, distances and descriptions of the bodies closest to a description (1, ...)."""
-        # The cosine distance, which finds the candidates, only approximates the distance of a head
-        n = 4 * CANDIDATES if isinstance(self.descriptor, EmbeddedDescriptor) else CANDIDATES
         with torch.inference_mode():
-            distance = self.descriptor.distances
-            return nearest_rows(
-                self.table, query, distance, top=top, exact=exact, candidates=n, where=where
+            found: Found = self.table.nearest(
+                query,
+                self.descriptor.distances,
+                top=top,
+                candidates=CANDIDATES,
+                exact=exact,
+                where=where,
             )
+        return found
+
+    def _reranked(self, query: Tensor, found: Found, top: int) -> Found:
+        """Order what `search` found by the neighbours that the bodies share."""
+        rows, distances, near = found
+        if not rows:
+            return found
+        ranking = SearchResult(torch.arange(len(rows))[None], distances[None])
+        with torch.inference_mode():
+            reranked = rerank_candidates(
+                query,
+                ranking,
+                near.__getitem__,
+                self.descriptor.distances,
+                top=min(top, len(rows)),
+            )
+        order = reranked.indices[0]
+        return [rows[i] for i in order.tolist()], reranked.distances[0], near[order]
 
     @classmethod
     def build(
@@ -197,7 +195,7 @@ class Gallery:
         Signatures that are not cached are computed one by one; `dataset.precompute()` computes them on all cores.
 
         Args:
-            path: folder of the gallery.
+            path: folder of the gallery, or its place in an object store.
             dataset: the bodies.
             descriptor: a name, which the gallery stores, or a descriptor, which has to be passed whenever the gallery
                 is opened.
@@ -205,15 +203,23 @@ class Gallery:
             strict: raise at the first body that cannot be described.
             progress: show a progress bar.
         """
-        chosen, failures = descriptor_of(descriptor), list[Failure]()
+        chosen = descriptor_of(descriptor)
         check_centres(chosen)
-        # Shuffled, because the encoder of short vectors is fitted to the first rows
+        failures: list[Failure] = []
+        # Shuffled, because the map to short vectors is fitted to the first rows
         mixed = dataset.subset(np.random.default_rng(0).permutation(len(dataset)).tolist())
         kinds = further_columns(dataset.bodies)
         batches = described_rows(mixed, chosen, kinds, {}, failures, n_workers, strict, progress)
         about = about_of(dataset.config, dataset.reading, descriptor)
         try:
-            tables().write(Path(path), about, chosen.search_distance, batches, kinds)
+            tables().write(
+                path,
+                about,
+                chosen.search_distance,
+                batches,
+                kinds,
+                weights=chosen.search_weights,
+            )
         except ValueError as error:
             if len(failures) < len(dataset):
                 raise
@@ -239,115 +245,27 @@ class Gallery:
             ValueError: the gallery was built with other parameters of the Signatures or other options of reading.
         """
         expected = about_of(dataset.config, dataset.reading, self.descriptor)
-        check_alike(
-            self.path, self.about, {name: expected[name] for name in ("signature", "reading")}
-        )
+        compared = {name: expected[name] for name in ("signature", "reading")}
+        check_alike(self.path, self.about, compared)
         known = {row["id"]: row["checksum"] for row in self.rows("id", "checksum")}
-        failures, further = list[Failure](), further_columns(dataset.bodies, self.columns)
+        failures: list[Failure] = []
+        further = further_columns(dataset.bodies, self.columns)
         for batch in described_rows(
             dataset, self.descriptor, further, known, failures, n_workers, strict, progress
         ):
             self.table.add(*batch, further)
         return failures
 
-    @classmethod
-    def merge(
-        cls,
-        path: str | Path,
-        others: Sequence[str | Path],
-        descriptor: str | Descriptor | None = None,
-        *,
-        progress: bool = False,
-    ) -> Self:
-        """Add the bodies of other galleries to the gallery at `path`, which is created if it does not exist.
-
-        The other galleries stay as they are.
-
-        Raises:
-            ValueError: the galleries have different descriptors or Signatures, or `others` is empty.
-        """
-        sources = [open_table(other) for other in others]
-        if not sources:
-            raise ValueError("others: expected at least one gallery, got none.")
-        with contextlib.suppress(FileNotFoundError):
-            sources.insert(0, open_table(path))
-        first, is_new = sources[0], len(sources) == len(others)
-        for table in sources:
-            check_alike(table.path, table.about, {**first.about, "names": table.about.get("names")})
-        owners = {
-            name: table for table in reversed(sources) for name in table.columns
-        }  # the first to have a column
-        for table in sources:
-            for name, kind in table.columns.items():
-                owners[name].check_kinds({name: kind})
-        with tqdm(
-            total=sum(map(len, sources[not is_new :])), desc="entries", disable=not progress
-        ) as bar:
-
-            def batches(table: Any) -> Iterator[Batch]:
-                for rows in table.batches():
-                    yield table.decoded(rows)
-                    bar.update(len(rows))
-
-            further = [
-                {name: table.columns[name] for name in table.columns.keys() - KNOWN.keys()}
-                for table in sources
-            ]
-            if is_new:
-                tables().write(
-                    Path(path), first.about, first.head["searched_by"], batches(first), further[0]
-                )
-            target = open_table(path)
-            for table, kinds in zip(sources[1:], further[1:], strict=True):
-                for batch in batches(table):
-                    target.add(*batch, kinds)
-        return cls(path, descriptor)
-
     def remove(self, where: str) -> int:
         """Remove the bodies that satisfy a condition, and return their number."""
         with self.table.changing(where) as table:
             return int(table.delete(where).num_deleted_rows)
 
-    def update(self, where: str, values: Mapping[str, str | float | None]) -> int:
-        """Set columns, such as {"class": "femur"}, of the bodies that satisfy a condition. Return their number."""
-        read_only = ("id", "checksum", "bytes", "modified", "thumbnail")
-        kinds = {name: kind for name, kind in self.columns.items() if name not in read_only}
-        if not values:
-            raise ValueError("values: expected at least one column, got none.")
-        if wrong := values.keys() - kinds.keys():
-            raise ValueError(f"{min(wrong)}: expected one of the columns {', '.join(kinds)}.")
-        if empty := [name for name in ("name", "file") if values.get(name, name) is None]:
-            raise ValueError(f"{empty[0]}: expected a value, got none; it identifies the body.")
-        if bad := [
-            name for name, value in values.items() if kinds[name] is float and not is_number(value)
-        ]:
-            raise ValueError(
-                f"values: expected numbers in columns of numbers, got {values[bad[0]]!r} for {bad[0]}."
-            )
-        typed = {
-            name: None if value is None else kinds[name](value) for name, value in values.items()
-        }
-        with self.table.changing(where) as table:
-            return int(table.update(where=where, values=typed).rows_updated)
-
-    def versions(self) -> list[dict[str, Any]]:
-        """Return number, time and count of bodies of each version, oldest first. Versions are kept for a month."""
-        return [
-            {
-                "version": version["version"],
-                "time": f"{version['timestamp']:%Y-%m-%d %H:%M:%S}",
-                "bodies": int(version["metadata"]["total_rows"]),
-            }
-            for version in self.table.table.list_versions()
-        ]
-
-    def restore(self, version: int) -> None:
-        """Return to an earlier version, as a new version with its content."""
-        open_table(self.path, version)  # raises an error for an unknown version
-        with self.table.changing() as table:
-            table.restore(version)
-
     def rows(self, *columns: str) -> Iterator[dict[str, Any]]:
         """Yield some columns of each row, always in the same order."""
         for batch in self.table.batches(columns=columns):
             yield from batch.to_pylist()
+
+
+def _match(row: dict[str, Any], distance: float) -> Match:
+    return Match(row["name"], row["class"], Path(row["file"]), distance, row)

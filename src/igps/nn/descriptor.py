@@ -33,6 +33,11 @@ from igps.signature.signature import SignatureConfig, compute_signature
 NAME = re.compile(r"\w{1,100}(\+\w{1,40}(=[\d.e-]{1,10})?){0,9}")
 """Pattern for the names of descriptors that can be saved, as file names are derived from these names."""
 
+# Weight, in a search for candidates, of the numbers of an embedding that distinguish bodies of one class. Among 100,000
+# varied descriptions by `pretrained`, 320 candidates hold all of the nearest ten. With a weight of 9, 640 candidates
+# hold 99.5 % of them; without a weight, about 85 % (among 200,000).
+_WITHIN_CLASS_WEIGHT = 16.0
+
 
 class Descriptor(Specified, ABC):
     """A descriptor: a module from a `SignatureBatch` to descriptions (N, ...), with a distance between descriptions.
@@ -126,6 +131,10 @@ class Descriptor(Specified, ABC):
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """Return distances (Q, G) ≥ 0 between descriptions (Q, ...) and (G, ...); by default, χ² distances."""
         return chi_square(queries, gallery)
+
+    def search_weights(self, width: int) -> list[float] | None:
+        """Return the weights of the `width` numbers of a description in `search_distance`; None if they are equal."""
+        return None
 
     def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """Map descriptions (N, ...) to vectors (N, D) for statistics by Euclidean distance.
@@ -307,6 +316,19 @@ class EmbeddedDescriptor(Descriptor):
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """Return the head's distances (Q, G) between embeddings (Q, D) and (G, D)."""
         return self.head.distances(queries, gallery)
+
+    def search_weights(self, width: int) -> list[float] | None:
+        """Return a weight for each number of an embedding, more for those that distinguish bodies of one class.
+
+        Among many bodies of one class, the nearest by the head's distance are those that these numbers show to be near.
+        """
+        numbers = torch.arange(width)
+        within_class = self.head.within_class(numbers[None])[0]
+        if len(within_class) == width:
+            return None
+        weights = torch.ones(width)
+        weights[within_class] = _WITHIN_CLASS_WEIGHT
+        return weights.tolist()
 
     def coordinates(self, embeddings: Tensor, *, within_class: bool = False) -> Tensor:
         """Return embeddings (N, D), for bodies of one class reduced by `Head.within_class`."""

@@ -19,14 +19,12 @@ from commands import error_of, run
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
 from igps.descriptors.fingerprint import fingerprint
-from igps.gallery import gallery as gallery_module
 from igps.gallery import rows
-from igps.gallery.gallery import CANDIDATES, Gallery
+from igps.gallery.about import check_alike
+from igps.gallery.gallery import Gallery
 from igps.gallery.sync import sync
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
-from igps.nn.descriptor import EmbeddedDescriptor
-from igps.nn.heads.two_level import TwoLevelHead
 from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior
@@ -73,50 +71,36 @@ def test_it_ranks_as_the_descriptor_does(
     )
 
 
-def test_more_are_ranked_under_a_head(
-    dataset: SignatureDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whose distance may be only near the cosine's, by which candidates are found."""
-    asked = []
-    search = gallery_module.nearest_rows
-
-    def spied(*arguments: Any, **options: Any) -> Any:
-        asked.append(options["candidates"])
-        return search(*arguments, **options)
-
-    monkeypatch.setattr(gallery_module, "nearest_rows", spied)
-    histograms = describe(dataset, small_interior())
-    embedded = EmbeddedDescriptor(small_interior(), TwoLevelHead().fit(histograms, dataset.labels))
-    for descriptor, descriptions in (
-        (small_interior(), histograms),
-        (embedded, embedded.head(histograms)),
-    ):
-        gallery, _ = Gallery.build(
-            tmp_path / f"{len(asked)}.igps", dataset, descriptor, n_workers=1
-        )
-        gallery.nearest(descriptions[:1], top=3)
-    assert asked[1] > asked[0] >= CANDIDATES
-
-
-def test_adding_and_merging_are_building(
-    dataset: SignatureDataset, root: Path, tmp_path: Path
-) -> None:
+def test_adding_is_building(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:
     whole, _ = Gallery.build(tmp_path / "whole.igps", dataset, INTERIOR, n_workers=1)
     added, _ = Gallery.build(tmp_path / "a.igps", dataset.subset([0, 1, 2]), INTERIOR, n_workers=1)
     added.add(dataset.subset([2, 3, 4]), n_workers=1)
     assert len(added) == 5
-    Gallery.build(tmp_path / "b.igps", dataset.subset([4, 5]), INTERIOR, n_workers=1)
-    merged = Gallery.merge(tmp_path / "c.igps", [tmp_path / "a.igps", tmp_path / "b.igps"])
+    added.add(dataset.subset([5]), n_workers=1)
     described = describe(dataset, small_interior())
-    assert merged.nearest(described) == whole.nearest(described)
+    assert added.nearest(described) == whole.nearest(described)
     # A file of other content takes the place of what it was.
     write_body(root / "ball" / "1.off", 3.0, 0.3)
-    changed = Gallery(tmp_path / "c.igps")
-    changed.add(dataset, n_workers=1)
-    assert len(changed) == 6
-    (first, *_) = changed.query(root / "ball" / "1.off", cache_dir=tmp_path / "cache")
+    added.add(dataset, n_workers=1)
+    assert len(added) == 6
+    (first, *_) = added.query(root / "ball" / "1.off", cache_dir=tmp_path / "cache")
     assert first.name == "ball/1.off"
     assert first.distance < 1e-6
+
+
+def test_a_gallery_is_merged_into_another_by_its_rows(
+    dataset: SignatureDataset, tmp_path: Path
+) -> None:
+    """As the page about galleries shows."""
+    whole, _ = Gallery.build(tmp_path / "whole.igps", dataset, INTERIOR, n_workers=1)
+    one, _ = Gallery.build(tmp_path / "a.igps", dataset.subset([0, 1, 2]), INTERIOR, n_workers=1)
+    rest = dataset.subset([2, 3, 4, 5])
+    other, _ = Gallery.build(tmp_path / "b.igps", rest, INTERIOR, n_workers=1)
+    check_alike(one.path, one.about, other.about)
+    for batch in other.table.batches():
+        one.table.add(*other.table.decoded(batch), {})
+    described = describe(dataset, small_interior())
+    assert one.nearest(described) == whole.nearest(described)
 
 
 def test_bodies_of_one_file_are_entries_of_their_own(tmp_path: Path) -> None:
@@ -172,80 +156,30 @@ def test_a_checksum_tells_descriptors_apart() -> None:
     assert len({fingerprint(one) for one in several}) == 5
 
 
-def test_commands(
+def test_a_query_of_a_gallery_is_that_of_its_folder(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    index, cache = tmp_path / "gallery.igps", ["--cache_dir", tmp_path / "cache"]
-    run(
-        monkeypatch,
-        "gallery",
-        "build",
-        root / "egg",
-        "--out",
-        index,
-        "--descriptor",
-        INTERIOR,
-        *cache,
-        *SMALL,
-    )
-    assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 3 bodies by {INTERIOR}"
-    run(
-        monkeypatch,
-        "gallery",
-        "build",
-        root,
-        "--out",
-        index,
-        "--descriptor",
-        INTERIOR,
-        *cache,
-        *SMALL,
-    )
-    assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 6 bodies by {INTERIOR}"
+    index = tmp_path / "gallery.igps"
+    cache = ["--cache_dir", tmp_path / "cache"]
+    by_name = ["--descriptor", INTERIOR, *cache, *SMALL]
 
-    wanted = root / "egg" / "1.off"
-    run(
-        monkeypatch,
-        "query",
-        wanted,
-        "--gallery",
-        root,
-        "--descriptor",
-        INTERIOR,
-        "--top",
-        4,
-        *cache,
-        *SMALL,
-    )
-    expected = capsys.readouterr().out
-    for which in (index, tmp_path / "copy.igps"):
-        run(monkeypatch, "query", wanted, "--gallery", which, "--top", 4, *cache)
-        assert capsys.readouterr().out == expected
-    run(
-        monkeypatch,
-        "query",
-        wanted,
-        "--gallery",
-        root,
-        "--descriptor",
-        INTERIOR,
-        "--rerank",
-        *cache,
-        *SMALL,
-    )
-    reranked = capsys.readouterr().out
-    assert len(reranked.splitlines()) == 7
-    assert reranked.splitlines()[:5] != expected.splitlines()[:5]
-    run(monkeypatch, "query", wanted, "--gallery", index, "--rerank", *cache)
-    assert capsys.readouterr().out == reranked
+    def lines(*arguments: object) -> list[str]:
+        run(monkeypatch, *arguments)
+        return capsys.readouterr().out.splitlines()
+
+    built = lines("gallery", "build", root, "--out", index, *by_name)
+    assert built[-1] == f"{index}: 6 bodies by {INTERIOR}"
+    query = ["query", root / "egg" / "1.off"]
+    expected = lines(*query, "--gallery", root, "--top", 4, *by_name)
+    assert lines(*query, "--gallery", index, "--top", 4, *cache) == expected
+    reranked = lines(*query, "--gallery", root, "--rerank", *by_name)
+    assert len(reranked) == 7
+    assert reranked[:5] != expected[:5]
+    assert lines(*query, "--gallery", index, "--rerank", *cache) == reranked
     (root / "egg" / "0.off").unlink()
-    run(monkeypatch, "query", wanted, "--gallery", index, "--top", 4, *cache)
-    out = capsys.readouterr().out
-    assert out.startswith(expected)
-    assert (
-        out.splitlines()[-1]
-        == "1 of these 4 files were moved or deleted since they were described."
-    )
+    *same, warning = lines(*query, "--gallery", index, "--top", 4, *cache)
+    assert same == expected
+    assert warning == "1 of these 4 files were moved or deleted since they were described."
 
 
 def test_what_does_not_fit_is_refused_in_a_sentence(
@@ -284,9 +218,6 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
     assert "version" in error_of(monkeypatch, capsys, *query)
     monkeypatch.undo()
-    with pytest.raises(SystemExit, match="2"):
-        run(monkeypatch, "gallery", "remove", index)
-    assert "the following arguments are required: --where" in capsys.readouterr().err
     gone = error_of(monkeypatch, capsys, "gallery", "sync", tmp_path / "gone", "--gallery", index)
     assert "gone: no such folder" in gone
     changed = small_interior()
@@ -348,9 +279,9 @@ def test_sync_finds_what_is_new_changed_and_gone(
     (tmp_path / "elsewhere").mkdir()
     write_body(tmp_path / "elsewhere" / "o'clock.off", 1.0, 1.5)
     gallery.add(SignatureDataset(tmp_path / "elsewhere", CONFIG, cache), n_workers=1)
-    version = gallery.versions()[-1]["version"]
+    version = gallery.table.table.version
     assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
-    assert gallery.versions()[-1]["version"] == version
+    assert gallery.table.table.version == version
     monkeypatch.setattr(rows, "MIN_AGE", 0)
     sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
     with monkeypatch.context() as context:
@@ -424,22 +355,24 @@ def test_it_opens_where_it_was_moved_to(dataset: SignatureDataset, tmp_path: Pat
 def test_commands_that_change_a_gallery(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    gallery, cache = (
-        tmp_path / "gallery.igps",
-        ["--cache_dir", tmp_path / "cache", "--n_workers", 1],
-    )
+    gallery = tmp_path / "gallery.igps"
+    cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
 
     def lines(*arguments: object) -> list[str]:
-        run(monkeypatch, "gallery", *arguments)
+        run(monkeypatch, *arguments)
         return capsys.readouterr().out.splitlines()
 
-    lines("build", root, "--out", gallery, "--descriptor", INTERIOR, *cache, *SMALL)
-    assert lines("remove", gallery, "--where", "name = 'egg/0.off'")[0] == "1 bodies removed"
+    lines("gallery", "build", root, "--out", gallery, "--descriptor", INTERIOR, *cache, *SMALL)
+    removed = lines("gallery", "remove", gallery, "--where", "name = 'egg/0.off'")
+    assert removed[0] == "1 bodies removed"
     (root / "egg" / "1.off").unlink()
-    synced = lines("sync", root, "--gallery", gallery, *cache)
+    synced = lines("gallery", "sync", root, "--gallery", gallery, *cache)
     assert synced[-2:] == ["1 bodies described, 1 removed", f"{gallery}: 5 bodies by {INTERIOR}"]
-    told = json.loads("\n".join(lines("info", gallery, "--json")))
-    assert (told["bodies"], told["descriptor"], told["columns"]["volume"]) == (5, INTERIOR, "float")
+    info = json.loads("\n".join(lines("gallery", "info", gallery, "--json")))
+    assert (info["bodies"], info["descriptor"]) == (5, INTERIOR)
+    assert info["columns"]["volume"] == "float"
+    query = ["query", root / "egg" / "2.off", "--gallery", gallery, "--where", "class = 'ball'"]
+    assert len(lines(*query, "--exact", *cache)) == 1 + 3
 
 
 def test_sync_notices_a_table_of_names_that_was_edited(
@@ -514,7 +447,6 @@ def test_a_condition_is_read_to_its_end(
     described = describe(dataset, small_interior())[:1]
     for ask in (
         gallery.remove,
-        lambda where: gallery.update(where, {"class": "egg"}),
         lambda where: gallery.nearest(described, where=where),
     ):
         with pytest.raises(
@@ -534,26 +466,12 @@ def test_a_folder_linked_twice_gives_each_body_once(root: Path, tmp_path: Path) 
     assert len(names) == 6 < len(dataset)
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert sorted(row["name"] for row in gallery.rows("name")) == names
-    n_versions = len(gallery.versions())
+    version = gallery.table.table.version
     assert sync(gallery, dataset, root, n_workers=1) == (0, 0, [])
-    assert len(gallery.versions()) == n_versions
+    assert gallery.table.table.version == version
     gallery.remove("class = 'egg'")
     gallery.add(dataset, n_workers=1)
     assert sorted(row["name"] for row in gallery.rows("name")) == names
-
-
-def test_update_takes_finite_numbers_alone(dataset: SignatureDataset, tmp_path: Path) -> None:
-    """A condition would keep what is no number as if it were more than all numbers."""
-    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
-    for wrong in ("nan", "inf", float("nan"), "1e999"):
-        with pytest.raises(
-            ValueError, match=r"values: expected numbers in columns of numbers, got .* for volume"
-        ):
-            gallery.update("true", {"volume": wrong})
-    with pytest.raises(ValueError, match="values: expected at least one column, got none"):
-        gallery.update("true", {})
-    assert gallery.update("true", {"volume": None, "area": "1e3"}) == 6
-    assert [*gallery.rows("area", "volume")] == [{"area": 1000.0, "volume": None}] * 6
 
 
 def test_a_gallery_is_no_file(dataset: SignatureDataset, tmp_path: Path) -> None:
@@ -600,9 +518,9 @@ def test_numbers_stay_as_they_are_written_in_a_column_of_text(root: Path, tmp_pa
     gallery, _ = Gallery.build(tmp_path / "g.igps", balls, small_interior(), n_workers=1)
     gallery.add(eggs, n_workers=1)
     assert {row["age"] for row in gallery.rows("age")} == {"old", "young", "03", "4", None}
-    n_versions = len(gallery.versions())
+    version = gallery.table.table.version
     assert sync(gallery, eggs, root / "egg", n_workers=1) == (0, 0, [])
-    assert len(gallery.versions()) == n_versions
+    assert gallery.table.table.version == version
 
 
 def test_what_labels_tell_no_more_sync_empties(root: Path, tmp_path: Path) -> None:
@@ -617,25 +535,9 @@ def test_what_labels_tell_no_more_sync_empties(root: Path, tmp_path: Path) -> No
         row["name"]: (row["age"], row["scanner"]) for row in gallery.rows("name", "age", "scanner")
     }
     assert told == {"ball/0.off": (None, "A"), "egg/0.off": (None, "C")}
-    n_versions = len(gallery.versions())
+    version = gallery.table.table.version
     sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
-    assert len(gallery.versions()) == n_versions
-
-
-def test_galleries_whose_columns_do_not_fit_are_not_merged_by_half(
-    root: Path, tmp_path: Path
-) -> None:
-    for label, age in (("ball", "41"), ("egg", "old")):
-        (root / label / "labels.csv").write_text(f"file,label,age\n0.off,{label},{age}\n")
-        dataset = SignatureDataset(root / label, CONFIG, tmp_path / "cache")
-        Gallery.build(tmp_path / label, dataset, small_interior(), n_workers=1)
-    with pytest.raises(
-        ValueError, match=r"age: expected numbers as in .*ball, got text\. Correct the labels"
-    ):
-        Gallery.merge(tmp_path / "all", [tmp_path / "ball", tmp_path / "egg"], small_interior())
-    assert not (tmp_path / "all").exists()
-    both = Gallery.merge(tmp_path / "all", [tmp_path / "egg", tmp_path / "ball"], small_interior())
-    assert {row["age"] for row in both.rows("age")} == {"old", "41.0"}
+    assert gallery.table.table.version == version
 
 
 def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
@@ -699,6 +601,3 @@ def test_a_gallery_remembers_the_table_of_names(
         run(monkeypatch, "gallery", "sync", "../scans", "--gallery", "../g.igps", *given, *cache)
         assert changes in capsys.readouterr().out
     assert {row["part"] for row in Gallery("../g.igps").rows("part")} == {"cube", "bar"}
-    run(monkeypatch, *build[:2], "../scans", "--out", "../plain.igps", *build[5:], *cache)
-    run(monkeypatch, "gallery", "merge", "../g.igps", "../plain.igps", "--out", "../all.igps")
-    assert {row["part"] for row in Gallery("../all.igps").rows("part")} == {"cube", "bar", "1", "2"}
