@@ -12,8 +12,8 @@ from igps.mesh.surface import unit
 
 # Times of the heat kernel over the area. The kernel of large times identifies the place on the body, the kernel of
 # small times depends on the surface around it
-_LARGE_TIMES = 0.01 * 2.0 ** np.arange(6)
-_SMALL_TIMES = 0.0008 * 2.0 ** np.arange(5)
+_LARGE_TIMES: Floats = np.asarray(0.01 * 2.0 ** np.arange(6), np.float64)
+_SMALL_TIMES: Floats = np.asarray(0.0008 * 2.0 ** np.arange(5), np.float64)
 _N_CORRESPONDING = 10  # samples of the other body that correspond to a sample
 # Smallest standard deviation at a place, as a fraction of that of the whole body
 _MIN_DEVIATION = 0.1

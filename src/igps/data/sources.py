@@ -359,10 +359,13 @@ def _bodies_in_files(
     """Return the bodies of files, given by path, name, label and part; without a part, all bodies of the file."""
     listed = {path: _listed(path, options) for path, _, _, chosen in rows if chosen is None}
     _number_lone_labels(listed)
-    entries = []
+    entries: list[tuple[int, Path, str, str | None, str | None]] = []
     for i, (path, name, label, chosen_part) in enumerate(rows):
-        parts = [chosen_part] if chosen_part is not None else [ref.part for ref in listed[path]]
-        for part in parts:
+        if chosen_part is not None:
+            chosen_parts: list[str | None] = [chosen_part]
+        else:
+            chosen_parts = [ref.part for ref in listed[path]]
+        for part in chosen_parts:
             entries.append((i, path, name if part is None else f"{name}#{part}", label, part))
     indices, paths, names, labels, parts = zip(*entries, strict=True)
     body_columns = {

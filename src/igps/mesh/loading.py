@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from igps._arrays import Floats, Integers
+from igps._arrays import Booleans, Floats, Integers
 from igps._threads import one_thread
 from igps.mesh._tidying import weld_boundaries
 from igps.mesh.errors import MeshError
@@ -198,7 +198,7 @@ def surface_body(
 
 def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:
     """Drop a few vertices that are not finite, with their faces; or return all if they are more than a sliver."""
-    is_lost = ~np.isfinite(vertices).all(axis=1)
+    is_lost: Booleans = np.asarray(~np.isfinite(vertices).all(axis=1))
     is_valid = len(faces) == 0 or (faces.min() >= 0 and faces.max() < len(vertices))
     if not is_lost.any() or not is_valid:
         return vertices, faces, []

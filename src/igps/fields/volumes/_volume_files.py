@@ -106,7 +106,7 @@ def _not_integers(path: str | Path, kind: str) -> MeshError:
 def _nibabel(path: Path) -> RawVolume:
     import nibabel
 
-    image = nibabel.load(path)
+    image: Any = nibabel.load(path)
     volume = of_nibabel(image, path)
     if path.suffix.lower() in (".gz", ".mgz"):  # nibabel stops behind the last voxel
         (values,) = volume.layers

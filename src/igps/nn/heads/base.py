@@ -50,6 +50,10 @@ class Head(Specified, ABC):
         """Return the columns (N, ≤ D) of embeddings (N, D) that distinguish bodies of one class; by default, all."""
         return embeddings
 
+    def compared_within_class(self, embeddings: Tensor) -> Tensor:
+        """Return those columns of `within_class` that `distances` compares directly; by default, all of them."""
+        return self.within_class(embeddings)
+
     def shorten(self, embeddings: Tensor) -> Tensor:
         """Map embeddings (N, D) to (N, ≤ 256) of length 1 with nearly the same cosines; by default, a ValueError."""
         got = f"{type(self).__name__} and embeddings of {embeddings.shape[1]} numbers"
