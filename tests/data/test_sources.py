@@ -57,8 +57,7 @@ def test_meshes_alone_have_no_classes(tmp_path: Path) -> None:
         ("file,label,age,age\n1.off,cat,1,2\n", "named twice"),
         ("file,label\n1.off,cat\n2.off,\n", "line 3"),
         ("file,label\n\n1.off,cat\n\n2.off,\n", "line 5"),
-        ("file;label\n1.off;cat\n", "separated by commas"),
-        ("file,label\n1.off,Wölfe\n", "CSV in UTF-8"),
+        ("name;label\n1.off;cat\n", "separated by commas"),
         (f"file,label\n1.off,{'x' * 200_000}\n", "not readable as a table"),
         ("file,label\n1.off,cat\n1.off,dog\n", r"1\.off is listed twice"),
         ("file,label\n1.off,cat\n./1.off,cat\n", r"\./1\.off is listed twice"),
@@ -74,6 +73,18 @@ def test_bad_labels_file(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "labels.csv").write_text(text, encoding="latin-1")
     with pytest.raises(ValueError, match=rf"labels\.csv: .*{message}"):
         find_bodies(tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_tables_as_spreadsheets_save_them(tmp_path: Path, encoding: str, separator: str) -> None:
+    touch(tmp_path, "1.off", "2.off")
+    rows = [("File", "Label", "Alter"), ("1.off", "Wölfe", "3"), ("2.off", "cat", "4")]
+    text = "".join(separator.join(row) + "\r\n" for row in rows)
+    (tmp_path / "labels.csv").write_bytes(text.encode(encoding))
+    found = find_bodies(tmp_path)
+    assert found.labels == ("Wölfe", "cat")
+    assert found.columns == {"Alter": ("3", "4")}
 
 
 def test_blanks_around_the_words_of_a_table_make_no_other_class(tmp_path: Path) -> None:

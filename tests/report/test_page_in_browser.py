@@ -843,11 +843,8 @@ def test_the_demo_ends_with_its_page(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """A smaller demo, the last line of which names a page that opens."""
-    monkeypatch.setattr(
-        sys.modules["igps.cli.demo"],
-        "ArticulatedShapes",
-        lambda **_: ArticulatedShapes(n_classes=2, n_per_class=2),
-    )
+    few = ArticulatedShapes(n_classes=2, n_per_class=2)
+    monkeypatch.setattr("igps.shapes.ArticulatedShapes", lambda **_: few)
     monkeypatch.setattr(sys, "argv", ["igps", "demo", "--out", str(tmp_path), "--n_workers", "1"])
     main()
     *_, last = capsys.readouterr().out.splitlines()
