@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 sys.path.append(str(Path(__file__).parents[2]))
 from tests.fields.cad.step_files import write_step
-from tests.mesh import test_volumes
+from tests.fields.volumes import test_volumes
 
 Array = NDArray[Any]
 
