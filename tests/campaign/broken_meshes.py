@@ -112,8 +112,8 @@ def judge(broken: Broken, folder: Path, number: int) -> Verdict:
 def _options(number: int) -> tuple[LoadOptions, bool]:
     """Options for reading the file of a number, and whether they may change the surface."""
     component: Component | None = "largest" if number % 7 == 1 else None
-    allow_open = number % 3 == 1
     mend = ("never", "auto", "never", "auto", "never", "auto", "never", "always")[number % 8]
+    allow_open = number % 3 == 1 and mend != "always"
     return LoadOptions(
         mend=mend, component=component, allow_open=allow_open
     ), mend != "never" or bool(component)  # type: ignore[arg-type]

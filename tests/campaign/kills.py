@@ -227,7 +227,7 @@ def _leftovers(folder: Path, expected: object) -> Row:
     for path in leftovers:
         os.utime(path, (time.time() - 2 * _DAY,) * 2)
     missed = []
-    for cache in {path.parents[1] for path in leftovers}:
+    for cache in {path.parents[2] for path in leftovers}:
         missed += _check_rerun(_Run(folder, cache.name), expected, f"leftover in {cache.name}")
     remaining = [path for path in leftovers if path.exists()]
     if remaining:

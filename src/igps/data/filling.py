@@ -10,12 +10,14 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 from tqdm import tqdm
 
 from igps._failures import Failed, Limits, MachineError
 from igps._parallel import run
 from igps._threads import n_cores
+from igps.data.cache import Kind
 from igps.data.cache_hit import CacheHit
 from igps.data.keys import FileDigest
 from igps.data.known_files import KnownFiles
@@ -66,7 +68,8 @@ def fill(
     except OSError as error:
         cause = f"cache_dir: {pipeline.cache_dir} cannot be created ({error.strerror})"
         raise MachineError(f"{cause}. Choose a writable folder and run again.") from error
-    pipeline.cache("signature").remove_abandoned()
+    for kind in get_args(Kind):
+        pipeline.cache(kind).remove_abandoned()
     known = KnownFiles(pipeline.cache_dir)
     found = find_cached(pipeline, bodies, read_files=executor is None)
     hits = [None if isinstance(outcome, Failed) else outcome for outcome in found]
