@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.stats import binomtest
 
 import igps as library
 from igps.cli import main
@@ -81,6 +82,8 @@ def test_fit_writes_model_and_card(
     assert card["classes"] == {"flat": 3, "long": 3}
     page = out.with_suffix(".md").read_text()
     assert "`rich` under the head" in page
+    lowest = binomtest(6, 6).proportion_ci(method="exact").low
+    assert f"of 6 bodies even 100 % means {lowest:.0%} to 100 %" in page
     assert f"| FT | {100 * card['held_out_scores']['ft']:.1f} |" in page
 
 
@@ -261,7 +264,9 @@ def test_what_is_unlike_everything_is_said(
         model,
     )
     lines = capsys.readouterr().out.splitlines()
-    assert "unlike every known class" in next(line for line in lines if "rod.off" in line)
+    rod = next(line for line in lines if "rod.off" in line)
+    assert "unlike every known class" in rod
+    assert "%" not in rod
     assert next(line for line in lines if "1.off" in line).endswith("flat")
 
 

@@ -160,7 +160,7 @@ def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(
     bare = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=own)
     with pytest.raises(
         ValueError,
-        match=r"attributes: expected 'height' of each body, got \[\]. Give it as --attribute",
+        match=r"attributes: expected 'height' of each body, got \[\].*file: depth, .*, hydropathy, ",
     ):
         fit_centres(igps.descriptor(write(tmp_path, text)), bare)
 

@@ -20,6 +20,7 @@ _TITLES = {
     "calibration_error": "expected calibration error",
     "unknown_auc": "recognising a class that was left out as unknown, AUC",
 }
+_N_BODIES = 20  # with fewer, the interval of a share is wider than 17 % even if all are right
 
 
 def fit(
@@ -89,10 +90,13 @@ def classify(
 ) -> list[dict[str, Any]]:
     """Classify meshes: print the most probable class of each, its probability, and the meshes that fit no class.
 
+    A mesh that fits no class has no probability: the probabilities of the classes hold for a mesh of one of them.
+
     Args:
         meshes: mesh files, or one folder.
         model: file or folder that igps fit wrote.
-        out: CSV file for the probabilities of all classes; the column class is empty for a mesh that fits no class.
+        out: CSV file for the probabilities of all classes, if the mesh is of one of them; the column class is empty
+            for a mesh that fits no class.
     """
     from igps.cli.reading import files_or_folder, print_failures, signatures
     from igps.descriptors import load
@@ -115,18 +119,18 @@ def classify(
     best = result.probabilities.max(dim=1)
     columns = (result.names, result.predicted, best.values.tolist(), best.indices.tolist())
     for name, predicted, value, likely in zip(*columns, strict=True):
-        shown = (
-            f"unlike every known class, most like {result.classes[likely]}"
-            if predicted is None
-            else predicted
-        )
-        print(f"{name:<{width}}  {value:>11.1%}  {shown}")
+        nearest = result.classes[likely]
+        shown = f"{value:.1%}"
+        if predicted is None:  # probabilities divide 1 among known classes, and it is in none
+            shown = "-"
+        words = predicted or f"unlike every known class; the nearest is {nearest}"
+        print(f"{name:<{width}}  {shown:>11}  {words}")
         rows.append(
             {
                 "name": name,
                 "class": predicted,
-                "most_like": result.classes[likely],
-                "probability": value,
+                "most_like": nearest,
+                "probability": None if predicted is None else value,
             }
         )
     print_failures(failures, len(rows))
@@ -158,8 +162,19 @@ for {use}. Scores in percent, means over held-out folds that neither the fit nor
 | | |
 |---|---|
 {scores}
-
+{_warning(sum(card["classes"].values()))}
 Fitted to {sum(card["classes"].values())} bodies of {len(card["classes"])} classes: {classes}.
 
 Signatures: `{json.dumps(card["signature"])}`. igps {card["version"]}.
+"""
+
+
+def _warning(n_bodies: int) -> str:
+    """Return a paragraph on how little a share of few bodies says; empty for more bodies."""
+    if n_bodies >= _N_BODIES:
+        return ""
+    # The exact interval of Clopper and Pearson (1934) where all are right
+    low = 0.025 ** (1 / n_bodies)
+    return f"""
+**Too few bodies for a result**: of {n_bodies} bodies even 100 % means {low:.0%} to 100 % (95 % interval).
 """

@@ -165,6 +165,11 @@ def named_source(name: str) -> AttributeSource | None:
     return None
 
 
+def attribute_names() -> list[str]:
+    """Return the names of attributes that the file of a body itself may give."""
+    return [name for kind in _source_kinds() for name in kind.names]
+
+
 def _source_kinds() -> list[SourceKind]:
     return [kind for field in field_packages() for kind in getattr(field, "ATTRIBUTES", ())]
 

@@ -18,14 +18,15 @@ from igps.nn.histograms.pairs import PairHistogram
 
 # Centres of the classes. The classes of the depth have their boundaries at 0.015, 0.03 and 0.06 of √area.
 _DEPTH = (0.0075, 0.0225, 0.0375, 0.0825)
-_ELECTROSTATIC_POTENTIAL = (2.4, 2.8, 3.2, 3.6)
+_SURFACE_POTENTIAL = (2.4, 2.8, 3.2, 3.6)
 _N_KNOTS = 12
 
 
 def rich(*, learnable: bool = False, n_training_samples: int | None = None) -> HistogramDescriptor:
     """Interior distances joined with Euclidean distances, directions and attributes of the samples, in three parts.
 
-    - Interior distances, some jointly with Euclidean distances, depth and electrostatic potential of the samples.
+    - Interior distances, some jointly with Euclidean distances, depth and surface potential of the samples. The surface
+      potential is that of a uniform charge on the surface, see `electrostatic_potential`.
     - Interior distances of interior samples, jointly with the angles of their directions to the surface.
     - Euclidean distances of surface samples, jointly with the angles of their directions.
 
@@ -53,7 +54,9 @@ def rich(*, learnable: bool = False, n_training_samples: int | None = None) -> H
     euclidean = partial(EuclideanDistance, learnable=learnable)
     cosines = partial(PairCosines, 5, learnable=learnable)
     depth = partial(Attribute, "depth", _DEPTH, learnable=learnable)
-    charge = Attribute("electrostatic_potential", _ELECTROSTATIC_POTENTIAL, learnable=learnable)
+    surface_potential = Attribute(
+        "electrostatic_potential", _SURFACE_POTENTIAL, learnable=learnable
+    )
     n = N_ORIENTED_SAMPLES
     return HistogramDescriptor(
         [
@@ -63,7 +66,7 @@ def rich(*, learnable: bool = False, n_training_samples: int | None = None) -> H
                 histogram(50, potential(4), distance(32), euclidean(16)),
                 histogram(50, potential(3), depth(), distance(12), euclidean(8)),
                 histogram(50, potential(4), depth(), distance(32)),
-                histogram(50, potential(4), charge, distance(32)),
+                histogram(50, potential(4), surface_potential, distance(32)),
             ],
             histogram(50, distance(6, 3.0), cosines(), n_samples=n),
             PairHistogram(

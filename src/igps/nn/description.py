@@ -5,6 +5,7 @@ import logging
 import time
 from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import torch
@@ -15,12 +16,14 @@ from igps._arrays import Singles
 from igps._failures import Failed
 from igps._parallel import on_threads, run
 from igps._threads import n_cores, one_thread
+from igps.data.attribute_sources import attribute_names
 from igps.data.cache import Record
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.keys import derived_key
 from igps.mesh.errors import MeshError
 from igps.nn.axes import Attribute
 from igps.nn.descriptor import BodyDescriptor, Descriptor
+from igps.signature.config import AttributeName
 
 logger = logging.getLogger(__name__)
 
@@ -137,9 +140,11 @@ def check_attributes(descriptor: nn.Module, names: Collection[str]) -> None:
     """Raise a ValueError if an axis needs an attribute that is not among the names."""
     for axis in descriptor.modules():
         if isinstance(axis, Attribute) and axis.name not in names:
+            known = ", ".join((*get_args(AttributeName), *attribute_names()))
             raise ValueError(
-                f"attributes: expected {axis.name!r} of each body, got {sorted(names)}. Give it as --attribute "
-                f"{axis.name}=..., or as SignatureDataset(attributes=...)."
+                f"attributes: expected {axis.name!r} of each body, got {sorted(names)}. Give it as "
+                f"--attribute {axis.name}=..., or as SignatureDataset(attributes=...). "
+                f"Known without a file: {known}."
             )
 
 
