@@ -68,7 +68,8 @@ class HatSurface:
         self.order = used[spatial_order(vertices[used], _LEAF_SIZE)]
         rank = np.empty(len(vertices), np.int64)
         rank[self.order] = np.arange(len(self.order))
-        vertices, self.faces = vertices[self.order], rank[faces]
+        vertices = vertices[self.order]
+        self.faces = rank[faces]
 
         corners = vertices[self.faces]
         sides = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
@@ -77,17 +78,14 @@ class HatSurface:
         normals /= double_areas
         inward = np.cross(normals[:, None], sides[:, :2])
         squared_sides = np.square(sides).sum(axis=2)
-        columns = (
-            corners.reshape(-1, 9),
-            normals,
-            inward.reshape(-1, 6),
-            squared_sides,
-            double_areas,
-        )
+        triangles = corners.reshape(-1, 9)
+        columns = (triangles, normals, inward.reshape(-1, 6), squared_sides, double_areas)
         self.table = np.concatenate(columns, axis=1)
         n_corners = 3 * len(faces)
-        arrays = np.ones(n_corners), self.faces.ravel(), np.arange(n_corners + 1)
-        incidence = sparse.csc_matrix(arrays, shape=(len(vertices), n_corners)).tocsr()
+        ones = np.ones(n_corners)
+        starts = np.arange(n_corners + 1)
+        shape = (len(vertices), n_corners)
+        incidence = sparse.csc_matrix((ones, self.faces.ravel(), starts), shape=shape).tocsr()
         self.hats = _hats(vertices, incidence, corners, normals, double_areas / 6, squared_sides)
         self.face_starts = incidence.indptr.astype(np.int64)
         self.incident_faces = incidence.indices.astype(np.int64) // 3
@@ -99,10 +97,10 @@ class HatSurface:
         the surface all rows are filled: with barycentric coordinates at the corners of its face, with zeros elsewhere.
         """
         near = np.zeros((len(hats) + 1, x.shape[1]), dtype=bool)
-        fill_hats(x, hats, self.hats, ratio, out[len(out) - len(hats) :], near)
-        add_near_faces(
-            x, hats, near, (self.faces, self.table, self.face_starts, self.incident_faces), out
-        )
+        last_rows = out[len(out) - len(hats) :]
+        fill_hats(x, hats, self.hats, ratio, last_rows, near)
+        surface = (self.faces, self.table, self.face_starts, self.incident_faces)
+        add_near_faces(x, hats, near, surface, out)
 
 
 def _hats(
@@ -127,9 +125,11 @@ def _hats(
         moments.reshape(-1, 9),
         _outer(normals, total).reshape(-1, 9),
     ]
-    sums = incidence @ np.repeat(third_areas * np.concatenate(columns, axis=1), 3, axis=0)
+    by_face = third_areas * np.concatenate(columns, axis=1)
+    sums = incidence @ np.repeat(by_face, 3, axis=0)
     mass, total, flux, moments, normal_moments = np.split(sums, (1, 4, 7, 16), axis=1)
-    total, moments = total / mass, moments.reshape(-1, 3, 3) / mass[..., None]
+    total = total / mass
+    moments = moments.reshape(-1, 3, 3) / mass[..., None]
     centres = (vertices + total) / 4
     to_vertex = vertices - centres
     mixed = _outer(vertices, total)
@@ -137,16 +137,17 @@ def _hats(
     covariance = hat_moments - _outer(centres, centres)
     normal_moments = normal_moments.reshape(-1, 3, 3) / 4 + _outer(flux, vertices / 4 - centres)
     trace = np.trace(covariance, axis1=1, axis2=2)[:, None]
-    # Longer of the two sides at each corner.
-    longest = np.sqrt(
-        np.maximum(np.roll(squared_sides, -1, axis=1), np.roll(squared_sides, -2, axis=1))
-    )
-    extents = np.maximum.reduceat(longest.ravel()[incidence.indices], incidence.indptr[:-1])
+    # At each corner, the longer of its two sides
+    one_side = np.roll(squared_sides, -1, axis=1)
+    other_side = np.roll(squared_sides, -2, axis=1)
+    longest = np.sqrt(np.maximum(one_side, other_side)).ravel()
+    extents = np.maximum.reduceat(longest[incidence.indices], incidence.indptr[:-1])
+    radii = extents[:, None] + np.linalg.norm(to_vertex, axis=1, keepdims=True)
     constant = (flux * to_vertex).sum(axis=1, keepdims=True)
     linear = -4 * np.einsum("vij,vi->vj", normal_moments, to_vertex) - 2 * trace * flux
     parts = [
         centres,
-        extents[:, None] + np.linalg.norm(to_vertex, axis=1, keepdims=True),
+        radii,
         constant,
         flux,
         -2 * trace * constant,
@@ -163,9 +164,8 @@ def _outer(left: Floats, right: Floats) -> Floats:
 
 def _entries(forms: Floats) -> Floats:
     """Return the coefficients (n, 6) of xx, xy, xz, yy, yz, zz of quadratic forms (n, 3, 3)."""
-    return ((forms + forms.transpose(0, 2, 1)) * _HALF_DIAGONAL)[
-        :, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
-    ]
+    coefficients = (forms + forms.transpose(0, 2, 1)) * _HALF_DIAGONAL
+    return coefficients[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
 
 
 @dataclass(frozen=True)
@@ -175,9 +175,8 @@ class HatClusters:
     centres: Floats  # (C, 3), level by level
     radii: Floats  # (C,) of balls about the centres that contain the balls of the hats
     level_starts: Integers  # (n_levels + 1,) first cluster of each level, and C
-    sums: NDArray[
-        np.floating
-    ]  # (C, 19, K) the 19 sums of each function, see the docstring of the module
+    # (C, 19, K) the 19 sums of each function, see the docstring of the module
+    sums: NDArray[np.floating]
     n_hats: int  # V
 
     @classmethod
@@ -187,14 +186,16 @@ class HatClusters:
         sizes = [_LEAF_SIZE]
         while 16 * sizes[-1] < n_hats:
             sizes.append(4 * sizes[-1])
-        centres, radii = [], []
+        hat_centres = hats[:, :3]
+        hat_radii = hats[:, 3]
+        centres = []
+        radii = []
         for size in sizes:
             starts = np.arange(0, n_hats, size)
             counts = np.diff(np.append(starts, n_hats))
-            centre = np.add.reduceat(hats[:, :3], starts) / counts[:, None]
-            extents = (
-                np.linalg.norm(hats[:, :3] - np.repeat(centre, counts, axis=0), axis=1) + hats[:, 3]
-            )
+            centre = np.add.reduceat(hat_centres, starts) / counts[:, None]
+            arms = hat_centres - np.repeat(centre, counts, axis=0)
+            extents = np.linalg.norm(arms, axis=1) + hat_radii
             centres.append(centre)
             radii.append(np.maximum.reduceat(extents, starts))
         level_starts = np.cumsum([0, *map(len, radii)])
@@ -202,11 +203,11 @@ class HatClusters:
 
         def fill(level: int) -> None:
             terms = np.empty((n_hats, _N_TERMS), functions.dtype)
-            fill_cluster_terms(hats, sizes[level], centres[level], radii[level], terms)
-            for cluster, start in enumerate(
-                range(0, n_hats, sizes[level]), start=level_starts[level]
-            ):
-                part = slice(start, start + sizes[level])
+            size = sizes[level]
+            fill_cluster_terms(hats, size, centres[level], radii[level], terms)
+            starts = range(0, n_hats, size)
+            for cluster, start in enumerate(starts, start=level_starts[level]):
+                part = slice(start, start + size)
                 np.matmul(terms[part].T, functions[part], out=sums[cluster])
 
         team.each(fill, range(len(sizes)))
@@ -214,7 +215,13 @@ class HatClusters:
 
     def far_clusters(self, x: Floats, ratio: float) -> tuple[Integers, Integers]:
         """Return the clusters that are `ratio` or more radii from the box of points x (3, n), and the other hats."""
-        box = x.min(axis=1), x.max(axis=1)
         return find_far_clusters(
-            *box, self.centres, self.radii, self.level_starts, ratio, _LEAF_SIZE, self.n_hats
+            x.min(axis=1),
+            x.max(axis=1),
+            self.centres,
+            self.radii,
+            self.level_starts,
+            ratio,
+            _LEAF_SIZE,
+            self.n_hats,
         )

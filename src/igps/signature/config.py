@@ -71,11 +71,15 @@ class SignatureConfig:
                 f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_kept + 1}, got {self.max_vertices}."
             )
         check_fraction(accuracy=self.accuracy)
-        names, known = tuple(self.attributes), get_args(AttributeName)  # JSON and YAML have lists
-        object.__setattr__(self, "attributes", names)
-        if not set(names) <= set(known) or len(set(names)) < len(names):
+        names = tuple(self.attributes)
+        object.__setattr__(self, "attributes", names)  # JSON and YAML have lists
+        known = get_args(AttributeName)
+        is_known = set(names) <= set(known)
+        is_distinct = len(set(names)) == len(names)
+        if not (is_known and is_distinct):
             raise ValueError(
-                f"attributes: expected distinct names among {', '.join(known)}, got {', '.join(names)}."
+                f"attributes: expected distinct names among {', '.join(known)}, "
+                f"got {', '.join(names)}."
             )
 
     @classmethod

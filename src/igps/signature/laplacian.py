@@ -39,9 +39,8 @@ def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_ma
     try:
         import robust_laplacian
     except ImportError as error:
-        raise ImportError(
-            'backend="robust" needs robust-laplacian: pip install "interior-gps[robust]".'
-        ) from error
+        remedy = 'pip install "interior-gps[robust]"'
+        raise ImportError(f'backend="robust" needs robust-laplacian: {remedy}.') from error
     # Scale the mesh to unit size, because robust-laplacian mollifies by an absolute length.
     scale = longest_side(mesh.vertices)
     centred = (mesh.vertices - mesh.vertices.mean(axis=0)) / scale
@@ -62,25 +61,34 @@ def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
         longest = np.sqrt(squared[is_thin].max(axis=1, keepdims=True))
         lengths = np.sqrt(squared[is_thin]) + _MOLLIFIER * longest
         squared[is_thin] = lengths**2
-        c, b, a = np.sort(
-            lengths, axis=1
-        ).T  # Heron's formula in Kahan's arrangement, stable for needles
-        double_area[is_thin] = 2 * (
-            np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4
-        )
+        double_area[is_thin] = 2 * _areas_by_lengths(lengths)
     # cot at corner i = (b·b + c·c − a·a) / (4 area), where a is the edge opposite corner i.
     cotangents = (squared.sum(axis=1, keepdims=True) - 2 * squared) / (2 * double_area[:, None])
-    mass = _mixed_voronoi_mass(mesh.faces, cotangents, squared, double_area / 2, len(mesh.vertices))
-    return _stiffness(mesh.faces, cotangents, len(mesh.vertices)), mass
+    n_vertices = len(mesh.vertices)
+    mass = _mixed_voronoi_mass(mesh.faces, cotangents, squared, double_area / 2, n_vertices)
+    return _stiffness(mesh.faces, cotangents, n_vertices), mass
+
+
+def _areas_by_lengths(lengths: Floats) -> Floats:
+    """Return areas by Heron's formula in Kahan's arrangement, which is stable for needles."""
+    shortest, middle, longest = np.sort(lengths, axis=1).T
+    difference = longest - middle
+    product = longest + (middle + shortest)
+    product = product * (shortest - difference)
+    product = product * (shortest + difference)
+    product = product * (longest + (middle - shortest))
+    return np.sqrt(product) / 4
 
 
 def _stiffness(faces: Integers, cotangents: Floats, n_vertices: int) -> sparse.csr_matrix:
     # Half of each corner's cotangent belongs to the edge opposite it. Enter it at one of the edge's two entries.
-    shape = n_vertices, n_vertices
-    ends = faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()
-    halves = sparse.csr_matrix((cotangents.ravel() / 2, ends), shape=shape)
+    starts = faces[:, [1, 2, 0]].ravel()
+    ends = faces[:, [2, 0, 1]].ravel()
+    shape = (n_vertices, n_vertices)
+    halves = sparse.csr_matrix((cotangents.ravel() / 2, (starts, ends)), shape=shape)
     weights = halves + halves.T
-    return sparse.diags(np.asarray(weights.sum(axis=1)).ravel(), format="csr") - weights
+    row_sums = np.asarray(weights.sum(axis=1)).ravel()
+    return sparse.diags(row_sums, format="csr") - weights
 
 
 def _mixed_voronoi_mass(

@@ -32,31 +32,26 @@ logger = logging.getLogger(__name__)
 
 _BLOCK_BYTES = 256 * 2**20  # largest block of weights
 _GROUP_SIZE = 192  # points for which the same clusters are far
-_COPY_ROWS = (
-    2**10
-)  # rows of the functions copied at a time: source and copy then fit into the processor's cache
+# Rows of the functions copied at a time: source and copy then fit into the processor's cache
+_COPY_ROWS = 2**10
 _REGISTER_SIZE = 16  # single-precision numbers in a register
 _MIN_TEAM_VERTICES = 2**14  # smallest mesh for which several threads pay
 _MIN_FAR_RATIO = 1.1  # smallest distance, in radii, at which a series is used
-_HAT_ERROR = 3.5e-3  # error of the hats' series one radius away; it falls with the third power of the distance
-_CLUSTER_ERROR = (
-    2.2e-3  # error of the clusters' series one radius from the cluster's ball; it falls likewise
-)
-_MIN_FINE_VERTICES = 2000  # on coarser meshes errors were up to three times larger:
-_COARSE_GAIN = 3  # the target for their accuracy is divided by this factor
-_MIN_CLUSTER_VERTICES = (
-    2**13
-)  # smallest mesh for which clusters pay; without them a value depends only on its point
-_MIN_FLOAT32_ACCURACY = (
-    1e-4  # smallest accuracy for which the product with the functions may be in single precision
-)
+# Errors of the series one radius away from a hat, and from the ball of a cluster. They fall with the
+# third power of the distance.
+_HAT_ERROR = 3.5e-3
+_CLUSTER_ERROR = 2.2e-3
+# On meshes of fewer vertices errors were up to three times larger: their target is divided by this.
+_MIN_FINE_VERTICES = 2000
+_COARSE_GAIN = 3
+# Smallest mesh for which clusters pay. Without them a value depends only on its point.
+_MIN_CLUSTER_VERTICES = 2**13
+# Smallest accuracy for which the product with the functions may be in single precision
+_MIN_FLOAT32_ACCURACY = 1e-4
 _N_CHECKED = 12  # points that are also evaluated exactly, to check the approximation
 _N_CHECK_PARTNERS = 64  # points whose distances from the checked ones are compared
-_CHECK_LINE = (
-    0.11,
-    0.37,
-    1.0,
-)  # in principal axes, the longest last; oblique, to give points distinct positions
+# In principal axes, the longest last; oblique, to give points distinct positions
+_CHECK_LINE = (0.11, 0.37, 1.0)
 _MAX_APPROXIMATIONS = 2  # then the closed form is used
 
 
@@ -106,11 +101,8 @@ class Extension:
     ) -> None:
         check_fraction(accuracy=accuracy)
         if dtype is None:
-            dtype = (
-                np.float32
-                if accuracy is not None and accuracy >= _MIN_FLOAT32_ACCURACY
-                else np.float64
-            )
+            is_single_enough = accuracy is not None and accuracy >= _MIN_FLOAT32_ACCURACY
+            dtype = np.float32 if is_single_enough else np.float64
         if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise ValueError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
         scaled, scaled_faces, _ = _scaled(vertices, faces, np.zeros((0, 3)))
@@ -137,13 +129,19 @@ class Extension:
         for start in range(0, len(order), _COPY_ROWS):
             part = slice(start, start + _COPY_ROWS)
             rows = values[order[part]]
-            self._columns[part, : self._n_functions] = rows if divisors is None else rows / divisors
-        self._vertices, self._faces, self._accuracy = vertices, faces, accuracy
+            if divisors is not None:
+                rows = rows / divisors
+            self._columns[part, : self._n_functions] = rows
+        self._vertices = vertices
+        self._faces = faces
+        self._accuracy = accuracy
 
     def __call__(self, points: NDArray[np.floating]) -> Floats:
         """Return the values (P, K) at points (P, 3); a ValueError if a sum of weights is zero."""
-        x = _scaled(self._vertices, self._faces, points)[2] @ self._surface.axes
-        accuracy = target = self._accuracy
+        _, _, scaled_points = _scaled(self._vertices, self._faces, points)
+        x = scaled_points @ self._surface.axes
+        accuracy = self._accuracy
+        target = accuracy
         if accuracy is not None and len(self._columns) < _MIN_FINE_VERTICES:
             target = accuracy / _COARSE_GAIN
         for attempt in range(_MAX_APPROXIMATIONS + 1):
@@ -155,12 +153,16 @@ class Extension:
             error = self._sampled_error(x, out)
             if error <= accuracy:
                 break
-            target = None if attempt + 1 == _MAX_APPROXIMATIONS else 0.5 * target * accuracy / error
+            target = 0.5 * target * accuracy / error
+            again = f"with {target:.1e}"
+            if attempt + 1 == _MAX_APPROXIMATIONS:
+                target = None
+                again = "exactly"
             logger.info(
                 "mean value coordinates: error %.1e exceeds accuracy %.1e, evaluated again %s",
                 error,
                 accuracy,
-                "exactly" if target is None else f"with {target:.1e}",
+                again,
             )
         return out
 
@@ -176,7 +178,8 @@ class Extension:
         self, x: Floats, target: float | None
     ) -> Iterator[tuple[Integers, NDArray[np.floating]]]:
         """Yield, for n points at a time, their indices (n,) and the columns (V, K) summed with their weights (n, K)."""
-        surface, columns = self._surface, self._columns
+        surface = self._surface
+        columns = self._columns
         hat_ratio, cluster_ratio = _far_ratios(target)
         order = spatial_order(x, _GROUP_SIZE)
 
@@ -184,27 +187,34 @@ class Extension:
             clusters: HatClusters | None, start: int
         ) -> list[tuple[Integers, NDArray[np.floating]]]:
             group = order[start : start + _GROUP_SIZE]
-            far, hats, values = np.empty(0, np.int64), np.arange(len(columns)), columns
+            far = np.empty(0, np.int64)
+            hats = np.arange(len(columns))
+            values = columns
             if clusters is not None:
                 far, hats = clusters.far_clusters(x[group].T, cluster_ratio)
-                values = np.concatenate(
-                    [clusters.sums[far].reshape(-1, columns.shape[1]), columns[hats]]
-                )
+                far_sums = clusters.sums[far].reshape(-1, columns.shape[1])
+                values = np.concatenate([far_sums, columns[hats]])
             results = []
-            size = max(1, min(_GROUP_SIZE, _BLOCK_BYTES // (8 * len(values))))
-            for rows in (group[i : i + size] for i in range(0, len(group), size)):
+            fitting = _BLOCK_BYTES // (8 * len(values))
+            size = max(1, min(_GROUP_SIZE, fitting))
+            for first in range(0, len(group), size):
+                rows = group[first : first + size]
                 block_points = np.ascontiguousarray(x[rows].T)
                 weights = np.empty((len(values), len(rows)))
                 if clusters is not None:
                     fill_clusters(block_points, far, clusters.centres, clusters.radii, weights)
                 surface.fill_weights(block_points, hats, hat_ratio, weights)
-                results.append((rows, weights.astype(columns.dtype, copy=False).T @ values))
+                sums = weights.astype(columns.dtype, copy=False).T @ values
+                results.append((rows, sums))
             return results
 
-        with Team(None if len(columns) >= _MIN_TEAM_VERTICES else 1) as team:
-            clustered = target is not None and len(columns) >= _MIN_CLUSTER_VERTICES
-            clusters = HatClusters.from_hats(surface.hats, columns, team) if clustered else None
-            for results in team.each(partial(sum_group, clusters), range(0, len(x), _GROUP_SIZE)):
+        n_threads = None if len(columns) >= _MIN_TEAM_VERTICES else 1
+        with Team(n_threads) as team:
+            clusters = None
+            if target is not None and len(columns) >= _MIN_CLUSTER_VERTICES:
+                clusters = HatClusters.from_hats(surface.hats, columns, team)
+            starts = range(0, len(x), _GROUP_SIZE)
+            for results in team.each(partial(sum_group, clusters), starts):
                 yield from results
 
     def _sampled_error(self, x: Floats, values: Floats) -> float:
@@ -219,24 +229,26 @@ class Extension:
         order = np.argsort(x @ np.array(_CHECK_LINE))
 
         def at_steps(count: int) -> Integers:
-            return order[
-                np.linspace(0, len(order) - 1, min(count, len(order))).round().astype(np.int64)
-            ]
+            n_steps = min(count, len(order))
+            steps = np.linspace(0, len(order) - 1, n_steps).round()
+            return order[steps.astype(np.int64)]
 
         chosen = at_steps(_N_CHECKED)
+        chosen_points = np.ascontiguousarray(x[chosen].T)
         weights = np.empty((len(self._surface.order), len(chosen)))
-        self._surface.fill_weights(
-            np.ascontiguousarray(x[chosen].T), np.arange(len(weights)), math.inf, weights
-        )
-        checked, others = values[chosen], values[at_steps(_N_CHECK_PARTNERS)]
+        self._surface.fill_weights(chosen_points, np.arange(len(weights)), math.inf, weights)
+        exact = self._values(weights.astype(self._columns.dtype, copy=False).T @ self._columns)
+        checked = values[chosen]
+        others = values[at_steps(_N_CHECK_PARTNERS)]
         # To first order, a distance d changes by error · (checked − others) / d.
-        errors = checked - self._values(
-            weights.astype(self._columns.dtype, copy=False).T @ self._columns
-        )
+        errors = checked - exact
         changes = (errors * checked).sum(axis=1, keepdims=True) - errors @ others.T
         squared = cdist(checked, others, "sqeuclidean")
-        relative = np.abs(changes)[squared > 0] / squared[squared > 0]
-        return float(np.sqrt(2) * np.quantile(relative, 0.99)) if len(relative) else 0.0
+        is_apart = squared > 0
+        if not is_apart.any():
+            return 0.0
+        relative = np.abs(changes)[is_apart] / squared[is_apart]
+        return float(np.sqrt(2) * np.quantile(relative, 0.99))
 
 
 def _far_ratios(accuracy: float | None) -> tuple[float, float]:
@@ -244,7 +256,8 @@ def _far_ratios(accuracy: float | None) -> tuple[float, float]:
     if accuracy is None:
         return math.inf, math.inf
     hats = max(_MIN_FAR_RATIO, (_HAT_ERROR / accuracy) ** (1 / 3))
-    return hats, max(hats, 1 + (_CLUSTER_ERROR / accuracy) ** (1 / 3))
+    clusters = 1 + (_CLUSTER_ERROR / accuracy) ** (1 / 3)
+    return hats, max(hats, clusters)
 
 
 def _scaled(
@@ -252,8 +265,10 @@ def _scaled(
 ) -> tuple[Floats, Integers, Floats]:
     """Check the arguments; return vertices, faces and points, with lengths scaled to the mesh."""
     vertices, faces, points = check_mesh_and_points(vertices, faces, points)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    centre, scale = (low + high) / 2, np.linalg.norm(high - low) / 2
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
+    centre = (low + high) / 2
+    scale = np.linalg.norm(high - low) / 2
     if not scale > 0:
         raise ValueError(
             "vertices: expected distinct positions, got the same for all; check the mesh"

@@ -57,7 +57,8 @@ def spatial_ordering_keys(mesh: Mesh) -> Floats:
     """
     areas = face_areas(mesh.vertices, mesh.faces)
     centres = mesh.vertices[mesh.faces].mean(axis=1)
-    embedding = mesh.vertices - areas @ centres / areas.sum()
+    centroid = areas @ centres / areas.sum()
+    embedding = mesh.vertices - centroid
     embedding /= np.linalg.norm(embedding, axis=1).max()
     return _keys(embedding, vertex_area_shares(mesh.faces, areas))
 
@@ -69,8 +70,10 @@ def in_canonical_order(mesh: Mesh) -> Mesh:
     rank[order] = np.arange(len(order))
     corners = rank[mesh.faces]
     first = corners.argmin(axis=1)[:, None]
-    corners = np.take_along_axis(corners, (first + np.arange(3)) % 3, axis=1)
-    return replace(mesh, vertices=mesh.vertices[order], faces=corners[np.lexsort(corners.T[::-1])])
+    turned = (first + np.arange(3)) % 3
+    corners = np.take_along_axis(corners, turned, axis=1)
+    ascending = np.lexsort(corners.T[::-1])
+    return replace(mesh, vertices=mesh.vertices[order], faces=corners[ascending])
 
 
 def _keys(embedding: Floats, tie_breakers: Floats | float) -> Floats:
@@ -88,13 +91,9 @@ def _keys(embedding: Floats, tie_breakers: Floats | float) -> Floats:
 def nearest_spacing(points: Floats) -> Floats:
     """Return each point's (P, 3) mean distance from its neighbours, over the mean of all: tie-breakers (P,)."""
     n_neighbours = min(_N_NEIGHBOURS + 1, len(points))
-    distance = (
-        cKDTree(points)
-        .query(points, n_neighbours)[0]
-        .reshape(len(points), n_neighbours)
-        .mean(axis=1)
-    )
-    return distance / max(distance.mean(), np.finfo(float).tiny)
+    distances, _ = cKDTree(points).query(points, n_neighbours)
+    spacing = distances.reshape(len(points), n_neighbours).mean(axis=1)
+    return spacing / max(spacing.mean(), np.finfo(float).tiny)
 
 
 def vertex_area_shares(faces: Integers, areas: Floats) -> Floats:
@@ -110,8 +109,11 @@ def systematic_sample(sizes: Floats, n: int, generator: np.random.Generator) -> 
     item may be drawn several times.
     """
     ends = np.cumsum(sizes)
-    positions = (np.arange(n) + generator.random(n)) * (ends[-1] / n)
-    return np.minimum(np.searchsorted(ends, positions, side="right"), np.flatnonzero(sizes)[-1])
+    part = ends[-1] / n
+    positions = (np.arange(n) + generator.random(n)) * part
+    drawn = np.searchsorted(ends, positions, side="right")
+    last = np.flatnonzero(sizes)[-1]
+    return np.minimum(drawn, last)
 
 
 def spatial_order(points: Floats, size: int) -> Integers:
@@ -123,15 +125,17 @@ def spatial_order(points: Floats, size: int) -> Integers:
     n_cuts = max(0, math.ceil(math.log2(max(1, n_points) / size)))
     order = np.minimum(np.arange(size << n_cuts), n_points)
     # Index n_points is padding: the mean point for bounding boxes, behind all others for cuts.
-    padded = np.ascontiguousarray(
-        np.vstack([points, points.mean(axis=0) if n_points else np.zeros(3)]).T
-    )
+    padding = points.mean(axis=0) if n_points else np.zeros(3)
+    padded = np.ascontiguousarray(np.vstack([points, padding]).T)
     for cut in range(n_cuts):
-        boxes = padded.take(order, axis=1).reshape(3, 1 << cut, -1)
-        along = boxes[np.ptp(boxes, axis=2).argmax(axis=0), np.arange(1 << cut)]
-        along[order.reshape(along.shape) == n_points] = np.inf
+        n_boxes = 1 << cut
+        boxes = padded.take(order, axis=1).reshape(3, n_boxes, -1)
+        longest = np.ptp(boxes, axis=2).argmax(axis=0)
+        along = boxes[longest, np.arange(n_boxes)]
+        order = order.reshape(along.shape)
+        along[order == n_points] = np.inf
         halves = np.argpartition(along, along.shape[1] // 2 - 1, axis=1)
-        order = np.take_along_axis(order.reshape(along.shape), halves, axis=1).ravel()
+        order = np.take_along_axis(order, halves, axis=1).ravel()
     return order[order < n_points]
 
 

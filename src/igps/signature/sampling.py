@@ -44,10 +44,9 @@ def surface_points(
     corner_keys = keys[mesh.faces]
     order = np.argsort(corner_keys.sum(axis=1), kind="stable")
     face = order[systematic_sample(area[order], n_points, generator)]
+    corner_order = np.argsort(corner_keys, axis=1)[face]
     weights = np.empty((n_points, 3))
-    np.put_along_axis(
-        weights, np.argsort(corner_keys, axis=1)[face], _in_triangles(n_points, generator), axis=1
-    )
+    np.put_along_axis(weights, corner_order, _in_triangles(n_points, generator), axis=1)
     return SurfacePoints(mesh, face, weights)
 
 

@@ -81,10 +81,13 @@ class Samples:
         attributes = dict(self.attributes)
         for name, value in values.items():
             array = np.asarray(value, dtype=np.float32)
-            if array.ndim not in (1, 2) or len(array) != len(self) or not np.isfinite(array).all():
+            fits = array.ndim in (1, 2) and len(array) == len(self)
+            n_not_finite = int((~np.isfinite(array)).sum())
+            if not fits or n_not_finite:
                 raise ValueError(
-                    f"{name}: expected a finite number, or several, for each of {len(self)} points, got an array of "
-                    f"shape {array.shape} with {int((~np.isfinite(array)).sum())} values that are not finite."
+                    f"{name}: expected a finite number, or several, for each of {len(self)} "
+                    f"points, got an array of shape {array.shape} with {n_not_finite} values "
+                    "that are not finite."
                 )
             attributes[name] = array
         return replace(self, attributes=attributes)
@@ -133,9 +136,8 @@ class Signature:
     @property
     def barycentroid(self) -> Floats:
         """Interior sample (3,) of smallest potential Σ φₖ²/λₖ, a centre that hardly moves with pose (Rustamov 2010)."""
-        potential = np.square(self.interior.eigenfunctions, dtype=np.float64) @ (
-            1 / self.eigenvalues
-        )
+        squares = np.square(self.interior.eigenfunctions, dtype=np.float64)
+        potential = squares @ (1 / self.eigenvalues)
         return self.interior.points[int(np.argmin(potential))]
 
     def map_samples(self, change: Callable[[Samples], Samples]) -> Signature:
@@ -194,11 +196,9 @@ def compute_signature(
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
     spectrum, notes = _spectrum(outer, config)
-    eigenvalues, functions, residual = (
-        spectrum.eigenvalues,
-        spectrum.eigenfunctions,
-        spectrum.residual,
-    )
+    eigenvalues = spectrum.eigenvalues
+    functions = spectrum.eigenfunctions
+    residual = spectrum.residual
     roots = np.sqrt(eigenvalues)
     # The accuracy is that of interior distances, which are distances between rows of eigenfunctions over √λ.
     extend = Extension(
@@ -271,15 +271,12 @@ def _interior(
     """Return the samples at interior points (P, 3), by the extension of the eigenfunctions over √λ."""
     values = extend(points)
     values *= np.sqrt(eigenvalues)
-    order = np.argsort(
-        ordering_keys(values, eigenvalues, mesh.area, nearest_spacing(points)), kind="stable"
-    )
-    points, values = points[order], values[order]
-    return Samples(
-        points,
-        np.asarray(values, dtype=np.float32),
-        interior_attributes(mesh, points, config.attributes),
-    )
+    keys = ordering_keys(values, eigenvalues, mesh.area, nearest_spacing(points))
+    order = np.argsort(keys, kind="stable")
+    points = points[order]
+    functions = np.asarray(values[order], dtype=np.float32)
+    attributes = interior_attributes(mesh, points, config.attributes)
+    return Samples(points, functions, attributes)
 
 
 def _surface(
@@ -289,6 +286,5 @@ def _surface(
     keys = ordering_keys(functions, eigenvalues, mesh.area, tie_breakers)
     points = surface_points(mesh, config.n_surface_samples, config.seed, keys)
     values = points.interpolate(functions).astype(np.float32)
-    return Samples(
-        points.positions, values, surface_attributes(mesh, points.face, config.attributes)
-    )
+    attributes = surface_attributes(mesh, points.face, config.attributes)
+    return Samples(points.positions, values, attributes)

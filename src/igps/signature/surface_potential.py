@@ -38,11 +38,7 @@ def surface_potential(
     corners = vertices[faces]
     centre, scale = corners.mean(axis=(0, 1)), longest_side(vertices)
     corners = (corners - centre) / scale
-    sides = np.roll(corners, -1, axis=1) - corners
-    heights = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / np.square(sides).sum(
-        axis=2
-    ).max(axis=1)
-    corners = corners[heights > _MIN_HEIGHT]
+    corners = corners[_relative_heights(corners) > _MIN_HEIGHT]
     x = (np.asarray(points, np.float64) - centre) / scale
     out = np.zeros(len(x))
     if not len(corners) or not len(x):
@@ -60,19 +56,28 @@ def surface_potential(
         whole_faces.radii / 2,
     )
     squared_limits = np.square(quarters.min_distances(accuracy) + whole_faces.radii / 2)
-    order = spatial_order(x, _BLOCK_SIZE)
-    potentials = np.empty(len(x))
+    sizes = [len(level.areas) for level in levels]
     tree = PatchTree(
         np.concatenate([level.table for level in levels]),
         np.concatenate([level.min_distances(accuracy) for level in levels]),
-        np.cumsum([0, *(len(level.areas) for level in levels)]),
+        np.cumsum([0, *sizes]),
         _BRANCHING,
         squared_limits,
         _face_table(corners),
     )
+    order = spatial_order(x, _BLOCK_SIZE)
+    potentials = np.empty(len(x))
     fill_potentials(x[order], _BLOCK_SIZE, tree, potentials)
     out[order] = potentials * scale
     return out
+
+
+def _relative_heights(corners: Floats) -> Floats:
+    """Return the height of each triangle (F, 3, 3) over its longest side."""
+    sides = np.roll(corners, -1, axis=1) - corners
+    double_areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    squared_lengths = np.square(sides).sum(axis=2)
+    return double_areas / squared_lengths.max(axis=1)
 
 
 @dataclass(frozen=True)
@@ -89,15 +94,11 @@ class _Patches:
         """Make a patch of each triangle (n, 3, 3)."""
         centres = corners.mean(axis=1)
         arms = corners - centres[:, None]
-        areas = (
-            np.linalg.norm(np.cross(arms[:, 0] - arms[:, 1], arms[:, 0] - arms[:, 2]), axis=1) / 2
-        )
-        return _Patches(
-            areas,
-            centres,
-            arms.transpose(0, 2, 1) @ arms / 12,
-            np.linalg.norm(arms, axis=2).max(axis=1),
-        )
+        normals = np.cross(arms[:, 0] - arms[:, 1], arms[:, 0] - arms[:, 2])
+        areas = np.linalg.norm(normals, axis=1) / 2
+        covariances = arms.transpose(0, 2, 1) @ arms / 12
+        radii = np.linalg.norm(arms, axis=2).max(axis=1)
+        return _Patches(areas, centres, covariances, radii)
 
     def merged(self, size: int) -> _Patches:
         """Merge each `size` consecutive patches into one."""
@@ -106,11 +107,12 @@ class _Patches:
         areas = np.add.reduceat(self.areas, starts)
         centres = np.add.reduceat(self.areas[:, None] * self.centres, starts) / areas[:, None]
         arms = self.centres - centres[group]
-        moments = self.areas[:, None, None] * (self.covariances + arms[:, :, None] * arms[:, None])
-        radii = np.maximum.reduceat(np.linalg.norm(arms, axis=1) + self.radii, starts)
-        return _Patches(
-            areas, centres, np.add.reduceat(moments, starts) / areas[:, None, None], radii
-        )
+        about_new_centres = self.covariances + arms[:, :, None] * arms[:, None]
+        moments = self.areas[:, None, None] * about_new_centres
+        covariances = np.add.reduceat(moments, starts) / areas[:, None, None]
+        reach = np.linalg.norm(arms, axis=1) + self.radii
+        radii = np.maximum.reduceat(reach, starts)
+        return _Patches(areas, centres, covariances, radii)
 
     def min_distances(self, accuracy: float) -> Floats:
         """Return the distances (n,) from the centroids beyond which the series has this relative accuracy."""
@@ -123,9 +125,8 @@ class _Patches:
     def table(self) -> Floats:
         """Columns (n, 10): centroid, area, and the quadratic form A·(3/2 C − ½ tr C·1) as xx, yy, zz, 2xy, 2xz, 2yz."""
         trace = np.trace(self.covariances, axis1=1, axis2=2)
-        form = self.areas[:, None, None] * (
-            1.5 * self.covariances - 0.5 * trace[:, None, None] * np.eye(3)
-        )
+        per_area = 1.5 * self.covariances - 0.5 * trace[:, None, None] * np.eye(3)
+        form = self.areas[:, None, None] * per_area
         entries = form[:, (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)] * [1, 1, 1, 2, 2, 2]
         return np.concatenate([self.centres, self.areas[:, None], entries], axis=1)
 
@@ -138,6 +139,5 @@ def _face_table(corners: Floats) -> Floats:
     normals = normals / double_areas
     lengths = np.linalg.norm(sides, axis=2)
     outward = np.cross(sides / lengths[..., None], normals[:, None])
-    return np.concatenate(
-        [corners.reshape(-1, 9), normals, outward.reshape(-1, 9), lengths, double_areas], axis=1
-    )
+    columns = [corners.reshape(-1, 9), normals, outward.reshape(-1, 9), lengths, double_areas]
+    return np.concatenate(columns, axis=1)

@@ -38,27 +38,35 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
             f"{mesh.name}: expected a resolution of at most {max_resolution} ({_MAX_RESOLUTION} cells along the "
             f"longest side, {_MAX_CELLS} in all), got {resolution}. Lower the resolution."
         )
+    least = max(min_samples, 1)
     while True:
         axes = grid_axes(mesh, resolution)
-        check_grid(len(axes[0]) * len(axes[1]) * len(axes[2]), mesh.name)
+        n_x, n_y, n_z = (len(axis) for axis in axes)
+        check_grid(n_x * n_y * n_z, mesh.name)
         inside = inside_grid(mesh, axes)
         count = int(inside.sum())
-        if count >= max(min_samples, 1):
-            cells = np.nonzero(inside)
-            return np.stack([axis[i] for axis, i in zip(axes, cells, strict=True)], axis=1)
+        if count >= least:
+            return _points_of(axes, np.nonzero(inside))
         if min_samples == 0 or resolution >= max_resolution:
-            remedy = (
-                "lower min_samples"
-                if min_samples
-                else "raise the resolution, or set min_samples to refine it"
-            )
+            remedy = "raise the resolution, or set min_samples to refine it"
+            if min_samples:
+                remedy = "lower min_samples"
             raise MeshError(
-                f"{mesh.name}: expected at least {max(min_samples, 1)} cells inside, got {count} in a grid of "
-                f"{resolution} along the longest side. The body is too thin for this grid: {remedy}."
+                f"{mesh.name}: expected at least {least} cells inside, got {count} in a grid of "
+                f"{resolution} along the longest side. "
+                f"The body is too thin for this grid: {remedy}."
             )
-        # The count grows with the cube of the resolution, for a thin body more slowly: approach min_samples from below.
+        # The count grows with the cube of the resolution, and for a thin body more slowly.
+        # Therefore `min_samples` is approached from below, by factors of 1.05 to 2.
         growth = (min_samples / max(count, 1)) ** (1 / 3)
-        resolution = min(int(np.ceil(resolution * min(max(growth, 1.05), 2.0))), max_resolution)
+        factor = min(max(growth, 1.05), 2.0)
+        resolution = min(int(np.ceil(resolution * factor)), max_resolution)
+
+
+def _points_of(axes: tuple[Floats, ...], cells: tuple[Integers, ...]) -> Floats:
+    """Return the centres (P, 3) of cells, given by their indices along each axis."""
+    coordinates = [axis[index] for axis, index in zip(axes, cells, strict=True)]
+    return np.stack(coordinates, axis=1)
 
 
 def _largest_resolution(mesh: Mesh) -> int:
@@ -72,15 +80,19 @@ def _largest_resolution(mesh: Mesh) -> int:
 
 def grid_axes(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Floats]:
     """Return the coordinates of the cell centres along x, y and z of the cubic grid centred on the bounding box."""
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    cell = (high - low).max() / resolution
+    low = mesh.vertices.min(axis=0)
+    high = mesh.vertices.max(axis=0)
+    sides = high - low
+    middle = (low + high) / 2
+    cell = sides.max() / resolution
     # A small tolerance keeps a side of exactly n cells at n cells in spite of rounding.
-    counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1).astype(int)
-    x, y, z = (
-        (low[i] + high[i]) / 2 + (np.arange(counts[i]) - (counts[i] - 1) / 2) * cell
-        for i in range(3)
-    )
-    return x, y, z
+    counts = np.maximum(np.ceil(sides / cell - 1e-6), 1).astype(int)
+
+    def centres_along(axis: int) -> Floats:
+        from_middle = np.arange(counts[axis]) - (counts[axis] - 1) / 2
+        return middle[axis] + from_middle * cell
+
+    return centres_along(0), centres_along(1), centres_along(2)
 
 
 def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
@@ -98,12 +110,14 @@ def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
         line = tuple(axes[k] for k in order)
         after, before, touching = _scan(mesh.vertices[:, order], mesh.faces, line)
         inverse = np.argsort(order)
-        votes += ((after > 0).astype(np.int8) + (before > 0)).transpose(inverse)
+        agreeing = (after > 0).astype(np.int8) + (before > 0)
+        votes += agreeing.transpose(inverse)
         on_surface |= touching.transpose(inverse)
     inside = votes >= 5
-    doubtful = np.nonzero((votes > 1) & (votes < 5) & ~on_surface)
-    if len(doubtful[0]):
-        points = np.stack([axis[i] for axis, i in zip(axes, doubtful, strict=True)], axis=1)
+    is_doubtful = (votes > 1) & (votes < 5) & ~on_surface
+    doubtful = np.nonzero(is_doubtful)
+    if is_doubtful.any():
+        points = _points_of(axes, doubtful)
         inside[doubtful] = winding_number(mesh.vertices, mesh.faces, points) > 0.5
     return inside & ~on_surface
 
@@ -122,53 +136,64 @@ def _scan(
     # whatever the face, so both faces compute the same point.
     start, end = directed_edges(faces)
     upward = vertices[start, 2] < vertices[end, 2]
-    low, high = np.where(upward, start, end), np.where(upward, end, start)
+    low = np.where(upward, start, end)
+    high = np.where(upward, end, start)
     first = np.searchsorted(z_axis, vertices[low, 2], side="left")
     last = np.searchsorted(z_axis, vertices[high, 2], side="left")
     half_edge, row = _ranges(first, last)
-    a, b = vertices[low[half_edge]], vertices[high[half_edge]]
+    a = vertices[low[half_edge]]
+    b = vertices[high[half_edge]]
     t = (z_axis[row] - a[:, 2]) / (b[:, 2] - a[:, 2])
-    y = a[:, 1] + t * (b[:, 1] - a[:, 1])
     x = a[:, 0] + t * (b[:, 0] - a[:, 0])
-    # A plane that crosses a face crosses exactly two of its edges, one upward and one downward: pair them.
+    y = a[:, 1] + t * (b[:, 1] - a[:, 1])
+    # A plane that crosses a face crosses exactly two of its edges, one upward and one downward:
+    # pair them.
     order = np.lexsort((upward[half_edge], row, half_edge // 3))
-    down, up = order[0::2], order[1::2]
+    down = order[0::2]
+    up = order[1::2]
     row = row[up]
 
     # Columns: the points of each such segment on the lines y = const, half-open in y.
-    column_down, column_up = (
-        np.searchsorted(y_axis, y[down], "left"),
-        np.searchsorted(y_axis, y[up], "left"),
-    )
-    segment, column = _ranges(
-        np.minimum(column_down, column_up), np.maximum(column_down, column_up)
-    )
-    # +1 where the outward normal points towards +x: seen from there, the upward edge has the larger y.
+    column_down = np.searchsorted(y_axis, y[down], "left")
+    column_up = np.searchsorted(y_axis, y[up], "left")
+    first = np.minimum(column_down, column_up)
+    last = np.maximum(column_down, column_up)
+    segment, column = _ranges(first, last)
+    row = row[segment]
+    # +1 where the outward normal points towards +x: seen from there, the upward edge has the
+    # larger y.
     sign = np.where(column_up > column_down, 1, -1)[segment].astype(np.int32)
-    y0, y1, x0, x1 = (values[segment] for values in (y[down], y[up], x[down], x[up]))
-    crossing = x0 + (y_axis[column] - y0) / (y1 - y0) * (x1 - x0)
+    down = down[segment]
+    up = up[segment]
+    t = (y_axis[column] - y[down]) / (y[up] - y[down])
+    crossing = x[down] + t * (x[up] - x[down])
 
-    # A crossing counts for all points of its line with smaller x: enter it where their suffix sum starts.
+    # A crossing counts for all points of its line with smaller x: enter it where their suffix sum
+    # starts.
     position = np.searchsorted(x_axis, crossing, "left")
     size = (len(x_axis) + 1, len(y_axis), len(z_axis))
-    flat = np.ravel_multi_index((position, column, row[segment]), size)
-    crossings = (
-        np.bincount(flat, weights=sign, minlength=int(np.prod(size))).reshape(size).astype(np.int32)
-    )
+    flat = np.ravel_multi_index((position, column, row), size)
+    counts = np.bincount(flat, weights=sign, minlength=int(np.prod(size)))
+    crossings = counts.reshape(size).astype(np.int32)
     # The points with smaller x than a crossing have indices below its position.
     after = np.cumsum(crossings[::-1], axis=0)[::-1][1:]
     before = -np.cumsum(crossings, axis=0)[:-1]
 
     on_surface = np.zeros(size, dtype=bool)
-    # Use the first axis with several points: an axis across a flat body may have only one.
-    cell = next(
-        (float(axis[1] - axis[0]) for axis in axes if len(axis) > 1), longest_side(vertices)
-    )
+    cell = _cell_size(axes, vertices)
     for neighbour in (position - 1, position):
         clipped = np.clip(neighbour, 0, len(x_axis) - 1)
         is_close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell
-        on_surface[clipped[is_close], column[is_close], row[segment][is_close]] = True
+        on_surface[clipped[is_close], column[is_close], row[is_close]] = True
     return after, before, on_surface[:-1]
+
+
+def _cell_size(axes: tuple[Floats, ...], vertices: Floats) -> float:
+    for axis in axes:
+        # An axis across a flat body may have only one point.
+        if len(axis) > 1:
+            return float(axis[1] - axis[0])
+    return longest_side(vertices)
 
 
 def _ranges(first: Integers, last: Integers) -> tuple[Integers, Integers]:
