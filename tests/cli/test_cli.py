@@ -404,7 +404,7 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
         (["retrieve", "ROOT/egg"], "no classes found"),
         (
             ["retrieve", "ROOT", "--descriptor", "best"],
-            f"expected one of {', '.join(NAMES)}, molecular, or .*, got 'best'",
+            f"expected one of {', '.join(NAMES)}, fold, molecular, or .*, got 'best'",
         ),
         (
             ["retrieve", "ROOT"],

@@ -161,6 +161,6 @@ def test_unknown_descriptor_is_named_before_anything_is_computed(
             tmp_path / "cache",
         )
     error = capsys.readouterr().err
-    assert f"expected one of {', '.join(NAMES)}, molecular, or package.module:NAME" in error
+    assert f"expected one of {', '.join(NAMES)}, fold, molecular, or package.module:NAME" in error
     assert "got 'd5'" in error
     assert not (tmp_path / "cache").exists()

@@ -77,7 +77,7 @@ def test_names_are_the_thirteen() -> None:
 
 
 def test_a_wrong_name_lists_all() -> None:
-    names = ", ".join((*THIRTEEN, "molecular"))
+    names = ", ".join((*THIRTEEN, "fold", "molecular"))
     with pytest.raises(
         ValueError, match=f"^descriptor: expected one of {names}, or .*, got 'best'"
     ):

@@ -80,7 +80,7 @@ def test_the_umask_says_who_may_read_a_model_and_the_system_why_none_is_written(
     assert sorted(os.listdir(tmp_path)) == ["folder.safetensors", "mine.safetensors"]
 
 
-@pytest.mark.parametrize("name", [*NAMES, "molecular"])
+@pytest.mark.parametrize("name", [*NAMES, "fold", "molecular"])
 def test_every_descriptor_of_the_library_comes_back(name: str, tmp_path: Path) -> None:
     descriptor = igps.descriptor(name)
     descriptor.save(tmp_path / "mine.safetensors")

@@ -299,7 +299,6 @@ _AXES = {
     "EmbeddedPairCosines": "directions to the surface",
     "BallRadius": "thickness",
     "Attribute": "attributes",
-    "Shares": "kinds of residues",
     "AxialHistogram": "place along the axes",
     "BranchHistogram": "lengths of limbs",
     "PieceHistogram": "sizes of pieces",
@@ -309,10 +308,11 @@ _AXES = {
 
 def part_name(part: DescriptionPart) -> str:
     """Return what a part of a description counts, as text."""
-    axes = [type(axis).__name__ for axis in getattr(part, "axes", [part])]
+    axes = getattr(part, "axes", [part])
     words = []
-    for name in axes:
-        word = _AXES.get(name, name)
+    for axis in axes:
+        name = type(axis).__name__
+        word = getattr(axis, "label", _AXES.get(name, name))
         is_only_position = name == "Potential" and len(axes) > 1
         if word not in words and not is_only_position:
             words.append(word)

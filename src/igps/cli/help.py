@@ -19,5 +19,6 @@ def show_help(topic: Literal["options", "descriptors"]) -> None:
         print("mend: always\ncache_dir: cache\nsignature:\n  resolution: 64")
     else:
         from igps.descriptors import NAMES
+        from igps.descriptors.registry import FIELD_NAMES
 
-        print("\n".join([*NAMES, "molecular"]))
+        print("\n".join([*NAMES, *FIELD_NAMES]))

@@ -30,11 +30,14 @@ _LIBRARY: Mapping[str, str] = {
     "canonical_form": "igps.descriptors.literature.canonical_form:CanonicalForm",
     "geodesic_spectral": "igps.descriptors.literature.geodesic_spectral:GeodesicSpectral",
     "spectral_gw": "igps.descriptors.literature.spectral_gw:SpectralGromovWasserstein",
+    "fold": "igps.fields.molecules.fold:fold",
     "molecular": "igps.fields.molecules.molecular:molecular",
 }
 
-# "molecular" needs attributes that only molecules have
-NAMES: tuple[str, ...] = tuple(name for name in _LIBRARY if name != "molecular")
+FIELD_NAMES: tuple[str, ...] = ("fold", "molecular")
+"""The names of the library's descriptors that need attributes of molecules."""
+
+NAMES: tuple[str, ...] = tuple(name for name in _LIBRARY if name not in FIELD_NAMES)
 """The names of the library's descriptors that describe any body."""
 
 ENTRY_POINTS = "igps.descriptors"
@@ -60,7 +63,7 @@ def descriptor(
         ('rich+side+size', 'rich+size')
 
     Args:
-        which: one of `NAMES`, or "molecular"; or a name that an installed package adds; or a file,
+        which: one of `NAMES` or `FIELD_NAMES`; or a name that an installed package adds; or a file,
             see `load`; or "package.module:NAME", where NAME is a descriptor or makes one; or a
             descriptor. The suffix "+size" of a name compares size, "+side" distinguishes mirror
             images, "+ct" or "+ct=0.5" adds an attribute, see `WithAttributes`.

@@ -27,6 +27,8 @@ _N_SAMPLES = 2000
 class Shares(PointAxis):
     """Classes of points by an attribute that holds their shares in C classes: (P, C), rows of sum 1."""
 
+    label = "kinds of residues"
+
     def __init__(self, name: str, n_classes: int) -> None:
         nn.Module.__init__(self)
         self.name = name

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats
@@ -69,10 +70,27 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
     return means
 
 
+def trace(molecule: Molecule, points: Floats) -> Floats:
+    """Return position, Å, and place along the chain (P, 4) of the nearest residue of a polymer to points (P, 3).
+
+    Positions are relative to the mean of the residues, as attributes have single precision.
+    """
+    is_linked = np.isfinite(molecule.places)
+    if not is_linked.any():
+        return np.full((len(points), 4), np.nan)
+    positions = molecule.residue_positions[is_linked]
+    _, nearest = cKDTree(positions).query(points)
+    rows = np.column_stack([positions - positions.mean(axis=0), molecule.places[is_linked]])
+    return rows[nearest]
+
+
 def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
-    """Return a named attribute of points (P, 3), Å: (P,), or (P, 25) for "residue_shares"; a ValueError for others."""
-    if name == "screened_potential":
-        return screened_potential(molecule, points)
+    """Return a named attribute of points (P, 3), Å: (P,), or (P, C) of several numbers; a ValueError for others.
+
+    "residue_shares" has 25 numbers, "trace" has 4.
+    """
+    if name in _AT_POINTS:
+        return _AT_POINTS[name](molecule, points)
     if name not in _COLUMNS:
         raise ValueError(
             f"attributes: expected names among {', '.join(RESIDUE_ATTRIBUTES)}, got {name!r}."
@@ -119,7 +137,12 @@ _COLUMNS: Mapping[str, Callable[[Molecule], Floats]] = {
     "residue_shares": _kinds,  # shares of `RESIDUE_KINDS`, which sum to 1
 }
 
-RESIDUE_ATTRIBUTES: tuple[str, ...] = (*_COLUMNS, "screened_potential")
+_AT_POINTS: Mapping[str, Callable[[Molecule, Floats], Floats]] = {
+    "screened_potential": screened_potential,  # kT/e
+    "trace": trace,
+}
+
+RESIDUE_ATTRIBUTES: tuple[str, ...] = (*_COLUMNS, *_AT_POINTS)
 """Names of the attributes, see `residue_attribute`."""
 
 

@@ -23,7 +23,7 @@ from igps.fields.molecules._gemmi import (
     suffix_of,
 )
 from igps.fields.molecules.molecular_surface import molecular_surface
-from igps.fields.molecules.molecule import Molecule
+from igps.fields.molecules.molecule import Molecule, chain_places
 from igps.fields.molecules.residues import (
     BACKBONE,
     CHARGED_ATOMS,
@@ -164,7 +164,8 @@ class _Builder:
         self.hydrogens = hydrogens
         self.is_pqr = is_pqr
         self.balls: list[tuple[Floats, float, float, int]] = []  # position, radius, charge, residue
-        self._residues: list[tuple[str, Floats, float]] = []  # name, position, B-factor
+        # Name, position, B-factor, number (NaN outside polymers) and chain
+        self._residues: list[tuple[str, Floats, float, float, str]] = []
         self._count: Counter[str] = Counter()
 
     def molecule(self, name: str, notes: list[str]) -> Molecule:
@@ -173,7 +174,8 @@ class _Builder:
             text.format(self._count[key]) for key, text in _NOTES.items() if self._count[key]
         ]
         positions, radii, charges, residue_of = map(np.array, zip(*self.balls, strict=True))
-        names, centres, b_factors = zip(*self._residues, strict=True)
+        names, centres, b_factors, numbers, chains = zip(*self._residues, strict=True)
+        places = chain_places(np.array(centres), np.array(numbers), np.array(chains))
         return Molecule(
             name,
             positions,
@@ -184,6 +186,7 @@ class _Builder:
             np.array(centres),
             np.array(b_factors),
             (*notes, *origin, *counted),
+            places,
         )
 
     def add_chain(self, chain: gemmi.Chain) -> None:
@@ -192,12 +195,12 @@ class _Builder:
             if residue.is_water() or residue.name in WATER:
                 continue
             atoms = self._atoms(residue)
-            if self._add_residue(residue, atoms):
+            if self._add_residue(residue, atoms, chain.name):
                 number = str(residue.seqid)
                 self._count["repeated"] += number in seen
                 seen.add(number)
 
-    def _add_residue(self, residue: gemmi.Residue, atoms: list[gemmi.Atom]) -> bool:
+    def _add_residue(self, residue: gemmi.Residue, atoms: list[gemmi.Atom], chain: str) -> bool:
         """Add the balls of a residue, unless it is a ligand to be left out; return whether it was added."""
         gemmi = gemmi_module()
         kind = gemmi.find_tabulated_residue(residue.name)
@@ -219,9 +222,9 @@ class _Builder:
             else None
         )
         b_factor = np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms]))
-        self._residues.append(
-            (name, positions.mean(axis=0) if alpha is None else positions[alpha], b_factor)
-        )
+        position = positions.mean(axis=0) if alpha is None else positions[alpha]
+        number = float(residue.seqid.num) if in_polymer else np.nan
+        self._residues.append((name, position, b_factor, number, chain))
         charged = (
             (PHOSPHATES if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {}))
             if in_polymer

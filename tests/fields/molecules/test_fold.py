@@ -1,0 +1,130 @@
+"""`fold`: what it counts, that residues count once and kinds of residues do not, and places along chains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+import igps
+from igps.analysis.explanation import explain
+from igps.data.collation import collate
+from igps.fields.molecules.fold import FoldHistogram, fold
+from igps.fields.molecules.molecule import BETWEEN_CHAINS, Molecule, chain_places
+from igps.fields.molecules.residue_attributes import residue_attribute
+from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
+
+Floats = NDArray[np.float64]
+BALL = compute_signature(
+    trimesh.creation.icosphere(subdivisions=2),
+    SignatureConfig(n_eigenpairs=5, resolution=10, min_samples=0, n_surface_samples=20),
+)
+N = len(BALL.interior.points)
+SEPARATIONS = np.array([0, 1, 2, 3, 4, 5, 6.5, 9, 12.5, 17.5, 25, 37, 57, 89, 130])
+
+
+def walk(seed: int, n: int = 150) -> Floats:
+    """(n, 3) Å, a random chain with a step of 3.8 Å."""
+    steps = np.random.default_rng(seed).normal([0.3, 0, 0], size=(n, 3))
+    return np.cumsum(3.8 * steps / np.linalg.norm(steps, axis=1, keepdims=True), axis=0)
+
+
+def signature(residues: Floats, places: Floats, nearest: NDArray[np.int64]) -> Signature:
+    """Samples of a ball, each with a residue."""
+    trace = np.column_stack([residues, places])[nearest]
+    return replace(BALL, interior=BALL.interior.with_attributes({"trace": trace}))
+
+
+def hats(values: Floats, centres: Floats) -> Floats:
+    """(..., C) shares of the two centres that surround each value."""
+    return np.stack([np.interp(values, centres, one) for one in np.eye(len(centres))], axis=-1)
+
+
+def test_every_residue_counts_once_in_the_row_of_its_separation() -> None:
+    residues = walk(0)
+    places = np.arange(150.0)
+    places[80:] += 20  # a gap
+    nearest = np.random.default_rng(1).integers(0, 150, N)
+    nearest[:150] = np.arange(150)  # each at least once, some often
+    found = fold()(collate([signature(residues, places, nearest)]))[0].double().numpy()
+    i, j = np.triu_indices(150, 1)
+    distance = np.linalg.norm(residues[i] - residues[j], axis=1)
+    rows = hats(np.abs(places[i] - places[j]), SEPARATIONS)[:, 2:]
+    wanted = rows.T @ hats(distance, (np.arange(32) + 0.5) * 40 / 32)
+    wanted /= wanted.sum(axis=1, keepdims=True) * len(wanted)
+    np.testing.assert_allclose(found, wanted, atol=2e-6)
+
+
+def test_short_chains_have_no_far_pairs_and_padding_changes_nothing() -> None:
+    short = signature(walk(2, 20), np.arange(20.0), np.arange(N) % 20)
+    long = signature(walk(3), np.arange(150.0), np.arange(N) % 150)
+    kept = Samples(
+        long.interior.points[:180],
+        long.interior.eigenfunctions[:180],
+        {"trace": long.interior.attributes["trace"][:180]},
+    )
+    fewer = replace(long, interior=kept)
+    one, other = fold()(collate([short, fewer]))
+    torch.testing.assert_close(one, fold()(collate([short]))[0])
+    torch.testing.assert_close(other, fold()(collate([fewer]))[0])
+    assert one.sum(dim=1)[-4:].tolist() == [0, 0, 0, 0]
+    assert float(one.sum()) == pytest.approx(1)
+
+
+def test_shares_of_samples_add_up_to_the_distance() -> None:
+    pair = [signature(walk(seed), np.arange(150.0), np.arange(N) % 150) for seed in (4, 5)]
+    one, other = (collate([item]) for item in pair)
+    told = explain(fold(), one, other)
+    wanted = float(fold().distances(fold()(one), fold()(other)))
+    assert told.distance == pytest.approx(wanted, rel=1e-4)
+    assert told.parts == {"fold (interior)": pytest.approx(told.distance)}
+    shares = [kind.sum() for body in told.samples for kind in body.values()]
+    assert sum(shares) == pytest.approx(told.distance)
+
+
+def test_residues_of_other_kinds_change_nothing() -> None:
+    residues = walk(6, 30)
+    points = residues + np.random.default_rng(7).normal(size=(30, 3))
+
+    def traced(name: str, motion: Floats) -> Floats:
+        at = residues @ motion
+        none = np.zeros(30)
+        names = (name,) * 30
+        molecule = Molecule(
+            "chain", at, none + 2, none, np.arange(30), names, at, none, places=np.arange(30.0)
+        )
+        return residue_attribute(molecule, points @ motion, "trace")
+
+    turn = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))[0]
+    one, other, turned = (
+        traced("GLY", np.eye(3)),
+        traced("TRP", np.eye(3)),
+        traced("GLY", turn),
+    )
+    np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(turned, np.column_stack([one[:, :3] @ turn, one[:, 3]]), atol=1e-9)
+
+
+def test_places_follow_bonds_then_numbers_then_distances() -> None:
+    at = [0, 3.8, 7.6, 27.6, 31.4, 35.2, 0, 3.8]
+    positions = np.column_stack([at, np.zeros(8), np.zeros(8)])
+    # A new way of numbering at a bond; a gap of 9 residues; a number that is too small; a ligand; another chain
+    numbers = np.array([1, 2, 1001, 1010, 1012, np.nan, 7, 8])
+    chains = np.array(list("AAAAAABB"))
+    found = chain_places(positions, numbers, chains)
+    expected = [0, 1, 2, 11, 12, np.nan, 12 + BETWEEN_CHAINS, 13 + BETWEEN_CHAINS]
+    np.testing.assert_array_equal(found, expected)
+    numbers[3] = 1002  # 20 Å apart: five steps at least must be missing, and 6 bridge them
+    assert chain_places(positions, numbers, chains)[3] == 2 + 6
+    assert np.isnan(chain_places(positions, np.full(8, np.nan), chains)).all()
+
+
+def test_it_is_found_by_name_and_asks_for_a_trace() -> None:
+    assert igps.descriptor("fold").n_features == 13 * 32
+    with pytest.raises(ValueError, match="needs signatures with trace"):
+        fold()(collate([BALL]))
+    assert FoldHistogram(n_bins=8, n_samples=None).shape == (13, 8)
