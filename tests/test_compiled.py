@@ -61,3 +61,24 @@ def test_loops_of_an_earlier_version_are_compiled_anew(tmp_path: Path) -> None:
             subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment).returncode
             == 0
         )
+
+
+def test_of_several_processes_one_compiles(tmp_path: Path) -> None:
+    (tmp_path / "loops.py").write_text(
+        "from igps._compiled import compiled\n@compiled()\ndef twice(x):\n    return 2 * x\n"
+    )
+    code = (
+        "import loops; loops.twice(1.5)\n"
+        "print(sum(loops.twice._entry.dispatcher.stats.cache_misses.values()))"
+    )
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(sys.path),
+        "NUMBA_CACHE_DIR": str(tmp_path),
+    }
+    command = [sys.executable, "-c", code]
+    processes = [
+        subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(3)
+    ]
+    assert sum(int(process.communicate()[0]) for process in processes) == 1

@@ -5,11 +5,15 @@ per version. Compiled code releases the global interpreter lock (GIL) and uses o
 threads run side by side.
 """
 
+import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, update_wrapper
+from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, Generic, ParamSpec, TypeVar
+
+from filelock import FileLock
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -58,11 +62,14 @@ class Compiled(Lazy, Generic[Arguments, Result]):
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         dispatcher: Any = self._entry.dispatcher
-        try:
+        if dispatcher.overloads:
             return dispatcher(*args, **kwargs)
-        except AttributeError:  # a file in the cache refers to a class of an earlier version
-            dispatcher._cache.flush()
-            return dispatcher(*args, **kwargs)
+        with _alone(dispatcher):
+            try:
+                return dispatcher(*args, **kwargs)
+            except AttributeError:  # a file in the cache refers to a class of an earlier version
+                dispatcher._cache.flush()
+                return dispatcher(*args, **kwargs)
 
 
 def compiled(
@@ -85,6 +92,21 @@ def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
     return _numba().njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options)(
         function
     )
+
+
+@contextlib.contextmanager
+def _alone(dispatcher: Any) -> Iterator[None]:
+    """Let other processes wait while this one calls a function for the first time.
+
+    They then load what it compiled. Otherwise, each of several workers of a new installation would compile everything.
+    """
+    folder = Path(dispatcher.stats.cache_path)
+    lock = FileLock(folder / f"{dispatcher.__name__}.lock")
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # such as a file system without locks: each compiles
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(lock)
+        yield
 
 
 @cache

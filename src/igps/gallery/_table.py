@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock
 from torch import Tensor
 
 from igps._threads import one_thread
@@ -29,7 +30,6 @@ from igps.retrieval.vectors import SearchDistance
 try:
     import lancedb
     import pyarrow as pa
-    from filelock import FileLock
     from lancedb.index import BTree, IvfSq
 
     from igps.gallery._encoding import (
