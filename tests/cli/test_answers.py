@@ -328,11 +328,12 @@ def test_explain_tells_how_much_of_the_surface_differs(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """One of 320 faces has the whole share, whose area trimesh gives; or no face has a positive share."""
-    areas = trimesh.load(root / "long3.off", process=False).area_faces
-    told = told.format(f"{100 * areas[-1] / areas.sum():.2g}")
+    """One of 162 vertices has the whole share, whose area trimesh gives; or no vertex has a positive share."""
+    body = trimesh.load(root / "long3.off", process=False)
+    area = body.area_faces[(body.faces == 161).any(axis=1)].sum() / 3
+    told = told.format(f"{100 * area / body.area:.2g}")
     monkeypatch.setattr(
-        "igps.analysis.explanation.share_density", lambda *_: np.append(np.full(319, -1.0), largest)
+        "igps.analysis.explanation.share_density", lambda *_: np.append(np.full(161, -1.0), largest)
     )
     igps(monkeypatch, root, "explain", root / "short0.off", root / "long3.off", *OWN)
     assert capsys.readouterr().out.splitlines()[-1] == f"{root}/long3.off: {told}"

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from igps.analysis.explanation import Explanation
     from igps.data.dataset import SignatureDataset
     from igps.data.sources import Bodies
-    from igps.mesh.mesh import Mesh
+    from igps.report.answers import Painted
 
 
+_LEGEND = "share of the distance, over that of an even spread"
 CALIBRATED = "pretrained"
 """The only descriptor whose distances are calibrated, see `igps.duplicates.calibration`."""
 
@@ -225,9 +226,9 @@ def explain(
     from igps.cli.reading import Folder, check_files, described, files_or_folder
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.fingerprint import cache_tag
-    from igps.mesh.surface import face_areas
+    from igps.mesh.surface import vertex_areas
     from igps.nn.description import describe
-    from igps.report.answers import explanation_figure, write_analysis
+    from igps.report.answers import painted_figure, write_analysis
 
     check_fraction(level=level)
     source = files_or_folder(meshes)
@@ -281,12 +282,13 @@ def explain(
         meaning = _meaning(descriptor, dataset, explanation.distance)
         print(meaning or f"what this distance means is known for {CALIBRATED} alone")
     painted = [_painted(dataset, i, explanation, side) for side, i in enumerate(pair)]
-    for name, mesh, values in painted:
-        print(f"{name}: {_extent(values, face_areas(mesh.vertices, mesh.faces))}")
+    for body in painted:
+        areas = vertex_areas(body.mesh.vertices, body.mesh.faces)
+        print(f"{body.name}: {_extent(body.values, areas)}")
     parts = [{"histogram": name, "share": share} for name, share in explanation.parts.items()]
     if out is not None:
         write_analysis(out, "explain_samples", _sample_rows(dataset, pair, explanation))
-        write_analysis(out, "explain", parts, explanation_figure(painted))
+        write_analysis(out, "explain", parts, painted_figure(painted, _LEGEND))
         print(f"written to {out}")
     return {
         "bodies": names,
@@ -314,22 +316,23 @@ def _check_two_classes(bodies: Bodies) -> None:
         raise ValueError(f"meshes: expected a folder of two classes, got {n}.")
 
 
-def _painted(
-    dataset: SignatureDataset, i: int, explanation: Explanation, side: int
-) -> tuple[str, Mesh, Any]:
-    """Return the name and mesh of a body, and the shares of its faces (F,) in the distance; `side` is 0 or 1."""
+def _painted(dataset: SignatureDataset, i: int, explanation: Explanation, side: int) -> Painted:
+    """Return a body with the shares of its vertices in the distance, over those of an even spread; `side` is 0 or 1."""
     from igps.analysis.explanation import share_density
+    from igps.report.answers import Painted
     from igps.signature.signature import SAMPLE_KINDS
 
-    mesh, signature = dataset.mesh(i), dataset[i].signature
-    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    mesh = dataset.mesh(i)
+    signature = dataset[i].signature
     samples = {kind: getattr(signature, kind).points for kind in SAMPLE_KINDS}
     shares = (explanation.places or explanation.samples)[side]
-    return dataset.bodies.names[i], mesh, share_density(shares, samples, centres)
+    density = share_density(shares, samples, mesh.vertices)
+    even = explanation.distance / 2 or 1.0
+    return Painted(dataset.bodies.names[i], mesh, density / even)
 
 
 def _extent(values: Any, areas: Any) -> str:
-    """Return as text how much of the surface holds half of the positive shares, from shares and areas (F,) of faces."""
+    """Return as text how much of the surface holds half of the positive shares; of vertices, shares and areas (V,)."""
     import numpy as np
 
     order = np.argsort(-values)

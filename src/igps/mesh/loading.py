@@ -179,7 +179,8 @@ def surface_body(
     notes = (*notes, *_rounding_notes(vertices, name))
     if options.allow_open and options.mend != "always":
         try:
-            return Mesh(vertices, faces, name=name, allow_open=True, notes=notes, unit=raw.unit)
+            mesh = Mesh(vertices, faces, name=name, allow_open=True, notes=notes, unit=raw.unit)
+            return mesh.annotated(frame=raw.frame)
         except MeshError:
             if options.mend == "never":
                 raise
@@ -193,7 +194,7 @@ def surface_body(
         denoise=raw.denoise,
         name=name,
     )
-    return mesh.annotated(notes=notes, unit=raw.unit)
+    return mesh.annotated(notes=notes, unit=raw.unit, frame=raw.frame)
 
 
 def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:

@@ -5,7 +5,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,9 @@ from igps.mesh.surface import (
 from igps.mesh.winding import winding_number
 
 logger = logging.getLogger(__name__)
+
+Frame = Literal["RAS"] | None
+"""Axes of a patient (x to the right, y to the front, z up), or None if they are not known."""
 
 MILLIMETRES: Mapping[str, float] = {
     "m": 1e3,
@@ -110,6 +113,7 @@ class Mesh:
         notes: earlier changes of the mesh, in words.
         unit: unit of length, such as "mm"; None if unknown.
         cavities: accept closed surfaces inside the largest, oriented inward, which bound hollows of the body.
+        frame: "RAS" if x points to the patient's right, y to the front and z up; None if this is not known.
 
     Raises:
         MeshError: no faces, NaN or infinite vertices, out-of-range or repeated indices, unreferenced vertices,
@@ -124,6 +128,7 @@ class Mesh:
     notes: tuple[str, ...] = field(default=())
     unit: str | None = None
     cavities: bool = False
+    frame: Frame = None
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64, order="C")
@@ -147,9 +152,13 @@ class Mesh:
         vertices.flags.writeable = faces.flags.writeable = False
         vars(self).update(vertices=vertices, faces=faces)  # the class is frozen
 
-    def annotated(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Self:
-        """Return the mesh with `notes` before its own, and with `unit` unless None, without checking it again."""
-        return self._changed(notes=(*notes, *self.notes), unit=unit or self.unit)
+    def annotated(
+        self, *, notes: tuple[str, ...] = (), unit: str | None = None, frame: Frame = None
+    ) -> Self:
+        """Return the mesh with `notes` before its own, and with `unit` and `frame` unless None, not checked again."""
+        return self._changed(
+            notes=(*notes, *self.notes), unit=unit or self.unit, frame=frame or self.frame
+        )
 
     def numbered_by_faces(self) -> Self:
         """Return the mesh with its vertices in the order in which the faces first use them."""

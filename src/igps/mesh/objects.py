@@ -44,7 +44,8 @@ def as_mesh(body: Any, spacing: Sequence[float] | None = None) -> Mesh:
         raw = _single(object_bodies(body if spacing is None else (body, spacing), name)).made()
     if raw.fault is not None:
         raise raw.fault
-    return Mesh(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
+    mesh = Mesh(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
+    return mesh.annotated(frame=raw.frame)
 
 
 def object_bodies(thing: Any, name: str, options: LoadOptions = LoadOptions()) -> Sequence[RawBody]:
@@ -87,9 +88,9 @@ def _surface(thing: Any) -> tuple[str, RawBody] | None:
             raise TypeError(
                 "mesh: expected a GIFTI image of a surface, got one without points or triangles."
             )
-        return name, RawBody(
-            np.asarray(points[0].data, np.float64), np.asarray(faces[0].data, np.int64), unit="mm"
-        )
+        vertices = np.asarray(points[0].data, np.float64)
+        triangles = np.asarray(faces[0].data, np.int64)
+        return name, RawBody(vertices, triangles, unit="mm", frame="RAS")
     if hasattr(thing, "points") and hasattr(thing, "faces"):
         vertices = np.asarray(thing.points, np.float64)
         corners, n_corners = corners_of_rows(np.asarray(thing.faces, dtype=np.int64))

@@ -12,7 +12,7 @@ import numpy as np
 from igps._arrays import Booleans, Floats, Integers
 from igps.mesh._tidying import are_specks, places
 from igps.mesh.errors import MeshError
-from igps.mesh.mesh import Mesh, check_arrays
+from igps.mesh.mesh import Frame, Mesh, check_arrays
 from igps.mesh.surface import compact, face_parts, stacked
 
 
@@ -47,6 +47,7 @@ class RawBody:
     denoise: bool = (
         True  # whether the surface may be noisy; False if it was computed from voxels or atoms
     )
+    frame: Frame = None  # see `Mesh`
     number: str | None = None  # of a label, by which it is found like by its name
 
     def made(self) -> RawBody:
@@ -68,7 +69,14 @@ def deferred(
         except MeshError as fault:
             return RawBody(part=part, fault=fault, voxels=voxels)
         return RawBody(
-            mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels, denoise=False
+            mesh.vertices,
+            mesh.faces,
+            part,
+            unit,
+            notes=mesh.notes,
+            voxels=voxels,
+            denoise=False,
+            frame=mesh.frame,
         )
 
     return RawBody(part=part, make=compute)
@@ -89,10 +97,12 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
         ):  # would refer to another body
             raise ValueError(f"{body.part} refers to vertices that are not there")
     units = {body.unit for body in joinable}
+    frames = {body.frame for body in joinable}
     normals = [body.normals for body in joinable if body.normals is not None]
     return RawBody(
         *stacked([(body.vertices, body.faces) for body in joinable]),
         unit=units.pop() if len(units) == 1 else None,
+        frame=frames.pop() if len(frames) == 1 else None,
         normals=np.concatenate(normals) if len(normals) == len(joinable) else None,
         notes=tuple(dict.fromkeys(note for body in joinable for note in body.notes)),
         denoise=any(body.denoise for body in joinable),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -18,20 +19,31 @@ from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
 from igps.report.drawing import (
+    GREY,
     PALETTE,
-    draw_body,
-    front_view,
     new_figure,
-    paint,
     save_figure,
     shortened,
+    thumbnail,
+    titles_of,
 )
 from igps.report.page_data import finite
 from igps.report.tables import write_rows
+from igps.report.views import common_views, draw_view, reach_of
 from igps.retrieval import PrecisionRecallCurve
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Painted:
+    """A body with values on its surface."""
+
+    name: str
+    mesh: Mesh
+    values: Floats  # (V,) at its vertices
+
 
 LEVEL = 0.05
 """Largest false discovery rate of bodies that are marked as significant."""
@@ -82,29 +94,42 @@ def outliers_figure(pictured: Sequence[tuple[Outlier, str, Mesh]]) -> Figure:
     all_axes = list(figure.subplots(n_rows, 4, squeeze=False).flat)
     for axes in all_axes:
         axes.set_axis_off()
-    for axes, (outlier, name, mesh) in zip(all_axes, pictured, strict=False):
-        draw_body(axes, mesh)
-        title = "\n".join(
-            wrap(f"{outlier.score:.1f}  {shortened(name)}", 38) + wrap(outlier.reason, 38)
-        )
+    names = titles_of([name for _, name, _ in pictured])
+    for axes, name, (outlier, _, mesh) in zip(all_axes, names, pictured, strict=False):
+        small = thumbnail(mesh)
+        views, (vertices,) = common_views([small])
+        draw_view(axes, views[0], small, vertices, GREY)
+        title = "\n".join(wrap(f"{outlier.score:.1f}  {name}", 38) + wrap(outlier.reason, 38))
         axes.set_title(title, fontsize=6, color=_SIGNIFICANT if outlier.is_outlier else "#000000")
     return figure
 
 
-def explanation_figure(painted: Sequence[tuple[str, Mesh, Floats]]) -> Figure:
-    """Draw named bodies from both sides, coloured by the shares (F,) of their faces: red positive, blue negative."""
-    figure = new_figure(7, 3.4 * len(painted))
-    all_axes = figure.subplots(len(painted), 2, squeeze=False)
-    for row, (name, mesh, values) in zip(all_axes, painted, strict=True):
-        largest = np.quantile(np.abs(values), 0.98) or 1.0
-        shares = np.clip(values / largest, -1, 1)[:, None]
-        colours = np.where(
-            shares > 0, _WHITE + shares * (_RED - _WHITE), _WHITE - shares * (_BLUE - _WHITE)
-        )
-        vertices = front_view(mesh.vertices)
-        for axes, signs, side in zip(row, ([1, 1, 1], [-1, 1, -1]), ("front", "back"), strict=True):
-            paint(axes, vertices * signs, mesh.faces, colours)
-            axes.set_title(f"{shortened(name)}, {side}", fontsize=7)
+def painted_figure(painted: Sequence[Painted], legend: str) -> Figure:
+    """Draw bodies from the same six sides and in the same scale, coloured by values: red positive, blue negative."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    views, bodies = common_views([body.mesh for body in painted])
+    reach = reach_of(views, bodies)
+    everything = np.abs(np.concatenate([body.values for body in painted]))
+    largest = float(np.quantile(everything, 0.98)) or float(everything.max()) or 1.0
+    lowest = min(float(body.values.min()) for body in painted)
+    figure = new_figure(12, 2.4 * len(painted) + 0.6)
+    figure.set_layout_engine("constrained", rect=(0, 0, 0.93, 1))
+    all_axes = figure.subplots(len(painted), len(views), squeeze=False)
+    colour_map = LinearSegmentedColormap.from_list("shares", [_BLUE, _WHITE, _RED])
+    scale = ScalarMappable(Normalize(-largest, largest), colour_map)
+    names = titles_of([body.name for body in painted])
+    for row, body, name, vertices in zip(all_axes, painted, names, bodies, strict=True):
+        colours = scale.to_rgba(body.values)[:, :3]
+        for axes, view in zip(row, views, strict=True):
+            draw_view(axes, view, body.mesh, vertices, colours, reach)
+            axes.set_title(view.title, fontsize=7)
+        row[0].set_title(f"{name}\n{views[0].title}", fontsize=7, loc="left")
+    bar = figure.colorbar(scale, cax=figure.add_axes((0.94, 0.2, 0.01, 0.6)))
+    bar.ax.set_ylim(-largest if lowest < 0 else 0, largest)
+    bar.ax.tick_params(labelsize=6)
+    bar.set_label(legend, fontsize=7)
     return figure
 
 
@@ -198,6 +223,4 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
 # Curves of precision and recall beyond the first round of colours differ by line style and marker
 _STYLES, _MARKERS = ("-", "--", ":"), ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 _MAP_MARKERS = ("o", "s", "^", "x", "+", "D")
-_WHITE, _RED, _BLUE = (
-    np.array(rgb) for rgb in ((0.9, 0.9, 0.9), (0.84, 0.25, 0.0), (0.0, 0.35, 0.7))
-)
+_BLUE, _WHITE, _RED = (0.0, 0.35, 0.7), (0.9, 0.9, 0.9), (0.84, 0.25, 0.0)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +18,7 @@ from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.mesh.simplification import simplify
-from igps.mesh.surface import area_vectors, unit
+from igps.mesh.surface import area_vectors, mean_of_neighbours, unit, vertex_normals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,32 +26,56 @@ if TYPE_CHECKING:
 
 PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Colours that remain distinct for colour-blind readers (Okabe and Ito 2008)."""
+_DPI = 200  # of surfaces within an SVG file
 GREY = (0.86, 0.88, 0.92)
 _RELEVANT, _IRRELEVANT, _QUERY = PALETTE[1], PALETTE[0], "#444444"
 _THUMBNAIL_VERTICES = (
     800  # enough for the detail of a thumbnail; drawing time grows with the number of faces
 )
 _MAX_NAME_LENGTH = 60  # characters
+_LIGHT: Floats = np.array([0.35, 0.45, 0.82])
+_MIN_SMOOTH = (
+    0.75  # cosine between the normals of a face and a vertex; with less, their edge stays sharp
+)
+_MARGIN = 1.08  # of a picture, over the size of the body
+_FAIR_STEPS = (0.5, -0.53) * 10  # of Taubin's smoothing, which shrinks nothing
 
 
-def paint(axis: Axes, vertices: Floats, faces: Integers, colour: Any) -> None:
-    """Draw a surface as seen from +z and lit from the upper right, in one colour (3,) or in colours of faces (F, 3)."""
-    from matplotlib.collections import PolyCollection
+def paint(
+    axis: Axes, vertices: Floats, faces: Integers, colour: Any, reach: float | None = None
+) -> None:
+    """Draw a surface as seen from +z and lit from the upper right.
 
-    normals = unit(area_vectors(vertices, faces))
-    front = np.nonzero(normals[:, 2] > 0)[0]
-    front = front[
-        np.argsort(vertices[faces[front], 2].mean(axis=1))
-    ]  # the painter's algorithm: far faces first
-    light = normals[front] @ np.array([0.35, 0.45, 0.82])
-    unlit = np.broadcast_to(colour, (len(faces), 3))[front]
-    colours = np.clip(0.35 + 0.6 * light, 0, 1)[:, None] * unlit
-    polygons = list(vertices[faces[front], :2])
-    axis.add_collection(
-        PolyCollection(polygons, facecolors=colours, edgecolors=colours, linewidths=0.3)
-    )
-    low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
-    (x, y), reach = (low + high) / 2, 0.54 * (high - low).max()
+    Args:
+        axis: where to draw.
+        vertices, faces: the surface; only faces that point to the viewer are drawn.
+        colour: one colour (3,), or colours of vertices (V, 3).
+        reach: distance from the middle of the picture to its edges; by default the surface fills it.
+    """
+    from matplotlib.collections import TriMesh
+    from matplotlib.tri import Triangulation
+
+    own = unit(area_vectors(vertices, faces))
+    front = np.nonzero(own[:, 2] > 0)[0]
+    depths = vertices[faces[front], 2].mean(axis=1)
+    front = front[np.argsort(depths)]  # the painter's algorithm: far faces first
+    shown = faces[front]
+    normals = vertex_normals(vertices, faces)[shown]
+    cosines = np.einsum("fkc,fc->fk", normals, own[front])
+    is_crease = cosines < _MIN_SMOOTH
+    normals = np.where(is_crease[..., None], own[front][:, None], normals)
+    light = np.clip(0.35 + 0.6 * normals @ _LIGHT, 0, 1)
+    unlit = np.broadcast_to(colour, vertices.shape)[shown]
+    corners = vertices[shown].reshape(-1, 3)
+    triangles = np.arange(len(corners)).reshape(-1, 3)
+    surface = TriMesh(Triangulation(corners[:, 0], corners[:, 1], triangles), rasterized=True)
+    surface.set_facecolor((light[..., None] * unlit).reshape(-1, 3))
+    axis.add_collection(surface)
+    low = vertices[:, :2].min(axis=0)
+    high = vertices[:, :2].max(axis=0)
+    x, y = (low + high) / 2
+    if reach is None:
+        reach = _MARGIN / 2 * (high - low).max()
     axis.set(
         xlim=(x - reach, x + reach),
         ylim=(y - reach, y + reach),
@@ -57,6 +83,13 @@ def paint(axis: Axes, vertices: Floats, faces: Integers, colour: Any) -> None:
         xticks=[],
         yticks=[],
     )
+
+
+def faired(vertices: Floats, faces: Integers) -> Floats:
+    """Return vertices (V, 3) without the terraces of voxels, for drawing only (Taubin 1995)."""
+    for step in _FAIR_STEPS:
+        vertices = vertices + step * (mean_of_neighbours(vertices, faces) - vertices)
+    return vertices
 
 
 def axes_of(points: Floats) -> Floats:
@@ -89,7 +122,7 @@ def save_figure(figure: Figure, path: Path, dpi: float | None = None) -> None:
         {"svg.hashsalt": "igps"}
     ):  # otherwise, the identifiers in an SVG file are random
         figure.savefig(
-            path, dpi=dpi or "figure", metadata={"Date": None} if path.suffix == ".svg" else None
+            path, dpi=dpi or _DPI, metadata={"Date": None} if path.suffix == ".svg" else None
         )
 
 
@@ -97,6 +130,14 @@ def shortened(name: str) -> str:
     """Return a name for a figure: the middle of a long name, which would leave no room for the plot, is left out."""
     half = _MAX_NAME_LENGTH // 2
     return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:half]}…{name[1 - half :]}"
+
+
+def titles_of(names: Sequence[str]) -> list[str]:
+    """Return the names of bodies for figures: without the folders that all share, and not too long."""
+    folders = {os.path.dirname(name) for name in names}
+    shared = os.path.commonpath(folders) if all(folders) else ""
+    start = len(shared.rstrip("/")) + 1 if shared else 0
+    return [shortened(name[start:]) for name in names]
 
 
 def ranked_results(
@@ -126,7 +167,8 @@ def ranked_results(
                 (model, f"{model}\n{distance:#.3g}", _RELEVANT if relevant else _IRRELEVANT)
             )
         for axis, (name, title, colour) in zip(row_axes, shown, strict=False):
-            draw_body(axis, load_mesh(root / name, LoadOptions(allow_open=True)))
+            mesh = thumbnail(load_mesh(root / name, LoadOptions(allow_open=True)))
+            paint(axis, front_view(mesh.vertices), mesh.faces, GREY)
             axis.set_title(title, fontsize=5.5, pad=2)
             for side in axis.spines.values():
                 side.set(
@@ -140,11 +182,11 @@ def ranked_results(
     save_figure(figure, out, dpi=110)
 
 
-def draw_body(axis: Axes, mesh: Mesh) -> None:
-    """Draw a shaded mesh, seen along its thinnest principal axis."""
-    with contextlib.suppress(MeshError):  # without simplification, drawing only takes longer
+def thumbnail(mesh: Mesh) -> Mesh:
+    """Return a simplified mesh for a small picture; the mesh itself if it cannot be simplified."""
+    with contextlib.suppress(MeshError):
         mesh = simplify(mesh, _THUMBNAIL_VERTICES)
-    paint(axis, front_view(mesh.vertices), mesh.faces, GREY)
+    return mesh
 
 
 def front_view(vertices: Floats) -> Floats:

@@ -48,9 +48,8 @@ def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBo
         raise ValueError(
             "no surface in it: expected points and triangles, which maps of values on a surface lack"
         )
-    return [
-        RawBody(arrays[_POINTS].astype(np.float64), arrays[_TRIANGLES].astype(np.int64), unit="mm")
-    ]
+    vertices = arrays[_POINTS].astype(np.float64)
+    return [RawBody(vertices, arrays[_TRIANGLES].astype(np.int64), unit="mm", frame="RAS")]
 
 
 def gifti_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
@@ -104,7 +103,7 @@ def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[
         )
     vertices = np.frombuffer(content, ">f4", 3 * n_vertices, at + 8).astype(np.float64)
     faces = np.frombuffer(content, ">i4", 3 * n_faces, at + 8 + 12 * n_vertices).astype(np.int64)
-    return [RawBody(vertices.reshape(-1, 3), faces.reshape(-1, 3), unit="mm")]
+    return [RawBody(vertices.reshape(-1, 3), faces.reshape(-1, 3), unit="mm", frame="RAS")]
 
 
 def in_scanner(path: Path, points: Floats) -> Floats:

@@ -18,7 +18,7 @@ from igps.fields.volumes._streams import check_gzip, check_zlib
 from igps.fields.volumes.label_names import names_in_extensions, names_in_tags
 from igps.mesh.errors import MeshError
 from igps.mesh.limits import check_fits
-from igps.mesh.mesh import unit_of_length
+from igps.mesh.mesh import Frame, unit_of_length
 
 _WORK_BYTES = 4  # bytes a voxel to hold and count labels, beyond those of the file
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # DICOM and ITK use LPS
@@ -35,6 +35,11 @@ _META_COMPRESSED = re.compile(
     rb"^\s*CompressedData\s*[=:]\s*(true|1|yes)", re.MULTILINE | re.IGNORECASE
 )
 _META_SIZE = re.compile(rb"^\s*CompressedDataSize\s*[=:]\s*(\d+)", re.MULTILINE | re.IGNORECASE)
+# The line of a NRRD or MetaImage header that says where the patient's sides are.
+_HAS_ORIENTATION = re.compile(
+    rb"^space:\s*(left|right|[lr][ap]s)|^\s*(TransformMatrix|AnatomicalOrientation)\s*[=:]",
+    re.MULTILINE | re.IGNORECASE,
+)
 # The line of a NRRD or MetaImage header that names the file of the voxels; ":" may stand for "=" in MetaImage.
 _DATA_FILE = re.compile(
     rb"(?:ElementDataFile[ \t]*[=:]|^data ?file:)[ \t]*(?:\./)?(.*?)[ \t]*\r?$",
@@ -53,6 +58,7 @@ class RawVolume:
         default_factory=list
     )  # (name, layer, value), if the file lists them
     unit: str | None = "mm"  # of length; None if the file states no lengths
+    frame: Frame = "RAS"  # None if the file does not say how the patient lies
     notes: list[str] = field(default_factory=list)  # remarks on its geometry, for the user
 
 
@@ -127,8 +133,11 @@ def of_nibabel(image: Any, path: str | Path) -> RawVolume:
     affine = np.array(image.affine, dtype=np.float64)
     names: dict[int, str] = {}
     notes: list[str] = []
+    frame: Frame = "RAS"
     if isinstance(image, nibabel.Nifti1Pair):  # the base class of all NIfTI images
         notes = _spacing_notes(image)
+        has_orientation = image.header["sform_code"] or image.header["qform_code"]
+        frame = "RAS" if has_orientation else None
         affine[:3] *= {1: 1e3, 3: 1e-3}.get(
             int(image.header["xyzt_units"]) % 8, 1.0
         )  # metres, micrometres
@@ -144,7 +153,7 @@ def of_nibabel(image: Any, path: str | Path) -> RawVolume:
         ) as file:  # nibabel does not read the tags
             file.seek(image.header.get_footer_offset() + _MGH_FOOTER)
             names = names_in_tags(file.read(_MAX_HEADER))
-    return RawVolume([values], affine, names, notes=notes)
+    return RawVolume([values], affine, names, notes=notes, frame=frame)
 
 
 def _spacing_notes(image: Any) -> list[str]:
@@ -188,9 +197,10 @@ def _simple_itk(path: Path) -> RawVolume:
     affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
     segments = [segment for segment in segments if segment[1] < len(layers)]
-    volume = RawVolume(layers, _LPS_TO_RAS @ affine, segments=segments)
+    header = _header(path)
+    frame: Frame = "RAS" if _HAS_ORIENTATION.search(header) else None
+    volume = RawVolume(layers, _LPS_TO_RAS @ affine, segments=segments, frame=frame)
     if suffix_of(path) in _NRRD:
-        header = _header(path)
         _check_directions(header, path)
         _apply_nrrd_unit(volume, header)
     return volume
@@ -404,7 +414,7 @@ def _tifffile(path: Path) -> RawVolume:
 
             values = SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(path)))  # it decodes LZW
         sides, unit = _tiff_sides(file)
-    return RawVolume([values.reshape(shape).T], np.diag([*sides, 1.0]), unit=unit)
+    return RawVolume([values.reshape(shape).T], np.diag([*sides, 1.0]), unit=unit, frame=None)
 
 
 def _check_complete(file: Any, path: Path) -> None:

@@ -29,7 +29,7 @@ from igps.fields.volumes.label_surface import MIN_VOXELS, voxel_spacing, voxel_s
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import Format, faults
 from igps.mesh.mending import Cavities, Mending, mend
-from igps.mesh.mesh import Mesh
+from igps.mesh.mesh import Frame, Mesh
 from igps.mesh.options import LoadOptions
 from igps.mesh.raw_body import LabelVoxels, RawBody, deferred
 
@@ -84,6 +84,7 @@ class LabelVolume:
     segments: tuple[tuple[int, int, int], ...] | None = None
     unit: str | None = "mm"  # of length, None if unknown
     notes: tuple[str, ...] = ()  # remarks on how the volume was read
+    frame: Frame = None  # None if it is not known how the patient lies
 
     def __post_init__(self) -> None:
         voxel_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
@@ -178,7 +179,10 @@ def volume_in_memory(
                 f"{name}: expected labels of shape (X, Y, Z) and three sides of a voxel, got {got}."
             )
         raw = RawVolume(
-            [array], np.diag([*(spacing or (1, 1, 1)), 1.0]), unit="mm" if spacing else None
+            [array],
+            np.diag([*(spacing or (1, 1, 1)), 1.0]),
+            unit="mm" if spacing else None,
+            frame=None,
         )
     return _labelled(raw, name, options)
 
@@ -201,7 +205,7 @@ def label_surface(
             "another label has the same name: the number was appended. Give names by a table",
         )
     mesh = mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name)
-    mesh = mesh.annotated(notes=(*volume.notes, *notes))
+    mesh = mesh.annotated(notes=(*volume.notes, *notes), frame=volume.frame)
     mesh = mesh.annotated(notes=_border_notes(volume, body, mesh.area))
     of_voxels = body.n_voxels * abs(float(np.linalg.det(affine[:3, :3])))
     surplus = mesh.volume / of_voxels - 1
@@ -288,8 +292,9 @@ def _labelled(
         is_mask = label in (1, 255) and bool(((layers[0] == 0) | (layers[0] == label)).all())
         if not names and not raw.segments and is_mask:
             names = {label: path.name[: -len(suffix_of(path))]}
+    remarks = tuple(dict.fromkeys(notes))
     return LabelVolume(
-        layers, raw.affine, name, names, segments, raw.unit, tuple(dict.fromkeys(notes))
+        layers, raw.affine, name, names, segments, raw.unit, notes=remarks, frame=raw.frame
     )
 
 
