@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from igps._arrays import Floats, Integers, Singles, Surface
+from igps._arrays import Booleans, Floats, Integers, Singles, Surface
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles
 from igps.mesh.errors import MeshError
 from igps.mesh.surface import (
@@ -14,7 +14,10 @@ from igps.mesh.surface import (
     vertex_normals,
 )
 
-_MIN_COSINE = 0.95  # of the normals of two triangles, before and after a flip of their edge, with the mean normal
+# Of the normals of two triangles, before and after a flip of their edge, with the mean normal
+_MIN_COSINE = 0.95
+_MIN_GAIN = 1e-3  # radians that two opposite angles exceed 180° by, so that their edge is flipped
+_MAX_FLIPS = 30  # rounds of flips
 
 
 def level_surface(field: Singles, name: str) -> Surface:
@@ -33,11 +36,9 @@ def level_surface(field: Singles, name: str) -> Surface:
             return vertices.astype(np.float64), faces
         # Fill the four or eight grid points around each vertex at which the surface meets itself.
         for vertex in np.unique(bad_edges):
-            low = np.floor(vertices[vertex]).astype(int)
-            high = np.ceil(vertices[vertex]).astype(int)
-            box = tuple(
-                slice(max(low[d], 1), min(high[d] + 1, field.shape[d] - 1)) for d in range(3)
-            )
+            low = np.maximum(np.floor(vertices[vertex]).astype(int), 1)
+            end = np.minimum(np.ceil(vertices[vertex]).astype(int) + 1, np.array(field.shape) - 1)
+            box = tuple(map(slice, low, end))
             field[box] = np.minimum(field[box], -MIN_ABS_VALUE)
         field = fill_bubbles(field)
     raise MeshError(
@@ -61,11 +62,8 @@ def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Su
             triangles = np.asfortranarray(triangles.astype(np.int32))
             points, triangles, *_ = collapse(np.asfortranarray(points), triangles, target)
     triangles = np.asarray(triangles, dtype=np.int64)
-    if (
-        len(triangles) == 0
-        or len(_non_manifold_edges(triangles, len(points)))
-        or not np.isfinite(points).all()
-    ):
+    is_closed = len(triangles) > 0 and not len(_non_manifold_edges(triangles, len(points)))
+    if not is_closed or not np.isfinite(points).all():
         return vertices, faces
     points, triangles = largest(points * scale, triangles)
     triangles = _flip_edges(points, triangles)
@@ -101,63 +99,80 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
     Quadrics leave long thin triangles in flat places. There the flips lead to a Delaunay triangulation, on which the
     cotangent weights are positive. Edges at which the surface bends are kept.
     """
-    for _ in range(30):
-        n = len(vertices)
-        start, end = directed_edges(faces)
-        opposite = np.roll(faces, 1, axis=1).ravel()
-        forward = start * n + end
-        order = np.argsort(forward)
-        # Each edge once: its side in one face, and the opposite side in the face beyond.
-        side = np.nonzero(start < end)[0]
-        other = order[np.searchsorted(forward[order], end[side] * n + start[side])]
-        a = start[side]
-        b = end[side]
-        c = opposite[side]
-        d = opposite[other]
-        pa = vertices[a]
-        pb = vertices[b]
-        pc = vertices[c]
-        pd = vertices[d]
-        gain = _angle(pc, pa, pb) + _angle(pd, pb, pa) - np.pi
-        old = [np.cross(pb - pa, pc - pa), np.cross(pa - pb, pd - pb)]
-        new = [np.cross(pd - pc, pb - pc), np.cross(pc - pd, pa - pd)]
-        mean = old[0] + old[1]
-        length = np.linalg.norm(mean, axis=1, keepdims=True)
-        mean = mean / np.maximum(length, 1e-30)
-        is_flat = np.ones(len(side), dtype=bool)
-        for vectors in (*old, *new):
-            size = np.linalg.norm(vectors, axis=1)
-            # The normal of a triangle without area does not matter.
-            is_flat &= (np.einsum("ij,ij->i", vectors, mean) > _MIN_COSINE * size) | (
-                size < 1e-3 * length[:, 0]
-            )
-        exists = np.isin(
-            np.minimum(c, d) * n + np.maximum(c, d),
-            np.minimum(start, end) * n + np.maximum(start, end),
-        )
-        flips = np.nonzero((gain > 1e-3) & is_flat & ~exists & (c != d))[0]
-        # Each face takes part only in its best flip, and no two flips create the same edge.
+    for _ in range(_MAX_FLIPS):
+        side, other, corners = _quadrilaterals(faces, len(vertices))
+        a, b, c, d = corners
+        ends = vertices[corners]
+        gain = _angle(ends[2], ends[0], ends[1]) + _angle(ends[3], ends[1], ends[0]) - np.pi
+        can_flip = (gain > _MIN_GAIN) & _are_flat(*ends) & (c != d)
+        can_flip &= ~_are_edges(c, d, faces, len(vertices))
+        flips = np.nonzero(can_flip)[0]
+        new_edges = np.minimum(c, d)[flips] * len(vertices) + np.maximum(c, d)[flips]
         left = side[flips] // 3
         right = other[flips] // 3
-        gain = gain[flips]
-        best = np.full(len(faces), -np.inf)
-        for face in (left, right):
-            np.maximum.at(best, face, gain)
-        chosen = np.nonzero((gain >= best[left]) & (gain >= best[right]))[0]
-        new_edges = np.minimum(c, d)[flips] * n + np.maximum(c, d)[flips]
-        chosen = chosen[np.unique(new_edges[chosen], return_index=True)[1]]
-        flipped, count = np.unique(
-            np.concatenate([left[chosen], right[chosen]]), return_counts=True
-        )
-        repeated = flipped[count > 1]
-        chosen = chosen[~np.isin(left[chosen], repeated) & ~np.isin(right[chosen], repeated)]
+        chosen = _independent(left, right, gain[flips], new_edges)
         if not len(chosen):
             break
-        a, b, c, d = (corner[flips[chosen]] for corner in (a, b, c, d))
+        a, b, c, d = corners[:, flips[chosen]]
         faces = faces.copy()
         faces[left[chosen]] = np.stack([c, d, b], axis=1)
         faces[right[chosen]] = np.stack([d, c, a], axis=1)
     return faces
+
+
+def _quadrilaterals(faces: Integers, n_vertices: int) -> tuple[Integers, Integers, Integers]:
+    """Return for each edge its side in one face, the opposite side in the face beyond, and four vertices (4, E).
+
+    These are the ends a and b of the edge, the third corner c of the one face, and the third corner d of the other.
+    """
+    start, end = directed_edges(faces)
+    opposite = np.roll(faces, 1, axis=1).ravel()
+    forward = start * n_vertices + end
+    order = np.argsort(forward)
+    side = np.nonzero(start < end)[0]
+    backward = end[side] * n_vertices + start[side]
+    other = order[np.searchsorted(forward[order], backward)]
+    return side, other, np.stack([start[side], end[side], opposite[side], opposite[other]])
+
+
+def _are_flat(a: Floats, b: Floats, c: Floats, d: Floats) -> Booleans:
+    """Return where the triangles abc and bad, and those after a flip, have nearly the same normal."""
+    old = [np.cross(b - a, c - a), np.cross(a - b, d - b)]
+    new = [np.cross(d - c, b - c), np.cross(c - d, a - d)]
+    mean = old[0] + old[1]
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    mean = mean / np.maximum(length, 1e-30)
+    is_flat = np.ones(len(a), dtype=bool)
+    for vectors in (*old, *new):
+        size = np.linalg.norm(vectors, axis=1)
+        is_parallel = np.einsum("ij,ij->i", vectors, mean) > _MIN_COSINE * size
+        # The normal of a triangle without area does not matter.
+        has_no_area = size < 1e-3 * length[:, 0]
+        is_flat &= is_parallel | has_no_area
+    return is_flat
+
+
+def _are_edges(a: Integers, b: Integers, faces: Integers, n_vertices: int) -> Booleans:
+    """Return which pairs of vertices are edges of the surface."""
+    start, end = directed_edges(faces)
+    pairs = np.minimum(a, b) * n_vertices + np.maximum(a, b)
+    edges = np.minimum(start, end) * n_vertices + np.maximum(start, end)
+    return np.isin(pairs, edges)
+
+
+def _independent(left: Integers, right: Integers, gain: Floats, new_edges: Integers) -> Integers:
+    """Choose flips: each face takes part only in its best one, and no two create the same edge."""
+    best = np.full(max(left.max(initial=0), right.max(initial=0)) + 1, -np.inf)
+    for face in (left, right):
+        np.maximum.at(best, face, gain)
+    chosen = np.nonzero((gain >= best[left]) & (gain >= best[right]))[0]
+    _, first = np.unique(new_edges[chosen], return_index=True)
+    chosen = chosen[first]
+    in_flips = np.concatenate([left[chosen], right[chosen]])
+    flipped, count = np.unique(in_flips, return_counts=True)
+    repeated = flipped[count > 1]
+    is_free = ~np.isin(left[chosen], repeated) & ~np.isin(right[chosen], repeated)
+    return chosen[is_free]
 
 
 def _angle(apex: Floats, a: Floats, b: Floats) -> Floats:

@@ -1,6 +1,7 @@
 """Compute the signed distances of grid points to the surface of one body, negative inside. Lengths are in cells."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -59,8 +60,10 @@ def cell_sizes(
     area = float(face_areas(vertices, faces).sum())
     by_volume = float(np.prod(np.maximum(sides, longest / 1000)) ** (1 / 3)) / resolution
     by_area = float(np.sqrt(area / (6 * resolution**2)))
-    min_size = max(min(max(by_volume, by_area), longest / (0.8 * resolution)), spacing)
-    return max(min_size, longest / (2 * resolution)), min_size
+    min_size = min(max(by_volume, by_area), longest / (0.8 * resolution))
+    min_size = max(min_size, spacing)
+    default_size = max(min_size, longest / (2 * resolution))
+    return default_size, min_size
 
 
 def merge_near_vertices(vertices: Floats, faces: Integers) -> Surface:
@@ -71,7 +74,8 @@ def merge_near_vertices(vertices: Floats, faces: Integers) -> Surface:
     # The mean of merged vertices, because lattice points would shift the surface.
     mean = sums(index, vertices, len(count)) / count[:, None]
     faces = np.sort(index[faces], axis=1)
-    return mean, np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
+    has_three_corners = (np.diff(faces, axis=1) > 0).all(axis=1)
+    return mean, np.unique(faces[has_three_corners], axis=0)
 
 
 def distances(
@@ -83,20 +87,17 @@ def distances(
     vertices = np.asfortranarray(vertices)
     faces = np.asfortranarray(faces)
     size = 8  # blocks that may be near the surface are halved until they are single grid points
-    blocks = np.stack(
-        np.meshgrid(*(np.arange(0, n, size) for n in shape), indexing="ij"), axis=-1
-    ).reshape(-1, 3)
+    blocks = _all_combinations([np.arange(0, n, size) for n in shape])
     while size > 1:
         centre = np.asfortranarray(blocks + (size - 1) / 2)
         squared, _, _ = igl.point_mesh_squared_distance(centre, vertices, faces)
         near = np.sqrt(squared) <= (size - 1) / 2 * np.sqrt(3) + _BAND
         size //= 2
-        corner = size * np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        corner = size * _all_combinations([np.arange(2)] * 3)
         blocks = (blocks[near][:, None] + corner).reshape(-1, 3)
         blocks = blocks[(blocks < shape).all(axis=1)]
-    squared, _, point = igl.point_mesh_squared_distance(
-        np.asfortranarray(blocks.astype(np.float64)), vertices, faces
-    )
+    points = np.asfortranarray(blocks.astype(np.float64))
+    squared, _, point = igl.point_mesh_squared_distance(points, vertices, faces)
     distance = np.full(shape, np.inf, dtype=np.float32)
     nearest = np.zeros((*shape, 3), dtype=np.float32)
     in_band = squared <= _BAND**2
@@ -104,6 +105,11 @@ def distances(
     distance[at] = np.sqrt(squared[in_band])
     nearest[at] = point[in_band]
     return distance, nearest
+
+
+def _all_combinations(axes: Sequence[Integers]) -> Integers:
+    """Return all points (P, 3) of a grid with these coordinates along its axes."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def level_set(
@@ -136,14 +142,12 @@ def level_set(
         inside[tuple(thin[surface.winding(thin) > 0.5].T)] = True
         is_solid = _is_solid(inside, at, foot, normal)
     # At least MIN_ABS_VALUE, because zero would have no sign.
-    field = np.where(inside, -1, 1) * np.clip(
-        distance, np.float32(MIN_ABS_VALUE), np.float32(_BAND)
-    )
+    clipped = np.clip(distance, np.float32(MIN_ABS_VALUE), np.float32(_BAND))
+    field = np.where(inside, -1, 1) * clipped
     sheet = tuple(index[~is_solid] for index in at)
     field[sheet] = distance[sheet] - _HALF_SHEET
-    field = np.where(
-        np.abs(field) < MIN_ABS_VALUE, np.where(field < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE), field
-    )
+    smallest = np.where(field < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE)
+    field = np.where(np.abs(field) < MIN_ABS_VALUE, smallest, field)
     return fill_bubbles(field.astype(np.float32))
 
 
@@ -191,10 +195,16 @@ def join_pieces(field: Singles, notes: list[str], radius: float = 0.0) -> Single
     contacts = []
     positions = np.arange(field.size).reshape(field.shape)
     for axis in range(3):
-        a = tuple(slice(None, -1) if i == axis else slice(None) for i in range(3))
-        b = tuple(slice(1, None) if i == axis else slice(None) for i in range(3))
-        pairs = (owner[a], owner[b], distance[a] + distance[b] + 1, positions[a], positions[b])
-        contacts.append([values[owner[a] != owner[b]] for values in pairs])
+        a: list[slice] = [slice(None)] * 3
+        b: list[slice] = [slice(None)] * 3
+        a[axis] = slice(None, -1)
+        b[axis] = slice(1, None)
+        here = tuple(a)
+        there = tuple(b)
+        width = distance[here] + distance[there] + 1
+        pairs = (owner[here], owner[there], width, positions[here], positions[there])
+        is_contact = owner[here] != owner[there]
+        contacts.append([values[is_contact] for values in pairs])
     i, j, width, p, q = (np.concatenate(values) for values in zip(*contacts, strict=True))
     order = np.argsort(width, kind="stable")
     pair = np.minimum(i, j).astype(np.int64) * (count + 1) + np.maximum(i, j)
@@ -203,10 +213,10 @@ def join_pieces(field: Singles, notes: list[str], radius: float = 0.0) -> Single
     graph = sparse.csr_array((width[chosen], (i[chosen], j[chosen])), shape=(count + 1,) * 2)
     tree = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
     lookup = {(int(i[k]), int(j[k])): k for k in chosen}
+    nearest = index.reshape(3, -1).astype(np.float64)
     for row, column in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
         k = lookup[row, column]
-        a, b = (index.reshape(3, -1)[:, position].astype(np.float64) for position in (p[k], q[k]))
-        _add_bar(field, a, b, max(radius, _MIN_BAR_RADIUS))
+        _add_bar(field, nearest[:, p[k]], nearest[:, q[k]], max(radius, _MIN_BAR_RADIUS))
     notes.append(f"joined {len(pieces)} pieces by bars")
     return fill_bubbles(field)
 
@@ -216,7 +226,8 @@ def _add_bar(field: Singles, a: Floats, b: Floats, radius: float) -> None:
     low = np.maximum(np.minimum(a, b).astype(int) - around, 0)
     high = np.minimum(np.maximum(a, b).astype(int) + around + 1, field.shape)
     box = tuple(map(slice, low, high))
-    points = np.moveaxis(np.indices(high - low), 0, -1) + low
-    along = np.clip(((points - a) @ (b - a)) / max(float((b - a) @ (b - a)), 1e-9), 0, 1)
-    distance = np.linalg.norm(points - a - along[..., None] * (b - a), axis=-1)
+    from_a = np.moveaxis(np.indices(high - low), 0, -1) + low - a
+    axis = b - a
+    along = np.clip((from_a @ axis) / max(float(axis @ axis), 1e-9), 0, 1)
+    distance = np.linalg.norm(from_a - along[..., None] * axis, axis=-1)
     field[box] = np.minimum(field[box], distance - radius)

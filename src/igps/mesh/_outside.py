@@ -29,11 +29,14 @@ WALL = 0.5 + 1e-6
 _MOUTH = 0.5  # minimal radius of a mouth, over that of the largest ball behind it
 _TWO_SIDED = 0.25  # a wall has two sides if the winding number behind the opening is below this
 # A surface is nearly closed below this mean deviation of winding numbers from whole numbers, beside this many faces.
-_NEARLY_CLOSED, _N_PROBES = 0.05, 1500
+_NEARLY_CLOSED = 0.05
+_N_PROBES = 1500
 # Number of parts that may be reversed to find the best orientation, and their minimal share of the area.
-_MAX_REVERSED, _MIN_REVERSED_AREA = 8, 0.01
+_MAX_REVERSED = 8
+_MIN_REVERSED_AREA = 0.01
 # Hidden faces, with the inside on both sides, are removed if they are at least this share and the faces not too many.
-_MIN_HIDDEN, _MAX_FACES_FOR_HIDDEN = 0.02, 200_000
+_MIN_HIDDEN = 0.02
+_MAX_FACES_FOR_HIDDEN = 200_000
 _MAX_EXACT_PAIRS = 10**7  # points times faces up to which winding numbers are exact
 
 
@@ -49,12 +52,13 @@ class OrientedSurface:
     def of(cls, vertices: Floats, faces: Integers) -> Self:
         import igl
 
-        _, first, index = np.unique(
-            np.round(vertices, 4), axis=0, return_index=True, return_inverse=True
-        )
+        rounded = np.round(vertices, 4)
+        _, first, index = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
         vertices = vertices[first]
         faces = index.ravel()[faces]
-        faces = faces[(np.diff(np.sort(faces, axis=1), axis=1) > 0).all(axis=1)]
+        steps = np.diff(np.sort(faces, axis=1), axis=1)
+        has_three_corners = (steps > 0).all(axis=1)
+        faces = faces[has_three_corners]
         if not len(faces):
             return cls(vertices, faces, False)
         faces, part = igl.bfs_orient(faces)
@@ -64,11 +68,9 @@ class OrientedSurface:
         # The outward side of an open part is a guess. Reversing a part negates its share of the winding numbers: parts
         # are reversed, one by one, as long as that brings the winding numbers closer to whole numbers.
         area = np.bincount(part, weights=face_areas(vertices, faces))
-        large = [
-            k
-            for k in np.argsort(-area)[:_MAX_REVERSED].tolist()
-            if area[k] > _MIN_REVERSED_AREA * area.sum()
-        ]
+        min_area = _MIN_REVERSED_AREA * area.sum()
+        largest = np.argsort(-area)[:_MAX_REVERSED].tolist()
+        large = [k for k in largest if area[k] > min_area]
         shares = [cls(vertices, faces[part == k], False).winding(points) for k in large]
         share_of_small = cls(vertices, faces[~np.isin(part, large)], False).winding(points)
         total = np.sum([share_of_small, *shares], axis=0)
@@ -84,11 +86,8 @@ class OrientedSurface:
             faces = np.ascontiguousarray(faces[:, ::-1])
         surface = cls(vertices, faces, _defect(total) < _NEARLY_CLOSED)
         is_hidden = total.reshape(2, -1).min(axis=0) > 0.5
-        if (
-            surface.is_nearly_closed
-            or is_hidden.mean() < _MIN_HIDDEN
-            or len(faces) > _MAX_FACES_FOR_HIDDEN
-        ):
+        pays = is_hidden.mean() >= _MIN_HIDDEN and len(faces) <= _MAX_FACES_FOR_HIDDEN
+        if surface.is_nearly_closed or not pays:
             return surface
         visible = surface._drop_hidden_faces()
         return visible if visible.is_nearly_closed else surface
@@ -96,9 +95,8 @@ class OrientedSurface:
     @property
     def thickness(self) -> float:
         """Volume over area, cells: half of a plate's thickness, half of a rod's radius, a third of a ball's radius."""
-        return signed_volume(self.vertices, self.faces) / float(
-            face_areas(self.vertices, self.faces).sum()
-        )
+        area = float(face_areas(self.vertices, self.faces).sum())
+        return signed_volume(self.vertices, self.faces) / area
 
     def winding(self, points: NDArray[Any]) -> Floats:
         """Return the winding numbers (P,) about points (P, 3)."""
@@ -115,8 +113,9 @@ class OrientedSurface:
         """Drop the faces with the inside on both sides, such as walls between solids that were put together."""
         normals = unit(area_vectors(self.vertices, self.faces))
         middle = self.vertices[self.faces].mean(axis=1)
-        lower = np.minimum(*(self.winding(middle + side * normals) for side in (0.25, -0.25)))
-        faces = self.faces[lower <= 0.5]
+        outside = self.winding(middle + 0.25 * normals)
+        inside = self.winding(middle - 0.25 * normals)
+        faces = self.faces[np.minimum(outside, inside) <= 0.5]
         if not len(faces):
             return self
         visible = replace(self, faces=faces)
@@ -138,7 +137,8 @@ def _probe_points(vertices: Floats, faces: Integers) -> Floats:
 
 def _defect(winding: Floats) -> float:
     """Return the mean distance to the nearest of 0, 1, 2, ...: zero beside closed, outward oriented surfaces."""
-    return float(np.abs(winding - np.maximum(np.round(winding), 0)).mean())
+    nearest = np.maximum(np.round(winding), 0)
+    return float(np.abs(winding - nearest).mean())
 
 
 def find_outside(distance: Singles, surface: OrientedSurface) -> tuple[Booleans, int]:
@@ -176,7 +176,9 @@ def _outside_by_winding(
     points = np.argwhere(outside[box]) + low
     inside = np.zeros_like(outside)
     # Where a base is missing, winding numbers are large beyond the bounding box, too, but no body reaches there.
-    points = points[((points >= MARGIN) & (points < np.array(outside.shape) - MARGIN)).all(axis=1)]
+    end = np.array(outside.shape) - MARGIN
+    is_in_box = ((points >= MARGIN) & (points < end)).all(axis=1)
+    points = points[is_in_box]
     inside[tuple(points[surface.winding(points) > 0.5].T)] = True
     _, count = ndimage.label(inside, structure=np.ones((3, 3, 3)))
     return outside & ~inside, count
@@ -195,10 +197,11 @@ def _cavities(outside: Booleans, surface: OrientedSurface) -> Booleans:
             label = label[1:-1, 1:-1, 1:-1]
             peak = ndimage.maximum(depth, label, np.arange(count + 1))
             for k in np.nonzero(peak * _MOUTH >= radius)[0]:
-                if k not in (0, open_label):
-                    core = label == k
-                    middle = np.argwhere(core & (depth >= peak[k] - 1e-9))[:8]
-                    if np.median(surface.winding(middle)) >= _TWO_SIDED:
-                        cavities |= core
+                if k in (0, open_label):
+                    continue
+                core = label == k
+                middle = np.argwhere(core & (depth >= peak[k] - 1e-9))[:8]
+                if np.median(surface.winding(middle)) >= _TWO_SIDED:
+                    cavities |= core
         radius *= 1.3
     return cavities

@@ -41,9 +41,8 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     The remaining vertices and faces keep their order.
     """
     n_before = len(vertices)
-    vertices, faces = compact(
-        vertices, faces
-    )  # the tolerance must not depend on unused vertices far away
+    # The tolerance must not depend on unused vertices far away.
+    vertices, faces = compact(vertices, faces)
     n_unused = n_before - len(vertices)
     place = places(vertices)
     place = _close_cracks(vertices, place[faces])[place]
@@ -68,12 +67,10 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
 def places(vertices: Floats) -> Integers:
     """Return, for each vertex (V,), the index of the first vertex at the same place, up to a tolerance."""
-    lattice = np.round(
-        (vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny))
-    )
-    _, first, index = np.unique(
-        lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
+    size = max(diagonal(vertices), np.finfo(float).tiny)
+    centred = vertices - vertices.mean(axis=0)
+    lattice = np.round(centred / (_WELD * size)).astype(np.int64)
+    _, first, index = np.unique(lattice, axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[index.ravel()])
 
 
@@ -95,19 +92,19 @@ def _close_cracks(vertices: Floats, faces: Integers) -> Integers:
     if tree.count_neighbors(tree, width) > _MAX_CRACK_NEIGHBOURS * len(boundary):
         return index
     pairs = tree.query_pairs(width, output_type="ndarray")
-    graph = sparse.coo_array(
-        (np.ones(len(pairs), dtype=np.int8), tuple(pairs.T)), shape=(len(boundary),) * 2
-    )
-    _, first, group = np.unique(
-        connected_components(graph, directed=False)[1], return_index=True, return_inverse=True
-    )
+    ones = np.ones(len(pairs), dtype=np.int8)
+    n = len(boundary)
+    graph = sparse.coo_array((ones, tuple(pairs.T)), shape=(n, n))
+    _, component = connected_components(graph, directed=False)
+    _, first, group = np.unique(component, return_index=True, return_inverse=True)
     index[boundary] = boundary[first[group]]
     return index
 
 
 def _boundary_vertices(vertices: Floats, faces: Integers) -> Integers:
     edges, edge_of_side = undirected_edges(faces, len(vertices))
-    return np.unique(edges[np.bincount(edge_of_side, minlength=len(edges)) == 1])
+    n_faces = np.bincount(edge_of_side, minlength=len(edges))
+    return np.unique(edges[n_faces == 1])
 
 
 def are_specks(areas: Floats) -> Booleans:
@@ -124,7 +121,10 @@ def orient(faces: Integers, notes: list[str]) -> Integers:
 
     aligned, part = igl.bfs_orient(faces)
     is_reversed = (aligned != faces).any(axis=1)
-    is_reversed ^= (np.bincount(part, weights=is_reversed) > np.bincount(part) / 2)[part]
+    n_reversed = np.bincount(part, weights=is_reversed)
+    # Where most faces of a part would be reversed, the others are reversed instead.
+    is_mostly_reversed = n_reversed > np.bincount(part) / 2
+    is_reversed ^= is_mostly_reversed[part]
     if is_reversed.any():
         notes.append(f"turned {int(is_reversed.sum())} faces to orient the surface")
         faces = np.where(is_reversed[:, None], faces[:, ::-1], faces)
@@ -151,13 +151,16 @@ def _drop_fins(vertices: Floats, faces: Integers) -> Integers:
     remaining = faces
     while len(remaining):
         _, edge_of_side = undirected_edges(remaining, len(vertices))
-        count = np.bincount(edge_of_side)[edge_of_side].reshape(-1, 3)
-        is_fin = (count == 1).any(axis=1) & (count > 2).any(axis=1)
+        n_faces = np.bincount(edge_of_side)[edge_of_side].reshape(-1, 3)
+        is_free = (n_faces == 1).any(axis=1)
+        is_crowded = (n_faces > 2).any(axis=1)
+        is_fin = is_free & is_crowded
         if not is_fin.any():
             break
         remaining = remaining[~is_fin]
     area = face_areas(vertices, remaining).sum()
-    return remaining if area >= (1 - _MAX_FINS) * face_areas(vertices, faces).sum() else faces
+    area_before = face_areas(vertices, faces).sum()
+    return remaining if area >= (1 - _MAX_FINS) * area_before else faces
 
 
 def drop_hidden_parts(
@@ -178,32 +181,44 @@ def drop_hidden_parts(
     others = np.unique(faces[part != largest])
     is_inside = np.zeros(len(vertices), dtype=bool)
     is_inside[others] = winding_number(body.vertices, body.faces, vertices[others]) > 0.5
-    is_hidden = np.bincount(part, weights=~is_inside[faces].all(axis=1), minlength=len(areas)) == 0
+    reaches_out = ~is_inside[faces].all(axis=1)
+    is_hidden = np.bincount(part, weights=reaches_out, minlength=len(areas)) == 0
     if not is_hidden.any():
         return vertices, faces
     if cavities:
+        # Compare signs, because the largest part may be inside out itself.
+        outer_sign = np.sign(signed_volume(vertices, faces[part == largest]))
         faces = faces.copy()
-        hollows: list[Mesh] = []
-        for k in sorted(np.flatnonzero(is_hidden), key=lambda k: -areas[k]):
-            surface = compact(vertices, faces[part == k])
-            try:
-                hollow = Mesh(*surface)
-            except MeshError:
-                continue
-            if any(
-                (winding_number(other.vertices, other.faces, hollow.vertices) > 0.5).any()
-                for other in hollows
-            ):
-                continue
-            hollows.append(hollow)
+        for k in _cavities_among(vertices, faces, part, np.flatnonzero(is_hidden), areas):
             is_hidden[k] = False
-            # Compare signs, because the largest part may be inside out itself.
-            if signed_volume(*surface) * signed_volume(vertices, faces[part == largest]) > 0:
+            if outer_sign * signed_volume(*compact(vertices, faces[part == k])) > 0:
                 notes.append("turned the surface of a cavity towards the inside")
                 faces[part == k] = faces[part == k][:, ::-1]
     if is_hidden.any():
         notes.append(f"dropped {int(is_hidden.sum())} parts hidden inside")
     return compact(vertices, faces[~is_hidden[part]])
+
+
+def _cavities_among(
+    vertices: Floats, faces: Integers, part: Integers, hidden: Integers, areas: Floats
+) -> list[int]:
+    """Return those of the hidden parts that are closed and lie in no other, the largest first."""
+    hollows: list[Mesh] = []
+    found = []
+    for k in sorted(hidden.tolist(), key=lambda k: -areas[k]):
+        try:
+            hollow = Mesh(*compact(vertices, faces[part == k]))
+        except MeshError:
+            continue
+        if any(_has_inside(other, hollow.vertices) for other in hollows):
+            continue
+        hollows.append(hollow)
+        found.append(k)
+    return found
+
+
+def _has_inside(body: Mesh, points: Floats) -> bool:
+    return bool((winding_number(body.vertices, body.faces, points) > 0.5).any())
 
 
 def fill_small_holes(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
@@ -212,8 +227,11 @@ def fill_small_holes(vertices: Floats, faces: Integers, notes: list[str]) -> Sur
     part_of_vertex[faces] = part[:, None]
     n_filled = 0
     for loop in _boundary_loops(faces):
-        length = np.linalg.norm(vertices[loop] - np.roll(vertices[loop], -1, axis=0), axis=1).sum()
-        if length**2 / (4 * np.pi) <= _SMALL_HOLE * areas[part_of_vertex[loop[0]]]:
+        rim = vertices[loop]
+        length = np.linalg.norm(rim - np.roll(rim, -1, axis=0), axis=1).sum()
+        area_of_circle = length**2 / (4 * np.pi)
+        area_of_part = areas[part_of_vertex[loop[0]]]
+        if area_of_circle <= _SMALL_HOLE * area_of_part:
             vertices, faces = _fill_hole(vertices, faces, loop)
             n_filled += 1
     if n_filled:
@@ -228,7 +246,8 @@ def closed_by_rims(vertices: Floats, faces: Integers) -> tuple[Floats, Integers,
         vertices, faces = _span(vertices, faces, loop)
     areas = face_areas(vertices, faces)
     total = areas.sum()
-    return vertices, faces, float(areas[n_faces:].sum() / total) if total else 0.0
+    share = float(areas[n_faces:].sum() / total) if total else 0.0
+    return vertices, faces, share
 
 
 def _boundary_loops(faces: Integers) -> list[Integers]:
@@ -294,14 +313,16 @@ def _span(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
     disc.append(np.zeros((1, 2)))
     plane = np.concatenate(disc)
     patch = Delaunay(plane).simplices.astype(np.int64)  # counter-clockwise, like the loop
-    points = np.vstack([rim, np.zeros((len(plane) - n, 3))])
+    n_new = len(plane) - n
+    points = np.vstack([rim, np.zeros((n_new, 3))])
     points[n:] = _solve_umbrella(points, patch, n, order=1)
-    index = np.concatenate([loop, len(vertices) + np.arange(len(points) - n)])
+    index = np.concatenate([loop, len(vertices) + np.arange(n_new)])
     return np.vstack([vertices, points[n:]]), np.vstack([faces, index[patch]])
 
 
 def _circle(turns: Floats, radius: float) -> Floats:
-    return radius * np.stack([np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], axis=1)
+    angles = 2 * np.pi * turns
+    return radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def _solve_umbrella(points: Floats, faces: Integers, n_fixed: int, order: int) -> Floats:
@@ -311,8 +332,12 @@ def _solve_umbrella(points: Floats, faces: Integers, n_fixed: int, order: int) -
     ends = (edges.T.ravel(), edges[:, ::-1].T.ravel())
     graph = sparse.coo_array((np.ones(2 * len(edges)), ends), shape=(size, size)).tocsr()
     umbrella = sparse.eye_array(size) - sparse.diags_array(1 / graph.sum(axis=1)) @ graph
-    operator = (umbrella @ umbrella if order == 2 else umbrella).tocsr()[n_fixed:]
-    solved = spsolve(operator[:, n_fixed:].tocsc(), -(operator[:, :n_fixed] @ points[:n_fixed]))
+    if order == 2:
+        umbrella = umbrella @ umbrella
+    operator = umbrella.tocsr()[n_fixed:]
+    of_free = operator[:, n_fixed:].tocsc()
+    of_fixed = operator[:, :n_fixed] @ points[:n_fixed]
+    solved = spsolve(of_free, -of_fixed)
     return np.asarray(solved).reshape(-1, 3)
 
 

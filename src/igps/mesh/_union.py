@@ -17,10 +17,12 @@ from igps.mesh.surface import (
 )
 
 _MIN_OPEN = 0.03  # a point of a surface is visible if this share of the directions on one of its sides is free
-_N_DIRECTIONS, _SAMPLES_PER_PATCH = 100, 30
+_N_DIRECTIONS = 100
+_SAMPLES_PER_PATCH = 30
 _COINCIDENT = 1e-6  # surfaces nearer than this coincide, in units of the bounding box's diagonal
 # Surfaces of more patches or parts are left to the grid, which is faster there.
-_MAX_PATCHES, _MAX_PARTS = 200, 200
+_MAX_PATCHES = 200
+_MAX_PARTS = 200
 
 
 def drop_inner_walls(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
@@ -64,20 +66,18 @@ def _superfluous_patch(
     is_left = patch >= 0
     size = np.bincount(patch[is_left], face_areas(points, faces[is_left]))
     in_patch = patch_of_sample >= 0
-    n_samples = np.maximum(np.bincount(patch_of_sample[in_patch], minlength=len(size)), 1)
-    visible_share = (
-        np.bincount(patch_of_sample[in_patch], is_visible[in_patch], len(size)) / n_samples
-    )
+    patches = patch_of_sample[in_patch]
+    n_samples = np.bincount(patches, minlength=len(size))
+    n_visible = np.bincount(patches, is_visible[in_patch], len(size))
+    visible_share = n_visible / np.maximum(n_samples, 1)
     for k in np.lexsort((size, visible_share)).tolist():
         if not ends_at_others[k]:
             continue
         visible = np.ascontiguousarray(samples[(patch_of_sample == k) & is_visible])
+        if not len(visible):
+            return k
         others = faces[is_left & (patch != k)]
-        squared = (
-            igl.point_mesh_squared_distance(visible, points, others)[0]
-            if len(visible)
-            else np.zeros(1)
-        )
+        squared, _, _ = igl.point_mesh_squared_distance(visible, points, others)
         if np.max(squared) <= _COINCIDENT**2:
             return k
     return -1
@@ -95,23 +95,20 @@ def _sample_patches(
     for k in range(int(patch.max()) + 1):
         members = np.nonzero((patch == k) & (areas > 0))[0]
         if len(members):
-            chosen.append(
-                generator.choice(
-                    members, _SAMPLES_PER_PATCH, p=areas[members] / areas[members].sum()
-                )
-            )
+            shares = areas[members] / areas[members].sum()
+            chosen.append(generator.choice(members, _SAMPLES_PER_PATCH, p=shares))
     face = np.concatenate(chosen)
-    samples = np.einsum(
-        "sc,scx->sx", generator.dirichlet(np.ones(3), len(face)), points[faces[face]]
-    )
+    weights = generator.dirichlet(np.ones(3), len(face))
+    samples = np.einsum("sc,scx->sx", weights, points[faces[face]])
     normals = unit(area_vectors(points, faces[face]))
-    occlusion = [
-        np.asarray(
-            igl.ambient_occlusion(points, faces, samples, np.ascontiguousarray(side), _N_DIRECTIONS)
-        ).ravel()
-        for side in (normals, -normals)
-    ]
-    return samples, face, 1 - np.minimum(*occlusion) > _MIN_OPEN
+
+    def hidden_share(directions: Floats) -> Floats:
+        directions = np.ascontiguousarray(directions)
+        share = igl.ambient_occlusion(points, faces, samples, directions, _N_DIRECTIONS)
+        return np.asarray(share).ravel()
+
+    hidden = np.minimum(hidden_share(normals), hidden_share(-normals))
+    return samples, face, 1 - hidden > _MIN_OPEN
 
 
 def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
@@ -123,11 +120,11 @@ def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     import manifold3d
 
     part, areas = face_parts(vertices, faces)
-    is_speck = areas < SPECK * areas.sum()
-    if not 1 < int((~is_speck).sum()) <= _MAX_PARTS:
+    large = np.nonzero(areas >= SPECK * areas.sum())[0]
+    if not 1 < len(large) <= _MAX_PARTS:
         return vertices, faces
     solids = []
-    for k in np.nonzero(~is_speck)[0]:
+    for k in large:
         points, triangles = compact(vertices, faces[part == k])
         for step in (weld, tidy, fill_small_holes):
             points, triangles = step(points, triangles, [])
@@ -135,9 +132,8 @@ def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
             body = Mesh(points, triangles)
         except MeshError:
             return vertices, faces
-        solid = manifold3d.Manifold(
-            manifold3d.Mesh64(body.vertices.copy(), body.faces.astype(np.uint64))
-        )
+        surface = manifold3d.Mesh64(body.vertices.copy(), body.faces.astype(np.uint64))
+        solid = manifold3d.Manifold(surface)
         if solid.status() != manifold3d.Error.NoError:
             return vertices, faces
         solids.append(solid)
@@ -146,6 +142,5 @@ def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
         return vertices, faces
     mesh = union.to_mesh64()
     notes.append(f"united {len(solids)} closed parts that overlap")
-    return np.asarray(mesh.vert_properties)[:, :3].copy(), np.asarray(
-        mesh.tri_verts, dtype=np.int64
-    )
+    united = np.asarray(mesh.vert_properties)[:, :3].copy()
+    return united, np.asarray(mesh.tri_verts, dtype=np.int64)

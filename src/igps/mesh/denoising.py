@@ -38,19 +38,26 @@ _THIN = 2.0
 _VERY_THIN = 8.0  # stretch at single vertices of other surfaces, such as on the rim of a fan of thousands of faces
 _MIN_LENGTH = 1e-9  # of an edge, in longest sides of the body; bounds the weights
 # Surfaces of fewer vertices are rough by design; those with a smaller share of edges at two faces lack clear normals.
-_MIN_VERTICES, _MIN_REGULAR = 1000, 0.97
-_SHRINK, _GROW = 0.5, -0.53  # Taubin's two steps
+_MIN_VERTICES = 1000
+_MIN_REGULAR = 0.97
+# Taubin's two steps
+_SHRINK = 0.5
+_GROW = -0.53
 # Number of Taubin passes for noise as large as the edges, and its bounds. n passes leave noise of wavelengths above
 # about n^(1/4) edges, and an excess area proportional to (noise / edge)² / n. The number is chosen to leave the same
 # excess on every surface, 0.1 to 0.6 %, at which normals are closest to those of clean surfaces. Fewer passes leave
 # noise, more passes erode thin limbs.
-_N_PASSES, _MIN_PASSES, _MAX_PASSES = 430, 3, 60
+_N_PASSES = 430
+_MIN_PASSES = 3
+_MAX_PASSES = 60
 # Maximal displacement, in standard deviations of the noise. Without it, plates with holes and thin triangles, whose
 # vertices have their near neighbours on one side, would lose half their volume.
 _MAX_DISPLACEMENT = 5
 # Width of the filter, as a difference of unit normals; its number of runs; and the number of steps in which the
 # vertices follow. Width 0.3 keeps more noise, 0.4 rounds more edges; weights by distance made no difference.
-_WIDTH, _N_RUNS, _N_STEPS = 0.35, 3, 10
+_WIDTH = 0.35
+_N_RUNS = 3
+_N_STEPS = 10
 # Faces filtered at a time, and the maximal number of faces at a vertex that count as neighbours of each other: those
 # around a hub of thousands would be millions of pairs.
 _FACES_AT_ONCE = 2**15
@@ -72,10 +79,15 @@ def is_noisy(vertices: Floats, faces: Integers) -> bool:
     normals = vertex_normals(averaging @ (averaging @ vertices), faces)
     height = np.einsum("ij,ij->i", vertices - averaging @ vertices, normals)
     residual = (height - averaging @ height) / np.maximum(around.length, np.finfo(float).tiny)
-    weights = averaging[edges[:, 0], edges[:, 1]] + averaging[edges[:, 1], edges[:, 0]]
-    same_sign = np.average(residual[edges[:, 0]] * residual[edges[:, 1]] > 0, weights=weights)
-    is_rough = np.quantile(np.abs(residual), 0.25) > _MIN_ROUGHNESS and same_sign < _MAX_SAME_SIGN
-    return bool(is_rough) and _share_of_flat_edges(vertices, faces, around.edge_of) < _MAX_FLAT
+    if np.quantile(np.abs(residual), 0.25) <= _MIN_ROUGHNESS:
+        return False
+    one_end = edges[:, 0]
+    other_end = edges[:, 1]
+    weights = averaging[one_end, other_end] + averaging[other_end, one_end]
+    has_same_sign = residual[one_end] * residual[other_end] > 0
+    if np.average(has_same_sign, weights=weights) >= _MAX_SAME_SIGN:
+        return False
+    return _share_of_flat_edges(vertices, faces, around.edge_of) < _MAX_FLAT
 
 
 @dataclass(frozen=True)
@@ -95,7 +107,8 @@ class Neighbours:
         rows = edges.T.ravel()
         columns = edges[:, ::-1].T.ravel()
         degree = np.maximum(np.bincount(rows, minlength=n), 1)
-        length = np.tile(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 2)
+        edge_vectors = vertices[edges[:, 0]] - vertices[edges[:, 1]]
+        length = np.tile(np.linalg.norm(edge_vectors, axis=1), 2)
         weights = np.ones(len(rows))
         mean_length = np.bincount(rows, weights=length, minlength=n) / degree
         inverse_squares = np.maximum(length, _MIN_LENGTH) ** -2.0
@@ -133,7 +146,9 @@ def remove_noise(vertices: Floats, faces: Integers) -> Floats:
     free[np.roll(faces, -1, axis=1)[is_boundary]] = 0
     noise, edge = noise_and_edge(vertices, faces, around)
     smooth = vertices
-    for _ in range(min(max(round(_N_PASSES * (noise / edge) ** 2), _MIN_PASSES), _MAX_PASSES)):
+    n_wanted = round(_N_PASSES * (noise / edge) ** 2)
+    n_passes = min(max(n_wanted, _MIN_PASSES), _MAX_PASSES)
+    for _ in range(n_passes):
         for step in (_SHRINK, _GROW):
             smooth = smooth + step * free * (around.averaging @ smooth - smooth)
     if np.median(around.stretch) <= _THIN:
@@ -141,7 +156,8 @@ def remove_noise(vertices: Floats, faces: Integers) -> Floats:
         smooth = np.where(around.stretch[:, None] > _VERY_THIN, smooth, sharp)
     move = smooth - vertices
     distance = np.linalg.norm(move, axis=1, keepdims=True)
-    move *= np.minimum(1, _MAX_DISPLACEMENT * noise / np.maximum(distance, np.finfo(float).tiny))
+    largest = _MAX_DISPLACEMENT * noise
+    move *= np.minimum(1, largest / np.maximum(distance, np.finfo(float).tiny))
     return unit_length * (vertices + move)
 
 
@@ -163,35 +179,32 @@ def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats
             half_squares = 1 - np.einsum("ij,ij->i", here, guide[weights.indices])
             weights.data = size[weights.indices] * np.exp(-half_squares / _WIDTH**2)
             means[part] = weights @ normals
-        normals = guide = unit(
-            means
-        )  # after the smooth surface, each result is the guide of the next run
+        normals = unit(means)
+        guide = normals  # after the smooth surface, each result is the guide of the next run
     return normals
 
 
 def _fit_to_normals(vertices: Floats, faces: Integers, normals: Floats, free: Floats) -> Floats:
     """Move the vertices (V, 3), where `free` (V, 1) is 1, until their faces have about the given normals (F, 3)."""
     to_vertices = _incidence(faces, len(vertices)).T.tocsr()
-    projections = (to_vertices @ (normals[:, :, None] * normals[:, None]).reshape(-1, 9)).reshape(
-        -1, 3, 3
-    )
-    share = free / np.maximum(to_vertices.sum(axis=1), 1)[:, None]
+    of_faces = (normals[:, :, None] * normals[:, None]).reshape(-1, 9)
+    projections = (to_vertices @ of_faces).reshape(-1, 3, 3)
+    n_faces = np.maximum(to_vertices.sum(axis=1), 1)
+    share = free / n_faces[:, None]
     for _ in range(_N_STEPS):
-        # The mean projection, on their normals, of the vectors to the centroids of the faces around.
+        # The mean projection, on their normals, of the vectors to the centroids of the faces around
         heights = np.einsum("ij,ij->i", normals, vertices[faces].mean(axis=1))
-        move = to_vertices @ (heights[:, None] * normals) - np.einsum(
-            "vij,vj->vi", projections, vertices
-        )
-        vertices = vertices + share * move
+        to_centroids = to_vertices @ (heights[:, None] * normals)
+        to_vertex = np.einsum("vij,vj->vi", projections, vertices)
+        vertices = vertices + share * (to_centroids - to_vertex)
     return vertices
 
 
 def _incidence(faces: Integers, n_vertices: int) -> sparse.csr_array:
     """(F, V) ones where a face has a vertex."""
     begins = 3 * np.arange(len(faces) + 1)
-    return sparse.csr_array(
-        (np.ones(faces.size), faces.ravel(), begins), shape=(len(faces), n_vertices)
-    )
+    arrays = (np.ones(faces.size), faces.ravel(), begins)
+    return sparse.csr_array(arrays, shape=(len(faces), n_vertices))
 
 
 def noise_and_edge(vertices: Floats, faces: Integers, around: Neighbours) -> tuple[float, float]:
@@ -205,7 +218,8 @@ def noise_and_edge(vertices: Floats, faces: Integers, around: Neighbours) -> tup
     residual = high_pass @ np.einsum("ij,ij->i", high_pass @ vertices, normals)
     white_noise = np.sqrt(np.asarray((high_pass @ high_pass).power(2).sum(axis=1)))
     noise = np.quantile(np.abs(residual) / white_noise, 0.25) / _QUARTILE
-    return float(noise), float(max(np.sqrt(np.mean(around.length**2)), np.finfo(float).tiny))
+    edge = np.sqrt(np.mean(around.length**2))
+    return float(noise), float(max(edge, np.finfo(float).tiny))
 
 
 def _unit_of_length(vertices: Floats) -> float:
@@ -219,5 +233,7 @@ def _share_of_flat_edges(vertices: Floats, faces: Integers, edge_of: Integers) -
     normals = unit(area_vectors(vertices, faces))
     order = np.argsort(edge_of, kind="stable")
     pairs = np.flatnonzero(edge_of[order[1:]] == edge_of[order[:-1]])
-    angles = np.linalg.norm(normals[order[pairs] // 3] - normals[order[pairs + 1] // 3], axis=1)
+    one_face = order[pairs] // 3
+    other_face = order[pairs + 1] // 3
+    angles = np.linalg.norm(normals[one_face] - normals[other_face], axis=1)
     return float((angles < _FLAT_ANGLE).mean())

@@ -38,21 +38,17 @@ Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertig
 MENDING_VERSION = 9
 """Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
 
-_STARTS: dict[str, Step] = {
-    step: step for step in get_args(Step)
-}  # steps by the first words of their notes
-_STARTS |= {
-    "dropped": "welded",
-    "turned": "welded",
-    "made watertight": "watertight",
-}
+# Steps by the first words of their notes
+_STARTS: dict[str, Step] = {step: step for step in get_args(Step)}
+_STARTS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
 # A mesh with too few vertices is subdivided to this multiple of the minimum: with just enough vertices the last
 # eigenfunctions would depend on the triangles.
 _SUBDIVISION_FACTOR = 4
 
-
-# A shell is named open if this share of its surface is missing, and it has less than this share of the volume within.
-_MIN_MISSING, _MAX_SHELL = 0.05, 0.5
+# A shell is named open if this share of its surface is missing, and it has less than this share of
+# the volume within.
+_MIN_MISSING = 0.05
+_MAX_SHELL = 0.5
 
 
 def mend(
@@ -114,12 +110,13 @@ def mend(
                 f"{name}: expected a surface, but all faces lie in one point. Check the file."
             )
         check_size(corners.reshape(-1, 3), name)  # before squares of lengths overflow or vanish
-        mesh = (_remake if how == "always" else _mend)(
-            vertices, triangles, name, cavities == "keep", denoise
-        )
-    n_outer = int(mesh.outer()[1].sum())
+        repair = _remake if how == "always" else _mend
+        mesh = repair(vertices, triangles, name, cavities == "keep", denoise)
+    _, is_outer = mesh.outer()
+    n_outer = int(is_outer.sum())
     if n_outer < least_vertices:
-        mesh = subdivide(mesh, _SUBDIVISION_FACTOR * least_vertices + len(mesh.vertices) - n_outer)
+        n_inner = len(mesh.vertices) - n_outer
+        mesh = subdivide(mesh, _SUBDIVISION_FACTOR * least_vertices + n_inner)
     for note in mesh.notes:
         logger.info("%s: %s", name, note)
     return mesh
@@ -127,11 +124,12 @@ def mend(
 
 def repair_steps(notes: Iterable[str]) -> tuple[Step, ...]:
     """Return the repairs that the notes of a `Mesh` or `Signature` record, in order and without repetition."""
-    return tuple(
-        dict.fromkeys(
-            step for note in notes for start, step in _STARTS.items() if note.startswith(start)
-        )
-    )
+    found: dict[Step, None] = {}
+    for note in notes:
+        for start, step in _STARTS.items():
+            if note.startswith(start):
+                found[step] = None
+    return tuple(found)
 
 
 def _mend(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
@@ -141,12 +139,12 @@ def _mend(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise:
     for step in (None, weld, tidy, fill_small_holes, drop_hidden):
         if step is not None and len(faces):
             vertices, faces = step(vertices, faces, notes)
-        if body := _body(vertices, faces, notes, name, cavities, denoise):
+        body = _body(vertices, faces, notes, name, cavities, denoise)
+        if body is not None:
             return body
     # These steps may give no body if there are many loose parts; their result is then discarded.
-    tidied = vertices, faces
     for step, surface, earlier in (
-        (drop_inner_walls, tidied, notes),
+        (drop_inner_walls, (vertices, faces), notes),
         (unite_parts, original, []),
     ):
         if not len(surface[1]):
@@ -182,7 +180,9 @@ def _body(
     except MeshError:
         return None
     smooth = _smooth(mesh.vertices, mesh.faces, notes, denoise)
-    return mesh if smooth is mesh.vertices else replace(mesh, vertices=smooth, notes=tuple(notes))
+    if smooth is mesh.vertices:
+        return mesh
+    return replace(mesh, vertices=smooth, notes=tuple(notes))
 
 
 def _remake(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
@@ -193,17 +193,13 @@ def _remake(vertices: Floats, faces: Integers, name: str, cavities: bool, denois
     for step in (None, weld):
         if step is not None:
             surface = step(vertices, faces, notes)
-        if (body := _body(*surface, notes, name, cavities, denoise)) and not crosses_itself(
-            body.vertices, body.faces
-        ):
+        body = _body(*surface, notes, name, cavities, denoise)
+        if body is not None and not crosses_itself(body.vertices, body.faces):
             return body
         notes = []
     smooth = _smooth(*surface, notes, denoise)
-    body = (
-        watertight(smooth, surface[1], name=name)
-        if notes
-        else watertight(vertices, faces, name=name)
-    )
+    last = (smooth, surface[1]) if notes else (vertices, faces)
+    body = watertight(*last, name=name)
     return body.annotated(notes=tuple(notes))
 
 

@@ -85,11 +85,12 @@ def unit_of_length(name: str) -> float | None:
 
 
 _REPAIR = 'LoadOptions(mend="auto"), on the command line --mend auto,'
-_MIN_VOLUME = (
-    1e-10  # of a body, over the cube of its diagonal; surfaces with less are folded sheets
-)
-# Between these diagonals, areas, volumes and eigenfunctions in single precision neither overflow nor lose digits.
-_MIN_DIAGONAL, _MAX_DIAGONAL = 1e-30, 1e30
+# Of a body, over the cube of its diagonal; surfaces with less are folded sheets
+_MIN_VOLUME = 1e-10
+# Between these diagonals, areas, volumes and eigenfunctions in single precision neither overflow
+# nor lose digits.
+_MIN_DIAGONAL = 1e-30
+_MAX_DIAGONAL = 1e30
 _MAX_DISTANCE = 1e6  # from the origin, in diagonals; the mesh keeps nine digits of its coordinates, which suffice
 
 
@@ -176,10 +177,12 @@ class Mesh:
         surfaces = connected(self.vertices, self.faces) if self.cavities else []
         if len(surfaces) < 2:
             return self, np.ones(len(self.vertices), dtype=bool)
-        outermost = int(np.argmax([signed_volume(*surface) for surface in surfaces]))
+        volumes = [signed_volume(*surface) for surface in surfaces]
+        outermost = int(np.argmax(volumes))
         vertices, faces = surfaces[outermost]
-        is_outer = components(self.faces, len(self.vertices))[1] == outermost
-        return replace(self, vertices=vertices, faces=faces, cavities=False), is_outer
+        _, surface_of_vertex = components(self.faces, len(self.vertices))
+        body = replace(self, vertices=vertices, faces=faces, cavities=False)
+        return body, surface_of_vertex == outermost
 
     @cached_property
     def area(self) -> float:
@@ -201,12 +204,15 @@ class Mesh:
         """Number of handles of all surfaces together; a MeshError for an open mesh."""
         n_vertices = len(self.vertices)
         n_faces = len(self.faces)
-        if len(undirected_edges(self.faces, n_vertices)[0]) * 2 != n_faces * 3:
+        edges, _ = undirected_edges(self.faces, n_vertices)
+        if len(edges) * 2 != n_faces * 3:
             raise MeshError(
                 f"{self.name}: an open surface has no genus; a closed one was expected. Close the holes."
             )
         # Euler's formula for C surfaces, V - E + F = 2 C - 2 genus, with 2 E = 3 F.
-        return components(self.faces, n_vertices)[0] - (n_vertices - n_faces // 2) // 2
+        n_surfaces, _ = components(self.faces, n_vertices)
+        characteristic = n_vertices - n_faces // 2
+        return n_surfaces - characteristic // 2
 
     def __repr__(self) -> str:
         return f"Mesh({self.name!r}, {len(self.vertices)} vertices, {len(self.faces)} faces)"
@@ -314,24 +320,22 @@ def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
     for k, (points, triangles) in enumerate(surfaces):
         if k == outer:
             continue
-        patch = face_patches(triangles, len(points))[
-            0
-        ]  # patches that meet in a vertex are one connected surface
-        is_outward = any(
-            signed_volume(points, triangles[patch == i]) >= 0 for i in range(patch.max() + 1)
+        # Patches that meet in a vertex are one connected surface.
+        patch, _ = face_patches(triangles, len(points))
+        patch_volumes = [
+            signed_volume(points, triangles[patch == i]) for i in range(patch.max() + 1)
+        ]
+        is_outward = max(patch_volumes) >= 0
+        lies_inside = winding_number(*surfaces[outer], points).min() >= 0.5
+        # The cavity's own surface is left out: at its vertices, its winding number may be anything
+        # from 0 to 1.
+        others = [surface for i, surface in enumerate(surfaces) if i not in (k, outer)]
+        lies_in_another = any(
+            np.abs(winding_number(*other, points)).max() > 0.5 for other in others
         )
-        # The cavity's own surface is left out: at its vertices, its winding number may be anything from 0 to 1.
-        around = {
-            i: winding_number(*surface, points) for i, surface in enumerate(surfaces) if i != k
-        }
-        lies_inside = around.pop(outer).min() >= 0.5
-        if (
-            is_outward
-            or not lies_inside
-            or any(abs(winding).max() > 0.5 for winding in around.values())
-        ):
-            reasons = (
-                "it is oriented outward, outside the largest surface, or inside another cavity"
+        if is_outward or not lies_inside or lies_in_another:
+            raise MeshError(
+                f"{name}: one of {len(surfaces)} closed surfaces bounds no cavity: it is oriented "
+                "outward, outside the largest surface, or inside another cavity. "
+                f"Read the file with {_REPAIR} or without cavities."
             )
-            fault = f"{name}: one of {len(surfaces)} closed surfaces bounds no cavity: {reasons}."
-            raise MeshError(f"{fault} Read the file with {_REPAIR} or without cavities.")

@@ -3,10 +3,10 @@
 import numpy as np
 
 from igps._arrays import Floats, Integers
+from igps.mesh.surface import sums
 
-_MAX_EAR_CORNERS = (
-    2000  # larger polygons are cut into fans: ear clipping takes quadratic time or worse
-)
+# Larger polygons are cut into fans: ear clipping takes quadratic time or worse.
+_MAX_EAR_CORNERS = 2000
 
 
 def triangles(corners: Integers, n_corners: Integers) -> Integers:
@@ -21,13 +21,11 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
     large = np.flatnonzero(n_corners > 4)
     if len(large):
         n_triangles = n_corners[large] - 2
-        at = np.arange(n_triangles.sum()) - np.repeat(
-            np.cumsum(n_triangles) - n_triangles, n_triangles
-        )
+        n_before = np.cumsum(n_triangles) - n_triangles
+        at = np.arange(n_triangles.sum()) - np.repeat(n_before, n_triangles)
         first = np.repeat(starts[large], n_triangles)
-        pieces.append(
-            np.stack([corners[first], corners[first + at + 1], corners[first + at + 2]], axis=1)
-        )
+        fans = [corners[first], corners[first + at + 1], corners[first + at + 2]]
+        pieces.append(np.stack(fans, axis=1))
     return np.concatenate(pieces)
 
 
@@ -58,14 +56,11 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
     following[starts + n_corners - 1] = corners[starts]
     # Doubled area vectors of the triangles in the fans, and of whole polygons
     in_fan = np.cross(vertices[corners] - vertices[first], vertices[following] - vertices[first])
-    total = np.stack(
-        [np.bincount(owner, in_fan[:, axis], len(n_corners)) for axis in range(3)], axis=1
-    )
+    total = sums(owner, in_fan, len(n_corners))
     with np.errstate(invalid="ignore"):  # coordinates that are not finite are refused later
-        is_flipped = (
-            np.einsum("ij,ij->i", in_fan, total[owner])
-            < -1e-9 * np.einsum("ij,ij->i", total, total)[owner]
-        )
+        along_total = np.einsum("ij,ij->i", in_fan, total[owner])
+        squared = np.einsum("ij,ij->i", total, total)
+        is_flipped = along_total < -1e-9 * squared[owner]
     is_folded = np.zeros(len(n_corners), dtype=bool)
     is_folded[owner[is_flipped]] = True
     is_folded &= n_corners <= _MAX_EAR_CORNERS

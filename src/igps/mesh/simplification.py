@@ -30,17 +30,16 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     centre = mesh.vertices.mean(axis=0)
     scale = longest_side(mesh.vertices)
     points = np.asfortranarray((mesh.vertices - centre) / scale)
-    points, faces, *_ = igl.qslim(
-        points, np.asfortranarray(mesh.faces), max(len(mesh.faces) - 2 * surplus, 4)
-    )
+    faces = np.asfortranarray(mesh.faces)
+    n_faces = max(len(faces) - 2 * surplus, 4)
+    points, faces, *_ = igl.qslim(points, faces, n_faces)
     if len(points) > max_vertices:
         fault = f"{mesh.name}: simplification reached only {len(points)} vertices, expected {max_vertices}"
         raise MeshError(f"{fault}; fewer would change the topology. Raise max_vertices.")
     note = f"simplified from {len(mesh.vertices)} to {len(points)} vertices"
+    vertices = points * scale + centre
     try:
-        return replace(
-            mesh, vertices=points * scale + centre, faces=faces, notes=(*mesh.notes, note)
-        )
+        return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))
     except MeshError as error:
         raise MeshError(
             f"{error} Simplification caused this: raise max_vertices above {max_vertices}."
@@ -58,10 +57,9 @@ def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
         edges, edge_of_side = undirected_edges(faces, len(vertices))
         length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
         # A pass cuts only edges about as long as the longest, so that edges are cut in the order of their lengths.
-        cut = np.argsort(-length, kind="stable")[: n_vertices - len(vertices)]
-        vertices, faces = _cut(
-            vertices, faces, edges, edge_of_side, cut[length[cut] > 0.7 * length.max()]
-        )
+        longest = np.argsort(-length, kind="stable")[: n_vertices - len(vertices)]
+        cut = longest[length[longest] > 0.7 * length.max()]
+        vertices, faces = _cut(vertices, faces, edges, edge_of_side, cut)
     note = f"subdivided from {n_before} to {len(vertices)} vertices"
     return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))
 
@@ -80,23 +78,23 @@ def _cut(
         f = faces[n_cut == n]
         k = middle_of_side[n_cut == n]
         # The corners are rotated so that the cut sides come first.
-        turn = (
-            np.argmax(k >= 0, axis=1)
-            if n == 1
-            else (np.argmin(k >= 0, axis=1) + 1 if n == 2 else 0)
-        )
-        order = (np.arange(3) + np.reshape(turn, (-1, 1))) % 3
-        a, b, c = np.take_along_axis(f, np.broadcast_to(order, f.shape), axis=1).T
-        p, q, r = np.take_along_axis(k, np.broadcast_to(order, k.shape), axis=1).T
+        turn = np.zeros(len(f), dtype=np.int64)
+        if n == 1:
+            turn = np.argmax(k >= 0, axis=1)
+        elif n == 2:
+            turn = np.argmin(k >= 0, axis=1) + 1
+        order = (np.arange(3) + turn[:, None]) % 3
+        a, b, c = np.take_along_axis(f, order, axis=1).T
+        p, q, r = np.take_along_axis(k, order, axis=1).T
         if n == 1:
             corners = [(a, p, c), (p, b, c)]
         elif n == 2:
             # The quadrilateral a p q c is divided along its shorter diagonal.
-            by_a = np.linalg.norm(vertices[a] - vertices[q], axis=1) < np.linalg.norm(
-                vertices[p] - vertices[c], axis=1
-            )
-            corners = [(p, b, q), (a, np.where(by_a, q, p), c)]
-            corners.append((np.where(by_a, a, p), np.where(by_a, p, q), np.where(by_a, q, c)))
+            from_a = np.linalg.norm(vertices[a] - vertices[q], axis=1)
+            from_p = np.linalg.norm(vertices[p] - vertices[c], axis=1)
+            by_a = from_a < from_p
+            third = (np.where(by_a, a, p), np.where(by_a, p, q), np.where(by_a, q, c))
+            corners = [(p, b, q), (a, np.where(by_a, q, p), c), third]
         else:
             corners = [(a, p, r), (p, b, q), (r, q, c), (p, q, r)]
         pieces.extend(np.stack(corner, axis=1) for corner in corners)

@@ -31,9 +31,8 @@ def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
 
 def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
     """Return the outward unit normals (V, 3) of the vertices: means of the face normals, weighted by area."""
-    return unit(
-        sums(faces.ravel(), np.repeat(area_vectors(vertices, faces), 3, axis=0), len(vertices))
-    )
+    at_corners = np.repeat(area_vectors(vertices, faces), 3, axis=0)
+    return unit(sums(faces.ravel(), at_corners, len(vertices)))
 
 
 def sums(index: Integers, rows: Floats, n: int) -> Floats:
@@ -57,9 +56,8 @@ def mean_of_neighbours(vertices: Floats, faces: Integers) -> Floats:
 
 def unit(vectors: Floats) -> Floats:
     """Return the vectors (N, 3) scaled to length 1; zero vectors stay zero."""
-    return vectors / np.maximum(
-        np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny
-    )
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.maximum(lengths, np.finfo(float).tiny)
 
 
 def box_sides(points: Floats) -> Floats:
@@ -86,25 +84,30 @@ def directed_edges(faces: Integers) -> tuple[Integers, Integers]:
 def undirected_edges(faces: Integers, n_vertices: int) -> tuple[Integers, Integers]:
     """Return the edges (E, 2) in ascending order, the smaller vertex first, and the edge (3F,) of every side."""
     start, end = directed_edges(faces)
-    keys, edge_of = np.unique(
-        np.minimum(start, end) * n_vertices + np.maximum(start, end), return_inverse=True
-    )
-    return np.stack([keys // n_vertices, keys % n_vertices], axis=1), edge_of
+    key_of_side = np.minimum(start, end) * n_vertices + np.maximum(start, end)
+    keys, edge_of = np.unique(key_of_side, return_inverse=True)
+    edges = np.stack([keys // n_vertices, keys % n_vertices], axis=1)
+    return edges, edge_of
 
 
 def components(faces: Integers, n_vertices: int) -> tuple[int, NDArray[np.int32]]:
     """Return the number of connected components, and the component (V,) of each vertex, from 0."""
     start, end = directed_edges(faces)
-    graph = sparse.coo_array(
-        (np.ones(len(start), dtype=np.int8), (start, end)), shape=(n_vertices, n_vertices)
-    )
+    return _connected(start, end, n_vertices)
+
+
+def _connected(start: Integers, end: Integers, n: int) -> tuple[int, NDArray[np.int32]]:
+    """Return the number of components of the graph of n nodes with these edges, and that of each."""
+    ones = np.ones(len(start), dtype=np.int8)
+    graph = sparse.coo_array((ones, (start, end)), shape=(n, n))
     count, label = connected_components(graph, directed=False)
     return int(count), label
 
 
 def face_parts(vertices: Floats, faces: Integers) -> tuple[Integers, Floats]:
     """Return the connected component (F,) of each face, from 0, and the areas of the components, length²."""
-    part = np.unique(components(faces, len(vertices))[1][faces[:, 0]], return_inverse=True)[1]
+    _, component = components(faces, len(vertices))
+    _, part = np.unique(component[faces[:, 0]], return_inverse=True)
     areas = np.bincount(part, weights=face_areas(vertices, faces))
     return part.astype(np.int64), np.asarray(areas, dtype=np.float64)
 
@@ -118,20 +121,18 @@ def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
     by_edge = np.argsort(edge_of_side, kind="stable")
     count = np.bincount(edge_of_side)
     at = (np.cumsum(count) - count)[count == 2]
-    a = by_edge[at] // 3
-    b = by_edge[at + 1] // 3
-    graph = sparse.coo_array(
-        (np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(faces), len(faces))
-    )
-    n_patches, patch = connected_components(graph, directed=False)
+    one_face = by_edge[at] // 3
+    other_face = by_edge[at + 1] // 3
+    n_patches, patch = _connected(one_face, other_face, len(faces))
     # Faces of the patch itself do not count, also where several of them meet in an edge.
-    pairs, n_own = np.unique(
-        np.stack([np.repeat(patch, 3), edge_of_side]), axis=1, return_counts=True
-    )
+    sides = np.stack([np.repeat(patch, 3), edge_of_side])
+    pairs, n_own = np.unique(sides, axis=1, return_counts=True)
     patch_at = pairs[0]
     n_at = count[pairs[1]]
-    n_free = np.bincount(patch_at, (n_at - n_own < 2) & (n_at != 2), n_patches)
-    return patch.astype(np.int64), (n_free == 0) & (np.bincount(patch_at, n_at > 2, n_patches) > 0)
+    is_free = (n_at - n_own < 2) & (n_at != 2)
+    n_free = np.bincount(patch_at, is_free, n_patches)
+    n_crowded = np.bincount(patch_at, n_at > 2, n_patches)
+    return patch.astype(np.int64), (n_free == 0) & (n_crowded > 0)
 
 
 def signed_volume(vertices: Floats, faces: Integers) -> float:
@@ -154,20 +155,25 @@ def connected(vertices: Floats, faces: Integers) -> list[Surface]:
 
 def largest(vertices: Floats, faces: Integers) -> Surface:
     """Return the connected component of the largest volume."""
-    return max(
-        connected(*compact(vertices, faces)), key=lambda surface: abs(signed_volume(*surface))
-    )
+    surfaces = connected(*compact(vertices, faces))
+    return max(surfaces, key=lambda surface: abs(signed_volume(*surface)))
 
 
 def stacked(surfaces: Sequence[Surface]) -> Surface:
     """Concatenate several surfaces to one."""
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
-    faces = [faces + start for (_, faces), start in zip(surfaces, starts, strict=False)]
-    return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)
+    all_vertices = []
+    all_faces = []
+    n_before = 0
+    for vertices, faces in surfaces:
+        all_vertices.append(vertices)
+        all_faces.append(faces + n_before)
+        n_before += len(vertices)
+    return np.concatenate(all_vertices), np.concatenate(all_faces)
 
 
 def has_area(corners: Floats) -> Booleans:
     """Return whether triangles with corners (F, 3, 3) have an area, beyond rounding errors: (F,)."""
     sides = corners - np.roll(corners, 1, axis=1)
     longest = (sides**2).sum(axis=2).max(axis=1)
-    return np.asarray(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > _FLAT * longest)
+    double_areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return np.asarray(double_areas > _FLAT * longest)

@@ -35,10 +35,12 @@ from igps.mesh.surface import diagonal, face_areas, largest, longest_side, unit
 
 # Groups of triangles of less than this share of the area are specks, if a grid of this many cells per side separates
 # them from all others.
-_SPECK_AREA, _SPECK_CELLS = 2e-3, 64
+_SPECK_AREA = 2e-3
+_SPECK_CELLS = 64
 # Thickness (volume over area, half a rod's radius) in cells: the grid is refined up to the first as far as its size
 # allows, and bodies below the second get a note that they are coarse.
-_FINE, _COARSE = 1.5, 0.75
+_FINE = 1.5
+_COARSE = 0.75
 _MAX_FACES = 400_000  # in larger meshes, vertices are first merged within quarters of a cell, to bound time and memory
 _MAX_POINTS = 200_000  # larger clouds are thinned out first
 _LINE = 1e-5  # points on a line in single precision have a smaller ratio of spread across to spread along
@@ -79,9 +81,8 @@ def watertight(
         vertices, faces, spacing = splats(vertices, normals, resolution, name)
         notes.append("points joined by small discs")
     faces = np.asarray(faces, dtype=np.int64)
-    faces = faces[
-        face_areas(vertices, faces) > 1e-14 * diagonal(vertices[faces].reshape(-1, 3)) ** 2
-    ]
+    size = diagonal(vertices[faces].reshape(-1, 3))
+    faces = faces[face_areas(vertices, faces) > 1e-14 * size**2]
     if not len(faces):
         raise MeshError(
             f"{name}: expected a surface, but no triangle has an area. Give lines some thickness."
@@ -100,9 +101,8 @@ def watertight(
     if cell > min_size:
         finest = grid
         grid = Grid.around(grid.from_cells(vertices), faces, cell)
-        vertices, oriented = (
-            grid.to_cells(finest.from_cells(points)) for points in (vertices, surface.vertices)
-        )
+        vertices = grid.to_cells(finest.from_cells(vertices))
+        oriented = grid.to_cells(finest.from_cells(surface.vertices))
         surface = replace(surface, vertices=oriented)
     distance, nearest = distances(vertices, faces, grid.shape)
     outside, n_closed = find_outside(distance, surface)
@@ -110,7 +110,8 @@ def watertight(
         notes.append(f"closed {n_closed} openings")
     field = join_pieces(level_set(distance, nearest, outside, surface), notes)
     vertices, faces = largest(*level_surface(field, name))
-    notes.append(f"made watertight on a grid of {' x '.join(str(n) for n in grid.shape)} cells")
+    sides = " x ".join(str(n) for n in grid.shape)
+    notes.append(f"made watertight on a grid of {sides} cells")
     if max_vertices is not None:
         vertices, faces = simplify_surface(vertices, faces, max_vertices)
     return Mesh(grid.from_cells(vertices), faces, name=name, notes=tuple(notes))
@@ -181,10 +182,9 @@ def splats(
         )
     if len(points) > _MAX_POINTS:
         # Keep one point in each quarter of a cell.
-        lattice = np.floor((points - points.min(axis=0)) / (side / (4 * resolution))).astype(
-            np.int64
-        )
-        _, first = np.unique(lattice, axis=0, return_index=True)
+        quarter = side / (4 * resolution)
+        lattice = np.floor((points - points.min(axis=0)) / quarter)
+        _, first = np.unique(lattice.astype(np.int64), axis=0, return_index=True)
         points = points[first]
         normals = None if normals is None else normals[first]
     distance, neighbours = cKDTree(points).query(points, k=min(13, len(points)))
@@ -206,9 +206,8 @@ def splats(
     u = unit(np.cross(normals, axis))
     v = unit(np.cross(normals, u))
     angle = np.arange(6)[:, None] * np.pi / 3
-    rim = points[:, None] + radius[:, None, None] * (
-        np.cos(angle) * u[:, None] + np.sin(angle) * v[:, None]
-    )
+    circle = np.cos(angle) * u[:, None] + np.sin(angle) * v[:, None]
+    rim = points[:, None] + radius[:, None, None] * circle
     fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
     faces = (6 * np.arange(len(points))[:, None, None] + fan).reshape(-1, 3)
     return rim.reshape(-1, 3), faces, spacing / 2
