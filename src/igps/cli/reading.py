@@ -1,9 +1,11 @@
 """The options by which commands read meshes, and the signatures and descriptions that result."""
 
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import reduce
+from itertools import chain
 from operator import or_
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,8 @@ from igps.nn.description import check_attributes, describe, fit_centres
 from igps.nn.descriptor import Descriptor
 from igps.report.tables import write_rows
 from igps.signature.signature import SignatureConfig
+
+_RESIDUES = re.compile(r"(\d+) (residues .*)")
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,8 @@ def signatures(
     usable = dataset.usable(failures)
     if summary := mending_summary(usable, len(dataset)):
         print(summary)
+    for line in residue_summaries(usable):
+        print(line)
     for descriptor in descriptors:
         print_reading_warning(descriptor, usable)
     return usable, failures
@@ -331,6 +337,17 @@ def mending_summary(dataset: SignatureDataset, n_total: int) -> str:
     words = {"watertight": "made watertight"}
     listed = ", ".join(f"{count} {words.get(step, step)}" for step, count in counts.most_common())
     return f"{sum(map(bool, steps))} of {n_total} meshes were repaired: {listed}"
+
+
+def residue_summaries(dataset: SignatureDataset) -> list[str]:
+    """Return a line for each kind of note on residues of molecules, such as those that were completed."""
+    counts: dict[str, list[int]] = {}
+    for note in chain.from_iterable(dataset.all_notes()):
+        match = _RESIDUES.fullmatch(note)
+        if match is not None:
+            counts.setdefault(match[2], []).append(int(match[1]))
+    n_bodies = len(dataset)
+    return [f"{sum(n):,} {text} (in {len(n)} of {n_bodies} bodies)" for text, n in counts.items()]
 
 
 def write_mending_notes(path: Path, dataset: SignatureDataset) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from igps.cli import main
 from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.fields.molecules.molecule import Molecule
 from igps.fields.molecules.residues import VOLUMES
@@ -20,7 +21,10 @@ from igps.mesh.mesh import Mesh
 
 pytest.importorskip("gemmi")
 
+COMPLETED = "{} residues were completed: balls stand for missing atoms of side chains"
 ALANINE = [("N", 0.0, 0.0), ("CA", 1.46, 0.0), ("C", 2.0, 1.4), ("O", 1.3, 2.4), ("CB", 2.0, -0.8)]
+
+SULFUR = [("CG", 2.5, -1.5), ("CE", 3.5, -3.5), ("SD", 3.0, -2.0)]
 
 
 @dataclass(frozen=True)
@@ -72,14 +76,14 @@ def backbone(atoms: int = 4) -> list[tuple[str, float, float]]:
 
 def test_atoms_have_the_radii_of_their_elements(tmp_path: Path) -> None:
     (molecule,) = read_molecule(
-        written(tmp_path, residue(1) + residue(2, "MET", [*ALANINE, ("SD", 3.0, -2.0)]))
+        written(tmp_path, residue(1) + residue(2, "MET", [*ALANINE, *SULFUR]))
     )
     np.testing.assert_allclose(
         molecule.radii[:5], [1.55, 1.70, 1.70, 1.52, 1.70], atol=1e-6
     )  # Bondi 1964
     assert molecule.radii[-1] == pytest.approx(1.80)
     assert molecule.residue_names == ("ALA", "MET")
-    assert molecule.residue_of.tolist() == [0] * 5 + [1] * 6
+    assert molecule.residue_of.tolist() == [0] * 5 + [1] * 8
     np.testing.assert_allclose(molecule.residue_positions, [[1.46, 0, 3.8], [1.46, 0, 7.6]])
     assert molecule.notes == ()
 
@@ -234,7 +238,7 @@ def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_pa
 def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
     water = Atom(9, "O", 9, 9, 9, residue="HOH", place=" 101 ", record="HETATM").line()
     ligand = Atom(10, "C1", 5, 5, 5, residue="XYZ", place=" 102 ", record="HETATM").line()
-    changed = residue(2, "MSE", [*ALANINE, ("SE", 3.0, -2.0)], record="HETATM")
+    changed = residue(2, "MSE", [*ALANINE, *SULFUR], record="HETATM")
     path = written(tmp_path, residue(1) + changed + water + ligand)
     (molecule,) = read_molecule(path)
     assert molecule.residue_names == ("ALA", "MET")
@@ -301,10 +305,11 @@ def test_a_backbone_gets_balls_of_its_side_chains(tmp_path: Path) -> None:
         + residue(3, "LYS", backbone())
     )
     (molecule,) = read_molecule(written(tmp_path, text))
-    assert molecule.notes == ("2 residues without a side chain: a ball of its volume was used",)
+    assert molecule.notes == (COMPLETED.format(2),)
     assert np.bincount(molecule.residue_of).tolist() == [5, 4, 5]
     leucine = molecule.positions[0], molecule.radii[0]
-    assert 4 / 3 * np.pi * leucine[1] ** 3 == pytest.approx(VOLUMES["LEU"] - VOLUMES["GLY"])
+    volume = 0.89 * (VOLUMES["LEU"] - VOLUMES["GLY"])
+    assert 4 / 3 * np.pi * leucine[1] ** 3 == pytest.approx(volume)
     # It touches Cα, on the side of Cβ, which tetrahedral geometry has away from N and C.
     away = leucine[0] - [1.46, 0, 3.8]
     assert np.linalg.norm(away) == pytest.approx(leucine[1])
@@ -313,6 +318,51 @@ def test_a_backbone_gets_balls_of_its_side_chains(tmp_path: Path) -> None:
         cosine = away @ bond / np.linalg.norm(away) / np.linalg.norm(bond)
         assert np.degrees(np.arccos(cosine)) == pytest.approx(109.5, abs=4)
     assert np.bincount(molecule.residue_of, molecule.charges).tolist() == [0, 0, 1]
+
+
+def side_chain(*names: str) -> list[tuple[str, float, float]]:
+    """Atoms in a line from Cα on, with Cβ as the first."""
+    return [(name, 2.0 + 0.6 * i, -0.8 - 1.2 * i) for i, name in enumerate(("CB", *names))]
+
+
+LYSINE = [*backbone(), *side_chain("CG", "CD", "CE", "NZ")]
+
+
+@pytest.mark.parametrize("n_present", [1, 2, 4])
+def test_a_cut_side_chain_gets_what_it_lacks_at_its_last_atom(
+    n_present: int, tmp_path: Path
+) -> None:
+    (whole,) = read_molecule(written(tmp_path, residue(1, "LYS", LYSINE)))
+    (cut,) = read_molecule(written(tmp_path, residue(1, "LYS", LYSINE[: 4 + n_present])))
+    assert whole.notes == ()
+    assert cut.notes == (COMPLETED.format(1),)
+    assert cut.charges.sum() == whole.charges.sum() == 1
+    ball, radius = cut.positions[0], cut.radii[0]
+    share = (5 - n_present) / 5
+    assert 4 / 3 * np.pi * radius**3 == pytest.approx(share * (VOLUMES["LYS"] - VOLUMES["GLY"]))
+    alpha = np.array([1.46, 0, 3.8])
+    last = np.array([2.0 + 0.6 * (n_present - 1), -0.8 - 1.2 * (n_present - 1), 3.8])
+    out = (last - alpha) / np.linalg.norm(last - alpha)
+    np.testing.assert_allclose(ball, last + radius * out, atol=1e-9)
+
+
+def test_names_tell_the_state_of_protonation(tmp_path: Path) -> None:
+    charges = {"HIP": 1, "HSP": 1, "HSD": 0, "HSE": 0, "HID": 0, "HIE": 0, "HIS": 0.1}
+    charges |= {"ASH": 0, "GLH": 0, "LYN": 0, "CYM": -1, "CYX": 0, "CYS": 0}
+    for atoms in (backbone(), ALANINE):
+        text = "".join(residue(i, name, atoms) for i, name in enumerate(charges, start=1))
+        (molecule,) = read_molecule(written(tmp_path, text))
+        sums = np.bincount(molecule.residue_of, molecule.charges)
+        np.testing.assert_allclose(sums, list(charges.values()), atol=1e-12)
+
+
+def test_an_atom_that_is_given_twice_counts_once(tmp_path: Path) -> None:
+    """As programs that complete side chains leave them, without a letter for alternative locations."""
+    twice = [*LYSINE, *LYSINE[-3:]]
+    (once,) = read_molecule(written(tmp_path, residue(1, "LYS", LYSINE)))
+    (molecule,) = read_molecule(written(tmp_path, residue(1, "LYS", twice)))
+    np.testing.assert_array_equal(molecule.positions, once.positions)
+    assert molecule.charges.sum() == 1
 
 
 def test_a_trace_has_balls_of_its_residues(tmp_path: Path) -> None:
@@ -329,14 +379,14 @@ def test_of_alternatives_the_most_occupied_is_taken(tmp_path: Path) -> None:
         Atom(5, "CB", 2, -0.8, 3.8, alternative="A", occupancy=0.4).line(),
         Atom(6, "CB", 2, -0.9, 3.8, alternative="B", occupancy=0.6).line(),
     ]
-    kinds = residue(2, "SER", alternative="A", occupancy=0.3) + residue(
-        2, "THR", alternative="B", occupancy=0.7
+    kinds = residue(2, "GLY", backbone(), alternative="A", occupancy=0.3) + residue(
+        2, alternative="B", occupancy=0.7
     )
     (molecule,) = read_molecule(
         written(tmp_path, residue(1, atoms=backbone()) + "".join(atoms) + kinds)
     )
     assert molecule.positions[4, 1] == pytest.approx(-0.9)
-    assert molecule.residue_names == ("ALA", "THR")
+    assert molecule.residue_names == ("ALA", "ALA")
     assert molecule.notes == ("2 alternative locations: the one of the highest occupancy was used",)
 
 
@@ -344,12 +394,12 @@ def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path: Path) -> 
     text = (
         residue(1, place="  -5 ")
         + residue(2, place="  -5A")
-        + residue(3, "GLY")
-        + residue(4, "SER", place="   3 ")
+        + residue(3, "GLY", backbone())
+        + residue(4, place="   3 ")
     )
     (molecule,) = read_molecule(written(tmp_path, text))
-    assert molecule.residue_names == ("ALA", "ALA", "GLY", "SER")
-    assert len(molecule.radii) == 20
+    assert molecule.residue_names == ("ALA", "ALA", "GLY", "ALA")
+    assert len(molecule.radii) == 19
     assert molecule.notes == ("1 residues repeat a number: all were kept",)
 
 
@@ -493,7 +543,7 @@ def test_b_factors_that_a_file_lacks_are_unknown(tmp_path: Path) -> None:
 
 
 def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> None:
-    names = ["N", "CA", "C", "O", "CB", "CD", "NE", "HG"]
+    names = ["N", "CA", "C", "O", "CB", "CG", "CD", "OE", "NE", "HG"]
     atoms = [(name, float(i), 0.0) for i, name in enumerate(names)]
     rows = [
         f"{row[:12]}{row[12:16].strip():<4}{row[16:66]}"
@@ -501,7 +551,7 @@ def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> Non
     ]
     (molecule,) = read_molecule(written(tmp_path, "\n".join(rows)))
     np.testing.assert_allclose(
-        molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.55], atol=1e-6
+        molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.7, 1.52, 1.55], atol=1e-6
     )  # Bondi 1964
     # And calcium, which some write as an atom of the polymer, is no residue.
     ion = Atom(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA").line()
@@ -531,3 +581,17 @@ def test_models_whose_number_repeats_are_all_read(tmp_path: Path) -> None:
     molecules = read_molecule(path, bodies="models")
     assert [len(molecule.radii) for molecule in molecules] == [10, 10, 10]
     assert len({molecule.name for molecule in molecules}) == 3
+
+
+def test_completed_residues_are_told_on_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, n_residues in (("one", 9), ("two", 12)):
+        text = "".join(residue(i, "LYS", backbone()) for i in range(1, n_residues + 1))
+        written(tmp_path, text, f"{name}.pdb")
+    arguments = ["extract", str(tmp_path), "--descriptor", "d2", "--out", str(tmp_path / "out.npz")]
+    options = ["--signature.resolution", "8", "--signature.min_samples", "20", "--n_workers", "1"]
+    monkeypatch.setattr("sys.argv", ["igps", *arguments, *options, "--cache_dir", str(tmp_path)])
+    main()
+    told = "21 residues were completed: balls stand for missing atoms of side chains (in 2 of 2"
+    assert told in capsys.readouterr().out

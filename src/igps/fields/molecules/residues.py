@@ -56,8 +56,16 @@ CHARGED_ATOMS: dict[str, dict[str, float]] = {
     "LYS": {"NZ": 1.0},
     "ARG": {"NH1": 0.5, "NH2": 0.5},
     "HIS": {"ND1": 0.05, "NE2": 0.05},
+    "HIP": {"ND1": 0.5, "NE2": 0.5},
+    "HSP": {"ND1": 0.5, "NE2": 0.5},
+    "CYM": {"SG": -1.0},
+    **{name: {} for name in ("ASH", "GLH", "HID", "HIE", "HSD", "HSE", "LYN")},
 }
-"""Charges of amino acid atoms at pH 7, in elementary charges; a tenth of all histidines is charged (pKa 6)."""
+"""Charges of amino acid atoms at pH 7, in elementary charges, by the name of the residue in the file.
+
+Names of Amber and CHARMM tell the state of protonation. HIS does not: its pKa is 6 to 7, so a tenth of a charge stands
+for all of these residues together, of which about one in ten is charged.
+"""
 
 PHOSPHATES = {"OP1": -0.5, "OP2": -0.5, "O1P": -0.5, "O2P": -0.5}
 """Charges of nucleotide atoms, in elementary charges."""
@@ -94,6 +102,34 @@ BACKBONE = frozenset(
 )
 """Names of backbone atoms, including those at the ends of chains."""
 
+SIDE_CHAIN_ATOMS = {
+    "ALA": 1,
+    "ARG": 7,
+    "ASN": 4,
+    "ASP": 4,
+    "CYS": 2,
+    "GLN": 5,
+    "GLU": 5,
+    "GLY": 0,
+    "HIS": 6,
+    "ILE": 4,
+    "LEU": 4,
+    "LYS": 5,
+    "MET": 4,
+    "PHE": 7,
+    "PRO": 3,
+    "SER": 2,
+    "THR": 3,
+    "TRP": 10,
+    "TYR": 8,
+    "VAL": 3,
+}
+"""Number of atoms of side chains, without hydrogens."""
+
+# No probe fits between the backbone and the ball of a whole side chain. With balls of the full volume, 18 chains cut to
+# their backbones enclosed 5.7 ± 2.2 % more than whole; cut to Cβ, 1.4 ± 2.3 %.
+_BARE_SHARE = 0.89
+
 _MEAN_VOLUME = sum(VOLUMES.values()) / len(VOLUMES)
 
 
@@ -102,6 +138,18 @@ def residue_ball(name: str) -> float:
     return math.cbrt(3 * VOLUMES.get(name, _MEAN_VOLUME) / (4 * math.pi))
 
 
-def side_chain_ball(name: str) -> float:
-    """Return the radius, Å, of a ball with the volume of a residue minus that of glycine."""
-    return math.cbrt(3 * (VOLUMES.get(name, _MEAN_VOLUME) - VOLUMES["GLY"]) / (4 * math.pi))
+def missing_share(name: str, n_atoms: int) -> float:
+    """Return the share of a side chain that is missing if it has `n_atoms` atoms, hydrogens aside.
+
+    The side chain of a residue that is not in `SIDE_CHAIN_ATOMS` is complete with any atom.
+    """
+    n_complete = SIDE_CHAIN_ATOMS.get(name, min(n_atoms, 1) or 1)
+    return max(n_complete - n_atoms, 0) / max(n_complete, 1)
+
+
+def side_chain_ball(name: str, share: float = 1.0) -> float:
+    """Return the radius, Å, of a ball for a share of the volume of a residue minus that of glycine."""
+    volume = share * (VOLUMES.get(name, _MEAN_VOLUME) - VOLUMES["GLY"])
+    if share == 1:
+        volume *= _BARE_SHARE
+    return math.cbrt(3 * volume / (4 * math.pi))

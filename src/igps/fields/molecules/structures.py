@@ -30,6 +30,7 @@ from igps.fields.molecules.residues import (
     PHOSPHATES,
     STANDARD,
     WATER,
+    missing_share,
     residue_ball,
     side_chain_ball,
 )
@@ -59,7 +60,7 @@ _NOTES = {
     "named": "{} atoms without an element: it was inferred from their names",
     "element": f"{{}} atoms of an unknown element: a radius of {_UNKNOWN_RADIUS} Å was used",
     "residue": "{} residues of an unknown name",
-    "side chain": "{} residues without a side chain: a ball of its volume was used",
+    "side chain": "{} residues were completed: balls stand for missing atoms of side chains",
     "alpha": "{} residues of Cα alone: a ball of the residue's volume was used",
     "repeated": "{} residues repeat a number: all were kept",
     "ligand": "{} ligands were left out",
@@ -85,8 +86,9 @@ def read_molecule(
     the elements (Bondi 1964), and charges those of residues at pH 7, without the ends of chains. Radii, charges and
     hydrogens of a PQR file are used as they are.
 
-    Backbones and Cα traces can be read, too (volumes of Zamyatnin 1972): if all atoms of a side chain are missing, a
-    ball of its volume touches Cα in the direction of Cβ, and a residue of Cα alone becomes a ball of its volume.
+    Backbones and Cα traces can be read, too (volumes of Zamyatnin 1972): for atoms that a side chain lacks, a ball with
+    their share of its volume and their charge touches the last atom that is there, in the direction of the side chain.
+    A residue of Cα alone becomes a ball of its volume.
 
     Example:
         >>> import tempfile
@@ -225,19 +227,17 @@ class _Builder:
         position = positions.mean(axis=0) if alpha is None else positions[alpha]
         number = float(residue.seqid.num) if in_polymer else np.nan
         self._residues.append((name, position, b_factor, number, chain))
-        charged = (
-            (PHOSPHATES if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {}))
-            if in_polymer
-            else {}
-        )
-        if (
-            alpha is not None
-            and not self.is_pqr
-            and (named == {"CA"} or (named <= BACKBONE and name != "GLY"))
-        ):
-            self._add_coarse_ball(name, atoms, positions, sum(charged.values()))
+        charged: dict[str, float] = {}
+        if in_polymer:
+            own_or_parent = CHARGED_ATOMS.get(residue.name, CHARGED_ATOMS.get(name, {}))
+            charged = PHOSPHATES if kind.is_nucleic_acid() else own_or_parent
+        if alpha is not None and not self.is_pqr:
+            lacking = sum(charged.values()) - sum(charged.get(atom, 0.0) for atom in named)
             if named == {"CA"}:
+                self._count["alpha"] += 1
+                self._add_ball(positions[alpha], residue_ball(name), lacking)
                 return True
+            self._complete(name, atoms, positions, lacking)
         for atom, position in zip(atoms, positions, strict=True):
             if self.is_pqr:
                 self._add_ball(position, atom.b_iso, atom.occ)
@@ -258,25 +258,32 @@ class _Builder:
     def _add_ball(self, position: Floats, radius: float, charge: float) -> None:
         self.balls.append((position, radius, charge, len(self._residues) - 1))
 
-    def _add_coarse_ball(
+    def _complete(
         self, name: str, atoms: list[gemmi.Atom], positions: Floats, charge: float
     ) -> None:
-        """Add the ball for a missing side chain, or for a residue of Cα alone."""
-        position_of = {atom.name: position for atom, position in zip(atoms, positions, strict=True)}
-        if len(position_of) == 1:
-            self._count["alpha"] += 1
-            self._add_ball(position_of["CA"], residue_ball(name), charge)
+        """Add a ball with the charge and the share of the volume of the atoms that a side chain lacks, if any."""
+        heavy = [i for i, atom in enumerate(atoms) if not _is_hydrogen(atom)]
+        side = [i for i in heavy if atoms[i].name not in BACKBONE]
+        share = missing_share(name, len(side))
+        if not share:
             return
         self._count["side chain"] += 1
-        radius = side_chain_ball(name)
-        centre = position_of["CA"]
-        if {"N", "C"} <= position_of.keys():
+        position_of = {atoms[i].name: positions[i] for i in heavy}
+        alpha = position_of["CA"]
+        end = alpha
+        direction = np.zeros(3)
+        if side:
+            distances = np.linalg.norm(positions[side] - alpha, axis=1)
+            end = positions[side[int(distances.argmax())]]
+            direction = end - alpha
+        elif {"N", "C"} <= position_of.keys():
             # The direction of Cβ in ideal tetrahedral geometry
-            b = centre - position_of["N"]
-            c = position_of["C"] - centre
+            b = alpha - position_of["N"]
+            c = position_of["C"] - alpha
             direction = -0.58273431 * np.cross(b, c) + 0.56802827 * b - 0.54067466 * c
-            centre = centre + radius * direction / max(float(np.linalg.norm(direction)), 1e-9)
-        self._add_ball(centre, radius, charge)
+        length = max(float(np.linalg.norm(direction)), 1e-9)
+        radius = side_chain_ball(name, share)
+        self._add_ball(end + radius / length * direction, radius, charge)
 
     def _conformers(self, chain: gemmi.Chain) -> Iterator[gemmi.Residue]:
         """Yield the residues; of alternative ones in the same place only the one of the highest occupancy."""
@@ -304,19 +311,22 @@ class _Builder:
             # If names begin in the wrong column, gemmi takes Cα for calcium
             if is_standard and atom.element.name not in _STANDARD_ELEMENTS:
                 atom.element = gemmi.Element("X")
-            is_hydrogen = atom.is_hydrogen() or (
-                not atom.element.atomic_number and _first_letter(atom) == "H"
-            )
-            if is_hydrogen and not self.hydrogens:
+            if _is_hydrogen(atom) and not self.hydrogens:
                 continue
             if not np.isfinite(atom.pos.tolist()).all():
                 self._count["nowhere"] += 1
                 continue
-            key = atom.name if atom.has_altloc() else number
+            # Programs that complete side chains may leave an atom twice, without a letter
+            key = atom.name if is_standard or atom.has_altloc() else number
             self._count["alternative"] += key in chosen
             if key not in chosen or atom.occ > chosen[key].occ:
                 chosen[key] = atom
         return list(chosen.values())
+
+
+def _is_hydrogen(atom: gemmi.Atom) -> bool:
+    is_unnamed = not atom.element.atomic_number
+    return bool(atom.is_hydrogen() or (is_unnamed and _first_letter(atom) == "H"))
 
 
 def _first_letter(atom: gemmi.Atom) -> str:
