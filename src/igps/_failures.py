@@ -24,9 +24,19 @@ class MachineError(RuntimeError):
 
 @dataclass(frozen=True)
 class Failed:
-    """The outcome of a job that failed, with the reason in one sentence."""
+    """The outcome of a job that failed."""
 
-    reason: str
+    reason: str  # in one sentence
+    summary: str = (
+        ""  # what the body is, if such failures are counted and not listed, see `MeshError.summary`
+    )
+
+    @staticmethod
+    def of(error: Exception) -> "Failed":
+        """Return the outcome of a job that raised an error."""
+        is_told = isinstance(error, ValueError)  # its message is a sentence
+        reason = str(error) if is_told else f"{type(error).__name__}: {error}"
+        return Failed(reason, getattr(error, "summary", ""))
 
 
 @dataclass(frozen=True)
@@ -81,13 +91,8 @@ def attempt(function: Callable[[], Result], limits: Limits = Limits()) -> Result
     except OSError as error:
         if is_machine_error(error):
             raise MachineError(machine_error_text(error)) from error
-        return Failed(_sentence(error))
+        return Failed.of(error)
     except Exception as error:
         # Dask raises KilledWorker after several workers died with the same job.
-        return Failed(
-            _KILLED_ON_CLUSTER if type(error).__name__ == "KilledWorker" else _sentence(error)
-        )
-
-
-def _sentence(error: Exception) -> str:
-    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        is_killed = type(error).__name__ == "KilledWorker"
+        return Failed(_KILLED_ON_CLUSTER) if is_killed else Failed.of(error)

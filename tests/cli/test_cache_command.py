@@ -48,7 +48,7 @@ def test_the_file_stands_for_the_folder(
     )
     told = capsys.readouterr().out
     assert f"4 signatures written to {out}\n" in told
-    assert ("1 of 5 meshes could not be used. The first: " in told) == (not labelled)
+    assert ("1 of 5 bodies could not be used. The first: " in told) == (not labelled)
     shutil.rmtree(tmp_path / "eggs")
     shutil.rmtree(tmp_path / "cache")
     if labelled:

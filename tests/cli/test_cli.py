@@ -267,7 +267,7 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
         *SMALL,
     ]
     run(monkeypatch, *arguments)
-    assert "1 of 7 meshes could not be used" in capsys.readouterr().out
+    assert "1 of 7 bodies could not be used" in capsys.readouterr().out
     (row,) = csv.DictReader((tmp_path / "out" / "failures.csv").open(newline=""))
     assert row["name"] == "egg/bad.off"
     assert "a single triangle" in row["error"]
@@ -422,7 +422,7 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
         ),
         (
             ["retrieve", "ROOT", "--paper", "--mend", "never", "--n_workers", "1"],
-            "none of 6 meshes could be used.*expected at least 252 vertices for 250 eigenpairs",
+            "none of 6 bodies could be used.*expected at least 252 vertices for 250 eigenpairs",
         ),
     ],
 )
@@ -503,7 +503,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
     arguments += ["--cache_dir", tmp_path / "cache", *SMALL]
     try:
         run(monkeypatch, *arguments)
-        assert "2 of 7 meshes could not be used" in capsys.readouterr().out
+        assert "2 of 7 bodies could not be used" in capsys.readouterr().out
         rows = list(csv.DictReader((tmp_path / "out" / "failures.csv").open(newline="")))
         assert [row["name"] for row in rows] == ["egg/bad.off", "egg/1.off"]
         assert "too much" in rows[1]["error"]

@@ -130,7 +130,7 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
         assert "a single triangle" in rows[1][2]
         assert "too much" in rows[2][2]
         printed = capsys.readouterr().out
-        assert "2 meshes could not be used or described" in printed
+        assert "2 bodies could not be used or described" in printed
         assert "broken: no scores: RuntimeError: out of order" in printed
         assert json.loads((tmp_path / "compare.json").read_text())[1]["nn"] is None
 

@@ -31,20 +31,14 @@ def test_table_and_file_of_a_folder_that_can_be_used(
     write_box(root / "b" / "box.off")
     run(monkeypatch, "doctor", root, "--out", out, *FEW)  # no status: nothing is raised
     header, *lines, total, written = capsys.readouterr().out.splitlines()
-    assert header.split() == ["vertices", "after", "seconds", "MB", "steps"]
+    assert header.split() == ["vertices", "after", "seconds", "MB", "unit", "remarks"]
     cells = {line.split()[0]: line.split()[1:] for line in lines}
-    assert cells["a/clean.off"][:2] + cells["a/clean.off"][4:] == [
-        str(N_VERTICES),
-        str(N_VERTICES),
-        "none",
-    ]
-    assert cells["a/soup.off"][:2] + cells["a/soup.off"][4:] == [
-        str(3 * N_FACES),
-        str(N_VERTICES),
-        "welded",
-    ]
+    size = str(N_VERTICES)
+    assert cells["a/clean.off"][:2] + cells["a/clean.off"][4:] == [size, size, "none", "none"]
+    soup = cells["a/soup.off"]
+    assert soup[:2] + soup[4:] == [str(3 * N_FACES), size, "none", "welded"]
     assert cells["b/box.off"][0] == "8"
-    assert cells["b/box.off"][4:] == ["subdivided"]
+    assert cells["b/box.off"][4:] == ["none", "subdivided"]
     assert total.startswith("3 bodies: 2 repaired, 0 cannot be used; about ")
     assert written == f"written to {out}"
 
@@ -105,7 +99,7 @@ def test_options_choose_the_mending(
         run(monkeypatch, "doctor", tmp_path, "--mend", "never", *FEW)
     assert "cannot be used" in capsys.readouterr().out
     run(monkeypatch, "doctor", tmp_path, "--mend", "always", *FEW)
-    assert capsys.readouterr().out.splitlines()[1].split()[-1] == "watertight"
+    assert "; watertight; closed 1 opening" in capsys.readouterr().out.splitlines()[1]
 
 
 def test_a_folder_without_meshes_is_an_error(
@@ -113,7 +107,7 @@ def test_a_folder_without_meshes_is_an_error(
 ) -> None:
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, "doctor", tmp_path, *FEW)
-    assert f"igps: {tmp_path}: no mesh found" in capsys.readouterr().err
+    assert f"igps: {tmp_path}: no body found" in capsys.readouterr().err
 
 
 def test_files_that_bodies_bring_along_are_not_examined(
@@ -123,7 +117,5 @@ def test_files_that_bodies_bring_along_are_not_examined(
     write_clean(tmp_path / "a" / "clean_fields.off")
     run(monkeypatch, "doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)
     assert (
-        capsys.readouterr()
-        .out.splitlines()[-1]
-        .startswith("1 bodies: 0 repaired, 0 cannot be used")
+        capsys.readouterr().out.splitlines()[-1].startswith("1 body: 0 repaired, 0 cannot be used")
     )

@@ -41,7 +41,7 @@ def root(tmp_path: Path) -> Path:
 
 
 WELDED = f"welded {3 * N_FACES - N_VERTICES} coincident vertices"
-SUMMARY = "5 of 8 meshes were repaired: 2 welded, 2 subdivided, 1 filled"
+SUMMARY = "5 of 8 bodies repaired: 2 welded, 2 subdivided, 1 filled"
 
 
 def notes(path: Path) -> list[tuple[str, str]]:
@@ -60,7 +60,7 @@ def check_notes(path: Path) -> None:
         "box/2.off",
     }
     assert found["ball/soup.off"] == found["egg/soup.off"] == WELDED
-    assert found["ball/holed.off"] == "filled 1 small holes"
+    assert found["ball/holed.off"] == "filled 1 small hole"
     assert all(found[f"box/{i}.off"].startswith("subdivided from 8 to ") for i in (1, 2))
 
 
@@ -114,7 +114,7 @@ def test_never_and_always(
     try:
         run(monkeypatch, "retrieve", root, "--mend", "never", *out, *ONE)
         printed = capsys.readouterr().out
-        assert "5 of 8 meshes could not be used." in printed
+        assert "5 of 8 bodies could not be used." in printed
         assert "repaired" not in printed
         refused = {
             row["name"]: row["error"]
@@ -134,7 +134,7 @@ def test_never_and_always(
         logging.disable(logging.NOTSET)
     run(monkeypatch, "retrieve", root, "--mend", "always", *out, *ONE)
     # What bounds a body without crossing itself is watertight.
-    summary = "5 of 8 meshes were repaired: 2 welded, 2 subdivided, 1 made watertight"
+    summary = "5 of 8 bodies repaired: 2 welded, 2 subdivided, 1 made watertight"
     assert capsys.readouterr().out.splitlines()[0] == summary
     made = {name for name, note in notes(tmp_path / "out" / "notes.csv") if "watertight" in note}
     assert made == {"ball/holed.off"}
@@ -214,4 +214,4 @@ def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
             f"egg/{name}": f"{root / 'egg' / name}: {sentence}"
             for name, sentence in sentences.items()
         }
-    assert f"{len(sentences)} of {4 + len(sentences)} meshes could not be used." in printed.out
+    assert f"{len(sentences)} of {4 + len(sentences)} bodies could not be used." in printed.out

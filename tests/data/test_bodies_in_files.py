@@ -16,6 +16,7 @@ import igps.data.pipeline as pipeline_module
 from igps._failures import Limits
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import compute
+from igps.data.keys import FileDigest
 from igps.data.sources import Bodies, bodies_of_files, find_bodies
 from igps.mesh.loading import BodyRef, load_mesh
 from igps.mesh.mesh import Mesh
@@ -372,7 +373,7 @@ def test_where_a_job_of_several_bodies_is_lost_each_is_tried_alone(
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", reading=OBJECTS)
     with Fragile(1) as executor:
         assert dataset.precompute(executor, n_workers=1, progress=False) == []
-    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 4
+    assert len(list((tmp_path / "cache" / "signatures").rglob("*.safetensors"))) == 4
 
 
 def test_a_name_that_is_too_long_for_a_file_costs_no_other(tmp_path: Path) -> None:
@@ -417,3 +418,29 @@ def test_a_folder_for_each_subject(tmp_path: Path) -> None:
     write_labels(tmp_path / "three" / "seg.nii.gz", 1)
     labels = find_bodies(tmp_path, classes="body").labels
     assert sorted(labels) == ["1", "1", "1", "2", "2"]
+
+
+def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "masks"
+    root.mkdir()
+    for name, n in {"liver": 8, "spleen": 7, "rib_1": 0, "rib_2": 0, "rib_3": 0, "lung": 1}.items():
+        mask = np.zeros((10, 10, 10), dtype=np.uint8)
+        mask[1 : 1 + n, 1 : 1 + n, 1 : 1 + n] = 1
+        path = root / f"{name}.nii.gz"
+        nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), path)
+        os.utime(path, (1e9, 1e9))
+    monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
+
+    def run() -> tuple[int, list[str]]:
+        caplog.clear()
+        dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+        failures = dataset.precompute(n_workers=1, progress=False)
+        return len(failures), [record.getMessage() for record in caplog.records]
+
+    expected = 4, ["4 masks left out: 3 empty, 1 of fewer than 8 voxels"]
+    assert run() == expected
+    monkeypatch.setattr(nibabel, "load", lambda path: pytest.fail(f"{path} is read again"))
+    monkeypatch.setattr(FileDigest, "of", lambda path: pytest.fail(f"{path} is read again"))
+    assert run() == expected

@@ -159,7 +159,7 @@ def test_labels_may_be_an_array_and_are_of_files_alone(tmp_path: Path) -> None:
 
 
 def test_nothing_there(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no mesh found"):
+    with pytest.raises(FileNotFoundError, match="no body found"):
         find_bodies(tmp_path)
     with pytest.raises(FileNotFoundError, match="no such folder"):
         find_bodies(tmp_path / "nowhere")

@@ -367,7 +367,7 @@ def test_commands_that_change_a_gallery(
     assert removed[0] == "1 bodies removed"
     (root / "egg" / "1.off").unlink()
     synced = lines("gallery", "sync", root, "--gallery", gallery, *cache)
-    assert synced[-2:] == ["1 bodies described, 1 removed", f"{gallery}: 5 bodies by {INTERIOR}"]
+    assert synced[-2:] == ["1 body described, 1 removed", f"{gallery}: 5 bodies by {INTERIOR}"]
     info = json.loads("\n".join(lines("gallery", "info", gallery, "--json")))
     assert (info["bodies"], info["descriptor"]) == (5, INTERIOR)
     assert info["columns"]["volume"] == "float"

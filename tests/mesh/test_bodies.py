@@ -144,7 +144,7 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path: Pat
     assert parts(tmp_path / "boxes.ply", PIECES) == ["piece 1", "piece 2", "piece 3"]
     bodies = load_bodies(tmp_path / "boxes.ply", PIECES)
     np.testing.assert_allclose([body.volume for body in bodies], [1, 27, 8], rtol=1e-6)
-    assert all("left out 1 specks" in body.notes for body in bodies)
+    assert all("left out 1 speck" in body.notes for body in bodies)
     text = "".join(
         "v {} {} {}\n".format(*place) for place in [*whole.vertices.tolist(), [1e9, 0, 0]]
     )  # used by no face

@@ -64,7 +64,7 @@ def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_o
     assert hollow.notes == (
         "turned the surface of a cavity towards the inside",
         "turned the surface of a cavity towards the inside",
-        "dropped 1 parts hidden inside",
+        "dropped 1 part hidden inside",
     )
     assert repair_steps(hollow.notes) == ("welded",)
 
@@ -232,7 +232,8 @@ def test_a_piece_of_a_label_in_its_cavity_is_told() -> None:
     assert Mesh(vertices, faces, cavities=True).volume == pytest.approx(
         np.count_nonzero(shell), rel=1e-3
     )
-    assert notes == (f"in a cavity: filled holes of {np.count_nonzero(seed)} voxels",)
+    n = np.count_nonzero(seed)
+    assert notes == (f"in a cavity: filled holes: {n} voxels, {n}",)
 
 
 def test_the_larger_the_cavity_the_farther_from_the_ball() -> None:

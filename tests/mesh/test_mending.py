@@ -275,7 +275,7 @@ def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob: Mesh) -> None
         blob.faces + (blob.faces >= 9),
     )
     assert same_surface(mesh, blob)
-    assert mesh.notes == ("dropped 1 unreferenced vertices",)
+    assert mesh.notes == ("dropped 1 unreferenced vertex",)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.5])

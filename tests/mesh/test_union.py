@@ -53,7 +53,7 @@ def with_wall():
 
 def test_a_wall_between_two_halves_is_dropped_and_nothing_else():
     body = mend(*with_wall())
-    assert any("dropped 1 walls inside" in note for note in body.notes)
+    assert any("dropped 1 wall inside" in note for note in body.notes)
     assert "watertight" not in repair_steps(body.notes)
     np.testing.assert_allclose((body.volume, body.area), (2, 10), rtol=1e-12)
 

@@ -6,18 +6,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 from tqdm import tqdm
 
 from igps._failures import Failed, Limits
 from igps._parallel import run
+from igps._text import counted
 from igps.data.filling import group_by_file
 from igps.data.sources import Bodies, BodyRef
 from igps.fields.volumes.label_measures import VoxelMeasures, measure
+from igps.mesh._tidying import closed_by_rims, weld
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import each_surface, surface_body
 from igps.mesh.mending import Step, repair_steps
+from igps.mesh.mesh import check_arrays
 from igps.mesh.options import LoadOptions
-from igps.mesh.raw_body import RawBody
+from igps.mesh.raw_body import RawBody, UnitSource
+from igps.mesh.surface import face_parts
 from igps.signature.signature import SignatureConfig
 
 # Seconds and bytes of a signature on one core, by vertices and eigenpairs, as fitted by tests/benchmarks/cost.py to 62
@@ -27,6 +32,10 @@ from igps.signature.signature import SignatureConfig
 # as loading compiled code. Other processors change all times by a common factor.
 _SECONDS, _SECONDS_PER_VERTEX, _SECONDS_PER_ENTRY = 0.468, 2.33e-5, 2.31e-7
 _BYTES, _BYTES_PER_VERTEX, _BYTES_PER_ENTRY = 4.57e8, 2820.0, 30.0
+
+
+# Smaller openings, as share of the surface, are not worth a remark.
+_MIN_MISSING = 0.001
 
 
 @dataclass(frozen=True)
@@ -44,9 +53,25 @@ class Finding:
     seconds: float | None = None  # expected processor time from file to signature
     memory: float | None = None  # expected peak memory, bytes
     error: str | None = None  # why the body cannot be used; None if it can
-    voxels: VoxelMeasures | None = (
-        None  # measures of a label of a volume; None for every other kind of body
-    )
+    summary: str = ""  # such as "empty", of a mask that holds no body, see `MeshError.summary`
+    unit: str | None = None  # of length; None if it is unknown
+    unit_from: UnitSource | None = None  # what states the unit
+    voxels: VoxelMeasures | None = None  # of a label of a volume; None for other bodies
+    n_pieces: int | None = None  # of the surface in the file, after welding; None for labels
+    missing: float = 0.0  # share of the surface that its openings leave out, see `closed_by_rims`
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What to know of the body: the notes of a label; else openings, pieces, steps, and notes on no step."""
+        if self.voxels is not None:
+            return self.notes
+        facts: list[str] = []
+        if self.n_pieces is not None and self.n_pieces > 1:
+            facts.append(counted(self.n_pieces, "piece"))
+        if self.missing >= _MIN_MISSING and not any(note.startswith("open") for note in self.notes):
+            facts.append(f"open: {self.missing:.1%} of the surface is missing")
+        others = [note for note in self.notes if not repair_steps([note])]
+        return (*facts, *self.steps, *others)
 
 
 def examine(
@@ -72,10 +97,10 @@ def examine(
         for number, outcome in outcomes:
             bar.update(len(jobs[number]))
             for k, i in enumerate(jobs[number]):
-                finding = (
-                    Finding("", error=outcome.reason) if isinstance(outcome, Failed) else outcome[k]
-                )
-                findings[i] = replace(finding, id=files.names[i])
+                if isinstance(outcome, Failed):
+                    findings[i] = Finding(files.names[i], error=outcome.reason)
+                else:
+                    findings[i] = replace(outcome[k], id=files.names[i])
     return [findings[i] for i in range(len(files))]
 
 
@@ -90,27 +115,33 @@ def _examine_file(
     reading: LoadOptions, config: SignatureConfig, bodies: Sequence[BodyRef]
 ) -> list[Finding]:
     """Examine bodies of the same file, which is read once."""
-    path, findings = bodies[0].path, {}
-    start, fault = (
-        time.process_time(),
-        f"{path}: the file has no such body. Choose a body of the file.",
-    )
+    path = bodies[0].path
+    findings: dict[BodyRef, Finding] = {}
+    start = time.process_time()
+    error = MeshError(f"{path}: the file has no such body. Choose a body of the file.")
     try:
         for ref, raw in each_surface(path, reading, parts=[body.part for body in bodies]):
             findings[ref] = _finding(ref, raw, reading, config, start)
             start = time.process_time()
-    except MeshError as error:
-        fault = str(error)
-    return [findings.get(body, Finding(str(body), fault=fault, error=fault)) for body in bodies]
+    except MeshError as raised:
+        error = raised
+    unread = _refused(Finding(str(path)), error)
+    return [findings.get(body, unread) for body in bodies]
+
+
+def _refused(finding: Finding, error: MeshError) -> Finding:
+    fault = finding.fault or str(error)
+    return replace(finding, fault=fault, error=str(error), summary=error.summary)
 
 
 def _finding(
     ref: BodyRef, raw: RawBody, reading: LoadOptions, config: SignatureConfig, start: float
 ) -> Finding:
     voxels = None if raw.voxels is None else measure(raw.voxels())
-    finding = Finding(str(ref), n_vertices=len(raw.vertices), voxels=voxels)
+    finding = Finding(str(ref), unit=raw.unit, unit_from=raw.unit_from, voxels=voxels)
     if raw.fault is not None:
-        return replace(finding, n_vertices=None, fault=str(raw.fault), error=str(raw.fault))
+        return _refused(finding, raw.fault)
+    finding = replace(finding, n_vertices=len(raw.vertices))
     try:
         surface_body(raw, ref, replace(reading, mend="never"))
     except MeshError as error:
@@ -118,15 +149,31 @@ def _finding(
     try:
         mesh = surface_body(raw, ref, reading, least_vertices=config.n_vertices_read)
     except MeshError as error:
-        return replace(finding, error=str(error))
+        return _refused(finding, error)
     n_simplified = min(len(mesh.vertices), config.max_vertices or len(mesh.vertices))
     seconds, memory = expected_cost(n_simplified, config.n_kept)
     seconds += time.process_time() - start
+    n_pieces, missing = (None, 0.0) if voxels is not None else _condition(raw)
     return replace(
         finding,
+        n_pieces=n_pieces,
+        missing=missing,
         steps=repair_steps(mesh.notes),
         notes=mesh.notes,
         n_vertices_after=len(mesh.vertices),
         seconds=seconds,
         memory=memory,
     )
+
+
+def _condition(raw: RawBody) -> tuple[int | None, float]:
+    """Return the number of pieces of a surface, and the share that is missing; None and 0 if it has no sound faces."""
+    try:
+        check_arrays(raw.vertices, raw.faces, "")
+    except MeshError:
+        return None, 0.0
+    if not len(raw.faces) or not np.isfinite(raw.vertices).all():
+        return None, 0.0
+    vertices, faces = weld(raw.vertices, raw.faces, [])
+    _, areas = face_parts(vertices, faces)
+    return len(areas), closed_by_rims(vertices, faces)[2]

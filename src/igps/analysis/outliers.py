@@ -356,12 +356,16 @@ def _scatter(values: Floats, minimum: float, use_tail: bool = True) -> float:
     return max(minimum, _NORMAL_RATIO * float(np.median(deviations)), float(tail))
 
 
+# Numbers, and the endings of nouns that depend on them.
+_NUMBER = re.compile(r"[\d.,]+|(ex|ices|y|ies|s)\b")
+
+
 def _rare_repairs(notes: Sequence[Sequence[str]]) -> tuple[Floats, list[list[str]]]:
     """Return twice the number of rare notes of each body (N,), and these notes.
 
     A note is rare if fewer than a quarter of the bodies have it, whatever its numbers.
     """
-    kinds = [[re.sub(r"[\d.,]+", "n", note) for note in notes_of_body] for notes_of_body in notes]
+    kinds = [[_NUMBER.sub("", note) for note in notes_of_body] for notes_of_body in notes]
     counts = Counter(kind for kinds_of_body in kinds for kind in set(kinds_of_body))
     rare = [
         [

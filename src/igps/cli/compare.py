@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from igps._text import counted
 from igps.cli.options import Mirror, Size
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def compare(
             _write(out, results, failures)
     print(comparison_table(results))
     if n_failed := len(failures) + sum(len(result.failures) for result in results):
-        print(f"{n_failed} meshes could not be used or described.")
+        print(f"{counted(n_failed, 'body')} could not be used or described.")
     if out is not None:
         write_mending_notes(out / "notes.csv", dataset)
         write_sources(out, dataset)

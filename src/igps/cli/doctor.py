@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, astuple
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,9 @@ def doctor(
     """Check each body of a folder: list its defects, how they are repaired, and the expected cost of its signature.
 
     For labels of volumes, also list the number of voxels and of pieces, and the thickness of the thinnest part in
-    voxels, up to ten. Bodies are repaired, but no signature is computed. The exit status is 1 if a body cannot be used.
+    voxels, up to ten. Remarks tell what was repaired or left out, what is open or in several pieces, and which sides
+    the border of the image may have cut; the unit, where it comes from: the header, the format, or a default. Bodies
+    are repaired, but no signature is computed. The exit status is 1 if a body cannot be used; empty masks are no fault.
 
     Args:
         out: CSV file for the findings, with all notes.
@@ -50,19 +52,24 @@ def doctor(
         print(f"written to {out}")
     return Verdict(
         [asdict(finding) for finding in findings],
-        all(finding.error is None for finding in findings),
+        all(finding.error is None or finding.summary for finding in findings),
     )
 
 
 def _row(finding: Finding) -> dict[str, Any]:
-    voxels = ("", "", "") if finding.voxels is None else astuple(finding.voxels)
+    voxels = finding.voxels
     return {
         "name": finding.id,
         "usable": "no" if finding.error else "yes",
         "fault": finding.fault,
         "mended_by": " ".join(finding.steps),
         "notes": "; ".join(finding.notes),
-        **dict(zip(("voxels", "pieces", "thinnest"), voxels, strict=True)),
+        "unit": finding.unit,
+        "unit_from": finding.unit_from if finding.unit else None,
+        "voxels": voxels.n_voxels if voxels else None,
+        "pieces": voxels.n_pieces if voxels else finding.n_pieces,
+        "thinnest": voxels.thinnest if voxels else None,
+        "missing": f"{finding.missing:.4f}",
         "vertices": finding.n_vertices,
         "vertices_after": finding.n_vertices_after,
         "seconds": None if finding.seconds is None else f"{finding.seconds:.1f}",

@@ -6,6 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from igps._text import counted
 from igps.cli.options import Size
 
 if TYPE_CHECKING:
@@ -73,7 +74,9 @@ def duplicates(
         result = find_duplicates(source, size=size, tolerance=tolerance, progress=True, **shared)
     _print_groups(result, poses)
     if failures := [*result.failures, *unread]:
-        print(f"{len(failures)} files could not be compared. The first: {failures[0].error}")
+        print(
+            f"{counted(len(failures), 'file')} could not be compared. The first: {failures[0].error}"
+        )
     if out is not None:
         rows = [
             (n, name, result.paths[name])

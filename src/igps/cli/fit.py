@@ -114,7 +114,7 @@ def classify(
         n_workers=reading.get("n_workers"),
     )
     width = max(map(len, result.names))
-    print(f"{'mesh':<{width}}  {'probability':>11}  class")
+    print(f"{'body':<{width}}  {'probability':>11}  class")
     rows = []
     best = result.probabilities.max(dim=1)
     columns = (result.names, result.predicted, best.values.tolist(), best.indices.tolist())

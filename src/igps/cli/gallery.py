@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from igps._text import counted
 from igps.cli.options import Mirror, Size
 from igps.mesh.options import LoadOptions
 from igps.signature.config import SignatureConfig
@@ -72,7 +73,7 @@ def sync(
     n_new, n_gone, failures = sync_folder(
         opened, dataset, root, n_workers=n_workers, strict=strict, progress=True
     )
-    print(f"{n_new} bodies described, {n_gone} removed")
+    print(f"{counted(n_new, 'body')} described, {n_gone} removed")
     _print_state(opened, failures)
 
 
@@ -98,9 +99,7 @@ def info(gallery: Path) -> dict[str, Any]:
         "bodies": len(opened),
         "columns": {name: kind.__name__ for name, kind in opened.columns.items()},
     }
-    print(
-        f"{opened.path}: {len(opened)} bodies by {opened.about['descriptor']}; columns: {', '.join(opened.columns)}"
-    )
+    print(f"{_in_words(opened)}; columns: {', '.join(opened.columns)}")
     return {**contents, **opened.about}
 
 
@@ -141,5 +140,9 @@ def gallery_options(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, A
 
 
 def _print_state(gallery: Gallery, failures: Sequence[Failure]) -> None:
-    skipped = f"; {len(failures)} bodies skipped" if failures else ""
-    print(f"{gallery.path}: {len(gallery)} bodies by {gallery.about['descriptor']}{skipped}")
+    skipped = f"; {counted(len(failures), 'body')} skipped" if failures else ""
+    print(f"{_in_words(gallery)}{skipped}")
+
+
+def _in_words(gallery: Gallery) -> str:
+    return f"{gallery.path}: {counted(len(gallery), 'body')} by {gallery.about['descriptor']}"

@@ -42,6 +42,7 @@ def precompute(
             memory-mapped when read, and holds no code and no paths. The commands doctor, duplicates, explain and
             outliers need the meshes themselves, and thus the folder.
     """
+    from igps._text import counted
     from igps.cli.reading import Folder, dataset_from_options, limits_of, print_failures
     from igps.data.requirements import Requirements
     from igps.descriptors import descriptor as descriptor_of
@@ -53,7 +54,7 @@ def precompute(
     dataset = dataset_from_options(Folder(root), requirements, **collection)
     dataset = dataset.subset(of_shard(len(dataset), shard))
     if not len(dataset):
-        print(f"{root}: no mesh in shard {shard}")
+        print(f"{root}: no body in shard {shard}")
         return
     limits = limits_of(time_limit, memory_limit)
     if cluster is None:
@@ -67,7 +68,7 @@ def precompute(
         usable = dataset.usable(failed)
         out.parent.mkdir(parents=True, exist_ok=True)
         usable.to_file(out)
-        print(f"{len(usable)} signatures written to {out}")
+        print(f"{counted(len(usable), 'signature')} written to {out}")
         print_failures(failed, len(usable))
     part = "" if shard is None else f" in shard {shard}"
     print(

@@ -15,8 +15,10 @@ from torch import Tensor
 from igps._arrays import Floats
 from igps._failures import Limits
 from igps._parameters import check_positive
+from igps._text import counted
 from igps.cli.options import ClassRule, Mirror, Size
 from igps.data.attribute_sources import attribute_sources
+from igps.data.cache import default_cache_dir
 from igps.data.collection import is_collection
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
@@ -106,7 +108,7 @@ def signatures(
     )
     if len(failures) == len(dataset):
         raise ValueError(
-            f"none of {len(dataset)} meshes could be used; the first: {failures[0].error}"
+            f"none of {counted(len(dataset), 'body')} could be used; the first: {failures[0].error}"
         )
     usable = dataset.usable(failures)
     if summary := mending_summary(usable, len(dataset)):
@@ -187,9 +189,14 @@ def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
 
 
 def print_failures(failures: Sequence[Failure], n_used: int) -> None:
-    """Print how many bodies could not be used, and the reason of the first; print nothing if there are none."""
-    if n := len(failures):
-        print(f"{n} of {n_used + n} meshes could not be used. The first: {failures[0].error}")
+    """Print how many bodies could not be used, and the reason of the first; print nothing if there are none.
+
+    Empty masks do not count: they are no fault, and a warning has told of them.
+    """
+    faults = [failure for failure in failures if not failure.summary]
+    if faults:
+        n_all = counted(n_used + len(failures), "body")
+        print(f"{len(faults)} of {n_all} could not be used. The first: {faults[0].error}")
 
 
 def with_side(descriptor: str, mirror: Mirror, size: Size) -> str:
@@ -313,6 +320,7 @@ def dataset_from_options(
             labelled=source.labelled,
             classes=classes or "folder",
             attributes=attributes.values(),
+            cache_dir=cache_dir or default_cache_dir(),
         )
         if source.check is not None:
             source.check(bodies)
@@ -329,14 +337,14 @@ def dataset_from_options(
 
 
 def mending_summary(dataset: SignatureDataset, n_total: int) -> str:
-    """Return a line on how many meshes were repaired and by which steps; empty if none was."""
+    """Return a line on how many bodies were repaired and by which steps; empty if none was."""
     steps = [repair_steps(notes) for notes in dataset.all_notes()]
     counts = Counter(step for steps_of_mesh in steps for step in steps_of_mesh)
     if not counts:
         return ""
     words = {"watertight": "made watertight"}
     listed = ", ".join(f"{count} {words.get(step, step)}" for step, count in counts.most_common())
-    return f"{sum(map(bool, steps))} of {n_total} meshes were repaired: {listed}"
+    return f"{sum(map(bool, steps))} of {counted(n_total, 'body')} repaired: {listed}"
 
 
 def residue_summaries(dataset: SignatureDataset) -> list[str]:

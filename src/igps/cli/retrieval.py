@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from igps._parameters import check_at_least
+from igps._text import counted
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -130,7 +131,9 @@ def extract(
         write_table(out, table)
     write_mending_notes(out.with_suffix(".notes.csv"), result.dataset)
     rows = f", rows: {len(next(iter(table.values())))}" if wide else ""
-    print(f"{len(features)} descriptions of shape {features.shape[1:]} written to {out}{rows}")
+    print(
+        f"{counted(len(features), 'description')} of shape {features.shape[1:]} written to {out}{rows}"
+    )
     print_failures(result.failures, len(features))
 
 
@@ -201,7 +204,7 @@ def query(
         for place, (name, label, value) in enumerate(nearest, 1)
     ]
     width = max((len(row["name"]) for row in rows), default=4)
-    print(f"{'rank':>4}  {'distance':>9}  {'mesh':<{width}}  class")
+    print(f"{'rank':>4}  {'distance':>9}  {'body':<{width}}  class")
     for row in rows:
         print(
             f"{row['rank']:>4}  {row['distance']:>9.3g}  {row['name']:<{width}}  {row['class'] or '-'}"

@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader, Sampler
 
 from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import LabelledSignature, SignatureBatch
+from igps.data.cache import default_cache_dir
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
@@ -89,9 +90,9 @@ class SignatureDataModule(LightningDataModule):
         check_at_least(1, evaluation_batch_size=evaluation_batch_size)
         if has_configuration():
             self.save_hyperparameters()
-        self.dataset = SignatureDataset(
-            find_bodies(root, labelled=True), config, cache_dir, reading=reading
-        )
+        directory = Path(cache_dir or default_cache_dir())
+        bodies = find_bodies(root, reading, labelled=True, cache_dir=directory)
+        self.dataset = SignatureDataset(bodies, config, directory, reading=reading)
         self.classes_per_batch, self.shapes_per_class = classes_per_batch, shapes_per_class
         self.n_samples_in_memory, self.evaluation_batch_size = (
             n_samples_in_memory,

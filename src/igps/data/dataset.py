@@ -105,16 +105,15 @@ class SignatureDataset(Dataset[LabelledSignature]):
                 bodies_in_memory(root_or_paths, labels, reading, config),
                 None,
             )
-        self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).with_classes(
-            classes or "folder"
-        )
+        directory = Path(cache_dir or default_cache_dir())
+        bodies = bodies_of(root_or_paths, labels, reading, sources.values(), directory)
+        self.bodies = bodies.with_classes(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and self._functions:
             raise ValueError(
                 "pre_transform: expected attributes with a cache_tag, got a function without one. "
                 'Give it one, such as height.cache_tag = "height 1".'
             )
-        directory = Path(cache_dir or default_cache_dir())
         self.config, self.reading = config.resolved(), reading
         self.pipeline = SignaturePipeline(
             self.config, reading, directory, sources, pre_transform, meshes

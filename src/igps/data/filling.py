@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from tqdm import tqdm
 
 from igps._failures import Failed, Limits, MachineError
 from igps._parallel import run
+from igps._text import counted
 from igps._threads import n_cores
 from igps.data.cache import Kind
 from igps.data.cache_hit import CacheHit
@@ -41,16 +43,27 @@ class Failure:
     id: str
     path: Path
     error: str
+    summary: str = ""  # such as "empty", if the file is sound; see `MeshError.summary`
 
     @staticmethod
-    def of(bodies: Bodies, i: int, reason: str) -> Failure:
+    def of(bodies: Bodies, i: int, reason: str, summary: str = "") -> Failure:
         """Return the failure of a body by its index, with its file named in the error."""
         path = bodies.paths[i]
         return Failure(
             bodies.names[i],
             path,
             reason if reason.startswith(str(path)) else f"{bodies[i]}: {reason}",
+            summary,
         )
+
+
+def left_out(summaries: Iterable[str]) -> str:
+    """Return a line such as "47 masks left out: 45 empty, 2 of …" on failures that have a summary; "" if none has."""
+    counts = Counter(summary for summary in summaries if summary)
+    if not counts:
+        return ""
+    listed = ", ".join(f"{n} {summary}" for summary, n in counts.most_common())
+    return f"{counted(counts.total(), 'mask')} left out: {listed}"
 
 
 def fill(
@@ -76,15 +89,16 @@ def fill(
     failures: dict[int, Failure] = {}
     missing = [i for i, outcome in enumerate(found) if outcome is None]
 
-    def fail(i: int, reason: str) -> None:
-        failures[i] = Failure.of(bodies, i, reason)
+    def fail(i: int, failed: Failed) -> None:
+        failures[i] = Failure.of(bodies, i, failed.reason, failed.summary)
         if strict:
             raise MeshError(failures[i].error)
-        logger.warning("skipped: %s", failures[i].error)
+        if not failed.summary:
+            logger.warning("skipped: %s", failures[i].error)
 
     for i, outcome in enumerate(found):
         if isinstance(outcome, Failed):
-            fail(i, outcome.reason)
+            fail(i, outcome)
     outcomes = compute(
         pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits()
     )
@@ -97,7 +111,7 @@ def fill(
             for i, outcome in outcomes:
                 bar.update()
                 if isinstance(outcome, Failed):
-                    fail(i, outcome.reason)
+                    fail(i, outcome)
                     continue
                 if not is_visible:
                     wait_until_visible(pipeline, outcome)
@@ -109,7 +123,14 @@ def fill(
                     new.clear()
         finally:
             known.remember(new)
+    _warn_of_left_out(failures.values())
     return hits, [failures[i] for i in sorted(failures)]
+
+
+def _warn_of_left_out(failures: Iterable[Failure]) -> None:
+    line = left_out(failure.summary for failure in failures)
+    if line:
+        logger.warning("%s", line)
 
 
 def find_cached(

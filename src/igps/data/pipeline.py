@@ -101,7 +101,9 @@ class SignaturePipeline:
         texts = self.cache("signature").texts(keys.key)
         if texts is None:
             failure = self.cache("failure").texts(self._failure_key(body, content))
-            return None if failure is None else Failed(failure["reason"])
+            if failure is None:
+                return None
+            return Failed(failure["reason"], failure.get("summary", ""))
         attributes = self.cache("attribute")
         if not all(key in attributes for key in keys.attributes.values()):
             return None
@@ -162,14 +164,14 @@ class SignaturePipeline:
                 body = missing[ref.part]
                 if isinstance(mesh, MeshError):
                     self._remember(body, content, mesh)
-                    outcomes[body] = Failed(str(mesh))
+                    outcomes[body] = Failed.of(mesh)
                 else:
                     outcomes[body] = attempt(partial(self.hit, body, content, mesh))
         except MeshError as error:  # in the file, and thus in all bodies that were not read before
             for body in missing.values():
                 if body not in outcomes:
                     self._remember(body, content, error)
-                    outcomes[body] = Failed(str(error))
+                    outcomes[body] = Failed.of(error)
         for body in bodies:
             if body not in outcomes:  # it is not in the file, which `hit` reports
                 outcomes[body] = attempt(partial(self.hit, body, content))
@@ -261,7 +263,7 @@ class SignaturePipeline:
         """Keep the reason why a body cannot be used, unless the machine may be at fault."""
         if body in self.meshes or isinstance(error.__cause__, OSError):
             return
-        record = Record({}, {"reason": str(error)})
+        record = Record({}, {"reason": str(error), "summary": error.summary})
         self.cache("failure").put(self._failure_key(body, content), record)
 
 

@@ -15,9 +15,9 @@ from typing import Literal, get_args
 
 from igps._files import delimiter_of, table_text
 from igps.data.attributes import AttributeSource, FileSource
-from igps.mesh.errors import MeshError
+from igps.data.listing import Listing
 from igps.mesh.formats import is_searched, searched_suffixes
-from igps.mesh.loading import BodyRef, list_bodies
+from igps.mesh.loading import BodyRef
 from igps.mesh.options import LoadOptions
 
 logger = logging.getLogger(__name__)
@@ -137,6 +137,7 @@ def find_bodies(
     classes: ClassRule = "folder",
     attributes: Iterable[AttributeSource] = (),
     labelled: bool = False,
+    cache_dir: Path | None = None,
 ) -> Bodies:
     """Find the bodies below a folder, with their classes if the folder has classes.
 
@@ -149,12 +150,15 @@ def find_bodies(
         classes: rule for the class of a body.
         attributes: attribute sources, whose files are not used as bodies.
         labelled: whether classes are required.
+        cache_dir: directory of the cache, in which the names of the bodies in a file are kept. If None, each file that
+            may hold several is read.
 
     Raises:
         FileNotFoundError: the folder does not exist, or has no file that may be a body.
         ValueError: `labels.csv` is invalid, or there are no classes although they are required.
     """
-    root, options = Path(root), options or LoadOptions()
+    root = Path(root)
+    listing = Listing(options or LoadOptions(), cache_dir)
     if not _is_utf8(root.absolute()):
         raise ValueError(f"{os.fsencode(root)!r}: expected a name in UTF-8. Rename the folder.")
     if not root.is_dir():
@@ -163,7 +167,7 @@ def find_bodies(
         )
     has_table = (root / LABELS_FILE).is_file()
     bodies = (
-        _from_labels_file(root, options) if has_table else _from_folder(root, options, attributes)
+        _from_labels_file(root, listing) if has_table else _from_folder(root, listing, attributes)
     )
     bodies = bodies.with_classes(classes)
     if labelled and bodies.labels is None:
@@ -178,7 +182,7 @@ def find_bodies(
     return bodies
 
 
-def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[AttributeSource]) -> Bodies:
+def _from_folder(root: Path, listing: Listing, attributes: Iterable[AttributeSource]) -> Bodies:
     links = [
         path
         for path in root.iterdir()
@@ -201,19 +205,20 @@ def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[Attribut
     names = [(path, path.relative_to(root)) for path in nested or at_root]
     if not names:
         raise FileNotFoundError(
-            f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
+            f"{root}: no body found. Expected a folder per class, or files with a {LABELS_FILE} (file,label), "
             f"in one of the formats {', '.join(searched_suffixes())}."
         )
     rows = [
         (path, name.as_posix(), name.parts[0] if nested else None, None) for path, name in names
     ]
-    return _bodies_in_files(rows, options)
+    return _bodies_in_files(rows, listing)
 
 
 def bodies_of_files(
     paths: Sequence[str | Path],
     labels: Sequence[str] | None = None,
     options: LoadOptions | None = None,
+    cache_dir: Path | None = None,
 ) -> Bodies:
     """Return the bodies of files in their order. ``FILE#PART`` selects one body of a file. Labels are given by file."""
     files = [file_and_part(Path(path)) for path in paths]
@@ -229,7 +234,7 @@ def bodies_of_files(
     rows = [
         (file, str(file), label, part) for (file, part), label in zip(files, classes, strict=True)
     ]
-    return _bodies_in_files(rows, options or LoadOptions())
+    return _bodies_in_files(rows, Listing(options or LoadOptions(), cache_dir))
 
 
 def bodies_of(
@@ -237,6 +242,7 @@ def bodies_of(
     labels: Sequence[str] | None = None,
     options: LoadOptions | None = None,
     attributes: Iterable[AttributeSource] = (),
+    cache_dir: Path | None = None,
 ) -> Bodies:
     """Return the bodies of a folder or of files, see `find_bodies` and `bodies_of_files`; return `Bodies` unchanged."""
     has_labels = isinstance(source, Bodies) or (
@@ -249,12 +255,12 @@ def bodies_of(
     if isinstance(source, Bodies):
         return source
     if not isinstance(source, str | Path):
-        return bodies_of_files(source, labels, options)
+        return bodies_of_files(source, labels, options, cache_dir)
     if Path(source).is_dir():
-        return find_bodies(source, options, attributes=attributes)
+        return find_bodies(source, options, attributes=attributes, cache_dir=cache_dir)
     if not file_and_part(Path(source))[0].exists():
         raise FileNotFoundError(f"{source}: no such file or folder. Check the path.")
-    return bodies_of_files([source], labels, options)
+    return bodies_of_files([source], labels, options, cache_dir)
 
 
 def file_and_part(path: Path) -> tuple[Path, str | None]:
@@ -280,15 +286,7 @@ def file_name_of(name: str, part: str | None) -> str:
     return name if part is None else name.removesuffix(f"#{part}")
 
 
-def _listed(path: Path, options: LoadOptions) -> list[BodyRef]:
-    """Return the bodies of a file; the file itself if it is unreadable, which the computation reports."""
-    try:
-        return list_bodies(path, options) or [BodyRef(path)]
-    except MeshError:
-        return [BodyRef(path)]
-
-
-def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
+def _from_labels_file(root: Path, listing: Listing) -> Bodies:
     file = root / LABELS_FILE
     text = table_text(file)
     with io.StringIO(text, newline="") as stream:
@@ -324,7 +322,7 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
     ]
     if not rows or invalid:
         cause = f"line {invalid[0]} lacks the name of a file, or a label" if invalid else "no rows"
-        raise ValueError(f"{file}: {cause}. Each line names a mesh file and its class.")
+        raise ValueError(f"{file}: {cause}. Each line names a file and its class.")
     missing = ("", "na", "n/a", "nan")  # as R and pandas write it
     columns = {
         name: [None if row[name].lower() in missing else row[name] for _, row in rows]
@@ -334,7 +332,7 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
         (root / row["file"], row["file"], row.get("label"), row.get("body") or None)
         for _, row in rows
     ]
-    bodies = _bodies_in_files(files, options, columns)
+    bodies = _bodies_in_files(files, listing, columns)
     counts = Counter(
         keys := [(os.path.abspath(body.path), body.part) for body in bodies]
     )  # ./1.off is 1.off
@@ -353,11 +351,11 @@ def _column_name(name: str) -> str:
 
 def _bodies_in_files(
     rows: Sequence[tuple[Path, str, str | None, str | None]],
-    options: LoadOptions,
+    listing: Listing,
     columns: Mapping[str, Sequence[str | None]] | None = None,
 ) -> Bodies:
     """Return the bodies of files, given by path, name, label and part; without a part, all bodies of the file."""
-    listed = {path: _listed(path, options) for path, _, _, chosen in rows if chosen is None}
+    listed = listing.of(path for path, _, _, chosen in rows if chosen is None)
     _number_lone_labels(listed)
     entries: list[tuple[int, Path, str, str | None, str | None]] = []
     for i, (path, name, label, chosen_part) in enumerate(rows):

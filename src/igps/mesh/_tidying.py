@@ -9,6 +9,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay, cKDTree
 
 from igps._arrays import Booleans, Floats, Integers, Surface
+from igps._text import counted
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import (
@@ -48,19 +49,19 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     place = _close_cracks(vertices, place[faces])[place]
     n_places = len(np.unique(place))
     if n_places < len(vertices):
-        notes.append(f"welded {len(vertices) - n_places} coincident vertices")
+        notes.append(f"welded {counted(len(vertices) - n_places, 'coincident vertex')}")
         faces = place[faces]
     is_degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     if is_degenerate.any():
-        notes.append(f"dropped {int(is_degenerate.sum())} degenerate faces")
+        notes.append(f"dropped {counted(int(is_degenerate.sum()), 'degenerate face')}")
         faces = faces[~is_degenerate]
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     if len(first) < len(faces):
-        notes.append(f"dropped {len(faces) - len(first)} duplicate faces")
+        notes.append(f"dropped {counted(len(faces) - len(first), 'duplicate face')}")
         faces = faces[np.sort(first)]
     n_unused += n_places - len(np.unique(faces))
     if n_unused:
-        notes.append(f"dropped {n_unused} unreferenced vertices")
+        notes.append(f"dropped {counted(n_unused, 'unreferenced vertex')}")
     vertices, faces = compact(vertices, faces)
     return vertices, orient(faces, notes)
 
@@ -126,7 +127,7 @@ def orient(faces: Integers, notes: list[str]) -> Integers:
     is_mostly_reversed = n_reversed > np.bincount(part) / 2
     is_reversed ^= is_mostly_reversed[part]
     if is_reversed.any():
-        notes.append(f"turned {int(is_reversed.sum())} faces to orient the surface")
+        notes.append(f"turned {counted(int(is_reversed.sum()), 'face')} to orient the surface")
         faces = np.where(is_reversed[:, None], faces[:, ::-1], faces)
     return faces
 
@@ -135,12 +136,12 @@ def tidy(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """Drop fins and specks, then orient neighbours alike, which fins may have prevented."""
     without_fins = _drop_fins(vertices, faces)
     if len(without_fins) < len(faces):
-        notes.append(f"dropped {len(faces) - len(without_fins)} faces of fins")
+        notes.append(f"dropped {counted(len(faces) - len(without_fins), 'face')} of fins")
         faces = without_fins
     part, areas = face_parts(vertices, faces)
     is_speck = are_specks(areas)
     if is_speck.any():
-        notes.append(f"dropped {int(is_speck.sum())} specks")
+        notes.append(f"dropped {counted(int(is_speck.sum()), 'speck')}")
         faces = faces[~is_speck[part]]
     vertices, faces = compact(vertices, faces)
     return vertices, orient(faces, notes)
@@ -195,7 +196,7 @@ def drop_hidden_parts(
                 notes.append("turned the surface of a cavity towards the inside")
                 faces[part == k] = faces[part == k][:, ::-1]
     if is_hidden.any():
-        notes.append(f"dropped {int(is_hidden.sum())} parts hidden inside")
+        notes.append(f"dropped {counted(int(is_hidden.sum()), 'part')} hidden inside")
     return compact(vertices, faces[~is_hidden[part]])
 
 
@@ -235,7 +236,7 @@ def fill_small_holes(vertices: Floats, faces: Integers, notes: list[str]) -> Sur
             vertices, faces = _fill_hole(vertices, faces, loop)
             n_filled += 1
     if n_filled:
-        notes.append(f"filled {n_filled} small holes")
+        notes.append(f"filled {counted(n_filled, 'small hole')}")
     return vertices, faces
 
 

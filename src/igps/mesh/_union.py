@@ -3,6 +3,7 @@
 import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers, Surface
+from igps._text import counted
 from igps.mesh._tidying import SPECK, fill_small_holes, orient, tidy, weld
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
@@ -45,7 +46,7 @@ def drop_inner_walls(vertices: Floats, faces: Integers, notes: list[str]) -> Sur
         n_dropped += 1
     if not n_dropped:
         return vertices, faces
-    notes.append(f"dropped {n_dropped} walls inside")
+    notes.append(f"dropped {counted(n_dropped, 'wall')} inside")
     vertices, faces = compact(vertices, faces[patch >= 0])
     return vertices, orient(faces, notes)
 

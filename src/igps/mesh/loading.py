@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers
+from igps._text import counted
 from igps._threads import one_thread
 from igps.mesh._tidying import weld_boundaries
 from igps.mesh.errors import MeshError
@@ -42,9 +43,14 @@ class BodyRef:
 def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[BodyRef]:
     """List the bodies of a file. Their surfaces are not computed, unless the format has no other way to list them."""
     path = Path(path)
-    if _body_kind(_format(path), options) == "whole":
+    if is_one_body(path, options):
         return [BodyRef(path)]
     return [BodyRef(path, body.part, body.number) for body in _read(path, options)]
+
+
+def is_one_body(path: Path, options: LoadOptions) -> bool:
+    """Return whether a file is one body whatever it holds; a MeshError if it has no known format."""
+    return _body_kind(_format(path), options) == "whole"
 
 
 @one_thread()
@@ -207,9 +213,8 @@ def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Intege
     share = has_lost.mean() if len(faces) else is_lost.mean()
     if share > _MAX_LOST:
         return vertices, faces, []
-    note = (
-        f"dropped {int(is_lost.sum())} vertices without coordinates and {int(has_lost.sum())} faces"
-    )
+    n_lost = counted(int(is_lost.sum()), "vertex")
+    note = f"dropped {n_lost} without coordinates and {counted(int(has_lost.sum()), 'face')}"
     if not len(faces):
         return vertices[~is_lost], faces, [note]
     return *compact(vertices, faces[~has_lost]), [note]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from igps._arrays import Booleans, Floats, Integers
+from igps._text import counted
 from igps.mesh.errors import MeshError
 from igps.mesh.surface import (
     components,
@@ -234,7 +235,8 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
     if f.min() < 0 or f.max() >= len(v):
         bad = int(((f < 0) | (f >= len(v))).any(axis=1).sum())
         raise MeshError(
-            f"{name}: {bad} faces refer to vertices out of range (0 to {len(v) - 1} exist, {f.min()} to {f.max()} are "
+            f"{name}: {counted(bad, 'face')} with vertices out of range "
+            f"(0 to {len(v) - 1} exist, {f.min()} to {f.max()} are "
             "used). The file is damaged; export it again."
         )
 
@@ -245,7 +247,9 @@ def check_coordinates(vertices: NDArray[Any], name: str) -> None:
         raise MeshError(f"{name}: vertices: expected shape (V, 3), got {vertices.shape}.")
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
-        fault = f"{name}: {int((~finite).sum())} vertices have NaN or infinite coordinates"
+        fault = (
+            f"{name}: {counted(int((~finite).sum()), 'vertex')} with NaN or infinite coordinates"
+        )
         raise MeshError(
             f"{fault}, the first is vertex {int(np.argmin(finite))}. Remove them or export the file again."
         )
@@ -282,23 +286,23 @@ def _check_topology(
     n_components, _ = components(faces, n_vertices)
     read = f"Read the file with {_REPAIR}"
     for is_wrong, message in (
-        (n_repeated, f"{n_repeated} faces use a vertex twice. {read} to drop them."),
-        (n_unused, f"{n_unused} vertices belong to no face. {read} to drop them."),
+        (n_repeated, f"{counted(n_repeated, 'face')} with a vertex twice. {read} to drop them."),
+        (n_unused, f"{counted(n_unused, 'vertex')} in no face. {read} to drop them."),
         (
             n_non_manifold,
-            f"{n_non_manifold} non-manifold edges (shared by more than two faces). {read} to drop "
+            f"{counted(n_non_manifold, 'non-manifold edge')} (shared by more than two faces). {read} to drop "
             "duplicate faces; if edges remain, separate the sheets that meet there in a modelling tool.",
         ),
         (
             n_boundary and not allow_open,
-            f"open surface with {n_boundary} boundary edges. Close the holes; or read the "
+            f"open surface with {counted(n_boundary, 'boundary edge')}. Close the holes; or read the "
             f"file with {_REPAIR} if vertices are only duplicated there (as in every STL file); "
             "or with allow_open=True, "
             "--allow_open, to tell inside from outside by the winding number.",
         ),
         (
             n_inconsistent,
-            f"inconsistent orientation, {n_inconsistent} edges are traversed twice in the same direction. "
+            f"inconsistent orientation, two faces go along {counted(n_inconsistent, 'edge')} in the same direction. "
             f"{read} to orient the faces.",
         ),
         (

@@ -6,10 +6,12 @@ import codecs
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers
+from igps._text import counted
 from igps.mesh._tidying import are_specks, places
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Frame, Mesh, check_arrays
@@ -26,6 +28,9 @@ class LabelVoxels:
     affine: Floats  # (4, 4) from voxel indices of the volume to world coordinates
 
 
+UnitSource = Literal["header", "format", "default"]
+"""What states the unit of a body: its file, its format, or nothing, where readers agree on millimetres."""
+
 ONLY_LINES = "it holds lines, such as centre lines, which bound no body; export the surface instead"
 
 
@@ -39,6 +44,7 @@ class RawBody:
     )  # (F, 3) vertex indices
     part: str | None = None  # name among the bodies of the file; None if the file is a single body
     unit: str | None = None  # unit of length, such as "mm"; None if the file does not state it
+    unit_from: UnitSource = "format"  # what states the unit, if there is one
     normals: Floats | None = None  # (V, 3), of a point cloud whose file has them
     notes: tuple[str, ...] = ()  # remarks made while reading, for the user
     fault: MeshError | None = None  # why this body has no surface, while others of its file may
@@ -60,6 +66,7 @@ def deferred(
     part: str | None,
     unit: str | None,
     voxels: Callable[[], LabelVoxels] | None = None,
+    unit_from: UnitSource = "format",
 ) -> RawBody:
     """Return a body whose surface is computed on demand; if that fails, the file's other bodies can still be read."""
 
@@ -73,6 +80,7 @@ def deferred(
             mesh.faces,
             part,
             unit,
+            unit_from,
             notes=mesh.notes,
             voxels=voxels,
             denoise=False,
@@ -103,6 +111,7 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
         *stacked([(body.vertices, body.faces) for body in joinable]),
         unit=units.pop() if len(units) == 1 else None,
         frame=frames.pop() if len(frames) == 1 else None,
+        unit_from=joinable[0].unit_from,
         normals=np.concatenate(normals) if len(normals) == len(joinable) else None,
         notes=tuple(dict.fromkeys(note for body in joinable for note in body.notes)),
         denoise=any(body.denoise for body in joinable),
@@ -122,7 +131,11 @@ def pieces(whole: RawBody) -> list[RawBody]:
     # Triangles need not share vertices: they are connected by position
     owner, areas = face_parts(vertices, places(vertices)[faces])
     small = are_specks(areas)
-    notes = (*whole.notes, f"left out {int(small.sum())} specks") if small.any() else whole.notes
+    notes = (
+        (*whole.notes, f"left out {counted(int(small.sum()), 'speck')}")
+        if small.any()
+        else whole.notes
+    )
     order = [k for k in np.argsort(np.unique(owner, return_index=True)[1]) if not small[k]]
     surfaces = [compact(vertices, faces[owner == k]) for k in order]
     return [

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
 from igps._parameters import check_at_least
+from igps._text import counted
 from igps.mesh._isosurface import level_surface, simplify_surface
 from igps.mesh._level_set import (
     Grid,
@@ -107,7 +108,7 @@ def watertight(
     distance, nearest = distances(vertices, faces, grid.shape)
     outside, n_closed = find_outside(distance, surface)
     if n_closed:
-        notes.append(f"closed {n_closed} openings")
+        notes.append(f"closed {counted(n_closed, 'opening')}")
     field = join_pieces(level_set(distance, nearest, outside, surface), notes)
     vertices, faces = largest(*level_surface(field, name))
     sides = " x ".join(str(n) for n in grid.shape)

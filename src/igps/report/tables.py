@@ -6,9 +6,11 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from igps._text import counted
 from igps.analysis.comparison import Result
 from igps.analysis.doctor import Finding
 from igps.analysis.groups import GroupTest
+from igps.data.filling import left_out
 from igps.retrieval import RetrievalScores
 
 TITLES = {
@@ -81,36 +83,40 @@ def comparison_table(results: Sequence[Result]) -> str:
 
 
 def findings_table(findings: Sequence[Finding]) -> str:
-    """Return a text table with one line per body: vertices, expected time and memory, and mending steps.
+    """Return a text table with one line per body: vertices, expected time and memory, unit, and remarks.
 
-    A body that cannot be used has the reason instead. For labels of volumes, the table also shows voxels, pieces, and
-    the thickness of the thinnest part in voxels.
+    A body that cannot be used has the reason instead; masks that hold no body are counted in the last line. For labels
+    of volumes, the table also shows voxels, pieces, and the thickness of the thinnest part in voxels.
     """
-    width = max(len(finding.id) for finding in findings)
+    listed = [finding for finding in findings if not finding.summary]
+    width = max((len(finding.id) for finding in listed), default=0)
     has_voxels = any(finding.voxels for finding in findings)
     header = f"{'voxels':>10}{'pieces':>8}{'thinnest':>10}" if has_voxels else ""
-    lines = [f"{'':<{width}}{header}{'vertices':>10}{'after':>9}{'seconds':>9}{'MB':>7}  steps"]
-    for finding in findings:
-        voxels = finding.voxels
-        counts = (
-            ("", "", "") if voxels is None else (voxels.n_voxels, voxels.n_pieces, voxels.thinnest)
-        )
-        start = f"{finding.id:<{width}}" + (
-            "{:>10}{:>8}{:>10}".format(*counts) if has_voxels else ""
-        )
+    costs = f"{'vertices':>10}{'after':>9}{'seconds':>9}{'MB':>7}"
+    lines = [f"{'':<{width}}{header}{costs}  {'unit':<12}  remarks"]
+    for finding in listed:
+        voxels = "{:>10}{:>8}{:>10}".format(*_voxel_counts(finding)) if has_voxels else ""
+        start = f"{finding.id:<{width}}{voxels}"
         if finding.error is not None:
             lines.append(f"{start}  cannot be used: {finding.error}")
             continue
-        steps = ", ".join(finding.steps) or ("; ".join(finding.notes) if voxels else "") or "none"
         cost = f"{finding.seconds or 0:>9.1f}{(finding.memory or 0) / 1e6:>7.0f}"
-        lines.append(f"{start}{finding.n_vertices:>10}{finding.n_vertices_after:>9}{cost}  {steps}")
-    n_bad = sum(finding.error is not None for finding in findings)
+        unit = f"{finding.unit} ({finding.unit_from})" if finding.unit else "none"
+        remarks = "; ".join(finding.remarks) or "none"
+        sizes = f"{finding.n_vertices:>10}{finding.n_vertices_after:>9}"
+        lines.append(f"{start}{sizes}{cost}  {unit:<12}  {remarks}")
+    n_bad = sum(finding.error is not None for finding in listed)
     n_repaired = sum(bool(finding.steps) for finding in findings)
     minutes = sum(finding.seconds or 0 for finding in findings) / 60
-    lines.append(
-        f"{len(findings)} bodies: {n_repaired} repaired, {n_bad} cannot be used; about {minutes:.1f} core-minutes"
-    )
-    return "\n".join(lines)
+    total = f"{counted(len(findings), 'body')}: {n_repaired} repaired, {n_bad} cannot be used"
+    lines.append(f"{total}; about {minutes:.1f} core-minutes")
+    nothing = left_out(finding.summary for finding in findings)
+    return "\n".join([*lines, nothing] if nothing else lines)
+
+
+def _voxel_counts(finding: Finding) -> tuple[object, ...]:
+    voxels = finding.voxels
+    return ("", "", "") if voxels is None else (voxels.n_voxels, voxels.n_pieces, voxels.thinnest)
 
 
 def groups_table(tests: Sequence[GroupTest]) -> str:

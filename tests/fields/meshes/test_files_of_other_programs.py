@@ -373,10 +373,10 @@ def test_a_few_vertices_without_coordinates_are_dropped(tmp_path: Path) -> None:
 
 def test_many_vertices_without_coordinates_are_refused(tmp_path: Path) -> None:
     path = write_ball(tmp_path / "ball.off", 100)
-    with pytest.raises(MeshError, match=r"ball\.off: 100 vertices have NaN"):
+    with pytest.raises(MeshError, match=r"ball\.off: 100 vertices with NaN"):
         load_mesh(path)
     few = write_ball(tmp_path / "few.off", 2)
-    with pytest.raises(MeshError, match=r"few\.off: 2 vertices have NaN"):
+    with pytest.raises(MeshError, match=r"few\.off: 2 vertices with NaN"):
         load_mesh(few, LoadOptions(mend="never"))
 
 

@@ -93,7 +93,7 @@ def test_a_speck_is_left_out_with_a_note_but_not_what_all_is_made_of(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found = molecular_surface(molecule([[0, 0, 0], [14, 0, 0]], [8.0, 0.9]))
-    assert "left out 1 specks" in found.notes
+    assert "left out 1 speck" in found.notes
     assert found.volume == pytest.approx(4 / 3 * np.pi * 8**3, rel=0.01)
     monkeypatch.setattr(
         "igps.fields.molecules.molecular_surface.SPECK_VOLUME", 0.2
@@ -169,7 +169,7 @@ def test_hollows_are_filled() -> None:
     mesh = molecular_surface(molecule(shell, np.full(120, 1.7)))
     assert mesh.genus == 0
     assert mesh.volume > ball(8.0)[1]
-    assert any("1 hollows inside were filled" in note for note in mesh.notes)
+    assert any("1 hollow inside: filled" in note for note in mesh.notes)
 
 
 def test_a_simplified_surface_keeps_the_volume() -> None:

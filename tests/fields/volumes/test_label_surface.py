@@ -248,7 +248,7 @@ def test_small_pieces_apart_are_dropped_and_large_ones_stay() -> None:
     mask[2:18, 2:18, 2:18] = mask[22:30, 2:18, 2:18] = mask[35:37, 5:7, 5:7] = True
     vertices, faces, notes = voxel_surface(mask)
     assert components(faces, len(vertices))[0] == 2
-    assert notes == ("dropped 1 small piece apart of 8 voxels, 0.1% of the label",)
+    assert notes == ("left out 1 small piece apart: 8 voxels, 8, 0.1% of the label",)
     assert Mesh(*largest(vertices, faces)).volume == pytest.approx(16**3, rel=0.01)
 
 
@@ -330,7 +330,7 @@ def test_holes_inside_are_filled() -> None:
     mask = np.ones((12, 12, 12), dtype=bool)
     mask[5:7, 5:7, 5:7] = False
     vertices, faces, notes = voxel_surface(mask)
-    assert notes == ("filled holes of 8 voxels",)
+    assert notes == ("filled holes: 8 voxels, 8",)
     assert Mesh(vertices, faces).volume == pytest.approx(12**3, rel=1e-3)
 
 

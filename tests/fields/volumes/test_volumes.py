@@ -845,7 +845,7 @@ def test_pieces_of_a_volume_are_what_does_not_touch_whatever_its_label(tmp_path:
     for part, n_voxels in (("piece 1", 384 + 320), ("piece 2", 512)):
         mesh = load_mesh(tmp_path / "x.nii", options, part=part)
         assert mesh.volume == pytest.approx(n_voxels * 3.75, rel=1e-3)
-        assert mesh.notes == ("left out 1 specks",)
+        assert mesh.notes == ("left out 1 speck",)
         assert mesh.unit == "mm"
     with pytest.raises(MeshError, match="2 connected components"):
         load_mesh(tmp_path / "x.nii", LoadOptions(bodies="whole", mend="never"))

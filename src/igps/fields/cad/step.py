@@ -36,7 +36,7 @@ def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBod
         names += [str(body.part)] * len(components)
     named = zip(solids, distinct(names), strict=True)
     return [
-        replace(solid, vertices=1000 * solid.vertices, part=name, unit="mm")
+        replace(solid, vertices=1000 * solid.vertices, part=name, unit="mm", unit_from="header")
         for solid, name in named
     ]
 

@@ -17,11 +17,12 @@ import numpy as np
 import trimesh
 
 from igps._arrays import Floats, Integers
+from igps._text import counted
 from igps.fields.meshes import _xml
 from igps.mesh.formats import Format
 from igps.mesh.limits import check_unpacked
 from igps.mesh.options import LoadOptions
-from igps.mesh.raw_body import RawBody, distinct, joined
+from igps.mesh.raw_body import RawBody, UnitSource, distinct, joined
 from igps.mesh.surface import compact
 
 _UNITS = {
@@ -144,7 +145,7 @@ class _Model:
         elif name == "item":
             self.items.append(self._placed(attributes))
         elif name == "model":
-            self.unit = self.unit or attributes.get("unit", "millimeter")
+            self.unit = self.unit or attributes.get("unit", "")
 
     def _placed(self, attributes: dict[str, str]) -> _Placed:
         numbers = attributes.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
@@ -195,9 +196,8 @@ def _material(parts: list[_Part], name: str) -> RawBody | None:
     notes = []
     n_others = len(parts) - len(solid) - len(negative)
     if n_others:
-        notes.append(
-            f"left out {n_others} parts that are not material, such as modifiers and supports"
-        )
+        others = counted(n_others, "part")
+        notes.append(f"left out {others} without material, such as modifiers and supports")
     if negative:
         operands = [_closed(part, name) for part in (*solid, *negative)]
         whole = trimesh.boolean.union(operands[: len(solid)], engine="manifold")
@@ -234,16 +234,18 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     parts = [list(model.parts(item, budget)) for item in items]
     check_unpacked(options.max_unpacked - budget[0], path, options.max_unpacked)
     names = distinct(item.name or model.objects[item.key].name for item in items)
-    unit = _UNITS.get(model.unit)
+    unit = _UNITS.get(model.unit or "millimeter")
+    source: UnitSource = "header" if model.unit else "format"
     bodies = [_material(own, name) for name, own in zip(names, parts, strict=True) if own]
-    material = [replace(body, unit=unit) for body in bodies if body is not None]
+    material = [replace(body, unit=unit, unit_from=source) for body in bodies if body is not None]
     if bodies and not material:
         raise ValueError(
             "nothing in it is material: all objects are supports, modifiers or negative"
         )
     n_left_out = len(bodies) - len(material)
     if n_left_out and material:
-        note = f"left out {n_left_out} objects that are not material, such as supports"
+        objects = counted(n_left_out, "object")
+        note = f"left out {objects} without material, such as supports"
         material[0] = replace(material[0], notes=(*material[0].notes, note))
     return material
 

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers, Singles, Surface
 from igps._parameters import check_one_of, check_positive
+from igps._text import counted
 from igps._threads import one_thread
 from igps.fields.molecules._molecular_loops import (
     Balls,
@@ -101,7 +102,7 @@ def molecular_surface(
     field = bounded.copy()
     if n_hollows := ndimage.label(field > 0)[1] - 1:
         field = fill_bubbles(field)
-        notes.append(f"{n_hollows} hollows inside were filled")
+        notes.append(f"{counted(n_hollows, 'hollow')} inside: filled")
     vertices, faces = level_surface(field.copy(), molecule.name)
     vertices = _fit_to_field(np.where(field == bounded, exact, field), vertices, faces)
     vertices, faces = _one_piece(vertices, faces, max_vertices, notes)
@@ -169,7 +170,7 @@ def _one_piece(
     ):  # as of a membrane, which consists of small molecules
         is_speck[:] = False
     elif is_speck.any():
-        notes.append(f"left out {is_speck.sum()} specks")
+        notes.append(f"left out {counted(int(is_speck.sum()), 'speck')}")
     parts = [part for part, is_small in zip(parts, is_speck, strict=True) if not is_small]
     if max_vertices is not None:
         n_vertices = sum(len(points) for points, _ in parts)

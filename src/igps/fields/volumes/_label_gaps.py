@@ -4,6 +4,7 @@ import numpy as np
 from scipy import ndimage
 
 from igps._arrays import Booleans
+from igps._text import counted
 from igps.mesh._level_set import SPECK_VOLUME
 
 TOUCHING = np.ones((3, 3, 3), dtype=bool)
@@ -46,5 +47,7 @@ def fill_missed_slices(mask: Booleans, notes: list[str]) -> Booleans:
                 for start, width, row, column in between[across, 2:]:
                     filled_slices[start + 1 : start + 1 + width, row, column] = True
     if n_filled := np.count_nonzero(filled) - np.count_nonzero(mask):
-        notes.append(f"filled {n_filled} voxels of slices that were missed between pieces")
+        notes.append(
+            f"filled {counted(int(n_filled), 'voxel')} of slices that were missed between pieces"
+        )
     return filled

@@ -19,6 +19,7 @@ from igps.fields.volumes.label_names import names_in_extensions, names_in_tags
 from igps.mesh.errors import MeshError
 from igps.mesh.limits import check_fits
 from igps.mesh.mesh import Frame, unit_of_length
+from igps.mesh.raw_body import UnitSource
 
 _WORK_BYTES = 4  # bytes a voxel to hold and count labels, beyond those of the file
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # DICOM and ITK use LPS
@@ -26,6 +27,7 @@ _EXPORT = "Export the labels."
 _NRRD = (".nrrd", ".nhdr")
 _META = (".mha", ".mhd")
 _MITK = "org.mitk.multilabel.segmentation.labelgroups"
+_NIFTI_UNITS = {1: 1e3, 2: 1.0, 3: 1e-3}  # metres, millimetres, micrometres, in millimetres
 _MAX_HEADER = 1 << 24  # bytes
 _MGH_FOOTER = 20  # bytes between voxels and tags
 _MAX_TAGS = 1 << 26  # bytes around the voxels of a compressed NIfTI or MGH file
@@ -59,6 +61,7 @@ class RawVolume:
     )  # (name, layer, value), if the file lists them
     unit: str | None = "mm"  # of length; None if the file states no lengths
     frame: Frame = "RAS"  # None if the file does not say how the patient lies
+    unit_from: UnitSource = "default"  # what states the unit
     notes: list[str] = field(default_factory=list)  # remarks on its geometry, for the user
 
 
@@ -134,13 +137,14 @@ def of_nibabel(image: Any, path: str | Path) -> RawVolume:
     names: dict[int, str] = {}
     notes: list[str] = []
     frame: Frame = "RAS"
+    source: UnitSource = "format"
     if isinstance(image, nibabel.Nifti1Pair):  # the base class of all NIfTI images
         notes = _spacing_notes(image)
         has_orientation = image.header["sform_code"] or image.header["qform_code"]
         frame = "RAS" if has_orientation else None
-        affine[:3] *= {1: 1e3, 3: 1e-3}.get(
-            int(image.header["xyzt_units"]) % 8, 1.0
-        )  # metres, micrometres
+        unit_code = int(image.header["xyzt_units"]) % 8
+        affine[:3] *= _NIFTI_UNITS.get(unit_code, 1.0)
+        source = "header" if unit_code in _NIFTI_UNITS else "default"
         names = names_in_extensions(
             bytes(x.get_content_bytes())
             if hasattr(x, "get_content_bytes")
@@ -153,7 +157,7 @@ def of_nibabel(image: Any, path: str | Path) -> RawVolume:
         ) as file:  # nibabel does not read the tags
             file.seek(image.header.get_footer_offset() + _MGH_FOOTER)
             names = names_in_tags(file.read(_MAX_HEADER))
-    return RawVolume([values], affine, names, notes=notes, frame=frame)
+    return RawVolume([values], affine, names, notes=notes, frame=frame, unit_from=source)
 
 
 def _spacing_notes(image: Any) -> list[str]:
@@ -288,6 +292,7 @@ def _apply_nrrd_unit(volume: RawVolume, header: bytes) -> None:
         shown = ", ".join(repr(name) for name in sorted(names))
         volume.notes.append(f"the header states the units {shown}: lengths have no unit")
         return
+    volume.unit_from = "header"
     volume.affine[:3] *= length
 
 
@@ -374,9 +379,8 @@ def _highdicom(path: Path) -> RawVolume:
     )
     segments = [(name, *place) for name, place in zip(names, places, strict=True)]
     # Axes of the arrays: slices, rows, columns, as in the affine of `geometry`
-    return RawVolume(
-        layers, _LPS_TO_RAS @ np.array(geometry.affine, dtype=np.float64), segments=segments
-    )
+    affine = _LPS_TO_RAS @ np.array(geometry.affine, dtype=np.float64)
+    return RawVolume(layers, affine, segments=segments, unit_from="format")
 
 
 def _tifffile(path: Path) -> RawVolume:
@@ -414,7 +418,13 @@ def _tifffile(path: Path) -> RawVolume:
 
             values = SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(path)))  # it decodes LZW
         sides, unit = _tiff_sides(file)
-    return RawVolume([values.reshape(shape).T], np.diag([*sides, 1.0]), unit=unit, frame=None)
+    return RawVolume(
+        [values.reshape(shape).T],
+        np.diag([*sides, 1.0]),
+        unit=unit,
+        unit_from="header",
+        frame=None,
+    )
 
 
 def _check_complete(file: Any, path: Path) -> None:

@@ -7,17 +7,19 @@ interpolated by cubic splines along the long sides of the voxels. Marching cubes
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers, Singles, Surface
+from igps._text import counted
 from igps.fields.volumes._label_field import PAD, filled_volume, smooth_field
 from igps.fields.volumes._label_gaps import TOUCHING, fill_missed_slices
 from igps.mesh._isosurface import level_surface, restore_volume, simplify_surface
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles, join_pieces
-from igps.mesh.errors import MeshError
+from igps.mesh.errors import MeshError, NoBodyError
 from igps.mesh.limits import check_grid
 from igps.mesh.surface import connected, signed_volume, stacked
 
@@ -26,6 +28,13 @@ MAX_VERTICES = 5000
 
 MIN_VOXELS = 8
 """Minimal number of voxels of a label; fewer have no shape."""
+
+
+class TooFewVoxelsError(NoBodyError):
+    """A label of so few voxels that it has no shape."""
+
+    summary = f"of fewer than {MIN_VOXELS} voxels"
+
 
 _ISLAND = 0.02  # separate pieces of less than this share of the voxels are dropped
 _MIN_OPEN_CAVITY = 0.1  # share of the voxels from which an open cavity is noted
@@ -48,6 +57,7 @@ def voxel_surface(
     cavities: bool = False,
     joins: bool = False,
     name: str = "volume",
+    unit: str | None = None,
 ) -> tuple[Floats, Integers, tuple[str, ...]]:
     """Make a closed, outward oriented surface of the voxels of a body.
 
@@ -69,6 +79,7 @@ def voxel_surface(
         joins: join separate pieces: up to three missed slices between them are filled, and wider gaps are bridged by
             bars where they are narrowest.
         name: name of the body in error messages.
+        unit: unit of length of the world, for notes.
 
     Returns:
         Vertices (V, 3) in world coordinates, faces (F, 3) of one or several closed pieces, and notes of what was done.
@@ -84,17 +95,20 @@ def voxel_surface(
     n_voxels = int(np.count_nonzero(mask))
     if n_voxels < MIN_VOXELS:
         few = f"expected at least {MIN_VOXELS} voxels, got {n_voxels}, which have no shape"
-        raise MeshError(f"{name}: {few}. Leave out the label, or segment it on a finer grid.")
+        raise TooFewVoxelsError(
+            f"{name}: {few}. Leave out the label, or segment it on a finer grid."
+        )
     (box,) = ndimage.find_objects(mask.view(np.uint8))
     low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
     mask = fill_missed_slices(mask[box], notes) if joins else mask[box]
-    mask, hollows = _clean(mask, notes, MIN_VOXELS if cavities else None, name)
+    voxel = Voxel(abs(float(np.linalg.det(matrix[:3, :3]))), unit)
+    mask, hollows = _clean(mask, notes, MIN_VOXELS if cavities else None, name, voxel)
     if cavities and (n_open := _n_nearly_enclosed(mask)) > _MIN_OPEN_CAVITY * np.count_nonzero(
         mask
     ):
         notes.append(
-            f"a cavity of about {n_open} voxels is open through gaps of up to two voxels in its wall"
+            f"a cavity of about {counted(n_open, 'voxel')} is open through gaps of up to two voxels in its wall"
         )
     share, factor = _coarsen(mask, spacing, max_vertices)
     volume = float(share.sum(dtype=np.float64))  # before contacts are thickened, which adds volume
@@ -126,7 +140,7 @@ def voxel_surface(
     matrix = matrix @ np.block([[np.eye(3), low[:, None]], [np.zeros(3), 1]])
     for hollow in hollows:
         points, triangles, cavity_notes = voxel_surface(
-            hollow, matrix, max_vertices=max_vertices, name=name
+            hollow, matrix, max_vertices=max_vertices, name=name, unit=unit
         )
         notes += [f"in a cavity: {note}" for note in cavity_notes]
         surfaces.append((points, triangles[:, ::-1]))
@@ -150,8 +164,20 @@ def voxel_spacing(affine: Floats, name: str) -> Floats:
     return spacing
 
 
+class Voxel(NamedTuple):
+    """The size of a voxel."""
+
+    volume: float
+    unit: str | None  # of length
+
+    def amount(self, n: int) -> str:
+        """Return a number of voxels with their volume, such as "8 voxels, 216 mm³"."""
+        cubed = f" {self.unit}³" if self.unit else ""
+        return f"{counted(n, 'voxel')}, {n * self.volume:.4g}{cubed}"
+
+
 def _clean(
-    mask: Booleans, notes: list[str], min_hole: int | None, name: str
+    mask: Booleans, notes: list[str], min_hole: int | None, name: str, voxel: Voxel
 ) -> tuple[Booleans, list[Booleans]]:
     """Drop islands and fill holes. Also return the masks of the holes of at least `min_hole` voxels, none if None."""
     label, island, size = _islands(mask)
@@ -164,10 +190,9 @@ def _clean(
                 f"{share}, each below {_ISLAND:.0%} of the label; one body was expected. {remedy}"
             )
         mask = mask & ~np.isin(label, island)
-        pieces = "1 small piece" if len(island) == 1 else f"{len(island)} small pieces"
-        notes.append(
-            f"dropped {pieces} apart of {n_dropped} voxels, {n_dropped / size.sum():.1%} of the label"
-        )
+        share = f"{n_dropped / size.sum():.1%} of the label"
+        pieces = counted(len(island), "small piece")
+        notes.append(f"left out {pieces} apart: {voxel.amount(n_dropped)}, {share}")
     # Voxels outside are connected only across faces.
     hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
     if n_hollow < 2:
@@ -178,7 +203,7 @@ def _clean(
     size[[0, outside]] = 0
     cavities = [] if min_hole is None else np.flatnonzero(size >= min_hole).tolist()
     if n_filled := int(size.sum() - size[cavities].sum()):
-        notes.append(f"filled holes of {n_filled} voxels")
+        notes.append(f"filled holes: {voxel.amount(n_filled)}")
     return np.asarray(hollow != outside), [hollow == k for k in cavities]
 
 

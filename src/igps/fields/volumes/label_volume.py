@@ -16,6 +16,7 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from igps._arrays import Booleans, Floats
+from igps._text import counted
 from igps.fields.volumes._volume_files import (
     READERS,
     RawVolume,
@@ -26,12 +27,12 @@ from igps.fields.volumes._volume_files import (
 )
 from igps.fields.volumes.label_names import cleaned, read_label_names, table_beside
 from igps.fields.volumes.label_surface import MIN_VOXELS, voxel_spacing, voxel_surface
-from igps.mesh.errors import MeshError
+from igps.mesh.errors import MeshError, NoBodyError
 from igps.mesh.formats import Format, faults
 from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Frame, Mesh
 from igps.mesh.options import LoadOptions
-from igps.mesh.raw_body import LabelVoxels, RawBody, deferred
+from igps.mesh.raw_body import LabelVoxels, RawBody, UnitSource, deferred
 
 # Volumes with more values than _MAX_LABELS are refused as images. So are those with more than _MAX_UNCHECKED values if
 # less than a share _MIN_EQUAL of adjacent voxels are equal; labels as thin as two voxels have a share of one half.
@@ -85,12 +86,13 @@ class LabelVolume:
     unit: str | None = "mm"  # of length, None if unknown
     notes: tuple[str, ...] = ()  # remarks on how the volume was read
     frame: Frame = None  # None if it is not known how the patient lies
+    unit_from: UnitSource = "default"  # what states the unit
 
     def __post_init__(self) -> None:
         voxel_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
         if not self.bodies:
             notes = f" ({'; '.join(self.notes)})" if self.notes else ""
-            raise MeshError(
+            raise NoBodyError(
                 f"{self.name}: no voxel has a label, all are 0{notes}. Check the export."
             )
         seen: dict[str, int] = {}  # a given name may equal one that was made distinct by its number
@@ -197,7 +199,12 @@ def label_surface(
     affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
     mask, affine = _reoriented(volume.mask(part), affine)
     vertices, faces, notes = voxel_surface(
-        mask, affine, cavities=cavities == "keep", joins=how != "never", name=name
+        mask,
+        affine,
+        cavities=cavities == "keep",
+        joins=how != "never",
+        name=name,
+        unit=volume.unit,
     )
     if (volume.names or {}).get(body.label, body.name) != body.name:
         notes = (
@@ -294,7 +301,15 @@ def _labelled(
             names = {label: path.name[: -len(suffix_of(path))]}
     remarks = tuple(dict.fromkeys(notes))
     return LabelVolume(
-        layers, raw.affine, name, names, segments, raw.unit, notes=remarks, frame=raw.frame
+        layers,
+        raw.affine,
+        name,
+        names,
+        segments,
+        raw.unit,
+        notes=remarks,
+        frame=raw.frame,
+        unit_from=raw.unit_from,
     )
 
 
@@ -406,13 +421,22 @@ def label_bodies(
         volume = _in_pieces(volume) if options.bodies == "pieces" else volume
     surface = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
     if options.bodies == "whole":
-        return [deferred(partial(surface, 1), None, volume.unit, partial(volume.voxels, 1))]
+        return [
+            deferred(
+                partial(surface, 1),
+                None,
+                volume.unit,
+                partial(volume.voxels, 1),
+                volume.unit_from,
+            )
+        ]
     chosen = volume.bodies if part is None else (volume.body(part),)
     raw_bodies = []
     for body in chosen:
         name = body.name if part is None else part  # a label is found by its number, too
         make = partial(surface, body.name)
-        raw = deferred(make, name, volume.unit, partial(volume.voxels, body.name))
+        voxels = partial(volume.voxels, body.name)
+        raw = deferred(make, name, volume.unit, voxels, volume.unit_from)
         raw_bodies.append(replace(raw, number=str(body.label)))
     return raw_bodies
 
@@ -425,7 +449,7 @@ def _in_pieces(volume: LabelVolume) -> LabelVolume:
     if is_speck[1:].all():  # keep them: their error says that they are too small
         is_speck[:] = False
     names = {k: f"piece {i}" for i, k in enumerate((np.flatnonzero(~is_speck[1:]) + 1).tolist(), 1)}
-    notes = (f"left out {is_speck.sum()} specks",) if is_speck.any() else ()
+    notes = (f"left out {counted(int(is_speck.sum()), 'speck')}",) if is_speck.any() else ()
     return replace(
         volume,
         layers=(np.where(is_speck[label], 0, label),),

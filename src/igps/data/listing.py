@@ -1,0 +1,83 @@
+"""Which bodies a file holds: asked of the file once, and afterwards of the cache."""
+
+import contextlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from igps.data.cache import Cache, Record
+from igps.data.keys import Content, FileDigest, derived_key
+from igps.data.known_files import KnownFiles
+from igps.data.pipeline import version
+from igps.mesh.errors import MeshError, NoBodyError
+from igps.mesh.formats import dependencies_of
+from igps.mesh.loading import BodyRef, is_one_body, list_bodies
+from igps.mesh.options import LoadOptions
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Lists the bodies of files; without a cache, all files are read."""
+
+    options: LoadOptions
+    cache_dir: Path | None = None
+
+    def of(self, paths: Iterable[Path]) -> dict[Path, list[BodyRef]]:
+        """Return the bodies of each file; the file itself if it is unreadable, which the computation reports."""
+        listed: dict[Path, list[BodyRef]] = {}
+        several: dict[Path, list[Path]] = {}  # files that may hold several, with those beside them
+        for path in dict.fromkeys(paths):
+            listed[path] = [BodyRef(path)]
+            try:
+                if not is_one_body(path, self.options):
+                    several[path] = dependencies_of(path, self.options)
+            except MeshError:
+                continue
+        known = self._known(several.values())
+        for path, files in several.items():
+            if all(file in known for file in files):
+                content = Content.of_files([known[file] for file in files])
+                listed[path] = self._cached(path, content)
+            else:
+                listed[path], _ = _read(path, self.options)
+        return listed
+
+    def _known(self, groups: Iterable[list[Path]]) -> dict[Path, FileDigest]:
+        """Return the digests of files, which are read only if they are new or have changed."""
+        if self.cache_dir is None:
+            return {}
+        files = dict.fromkeys(file for group in groups for file in group)
+        database = KnownFiles(self.cache_dir)
+        known = database.unchanged(files)
+        new = {}
+        for file in files:
+            if file not in known:
+                with contextlib.suppress(OSError):  # which the computation reports
+                    new[file] = FileDigest.of(file)
+        database.remember(new.values())
+        return known | new
+
+    def _cached(self, path: Path, content: Content) -> list[BodyRef]:
+        """Return the bodies of a file from the cache, where they are stored if they were missing."""
+        assert self.cache_dir is not None
+        cache = Cache(self.cache_dir, "listing")
+        options = json.dumps(self.options.as_dict(), sort_keys=True)
+        key = derived_key("listing", content.digest.hex(), path.name, options, version())
+        texts = cache.texts(key)
+        if texts is not None:
+            return [BodyRef(path, part, number) for part, number in json.loads(texts["bodies"])]
+        bodies, is_sound = _read(path, self.options)
+        if is_sound:
+            rows = json.dumps([(body.part, body.number) for body in bodies])
+            with contextlib.suppress(OSError):  # a folder that cannot be written is reported later
+                cache.put(key, Record({}, {"bodies": rows}))
+        return bodies
+
+
+def _read(path: Path, options: LoadOptions) -> tuple[list[BodyRef], bool]:
+    """Return the bodies of a file, and whether that is certain: it is not if reading failed."""
+    try:
+        return list_bodies(path, options) or [BodyRef(path)], True
+    except MeshError as error:
+        return [BodyRef(path)], isinstance(error, NoBodyError)
