@@ -233,7 +233,7 @@ def test_a_piece_of_a_label_in_its_cavity_is_told() -> None:
         np.count_nonzero(shell), rel=1e-3
     )
     n = np.count_nonzero(seed)
-    assert notes == (f"in a cavity: filled holes: {n} voxels, {n}",)
+    assert notes == (f"in a cavity: filled holes: {n:,} voxels, {n:,}",)
 
 
 def test_the_larger_the_cavity_the_farther_from_the_ball() -> None:

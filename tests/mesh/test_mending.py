@@ -10,6 +10,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from tests.mesh.damages import DAMAGES, halves, holes
 
+from igps._text import counted
 from igps.mesh._tidying import fill_small_holes, weld
 from igps.mesh.errors import MeshError
 from igps.mesh.mending import mend, repair_steps
@@ -266,7 +267,7 @@ def test_neighbours_are_turned_alike_in_every_part(blob: Mesh) -> None:
     again, turned = weld(vertices, flipped, notes)
     np.testing.assert_array_equal(again, vertices)
     np.testing.assert_array_equal(turned, np.where(chosen[:, None], faces[:, ::-1][:, ::-1], faces))
-    assert notes == [f"turned {int(chosen.sum())} faces to orient the surface"]
+    assert notes == [f"turned {counted(int(chosen.sum()), 'face')} to orient the surface"]
 
 
 def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob: Mesh) -> None:

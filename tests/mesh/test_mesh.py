@@ -48,7 +48,11 @@ def test_inside_out_mesh_is_turned_and_says_so() -> None:
         (TETRAHEDRON, FACES + 1, "3 faces with vertices out of range"),
         (TETRAHEDRON, FACES - 1, "out of range"),
         (TETRAHEDRON, FACES[:3], "3 boundary edges"),
-        (TETRAHEDRON, np.vstack([FACES[:3], FACES[3:, ::-1]]), "inconsistent orientation, 3 edges"),
+        (
+            TETRAHEDRON,
+            np.vstack([FACES[:3], FACES[3:, ::-1]]),
+            "inconsistent orientation, two faces go along 3 edges",
+        ),
         (TETRAHEDRON, np.vstack([FACES, [[0, 0, 1]]]), "1 face with a vertex twice"),
         (np.vstack([TETRAHEDRON, [[5, 5, 5]]]), FACES, "1 vertex in no face"),
         (

@@ -196,7 +196,7 @@ def test_modifiers_and_supports_are_left_out(tmp_path: Path) -> None:
     ):
         mesh = load_mesh(path)
         assert mesh.volume == pytest.approx(VOLUME)
-        assert any(note.startswith("left out 1 parts") for note in mesh.notes)
+        assert any(note.startswith("left out 1 part ") for note in mesh.notes)
 
 
 def test_other_parts_are_united(tmp_path: Path) -> None:
@@ -213,7 +213,7 @@ def test_objects_of_type_support_are_left_out(tmp_path: Path) -> None:
     both = model(parts, '<item objectid="1"/><item objectid="2"/>')
     mesh = load_mesh(write_3mf(tmp_path / "box.3mf", both))
     assert mesh.volume == pytest.approx(VOLUME)
-    assert any(note.startswith("left out 1 objects") for note in mesh.notes)
+    assert any(note.startswith("left out 1 object ") for note in mesh.notes)
     alone = model(parts, '<item objectid="2"/>')
     with pytest.raises(MeshError, match=r"alone\.3mf.*nothing in it is material"):
         load_mesh(write_3mf(tmp_path / "alone.3mf", alone))

@@ -173,7 +173,9 @@ class Voxel(NamedTuple):
     def amount(self, n: int) -> str:
         """Return a number of voxels with their volume, such as "8 voxels, 216 mm³"."""
         cubed = f" {self.unit}³" if self.unit else ""
-        return f"{counted(n, 'voxel')}, {n * self.volume:.4g}{cubed}"
+        volume = n * self.volume
+        shown = f"{volume:,.0f}" if volume >= 1000 else f"{volume:.3g}"
+        return f"{counted(n, 'voxel')}, {shown}{cubed}"
 
 
 def _clean(
