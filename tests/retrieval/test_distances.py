@@ -29,7 +29,7 @@ ORACLES: dict[Distance, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 @pytest.fixture(params=["loops", "tiles"])
 def either_device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The distances of the processor's memory, by compiled loops, and those of a device, by PyTorch's tiles."""
-    monkeypatch.setattr(distances, "_can_use_loops", lambda _: request.param == "loops")
+    monkeypatch.setattr(distances, "_uses_loops", lambda a, b: request.param == "loops")
 
 
 def histograms(n: int, cells: tuple[int, ...], *, seed: int, filled: float = 0.6) -> Tensor:

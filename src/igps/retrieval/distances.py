@@ -29,6 +29,8 @@ _DEVICE_TILE_BYTES = 48 * 2**20
 _CELLS_PER_TILE = 4096
 # Smallest number of triples per thread of the compiled loops, which takes some milliseconds.
 _TRIPLES_PER_THREAD = 2**24
+# Fewer triples take PyTorch less than ten milliseconds; to load the compiled loops takes half a second.
+_MIN_TRIPLES = 2**22
 # Squared distances below this share of the sum of the two squared lengths are rounding errors of double precision.
 _CANCELLATION = 1e-14
 
@@ -82,7 +84,7 @@ class _ChiSquare(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
         ctx.save_for_backward(a, b)
-        if _can_use_loops(a):
+        if _uses_loops(a, b):
             return _sums_by_loops(a, b, chi_square=True).mul_(0.5)
         distances = a.new_zeros(len(a), len(b))
         for q, g, c in _tiles(a, b):
@@ -122,9 +124,11 @@ def _chi_square_by_torch(a: Tensor, b: Tensor) -> Tensor:
     return (difference.square() / torch.where(filled, total, 1)).sum(dim=-1) / 2
 
 
-def _can_use_loops(tensor: Tensor) -> bool:
-    """Whether compiled loops can read a tensor: it is on the CPU, and not traced or transformed."""
-    return tensor.device.type == "cpu" and not torch.compiler.is_compiling() and not in_transforms()
+def _uses_loops(a: Tensor, b: Tensor) -> bool:
+    """Whether compiled loops can read rows, on the CPU and not traced or transformed, and are worth being loaded."""
+    if a.device.type != "cpu" or torch.compiler.is_compiling() or in_transforms():
+        return False
+    return len(a) * len(b) * a.shape[1] > _MIN_TRIPLES
 
 
 def in_transforms() -> bool:
@@ -184,7 +188,7 @@ def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
     needs_gradients = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
-    if _can_use_loops(a) and not needs_gradients:
+    if _uses_loops(a, b) and not needs_gradients:
         return _sums_by_loops(a, b, chi_square=False).sqrt_()
     return row_distances(a, b)
 

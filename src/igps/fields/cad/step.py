@@ -7,7 +7,6 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from igps.fields.meshes._trimesh import objects
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import Format
 from igps.mesh.options import LoadOptions
@@ -24,6 +23,8 @@ _CONVERT = (
 
 def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """Read the solids of a STEP file, in millimetres, each named after its part."""
+    from igps.fields.meshes._trimesh import objects
+
     solids = []
     names = []
     for body in objects(path, options, _converted(path), file_type="glb", merge_primitives=True):

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from igps._arrays import Floats, Surface
-from igps.fields.meshes._trimesh import objects
 from igps.mesh.formats import Format
 from igps.mesh.options import LoadOptions
 from igps.mesh.polygons import flat_triangles, strip_triangles
@@ -90,6 +89,8 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         surface = None  # a rare file, or a broken one: trimesh names the fault
     if surface is not None:
         return [RawBody(*surface)]
+    from igps.fields.meshes._trimesh import objects
+
     # Trimesh expects a header in UTF-8. Without fix_texture=False, it splits vertices at the seams of textures
     content = head.decode("latin-1").encode("ascii", "replace") + end + body
     bodies = objects(path, options, content, fix_texture=False)

@@ -7,7 +7,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from igps.fields.meshes._trimesh import FolderResolver, objects
 from igps.mesh.formats import Format
 from igps.mesh.limits import check_memory, check_unpacked
 from igps.mesh.options import LoadOptions
@@ -23,6 +22,8 @@ _MAX_ITEM = 64  # bytes of the largest item of an array, a 4 × 4 matrix
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    from igps.fields.meshes._trimesh import objects
+
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             check_unpacked(
@@ -33,6 +34,8 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 
 def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """Read the objects of a glTF scene, in metres. An object is a node, with all its materials."""
+    from igps.fields.meshes._trimesh import objects
+
     scene = _scene(path)
     _check_extensions(scene)
     _check_poses(scene)
@@ -113,6 +116,8 @@ def _buffers(path: Path, options: LoadOptions) -> list[Path]:
     """Return the files beside a glTF scene that hold its arrays."""
     if path.suffix.lower() != ".gltf":
         return []
+    from igps.fields.meshes._trimesh import FolderResolver
+
     check_memory(path)
     names = [buffer.get("uri", "data:") for buffer in _scene(path).get("buffers", [])]
     return [

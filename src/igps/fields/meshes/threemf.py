@@ -11,10 +11,10 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Element
 
 import numpy as np
-import trimesh
 
 from igps._arrays import Floats, Integers
 from igps._text import counted
@@ -24,6 +24,9 @@ from igps.mesh.limits import check_unpacked
 from igps.mesh.options import LoadOptions
 from igps.mesh.raw_body import RawBody, UnitSource, distinct, joined
 from igps.mesh.surface import compact
+
+if TYPE_CHECKING:
+    import trimesh
 
 _UNITS = {
     "micron": "µm",
@@ -199,6 +202,8 @@ def _material(parts: list[_Part], name: str) -> RawBody | None:
         others = counted(n_others, "part")
         notes.append(f"left out {others} without material, such as modifiers and supports")
     if negative:
+        import trimesh
+
         operands = [_closed(part, name) for part in (*solid, *negative)]
         whole = trimesh.boolean.union(operands[: len(solid)], engine="manifold")
         cut = trimesh.boolean.difference([whole, *operands[len(solid) :]], engine="manifold")
@@ -209,6 +214,8 @@ def _material(parts: list[_Part], name: str) -> RawBody | None:
 
 def _closed(part: RawBody, name: str) -> trimesh.Trimesh:
     """Return a part as a closed mesh; a ValueError if it is not closed, as nothing can be cut from it then."""
+    import trimesh
+
     mesh = trimesh.Trimesh(*compact(part.vertices, part.faces), process=True)
     if not mesh.is_volume:
         raise ValueError(

@@ -5,12 +5,10 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from igps._arrays import Floats, Integers
 from igps.fields.meshes import brains, vtk
-from igps.fields.meshes._trimesh import ply_columns
 from igps.mesh.errors import MeshError
 from igps.mesh.options import LoadOptions
 
@@ -67,6 +65,10 @@ def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
 
 def _ply(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the properties of vertices other than coordinates, normals and colours."""
+    import trimesh
+
+    from igps.fields.meshes._trimesh import ply_columns
+
     scene = trimesh.load_scene(
         BytesIO(path.read_bytes()), file_type="ply", process=False, fix_texture=False
     )
