@@ -21,7 +21,6 @@ NAMES = [
     "BodyDescriptor",
     "Descriptor",
     "HistogramDescriptor",
-    "KernelHead",
     "Mesh",
     "MeshError",
     "LoadOptions",
@@ -40,6 +39,7 @@ NAMES = [
     "fit",
     "load",
     "load_mesh",
+    "measures",
     "retrieval_scores",
     "search",
 ]

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from igps.nn.description import describe
     from igps.nn.descriptor import BodyDescriptor, Descriptor, HistogramDescriptor
     from igps.nn.embedding import SpectralEmbedding
-    from igps.nn.heads.closed_form import KernelHead
     from igps.nn.histograms.pairs import PairHistogram
     from igps.nn.learner import RetrievalLearner
     from igps.retrieval import retrieval_scores, search
     from igps.shapes import ArticulatedShapes
+    from igps.signature.measures import measures
     from igps.signature.signature import SignatureConfig, compute_signature
 
 # A name is imported when it is first used: `import igps` loads no other package, and the command line starts at once.
@@ -38,7 +38,6 @@ _MODULES = {
     "BodyDescriptor": "igps.nn.descriptor",
     "Descriptor": "igps.nn.descriptor",
     "HistogramDescriptor": "igps.nn.descriptor",
-    "KernelHead": "igps.nn.heads.closed_form",
     "LoadOptions": "igps.mesh.options",
     "Mesh": "igps.mesh.mesh",
     "MeshError": "igps.mesh.errors",
@@ -57,6 +56,7 @@ _MODULES = {
     "fit": "igps.learning",
     "load": "igps.descriptors",
     "load_mesh": "igps.mesh.loading",
+    "measures": "igps.signature.measures",
     "retrieval_scores": "igps.retrieval",
     "search": "igps.retrieval",
 }
@@ -66,7 +66,6 @@ __all__ = [
     "BodyDescriptor",
     "Descriptor",
     "HistogramDescriptor",
-    "KernelHead",
     "LoadOptions",
     "Mesh",
     "MeshError",
@@ -85,6 +84,7 @@ __all__ = [
     "fit",
     "load",
     "load_mesh",
+    "measures",
     "retrieval_scores",
     "search",
 ]

@@ -21,6 +21,7 @@ from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
+from igps.signature.measures import MEASURES_VERSION
 from igps.signature.signature import Signature, SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
@@ -123,11 +124,11 @@ def test_the_key_tells_pdb_from_pqr_also_when_compressed(
 def test_keys_are_those_of_the_caches_that_exist(
     pipeline: SignaturePipeline, tmp_path: Path
 ) -> None:
-    """Frozen: another key leaves all caches useless. It changes with the two versions alone."""
+    """Frozen: another key leaves all caches useless. It changes with the three versions alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
-    assert (SignatureConfig.ALGORITHM_VERSION, MENDING_VERSION) == (5, 9)
+    assert (SignatureConfig.ALGORITHM_VERSION, MENDING_VERSION, MEASURES_VERSION) == (5, 9, 1)
     key = pipeline.key(BodyRef(tmp_path / "frozen.off"))
-    assert key == "cf214e8c36d0119b57672cdf33e347dc37fdb9ee7dec32c2ab84c98816bedfb7"
+    assert key == "05e1832d4d3ad52537e28ccb126fad76c06d0ddc57b9de5f7774711f2f0c7db0"
 
 
 @pytest.mark.parametrize("name", ["igps.data.keys.MENDING_VERSION", "ALGORITHM_VERSION"])

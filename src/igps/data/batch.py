@@ -148,6 +148,7 @@ class SignatureBatch:
         ids: N names.
         meshes: N surfaces, for descriptors that need more than the Signatures; None without meshes.
         units: N units of length, each None if unknown; None if all are unknown.
+        measures: (N, M) float64, the plain numbers in the order of `POWERS`, NaN where unknown; None without them.
     """
 
     eigenvalues: Tensor
@@ -159,6 +160,7 @@ class SignatureBatch:
     ids: tuple[str, ...]
     meshes: tuple[Mesh, ...] | None = None
     units: tuple[str | None, ...] | None = None
+    measures: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -202,6 +204,7 @@ class SignatureBatch:
             area=function(self.area),
             volume=function(self.volume),
             labels=function(self.labels),
+            measures=None if self.measures is None else function(self.measures),
         )
 
     def to(
@@ -229,6 +232,7 @@ class SignatureBatch:
             raise ValueError(
                 "batches: expected meshes in all batches or in none, got some of each."
             )
+        measures = [batch.measures for batch in batches if batch.measures is not None]
         return SignatureBatch(
             eigenvalues=_joined([batch.eigenvalues for batch in batches], math.inf),
             interior=_joined_samples([batch.interior for batch in batches]),
@@ -239,6 +243,7 @@ class SignatureBatch:
             ids=tuple(name for batch in batches for name in batch.ids),
             meshes=tuple(itertools.chain(*meshes)) if meshes else None,
             units=tuple(unit for batch in batches for unit in batch.units or (None,) * len(batch)),
+            measures=torch.cat(measures) if len(measures) == len(batches) else None,
         )
 
     def bodies(self) -> Iterator[Body]:

@@ -24,7 +24,7 @@ Kind = Literal["signature", "attribute", "description", "failure", "listing"]
 
 _FORMAT = "igps-cache-3"
 # Fields of a Signature besides arrays and configuration
-_SCALAR_FIELDS = ("area", "volume", "name", "notes", "residual", "unit")
+_SCALAR_FIELDS = ("area", "volume", "name", "notes", "residual", "unit", "measures")
 # Seconds until a partial file is removed; writing a file takes well below one second
 _ABANDONED_AGE = 24 * 3600
 _CHECKSUM_ROW = 4096  # bytes of a row of the matrix whose column sums enter a checksum

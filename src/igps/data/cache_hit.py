@@ -16,6 +16,7 @@ class CacheHit:
     files: tuple[FileDigest, ...] = ()  # that were read to find the key
     notes: tuple[str, ...] = ()  # on how the mesh was changed
     unit: str | None = None  # of length
+    measures: Mapping[str, float] = field(default_factory=dict)  # plain numbers, by name
 
     @property
     def whole_key(self) -> str:
@@ -25,6 +26,10 @@ class CacheHit:
         return derived_key("with attributes", self.key, sorted(self.attributes.items()))
 
     def with_header(self, texts: Mapping[str, str]) -> "CacheHit":
-        """Return the entry with notes and unit from the texts of the Signature's file."""
-        notes = tuple(json.loads(texts["notes"]))
-        return replace(self, notes=notes, unit=json.loads(texts["unit"]))
+        """Return the entry with notes, unit and measures from the texts of the Signature's file."""
+        return replace(
+            self,
+            notes=tuple(json.loads(texts["notes"])),
+            unit=json.loads(texts["unit"]),
+            measures=json.loads(texts["measures"]),
+        )

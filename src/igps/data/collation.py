@@ -1,6 +1,6 @@
 """Collation of Signatures to a padded batch."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch import Tensor
 from igps.data._shared_memory import empty_arrays
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, attribute_names
 from igps.mesh.mesh import Mesh
+from igps.signature.measures import POWERS
 from igps.signature.signature import Samples, Signature
 
 
@@ -58,11 +59,12 @@ def collate(
         [np.float64(s.area) for s in signatures],
         [np.float64(s.volume) for s in signatures],
         [np.int64(item.label) for item in labelled],
+        [_row(s.measures) for s in signatures],
     ]
     samples_by_kind = [[s.interior for s in signatures], [s.surface for s in signatures]]
     for samples in samples_by_kind:
         columns += _sample_columns(samples)
-    eigenvalues, area, volume, labels, *sample_tensors = _padded(columns)
+    eigenvalues, area, volume, labels, rows, *sample_tensors = _padded(columns)
     data = iter(sample_tensors)
     interior, surface = (
         SampleBatch(
@@ -75,9 +77,14 @@ def collate(
     )
     ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
     surfaces = None if meshes is None else tuple(meshes)
+    measures = rows if all(s.measures for s in signatures) else None
     return SignatureBatch(
-        eigenvalues, interior, surface, area, volume, labels, ids, surfaces, units
+        eigenvalues, interior, surface, area, volume, labels, ids, surfaces, units, measures
     )
+
+
+def _row(measures: Mapping[str, float]) -> NDArray[np.float64]:
+    return np.array([measures.get(name, np.nan) for name in POWERS])
 
 
 def _sample_columns(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:

@@ -218,6 +218,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
             return [signature.unit for signature in self._loaded]
         return [None if hit is None else hit.unit for hit in self._find_hits()]
 
+    def measures(self) -> list[Mapping[str, float]]:
+        """Return the plain numbers of each body by name, see `igps.measures`; none without a cached Signature."""
+        if isinstance(self._loaded, list):
+            return [signature.measures for signature in self._loaded]
+        return [{} if hit is None else hit.measures for hit in self._find_hits()]
+
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Return a batch of some of the items, optionally with their meshes."""
         return collate(

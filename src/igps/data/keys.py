@@ -1,8 +1,9 @@
 """Identities: the content of files, the key of a Signature, and the keys of all that is made from it.
 
 The key of a Signature is the hash of everything that it depends on: the content of its files, the load options, the
-configuration, and the versions of mending and of the algorithm. Whatever is made from a Signature (an attribute, a
-transformed Signature, a description) has the hash of that key and of its own parameters as key, see `derived_key`.
+configuration, and the versions of mending, of the measures and of the algorithm. Whatever is made from a Signature (an
+attribute, a transformed Signature, a description) has the hash of that key and of its own parameters as key, see
+`derived_key`.
 """
 
 import hashlib
@@ -18,6 +19,7 @@ from igps.mesh.mending import MENDING_VERSION
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.signature.config import SignatureConfig
+from igps.signature.measures import MEASURES_VERSION
 
 Stamp = tuple[int, int, int]
 """Size in bytes, and times of the last change of the content and of the metadata in nanoseconds, see `stat_key`."""
@@ -92,6 +94,7 @@ def _parameters(
         "part": part,
         "reading": reading.as_dict(),
         "mending": MENDING_VERSION,
+        "measures": MEASURES_VERSION,
         "config": config.as_dict(),  # with the version of the algorithm
     }
     return json.dumps(fields, sort_keys=True).encode()

@@ -137,8 +137,12 @@ class SignaturePipeline:
             raise MeshError(found.reason)
         if found is None:
             signature = self._compute(body, content, mesh)
-            keys = self._keys(body, content)
-            found = replace(keys, notes=tuple(signature.notes), unit=signature.unit)
+            found = replace(
+                self._keys(body, content),
+                notes=tuple(signature.notes),
+                unit=signature.unit,
+                measures=signature.measures,
+            )
         return found
 
     def fill(self, bodies: Sequence[BodyRef]) -> list[CacheHit | Failed]:

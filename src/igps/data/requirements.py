@@ -22,6 +22,7 @@ class Requirements:
     n_eigenpairs: int = 0  # minimum number; fewer would give another descriptor
     attributes: tuple[AttributeName, ...] = ()  # of the samples, see `SignatureConfig`
     mesh: bool = False  # whether the mesh is needed
+    eigenpairs: bool = True  # whether any are needed, and not plain numbers or samples alone
     whole_spectrum: bool = (
         False  # whether all eigenpairs are used, so that more would give another descriptor
     )
@@ -31,11 +32,12 @@ class Requirements:
     def __or__(self, other: Requirements) -> Requirements:
         """Return requirements that meet those of both."""
         return Requirements(
-            max(self.n_eigenpairs, other.n_eigenpairs),
-            tuple(dict.fromkeys((*self.attributes, *other.attributes))),
-            self.mesh or other.mesh,
-            self.whole_spectrum or other.whole_spectrum,
-            {**self.sources, **other.sources},
+            n_eigenpairs=max(self.n_eigenpairs, other.n_eigenpairs),
+            attributes=tuple(dict.fromkeys((*self.attributes, *other.attributes))),
+            mesh=self.mesh or other.mesh,
+            eigenpairs=self.eigenpairs or other.eigenpairs,
+            whole_spectrum=self.whole_spectrum or other.whole_spectrum,
+            sources={**self.sources, **other.sources},
         )
 
     def apply_to(self, config: SignatureConfig) -> SignatureConfig:
@@ -44,6 +46,8 @@ class Requirements:
         For a whole spectrum, the number is at least the default. A ValueError is raised if the configuration has fewer.
         """
         default = SignatureConfig.DEFAULT_EIGENPAIRS if self.whole_spectrum else 0
+        if config.n_eigenpairs is None and not self.eigenpairs:
+            config = replace(config, n_eigenpairs=0)
         config = config.with_eigenpairs(max(default, self.n_eigenpairs))
         self._check_eigenpairs(config.n_kept)
         return replace(

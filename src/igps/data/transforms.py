@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from igps.signature.measures import POWERS
 from igps.signature.signature import Samples, Signature
 
 
@@ -139,7 +140,13 @@ class Scale(Transform):
 
         area, volume = signature.area * factor**2, signature.volume * factor**3
         rescaled = replace(
-            signature, eigenvalues=signature.eigenvalues / factor**2, area=area, volume=volume
+            signature,
+            eigenvalues=signature.eigenvalues / factor**2,
+            area=area,
+            volume=volume,
+            measures={
+                name: value * factor ** POWERS[name] for name, value in signature.measures.items()
+            },
         )
         return rescaled.map_samples(scaled)
 

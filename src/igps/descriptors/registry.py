@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 from igps._parameters import check_one_of
 from igps.descriptors.from_file import is_descriptor_file, load
+from igps.descriptors.measures import Measures
 from igps.descriptors.size_and_side import SIDE, SIZE, Mirror, Size, SizeAndSide, keeps_size
 from igps.descriptors.with_attributes import WithAttributes
 from igps.nn.descriptor import Descriptor
@@ -31,6 +32,7 @@ _LIBRARY: Mapping[str, str] = {
     "geodesic_spectral": "igps.descriptors.literature.geodesic_spectral:GeodesicSpectral",
     "spectral_gw": "igps.descriptors.literature.spectral_gw:SpectralGromovWasserstein",
     "fold": "igps.fields.molecules.fold:fold",
+    "measures": "igps.descriptors.measures:Measures",
     "molecular": "igps.fields.molecules.molecular:molecular",
 }
 
@@ -88,6 +90,9 @@ def descriptor(
     compares_size = size == "keep" if units is None else keeps_size(size, units)[0]
     with_size = compares_size or SIZE in suffixes
     with_side = mirror == "distinct" or SIDE in suffixes
+    if with_size and isinstance(base, Measures):
+        base = base.with_size().eval()
+        with_size = False
     if not with_size and not with_side:
         return base
     scale = base.scale

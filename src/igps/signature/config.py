@@ -27,7 +27,7 @@ class SignatureConfig:
 
     Args:
         n_eigenpairs: number of eigenpairs, without the constant one; None for the number that the descriptor requires
-            (see `Requirements.apply_to`), or 250 without a descriptor.
+            (see `Requirements.apply_to`), or 250 without a descriptor; 0 for samples and plain numbers alone.
         resolution: voxels along the longest side of the bounding box.
         min_samples: the grid is refined until at least this many voxels lie inside; 0 keeps `resolution`.
         n_surface_samples: number of area-weighted random samples of the surface.
@@ -60,11 +60,9 @@ class SignatureConfig:
     least_vertices: int | None = None
 
     def __post_init__(self) -> None:
-        check_at_least(1, n_eigenpairs=self.n_eigenpairs, resolution=self.resolution)
-        check_at_least(1, n_surface_samples=self.n_surface_samples)
-        check_at_least(
-            0, min_samples=self.min_samples, least_vertices=self.least_vertices, seed=self.seed
-        )
+        check_at_least(1, resolution=self.resolution, n_surface_samples=self.n_surface_samples)
+        check_at_least(0, n_eigenpairs=self.n_eigenpairs, min_samples=self.min_samples)
+        check_at_least(0, least_vertices=self.least_vertices, seed=self.seed)
         check_one_of(get_args(Backend), backend=self.backend)
         if self.max_vertices is not None and self.max_vertices <= self.n_kept + 1:
             raise ValueError(

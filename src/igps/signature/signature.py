@@ -22,7 +22,13 @@ from igps.signature.attributes import interior_attributes, surface_attributes
 from igps.signature.config import SignatureConfig
 from igps.signature.laplacian import laplacian
 from igps.signature.mean_value import Extension
-from igps.signature.ordering import nearest_spacing, ordering_keys, vertex_area_shares
+from igps.signature.measures import measures
+from igps.signature.ordering import (
+    nearest_spacing,
+    ordering_keys,
+    spatial_ordering_keys,
+    vertex_area_shares,
+)
 from igps.signature.sampling import surface_points
 from igps.signature.voxels import interior_samples
 from igps.spectra import ConvergenceError, Spectrum, eigenpairs
@@ -120,6 +126,7 @@ class Signature:
         notes: changes made to the mesh, and fallbacks of the computation, in words.
         residual: largest residual of the eigenpairs, relative to the eigenvalue; NaN if unknown.
         unit: of length, such as "mm"; None if unknown.
+        measures: plain numbers by name, see `igps.measures`; none if it was not computed from a mesh.
     """
 
     eigenvalues: Floats
@@ -132,6 +139,7 @@ class Signature:
     notes: tuple[str, ...] = ()
     residual: float = math.nan
     unit: str | None = None
+    measures: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def barycentroid(self) -> Floats:
@@ -195,6 +203,8 @@ def compute_signature(
             f"{len(outer.vertices)}. Subdivide the mesh or lower n_eigenpairs."
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
+    if config.n_kept == 0:
+        return _without_eigenpairs(mesh, points, config)
     spectrum, notes = _spectrum(outer, config)
     eigenvalues = spectrum.eigenvalues
     functions = spectrum.eigenfunctions
@@ -228,6 +238,29 @@ def compute_signature(
         notes=(*mesh.notes, *notes),
         residual=residual,
         unit=mesh.unit,
+        measures=measures(mesh, points),
+    )
+
+
+def _without_eigenpairs(mesh: Mesh, points: Floats, config: SignatureConfig) -> Signature:
+    """Return samples, attributes and plain numbers alone."""
+    keys = spatial_ordering_keys(mesh)
+    surface = surface_points(mesh, config.n_surface_samples, config.seed, keys)
+
+    def samples(positions: Floats, attributes: Mapping[str, Singles]) -> Samples:
+        return Samples(positions, np.zeros((len(positions), 0), dtype=np.float32), attributes)
+
+    return Signature(
+        np.zeros(0),
+        samples(points, interior_attributes(mesh, points, config.attributes)),
+        samples(surface.positions, surface_attributes(mesh, surface.face, config.attributes)),
+        mesh.area,
+        mesh.volume,
+        config,
+        mesh.name,
+        notes=mesh.notes,
+        unit=mesh.unit,
+        measures=measures(mesh, points),
     )
 
 

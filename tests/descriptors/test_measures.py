@@ -1,0 +1,73 @@
+"""Plain numbers as a descriptor, from files to distances."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+
+import igps
+from igps.data.collation import collate
+from igps.data.transforms import Scale
+from igps.descriptors.measures import Measures
+from igps.mesh.mesh import Mesh
+from igps.signature.signature import SignatureConfig, compute_signature
+
+SPHERE = trimesh.creation.icosphere(subdivisions=3)
+CONFIG = SignatureConfig(n_eigenpairs=0)
+
+
+def ellipsoid(*semi_axes: float, unit: str | None = None) -> Mesh:
+    return Mesh(SPHERE.vertices * semi_axes, SPHERE.faces, unit=unit)
+
+
+def test_signatures_of_files_hold_the_numbers_of_their_meshes(tmp_path: Path) -> None:
+    for height in (1, 2):
+        tall = trimesh.Trimesh(SPHERE.vertices * [1, 1, height], SPHERE.faces)
+        tall.export(tmp_path / f"{height}.off")
+    described = igps.SignatureDataset(tmp_path, descriptor=Measures(), cache_dir=tmp_path / "cache")
+    assert described.precompute(progress=False, n_workers=1) == []
+    assert described.config.n_eigenpairs == 0
+    first, second = described.measures()
+    assert second["volume"] / first["volume"] == pytest.approx(2)
+    assert dict(described[1].signature.measures) == dict(second)
+    assert len(described[1].signature.eigenvalues) == 0
+
+
+def test_scaled_bodies_differ_by_their_size_alone() -> None:
+    bodies = [
+        ellipsoid(1, 2, 3),
+        ellipsoid(2, 4, 6),
+        ellipsoid(1, 1, 3),
+        ellipsoid(0.1, 0.2, 0.3, unit="cm"),
+    ]
+    batch = collate([compute_signature(body, CONFIG) for body in bodies])
+    found = igps.descriptor("measures")
+    first = found(batch)
+    same, other, in_centimetres = found.distances(first[:1], first[1:])[0].tolist()
+    assert max(same, in_centimetres) < 1e-3 < 0.1 < other
+    sized = igps.descriptor("measures", size="keep")
+    assert sized.name == "measures+size"
+    logarithms = sized(batch) * sized.spread
+    has_unit = torch.tensor(
+        [name not in ("extent", "convexity", "n_pieces", "euler_number") for name in sized.columns]
+    )
+    doubled = (logarithms[1] - logarithms[0])[has_unit]
+    torch.testing.assert_close(doubled, torch.full_like(doubled, math.log(2)), atol=1e-3, rtol=0)
+    torch.testing.assert_close(logarithms[3], logarithms[0], atol=1e-3, rtol=0)
+
+
+def test_a_scaled_signature_has_the_numbers_of_the_scaled_body() -> None:
+    scaled = Scale(smallest=2, largest=2, seed=0)(compute_signature(ellipsoid(1, 2, 3), CONFIG))
+    expected = compute_signature(ellipsoid(2, 4, 6), CONFIG)
+    assert dict(scaled.measures) == pytest.approx(dict(expected.measures))
+
+
+def test_bodies_without_numbers_are_refused() -> None:
+    bare = replace(compute_signature(ellipsoid(1, 2, 3), CONFIG), measures={})
+    with pytest.raises(ValueError, match=r"^measures: expected bodies with plain numbers"):
+        igps.descriptor("measures")(collate([bare]))
