@@ -143,7 +143,12 @@ class OfTensors(nn.Module):
         self.like = like
 
     def forward(
-        self, eigenvalues: Tensor, area: Tensor, volume: Tensor, kinds: dict[str, dict[str, Tensor]]
+        self,
+        eigenvalues: Tensor,
+        area: Tensor,
+        volume: Tensor,
+        kinds: dict[str, dict[str, Tensor]],
+        measures: Tensor,
     ) -> Tensor:
         own = ("points", "eigenfunctions", "mask")
         samples = {
@@ -153,11 +158,20 @@ class OfTensors(nn.Module):
             for kind, one in kinds.items()
         }
         return self.descriptor(
-            replace(self.like, eigenvalues=eigenvalues, area=area, volume=volume, **samples)
+            replace(
+                self.like,
+                eigenvalues=eigenvalues,
+                area=area,
+                volume=volume,
+                measures=measures,
+                **samples,
+            )
         )
 
 
-def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, Tensor, dict[str, dict[str, Tensor]]]:
+def tensors(
+    batch: SignatureBatch,
+) -> tuple[Tensor, Tensor, Tensor, dict[str, dict[str, Tensor]], Tensor]:
     """What `OfTensors` takes of a batch."""
     kinds = {
         kind: {
@@ -168,7 +182,8 @@ def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, Tensor, dict[str, di
         }
         for kind, one in (("interior", batch.interior), ("surface", batch.surface))
     }
-    return batch.eigenvalues, batch.area, batch.volume, kinds
+    measures = batch.area[:, None] if batch.measures is None else batch.measures
+    return batch.eigenvalues, batch.area, batch.volume, kinds, measures
 
 
 def exported(descriptor: nn.Module, batch: SignatureBatch) -> nn.Module:
@@ -179,7 +194,7 @@ def exported(descriptor: nn.Module, batch: SignatureBatch) -> nn.Module:
         kind: {name: {**some, 1: torch.export.Dim.AUTO} for name in one}
         for kind, one in given[3].items()
     }
-    shapes = (some, some, some, of_samples)
+    shapes = (some, some, some, of_samples, some)
     program = torch.export.export(
         OfTensors(descriptor, batch), given, dynamic_shapes=shapes, strict=False
     )

@@ -91,7 +91,8 @@ def signature(
     eigenvalues: NDArray[np.float64], interior: Samples, surface: Samples, of: Body
 ) -> Signature:
     config = SignatureConfig(n_eigenpairs=len(eigenvalues))
-    return Signature(eigenvalues, interior, surface, of.area, of.volume, config, of.id)
+    sizes = (of.area, of.volume)
+    return Signature(eigenvalues, interior, surface, *sizes, config, of.id, measures=of.measures)
 
 
 @cache

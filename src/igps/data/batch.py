@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import overload
 
 import numpy as np
@@ -15,6 +15,7 @@ from torch import Tensor
 from igps._arrays import Floats, Singles
 from igps.data.indices import Indices, resolve_indices, scalar_index
 from igps.mesh.mesh import Mesh
+from igps.signature.measures import POWERS
 from igps.signature.signature import Samples, Signature
 
 
@@ -115,6 +116,7 @@ class Body:
     volume: float  # of the body, length³
     id: str  # name
     surface_mesh: Mesh | None  # None if the batch has no meshes
+    measures: Mapping[str, float] = field(default_factory=dict)  # plain numbers by name, if known
 
     @property
     def mesh(self) -> Mesh:
@@ -264,6 +266,7 @@ class SignatureBatch:
             float(self.volume[i]),
             self.ids[i],
             mesh,
+            {} if self.measures is None else _known(self.measures[i]),
         )
 
 
@@ -296,6 +299,12 @@ def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
     )
     attributes = {name: _joined([part.attributes[name] for part in parts]) for name in names}
     return SampleBatch(points, eigenfunctions, mask, attributes)
+
+
+def _known(measures: Tensor) -> dict[str, float]:
+    """Return a row of measures by name, without those that are unknown."""
+    named = zip(POWERS, measures.tolist(), strict=True)
+    return {name: value for name, value in named if not math.isnan(value)}
 
 
 def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:

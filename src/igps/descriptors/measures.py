@@ -59,11 +59,10 @@ class Measures(Descriptor):
             raise ValueError(
                 "measures: expected bodies with plain numbers, got Signatures without them. Compute these from meshes."
             )
-        units = [millimetres(unit) for unit in batch.units or [None] * len(batch)]
-        size = batch.volume.pow(1 / 3)
-        factors = (
-            torch.tensor(units, dtype=size.dtype, device=size.device) if self.size else 1 / size
-        )
+        factors = 1 / batch.volume.pow(1 / 3)
+        if self.size:
+            units = batch.units or (None,) * len(batch)
+            factors = factors.new_tensor([millimetres(unit) for unit in units])
         names = list(POWERS)
         columns = []
         for name in self.columns:
