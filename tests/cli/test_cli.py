@@ -813,7 +813,7 @@ def test_completion_knows_commands_and_options(
     shell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The shell itself reads the script, and completes by it."""
-    run(monkeypatch, "completion", shell)
+    run(monkeypatch, "help", shell)
     script = capsys.readouterr().out
     assert all(word in script for word in ("retrieve", "doctor", "--mend", "--cache_dir"))
     program = shutil.which(shell)
@@ -823,7 +823,7 @@ def test_completion_knows_commands_and_options(
     path.write_text(script)
     subprocess.run([program, "-n", str(path)], check=True)
     typed = {
-        "igps comp": ["compare", "completion"],
+        "igps comp": ["compare"],
         "igps gallery r": ["remove"],
         "igps gallery build --des": ["--descriptor"],
         "igps doctor --js": ["--json"],

@@ -166,7 +166,7 @@ def test_every_command_that_reads_meshes_has_the_choice(
 
 def test_the_commands_that_read_no_meshes() -> None:
     """The demo makes its own; a report reads those of its results; the others read none."""
-    others = {"report", "demo", "completion", "help", "gallery remove", "gallery info"}
+    others = {"report", "demo", "help", "gallery remove", "gallery info"}
     assert set(COMMANDS) - set(READS) == others
 
 

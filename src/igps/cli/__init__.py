@@ -119,7 +119,7 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
 
 def _threads_of(command: Command) -> AbstractContextManager[object]:
     """Return the context in which a command runs: its numerical libraries take one thread in each process."""
-    if command.name in ("help", "completion"):
+    if command.name == "help":
         return contextlib.nullcontext()
     from igps._threads import one_thread
 

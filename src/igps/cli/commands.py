@@ -20,6 +20,7 @@ COMMANDS: Mapping[str, str] = {
     "compare": "igps.cli.compare:compare",
     "fit": "igps.cli.fit:fit",
     "classify": "igps.cli.fit:classify",
+    "inside": "igps.cli.inside:inside",
     "groups": "igps.cli.answers:groups",
     "explain": "igps.cli.answers:explain",
     "outliers": "igps.cli.answers:outliers",
@@ -34,7 +35,6 @@ COMMANDS: Mapping[str, str] = {
     "gallery info": "igps.cli.gallery:info",
     "precompute": "igps.cli.precompute:precompute",
     "demo": "igps.cli.demo:demo",
-    "completion": "igps.cli.completion:completion",
     "help": "igps.cli.help:show_help",
 }
 """Where the function of each command is. Its module imports other packages inside its functions, see `Command`."""
@@ -44,6 +44,7 @@ ENTRY_POINTS = "igps.commands"
 
 ENDINGS: Mapping[str, Sequence[str]] = {
     "extract": (".csv", ".parquet", ".npz"),
+    "inside": (".csv", ".parquet"),
     "fit": (".safetensors", ""),
     "precompute": (".igps",),
     "classify": (".csv",),

@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from igps._arrays import Booleans, Floats
+from igps._arrays import Floats
 from igps.data.attributes import AttributeSource
+from igps.data.grids import is_known
 from igps.data.keys import content_digest
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of, field_packages, stat_key
@@ -31,7 +31,6 @@ from igps.mesh.options import LoadOptions
 
 logger = logging.getLogger(__name__)
 
-_MAX_VALUE = 1e15  # larger values are placeholders for missing values, such as 7e18 at the border of some grids
 _MAX_MISSING_SHARE = 0.1
 
 
@@ -218,8 +217,3 @@ def fill_missing(values: Floats, points: Floats, label: str) -> Floats:
         values = values.copy()
         values[~known] = values[known][nearest]
     return values
-
-
-def is_known(values: NDArray[Any]) -> Booleans:
-    """Return which values are finite and no placeholders for missing values."""
-    return np.isfinite(values) & (np.abs(values) < _MAX_VALUE)

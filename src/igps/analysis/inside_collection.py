@@ -1,0 +1,153 @@
+"""Where inside the bodies of a collection attributes lie: cached rows, and remarks on what they cannot tell."""
+
+import contextlib
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from igps._arrays import Floats
+from igps._parallel import on_threads
+from igps.analysis.inside import (
+    MIN_SAMPLES,
+    REQUIREMENTS,
+    VERSION,
+    column_names,
+    has_unit,
+    inside_numbers,
+)
+from igps.data.attribute_sources import FileAttribute
+from igps.data.cache import Record
+from igps.data.dataset import Failure, SignatureDataset
+from igps.data.keys import derived_key
+from igps.mesh.errors import MeshError
+from igps.signature.config import SignatureConfig
+
+# Bodies of one kind hardly differ this much in the spread of one quantity, but units do: metres and millimetres, or
+# shares and Hounsfield units
+_MAX_RATIO = 30.0
+
+
+def inside_config(config: SignatureConfig) -> SignatureConfig:
+    """Return a configuration with what the numbers need."""
+    n_samples = max(config.min_samples, MIN_SAMPLES)
+    return REQUIREMENTS.apply_to(replace(config, min_samples=n_samples))
+
+
+@dataclass(frozen=True, eq=False)
+class InsideTable:
+    """Numbers that tell where inside N bodies attributes lie."""
+
+    attributes: tuple[str, ...]
+    columns: tuple[str, ...]  # names of the numbers, see `column_names`
+    rows: Floats  # (N, columns), NaN where a number is not defined
+
+    def column(self, name: str) -> Floats:
+        """Return the numbers (N,) of a column."""
+        return self.rows[:, self.columns.index(name)]
+
+    def without_units(self) -> Floats:
+        """Return the numbers that only tell where values lie, as standard scores; (N, 0) if none varies.
+
+        A column with NaN, or without variation, is left out.
+        """
+        chosen = [i for i, name in enumerate(self.columns) if not has_unit(name)]
+        numbers = self.rows[:, chosen]
+        spread = numbers.std(axis=0)
+        kept = spread > 0  # not if NaN
+        return (numbers[:, kept] - numbers[:, kept].mean(axis=0)) / spread[kept]
+
+
+def inside_table(
+    dataset: SignatureDataset,
+    attributes: Sequence[str],
+    *,
+    failures: list[Failure] | None = None,
+    n_workers: int | None = None,
+) -> InsideTable:
+    """Return where inside the bodies of a dataset its attributes lie, from the cache where they are known.
+
+    Args:
+        dataset: N bodies with `inside_config` and the attributes.
+        attributes: their names.
+        failures: a list that receives the bodies without numbers; their rows are NaN. If None, the first raises.
+        n_workers: number of threads.
+
+    Raises:
+        MeshError: a body has no numbers, and `failures` is None.
+    """
+    names = column_names(attributes)
+    keys = dataset.cached_keys()
+    cache = dataset.pipeline.cache("description")
+
+    def row(i: int) -> Floats | str:
+        key = keys[i] and derived_key("inside", keys[i], VERSION, list(attributes))
+        known = None if key is None else cache.get(key, lambda record: record.arrays["numbers"])
+        if known is not None:
+            return known
+        try:
+            numbers = inside_numbers(dataset[i].signature, attributes)
+        except ValueError as error:
+            return str(error)
+        found = np.array([numbers[name] for name in names])
+        if key is not None:
+            with contextlib.suppress(OSError):  # a cache that is not writable only costs time
+                cache.put(key, Record({"numbers": found}))
+        return found
+
+    rows = []
+    for i, found in enumerate(on_threads(row, range(len(dataset)), n_workers)):
+        if isinstance(found, str):
+            if failures is None:
+                raise MeshError(found)
+            failures.append(Failure.of(dataset.bodies, i, found))
+            found = np.full(len(names), np.nan)
+        rows.append(found)
+    return InsideTable(tuple(attributes), tuple(names), np.array(rows))
+
+
+def remarks(dataset: SignatureDataset, table: InsideTable) -> Iterator[str]:
+    """Yield a sentence for each thing that makes numbers of an attribute undefined, or not comparable."""
+    names = dataset.bodies.names
+    for attribute in table.attributes:
+        mean = table.column(f"{attribute}.mean")
+        spread = table.column(f"{attribute}.sd")
+        is_constant = np.isfinite(mean) & np.isnan(table.column(f"{attribute}.moran"))
+        if is_constant.any():
+            first = names[int(np.argmax(is_constant))]
+            yield (
+                f"{attribute} is constant in {is_constant.sum()} of {len(names)} bodies, such as {first}: "
+                "numbers that compare its values are left out."
+            )
+        varying = np.flatnonzero(np.isfinite(spread) & ~is_constant)
+        if not len(varying):
+            continue
+        middle = np.median(spread[varying])
+        ratio = np.maximum(spread[varying] / middle, middle / spread[varying])
+        worst = varying[int(np.argmax(ratio))]
+        if ratio.max() > _MAX_RATIO:
+            yield (
+                f"{attribute} varies by {spread[worst]:.3g} in {names[worst]}, but by {middle:.3g} in most bodies: "
+                "its unit seems to differ. Give all in one unit; until then use no mean, sd or quantile."
+            )
+        yield from _shared_files(dataset, attribute)
+
+
+def _shared_files(dataset: SignatureDataset, attribute: str) -> Iterator[str]:
+    """Yield a sentence if one image serves bodies of several files, and is thus not of every subject."""
+    source = dataset.pipeline.attributes.get(attribute)
+    if not isinstance(source, FileAttribute):
+        return
+    bodies_of: dict[str, set[Path]] = defaultdict(set)
+    for body in dataset.bodies:
+        bodies_of[source.cache_tag(body)].add(body.path)
+    for files in bodies_of.values():
+        if len(files) > 1:
+            first, second = sorted(files)[:2]
+            yield (
+                f"{attribute} of {first.name} and of {second.name} is the same image: one of both is of another "
+                "subject, unless the files show the same one. Check the pattern."
+            )
+            return

@@ -1,0 +1,95 @@
+"""The command `igps inside`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from igps.analysis.inside_collection import InsideTable
+    from igps.cli.reading import Folder
+    from igps.data.dataset import Failure, SignatureDataset
+    from igps.data.sources import Bodies
+
+_SHOWN = ("mean", "rim.contrast", "core.contrast", "ends.contrast", "axis1.correlation", "moran")
+_N_SHOWN = 20  # bodies
+
+
+def inside(meshes: list[Path], out: Path | None = None, **reading: Any) -> list[dict[str, Any]]:
+    """Tell where in each body the values of --attribute lie, in numbers that do not depend on pose.
+
+    For each attribute, a row of the table has the mean, spread and quantiles in the core, the middle and the ends of
+    the body, and from its rim to its depth; contrasts; correlations with the first axes of the body; how alike values
+    are at small, middle and large interior distance; and the share of the brightest tenth in each class. For two
+    attributes, it has their joint distribution.
+
+    Args:
+        meshes: a folder of bodies, or files.
+        out: file ending in .csv or .parquet for the table: a row per body, with the columns file, part, name, class,
+            further columns of labels.csv, unit, volume, area, and all numbers.
+    """
+    from igps.cli.feature_table import feature_table, write_table
+    from igps.cli.reading import files_or_folder, print_failures
+
+    dataset, table, failures = inside_bodies(files_or_folder(meshes), **reading)
+    rows = []
+    for name, numbers in zip(dataset.bodies.names, table.rows.tolist(), strict=True):
+        defined = (None if number != number else number for number in numbers)
+        rows.append({"name": name, **dict(zip(table.columns, defined, strict=True))})
+    if out is not None:
+        metadata, measured = feature_table(dataset, table.rows[:, :0])
+        columns = {name: [row[name] for row in rows] for name in table.columns}
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_table(out, {**metadata, **measured, **columns})
+    print(_text(rows, table.attributes))
+    print_failures(failures, len(rows))
+    if out is not None:
+        print(f"{len(table.columns)} numbers of {len(rows)} bodies written to {out}")
+    return rows
+
+
+def inside_bodies(
+    source: Folder | Sequence[Path] | Bodies, **reading: Any
+) -> tuple[SignatureDataset, InsideTable, list[Failure]]:
+    """Return the bodies that could be used, where inside them the attributes lie, and the failures of the others.
+
+    Remarks on the numbers are printed. A ValueError is raised if there is no attribute.
+    """
+    from igps.analysis.inside_collection import inside_config, inside_table, remarks
+    from igps.cli.reading import signatures
+    from igps.signature.config import SignatureConfig
+
+    if not reading.get("attribute"):
+        raise ValueError(
+            "attribute: expected at least one, such as --attribute ct=images/{stem}.nii.gz, got none."
+        )
+    config = inside_config(reading.pop("signature", SignatureConfig()))
+    dataset, failures = signatures(source, signature=config, **reading)
+    unusable: list[Failure] = []
+    attributes = tuple(dataset.pipeline.attributes)
+    n_workers = reading.get("n_workers")
+    table = inside_table(dataset, attributes, failures=unusable, n_workers=n_workers)
+    for remark in remarks(dataset, table):
+        print(remark)
+    return dataset, table, [*failures, *unusable]
+
+
+def _text(rows: Sequence[dict[str, Any]], attributes: Sequence[str]) -> str:
+    """Return a text table of the numbers that tell most, with one line per body."""
+    shown = rows[:_N_SHOWN]
+    width = max(len(row["name"]) for row in shown)
+    lines = []
+    for attribute in attributes:
+        titles = [f"{attribute}.{number}" for number in _SHOWN]
+        widths = [max(len(title), 9) + 2 for title in titles]
+        head = "".join(f"{title:>{w}}" for title, w in zip(titles, widths, strict=True))
+        lines.append(" " * width + head)
+        for row in shown:
+            cells = ("–" if row[title] is None else f"{row[title]:.4g}" for title in titles)
+            numbers = "".join(f"{cell:>{w}}" for cell, w in zip(cells, widths, strict=True))
+            lines.append(f"{row['name']:<{width}}{numbers}")
+    if len(rows) > len(shown):
+        lines.append(f"the first {len(shown)} of {len(rows)} bodies; --out writes all")
+    return "\n".join(lines)
