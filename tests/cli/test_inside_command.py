@@ -124,3 +124,32 @@ def test_a_body_of_three_voxels_and_no_attribute_are_refused_with_a_sentence(
     with pytest.raises(SystemExit):
         igps(monkeypatch, tmp_path, "inside", tmp_path)
     assert "attribute: expected at least one" in capsys.readouterr().err
+
+
+def test_groups_tests_where_the_signal_lies_beside_shape(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two groups of equal form and equal values, which lie at the rim in one and in the core of the other."""
+    random = np.random.default_rng(0)
+    for i in range(14):
+        folder = tmp_path / "bodies" / ("rim", "core")[i % 2]
+        scale = random.uniform(0.95, 1.05)
+        away = radius(scale) if i % 2 else -radius(scale)
+        image = np.argsort(np.argsort(away, axis=None)).reshape(SHAPE) + random.normal(size=SHAPE)
+        write(folder / f"{i}.nii.gz", (radius(scale) < 1).astype(np.uint8))
+        write(tmp_path / "bodies" / "ct" / f"{i}.nii.gz", image.astype(np.float32))
+    words = ["groups", tmp_path / "bodies", "--attribute", "ct=ct/{stem}.nii.gz", "--inside"]
+    words += ["--descriptor", "shape_dna", "--n_permutations", 499, "--out", tmp_path / "out"]
+    igps(monkeypatch, tmp_path, *words)
+    printed = capsys.readouterr().out
+    with (tmp_path / "out" / "groups.csv").open(newline="") as file:
+        rows = {row["body"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"all", "all, inside", *(f"all, {name}" for name in column_names(["ct"]))}
+    assert float(rows["all"]["permanova_p"]) > 0.05
+    assert float(rows["all, inside"]["permanova_p"]) <= 0.01
+    assert float(rows["all, ct.rim.contrast"]["permanova_q"]) <= 0.01
+    n_numbers = len(column_names(["ct"]))
+    assert f"the first of {n_numbers} numbers, q over all of them" in printed
+    with pytest.raises(SystemExit):
+        igps(monkeypatch, tmp_path, "groups", tmp_path / "bodies", "--inside")
+    assert "attribute: expected at least one" in capsys.readouterr().err

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from igps._arrays import Floats
+from igps._arrays import Booleans, Floats
 from igps._parallel import on_threads
 from igps.analysis.inside import (
     MIN_SAMPLES,
@@ -28,6 +28,7 @@ from igps.signature.config import SignatureConfig
 # Bodies of one kind hardly differ this much in the spread of one quantity, but units do: metres and millimetres, or
 # shares and Hounsfield units
 _MAX_RATIO = 30.0
+_ROUNDING = 1e-9  # relative; numbers that vary less do not vary
 
 
 def inside_config(config: SignatureConfig) -> SignatureConfig:
@@ -48,16 +49,35 @@ class InsideTable:
         """Return the numbers (N,) of a column."""
         return self.rows[:, self.columns.index(name)]
 
-    def without_units(self) -> Floats:
-        """Return the numbers that only tell where values lie, as standard scores; (N, 0) if none varies.
+    def subset(self, indices: Sequence[int]) -> "InsideTable":
+        """Return the rows of some of the bodies."""
+        return replace(self, rows=self.rows[list(indices)])
 
-        A column with NaN, or without variation, is left out.
+    def known(self, name: str) -> tuple[Booleans, Floats]:
+        """Return which bodies have a number (N,), and the numbers (those bodies, 1)."""
+        numbers = self.column(name)
+        is_known = np.isfinite(numbers)
+        return is_known, numbers[is_known, None]
+
+    def scores(self) -> tuple[Booleans, Floats]:
+        """Return which bodies have all numbers without a unit (N,), and these numbers as standard scores.
+
+        Numbers that do not vary between bodies are left out.
         """
         chosen = [i for i, name in enumerate(self.columns) if not has_unit(name)]
         numbers = self.rows[:, chosen]
-        spread = numbers.std(axis=0)
-        kept = spread > 0  # not if NaN
-        return (numbers[:, kept] - numbers[:, kept].mean(axis=0)) / spread[kept]
+        is_whole = np.isfinite(numbers).all(axis=1)
+        return is_whole, standard_scores(numbers[is_whole])
+
+
+def standard_scores(numbers: Floats) -> Floats:
+    """Return the columns of numbers (N, D) that vary, with mean 0 and standard deviation 1."""
+    if not len(numbers):
+        return numbers
+    spread = numbers.std(axis=0)
+    size = np.abs(numbers).max(axis=0)
+    varies = spread > _ROUNDING * size
+    return (numbers[:, varies] - numbers[:, varies].mean(axis=0)) / spread[varies]
 
 
 def inside_table(

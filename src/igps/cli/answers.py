@@ -12,6 +12,7 @@ from igps.cli.options import Size
 
 if TYPE_CHECKING:
     from igps.analysis.explanation import Explanation
+    from igps.analysis.groups import GroupTest
     from igps.data.dataset import SignatureDataset
     from igps.data.sources import Bodies
     from igps.report.answers import Painted
@@ -21,6 +22,8 @@ _LEGEND = "share of the distance, over that of an even spread"
 CALIBRATED = "pretrained"
 """The only descriptor whose distances are calibrated, see `igps.duplicates.calibration`."""
 
+_N_NUMBERS = 10  # of `igps groups --inside`, those that are printed
+
 
 def groups(
     root: Path,
@@ -29,6 +32,7 @@ def groups(
     strata: str | None = None,
     covariate: list[str] | None = None,
     test_size: bool = False,
+    inside: bool = False,
     out: Path | None = None,
     n_permutations: int = 10_000,
     seed: int = 0,
@@ -45,6 +49,8 @@ def groups(
         strata: column of labels.csv, such as scanner; bodies are permuted only among those with the same value.
         covariate: columns that are regressed out first: numeric, such as age, or categorical, such as sex.
         test_size: also test the size (the logarithm of the volume), in separate lines
+        inside: also test where inside the bodies the values of --attribute lie, all numbers of igps inside
+            without a unit at once, and each number by itself, with false discovery rates over the numbers.
         out: folder for groups.csv, groups.json, and the effects as groups.svg and groups.png.
         n_permutations: number of random permutations.
         seed: seed of the permutations, bootstraps and folds.
@@ -53,7 +59,8 @@ def groups(
     from tqdm import tqdm
 
     from igps.analysis.groups import group_test, with_q_values
-    from igps.cli.reading import Folder, described, is_named_after_file, print_failures
+    from igps.cli.inside import check_has_attribute, inside_vectors
+    from igps.cli.reading import Folder, described, print_failures
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import keeps_size
     from igps.mesh.mesh import millimetres
@@ -62,6 +69,8 @@ def groups(
 
     check_at_least(1, n_permutations=n_permutations)
     check_seed(seed)
+    if inside:
+        check_has_attribute(reading)
 
     def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
         labels = np.array(bodies.labels if group is None else bodies.column(group))
@@ -85,6 +94,53 @@ def groups(
         vectors[", size"] = np.log(
             [[s.volume * millimetres(s.unit) ** 3] for s in result.dataset.signatures()]
         )
+    members = _members(bodies, labels)
+    jobs = [
+        (body + suffix, i, rows[i])
+        for body, i in members.items()
+        for suffix, rows in vectors.items()
+    ]
+    by_number: list[tuple[str, list[int], Any]] = []
+    if inside:
+        whole, by_number = inside_vectors(folder, bodies, members, **reading)
+        jobs += whole
+
+    def tested(jobs: list[tuple[str, list[int], Any]]) -> list[GroupTest]:
+        found = []
+        for body, i, rows in tqdm(jobs, desc="tests"):
+            test = group_test(
+                rows,
+                labels[i].tolist(),
+                body=body,
+                n_permutations=n_permutations,
+                seed=seed,
+                strata=None if stratum is None else stratum[i].tolist(),
+                covariates=None if covariates is None else covariates[i],
+            )
+            found.append(test)
+        return with_q_values(found)
+
+    tests = tested(jobs)
+    numbers = tested(by_number)
+    print(groups_table(tests))
+    if numbers:
+        numbers.sort(key=lambda test: 1 if test.permanova_p is None else test.permanova_p)
+        print(f"\nthe first of {len(numbers)} numbers, q over all of them")
+        print(groups_table(numbers[:_N_NUMBERS]))
+    print_failures(result.failures, len(bodies))
+    if out is not None:
+        rows = [asdict(test) for test in [*tests, *numbers]]
+        for row in rows:
+            row["sizes"] = " ".join(f"{name}:{count}" for name, count in row["sizes"].items())
+        write_analysis(out, "groups", rows, groups_figure(tests))
+        print(f"written to {out}")
+    return [asdict(test) for test in [*tests, *numbers]]
+
+
+def _members(bodies: Bodies, labels: Any) -> dict[str, list[int]]:
+    """Return the indices of the bodies of each kind, such as an organ; "all" if the parts are no kinds."""
+    from igps.cli.reading import is_named_after_file
+
     members: dict[str, list[int]] = {}
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
@@ -95,35 +151,8 @@ def groups(
     if is_named_by_file or n_pairs == len(members) in (len(set(labels)), len(bodies)):
         # The parts are not organs: they are the groups, or the names of files with one mask each, which may repeat in
         # each group
-        members = {"all": list(range(len(bodies)))}
-    jobs = [
-        (body + suffix, i, rows[i])
-        for body, i in members.items()
-        for suffix, rows in vectors.items()
-    ]
-    tests = with_q_values(
-        [
-            group_test(
-                rows,
-                labels[i].tolist(),
-                body=body,
-                n_permutations=n_permutations,
-                seed=seed,
-                strata=None if stratum is None else stratum[i].tolist(),
-                covariates=None if covariates is None else covariates[i],
-            )
-            for body, i, rows in tqdm(jobs, desc="tests")
-        ]
-    )
-    print(groups_table(tests))
-    print_failures(result.failures, len(bodies))
-    if out is not None:
-        rows = [asdict(test) for test in tests]
-        for row in rows:
-            row["sizes"] = " ".join(f"{name}:{count}" for name, count in row["sizes"].items())
-        write_analysis(out, "groups", rows, groups_figure(tests))
-        print(f"written to {out}")
-    return [asdict(test) for test in tests]
+        return {"all": list(range(len(bodies)))}
+    return members
 
 
 def _design(bodies: Bodies, name: str) -> Any:

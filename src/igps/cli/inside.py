@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from igps.analysis.inside_collection import InsideTable
     from igps.cli.reading import Folder
@@ -61,10 +62,7 @@ def inside_bodies(
     from igps.cli.reading import signatures
     from igps.signature.config import SignatureConfig
 
-    if not reading.get("attribute"):
-        raise ValueError(
-            "attribute: expected at least one, such as --attribute ct=images/{stem}.nii.gz, got none."
-        )
+    check_has_attribute(reading)
     config = inside_config(reading.pop("signature", SignatureConfig()))
     dataset, failures = signatures(source, signature=config, **reading)
     unusable: list[Failure] = []
@@ -74,6 +72,46 @@ def inside_bodies(
     for remark in remarks(dataset, table):
         print(remark)
     return dataset, table, [*failures, *unusable]
+
+
+def check_has_attribute(reading: Mapping[str, Any]) -> None:
+    """Raise a ValueError if the options of reading name no attribute."""
+    if not reading.get("attribute"):
+        raise ValueError(
+            "attribute: expected at least one, such as --attribute ct=images/{stem}.nii.gz, got none."
+        )
+
+
+Vectors = tuple[str, list[int], Any]
+"""A title, the indices of N bodies, and their vectors (N, D)."""
+
+
+def inside_vectors(
+    source: Folder, bodies: Bodies, members: Mapping[str, list[int]], **reading: Any
+) -> tuple[list[Vectors], list[Vectors]]:
+    """Return what `igps groups` tests inside bodies; a body whose numbers are not defined is left out.
+
+    Args:
+        source: where the bodies are read.
+        bodies: the bodies that are tested.
+        members: indices of the bodies of each kind, such as an organ.
+
+    Returns:
+        All numbers without a unit at once, as standard scores, for each kind; and each number by itself.
+    """
+    dataset, table, _ = inside_bodies(source, **reading)
+    row_of = {name: row for row, name in enumerate(dataset.bodies.names)}
+    whole: list[Vectors] = []
+    by_number: list[Vectors] = []
+    for kind, indices in members.items():
+        own = [i for i in indices if bodies.names[i] in row_of]
+        part = table.subset([row_of[bodies.names[i]] for i in own])
+        is_whole, scores = part.scores()
+        whole.append((f"{kind}, inside", list(compress(own, is_whole)), scores))
+        for name in table.columns:
+            is_known, numbers = part.known(name)
+            by_number.append((f"{kind}, {name}", list(compress(own, is_known)), numbers))
+    return whole, by_number
 
 
 def _text(rows: Sequence[dict[str, Any]], attributes: Sequence[str]) -> str:
