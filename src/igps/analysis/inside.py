@@ -117,7 +117,7 @@ class _Places:
     @staticmethod
     def of(signature: Signature) -> "_Places":
         samples = signature.interior
-        embedded = samples.eigenfunctions / np.sqrt(signature.eigenvalues)
+        embedded = np.asarray(samples.eigenfunctions / np.sqrt(signature.eigenvalues))
         potential = np.square(embedded).sum(axis=1)
         depth = samples.attributes["depth"]
         classes = _thirds(potential, BY_POTENTIAL) | _thirds(depth, BY_DEPTH)
@@ -129,7 +129,7 @@ class _Places:
         return _Places(classes, centred, _pair_classes(embedded, paired))
 
 
-def _thirds(values: Singles, names: Sequence[str]) -> dict[str, Booleans]:
+def _thirds(values: Floats | Singles, names: Sequence[str]) -> dict[str, Booleans]:
     """Return the samples with the lowest, middle and highest third of values, by name."""
     ranks = np.empty(len(values), dtype=np.int64)
     ranks[np.argsort(values, kind="stable")] = np.arange(len(values))
@@ -150,7 +150,7 @@ def _axes(eigenvalues: Floats) -> list[list[int]]:
     return axes
 
 
-def _pair_classes(embedded: Singles, chosen: Integers) -> dict[str, tuple[Integers, Integers]]:
+def _pair_classes(embedded: Floats, chosen: Integers) -> dict[str, tuple[Integers, Integers]]:
     """Return the pairs of chosen samples at small, middle and large interior distance, by name."""
     distances = pdist(embedded[chosen])
     bounds = np.quantile(distances, _PAIR_SHARES)
@@ -215,8 +215,8 @@ def _multiple_correlation(values: Floats, modes: Floats) -> float:
     """Return the coefficient, 0 to 1, of the best linear prediction of values (P,) by modes (P, m) of mean 0."""
     centred = values - values.mean()
     weights = np.linalg.lstsq(modes, centred, rcond=None)[0]
-    explained = np.linalg.norm(modes @ weights) / np.linalg.norm(centred)
-    return float(min(explained, 1.0))
+    explained = float(np.linalg.norm(modes @ weights) / np.linalg.norm(centred))
+    return min(explained, 1.0)
 
 
 def _spatial(values: Floats, places: _Places) -> dict[str, float]:

@@ -66,7 +66,7 @@ class InsideTable:
         """
         chosen = [i for i, name in enumerate(self.columns) if not has_unit(name)]
         numbers = self.rows[:, chosen]
-        is_whole = np.isfinite(numbers).all(axis=1)
+        is_whole = np.asarray(np.isfinite(numbers).all(axis=1))
         return is_whole, standard_scores(numbers[is_whole])
 
 
@@ -103,7 +103,10 @@ def inside_table(
     cache = dataset.pipeline.cache("description")
 
     def row(i: int) -> Floats | str:
-        key = keys[i] and derived_key("inside", keys[i], VERSION, list(attributes))
+        whole_key = keys[i]
+        key = None
+        if whole_key is not None:
+            key = derived_key("inside", whole_key, VERSION, list(attributes))
         known = None if key is None else cache.get(key, lambda record: record.arrays["numbers"])
         if known is not None:
             return known
