@@ -1,6 +1,7 @@
 """Read a file: list its bodies, and make a closed surface of each."""
 
 import logging
+import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,7 @@ from igps.mesh.mending import mend
 from igps.mesh.mesh import Mesh, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.raw_body import RawBody, joined, pieces
-from igps.mesh.surface import compact, diagonal, face_parts
+from igps.mesh.surface import compact, diagonal, face_areas, face_parts
 
 logger = logging.getLogger(__name__)
 
@@ -200,7 +201,10 @@ def surface_body(
         denoise=raw.denoise,
         name=name,
     )
-    return mesh.annotated(notes=notes, unit=raw.unit, frame=raw.frame)
+    # Of another surface, such as one of the pieces, the area is not known
+    is_same = math.isclose(mesh.area, face_areas(raw.vertices, raw.faces).sum(), rel_tol=1e-6)
+    fine_area = raw.fine_area if is_same else None
+    return mesh.annotated(notes=notes, unit=raw.unit, frame=raw.frame, fine_area=fine_area)
 
 
 def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:

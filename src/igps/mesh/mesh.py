@@ -116,6 +116,7 @@ class Mesh:
         unit: unit of length, such as "mm"; None if unknown.
         cavities: accept closed surfaces inside the largest, oriented inward, which bound hollows of the body.
         frame: "RAS" if x points to the patient's right, y to the front and z up; None if this is not known.
+        fine_area: area, length², of the finer surface that these triangles stand for, which `area` then returns.
 
     Raises:
         MeshError: no faces, NaN or infinite vertices, out-of-range or repeated indices, unreferenced vertices,
@@ -131,6 +132,7 @@ class Mesh:
     unit: str | None = None
     cavities: bool = False
     frame: Frame = None
+    fine_area: float | None = None
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64, order="C")
@@ -155,11 +157,19 @@ class Mesh:
         vars(self).update(vertices=vertices, faces=faces)  # the class is frozen
 
     def annotated(
-        self, *, notes: tuple[str, ...] = (), unit: str | None = None, frame: Frame = None
+        self,
+        *,
+        notes: tuple[str, ...] = (),
+        unit: str | None = None,
+        frame: Frame = None,
+        fine_area: float | None = None,
     ) -> Self:
-        """Return the mesh with `notes` before its own, and with `unit` and `frame` unless None, not checked again."""
+        """Return the mesh with `notes` before its own, and with the others unless None, not checked again."""
         return self._changed(
-            notes=(*notes, *self.notes), unit=unit or self.unit, frame=frame or self.frame
+            notes=(*notes, *self.notes),
+            unit=unit or self.unit,
+            frame=frame or self.frame,
+            fine_area=fine_area or self.fine_area,
         )
 
     def numbered_by_faces(self) -> Self:
@@ -182,12 +192,16 @@ class Mesh:
         outermost = int(np.argmax(volumes))
         vertices, faces = surfaces[outermost]
         _, surface_of_vertex = components(self.faces, len(self.vertices))
-        body = replace(self, vertices=vertices, faces=faces, cavities=False)
+        body = replace(self, vertices=vertices, faces=faces, cavities=False, fine_area=None)
         return body, surface_of_vertex == outermost
 
-    @cached_property
+    @property
     def area(self) -> float:
-        """Surface area, length²."""
+        """Surface area, length²: `fine_area` if it is known, else the sum over the triangles."""
+        return self._area_of_triangles if self.fine_area is None else self.fine_area
+
+    @cached_property
+    def _area_of_triangles(self) -> float:
         return float(face_areas(self.vertices, self.faces).sum())
 
     @property

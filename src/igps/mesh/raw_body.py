@@ -54,6 +54,7 @@ class RawBody:
         True  # whether the surface may be noisy; False if it was computed from voxels or atoms
     )
     frame: Frame = None  # see `Mesh`
+    fine_area: float | None = None  # see `Mesh`
     number: str | None = None  # of a label, by which it is found like by its name
 
     def made(self) -> RawBody:
@@ -85,6 +86,7 @@ def deferred(
             voxels=voxels,
             denoise=False,
             frame=mesh.frame,
+            fine_area=mesh.fine_area,
         )
 
     return RawBody(part=part, make=compute)

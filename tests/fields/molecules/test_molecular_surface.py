@@ -181,6 +181,31 @@ def test_a_simplified_surface_keeps_the_volume() -> None:
     assert fewer.volume == pytest.approx(whole.volume, rel=0.01)
 
 
+def test_a_simplified_surface_has_the_area_of_the_fine_one() -> None:
+    body = molecule(chain(60), np.full(60, 1.7))
+    fine = molecular_surface(body, max_vertices=None)
+    coarse = molecular_surface(body, max_vertices=60)
+    assert coarse.area == fine.area
+    triangles = coarse.vertices[coarse.faces]
+    sides = triangles[:, 1:] - triangles[:, :1]
+    own = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
+    assert abs(own / fine.area - 1) > 0.01
+
+
+def test_the_accessible_area_is_that_of_points_which_no_other_ball_covers() -> None:
+    at = chain(40, seed=1)
+    found = molecular_surface(molecule(at, np.full(40, 1.7)), "accessible").area
+    directions = np.random.default_rng(0).normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    n_free = 0
+    for i, centre in enumerate(at):
+        distance = np.linalg.norm(
+            centre + 3.1 * directions[:, None] - np.delete(at, i, axis=0), axis=2
+        )
+        n_free += int((distance > 3.1).all(axis=1).sum())
+    assert found == pytest.approx(4 * np.pi * 3.1**2 * n_free / 4000, rel=0.01)
+
+
 def test_stray_atoms_are_named_with_the_remedy() -> None:
     with pytest.raises(
         MeshError, match=r"balls: expected a grid of .* Raise the spacing, or remove stray atoms"

@@ -287,6 +287,23 @@ def _is_covered(balls: Balls, i: int, x: float, y: float, z: float) -> bool:
 
 
 @compiled()
+def exposed_areas(balls: Balls, directions: Floats) -> Floats:
+    """Return the area of each sphere outside all other balls, by the share of its points in these directions (M, 3)."""
+    areas = np.zeros(len(balls.radii))
+    for i in range(len(areas)):
+        radius = balls.radii[i]
+        n_exposed = 0
+        for n in range(len(directions)):
+            x = balls.centres[i, 0] + radius * directions[n, 0]
+            y = balls.centres[i, 1] + radius * directions[n, 1]
+            z = balls.centres[i, 2] + radius * directions[n, 2]
+            if not _is_covered(balls, i, x, y, z):
+                n_exposed += 1
+        areas[i] = 4 * math.pi * radius**2 * n_exposed / len(directions)
+    return areas
+
+
+@compiled()
 def _reduce_by_arc(
     distance: Singles,
     waiting: Booleans,
