@@ -25,6 +25,7 @@ from outcome import Row, table
 _AMOUNTS: dict[str, tuple[int, int | None]] = {
     "broken_meshes": (10_000, 200),
     "broken_bodies": (3_000, 90),
+    "changed_streams": (2_000, 20),
     "kills": (200, 8),
     "gallery_kills": (200, 8),
     "machine_faults": (0, None),
@@ -36,7 +37,7 @@ _AMOUNTS: dict[str, tuple[int, int | None]] = {
 # kills and all properties keep one core busy.
 _STAGES = (
     (("broken_meshes",),),
-    (("broken_bodies",),),
+    (("broken_bodies",), ("changed_streams",)),
     (("kills",), ("properties", "machine_faults", "gallery_kills")),
 )
 

@@ -504,3 +504,40 @@ def test_tables_of_names_as_spreadsheets_save_them(
 def test_a_table_of_names_in_cp1252(tmp_path: Path) -> None:
     (tmp_path / "names.csv").write_bytes("label,name\n1,Brücke\n".encode("cp1252"))
     assert read_label_names(tmp_path / "names.csv") == {1: "Brücke"}
+
+
+@pytest.mark.parametrize("name", ["ball.vtp", "ball.vtk"])
+def test_a_file_that_lost_its_cells_is_no_cloud_of_points(name: str, tmp_path: Path) -> None:
+    """Damage of one letter left the points alone, and a surface was made around them."""
+    points = trimesh.creation.icosphere(subdivisions=2).vertices
+    numbers = " ".join(f"{x:.6f}" for x in points.ravel())
+    text = (
+        f"# vtk DataFile Version 3.0\nball\nASCII\nDATASET POLYDATA\nPOINTS {len(points)} float\n"
+    )
+    text += f"{numbers}\nPOLYGANS 1 4\n3 0 1 2\n"
+    if name.endswith("vtp"):
+        counts = f'NumberOfPoints="{len(points)}" NumberOfPolys="320"'
+        array = (
+            f'<DataArray type="Float32" NumberOfComponents="3" format="ascii">{numbers}</DataArray>'
+        )
+        text = f'<VTKFile type="PolyData"><PolyData><Piece {counts}><Points>{array}</Points>'
+        text += "<Palys/></Piece></PolyData></VTKFile>"
+    (tmp_path / name).write_text(text)
+    with pytest.raises(MeshError, match=r"320 polys are declared, 0 are there|got 'POLYGANS'"):
+        load_mesh(tmp_path / name)
+
+
+def test_a_byte_order_that_damage_has_changed_is_refused(tmp_path: Path) -> None:
+    points = np.zeros((3, 3), np.float32)
+    mesh = nibabel.GiftiImage(
+        darrays=[
+            nibabel.gifti.GiftiDataArray(points, "NIFTI_INTENT_POINTSET", "NIFTI_TYPE_FLOAT32"),
+            nibabel.gifti.GiftiDataArray(
+                np.array([[0, 1, 2]], np.int32), "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32"
+            ),
+        ]
+    )
+    content = mesh.to_xml().replace(b'"LittleEndian"', b'"LitLittleEndian"')
+    (tmp_path / "ball.gii").write_bytes(content)
+    with pytest.raises(MeshError, match=r"byte order .*, got 'LitLittleEndian'"):
+        load_mesh(tmp_path / "ball.gii")

@@ -3,7 +3,7 @@
 import lzma
 import zlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -41,6 +41,15 @@ def _refuse(name: str, *_: object) -> None:
 def from_text(text: str, kind: np.dtype) -> NDArray[np.generic]:
     """Parse numbers separated by white space."""
     return np.array(text.split(), dtype=kind)  # an array of strings would be as wide as the longest
+
+
+def byte_order(name: str) -> Literal["<", ">"]:
+    """Return numpy's sign of a byte order; a ValueError for any other word, which damage may have left."""
+    if name == "LittleEndian":
+        return "<"
+    if name == "BigEndian":
+        return ">"
+    raise ValueError(f"expected the byte order LittleEndian or BigEndian, got {name[:40]!r}")
 
 
 def inflated(content: bytes, n_bytes: int, name: str = "zlib") -> bytes:

@@ -80,12 +80,14 @@ def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.gen
     elif encoding in ("Base64Binary", "GZipBase64Binary"):
         content = base64.b64decode("".join(text.split()), validate=True)
         content = _xml.inflated(content, n_bytes) if encoding.startswith("GZip") else content
-        values = np.frombuffer(
-            content, kind.newbyteorder("<" if element.get("Endian") == "LittleEndian" else ">")
-        )
+        order = _xml.byte_order(element.get("Endian", ""))
+        values = np.frombuffer(content, kind.newbyteorder(order))
     else:
         raise ValueError(f"its numbers are encoded as {encoding}, which is not supported")
-    is_column_major = element.get("ArrayIndexingOrder") == "ColumnMajorOrder"
+    indexing = element.get("ArrayIndexingOrder", "RowMajorOrder")
+    if indexing not in ("RowMajorOrder", "ColumnMajorOrder"):
+        raise ValueError(f"expected RowMajorOrder or ColumnMajorOrder, got {indexing[:40]!r}")
+    is_column_major = indexing == "ColumnMajorOrder"
     return values.reshape(shape[::-1]).T if is_column_major else values.reshape(shape)
 
 

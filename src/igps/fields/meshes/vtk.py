@@ -9,7 +9,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -121,6 +120,11 @@ class _Legacy:
             raise ValueError("the numbers of corners do not add up")
         return corners, n_corners
 
+    def skip_field(self, n_arrays: int) -> None:
+        for _ in range(n_arrays):
+            _, width, length, kind = self.line().split()
+            self.numbers(int(width) * int(length), kind)
+
     def geometry(self) -> tuple[Floats, list[Cells], str]:
         """Read points and cells; return also the first line behind them."""
         vertices = np.zeros((0, 3))
@@ -143,6 +147,10 @@ class _Legacy:
                 )
             elif word == "CELL_TYPES" and cells:
                 cells[-1] = (*cells[-1][:2], self.numbers(int(words[1]), "int").astype(np.int64))
+            elif word == "FIELD":
+                self.skip_field(int(words[2]))
+            elif word != "DATASET":  # skipped cells would leave a cloud of points
+                raise ValueError(f"expected a section of points or cells, got {word[:40]!r}")
         return vertices, cells, " ".join(words).upper()
 
     def arrays(self, heading: str, n_points: int) -> dict[str, NDArray[np.generic]]:
@@ -251,7 +259,7 @@ class _Xml:
             self._appended = content[begin : content.rfind(b"</AppendedData>")]
             content = content[:start] + b"</VTKFile>"
         self.root = _xml.parse(content)
-        self._order: Literal["<", ">"] = "<" if self.root.get("byte_order") != "BigEndian" else ">"
+        self._order = _xml.byte_order(self.root.get("byte_order", "LittleEndian"))
         self._header = np.dtype(
             f"{self._order}u{8 if self.root.get('header_type') == 'UInt64' else 4}"
         )
@@ -267,12 +275,14 @@ class _Xml:
         if points is None:
             raise ValueError("no points in it")
         vertices = self.array(points).astype(np.float64).reshape(-1, 3)
+        _check_declared(piece, "Points", len(vertices))
         cells: list[Cells] = []
         for group in (*_XML_CELLS, "Cells"):
             arrays = {
                 element.get("Name"): self.array(element)
                 for element in piece.findall(f"{group}/DataArray")
             }
+            _check_declared(piece, group, len(arrays.get("offsets", ())))
             if len(arrays) >= 2:
                 n_corners = np.asarray(
                     np.diff(arrays["offsets"].astype(np.int64), prepend=0), dtype=np.int64
@@ -324,6 +334,13 @@ class _Xml:
             blocks.append(_xml.inflated(packed[at : at + n_packed], n_unpacked, self._compressor))
             at += n_packed
         return b"".join(blocks)
+
+
+def _check_declared(piece: Element, group: str, n: int) -> None:
+    """Raise a ValueError unless a piece has as many points or cells as it declares: without cells it is a cloud."""
+    n_declared = int(piece.get(f"NumberOf{group}", n))
+    if n_declared != n:
+        raise ValueError(f"{n_declared} {group.lower()} are declared, {n} are there")
 
 
 def _first(n: int, content: bytes, is_raw: bool) -> bytes:

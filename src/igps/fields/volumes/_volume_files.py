@@ -440,7 +440,11 @@ def _check_complete(file: Any, path: Path) -> None:
         "big" if file.byteorder == ">" else "little",
     )
     is_complete = len(list(first.tags)) == n_entries
+    places: set[int] = set()
     for page in file.pages:
+        if page.offset in places:
+            raise MeshError(f"{path}: its pages form a circle. Copy it again, or export it again.")
+        places.add(page.offset)
         for start, size in zip(page.dataoffsets, page.databytecounts, strict=True):
             is_complete &= start + size <= n_bytes
     if not is_complete:
