@@ -31,6 +31,9 @@ HEAVY = (
 SOURCE = Path(igps.__file__).parents[1]
 
 
+NO_WORKERS = "import igps._workers; igps._workers.Worker = None"
+
+
 def igps_with(*words: str, code: str = "") -> subprocess.CompletedProcess[str]:
     """Run `igps` in a process of its own, and print at its end which heavy modules it has imported."""
     told = f"print('HEAVY', [name for name in {HEAVY!r} if name in sys.modules])"
@@ -45,6 +48,19 @@ def igps_with(*words: str, code: str = "") -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", "\n".join(lines)]
     environment = {**os.environ, "PYTHONPATH": str(SOURCE)}
     return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+
+
+def test_a_cached_folder_is_queried_without_compiled_loops_and_without_workers(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    shapes = tmp_path / "shapes"
+    igps.ArticulatedShapes(n_classes=2, n_per_class=2, n_vertices=500).write(shapes)
+    first = next(shapes.rglob("*.off"))
+    words = ("query", str(first), "--gallery", str(shapes), "--cache_dir", str(tmp_path / "cache"))
+    run(monkeypatch, *words)
+    done = igps_with(*words, code=NO_WORKERS)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "HEAVY ['torch', 'numpy', 'scipy']"
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,21 @@
 """Tables of results, as text for a terminal and as CSV files."""
 
+from __future__ import annotations
+
 import csv
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from igps._text import counted
-from igps.analysis.comparison import Result
-from igps.analysis.doctor import Finding
-from igps.analysis.groups import GroupTest
 from igps.data.filling import left_out
 from igps.retrieval import RetrievalScores
+
+if TYPE_CHECKING:
+    from igps.analysis.comparison import Result
+    from igps.analysis.doctor import Finding
+    from igps.analysis.groups import GroupTest
 
 TITLES = {
     "nn": "NN",

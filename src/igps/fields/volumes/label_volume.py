@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
-from scipy.optimize import linear_sum_assignment
 
 from igps._arrays import Booleans, Floats
 from igps._text import counted
@@ -260,9 +259,10 @@ def _side_of(direction: Floats) -> str:
 
 def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
     """Permute and flip the axes to run as nearly along x, y, z as possible, whatever order a format stores them in."""
-    order = linear_sum_assignment(-np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0))[
-        1
-    ]
+    from scipy.optimize import linear_sum_assignment
+
+    cosines = np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0)
+    _, order = linear_sum_assignment(-cosines)
     mask = mask.transpose(order)
     affine = affine[:, [*order, 3]]
     for axis in np.nonzero(np.diag(affine)[:3] < 0)[0]:
