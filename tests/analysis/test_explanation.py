@@ -256,7 +256,7 @@ def test_equal_bodies_have_nothing_to_share(name: str, batches: list[SignatureBa
     found = explain(descriptor(name), batches[0], batches[0])
     assert found.distance == 0
     assert not any(values.any() for of_body in found.samples for values in of_body.values())
-    assert found.summary() == "no difference"
+    assert found.summary() == "identical"
 
 
 def test_what_knows_no_samples_is_refused(batches: list[SignatureBatch]) -> None:

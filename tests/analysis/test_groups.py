@@ -242,7 +242,7 @@ def test_a_probability_is_that_of_all_arrangements() -> None:
             {"covariates": np.repeat([[0.0], [1.0]], 12, axis=0)},
             "covariates or strata determine the groups",
         ),
-        ({"vectors": np.ones((24, 3))}, "do not differ"),
+        ({"vectors": np.ones((24, 3))}, "identical"),
         ({"covariates": np.random.default_rng(0).normal(size=(24, 21))}, "too few"),
     ],
 )

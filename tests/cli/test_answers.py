@@ -314,6 +314,37 @@ def test_explain_writes_shares_that_add_up(
     assert imread(tmp_path / "explain.png").std() > 0.02
 
 
+def test_explain_and_groups_paint_where_an_organ_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Organ 1 has a knob on the patient's left in one group; organ 2 does not differ."""
+    nibabel = pytest.importorskip("nibabel")
+    random = np.random.default_rng(0)
+    world = np.stack(np.indices((32, 20, 36)), axis=-1) * 1.5 - 24.0
+    rows = [("file", "diagnosis")]
+    for i in range(12):
+        sizes = random.uniform(0.95, 1.05, 3) * [10.0, 8.0, 9.0]
+        centre = np.array([0.0, -9.0, -10.0])
+        organ = (((world - centre) / sizes) ** 2).sum(axis=-1) < 1
+        knob = np.linalg.norm(world - centre - [-sizes[0], 0, 0], axis=-1) < 5.5
+        other = (((world - [0.0, -9.0, 14.0]) / sizes) ** 2).sum(axis=-1) < 1
+        labels = (organ | (knob & (i < 6))).astype(np.uint8) + 2 * other.astype(np.uint8)
+        affine = np.diag([1.5, 1.5, 1.5, 1.0])
+        (tmp_path / "scans").mkdir(exist_ok=True)
+        nibabel.save(nibabel.Nifti1Image(labels, affine), tmp_path / "scans" / f"s{i}.nii.gz")
+        rows.append((f"s{i}.nii.gz", "ill" if i < 6 else "healthy"))
+    with (tmp_path / "scans" / "labels.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    what = [tmp_path / "scans", *OWN, "--group", "diagnosis", "--n_workers", 1]
+    igps(monkeypatch, tmp_path, "explain", *what, "--body", "1", "--out", tmp_path / "one")
+    printed = capsys.readouterr().out
+    assert "ill lies outside healthy by up to" in printed
+    assert imread(tmp_path / "one" / "explain.png").std() > 0.02
+    igps(monkeypatch, tmp_path, "groups", *what, "--out", tmp_path / "all")
+    assert (tmp_path / "all" / "places_1.png").is_file()
+    assert not (tmp_path / "all" / "places_2.png").exists()
+
+
 @pytest.mark.parametrize(
     ("largest", "told"),
     [
@@ -542,5 +573,5 @@ def test_three_classes_are_refused_before_anything_is_computed(
     )
     with pytest.raises(SystemExit, match="1"):
         main()
-    assert "expected a folder of two classes, got 3" in capsys.readouterr().err
+    assert "expected a folder of two groups, got 3" in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()

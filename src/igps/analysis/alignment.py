@@ -13,7 +13,7 @@ from igps.mesh.surface import area_vectors, unit
 
 _N_COARSE, _N_FINE, _N_TARGET = 200, 1000, 6000  # points on the surfaces
 _N_COARSE_STEPS, _N_FINE_STEPS = 10, 30
-_KEPT = 0.8  # share of the nearest points that count, so that a local difference moves nothing
+_KEPT = 0.8  # share of the points whose gaps are nearest to the median that count: a local difference moves nothing
 _MIN_TURN = 1e-5  # radians; smaller steps end the alignment
 
 
@@ -46,7 +46,7 @@ def rigid_motion(body: Mesh, target: Mesh, *, scale: float = 1.0) -> Motion:
 
     The bodies are first laid centre on centre. In the frame of the patient they are turned from there; bodies without
     a frame are tried with their principal axes in all 24 ways. Then points on the body move towards the tangent planes
-    of the nearest points of the target (Chen and Medioni 1992), the nearest four fifths of them.
+    of the nearest points of the target (Chen and Medioni 1992): those four fifths whose gaps are nearest to the median.
     """
     points, _ = _spread(body, _N_FINE)
     target_points, normals = _spread(target, _N_TARGET)
@@ -95,10 +95,13 @@ def _turns(points: Floats, target: Floats) -> list[Floats]:
 def _fitted(motion: Motion, points: Floats, target: _Target, n_steps: int) -> Motion:
     for _ in range(n_steps):
         moved = motion.of(points)
-        distances, nearest = target.tree.query(moved)
-        kept = np.argsort(distances)[: int(_KEPT * len(points))]
-        normals = target.normals[nearest[kept]]
-        gaps = ((target.points[nearest[kept]] - moved[kept]) * normals).sum(axis=1)
+        _, nearest = target.tree.query(moved)
+        normals = target.normals[nearest]
+        gaps = ((target.points[nearest] - moved) * normals).sum(axis=1)
+        gaps -= np.median(gaps)  # a body that is larger all around stays where it is
+        kept = np.argsort(np.abs(gaps))[: int(_KEPT * len(points))]
+        normals = normals[kept]
+        gaps = gaps[kept]
         centre = moved.mean(axis=0)
         size = np.linalg.norm(moved - centre, axis=1).mean()
         arms = np.cross((moved[kept] - centre) / size, normals)

@@ -45,7 +45,7 @@ class Explanation:
     def summary(self) -> str:
         """Return the three largest shares of histograms as text."""
         if not self.distance:
-            return "no difference"
+            return "identical"
         by_size = sorted(self.parts.items(), key=lambda item: -abs(item[1]))
         largest = by_size[:3]
         return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)

@@ -47,6 +47,11 @@ class GroupTest:
     auc: float | None = None
     refused: str | None = None  # reason for no test
 
+    def differs(self, level: float) -> bool:
+        """Return whether one of both tests finds a difference at a false discovery rate."""
+        found = [q for q in (self.permanova_q, self.kernel_q) if q is not None]
+        return bool(found) and min(found) <= level
+
 
 def squared_distances(rows: Floats) -> Floats:
     """Return the squared Euclidean distances (N, N) of rows (N, D)."""
@@ -95,8 +100,8 @@ def group_test(  # noqa: PLR0913 (two arrays, and settings that all have a defau
     check_at_least(1, n_permutations=n_permutations)
     n = len(vectors)
     strata = ["all"] * n if strata is None else strata
-    group = _codes(groups)
-    stratum = _codes(strata)
+    group = codes_of(groups)
+    stratum = codes_of(strata)
     numbers = np.ones((n, 0))
     if covariates is not None:
         numbers = np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
@@ -106,7 +111,9 @@ def group_test(  # noqa: PLR0913 (two arrays, and settings that all have a defau
     reason = _obstacle(untested.sizes, group, stratum)
     if reason is not None:
         return replace(untested, refused=reason)
-    design = _design(group, stratum, numbers)
+    if np.ptp(vectors, axis=0).max() <= _ROUNDING * np.abs(vectors).max():
+        return replace(untested, refused="all bodies are identical.")
+    design = design_of(group, stratum, numbers)
     n_added = design.added.shape[1]
     if n_added < len(untested.sizes) - 1:
         return replace(untested, refused="covariates or strata determine the groups.")
@@ -151,7 +158,7 @@ def group_test(  # noqa: PLR0913 (two arrays, and settings that all have a defau
     )
 
 
-def _codes(names: Sequence[str]) -> Integers:
+def codes_of(names: Sequence[str]) -> Integers:
     """Return the number of each name in the order of the alphabet."""
     _, codes = np.unique(np.asarray(names), return_inverse=True)
     return codes
@@ -170,7 +177,7 @@ def _check_finite(**values: Floats) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Design:
+class Design:
     """Orthonormal bases (N, k). A permutation within strata changes the covariates, but not the means of strata."""
 
     nuisance: Floats  # the means of strata, and what covariates add to these
@@ -178,7 +185,7 @@ class _Design:
     added: Floats  # what groups add to both
 
 
-def _design(group: Integers, stratum: Integers, covariates: Floats) -> _Design:
+def design_of(group: Integers, stratum: Integers, covariates: Floats) -> Design:
     strata = _orthonormal(_indicators(stratum), _ROUNDING)
     largest = np.abs(covariates).max(axis=0, initial=0)
     scaled = covariates / np.maximum(largest, _TINY)  # whatever the units
@@ -188,7 +195,7 @@ def _design(group: Integers, stratum: Integers, covariates: Floats) -> _Design:
     nuisance = np.column_stack([strata, basis])
     indicators = _indicators(group)
     beyond_both = indicators - nuisance @ (nuisance.T @ indicators)
-    return _Design(nuisance, basis, _orthonormal(beyond_both, _MIN_ADDED))
+    return Design(nuisance, basis, _orthonormal(beyond_both, _MIN_ADDED))
 
 
 def _gaussian_kernel(gram: Floats) -> Floats:
@@ -213,7 +220,7 @@ class _Traces:
 def _permuted_traces(
     gram: Floats,
     kernel: Floats,
-    design: _Design,
+    design: Design,
     stratum: Integers,
     n_permutations: int,
     random: np.random.Generator,
@@ -224,7 +231,7 @@ def _permuted_traces(
     n_columns = design.nuisance.shape[1] + design.added.shape[1]
     block = max(1, _BLOCK // (len(gram) * n_columns))
     for first in range(0, count, block):
-        orders = _permutations(stratum, min(block, count - first), random)
+        orders = permutations(stratum, min(block, count - first), random)
         if first == 0:
             orders[0] = np.arange(len(gram))
         part = slice(first, first + len(orders))
@@ -236,7 +243,7 @@ def _permuted_traces(
 
 
 def _squares_for_effect(
-    gram: Floats, residual: Floats, design: _Design, group: Integers, freedom: int
+    gram: Floats, residual: Floats, design: Design, group: Integers, freedom: int
 ) -> Floats:
     """Return squared distances (N, N) as if there were no strata and covariates.
 
@@ -338,7 +345,7 @@ def _squares(gram: Floats) -> Floats:
     return squares
 
 
-def _permutations(stratum: Integers, count: int, random: np.random.Generator) -> Integers:
+def permutations(stratum: Integers, count: int, random: np.random.Generator) -> Integers:
     """Return random permutations (count, N) within strata."""
     orders = np.empty((count, len(stratum)), dtype=np.int64)
     for code in range(stratum.max() + 1):

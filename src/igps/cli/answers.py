@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +14,12 @@ from igps.cli.options import Size
 if TYPE_CHECKING:
     from igps.analysis.explanation import Explanation
     from igps.analysis.groups import GroupTest
+    from igps.cli.reading import Described
     from igps.data.dataset import SignatureDataset
     from igps.data.sources import Bodies
     from igps.report.answers import Painted
 
 
-_LEGEND = "share of the distance, over that of an even spread"
 CALIBRATED = "pretrained"
 """The only descriptor whose distances are calibrated, see `igps.duplicates.calibration`."""
 
@@ -51,7 +52,8 @@ def groups(
         test_size: also test the size (the logarithm of the volume), in separate lines
         inside: also test where inside the bodies the values of --attribute lie, all numbers of igps inside
             without a unit at once, and each number by itself, with false discovery rates over the numbers.
-        out: folder for groups.csv, groups.json, and the effects as groups.svg and groups.png.
+        out: folder for groups.csv, groups.json, the effects as groups.svg and groups.png, and for each body in which
+            two groups differ a picture of the places, places_BODY.svg and places_BODY.png.
         n_permutations: number of random permutations.
         seed: seed of the permutations, bootstraps and folds.
     """
@@ -64,7 +66,7 @@ def groups(
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import keeps_size
     from igps.mesh.mesh import millimetres
-    from igps.report.answers import groups_figure, write_analysis
+    from igps.report.answers import LEVEL, groups_figure, write_analysis
     from igps.report.tables import groups_table
 
     check_at_least(1, n_permutations=n_permutations)
@@ -133,6 +135,13 @@ def groups(
         for row in rows:
             row["sizes"] = " ".join(f"{name}:{count}" for name, count in row["sizes"].items())
         write_analysis(out, "groups", rows, groups_figure(tests))
+        options = {"level": LEVEL, "seed": seed, "n_workers": reading.get("n_workers")}
+        differing = [test.body for test in tests if test.differs(LEVEL) and len(test.sizes) == 2]
+        for body in differing:
+            own = members.get(body, [])  # none of a size
+            options["strata"] = None if stratum is None else stratum[own]
+            options["covariates"] = None if covariates is None else covariates[own]
+            _write_places(result, own, labels[own].tolist(), body, out, **options)
         print(f"written to {out}")
     return [asdict(test) for test in [*tests, *numbers]]
 
@@ -153,6 +162,34 @@ def _members(bodies: Bodies, labels: Any) -> dict[str, list[int]]:
         # each group
         return {"all": list(range(len(bodies)))}
     return members
+
+
+def _write_places(
+    result: Described, members: list[int], groups: list[str], body: str, out: Path, **test: Any
+) -> None:
+    """Write a picture of where two groups of an organ differ."""
+    from igps.cli.places import places_of_groups
+    from igps.descriptors.size_and_side import SIZE
+    from igps.mesh.errors import MeshError
+    from igps.report.answers import painted_figure
+    from igps.report.drawing import save_figure
+
+    if not members:
+        return
+    keep_size = SIZE in result.descriptor.name
+    vectors = result.coordinates(within_class=True)[members]
+    try:
+        places = places_of_groups(
+            result.dataset, members, vectors, groups, keep_size=keep_size, **test
+        )
+    except MeshError as error:
+        print(f"{body}: no picture: {error}")
+        return
+    print(f"{body}: {places.words}")
+    figure = painted_figure([places.painted], places.legend)
+    name = re.sub(r"[^\w.-]+", "_", f"places_{body}")
+    save_figure(figure, out / f"{name}.svg")
+    save_figure(figure, out / f"{name}.png", dpi=150)
 
 
 def _design(bodies: Bodies, name: str) -> Any:
@@ -234,6 +271,8 @@ def outliers(
 def explain(
     meshes: list[Path],
     descriptor: str = "pretrained",
+    group: str | None = None,
+    body: str | None = None,
     level: float = 0.05,
     out: Path | None = None,
     **describing: Any,
@@ -241,20 +280,24 @@ def explain(
     """Show where two bodies or two groups of bodies differ, by the share of each part in their distance.
 
     Args:
-        meshes: two files, or a folder with two classes.
+        meshes: two files, or a folder with two groups.
         descriptor: a descriptor made of histograms, such as interior, rich or pretrained.
-        level: family-wise error rate, for two groups: only histogram cells whose means differ significantly count.
-        out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and both
-            bodies painted with their shares, from the front and from behind, as explain.svg and explain.png.
+        group: column of labels.csv that holds the groups of a folder; the class if not given.
+        body: of a folder, only the bodies of this name in their files, such as an organ.
+        level: family-wise error rate, for two groups: only histogram cells and places that differ significantly count.
+        out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and
+            explain.svg and explain.png: two bodies painted with their shares, or the mean difference of two groups.
     """
     import numpy as np
 
     from igps.analysis.explanation import explain as explain_pair
     from igps.analysis.explanation import explain_groups, without_head
     from igps.analysis.groups import squared_distances
+    from igps.cli.places import places_of_groups
     from igps.cli.reading import Folder, check_files, described, files_or_folder
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.fingerprint import cache_tag
+    from igps.descriptors.size_and_side import SIZE
     from igps.mesh.surface import vertex_areas
     from igps.nn.description import describe
     from igps.report.answers import painted_figure, write_analysis
@@ -264,21 +307,24 @@ def explain(
     if not isinstance(source, Folder):
         if len(source) != 2:
             raise ValueError(
-                f"meshes: expected two files, or a folder of two classes, got {len(source)} files."
+                f"meshes: expected two files, or a folder of two groups, got {len(source)} files."
             )
+        if group is not None or body is not None:
+            raise ValueError("group, body: expected a folder with them, got files. Leave them out.")
         check_files(source)
     without_head(
         descriptor_of(descriptor)
     )  # raises for other descriptors before anything is computed
     if isinstance(source, Folder):
-        folder = Folder(source.root, labelled=True, needs_meshes=True, check=_check_two_classes)
+        check = partial(_two_groups, group=group)
+        folder = Folder(source.root, group is None, needs_meshes=True, check=check, body=body)
         result = described(folder, descriptor, **describing)
-        _check_two_classes(result.dataset.bodies)  # without the bodies that could not be used
-        dataset, module, labels = (
-            result.dataset,
-            result.descriptor,
-            np.array(result.dataset.bodies.labels),
-        )
+        dataset = result.dataset
+        module = result.descriptor
+        labels = check(dataset.bodies)  # without the bodies that could not be used
+        parts_found = len(set(dataset.bodies.parts))
+        if body is None and parts_found > 1:
+            print(f"{parts_found} kinds of bodies are taken together; --body NAME chooses one")
         inner, n_workers = without_head(module), describing.get("n_workers")
         descriptions = describe(
             dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True
@@ -292,7 +338,16 @@ def explain(
         first, second = (descriptions[own] for own in members)
         explanation, is_significant = explain_groups(module, first, second, batches, level=level)
         n_cells = f"{int(is_significant.sum())} of {len(is_significant)}"
-        print(f"{n_cells} cells differ significantly; painted: the medoid of each group")
+        print(f"{n_cells} cells differ significantly; their samples: in the medoid of each group")
+        places = places_of_groups(
+            dataset,
+            range(len(dataset)),
+            result.coordinates(),
+            labels.tolist(),
+            keep_size=SIZE in module.name,
+            n_workers=n_workers,
+            level=level,
+        )
     else:
         result, pair = described(source, descriptor, **{**describing, "strict": True}), [0, 1]
         dataset, module = result.dataset, result.descriptor
@@ -310,14 +365,20 @@ def explain(
     if not isinstance(source, Folder):
         meaning = _meaning(descriptor, dataset, explanation.distance)
         print(meaning or f"what this distance means is known for {CALIBRATED} alone")
-    painted = [_painted(dataset, i, explanation, side) for side, i in enumerate(pair)]
-    for body in painted:
-        areas = vertex_areas(body.mesh.vertices, body.mesh.faces)
-        print(f"{body.name}: {_extent(body.values, areas)}")
+    if isinstance(source, Folder):
+        painted = [places.painted]
+        legend = places.legend
+        print(places.words)
+    else:
+        painted = [_painted(dataset, i, explanation, side) for side, i in enumerate(pair)]
+        legend = "share of the distance, over that of an even spread"
+        for one in painted:
+            areas = vertex_areas(one.mesh.vertices, one.mesh.faces)
+            print(f"{one.name}: {_extent(one.values, areas)}")
     parts = [{"histogram": name, "share": share} for name, share in explanation.parts.items()]
     if out is not None:
         write_analysis(out, "explain_samples", _sample_rows(dataset, pair, explanation))
-        write_analysis(out, "explain", parts, painted_figure(painted, _LEGEND))
+        write_analysis(out, "explain", parts, painted_figure(painted, legend))
         print(f"written to {out}")
     return {
         "bodies": names,
@@ -340,9 +401,16 @@ def _meaning(descriptor: str, dataset: SignatureDataset, distance: float) -> str
     return calibration.words(distance)
 
 
-def _check_two_classes(bodies: Bodies) -> None:
-    if (n := len(set(bodies.labels or ()))) != 2:
-        raise ValueError(f"meshes: expected a folder of two classes, got {n}.")
+def _two_groups(bodies: Bodies, group: str | None) -> Any:
+    """Return the group of each body (N,) as an array; raise a ValueError unless there are two groups."""
+    import numpy as np
+
+    labels = np.array((bodies.labels or ()) if group is None else bodies.column(group))
+    names = sorted(set(labels.tolist()))
+    if len(names) != 2:
+        listed = ", ".join(names[:5])
+        raise ValueError(f"meshes: expected a folder of two groups, got {len(names)}: {listed}.")
+    return labels
 
 
 def _painted(dataset: SignatureDataset, i: int, explanation: Explanation, side: int) -> Painted:

@@ -48,6 +48,7 @@ class Folder:
     check: Callable[[Bodies], object] | None = (
         None  # called before any computation; raises for unsuitable bodies
     )
+    body: str | None = None  # only bodies of this name in their files, such as an organ
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,6 +323,8 @@ def dataset_from_options(
             attributes=attributes.values(),
             cache_dir=cache_dir or default_cache_dir(),
         )
+        if source.body is not None:
+            bodies = _named(bodies, source.body)
         if source.check is not None:
             source.check(bodies)
         source = bodies
@@ -334,6 +337,15 @@ def dataset_from_options(
         reading=reading,
         attributes=attributes,
     )
+
+
+def _named(bodies: Bodies, name: str) -> Bodies:
+    """Return the bodies of a name in their files."""
+    chosen = [i for i, part in enumerate(bodies.parts) if part == name]
+    if not chosen:
+        known = ", ".join(sorted({part for part in bodies.parts if part is not None})[:10])
+        raise ValueError(f"body: no file has a body {name!r}; there are: {known or 'none'}.")
+    return bodies.subset(chosen)
 
 
 def mending_summary(dataset: SignatureDataset, n_total: int) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.cluster.hierarchy import dendrogram
 
-from igps._arrays import Floats
+from igps._arrays import Booleans, Floats
 from igps.analysis.clusters import STABLE, Clusters
 from igps.analysis.groups import GroupTest
 from igps.analysis.map import BodyMap
@@ -43,6 +43,7 @@ class Painted:
     name: str
     mesh: Mesh
     values: Floats  # (V,) at its vertices
+    is_held: Booleans | None = None  # (V,) where the values count; they are pale elsewhere
 
 
 LEVEL = 0.05
@@ -122,6 +123,9 @@ def painted_figure(painted: Sequence[Painted], legend: str) -> Figure:
     names = titles_of([body.name for body in painted])
     for row, body, name, vertices in zip(all_axes, painted, names, bodies, strict=True):
         colours = scale.to_rgba(body.values)[:, :3]
+        if body.is_held is not None:
+            pale = _WHITE + _PALE * (colours - _WHITE)
+            colours = np.where(body.is_held[:, None], colours, pale)
         for axes, view in zip(row, views, strict=True):
             draw_view(axes, view, body.mesh, vertices, colours, reach)
             axes.set_title(view.title, fontsize=7)
@@ -223,4 +227,5 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
 # Curves of precision and recall beyond the first round of colours differ by line style and marker
 _STYLES, _MARKERS = ("-", "--", ":"), ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 _MAP_MARKERS = ("o", "s", "^", "x", "+", "D")
-_BLUE, _WHITE, _RED = (0.0, 0.35, 0.7), (0.9, 0.9, 0.9), (0.84, 0.25, 0.0)
+_BLUE, _WHITE, _RED = np.array([[0.0, 0.35, 0.7], [0.9, 0.9, 0.9], [0.84, 0.25, 0.0]])
+_PALE = 0.3  # strength of the colours where values do not count

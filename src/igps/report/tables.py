@@ -126,8 +126,8 @@ def _voxel_counts(finding: Finding) -> tuple[object, ...]:
 def groups_table(tests: Sequence[GroupTest]) -> str:
     """Return a text table with one line per body: p-values and q-values, effect, area under the curve, group sizes."""
     width = max(len("body"), *(len(test.body) for test in tests))
-    row = "{:>13}{:>9}{:>10}{:>9}{:>8}{:>17}{:>7}  {}".format
-    titles = ("PERMANOVA p", "q", "kernel p", "q", "effect", "95 %", "AUC", "groups")
+    row = "{:>13}{:>13}{:>10}{:>10}{:>8}{:>17}{:>7}  {}".format
+    titles = ("PERMANOVA p", "PERMANOVA q", "kernel p", "kernel q", "effect", "95 %", "AUC", "n")
     lines = [f"{'body':<{width}}" + row(*titles)]
     for test in tests:
         sizes = ", ".join(f"{count} {name}" for name, count in test.sizes.items())
@@ -139,6 +139,11 @@ def groups_table(tests: Sequence[GroupTest]) -> str:
         cells += [f"{test.effect_low:.3f} to {test.effect_high:.3f}", f"{test.auc:.2f}", sizes]
         lines.append(f"{test.body:<{width}}" + row(*cells))
     lines.append(
-        "p: by permutation; q: false discovery rate over the bodies; effect: share of squared distances"
+        "p: by permutation; q: false discovery rate over the bodies; effect: share of squared distances; n: bodies"
     )
+    tested = [test for test in tests if test.refused is None]
+    if any((test.effect or 0) < 0 or (test.auc is not None and test.auc < 0.5) for test in tested):
+        lines.append(
+            "an effect below 0, or an AUC below 0.5, is as good as 0 and 0.5: chance goes both ways"
+        )
     return "\n".join(lines)
