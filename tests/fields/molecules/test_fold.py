@@ -33,9 +33,15 @@ def walk(seed: int, n: int = 150) -> Floats:
     return np.cumsum(3.8 * steps / np.linalg.norm(steps, axis=1, keepdims=True), axis=0)
 
 
+def directions_of(residues: Floats) -> Floats:
+    """(n, 3) unit vectors along a chain without gaps."""
+    vectors = np.gradient(residues, axis=0)
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 def signature(residues: Floats, places: Floats, nearest: NDArray[np.int64]) -> Signature:
     """Samples of a ball, each with a residue."""
-    trace = np.column_stack([residues, places])[nearest]
+    trace = np.column_stack([residues, directions_of(residues), places])[nearest]
     return replace(BALL, interior=BALL.interior.with_attributes({"trace": trace}))
 
 
@@ -52,11 +58,20 @@ def test_every_residue_counts_once_in_the_row_of_its_separation() -> None:
     nearest[:150] = np.arange(150)  # each at least once, some often
     found = fold()(collate([signature(residues, places, nearest)]))[0].double().numpy()
     i, j = np.triu_indices(150, 1)
-    distance = np.linalg.norm(residues[i] - residues[j], axis=1)
-    rows = hats(np.abs(places[i] - places[j]), SEPARATIONS)[:, 2:]
-    wanted = rows.T @ hats(distance, (np.arange(32) + 0.5) * 40 / 32)
-    wanted /= wanted.sum(axis=1, keepdims=True) * len(wanted)
-    np.testing.assert_allclose(found, wanted, atol=2e-6)
+    line = residues[j] - residues[i]
+    distance = np.linalg.norm(line, axis=1)
+    one, other = directions_of(residues)[[i, j]]
+    twist = (np.cross(one, other) * line).sum(axis=1) / distance
+    separation = hats(np.abs(places[i] - places[j]), SEPARATIONS)[:, 2:]
+    axes = (
+        hats(distance, np.arange(2.5, 40, 5)),
+        hats((one * other).sum(axis=1), np.array([-0.66, 0, 0.66])),
+        hats(twist, np.array([-0.5, 0, 0.5])),
+    )
+    wanted = np.einsum("ps,pd,pc,pt->sdct", separation, *axes, optimize=True)
+    weights = 1 / (1 + SEPARATIONS[2:] / 30)
+    weights /= weights.sum() * wanted.sum(axis=(1, 2, 3))
+    np.testing.assert_allclose(found, wanted * weights[:, None, None, None], atol=2e-6)
 
 
 def test_short_chains_have_no_far_pairs_and_padding_changes_nothing() -> None:
@@ -71,7 +86,7 @@ def test_short_chains_have_no_far_pairs_and_padding_changes_nothing() -> None:
     one, other = fold()(collate([short, fewer]))
     torch.testing.assert_close(one, fold()(collate([short]))[0])
     torch.testing.assert_close(other, fold()(collate([fewer]))[0])
-    assert one.sum(dim=1)[-4:].tolist() == [0, 0, 0, 0]
+    assert one.flatten(1).sum(dim=1)[-4:].tolist() == [0, 0, 0, 0]
     assert float(one.sum()) == pytest.approx(1)
 
 
@@ -106,7 +121,10 @@ def test_residues_of_other_kinds_change_nothing() -> None:
         traced("GLY", turn),
     )
     np.testing.assert_array_equal(one, other)
-    np.testing.assert_allclose(turned, np.column_stack([one[:, :3] @ turn, one[:, 3]]), atol=1e-9)
+    wanted = [one[:, :3] @ turn, one[:, 3:6] @ turn, one[:, 6]]
+    np.testing.assert_allclose(turned, np.column_stack(wanted), atol=1e-9)
+    nearest = one[:, 6].astype(int)
+    np.testing.assert_allclose(one[:, 3:6], directions_of(residues)[nearest], atol=1e-9)
 
 
 def test_places_follow_bonds_then_numbers_then_distances() -> None:
@@ -123,8 +141,22 @@ def test_places_follow_bonds_then_numbers_then_distances() -> None:
     assert np.isnan(chain_places(positions, np.full(8, np.nan), chains)).all()
 
 
+def test_directions_do_not_cross_gaps() -> None:
+    positions = np.array(
+        [[0.0, 0, 0], [3.8, 0, 0], [20, 0, 0], [20, 3.8, 0], [20, 7.6, 0], [99, 0, 0]]
+    )
+    none = np.zeros(6)
+    places = np.array([0.0, 1, 6, 7, 8, 1008])
+    molecule = Molecule(
+        "gaps", positions, none, none, np.arange(6), ("ALA",) * 6, positions, none, places=places
+    )
+    found = residue_attribute(molecule, positions, "trace")[:, 3:6]
+    x, y = [1, 0, 0], [0, 1, 0]
+    np.testing.assert_allclose(found, [x, x, y, y, y, [0, 0, 0]], atol=1e-12)
+
+
 def test_it_is_found_by_name_and_asks_for_a_trace() -> None:
-    assert igps.descriptor("fold").n_features == 13 * 32
+    assert igps.descriptor("fold").n_features == 13 * 8 * 9
     with pytest.raises(ValueError, match="needs signatures with trace"):
         fold()(collate([BALL]))
-    assert FoldHistogram(n_bins=8, n_samples=None).shape == (13, 8)
+    assert FoldHistogram(n_bins=5, n_samples=None).shape == (13, 5, 3, 3)

@@ -71,23 +71,31 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
 
 
 def trace(molecule: Molecule, points: Floats) -> Floats:
-    """Return position, Å, and place along the chain (P, 4) of the nearest residue of a polymer to points (P, 3).
+    """Return the nearest residue of a polymer to points (P, 3), as (P, 7): position, direction of the chain, place.
 
-    Positions are relative to the mean of the residues, as attributes have single precision.
+    Positions, Å, are relative to the mean of the residues, as attributes have single precision. Directions, of length
+    1, point from the residue before to the residue after; 0 for a residue without both.
     """
     is_linked = np.isfinite(molecule.places)
     if not is_linked.any():
-        return np.full((len(points), 4), np.nan)
+        return np.full((len(points), 7), np.nan)
     positions = molecule.residue_positions[is_linked]
+    places = molecule.places[is_linked]
+    steps = np.diff(positions, axis=0) * (np.diff(places) == 1)[:, None]
+    directions = np.zeros_like(positions)
+    directions[1:] += steps
+    directions[:-1] += steps
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    directions /= np.maximum(lengths, 1e-9)
+    rows = np.column_stack([positions - positions.mean(axis=0), directions, places])
     _, nearest = cKDTree(positions).query(points)
-    rows = np.column_stack([positions - positions.mean(axis=0), molecule.places[is_linked]])
     return rows[nearest]
 
 
 def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
     """Return a named attribute of points (P, 3), Å: (P,), or (P, C) of several numbers; a ValueError for others.
 
-    "residue_shares" has 25 numbers, "trace" has 4.
+    "residue_shares" has 25 numbers, "trace" has 7.
     """
     if name in _AT_POINTS:
         return _AT_POINTS[name](molecule, points)
@@ -162,7 +170,7 @@ class ResidueAttribute:
 
     def cache_tag(self, body: BodyRef) -> str:
         """Return the name. The molecule is the body's own file, which is part of the key of its Signature."""
-        return f"residues 1 {self.name}"
+        return f"residues 2 {self.name}"
 
     def __call__(self, body: BodyRef, points: Floats) -> Floats:
         """Return values (P,) or (P, C) at points (P, 3), Å; raise a MeshError if the body has no such values."""
