@@ -31,7 +31,7 @@ FLOORS = (
     ("duplicates",),
     ("analysis",),
     ("report",),
-    ("cli", "sklearn"),
+    ("cli", "monai", "sklearn"),
 )
 # The rooms around the core, each of which can be taken away.
 AROUND = ("fields", "analysis", "gallery", "duplicates", "report", "cli")
@@ -46,6 +46,7 @@ FILES = (
     "_text",
     "_threads",
     "_workers",
+    "monai",
     "sklearn",
 )
 

@@ -11,9 +11,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from igps.analysis.inside_objects import inside
     from igps.data.batch import SignatureBatch
     from igps.data.collation import collate
-    from igps.data.datamodule import SignatureDataModule
     from igps.data.dataset import SignatureDataset
     from igps.descriptors import descriptor, load
     from igps.learning import fit
@@ -45,7 +45,6 @@ _MODULES = {
     "RetrievalLearner": "igps.nn.learner",
     "SignatureBatch": "igps.data.batch",
     "SignatureConfig": "igps.signature.config",
-    "SignatureDataModule": "igps.data.datamodule",
     "SignatureDataset": "igps.data.dataset",
     "SpectralEmbedding": "igps.nn.embedding",
     "as_mesh": "igps.mesh.objects",
@@ -54,6 +53,7 @@ _MODULES = {
     "describe": "igps.nn.description",
     "descriptor": "igps.descriptors",
     "fit": "igps.learning",
+    "inside": "igps.analysis.inside_objects",
     "load": "igps.descriptors",
     "load_mesh": "igps.mesh.loading",
     "measures": "igps.signature.measures",
@@ -73,7 +73,6 @@ __all__ = [
     "RetrievalLearner",
     "SignatureBatch",
     "SignatureConfig",
-    "SignatureDataModule",
     "SignatureDataset",
     "SpectralEmbedding",
     "as_mesh",
@@ -82,6 +81,7 @@ __all__ = [
     "describe",
     "descriptor",
     "fit",
+    "inside",
     "load",
     "load_mesh",
     "measures",

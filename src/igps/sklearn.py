@@ -11,6 +11,10 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.validation import check_is_fitted
 
 from igps._arrays import Singles
+from igps.analysis.inside import column_names
+from igps.analysis.inside_collection import inside_config, inside_table
+from igps.data.attribute_sources import attribute_sources
+from igps.data.attributes import AttributeSource
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
@@ -38,6 +42,9 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
     Args:
         descriptor: a name, "package.module:NAME", or a `Descriptor`; see `igps.descriptor`.
         square_root: take square roots of the cells of histograms. Other descriptions are unchanged.
+        inside: attributes of mesh files whose numbers of `igps inside` follow the description, NaN where a number is
+            not defined. Each is a definition, such as "ct=ct/{stem}.nii.gz" with a path from the folder of the file,
+            or the name of an attribute that the file itself has, such as "charge".
         config: configuration of the signatures, completed by the requirements of the descriptor; the default if None.
         reading: options for reading mesh files.
         cache_dir: cache of the signatures of mesh files; the user's cache directory if None. Meshes are not cached.
@@ -49,6 +56,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         descriptor: str | Descriptor = "pretrained",
         *,
         square_root: bool = True,
+        inside: Sequence[str] = (),
         config: SignatureConfig | None = None,
         reading: LoadOptions | None = None,
         cache_dir: str | Path | None = None,
@@ -56,6 +64,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
     ) -> None:
         self.descriptor = descriptor
         self.square_root = square_root
+        self.inside = inside
         self.config = config
         self.reading = reading
         self.cache_dir = cache_dir
@@ -66,8 +75,9 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         chosen = descriptor_of(self.descriptor)
         shapes = _checked(X)
         self._name = chosen.name
+        self._inside_names = column_names(list(self._sources()))
         if isinstance(chosen, HistogramDescriptor):
-            self._n_features_out = chosen.n_features
+            self._n_features_out = chosen.n_features + len(self._inside_names)
         else:  # known only after describing a shape
             self._n_features_out = self._features(shapes[:1]).shape[1]
         return self
@@ -82,7 +92,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         return self._features(_checked(X))
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
-        """Return the names of the columns: the name of the descriptor with an index.
+        """Return the names of the columns: the name of the descriptor with an index, and the numbers inside.
 
         Args:
             input_features: ignored, because meshes have no columns.
@@ -91,7 +101,16 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             NotFittedError: before `fit`.
         """
         check_is_fitted(self, "_n_features_out")
-        return np.array([f"{self._name}{i}" for i in range(self._n_features_out)], dtype=object)
+        n_described = self._n_features_out - len(self._inside_names)
+        described = [f"{self._name}{i}" for i in range(n_described)]
+        return np.array([*described, *self._inside_names], dtype=object)
+
+    def _sources(self) -> dict[str, AttributeSource]:
+        if isinstance(self.inside, str):
+            raise TypeError(f"inside: expected a list of attributes, got {self.inside!r} alone.")
+        # The name of an attribute that the file itself has stands for its definition, too
+        definitions = [text if "=" in text else f"{text}={text}" for text in self.inside]
+        return attribute_sources(definitions, None)
 
     def _features(self, shapes: list[Any]) -> Singles:
         chosen = descriptor_of(self.descriptor)
@@ -122,7 +141,24 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             cells[
                 :, : sum(chosen.part_cells)
             ].sqrt_()  # not the size of molecules, which follows the cells
-        return cells.numpy()
+        sources = self._sources()
+        if not sources:
+            return cells.numpy()
+        return np.hstack([cells.numpy(), self._inside(shapes, sources)])
+
+    def _inside(self, shapes: list[Any], sources: dict[str, AttributeSource]) -> Singles:
+        """Return the numbers (N, ...) that tell where inside N mesh files their attributes lie."""
+        if isinstance(shapes[0], Mesh):
+            raise ValueError(
+                "X: expected mesh files with `inside`, got meshes. Give files, or use igps.inside."
+            )
+        config = inside_config(self.config or SignatureConfig())
+        dataset = SignatureDataset(
+            shapes, config, self.cache_dir, reading=self.reading, attributes=sources
+        )
+        dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
+        table = inside_table(dataset, list(sources), n_workers=self.n_workers)
+        return table.rows.astype(np.float32)
 
     def __sklearn_is_fitted__(self) -> bool:
         return True

@@ -40,7 +40,8 @@ class RetrievalLearner(LightningModule):
     Example:
         >>> import tempfile
         >>> from pytorch_lightning import Trainer
-        >>> from igps import ArticulatedShapes, HistogramDescriptor, PairHistogram, SignatureConfig, SignatureDataModule
+        >>> from igps import ArticulatedShapes, HistogramDescriptor, PairHistogram, SignatureConfig
+        >>> from igps.data.datamodule import SignatureDataModule
         >>> from igps.nn.heads.learned import BlendedDistance, ProjectionHead
         >>> learner = RetrievalLearner(HistogramDescriptor(PairHistogram()), BlendedDistance(ProjectionHead()))
         >>> trainer = Trainer(
