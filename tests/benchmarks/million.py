@@ -26,11 +26,22 @@ from igps.nn.description import describe
 
 BATCH, TOP = 10_000, 10
 NOISE = 0.05  # length, beside descriptions of length 1
+N_CLASSES = 12
+# Of the rows among which is searched; a query has the class {own}, and {other} is another one.
 CONDITIONS = {
     "all": None,
     "1 % at random": "volume < 0.01",
-    "a class of twelve": "class = '3'",
+    "its own class of twelve": "class = '{own}'",
+    "another class": "class = '{other}'",
 }
+
+
+def condition(name: str, own: int) -> str | None:
+    """The condition for a query of the class `own`."""
+    template = CONDITIONS[name]
+    if template is None:
+        return None
+    return template.format(own=own, other=(own + 1) % N_CLASSES)
 
 
 class Rows:
@@ -79,7 +90,7 @@ class Rows:
 
 
 def _describe_bodies(folder: Path, out: Path) -> None:
-    shapes = igps.ArticulatedShapes(n_classes=12, n_per_class=50, n_vertices=700)
+    shapes = igps.ArticulatedShapes(n_classes=N_CLASSES, n_per_class=50, n_vertices=700)
     shapes.write(folder / "meshes")
     descriptor = igps.descriptor("pretrained")
     dataset = igps.SignatureDataset(
@@ -90,7 +101,9 @@ def _describe_bodies(folder: Path, out: Path) -> None:
     np.savez(out, descriptions=descriptions, labels=np.array(dataset.bodies.labels))
 
 
-def exact_nearest(table: BodyTable, queries: torch.Tensor, distance: Any) -> dict[str, np.ndarray]:
+def exact_nearest(
+    table: BodyTable, queries: torch.Tensor, classes: np.ndarray, distance: Any
+) -> dict[str, np.ndarray]:
     """Return the names (Q, 10) of the nearest rows under each condition, by comparison with all rows."""
     distances = {name: np.full((len(queries), TOP), np.inf) for name in CONDITIONS}
     names = {name: np.zeros((len(queries), TOP), np.int64) for name in CONDITIONS}
@@ -99,14 +112,19 @@ def exact_nearest(table: BodyTable, queries: torch.Tensor, distance: Any) -> dic
         with torch.inference_mode():
             to_batch = distance(queries, descriptions).numpy()
         numbers = np.array([int(row["name"]) for row in rows])
+        volumes = np.array([row["volume"] for row in rows])
+        classes_of_rows = np.array([int(row["class"]) for row in rows])
+        has_own_class = classes[:, None] == classes_of_rows
+        has_next_class = (classes[:, None] + 1) % N_CLASSES == classes_of_rows
         masks = {
-            "all": np.ones(len(rows), bool),
-            "1 % at random": np.array([row["volume"] < 0.01 for row in rows]),
-            "a class of twelve": np.array([row["class"] == "3" for row in rows]),
+            "all": np.ones_like(has_own_class),
+            "1 % at random": np.broadcast_to(volumes < 0.01, has_own_class.shape),
+            "its own class of twelve": has_own_class,
+            "another class": has_next_class,
         }
         for name, mask in masks.items():
-            others = np.broadcast_to(numbers[mask], (len(queries), int(mask.sum())))
-            candidates = np.hstack([distances[name], to_batch[:, mask]])
+            others = np.broadcast_to(numbers, mask.shape)
+            candidates = np.hstack([distances[name], np.where(mask, to_batch, np.inf)])
             best = np.argsort(candidates, axis=1)[:, :TOP]
             distances[name] = np.take_along_axis(candidates, best, axis=1)
             names[name] = np.take_along_axis(np.hstack([names[name], others]), best, axis=1)
@@ -139,11 +157,13 @@ def main() -> None:
         seconds = time.monotonic() - start
         print(f"built in {seconds:.0f} s, {size / 2**30:.2f} GiB, {memory()}", flush=True)
     table = BodyTable(path)
-    queries = torch.from_numpy(rows.descriptions(arguments.n_queries, 3)[0])
+    descriptions, classes = rows.descriptions(arguments.n_queries, 3)
+    queries = torch.from_numpy(descriptions)
     found: dict[str, list[list[int]]] = {name: [] for name in CONDITIONS}
     seconds_of: dict[str, list[float]] = {name: [] for name in CONDITIONS}
-    for name, where in CONDITIONS.items():
-        for query in queries:
+    for name in CONDITIONS:
+        for query, own in zip(queries, classes.tolist(), strict=True):
+            where = condition(name, own)
             start = time.perf_counter()
             with torch.inference_mode():
                 nearest, _, _ = table.nearest(
@@ -157,7 +177,8 @@ def main() -> None:
             found[name].append([int(row["name"]) for row in nearest])
         median, slow = (1e3 * np.quantile(seconds_of[name], share) for share in (0.5, 0.99))
         print(f"{name}: {median:.0f} ms (median), {slow:.0f} ms (99 %); {memory()}", flush=True)
-    for name, expected in exact_nearest(table, queries, descriptor.distances).items():
+    exact = exact_nearest(table, queries, classes, descriptor.distances)
+    for name, expected in exact.items():
         pairs = zip(found[name], expected.tolist(), strict=True)
         shares = [len(set(one) & set(other)) / TOP for one, other in pairs]
         print(f"{name}: recall {np.mean(shares):.4f} at {TOP}", flush=True)
