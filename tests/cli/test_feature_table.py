@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from igps.cli import main
+from igps.signature.measures import POWERS
 from own_descriptors import SMALL
 
 nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
@@ -55,7 +56,9 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     extract(monkeypatch, root, tmp_path / "features.csv")
-    assert "4 descriptions of shape (642,)" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "4 bodies written to" in printed
+    assert "compare it by igps.descriptor(" in printed
     table = pd.read_csv(tmp_path / "features.csv", dtype={"age": str}, keep_default_na=False)
     assert table["name"].tolist() == [
         "1.nii.gz#liver",
@@ -71,12 +74,20 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(
     n_voxels = [
         nibabel.load(root / f"{i}.nii.gz").get_fdata() == label for i in (1, 2) for label in (1, 2)
     ]
-    np.testing.assert_allclose(table["volume"], [8 * mask.sum() for mask in n_voxels], rtol=1e-3)
-    assert (table["area"] > (36 * np.pi) ** (1 / 3) * table["volume"] ** (2 / 3)).all()
+    volumes = [8 * mask.sum() for mask in n_voxels]
+    np.testing.assert_allclose(table["voxel_volume_mm3"], volumes)
+    np.testing.assert_allclose(table["volume_mm3"], volumes, rtol=1e-3)
+    np.testing.assert_allclose(table["spacing_z_mm"], 2)
+    centres = [2 * np.argwhere(mask).mean(axis=0) for mask in n_voxels]
+    places = table[["centroid_x_mm", "centroid_y_mm", "centroid_z_mm"]]
+    np.testing.assert_allclose(places, centres, atol=0.1)
+    ball = (36 * np.pi) ** (1 / 3) * table["volume_mm3"] ** (2 / 3)
+    np.testing.assert_allclose(table["area_mm2"] * table["sphericity"], ball)
     extract(monkeypatch, root, tmp_path / "features.npz")
     with np.load(tmp_path / "features.npz") as archive:
         vectors = archive["features"].reshape(4, -1)
-    columns = [f"v{i}" for i in range(642)]  # the last two are of size, as there is a unit
+    size = ["size.log_root_area", "size.log_cube_root_volume"]  # as there is a unit
+    columns = [*(f"v{i}" for i in range(640)), *size]
     assert table.columns.tolist()[-642:] == columns
     assert np.array_equal(table[columns].to_numpy(np.float32), vectors)
 
@@ -91,20 +102,14 @@ def test_a_wide_table_has_a_row_for_each_file(
     extract(monkeypatch, root, tmp_path / f"long.{suffix}")
     extract(monkeypatch, root, tmp_path / f"wide.{suffix}", "--wide")
     long, wide = read(tmp_path / f"long.{suffix}"), read(tmp_path / f"wide.{suffix}")
-    assert wide.columns.tolist()[:6] == [
-        "file",
-        "class",
-        "age",
-        "unit",
-        "liver.volume",
-        "liver.area",
-    ]
-    assert len(wide.columns) == 4 + 2 * (2 + 642)
+    first = ["file", "class", "age", "unit", "liver.notes", "liver.voxel_volume_mm3"]
+    assert wide.columns.tolist()[:6] == first
+    assert len(wide.columns) == 4 + 2 * (1 + len(POWERS) + 642)
     assert wide["class"].tolist() == ["well", "ill"]
     assert wide["age"].sum() == 40  # a number in Parquet, too
     for part in ("liver", "spleen"):
         rows = long[long["part"] == part]
-        for column in ("volume", "area", "v17", "v300"):
+        for column in ("volume_mm3", "area_mm2", "v17", "v300"):
             assert wide[f"{part}.{column}"].tolist() == rows[column].tolist()
 
 
@@ -133,8 +138,8 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
     extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     assert wide["folder"].tolist() == [f"s{i}/segmentations" for i in range(3)]
-    np.testing.assert_allclose(wide["cube.volume"], [512, 729, 1000], rtol=1e-3)
-    np.testing.assert_allclose(wide["bar.volume"], [375, 425, np.nan], rtol=1e-3)
+    np.testing.assert_allclose(wide["cube.volume_mm3"], [512, 729, 1000], rtol=1e-3)
+    np.testing.assert_allclose(wide["bar.volume_mm3"], [375, 425, np.nan], rtol=1e-3)
     assert wide["folder of labels.csv"].tolist() == [
         "a",
         "a",
@@ -147,7 +152,7 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
         monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide"
     )  # of a single subject
     one = pd.read_csv(tmp_path / "one.csv")
-    np.testing.assert_allclose(one[["bar.volume", "cube.volume"]], [[375, 512]], rtol=1e-3)
+    np.testing.assert_allclose(one[["bar.volume_mm3", "cube.volume_mm3"]], [[375, 512]], rtol=1e-3)
 
 
 def test_masks_that_are_numbered_have_a_row_each(
@@ -162,9 +167,11 @@ def test_masks_that_are_numbered_have_a_row_each(
         nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), folder / f"{number}.nii.gz")
     extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
-    assert wide.columns.tolist()[:5] == ["file", "class", "unit", "volume", "area"]
+    assert wide.columns.tolist()[:5] == ["file", "class", "unit", "notes", "voxel_volume_mm3"]
     assert wide["file"].tolist() == [f"{label}/{number}.nii.gz" for label, number in sides]
-    np.testing.assert_allclose(wide["volume"], [49 * side for side in sides.values()], rtol=1e-3)
+    np.testing.assert_allclose(
+        wide["volume_mm3"], [49 * side for side in sides.values()], rtol=1e-3
+    )
 
 
 @pytest.mark.parametrize("options", [[], ["--wide"]])
@@ -172,12 +179,12 @@ def test_columns_that_are_called_as_ours_are_kept_beside_them(
     options: list[str], root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "labels.csv").write_text(
-        f"file,volume,unit,v0,age\n{root / '1.nii.gz'},7,left,x,40\n{root / '2.nii.gz'},8,right,y,50\n"
+        f"file,volume_mm3,unit,v0,age\n{root / '1.nii.gz'},7,left,x,40\n{root / '2.nii.gz'},8,right,y,50\n"
     )
     extract(monkeypatch, tmp_path, tmp_path / "features.csv", *options)
     table = pd.read_csv(tmp_path / "features.csv")
-    n_rows, ours = (1, "liver.volume") if options else (2, "volume")
-    assert table["volume of labels.csv"].tolist() == [7] * n_rows + [8] * n_rows
+    n_rows, ours = (1, "liver.volume_mm3") if options else (2, "volume_mm3")
+    assert table["volume_mm3 of labels.csv"].tolist() == [7] * n_rows + [8] * n_rows
     assert table["unit of labels.csv"].tolist() == ["left"] * n_rows + ["right"] * n_rows
     assert table["v0 of labels.csv"].tolist() == ["x"] * n_rows + ["y"] * n_rows
     assert table["age"].tolist() == [40] * n_rows + [50] * n_rows
@@ -203,7 +210,7 @@ def test_a_body_that_a_file_lacks_has_no_values(
     ("options", "words"),
     [
         (["out.txt"], "ending in .csv, .parquet, .npz"),
-        (["out.npz", "--wide"], "wide table ending in .csv or .parquet"),
+        (["out.npz", "--wide"], "a table ending in .csv or .parquet"),
     ],
 )
 def test_a_file_of_another_kind_is_refused_before_anything_is_computed(
@@ -217,3 +224,23 @@ def test_a_file_of_another_kind_is_refused_before_anything_is_computed(
     with pytest.raises(SystemExit, match="1"):
         extract(monkeypatch, root, tmp_path / options[0], *options[1:])
     assert words in capsys.readouterr().err.replace("one of ", "")
+
+
+def test_plain_numbers_alone_need_no_descriptor_and_notes_stand_in_the_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mask = np.zeros((16, 16, 16), dtype=np.uint8)
+    mask[2:11, 2:11, 2:11] = 1
+    mask[14, 14, 14] = 1
+    nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), tmp_path / "cube.nii.gz")
+    words = ["extract", str(tmp_path), "--out", str(tmp_path / "plain.csv"), "--no_vector"]
+    cache = ["--cache_dir", str(tmp_path / "cache"), "--n_workers", "1"]
+    monkeypatch.setattr(sys, "argv", ["igps", *words, *cache])
+    main()
+    table = pd.read_csv(tmp_path / "plain.csv", keep_default_na=False)
+    assert table.columns.tolist()[:6] == ["file", "part", "name", "class", "unit", "notes"]
+    assert len(table.columns) == 6 + len(POWERS)
+    assert table["voxel_volume_mm3"].tolist() == [730]
+    assert table["n_pieces"].tolist() == [2]
+    assert table["euler_number"].tolist() == [2]
+    assert "left out 1 small piece" in table["notes"][0]

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from igps._arrays import Floats
+from igps._arrays import Floats, Singles
 from igps._failures import Limits
 from igps._parameters import check_positive
 from igps._text import counted
@@ -25,6 +25,7 @@ from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, file_and_part, file_name_of, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
+from igps.descriptors.measures import Measures
 from igps.descriptors.size_and_side import SIDE, SIZE, keeps_size, scale_of
 from igps.mesh.formats import is_searched
 from igps.mesh.mending import repair_steps
@@ -62,6 +63,11 @@ class Described:
     name: (
         str | None
     )  # name that loads the descriptor; None where its centres were fitted to the collection
+
+    def vectors(self, short: bool = False) -> Singles:
+        """Return the descriptions (N, ...), or their short vectors, see `Descriptor.shorten`."""
+        rows = self.descriptor.shorten(self.descriptions) if short else self.descriptions
+        return rows.numpy()
 
     def coordinates(self, *, within_class: bool = False) -> Floats:
         """Return vectors (N, D) for statistics, see `Descriptor.coordinates`."""
@@ -225,7 +231,8 @@ def with_size(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
             )
         return descriptor
     is_kept, warning = keeps_size(size, () if size == "ignore" else dataset.units())
-    if is_kept and size == "auto" and scale_of(module) is None:
+    can_keep = isinstance(module, Measures) or scale_of(module) is not None
+    if is_kept and size == "auto" and not can_keep:
         is_kept, warning = (
             False,
             f"size is ignored: set the attribute `scale` of {descriptor} to keep it",

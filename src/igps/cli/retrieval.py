@@ -77,37 +77,39 @@ def extract(
     out: Path,
     descriptor: str = "pretrained",
     short: bool = False,
+    no_vector: bool = False,
     wide: bool = False,
     **describing: Any,
 ) -> None:
     """Write the descriptions of meshes to a file, for use in any classifier, statistics package or vector database.
 
     A table (.csv or .parquet) has one row per body, with the columns file, part, name, class, further columns of
-    labels.csv, unit (of length), volume, area, and the description as v0, v1 and so on. A NumPy archive (.npz) has
-    features (N, ...) as the descriptor returns them, names (N,), and labels (N,) if the meshes come from a folder with
-    classes.
+    labels.csv, unit (of length), notes, plain numbers such as volume_mm3, and the description, its columns named after
+    its parts. A NumPy archive (.npz) has features (N, ...) as the descriptor returns them, names (N,), and labels (N,)
+    if the meshes come from a folder with classes.
 
     Args:
         meshes: mesh files, or one folder.
         out: file ending in .csv, .parquet or .npz; notes on repaired meshes are written beside it, to a file of the
             same name ending in .notes.csv.
         short: write unit vectors of at most 256 numbers, for search engines that compare by the cosine (pretrained).
-        wide: write one row per file, or per folder with one mask file per organ, and columns such as PART.volume and
-            PART.v0 for each of its bodies.
+        no_vector: write plain numbers alone, without a descriptor
+        wide: write one row per file, or per folder with one mask file per organ, and columns such as PART.volume_mm3
+            for each of its bodies.
     """
-    import numpy as np
-
-    from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
+    from igps.cli.feature_table import SUFFIXES
     from igps.cli.reading import described, files_or_folder, print_failures, write_mending_notes
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import SizeAndSide
     from igps.nn.descriptor import EmbeddedDescriptor
 
-    suffix = out.suffix.lower()
-    if wide and suffix == ".npz":
+    is_archive = out.suffix.lower() == ".npz"
+    if is_archive and (wide or no_vector):
         raise ValueError(
-            f"out: expected a file of a wide table ending in {' or '.join(SUFFIXES)}, got {out}."
+            f"out: expected a file of a table ending in {' or '.join(SUFFIXES)}, got {out}."
         )
+    if no_vector:
+        descriptor = "measures"
     module = descriptor_of(descriptor)
     inner = module.descriptor if isinstance(module, SizeAndSide) else module
     if short and not isinstance(inner, EmbeddedDescriptor):
@@ -115,26 +117,52 @@ def extract(
             f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}."
         )
     result = described(files_or_folder(meshes), descriptor, **describing)
-    features = (
-        result.descriptor.shorten(result.descriptions) if short else result.descriptions
-    ).numpy()
     out.parent.mkdir(parents=True, exist_ok=True)
-    if suffix == ".npz":
-        bodies = result.dataset.bodies
-        labels: dict[str, Any] = (
-            {} if bodies.labels is None else {"labels": np.array(bodies.labels)}
-        )
-        np.savez_compressed(out, features=features, names=np.array(bodies.names), **labels)
+    if is_archive:
+        _write_archive(out, result, short)
     else:
-        metadata, measured = feature_table(result.dataset, features)
-        table = wide_table(metadata, measured) if wide else {**metadata, **measured}
-        write_table(out, table)
+        _write_features(out, result, short, wide)
     write_mending_notes(out.with_suffix(".notes.csv"), result.dataset)
-    rows = f", rows: {len(next(iter(table.values())))}" if wide else ""
-    print(
-        f"{counted(len(features), 'description')} of shape {features.shape[1:]} written to {out}{rows}"
-    )
-    print_failures(result.failures, len(features))
+    print_failures(result.failures, len(result.dataset))
+
+
+def _write_archive(out: Path, result: Described, short: bool) -> None:
+    import numpy as np
+
+    features = result.vectors(short)
+    bodies = result.dataset.bodies
+    labels: dict[str, Any] = {}
+    if bodies.labels is not None:
+        labels["labels"] = np.array(bodies.labels)
+    np.savez_compressed(out, features=features, names=np.array(bodies.names), **labels)
+    n_described = counted(len(features), "description")
+    print(f"{n_described} of shape {features.shape[1:]} written to {out}")
+
+
+def _write_features(out: Path, result: Described, short: bool, wide: bool) -> None:
+    from igps.cli.feature_table import feature_table, wide_table, write_table
+    from igps.descriptors.measures import Measures
+
+    vectors = result.vectors(short).reshape(len(result.dataset), -1)
+    columns = [f"short.{i}" for i in range(vectors.shape[1])]
+    if not short:
+        columns = result.descriptor.column_names(vectors.shape[1])
+    if isinstance(result.descriptor, Measures):  # whose numbers every table has, in their units
+        columns = []
+    metadata, measured = feature_table(result.dataset, vectors[:, : len(columns)], columns)
+    table = {**metadata, **measured}
+    if wide:
+        table = wide_table(metadata, measured)
+    write_table(out, table)
+    n_rows = len(next(iter(table.values())))
+    n_bodies = counted(len(result.dataset), "body")
+    print(f"{n_bodies} written to {out}, rows: {n_rows}, columns: {len(table)}")
+    if columns:
+        how = f"igps.descriptor({result.descriptor.name!r}).distances"
+        if short:
+            how = "the cosine"
+        whole = f"{columns[0]} to {columns[-1]}"
+        print(f"{whole} are one vector: compare it by {how}, and not column by column")
 
 
 def query(

@@ -59,7 +59,7 @@ class Content:
     @staticmethod
     def of_mesh(mesh: Mesh) -> "Content":
         """Return the content of a mesh in memory."""
-        facts = repr((mesh.unit, mesh.notes)).encode()
+        facts = repr((mesh.unit, mesh.notes, dict(mesh.given))).encode()
         arrays = (mesh.vertices.tobytes(), mesh.faces.tobytes())
         return Content(b"".join(_hash(part) for part in (*arrays, facts)))
 

@@ -74,6 +74,10 @@ class Measures(Descriptor):
         """(Q, G) Euclidean distances."""
         return euclidean(queries, gallery)
 
+    def column_names(self, width: int) -> list[str]:
+        """Return the names of the measures, after `log`."""
+        return [f"log.{name}" for name in self.columns]
+
     def with_size(self) -> "Measures":
         """Return the descriptor that compares size, too."""
         return Measures(size=True)

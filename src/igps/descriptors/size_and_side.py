@@ -24,6 +24,9 @@ Mirror = Literal["same", "distinct"]
 SIZE, SIDE = "+size", "+side"
 """Suffixes of the names of descriptors that keep size, and that distinguish a body from its mirror image."""
 
+SIZE_COLUMNS = ("size.log_root_area", "size.log_cube_root_volume")
+"""Names of the columns that hold the size of a body."""
+
 SCALES: Mapping[str, float] = {
     "interior": 0.017,
     "gps": 0.017,
@@ -152,6 +155,14 @@ class SizeAndSide(Descriptor):
         form, side, size = self.split(descriptions)
         coordinates = self.descriptor.coordinates(form, within_class=within_class)
         return torch.cat([coordinates, side, size], dim=1)
+
+    def column_names(self, width: int) -> list[str]:
+        """Return the names of the descriptor's own columns, then `side.0` and so on, and those of size."""
+        columns = torch.arange(width)[None]
+        form, side, size = self.split(columns)
+        names = self.descriptor.column_names(form.numel())
+        names += [f"side.{i}" for i in range(side.shape[1])]
+        return names + list(SIZE_COLUMNS)[: size.shape[1]]
 
     def shorten(self, descriptions: Tensor) -> Tensor:
         """(N, D) descriptions to (N, ≤ 256 + 55): `shorten` of the descriptor (or its ValueError), then others."""

@@ -36,6 +36,10 @@ class SizedHistograms(HistogramDescriptor):
         size = torch.stack([batch.area, batch.volume], dim=1).log()
         return torch.cat([super().describe(batch), size.float()], dim=1)
 
+    def column_names(self, width: int) -> list[str]:
+        """Return the names of the cells, then those of the logarithms."""
+        return [*super().column_names(width - 2), "size.log_area", "size.log_volume"]
+
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) distances."""
         size = torch.cdist(queries[:, -2:], gallery[:, -2:], p=1)

@@ -187,7 +187,7 @@ def surface_body(
     if options.allow_open and options.mend != "always":
         try:
             mesh = Mesh(vertices, faces, name=name, allow_open=True, notes=notes, unit=raw.unit)
-            return mesh.annotated(frame=raw.frame)
+            return mesh.annotated(frame=raw.frame, given=raw.given)
         except MeshError:
             if options.mend == "never":
                 raise
@@ -204,7 +204,9 @@ def surface_body(
     # Of another surface, such as one of the pieces, the area is not known
     is_same = math.isclose(mesh.area, face_areas(raw.vertices, raw.faces).sum(), rel_tol=1e-6)
     fine_area = raw.fine_area if is_same else None
-    return mesh.annotated(notes=notes, unit=raw.unit, frame=raw.frame, fine_area=fine_area)
+    return mesh.annotated(
+        notes=notes, unit=raw.unit, frame=raw.frame, fine_area=fine_area, given=raw.given
+    )
 
 
 def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:

@@ -117,6 +117,7 @@ class Mesh:
         cavities: accept closed surfaces inside the largest, oriented inward, which bound hollows of the body.
         frame: "RAS" if x points to the patient's right, y to the front and z up; None if this is not known.
         fine_area: area, length², of the finer surface that these triangles stand for, which `area` then returns.
+        given: numbers by name that its source knows and its surface does not tell, such as the volume of its voxels.
 
     Raises:
         MeshError: no faces, NaN or infinite vertices, out-of-range or repeated indices, unreferenced vertices,
@@ -133,6 +134,7 @@ class Mesh:
     cavities: bool = False
     frame: Frame = None
     fine_area: float | None = None
+    given: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64, order="C")
@@ -163,13 +165,15 @@ class Mesh:
         unit: str | None = None,
         frame: Frame = None,
         fine_area: float | None = None,
+        given: Mapping[str, float] | None = None,
     ) -> Self:
-        """Return the mesh with `notes` before its own, and with the others unless None, not checked again."""
+        """Return the mesh with `notes` before its own, and with what else is not None, not checked again."""
         return self._changed(
             notes=(*notes, *self.notes),
             unit=unit or self.unit,
             frame=frame or self.frame,
             fine_area=fine_area or self.fine_area,
+            given=given or self.given,
         )
 
     def numbered_by_faces(self) -> Self:

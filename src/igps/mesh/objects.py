@@ -45,7 +45,7 @@ def as_mesh(body: Any, spacing: Sequence[float] | None = None) -> Mesh:
     if raw.fault is not None:
         raise raw.fault
     mesh = Mesh(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
-    return mesh.annotated(frame=raw.frame)
+    return mesh.annotated(frame=raw.frame, given=raw.given)
 
 
 def object_bodies(thing: Any, name: str, options: LoadOptions = LoadOptions()) -> Sequence[RawBody]:

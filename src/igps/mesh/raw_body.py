@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import codecs
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -55,6 +55,7 @@ class RawBody:
     )
     frame: Frame = None  # see `Mesh`
     fine_area: float | None = None  # see `Mesh`
+    given: Mapping[str, float] = field(default_factory=dict)  # see `Mesh`
     number: str | None = None  # of a label, by which it is found like by its name
 
     def made(self) -> RawBody:
@@ -87,6 +88,7 @@ def deferred(
             denoise=False,
             frame=mesh.frame,
             fine_area=mesh.fine_area,
+            given=mesh.given,
         )
 
     return RawBody(part=part, make=compute)

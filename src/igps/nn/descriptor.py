@@ -146,6 +146,10 @@ class Descriptor(Specified, ABC):
         rows = descriptions.flatten(1)
         return rows.sqrt() if self.search_distance == "chi_square" else rows
 
+    def column_names(self, width: int) -> list[str]:
+        """Return names for the `width` numbers of a description in a table, after their parts if it has several."""
+        return [f"v{i}" for i in range(width)]
+
     def shorten(self, descriptions: Tensor) -> Tensor:
         """Map descriptions (N, D) to (N, ≤ 256) for engines with cosine distances; by default, a ValueError."""
         raise ValueError(
@@ -256,6 +260,13 @@ class HistogramDescriptor(Descriptor):
         """The number of cells of all parts."""
         return sum(self.part_cells)
 
+    def column_names(self, width: int) -> list[str]:
+        """Return `v0` and so on, of several parts `part1.v0`."""
+        if len(self.parts) == 1:
+            return super().column_names(width)
+        cells = enumerate(self.part_cells, 1)
+        return [f"part{part}.v{i}" for part, n_cells in cells for i in range(n_cells)]
+
     def describe(self, batch: SignatureBatch) -> Tensor:
         """Return descriptions of sum 1: of a single histogram in its shape (N, ...), of several as (N, cells)."""
         if self._sizes is None:
@@ -330,6 +341,16 @@ class EmbeddedDescriptor(Descriptor):
         weights[within_class] = 0.0  # such as lengths, which would outweigh all directions
         weights[self.head.compared_within_class(columns)[0]] = _WITHIN_CLASS_WEIGHT
         return weights.tolist()
+
+    def column_names(self, width: int) -> list[str]:
+        """Return `class.0` and so on for the numbers that distinguish classes, `body.0` for those within a class."""
+        columns = torch.arange(width)[None]
+        n_of_bodies = self.head.within_class(columns).shape[1]
+        if n_of_bodies == width:
+            return super().column_names(width)
+        n_of_classes = width - n_of_bodies
+        classes = [f"class.{i}" for i in range(n_of_classes)]
+        return classes + [f"body.{i}" for i in range(n_of_bodies)]
 
     def coordinates(self, embeddings: Tensor, *, within_class: bool = False) -> Tensor:
         """Return embeddings (N, D), for bodies of one class reduced by `Head.within_class`."""

@@ -19,7 +19,7 @@ from igps.mesh.surface import area_vectors, components, directed_edges, undirect
 from igps.signature.sampling import surface_points
 from igps.signature.voxels import interior_samples
 
-MEASURES_VERSION = 1
+MEASURES_VERSION = 2
 """Part of every cache key: raise it whenever the same mesh would give other numbers."""
 
 POWERS: Mapping[str, int] = {
@@ -42,6 +42,12 @@ POWERS: Mapping[str, int] = {
     "euler_number": 0,
     "mean_curvature": -1,
     "total_curvature": 1,
+    "centroid_x": 1,
+    "centroid_y": 1,
+    "centroid_z": 1,
+    "spacing_x": 1,
+    "spacing_y": 1,
+    "spacing_z": 1,
 }
 """The power of the unit of length of each measure, by its name."""
 
@@ -87,6 +93,8 @@ def measures(mesh: Mesh, points: Floats | None = None) -> dict[str, float]:
     - `convexity` (R3ER): volume over that of the convex hull.
     - `n_pieces`: pieces that share no corner, before small ones were dropped; of a body from voxels, of its voxels.
     - `euler_number`: pieces minus tunnels plus cavities; of a body from voxels, of its voxels.
+    - `centroid_x`, `centroid_y`, `centroid_z`: centre of the volume, in the coordinates of the file; of volumes in RAS.
+    - `spacing_x`, `spacing_y`, `spacing_z`: sides of a voxel, along the axes of the image next to x, y and z.
     - `total_curvature`: the integral of the mean curvature M, half the sum over edges of length times angle (Steiner
       1840); 4πr for a ball. `mean_curvature`: M/A.
 
@@ -101,7 +109,7 @@ def measures(mesh: Mesh, points: Floats | None = None) -> dict[str, float]:
     area = mesh.area
     hull = ConvexHull(mesh.vertices)
     corners = mesh.vertices[hull.vertices]
-    variances, axes = _principal_axes(mesh)
+    centroid, variances, axes = _moments(mesh)
     least, minor, major = 4 * np.sqrt(variances)
     box = np.ptp(corners @ axes, axis=0).prod()
     if points is None:
@@ -127,8 +135,13 @@ def measures(mesh: Mesh, points: Floats | None = None) -> dict[str, float]:
         "euler_number": _euler_number(mesh),
         "mean_curvature": total_curvature / area,
         "total_curvature": total_curvature,
+        "centroid_x": centroid[0],
+        "centroid_y": centroid[1],
+        "centroid_z": centroid[2],
+        **mesh.given,
     }
-    return {name: float(value) for name, value in numbers.items()}
+    known = [name for name in POWERS if name in numbers]
+    return {name: float(numbers[name]) for name in known}
 
 
 def local_thickness(mesh: Mesh, points: Floats) -> Floats:
@@ -201,8 +214,8 @@ class _NearestPoints:
         return lengths[rows, best], unit(vectors[rows, best])
 
 
-def _principal_axes(mesh: Mesh) -> tuple[Floats, Floats]:
-    """Return the variances (3,) of the points of a body along its principal axes, ascending, and the axes as columns.
+def _moments(mesh: Mesh) -> tuple[Floats, Floats, Floats]:
+    """Return the centroid (3,) of a body, its variances (3,) along the principal axes, ascending, and these as columns.
 
     The body is the signed sum of the tetrahedra over its faces. In a tetrahedron with corners 0, a, b and c, the mean
     of x xᵀ is (a aᵀ + b bᵀ + c cᵀ + s sᵀ)/20 with s = a + b + c.
@@ -215,7 +228,7 @@ def _principal_axes(mesh: Mesh) -> tuple[Floats, Floats]:
     vectors = np.concatenate([corners, sums[:, None]], axis=1)
     second = np.einsum("f,fki,fkj->ij", shares, vectors, vectors) / 20
     variances, axes = np.linalg.eigh(second - np.outer(mean, mean))
-    return np.maximum(variances, 0), axes
+    return origin + mean, np.maximum(variances, 0), axes
 
 
 def _diameter(corners: Floats) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from igps._arrays import Booleans, Integers
+from igps._arrays import Booleans, Floats, Integers
 from igps.mesh.raw_body import LabelVoxels
 
 # A label is as thick as a ball if balls of that size that fit inside it cover this share of its voxels.
@@ -34,6 +34,27 @@ def measure(voxels: LabelVoxels) -> VoxelMeasures:
     n_pieces = ndimage.label(voxels.mask, np.ones((3, 3, 3)))[1]
     n_voxels = int(np.count_nonzero(voxels.mask))
     return VoxelMeasures(n_voxels, int(n_pieces), thinnest_part(voxels.mask))
+
+
+def voxel_numbers(mask: Booleans, affine: Floats) -> dict[str, float]:
+    """Return what a surface does not tell of a label, see `igps.measures`: volume, pieces, Euler number, spacing.
+
+    Args:
+        mask: (X, Y, Z), its axes along x, y and z.
+        affine: (4, 4) from voxel indices to the world.
+    """
+    from skimage.measure import euler_number
+
+    axes = affine[:3, :3]
+    spacing = np.linalg.norm(axes, axis=0)
+    return {
+        "voxel_volume": float(np.count_nonzero(mask) * abs(np.linalg.det(axes))),
+        "n_pieces": float(ndimage.label(mask, np.ones((3, 3, 3)))[1]),
+        "euler_number": float(euler_number(mask, connectivity=3)),
+        "spacing_x": float(spacing[0]),
+        "spacing_y": float(spacing[1]),
+        "spacing_z": float(spacing[2]),
+    }
 
 
 def thinnest_part(mask: Booleans) -> int:

@@ -24,6 +24,7 @@ from igps.fields.volumes._volume_files import (
     read_raw,
     suffix_of,
 )
+from igps.fields.volumes.label_measures import voxel_numbers
 from igps.fields.volumes.label_names import cleaned, read_label_names, table_beside
 from igps.fields.volumes.label_surface import MIN_VOXELS, voxel_spacing, voxel_surface
 from igps.mesh.errors import MeshError, NoBodyError
@@ -211,9 +212,11 @@ def label_surface(
             "another label has the same name: the number was appended. Give names by a table",
         )
     mesh = mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name)
-    mesh = mesh.annotated(notes=(*volume.notes, *notes), frame=volume.frame)
+    notes = (*volume.notes, *notes)
+    given = voxel_numbers(mask, affine)
+    mesh = mesh.annotated(notes=notes, frame=volume.frame, given=given)
     mesh = mesh.annotated(notes=_border_notes(volume, body, mesh.area))
-    of_voxels = body.n_voxels * abs(float(np.linalg.det(affine[:3, :3])))
+    of_voxels = given["voxel_volume"]
     surplus = mesh.volume / of_voxels - 1
     if abs(surplus) <= _VOLUME_TOLERANCE:
         return mesh
