@@ -53,7 +53,7 @@ def groups(
         inside: also test where inside the bodies the values of --attribute lie, all numbers of igps inside
             without a unit at once, and each number by itself, with false discovery rates over the numbers.
         out: folder for groups.csv, groups.json, the effects as groups.svg and groups.png, and for each body in which
-            two groups differ a picture of the places, places_BODY.svg and places_BODY.png.
+            two groups differ the places, places_BODY.svg and .png, and .ply, .vtk, .gii and .nii.gz for viewers.
         n_permutations: number of random permutations.
         seed: seed of the permutations, bootstraps and folds.
     """
@@ -171,8 +171,8 @@ def _write_places(
     from igps.cli.places import places_of_groups
     from igps.descriptors.size_and_side import SIZE
     from igps.mesh.errors import MeshError
-    from igps.report.answers import painted_figure
-    from igps.report.drawing import save_figure
+    from igps.report.answers import painted_figure, write_painted
+    from igps.report.drawing import file_names, save_figure
 
     if not members:
         return
@@ -187,9 +187,10 @@ def _write_places(
         return
     print(f"{body}: {places.words}")
     figure = painted_figure([places.painted], places.legend)
-    name = re.sub(r"[^\w.-]+", "_", f"places_{body}")
+    (name,) = file_names([f"places_{body}"])
     save_figure(figure, out / f"{name}.svg")
     save_figure(figure, out / f"{name}.png", dpi=150)
+    write_painted(out, [name], [places.painted], result.dataset)
 
 
 def _design(bodies: Bodies, name: str) -> Any:
@@ -286,7 +287,8 @@ def explain(
         body: of a folder, only the bodies of this name in their files, such as an organ.
         level: family-wise error rate, for two groups: only histogram cells and places that differ significantly count.
         out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and
-            explain.svg and explain.png: two bodies painted with their shares, or the mean difference of two groups.
+            explain.svg and explain.png: two bodies painted with their shares, or the mean difference of two groups;
+            the same for viewers as explain_BODY.ply, .vtk, .gii and .nii.gz.
     """
     import numpy as np
 
@@ -300,7 +302,8 @@ def explain(
     from igps.descriptors.size_and_side import SIZE
     from igps.mesh.surface import vertex_areas
     from igps.nn.description import describe
-    from igps.report.answers import painted_figure, write_analysis
+    from igps.report.answers import painted_figure, write_analysis, write_painted
+    from igps.report.drawing import file_names
 
     check_fraction(level=level)
     source = files_or_folder(meshes)
@@ -379,6 +382,8 @@ def explain(
     if out is not None:
         write_analysis(out, "explain_samples", _sample_rows(dataset, pair, explanation))
         write_analysis(out, "explain", parts, painted_figure(painted, legend))
+        names = [f"explain_{name}" for name in file_names([one.name for one in painted])]
+        write_painted(out, names, painted, dataset)
         print(f"written to {out}")
     return {
         "bodies": names,

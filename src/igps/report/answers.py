@@ -17,6 +17,8 @@ from igps.analysis.clusters import STABLE, Clusters
 from igps.analysis.groups import GroupTest
 from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
+from igps.data.dataset import SignatureDataset
+from igps.mesh.loading import read_surface
 from igps.mesh.mesh import Mesh
 from igps.report.drawing import (
     GREY,
@@ -27,6 +29,7 @@ from igps.report.drawing import (
     thumbnail,
     titles_of,
 )
+from igps.report.exports import write_places
 from igps.report.page_data import finite
 from igps.report.tables import write_rows
 from igps.report.views import common_views, draw_view, reach_of
@@ -135,6 +138,23 @@ def painted_figure(painted: Sequence[Painted], legend: str) -> Figure:
     bar.ax.tick_params(labelsize=6)
     bar.set_label(legend, fontsize=7)
     return figure
+
+
+def write_painted(
+    out: Path, names: Sequence[str], painted: Sequence[Painted], dataset: SignatureDataset
+) -> None:
+    """Write the values of painted bodies of a dataset as out/NAME.ply and others, see `write_places`."""
+    for stem, body in zip(names, painted, strict=True):
+        values = {"value": body.values}
+        if body.is_held is not None:
+            values["significant"] = body.is_held.astype(np.float64)
+        number = dataset.bodies.number(body.name)
+        ref = dataset.bodies[number]
+        voxels = None
+        if ref.path.is_file():
+            raw = read_surface(ref.path, dataset.reading, part=ref.part)
+            voxels = None if raw.voxels is None else raw.voxels()
+        write_places(out / stem, body.mesh, values, voxels)
 
 
 def map_figure(body_map: BodyMap, values: Sequence[str] | Sequence[float], title: str) -> Figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -138,6 +139,11 @@ def titles_of(names: Sequence[str]) -> list[str]:
     shared = os.path.commonpath(folders) if all(folders) else ""
     start = len(shared.rstrip("/")) + 1 if shared else 0
     return [shortened(name[start:]) for name in names]
+
+
+def file_names(names: Sequence[str]) -> list[str]:
+    """Return the titles of bodies as names of files, without an ending."""
+    return [re.sub(r"[^\w.-]+", "_", title) for title in titles_of(names)]
 
 
 def ranked_results(
