@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from igps.duplicates._alignment import (
     SurfaceSamples,
     TriangleSurface,
+    changed_share,
     offset_in_place,
     surface_distance,
 )
@@ -251,3 +252,53 @@ def test_what_is_farther_than_asked_for_is_told_to_be() -> None:
     far = surface_distance(one, other)
     assert far / 3 < surface_distance(one, other, max_distance=far / 3) <= far
     assert surface_distance(one, other, max_distance=1.01 * far) == far
+
+
+def part(
+    step: float = 0.0, boss: float = 0.0, hole: float = 4.0, sections: int = 32
+) -> SurfaceSamples:
+    """A chiral plate of 45 mm with a step, a boss, and a hole of so many segments."""
+    plate = trimesh.creation.box((45, 30, 8))
+    block = trimesh.creation.box((10, 8, 12))
+    block.apply_translation((14, -9, 5 + step))
+    stud = trimesh.creation.cylinder(3, 12, sections=sections)
+    stud.apply_translation((6 + boss, 5, 6))
+    drill = trimesh.creation.cylinder(hole, 40, sections=sections)
+    drill.apply_translation((-12, 6, 0))
+    solid = trimesh.boolean.union([plate, block, stud], engine="manifold")
+    return sampled(trimesh.boolean.difference([solid, drill], engine="manifold"))
+
+
+def sampled(body: trimesh.Trimesh) -> SurfaceSamples:
+    points, faces = trimesh.sample.sample_surface(body, 1500, seed=len(body.faces))
+    samples = SurfaceSamples.of(points, body.face_normals[faces], body.area)
+    vertices = (body.vertices - points.mean(axis=0)) / body.area**0.5
+    surface = TriangleSurface(vertices, np.asarray(body.faces, dtype=np.int64))
+    return replace(samples, surface=lambda: surface)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"step": 0.45}, {"boss": 0.45}, {"hole": 4.2}],
+    ids=["a higher step", "a boss moved", "a wider hole"],
+)
+def test_a_changed_part_is_told_from_another_level_of_detail(change: dict[str, float]) -> None:
+    """One percent of the length, in a few places. Fewer segments lie as far apart, but on round places alone."""
+    assert changed_share(part(), part(**change), 5e-4) > 0.015
+    for n_segments in (8, 16):
+        assert changed_share(part(), part(sections=n_segments), 5e-4) < 0.005
+
+
+def test_only_a_reflection_lays_a_chiral_part_onto_its_mirror_image() -> None:
+    one = part()
+    assert one.surface is not None
+    surface = one.surface()
+    vertices, faces = surface._triangles
+    mirror = np.array([-1.0, 1.0, 1.0])
+    other = replace(
+        SurfaceSamples.of(one.points * mirror, one.normals * mirror, 1.0),
+        surface=lambda: TriangleSurface(vertices * mirror, np.ascontiguousarray(faces[:, ::-1])),
+    )
+    apart = {side: surface_distance(one, other, side=side) for side in ("same", "mirrored")}
+    assert apart["mirrored"] < 1e-4
+    assert apart["same"] > 100 * apart["mirrored"]

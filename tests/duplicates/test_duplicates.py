@@ -37,6 +37,10 @@ CONFIG = descriptor("pretrained").requirements.apply_to(SignatureConfig())
 SAME = {frozenset({"lump.off", "lump.stl"}), frozenset({"bar.off", "bar.ply", "bar.obj"})}
 
 
+# Corners of three boxes that turn to one side.
+BRACKET = (((0, 0, 0), (6, 1, 1)), ((0, 0, 0), (1, 4, 1)), ((5, 0, 0), (6, 1, 3)))
+
+
 def ball(subdivisions: int) -> trimesh.Trimesh:
     return trimesh.creation.icosphere(subdivisions=subdivisions)
 
@@ -291,6 +295,24 @@ def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
     mirrored.export(tmp_path / "mirrored.off")
     found = duplicates(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"), n_workers=1)
     assert grouped(found.groups) == {frozenset({"one.off", "mirrored.off"})}
+    assert not found.mirrored  # a washer is its own mirror image
+
+
+def test_a_mirror_image_is_called_so(tmp_path: Path) -> None:
+    """A bracket of three boxes in a spiral, its copy, and its mirror image."""
+    boxes = [trimesh.creation.box(bounds=b) for b in BRACKET]
+    bracket = trimesh.boolean.union(boxes, engine="manifold")
+    bracket.export(tmp_path / "left.off")
+    turned = bracket.copy()
+    turned.apply_transform(trimesh.transformations.rotation_matrix(1.0, [1, 2, 3]))
+    turned.export(tmp_path / "copy.off")
+    bracket.apply_scale([-1, 1, 1])
+    bracket.export(tmp_path / "right.off")
+    found = duplicates(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"), n_workers=1)
+    assert grouped(found.groups) == {frozenset({"left.off", "right.off", "copy.off"})}
+    mirrored = {pair: "right.off" in pair for pair in found.pairs}
+    assert found.mirrored == {pair for pair, is_mirrored in mirrored.items() if is_mirrored}
+    assert len(found.mirrored) == 1
 
 
 @pytest.mark.parametrize("numbered", ["alike", "otherwise"])

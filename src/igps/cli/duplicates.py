@@ -90,7 +90,13 @@ def duplicates(
             zip(("largest", "largest_length", "unit"), result.largest.get(pair, ()), strict=False)
         )
         pairs.append(
-            {"files": list(pair), "distance": apart, "grade": result.grades.get(pair), **largest}
+            {
+                "files": list(pair),
+                "distance": apart,
+                "grade": result.grades.get(pair),
+                "mirrored": pair in result.mirrored,
+                **largest,
+            }
         )
     return {
         "groups": [list(group) for group in result.groups],
@@ -108,12 +114,15 @@ def _print_groups(result: Duplicates, poses: bool) -> None:
 
     for number, group in enumerate(result.groups, 1):
         print(f"group {number}: " + "  ".join(group))
+    for pair in sorted(result.mirrored):
+        print(f"mirror image: {'  '.join(pair)}")
     for pair, distance in result.nearly.items():
         print(f"nearly: {'  '.join(pair)}  {distance:.3%} of the square root of the area apart")
     calibration, n_grouped = Calibration.load(), sum(map(len, result.groups))
     threshold, kind = (calibration.pose, "poses") if poses else (calibration.detail, "copies")
     grades = "".join(
-        f"; {n} pairs {grade}" for grade, n in Counter(result.grades.values()).most_common()
+        f"; {counted(n, 'pair')} {grade}"
+        for grade, n in Counter(result.grades.values()).most_common()
     )
     print(
         f"{n_grouped} of {result.n_files} files in {len(result.groups)} groups; on generated bodies, this finds "

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import product
 from operator import itemgetter
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from igps._arrays import Floats, Integers
-from igps.mesh.surface import area_vectors, unit
+from igps.mesh.surface import area_vectors, face_areas, undirected_edges, unit
 
 # Lengths are over √area.
 _NORMAL_WEIGHT = 0.1  # of normals in the search for the nearest sample, to tell apart the two sides of a thin sheet
@@ -32,6 +33,13 @@ _CLOSE_FIT = 1.5
 _FINE_FACTOR = 1.5
 _LAST_GAIN = 0.004  # upper bound of the decrease of a distance by the last steps; 0.0001 for copies of generated bodies
 _PATCH_SIZE = 10  # neighbouring samples whose offsets are averaged
+# Degrees between neighbouring triangles: less than the first is flat, up to the second round, and beyond the third an
+# edge. In between it may be either.
+_BENDS = (1.0, 30.0, 60.0)
+# Flat faces tell whether a body was changed if they have this share of the samples, and half of these lie nearer than
+# the tolerance over _COINCIDING. The alignment is improved _N_TRIMMED times.
+_MIN_FLAT, _COINCIDING, _N_TRIMMED = 0.1, 5.0, 3
+_PLAY = 2.0  # times the play of both surfaces by which round places may lie apart
 MAX_LOG_SCALE = math.log(1.1)
 """Largest logarithm of the scale of an alignment."""
 
@@ -105,6 +113,40 @@ class TriangleSurface:
         )
         return np.asarray(points), self._normals[np.asarray(face).ravel()]
 
+    def play_at(self, samples: SurfaceSamples) -> Floats:
+        """Return how far (P,) the round surface behind the nearest triangles may lie from them: 0 on flat faces.
+
+        Bends of a few degrees are those of a round surface. An arc whose chords are w wide and bend by β lies up to
+        w/2 · tan(β/4) off them. Bends of more degrees may be edges or coarse arcs: infinity.
+        """
+        points = np.ascontiguousarray(samples.points)
+        _, face, _ = self._tree.squared_distance(*self._triangles, points)
+        return self._play[np.asarray(face).ravel()]
+
+    @cached_property
+    def _play(self) -> Floats:
+        vertices, faces = self._triangles
+        edges, edge_of_side = undirected_edges(faces, len(vertices))
+        lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+        count = np.bincount(edge_of_side, minlength=len(edges))
+        sides = np.argsort(edge_of_side, kind="stable")
+        starts = (np.cumsum(count) - count)[count == 2]
+        pairs = np.stack([sides[starts], sides[starts + 1]]) // 3  # the two faces (2, E) of edges
+        cosines = np.einsum("ei,ei->e", *self._normals[pairs])
+        bends = np.arccos(np.clip(cosines, -1, 1))
+        flat, round_, arc = np.radians(_BENDS)
+        widths = 2 * face_areas(vertices, faces)[pairs] / np.maximum(lengths[count == 2], 1e-12)
+        play = widths / 2 * np.tan(bends / 4)
+        play[:, bends > round_] = np.inf
+        play[:, (bends < flat) | (bends > arc)] = 0.0
+        largest = np.zeros(len(faces))
+        np.maximum.at(largest, pairs, play)
+        return largest
+
+
+Side = Literal["any", "same", "mirrored"]
+"""Which alignments are tried: all, those without a reflection, or those with one."""
+
 
 def surface_distance(
     one: SurfaceSamples,
@@ -114,6 +156,7 @@ def surface_distance(
     hopeless: float = math.inf,
     max_distance: float = math.inf,
     patch_size: int = _PATCH_SIZE,
+    side: Side = "any",
 ) -> float:
     """Return the distance of two surfaces after alignment, over √area: root mean square over patches, both ways.
 
@@ -136,11 +179,12 @@ def surface_distance(
         max_distance: distance beyond which the result is only a lower bound, for which one direction may be enough.
         patch_size: samples in a patch. With 1, for surfaces known to be the same, lost relief counts, and the largest
             offset is returned instead of the root mean square.
+        side: which alignments are tried.
     """
     best = math.inf
     is_ambiguous = min(_min_extent_ratio(one), _min_extent_ratio(other)) < _AMBIGUITY
     samples = _subset(one, _N_FITTED)
-    for starts in (_principal_starts(one, other), _uniform_starts()):
+    for starts in _starts(one, other, side):
         order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")[
             :_N_STARTS
         ]
@@ -160,6 +204,49 @@ def surface_distance(
         if best <= stop_at or ((best > hopeless or patch_size == 1) and not is_ambiguous):
             break
     return best
+
+
+def _starts(one: SurfaceSamples, other: SurfaceSamples, side: Side) -> list[Floats]:
+    """Return the maps (S, 3, 3) of principal axes, and those spread evenly, on the given side."""
+    all_starts = [_principal_starts(one, other), _uniform_starts()]
+    if side == "any":
+        return all_starts
+    is_mirrored = side == "mirrored"
+    return [starts[(np.linalg.det(starts) < 0) == is_mirrored] for starts in all_starts]
+
+
+def changed_share(one: SurfaceSamples, other: SurfaceSamples, tolerance: float) -> float:
+    """Return the share of two aligned surfaces that lies apart, if flat faces mostly coincide; else 0.
+
+    Another level of detail moves round places by their play, see `TriangleSurface.play_at`, but no flat face. So
+    surfaces whose flat faces mostly coincide, and that lie farther apart elsewhere, are those of different bodies. The
+    alignment is that of the half that fits best.
+    """
+    surface = other.surface
+    if surface is None or one.surface is None:
+        return 0.0
+    target = surface()
+    fits = []
+    for starts in _starts(one, other, "any"):
+        order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")
+        few = _subset(one, _N_FITTED)
+        coarse = [
+            _fit(few, other, _Alignment(starts[i]), _N_COARSE_STEPS) for i in order[:_N_STARTS]
+        ]
+        fits += [_fit(few, target, alignment, _N_FINE_STEPS) for _, alignment in coarse]
+    _, alignment = min(fits, key=itemgetter(0))
+    for _ in range(_N_TRIMMED):
+        apart = np.linalg.norm(_offsets(alignment(one), target), axis=1)
+        is_near = apart <= np.median(apart)
+        half = SurfaceSamples(one.points[is_near], one.normals[is_near])
+        _, alignment = _fit(half, target, alignment, _N_LAST_STEPS)
+    moved = alignment(one)
+    play = one.surface().play_at(one) + target.play_at(moved)
+    apart = np.linalg.norm(_offsets(moved, target), axis=1)
+    on_flat = apart[play == 0]
+    if len(on_flat) < _MIN_FLAT * len(apart) or np.median(on_flat) > tolerance / _COINCIDING:
+        return 0.0
+    return float((apart > tolerance + _PLAY * play).mean())
 
 
 def offset_in_place(samples: SurfaceSamples, surface: TriangleSurface) -> float:

@@ -49,6 +49,7 @@ class Duplicates:
     # Largest deviation of these pairs, from a sample of one surface to the other: over √area, as a length, and the unit
     # of the length if known
     largest: dict[tuple[str, str], tuple[float, float, str | None]]
+    mirrored: frozenset[tuple[str, str]]  # of these pairs; the others agree without a reflection
     nearly: dict[
         tuple[str, str], float
     ]  # distances over √area of pairs that are not copies, but within the tolerance
@@ -172,6 +173,7 @@ def _found(dataset: SignatureDataset, joined: Pairs, failures: list[Failure]) ->
         pairs={(names[i], names[j]): distance for (i, j), distance in joined.items()},
         grades={},
         largest={},
+        mirrored=frozenset(),
         nearly={},
         n_files=len(dataset),
         failures=tuple(failures),
@@ -184,6 +186,12 @@ def _with_grades(found: Duplicates, joined: Pairs, surfaces: Surfaces, work: _Wo
     grades: dict[tuple[str, str], Grade] = {}
     largest: dict[tuple[str, str], tuple[float, float, str | None]] = {}
     graded = on_threads(lambda pair: surfaces.grade(*pair), list(joined), work.n_workers)
+    sides = on_threads(lambda pair: surfaces.is_mirrored(*pair), list(joined), work.n_workers)
+    mirrored = frozenset(
+        (names[i], names[j])
+        for (i, j), is_mirrored in zip(joined, sides, strict=True)
+        if is_mirrored
+    )
     for (i, j), (grade, deviation) in zip(joined, graded, strict=True):
         pair = names[i], names[j]
         length, unit = surfaces.length(i)
@@ -196,7 +204,7 @@ def _with_grades(found: Duplicates, joined: Pairs, surfaces: Surfaces, work: _Wo
         other = group_of.get(names[j])
         if one is None or one != other:
             nearly[names[i], names[j]] = distance
-    return replace(found, grades=grades, largest=largest, nearly=nearly)
+    return replace(found, grades=grades, largest=largest, mirrored=mirrored, nearly=nearly)
 
 
 def _join(near: NearPairs, surfaces: Surfaces | None, work: _Work) -> Pairs:

@@ -26,6 +26,7 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.duplicates._alignment import (
     SurfaceSamples,
     TriangleSurface,
+    changed_share,
     offset_in_place,
     surface_distance,
 )
@@ -56,6 +57,12 @@ _SAME_SURFACE = 2.5e-5
 Grade = Literal["same file", "same mesh", "same surface", "same at another level of detail"]
 """Agreement of two files of one body, from the closest to the loosest. The same mesh has the same order of vertices."""
 
+# A body is chiral if its mirror image is this many times as far from it as from its copy.
+_CHIRAL = 2.0
+_MIN_CHANGED = (
+    0.01  # smallest share of the flat places that tells a changed body, see `changed_share`
+)
+
 _HANDLE_PRESERVING: set[Step] = {"welded", "smoothed", "subdivided"}  # steps of mending
 
 
@@ -72,6 +79,11 @@ def distance_if_alike(
     return surface_distance(
         one, other, stop_at=stop_at, hopeless=_HOPELESS, max_distance=max_distance
     )
+
+
+def _is_changed(one: SurfaceSamples, other: SurfaceSamples, distance: float) -> bool:
+    """Return whether surfaces at this distance differ in a way that no level of detail explains."""
+    return distance > _SAME_SURFACE and changed_share(one, other, _ROUNDING) >= _MIN_CHANGED
 
 
 class Surfaces:
@@ -140,7 +152,7 @@ class Surfaces:
                     distance = distance_if_alike(
                         one, other, stop_at=limit, max_distance=max(limit, self._tolerance)
                     )
-            if distance <= limit:
+            if distance <= limit and not _is_changed(one, other, distance):
                 return distance
             if distance <= self._tolerance:
                 self.nearly[min(i, j), max(i, j)] = distance
@@ -165,6 +177,12 @@ class Surfaces:
         return (
             "same surface" if deviation <= _SAME_SURFACE else "same at another level of detail"
         ), deviation
+
+    def is_mirrored(self, i: int, j: int) -> bool:
+        """Return whether one of two copies is the mirror image of the other, and not also the other itself."""
+        one, other = self._cached_samples(i), self._cached_samples(j)
+        distance = partial(surface_distance, one, other, stop_at=_SAME_SURFACE, hopeless=_HOPELESS)
+        return distance(side="same") > max(_CHIRAL * distance(side="mirrored"), _ROUNDING)
 
     def length(self, i: int) -> tuple[float, str | None]:
         """Return √area of a body, and its unit of length if known."""

@@ -287,7 +287,11 @@ class _Xml:
                 n_corners = np.asarray(
                     np.diff(arrays["offsets"].astype(np.int64), prepend=0), dtype=np.int64
                 )
-                kinds = arrays.get("types", np.full(len(n_corners), _XML_CELLS.get(group, 0)))
+                kinds = (
+                    arrays["types"]
+                    if group == "Cells"
+                    else np.full(len(n_corners), _XML_CELLS[group])
+                )
                 cells.append(
                     (arrays["connectivity"].astype(np.int64), n_corners, kinds.astype(np.int64))
                 )
