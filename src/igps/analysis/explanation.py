@@ -308,6 +308,9 @@ _AXES = {
 
 def part_name(part: DescriptionPart) -> str:
     """Return what a part of a description counts, as text."""
+    label: str = getattr(part, "label", "")
+    if label:
+        return label
     axes = getattr(part, "axes", [part])
     words = []
     for axis in axes:

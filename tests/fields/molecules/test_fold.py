@@ -96,7 +96,7 @@ def test_shares_of_samples_add_up_to_the_distance() -> None:
     told = explain(fold(), one, other)
     wanted = float(fold().distances(fold()(one), fold()(other)))
     assert told.distance == pytest.approx(wanted, rel=1e-4)
-    assert told.parts == {"fold (interior)": pytest.approx(told.distance)}
+    assert told.parts == {"fold": pytest.approx(told.distance)}
     shares = [kind.sum() for body in told.samples for kind in body.values()]
     assert sum(shares) == pytest.approx(told.distance)
 

@@ -148,7 +148,7 @@ def test_it_has_a_name_but_is_not_for_any_body() -> None:
     assert "molecular" not in NAMES
     bare = replace(signature(0, 0.0), interior=replace(signature(0, 0.0).interior, attributes={}))
     with pytest.raises(
-        ValueError, match="attributes: expected the interior samples to have 'residue_shares'"
+        ValueError, match="attributes: expected the interior samples to have 'trace'"
     ):
         described(bare)
 
@@ -175,6 +175,7 @@ def test_a_head_is_fitted_to_the_histograms_and_an_explanation_holds_the_size() 
         float(molecular().distances(found[:1], found[1:])), rel=1e-3
     )
     assert sum(told.parts.values()) == pytest.approx(told.distance, rel=1e-6)
+    assert list(told.parts) == ["form", "fold", "composition", "charges", "size"]
     assert sum(one.sum() for of_body in told.samples for one in of_body.values()) == pytest.approx(
         told.distance
     )

@@ -1,17 +1,19 @@
-"""Interior distances of a molecule, joined with properties of its residues."""
+"""Form, fold, composition and charges of a molecule, each a part of its own."""
 
 import torch
 from torch import Tensor, nn
 
 from igps.data.requirements import Requirements
 from igps.descriptors.sized_histograms import SizedHistograms
+from igps.fields.molecules.fold import FoldHistogram
 from igps.fields.molecules.residue_attributes import RESIDUE_KINDS
-from igps.nn.axes import Attribute, InteriorDistance, PointAxis
+from igps.nn.axes import Attribute, InteriorDistance, PointAxis, Potential
 from igps.nn.axes.points import attribute_requirements, largest_members
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
+from igps.nn.histograms.points import PointHistogram
 
 # Centres of the classes: in elementary charges, in kT/e, and on the scale of Kyte and Doolittle.
 _CENTRES = {
@@ -19,7 +21,7 @@ _CENTRES = {
     "screened_potential": (-1.5, -0.5, 0.5, 1.5),
     "hydropathy": (-2.0, -1.0, 0.0, 1.0),
 }
-# Distances change with the conformation, so wide bins retrieve proteins better than narrow bins.
+# Distances change with the conformation, so the bins are wide.
 _N_BINS = 4
 _N_SAMPLES = 2000
 
@@ -64,12 +66,31 @@ class Shares(PointAxis):
         return largest_members(values, mask)
 
 
-def molecular(*, size: bool = True) -> HistogramDescriptor:
-    """Histograms of the interior distances between samples, by properties of the residues around the samples.
+class Form(PairHistogram):
+    """The part `form`: interior distances, by potential."""
 
-    The description has two parts of equal share: distances for each pair of 25 kinds of residues; and distances for
-    each pair of classes of charge, of screened potential and of hydropathy. The layout was chosen on halves of 39
-    proteins; see the documentation.
+    label = "form"
+
+
+class Composition(PointHistogram):
+    """The part `composition`: shares of the kinds of residues, without any geometry."""
+
+    label = "composition"
+
+
+class Charges(PairHistogram):
+    """The part `charges`: interior distances, by charge, potential or hydropathy."""
+
+    label = "charges"
+
+
+def molecular(*, size: bool = True) -> HistogramDescriptor:
+    """Form, fold, composition and charges of a molecule, in four parts of equal share.
+
+    - Form: interior distances by barycentroid potential, as `interior`.
+    - Fold: residues by their separation along the chain, see `fold`.
+    - Composition: the shares of 25 kinds of residues.
+    - Charges: interior distances for each pair of classes of charge, of screened potential and of hydropathy.
 
     Source: Rustamov 2010, section 4, for attributes as further dimensions; Kyte and Doolittle 1982.
 
@@ -78,14 +99,18 @@ def molecular(*, size: bool = True) -> HistogramDescriptor:
     """
     embedding = SpectralEmbedding(n_eigenpairs=50)
 
-    def histogram(axis: PointAxis) -> PairHistogram:
-        return PairHistogram([axis, InteriorDistance(_N_BINS)], embedding, n_samples=_N_SAMPLES)
+    def charges(name: str) -> PairHistogram:
+        axes = [Attribute(name, _CENTRES[name], soft=True), InteriorDistance(_N_BINS)]
+        return Charges(axes, embedding, n_samples=_N_SAMPLES)
 
-    kinds = histogram(Shares("residue_shares", len(RESIDUE_KINDS)))
-    scalars = [histogram(Attribute(name, centres, soft=True)) for name, centres in _CENTRES.items()]
     kind = SizedHistograms if size else HistogramDescriptor
     return kind(
-        [kinds, scalars],
+        [
+            Form([Potential(4), InteriorDistance(32)], embedding, n_samples=_N_SAMPLES),
+            FoldHistogram(),
+            Composition([Shares("residue_shares", len(RESIDUE_KINDS))], embedding, "interior"),
+            [charges(name) for name in _CENTRES],
+        ],
         name="molecular",
         source="Rustamov 2010; Kyte and Doolittle 1982",
         invariant_to=("motion",),
