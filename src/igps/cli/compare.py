@@ -28,6 +28,8 @@ def compare(
 ) -> list[dict[str, Any]]:
     """Compare descriptors on a labelled collection and print a table of their retrieval scores.
 
+    What plain numbers find is printed below the table.
+
     Every mesh is compared with all others (leave-one-out) by the distance of each descriptor. A mesh that a descriptor
     cannot describe does not count for its scores; the table lists how many meshes each descriptor describes.
 
@@ -41,6 +43,7 @@ def compare(
     """
     from igps.analysis.comparison import check_names
     from igps.analysis.comparison import compare as compare_descriptors
+    from igps.analysis.plain_numbers import plain_scores, plain_table
     from igps.cli.reading import Folder, signatures, with_side, with_size, write_mending_notes
     from igps.cli.report import check_report_folder
     from igps.cli.report import report as write_report
@@ -75,6 +78,9 @@ def compare(
         ):  # after each descriptor, so that an interrupted run keeps its results so far
             _write(out, results, failures)
     print(comparison_table(results))
+    best = max(results, key=_first_tier)
+    if best.scores is not None:
+        print(plain_table(plain_scores(dataset), best.descriptor.name, best.scores))
     if n_failed := len(failures) + sum(len(result.failures) for result in results):
         print(f"{counted(n_failed, 'body')} could not be used or described.")
     if out is not None:
@@ -91,6 +97,10 @@ def compare(
         if report:
             write_report(out, n_workers=n_workers)
     return [result.row() for result in results]
+
+
+def _first_tier(result: Result) -> float:
+    return 0.0 if result.scores is None else result.scores.mean()["ft"]
 
 
 def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) -> None:

@@ -24,7 +24,7 @@ Table = Mapping[str, Sequence[Any]]
 
 
 def feature_table(
-    dataset: SignatureDataset, vectors: np.ndarray, columns: Sequence[str]
+    dataset: SignatureDataset, vectors: np.ndarray, columns: Sequence[str] = ()
 ) -> tuple[Table, Table]:
     """Return the metadata and the measured values of bodies as two tables with one row per body.
 
@@ -49,7 +49,10 @@ def feature_table(
     }
     measured = _plain_numbers(dataset)
     measured |= {name: list(column) for name, column in zip(columns, vectors.T, strict=True)}
-    last = {"unit": dataset.units(), "notes": ["; ".join(notes) for notes in dataset.all_notes()]}
+    last: dict[str, Sequence[Any]] = {
+        "unit": dataset.units(),
+        "notes": ["; ".join(notes) for notes in dataset.all_notes()],
+    }
     reserved = {"folder", *own, *last, *measured}
     further = {}
     for name, values in bodies.columns.items():
@@ -60,7 +63,7 @@ def feature_table(
 def _plain_numbers(dataset: SignatureDataset) -> dict[str, Sequence[Any]]:
     """Return a column for each measure, None where a body has none; the name of a column ends with its unit."""
     units = dataset.units()
-    known = [unit for unit in units if unit in MILLIMETRES]
+    known = [unit for unit in units if unit is not None and unit in MILLIMETRES]
     is_known = len(known) == len(units)
     is_mixed = is_known and len(set(known)) > 1
     suffix = ""

@@ -42,6 +42,7 @@ def retrieve(
             scores in a second table; distances.npz holds them as "reranked".
     """
     from igps.analysis.comparison import pair_distances
+    from igps.analysis.plain_numbers import plain_scores, plain_table
     from igps.cli.reading import Folder, described, print_failures
     from igps.cli.report import check_report_folder
     from igps.cli.report import report as write_report
@@ -54,7 +55,10 @@ def retrieve(
     labels = result.dataset.bodies.labels or ()
     distances = {"distances": pair_distances(result.descriptor, result.descriptions, progress=True)}
     scores = retrieval_scores(distances["distances"], labels)
+    plain = plain_scores(result.dataset)
+    beside = plain_table(plain, result.descriptor.name, scores)
     summary = _summary(result, scores)
+    summary["plain_numbers"] = {name: row.mean() for name, row in plain.items()}
     tables = scores_table(scores)
     if rerank:
         distances["reranked"] = reranked_distances(distances["distances"])
@@ -64,6 +68,7 @@ def retrieve(
     if out is not None:  # before printing, because a closed pipe, as of `head`, ends the command
         _write_retrieval(out, result, summary, distances)
     print(tables)
+    print(beside)
     print_failures(result.failures, len(result.dataset))
     if out is not None:
         print(f"written to {out}")
@@ -140,7 +145,7 @@ def _write_archive(out: Path, result: Described, short: bool) -> None:
 
 
 def _write_features(out: Path, result: Described, short: bool, wide: bool) -> None:
-    from igps.cli.feature_table import feature_table, wide_table, write_table
+    from igps.cli.feature_table import Table, feature_table, wide_table, write_table
     from igps.descriptors.measures import Measures
 
     vectors = result.vectors(short).reshape(len(result.dataset), -1)
@@ -150,7 +155,7 @@ def _write_features(out: Path, result: Described, short: bool, wide: bool) -> No
     if isinstance(result.descriptor, Measures):  # whose numbers every table has, in their units
         columns = []
     metadata, measured = feature_table(result.dataset, vectors[:, : len(columns)], columns)
-    table = {**metadata, **measured}
+    table: Table = {**metadata, **measured}
     if wide:
         table = wide_table(metadata, measured)
     write_table(out, table)

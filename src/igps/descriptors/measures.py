@@ -1,5 +1,8 @@
 """The plain numbers of a body as a descriptor."""
 
+import math
+from collections.abc import Mapping, Sequence
+
 import torch
 from torch import Tensor
 
@@ -27,11 +30,15 @@ COLUMNS = {
 }
 """The measures that are compared, and the spread of each column among generated bodies. Others follow from these."""
 
+_MIN_SPREAD = 1e-3  # smaller ones are those of discretisation
 _SIGNED = ("total_curvature", "euler_number")
 
 
 class Measures(Descriptor):
     """Logarithms of plain numbers, see `igps.measures`, each over its spread; compared by the Euclidean distance.
+
+    The spread of each column is its standard deviation in a collection, see `igps.nn.fit_centres`, and among generated
+    bodies before it is fitted.
 
     A measure with a unit enters as the logarithm of a length: √area, ∛volume. Without size, lengths are over ∛volume.
     Total curvature and the Euler number, which may be negative, enter as asinh(x); all others as log(x).
@@ -59,16 +66,31 @@ class Measures(Descriptor):
             raise ValueError(
                 "measures: expected bodies with plain numbers, got Signatures without them. Compute these from meshes."
             )
-        factors = 1 / batch.volume.pow(1 / 3)
-        if self.size:
-            units = batch.units or (None,) * len(batch)
-            factors = factors.new_tensor([millimetres(unit) for unit in units])
+        units = batch.units or (None,) * len(batch)
+        return (self.logarithms(batch.measures, units) / self.spread).float()
+
+    def logarithms(self, rows: Tensor, units: Sequence[str | None]) -> Tensor:
+        """Return the columns (N, D) of measures (N, M) in the order of `POWERS`, of bodies with these units."""
         names = list(POWERS)
+        factors = rows[:, names.index("volume")].pow(-1 / 3)
+        if self.size:
+            factors = factors.new_tensor([millimetres(unit) for unit in units])
         columns = []
         for name in self.columns:
-            values = batch.measures[:, names.index(name)] * factors ** POWERS[name]
+            values = rows[:, names.index(name)] * factors ** POWERS[name]
             columns.append(_logarithm(name, values))
-        return (torch.stack(columns, dim=1) / self.spread).float()
+        return torch.stack(columns, dim=1)
+
+    def fit_collection(
+        self, measures: Sequence[Mapping[str, float]], units: Sequence[str | None]
+    ) -> bool:
+        """Set the spread of each column to that of N bodies; one that is the same in all of them keeps its spread."""
+        if len(measures) < 2 or not all(measures):
+            return False
+        rows = [[row.get(name, math.nan) for name in POWERS] for row in measures]
+        spread = self.logarithms(torch.tensor(rows, dtype=torch.float64), units).std(dim=0)
+        self.spread.copy_(torch.where(spread > _MIN_SPREAD, spread, self.spread))
+        return True
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) Euclidean distances."""

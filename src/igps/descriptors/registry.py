@@ -33,10 +33,11 @@ _LIBRARY: Mapping[str, str] = {
     "spectral_gw": "igps.descriptors.literature.spectral_gw:SpectralGromovWasserstein",
     "fold": "igps.fields.molecules.fold:fold",
     "measures": "igps.descriptors.measures:Measures",
+    "composition": "igps.fields.molecules.composition:Composition",
     "molecular": "igps.fields.molecules.molecular:molecular",
 }
 
-FIELD_NAMES: tuple[str, ...] = ("fold", "molecular")
+FIELD_NAMES: tuple[str, ...] = ("composition", "fold", "molecular")
 """The names of the library's descriptors that need attributes of molecules."""
 
 NAMES: tuple[str, ...] = tuple(name for name in _LIBRARY if name not in FIELD_NAMES)

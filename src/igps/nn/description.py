@@ -118,10 +118,11 @@ def describe(
 
 
 def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
-    """Fit the centres of quantile axes to the samples of a collection, and return whether any axis was fitted.
+    """Fit the centres of quantile axes to the samples of a collection, and return whether anything was fitted.
 
-    Axes that are fitted already stay unchanged. Each body contributes its first 500 interior samples. Raises a
-    ValueError if a body does not have the attribute of an axis.
+    The descriptor `measures` is fitted to the spread of its columns. Axes that are fitted already stay unchanged. Each
+    body contributes its first 500 interior samples. Raises a ValueError if a body does not have the attribute of an
+    axis.
     """
     axes = [
         axis for axis in descriptor.modules() if isinstance(axis, Attribute) and not axis.is_fitted
@@ -133,7 +134,10 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
             samples.append(signature.interior.attributes[axis.name][:500])
     for axis, samples in zip(axes, values, strict=True):
         axis.fit(torch.from_numpy(np.concatenate(samples)))
-    return bool(axes)
+    is_fitted = isinstance(descriptor, Descriptor) and descriptor.fit_collection(
+        dataset.measures(), dataset.units()
+    )
+    return bool(axes) or is_fitted
 
 
 def check_attributes(descriptor: nn.Module, names: Collection[str]) -> None:

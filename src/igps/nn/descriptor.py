@@ -150,6 +150,12 @@ class Descriptor(Specified, ABC):
         """Return names for the `width` numbers of a description in a table, after their parts if it has several."""
         return [f"v{i}" for i in range(width)]
 
+    def fit_collection(
+        self, measures: Sequence[Mapping[str, float]], units: Sequence[str | None]
+    ) -> bool:
+        """Adapt to the plain numbers of N bodies of a collection and their units; return whether anything changed."""
+        return False
+
     def shorten(self, descriptions: Tensor) -> Tensor:
         """Map descriptions (N, D) to (N, ≤ 256) for engines with cosine distances; by default, a ValueError."""
         raise ValueError(

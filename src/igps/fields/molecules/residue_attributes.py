@@ -92,10 +92,17 @@ def trace(molecule: Molecule, points: Floats) -> Floats:
     return rows[nearest]
 
 
+def composition(molecule: Molecule, points: Floats) -> Floats:
+    """Return the shares of `RESIDUE_KINDS` and the logarithm of the number of residues, the same at all points."""
+    kinds = _kinds(molecule)
+    row = np.append(kinds.mean(axis=0), np.log(len(kinds)))
+    return np.tile(row, (len(points), 1))
+
+
 def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
     """Return a named attribute of points (P, 3), Å: (P,), or (P, C) of several numbers; a ValueError for others.
 
-    "residue_shares" has 25 numbers, "trace" has 7.
+    "residue_shares" has 25 numbers, "composition" 26, "trace" 7.
     """
     if name in _AT_POINTS:
         return _AT_POINTS[name](molecule, points)
@@ -148,6 +155,7 @@ _COLUMNS: Mapping[str, Callable[[Molecule], Floats]] = {
 _AT_POINTS: Mapping[str, Callable[[Molecule, Floats], Floats]] = {
     "screened_potential": screened_potential,  # kT/e
     "trace": trace,
+    "composition": composition,
 }
 
 RESIDUE_ATTRIBUTES: tuple[str, ...] = (*_COLUMNS, *_AT_POINTS)
