@@ -13,7 +13,9 @@ from torch import Tensor
 
 from igps._arrays import Floats
 from igps.analysis.correspondence import dissimilarity
+from igps.analysis.superposition import Movement
 from igps.data.batch import SampleBatch, SignatureBatch
+from igps.data.dataset import SignatureDataset
 from igps.descriptors.size_and_side import SizeAndSide
 from igps.nn.batch_features import WEIGHT, BatchFeatures
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
@@ -39,7 +41,7 @@ class Explanation:
     parts: Mapping[str, float]
     # Shares (P,) of the samples of each kind in the first and in the second body; all together sum to the distance
     samples: tuple[Shares, Shares]
-    # As `samples`, but non-negative and by local dissimilarity, see `igps.analysis.correspondence`; None for groups
+    # As `samples`, but non-negative and by weights or local dissimilarity, see `explain`; None for groups
     places: tuple[Shares, Shares] | None = None
 
     def summary(self) -> str:
@@ -51,7 +53,12 @@ class Explanation:
         return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)
 
 
-def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) -> Explanation:
+def explain(
+    descriptor: Descriptor,
+    one: SignatureBatch,
+    other: SignatureBatch,
+    weights: tuple[Floats, Floats] | None = None,
+) -> Explanation:
     """Divide the distance of two bodies among the histograms, and among the samples of both bodies.
 
     The share of a histogram cell is its value by Aumann and Shapley (1974): the derivative of the distance with respect
@@ -66,12 +73,14 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
 
     Between poses, most pairs change a little, and these shares spread over the whole body. The field `places` locates
     small differences better: each body has half of the distance, divided among its surface samples in proportion to
-    their dissimilarity to the corresponding samples of the other body.
+    their dissimilarity to the corresponding samples of the other body, or to given weights: such as those of a
+    `Movement`, where places of the bodies correspond by what their files say.
 
     Args:
         descriptor: histograms, such as interior or rich, or histograms under a head, such as pretrained; with or
             without side and size.
         one, other: batches of one body each.
+        weights: (P,) of the surface samples of both bodies, not negative, for `places`.
 
     Raises:
         ValueError: another kind of descriptor, or a batch of several bodies.
@@ -88,22 +97,27 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     shares = units * (first - second)
     parts = _part_shares(descriptor, shares)
     samples = _sample_shares(descriptor, pair, units, shares)
-    places = (
-        _place_shares(one, other, samples[0], distance),
-        _place_shares(other, one, samples[1], distance),
-    )
+    if weights is None:
+        weights = (dissimilarity(one, other), dissimilarity(other, one))
+    halves = [distance / 2 * own / own.sum() for own in weights]
+    places = (_on_surface(halves[0], samples[0]), _on_surface(halves[1], samples[1]))
     return Explanation(distance, parts, samples, places)
 
 
-def _place_shares(
-    body: SignatureBatch, other: SignatureBatch, samples: Shares, distance: float
-) -> Shares:
-    """Divide half of the distance among the surface samples of a body, by their dissimilarity to the other body."""
-    weights = dissimilarity(body, other)
-    return {
-        "interior": np.zeros(len(samples["interior"])),
-        "surface": distance / 2 * weights / weights.sum(),
-    }
+def explain_bodies(
+    descriptor: Descriptor, dataset: SignatureDataset, moved: Movement | None
+) -> Explanation:
+    """Divide the distance of the two bodies of a dataset, by how far their places moved, if that is known."""
+    weights = None
+    if moved is not None:
+        first, second = (dataset[i].signature.surface.points for i in (0, 1))
+        weights = moved.weights(first, second)
+    return explain(descriptor, dataset.batch([0]), dataset.batch([1]), weights)
+
+
+def _on_surface(values: Floats, like: Shares) -> Shares:
+    """Return shares of the surface samples alone."""
+    return {"interior": np.zeros(len(like["interior"])), "surface": values}
 
 
 def without_head(descriptor: Descriptor) -> Descriptor:

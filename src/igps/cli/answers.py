@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ from igps.cli.options import Size
 if TYPE_CHECKING:
     from igps.analysis.explanation import Explanation
     from igps.analysis.groups import GroupTest
+    from igps.analysis.superposition import Movement
     from igps.cli.reading import Described
     from igps.data.dataset import SignatureDataset
     from igps.data.sources import Bodies
@@ -288,21 +290,27 @@ def explain(
         level: family-wise error rate, for two groups: only histogram cells and places that differ significantly count.
         out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and
             explain.svg and explain.png: two bodies painted with their shares, or the mean difference of two groups;
-            the same for viewers as explain_BODY.ply, .vtk, .gii and .nii.gz.
+            the same for viewers as explain_BODY.ply, .vtk, .gii and .nii.gz;
+            of two molecules of one sequence also explain_residues.csv, and both superposed as explain_1.cif and
+            explain_2.cif with the shares of residues in percent in place of B-factors.
     """
     import numpy as np
 
-    from igps.analysis.explanation import explain as explain_pair
-    from igps.analysis.explanation import explain_groups, without_head
+    from igps.analysis.explanation import explain_bodies, explain_groups, without_head
     from igps.analysis.groups import squared_distances
+    from igps.analysis.superposition import movement
     from igps.cli.places import places_of_groups
     from igps.cli.reading import Folder, check_files, described, files_or_folder
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.fingerprint import cache_tag
     from igps.descriptors.size_and_side import SIZE
-    from igps.mesh.surface import vertex_areas
     from igps.nn.description import describe
-    from igps.report.answers import painted_figure, write_analysis, write_painted
+    from igps.report.answers import (
+        painted_figure,
+        write_analysis,
+        write_movement,
+        write_painted,
+    )
     from igps.report.drawing import file_names
 
     check_fraction(level=level)
@@ -318,6 +326,7 @@ def explain(
     without_head(
         descriptor_of(descriptor)
     )  # raises for other descriptors before anything is computed
+    moved = None
     if isinstance(source, Folder):
         check = partial(_two_groups, group=group)
         folder = Folder(source.root, group is None, needs_meshes=True, check=check, body=body)
@@ -359,7 +368,8 @@ def explain(
             raise ValueError(
                 f"meshes: expected two bodies, got {len(dataset)}: {listed}. Name each as FILE#PART."
             )
-        explanation = explain_pair(module, *(dataset.batch([i]) for i in pair))
+        moved = movement(*dataset.bodies)
+        explanation = explain_bodies(module, dataset, moved)
     names = [dataset.bodies.names[i] for i in pair]
     print(
         f"{' and '.join(names)}: {explanation.distance:.4g} by {module.name}: {explanation.summary()}"
@@ -375,15 +385,16 @@ def explain(
     else:
         painted = [_painted(dataset, i, explanation, side) for side, i in enumerate(pair)]
         legend = "share of the distance, over that of an even spread"
-        for one in painted:
-            areas = vertex_areas(one.mesh.vertices, one.mesh.faces)
-            print(f"{one.name}: {_extent(one.values, areas)}")
+        _print_extents(painted, moved)
     parts = [{"histogram": name, "share": share} for name, share in explanation.parts.items()]
     if out is not None:
         write_analysis(out, "explain_samples", _sample_rows(dataset, pair, explanation))
-        write_analysis(out, "explain", parts, painted_figure(painted, legend))
-        names = [f"explain_{name}" for name in file_names([one.name for one in painted])]
-        write_painted(out, names, painted, dataset)
+        superposed = _superposed(painted, moved)
+        write_analysis(out, "explain", parts, painted_figure(painted, legend, superposed))
+        files = [f"explain_{name}" for name in file_names([one.name for one in painted])]
+        write_painted(out, files, painted, dataset)
+        if moved is not None:
+            write_movement(out, names, moved)
         print(f"written to {out}")
     return {
         "bodies": names,
@@ -391,6 +402,36 @@ def explain(
         "meaning": meaning,
         "shares": parts,
     }
+
+
+def _print_extents(painted: Sequence[Painted], movement: Movement | None) -> None:
+    """Print what is painted, and how much of each surface holds half of the paint."""
+    from igps.mesh.surface import vertex_areas
+
+    if movement is not None:
+        print(_moved_words(movement))
+    for one in painted:
+        areas = vertex_areas(one.mesh.vertices, one.mesh.faces)
+        print(f"{one.name}: {_extent(one.values, areas)}")
+
+
+def _moved_words(movement: Movement) -> str:
+    """Return as text what was superposed, and what is painted."""
+    found = movement.correspondence
+    steps = sorted(movement.superposition.distances)
+    return (
+        f"{len(found.pairs)} {found.kind} correspond; painted: the square of how far they moved after superposition "
+        f"(median {steps[len(steps) // 2]:.2g}, largest {steps[-1]:.2g})"
+    )
+
+
+def _superposed(painted: Sequence[Painted], movement: Movement | None) -> list[Any] | None:
+    """Return the vertices (V, 3) of two bodies, those of the second after superposition onto the first."""
+    if movement is None:
+        return None
+    first, second = painted
+    motion = movement.superposition
+    return [first.mesh.vertices, second.mesh.vertices @ motion.rotation.T + motion.shift]
 
 
 def _meaning(descriptor: str, dataset: SignatureDataset, distance: float) -> str | None:

@@ -17,6 +17,7 @@ from igps.analysis.clusters import STABLE, Clusters
 from igps.analysis.groups import GroupTest
 from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
+from igps.analysis.superposition import Movement
 from igps.data.dataset import SignatureDataset
 from igps.mesh.loading import read_surface
 from igps.mesh.mesh import Mesh
@@ -66,6 +67,26 @@ def write_analysis(
         save_figure(figure, out / f"{name}.png", dpi=150)
 
 
+def write_movement(out: Path, names: Sequence[str], movement: Movement) -> None:
+    """Write how far each place of two bodies moved, as explain_KIND.csv, and both bodies with the shares of places.
+
+    The bodies, explain_1 and explain_2, are superposed; a share, in percent, takes the place of the B-factor.
+    """
+    rows = []
+    rotations = (np.eye(3), movement.superposition.rotation)
+    shifts = (np.zeros(3), movement.superposition.shift)
+    for side, (name, places) in enumerate(zip(names, movement.correspondence.places, strict=True)):
+        shares = movement.shares(side)
+        columns = (places.names, movement.displacements[side].tolist(), shares.tolist())
+        for place, displacement, share in zip(*columns, strict=True):
+            rows.append(
+                {"name": name, "place": place, "displacement": displacement, "share": share}
+            )
+        path = out / f"explain_{side + 1}{places.suffix}"
+        places.save(path, 100 * shares, rotations[side], shifts[side])
+    write_analysis(out, f"explain_{movement.correspondence.kind}", rows)
+
+
 def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
     """Plot the effects of all tested bodies with their intervals, the largest on top; return None if there are none."""
     tested = sorted(
@@ -108,12 +129,17 @@ def outliers_figure(pictured: Sequence[tuple[Outlier, str, Mesh]]) -> Figure:
     return figure
 
 
-def painted_figure(painted: Sequence[Painted], legend: str) -> Figure:
-    """Draw bodies from the same six sides and in the same scale, coloured by values: red positive, blue negative."""
+def painted_figure(
+    painted: Sequence[Painted], legend: str, superposed: Sequence[Floats] | None = None
+) -> Figure:
+    """Draw bodies from the same six sides and in the same scale, coloured by values: red positive, blue negative.
+
+    For `superposed` see `common_views`.
+    """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
-    views, bodies = common_views([body.mesh for body in painted])
+    views, bodies = common_views([body.mesh for body in painted], superposed)
     reach = reach_of(views, bodies)
     everything = np.abs(np.concatenate([body.values for body in painted]))
     largest = float(np.quantile(everything, 0.98)) or float(everything.max()) or 1.0

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._threads import one_thread
-from igps.analysis.explanation import Shares, explain, share_density
+from igps.analysis.explanation import Shares, explain_bodies, share_density
+from igps.analysis.superposition import movement
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
@@ -95,7 +96,7 @@ def _explain_pair(
 ) -> SurfaceExplanation:
     descriptor, dataset, surfaces = job
     with one_thread():
-        explanation = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
+        explanation = explain_bodies(descriptor, dataset, movement(*dataset.bodies))
     shares = explanation.places or explanation.samples
     first, second = (
         _vertex_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i])

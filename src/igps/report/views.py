@@ -77,14 +77,19 @@ def numbered_views(axes: Floats) -> list[View]:
     return views
 
 
-def common_views(meshes: Sequence[Mesh]) -> tuple[list[View], list[Floats]]:
+def common_views(
+    meshes: Sequence[Mesh], superposed: Sequence[Floats] | None = None
+) -> tuple[list[View], list[Floats]]:
     """Return views from the same sides for bodies that are compared, and the vertices (V, 3) of each to draw.
 
-    In the frame of the patient, bodies lie as they are. Others are first moved onto the first body, without mirroring.
+    In the frame of the patient, bodies lie as they are. Others are first moved onto the first body, without mirroring,
+    unless `superposed` has the vertices of all bodies after that.
     """
     if all(mesh.frame == "RAS" for mesh in meshes):
         return patient_views(), [mesh.vertices for mesh in meshes]
     first = meshes[0]
+    if superposed is not None:
+        return numbered_views(axes_of(first.vertices)), list(superposed)
     moved = [first.vertices]
     for mesh in meshes[1:]:
         moved.append(rigid_motion(mesh, first).of(mesh.vertices))

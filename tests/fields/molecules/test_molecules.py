@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from igps.cli import main
+from igps.fields.molecules.bodies import molecule_of
 from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.fields.molecules.molecule import Molecule
 from igps.fields.molecules.residues import VOLUMES
-from igps.fields.molecules.structures import is_structure, molecule_of, read_molecule
+from igps.fields.molecules.structures import is_structure, read_molecule
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef, each_body
 from igps.mesh.mesh import Mesh
@@ -447,7 +448,7 @@ def test_a_surface_that_fails_in_any_way_costs_no_other_chain(
             raise ValueError("of any kind")
         return molecular_surface(molecule)
 
-    monkeypatch.setattr("igps.fields.molecules.structures.molecular_surface", faulty)
+    monkeypatch.setattr("igps.fields.molecules.bodies.molecular_surface", faulty)
     found = {body.part: mesh for body, mesh in each_body(path)}
     assert [name for name, mesh in found.items() if isinstance(mesh, Mesh)] == [
         "chain A",

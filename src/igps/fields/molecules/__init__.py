@@ -1,12 +1,13 @@
 """Molecules: structures, their surfaces, what their residues know, and the descriptor `molecular`."""
 
 from igps.data.attribute_sources import SourceKind
-from igps.fields.molecules import residue_attributes, structures
+from igps.fields.molecules import bodies, residue_attributes, residue_correspondence
 
-FORMATS = (structures.FORMAT,)
+FORMATS = (bodies.FORMAT,)
 ATTRIBUTES = (
     SourceKind(
         lambda name, root: residue_attributes.ResidueAttribute(name),
         names=tuple(residue_attributes.RESIDUE_ATTRIBUTES),
     ),
 )
+CORRESPONDENCE = residue_correspondence.residue_correspondence

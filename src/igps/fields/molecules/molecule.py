@@ -1,6 +1,9 @@
 """A molecule: balls and residues."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,15 +42,47 @@ class Molecule:
     # (R,) places along the chain: neighbours differ by 1, the ends of a gap by more, chains by `BETWEEN_CHAINS`;
     # NaN for a residue of no polymer
     places: Floats = field(default_factory=lambda: np.empty(0))
+    residue_labels: tuple[str, ...] = ()  # (R,) chain and number in the file, as "A 12"
 
     def __post_init__(self) -> None:
+        n_residues = len(self.residue_names)
         if not len(self.places):
-            object.__setattr__(self, "places", np.arange(len(self.residue_names), dtype=float))
+            object.__setattr__(self, "places", np.arange(n_residues, dtype=float))
+        if not self.residue_labels:
+            labels = tuple(str(number + 1) for number in range(n_residues))
+            object.__setattr__(self, "residue_labels", labels)
 
     def __repr__(self) -> str:
         return (
             f"Molecule({self.name!r}, {len(self.residue_names)} residues, {len(self.radii)} balls)"
         )
+
+
+def joined(molecules: Sequence[Molecule]) -> Molecule:
+    """Return one molecule of several, such as the models of a file."""
+    if len(molecules) == 1:
+        return molecules[0]
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(molecule, name) for molecule in molecules])
+        for name in ("positions", "radii", "charges", "residue_positions", "b_factors")
+    }
+    residues = []
+    places = []
+    n_residues = 0
+    last_place = 0.0
+    for molecule in molecules:
+        residues.append(molecule.residue_of + n_residues)
+        places.append(molecule.places + last_place)
+        n_residues += len(molecule.residue_names)
+        last_place += np.nanmax(molecule.places, initial=0.0) + BETWEEN_CHAINS
+    return replace(
+        molecules[0],
+        residue_of=np.concatenate(residues),
+        places=np.concatenate(places),
+        residue_names=tuple(chain.from_iterable(each.residue_names for each in molecules)),
+        residue_labels=tuple(chain.from_iterable(each.residue_labels for each in molecules)),
+        **arrays,
+    )
 
 
 def chain_places(positions: Floats, numbers: Floats, chains: NDArray[np.str_]) -> Floats:

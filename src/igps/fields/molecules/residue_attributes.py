@@ -14,9 +14,10 @@ from scipy.spatial.distance import cdist
 from igps._arrays import Floats
 from igps._parameters import check_one_of
 from igps.data.attribute_sources import fill_missing
+from igps.fields.molecules.bodies import molecule_of
 from igps.fields.molecules.molecule import Molecule
 from igps.fields.molecules.residues import ACCEPTORS, AROMATIC, DONORS, HYDROPATHY, VOLUMES
-from igps.fields.molecules.structures import is_structure, molecule_of
+from igps.fields.molecules.structures import is_structure
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 

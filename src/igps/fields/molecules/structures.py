@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
-from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -22,7 +20,6 @@ from igps.fields.molecules._gemmi import (
     read_structures,
     suffix_of,
 )
-from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.fields.molecules.molecule import Molecule, chain_places
 from igps.fields.molecules.residues import (
     BACKBONE,
@@ -35,10 +32,6 @@ from igps.fields.molecules.residues import (
     side_chain_ball,
 )
 from igps.mesh.errors import MeshError
-from igps.mesh.formats import Format, stat_key
-from igps.mesh.loading import BodyRef
-from igps.mesh.options import LoadOptions
-from igps.mesh.raw_body import RawBody, deferred
 
 if TYPE_CHECKING:
     import gemmi
@@ -128,18 +121,6 @@ def read_molecule(
     return molecules
 
 
-@lru_cache(maxsize=1)
-def molecules_by_part(
-    path: Path, changed: tuple[int, int, int], bodies: MoleculeBodies
-) -> dict[str, Molecule]:
-    """Return the bodies of a structure file by part; `changed`, its `stat_key`, is part of the cache key."""
-    molecules = read_molecule(path, bodies)
-    return {
-        molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule
-        for molecule in molecules
-    }
-
-
 def _molecules(
     parts: list[tuple[str, list[gemmi.Chain], list[str]]],
     ligands: bool,
@@ -166,8 +147,8 @@ class _Builder:
         self.hydrogens = hydrogens
         self.is_pqr = is_pqr
         self.balls: list[tuple[Floats, float, float, int]] = []  # position, radius, charge, residue
-        # Name, position, B-factor, number (NaN outside polymers) and chain
-        self._residues: list[tuple[str, Floats, float, float, str]] = []
+        # Name, position, B-factor, number (NaN outside polymers), chain and label
+        self._residues: list[tuple[str, Floats, float, float, str, str]] = []
         self._count: Counter[str] = Counter()
 
     def molecule(self, name: str, notes: list[str]) -> Molecule:
@@ -176,7 +157,7 @@ class _Builder:
             text.format(self._count[key]) for key, text in _NOTES.items() if self._count[key]
         ]
         positions, radii, charges, residue_of = map(np.array, zip(*self.balls, strict=True))
-        names, centres, b_factors, numbers, chains = zip(*self._residues, strict=True)
+        names, centres, b_factors, numbers, chains, labels = zip(*self._residues, strict=True)
         places = chain_places(np.array(centres), np.array(numbers), np.array(chains))
         return Molecule(
             name,
@@ -189,6 +170,7 @@ class _Builder:
             np.array(b_factors),
             (*notes, *origin, *counted),
             places,
+            labels,
         )
 
     def add_chain(self, chain: gemmi.Chain) -> None:
@@ -226,7 +208,8 @@ class _Builder:
         b_factor = np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms]))
         position = positions.mean(axis=0) if alpha is None else positions[alpha]
         number = float(residue.seqid.num) if in_polymer else np.nan
-        self._residues.append((name, position, b_factor, number, chain))
+        label = f"{chain} {residue.seqid}".strip()
+        self._residues.append((name, position, b_factor, number, chain, label))
         charged: dict[str, float] = {}
         if in_polymer:
             own_or_parent = CHARGED_ATOMS.get(residue.name, CHARGED_ATOMS.get(name, {}))
@@ -342,41 +325,3 @@ def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
         return name
     gemmi = gemmi_module()
     return gemmi.expand_one_letter(kind.one_letter_code.upper(), gemmi.ResidueKind.AA) or name
-
-
-def molecule_of(body: BodyRef) -> Molecule:
-    """Return the atoms and residues of a body: of a chain, an assembly or a model, or of all models."""
-    part = body.part or ""
-    stamp = stat_key(body.path)
-    words = part.split()  # in a file of several structures, the first is the name of a structure
-    kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
-    for kind in (*(kinds[word] for word in kinds if word in words), "models"):
-        molecules = molecules_by_part(body.path, stamp, kind)
-        if part in molecules:
-            return molecules[part]
-    models = list(molecules.values())
-    fields = ("positions", "radii", "charges", "residue_positions", "b_factors")
-    arrays: dict[str, Any] = {
-        field: np.concatenate([getattr(model, field) for model in models]) for field in fields
-    }
-    starts = np.cumsum([0, *(len(model.residue_names) for model in models)])
-    arrays["residue_of"] = np.concatenate(
-        [model.residue_of + i for model, i in zip(models, starts, strict=False)]
-    )
-    return replace(
-        models[0], residue_names=tuple(name for m in models for name in m.residue_names), **arrays
-    )
-
-
-def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """Return the surfaces of the chains, models or assemblies of a structure file, in ångström."""
-    bodies: MoleculeBodies = (
-        options.bodies if options.bodies in ("chains", "assembly") else "models"
-    )
-    molecules = molecules_by_part(path, stat_key(path), bodies)
-    names = [name for name in molecules if part in (None, name)]
-    return [deferred(partial(molecular_surface, molecules[name]), name, "Å") for name in names]
-
-
-_SUFFIXES = tuple(sorted(suffix + ending for suffix in SUFFIXES for ending in ("", ".gz")))
-FORMAT = Format("a structure", _SUFFIXES, read, ("chains", "models", "assembly"), extra="molecules")
