@@ -24,7 +24,8 @@ def assemble(
     for k in range(boundary_start[node], boundary_start[node + 1]):
         boundary_row[tree.boundary[k]] = n_own + k - boundary_start[node]
     for i in range(width):
-        front[i * width + i : (i + 1) * width] = 0.0
+        for j in range(i * width + i, (i + 1) * width):
+            front[j] = 0.0
     for i in range(n_own):
         vertex = tree.order[own_begin + i]
         for k in range(tree.indptr[vertex], tree.indptr[vertex + 1]):
@@ -89,9 +90,7 @@ def eliminate(
             continue
         coupling, elimination = (front, n_own, width), (blocks, begin + n_own, width)
         shape = (n_own, n_boundary, n_own)
-        product(
-            shape, -1.0, (inverse, ZERO, ONE, padded), coupling, False, elimination, elimination
-        )
+        product(shape, -1.0, (inverse, ZERO, ONE, padded), coupling, ZERO, elimination, elimination)
         # Compute the upper triangle of the Schur complement, a few rows at a time.
         for i in range(0, n_boundary, ROWS):
             n_rows, skipped = min(ROWS, n_boundary - i), max(0, min(i, n_boundary - COLUMNS))
@@ -100,7 +99,7 @@ def eliminate(
                 1.0,
                 (front, n_own + i, width, ONE),
                 (blocks, begin + n_own + skipped, width),
-                True,
+                ONE,
                 (front, (n_own + i) * width + n_own + skipped, width),
                 (updates, update_begin + i * n_boundary + skipped, n_boundary),
             )
@@ -162,7 +161,7 @@ def forward(
             1.0,
             block,
             (x, own_start[node] * b, b),
-            False,
+            ZERO,
             product_rows,
             product_rows,
         )
@@ -214,7 +213,7 @@ def backward(
             1.0,
             elimination,
             (boundary_x, ZERO, b),
-            True,
+            ONE,
             (x, own_start[node] * b, b),
             product_rows,
         )

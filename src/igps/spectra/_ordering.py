@@ -76,7 +76,20 @@ def nested_dissection(
     indptr, indices = (
         array.astype(np.int32, copy=False) for array in (graph.indptr, graph.indices)
     )
-    return _dissect(np.stack(orders), indptr, indices, depth, CUT_WINDOW), depth + 1
+    scratch = _Scratch(
+        rank=np.full(n_vertices, -1, np.int32),
+        low=np.empty(n_vertices, np.int32),
+        high=np.empty(n_vertices, np.int32),
+        n_lowest=np.empty(n_vertices + 1, np.int32),
+        n_highest=np.empty(n_vertices + 1, np.int32),
+        side=np.empty(n_vertices, np.int32),
+        right=np.empty(n_vertices, np.int64),
+        begin=np.zeros(2**depth, np.int64),
+        end=np.full(2**depth, n_vertices, np.int64),
+        node=np.empty(n_vertices, np.int64),
+    )
+    _dissect(np.stack(orders), indptr, indices, depth, CUT_WINDOW, scratch)
+    return scratch.node, depth + 1
 
 
 class _Scratch(NamedTuple):
@@ -92,6 +105,8 @@ class _Scratch(NamedTuple):
         n_highest: (V + 1,) the same of the highest rank.
         side: (V,) of each vertex: 0 left, 1 right, 2 separator.
         right: (V,) vertices of the right side, in order.
+        begin, end: (2^depth,) where the vertices of each part of a level are in the orders; at first, one part has all.
+        node: (V,) the result.
     """
 
     rank: np.ndarray
@@ -101,6 +116,9 @@ class _Scratch(NamedTuple):
     n_highest: np.ndarray
     side: np.ndarray
     right: np.ndarray
+    begin: np.ndarray
+    end: np.ndarray
+    node: np.ndarray
 
 
 class _Cut(NamedTuple):
@@ -113,29 +131,24 @@ class _Cut(NamedTuple):
 
 @compiled()
 def _dissect(
-    orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth: int, window: float
-) -> np.ndarray:
-    """Return the node of each vertex. The orders (d, V), vertices sorted by each coordinate, are overwritten."""
+    orders: np.ndarray,
+    indptr: np.ndarray,
+    indices: np.ndarray,
+    depth: int,
+    window: float,
+    scratch: _Scratch,
+) -> None:
+    """Fill in the node of each vertex. The orders (d, V), vertices sorted by each coordinate, are overwritten."""
     n_coordinates, n_vertices = orders.shape
-    node = np.empty(n_vertices, np.int64)
-    scratch = _Scratch(
-        np.full(n_vertices, -1, np.int32),
-        np.empty(n_vertices, np.int32),
-        np.empty(n_vertices, np.int32),
-        np.empty(n_vertices + 1, np.int32),
-        np.empty(n_vertices + 1, np.int32),
-        np.empty(n_vertices, np.int8),
-        np.empty(n_vertices, orders.dtype),
-    )
-    begin = np.zeros(1, np.int64)
-    end = np.full(1, n_vertices, np.int64)
+    begin, end, node = scratch.begin, scratch.end, scratch.node
     for level in range(depth):
-        next_begin = np.zeros(2 ** (level + 1), np.int64)
-        next_end = np.zeros(2 ** (level + 1), np.int64)
-        for part in range(2**level):
+        # The halves of a part take the places of itself and of a part behind it, which was divided before.
+        for part in range((1 << level) - 1, -1, -1):
             first = begin[part]
             last = end[part]
             if last == first:
+                begin[2 * part] = end[2 * part] = first
+                begin[2 * part + 1] = end[2 * part + 1] = first
                 continue
             min_size = n_vertices + 1
             for c in range(n_coordinates):
@@ -148,21 +161,18 @@ def _dissect(
             for i in range(first, last):
                 scratch.rank[orders[0, i]] = -1
                 if scratch.side[orders[0, i]] == 2:
-                    node[orders[0, i]] = 2**level - 1 + part
+                    node[orders[0, i]] = (1 << level) - 1 + part
             n_left = 0
             n_right = 0
             for c in range(n_coordinates):
                 n_left, n_right = _separate(orders[c, first:last], scratch)
-            next_begin[2 * part] = first
-            next_end[2 * part] = first + n_left
-            next_begin[2 * part + 1] = first + n_left
-            next_end[2 * part + 1] = first + n_left + n_right
-        begin = next_begin
-        end = next_end
-    for part in range(2**depth):
+            begin[2 * part] = first
+            end[2 * part] = first + n_left
+            begin[2 * part + 1] = first + n_left
+            end[2 * part + 1] = first + n_left + n_right
+    for part in range(1 << depth):
         for i in range(begin[part], end[part]):
-            node[orders[0, i]] = 2**depth - 1 + part
-    return node
+            node[orders[0, i]] = (1 << depth) - 1 + part
 
 
 @compiled()
@@ -173,8 +183,9 @@ def _rank_neighbours(
     size = len(order)
     for i in range(size):
         scratch.rank[order[i]] = i
-    scratch.n_highest[: size + 1] = 0
-    scratch.n_lowest[: size + 1] = 0
+    for i in range(size + 1):
+        scratch.n_highest[i] = 0
+        scratch.n_lowest[i] = 0
     for i in range(size):
         lowest = np.uint32(i)
         highest = np.int32(i)

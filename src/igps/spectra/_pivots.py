@@ -74,7 +74,7 @@ def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np
         # Multiply the eliminated rows by the inverse of their pivot block.
         eliminated, scaled = (matrix, k * width, width), (rows, ZERO, width)
         product(
-            (size, width, size), 1.0, (pivot, ZERO, STEP, ONE), eliminated, False, scaled, scaled
+            (size, width, size), 1.0, (pivot, ZERO, STEP, ONE), eliminated, ZERO, scaled, scaled
         )
         for i in range(size):
             for j in range(size):
@@ -85,7 +85,7 @@ def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np
                 matrix[i * width + k + j] = 0.0
         for begin, end in ((0, k), (k + size, n)):
             shape, others = (end - begin, width, size), (matrix, begin * width, width)
-            product(shape, -1.0, (columns, begin * STEP, ONE, STEP), scaled, True, others, others)
+            product(shape, -1.0, (columns, begin * STEP, ONE, STEP), scaled, ONE, others, others)
         for i in range(size * width):
             matrix[k * width + i] = rows[i]
     return n_negative
@@ -120,7 +120,7 @@ def residual_norm(
         -1.0,
         (matrix, ZERO, width, ONE),
         (inverse, ZERO, width),
-        True,
+        ONE,
         residual,
         residual,
     )

@@ -28,7 +28,7 @@ Four = tuple[float, float, float, float]
 ROWS, COLUMNS = 6, 8
 # Number of columns of a few rows that the second-level cache holds.
 CHUNK = 4096
-# Arguments of `product`. A plain 0 or 1 would become part of the type of its tuple, and Numba compile for each type.
+# Arguments of `product`. A plain 0, 1, True or False would be part of the argument's type, and Numba compile for each.
 ZERO, ONE = cast(int, np.int64(0)), cast(int, np.int64(1))
 
 Rows = tuple[np.ndarray, int, int]
@@ -208,15 +208,18 @@ def product(
     scale: float,
     a: Strided,
     x: Rows,
-    add: bool,
+    add: int,
     source: Rows,
     out: Rows,
 ) -> None:
-    """Compute out ← scale · Aᵀ X, plus the source if `add`; shape is (m, n, k) for out (m, n), A (k, m) and X (k, n).
+    """Compute out ← scale · Aᵀ X, plus the source if `add` is ONE.
+
+    The shape is (m, n, k) for out (m, n), A (k, m) and X (k, n).
 
     Rows of n numbers are written once or twice: ``out`` may not be the source, unless n is a multiple of COLUMNS.
     """
     m, n, k = shape
+    is_added = add != 0
     for i in range(0, m, ROWS):
         n_rows = min(ROWS, m - i)
         if n < COLUMNS:
@@ -229,7 +232,7 @@ def product(
                     x[0],
                     x[1] + j,
                     x[2],
-                    add,
+                    is_added,
                     source[0],
                     source[1] + i * source[2] + j,
                     source[2],
@@ -250,7 +253,7 @@ def product(
                 x[0],
                 x[1] + j,
                 x[2],
-                add,
+                is_added,
                 source[0],
                 source[1] + i * source[2] + j,
                 source[2],

@@ -38,14 +38,13 @@ def add_whole_pairs(cell: Indices, integer_shares: Indices, packed: Integers) ->
 def unpack(packed: Integers, sums: Floats) -> None:
     """Write the packed counts to the sums (cells, 2), and clear them."""
     for c in range(len(packed) // LANES):
-        pairs = packed[LANES * c : LANES * (c + 1)]
         packed_sum = 0
-        for lane in range(LANES):
-            packed_sum += pairs[lane]
+        for lane in range(LANES * c, LANES * (c + 1)):
+            packed_sum += packed[lane]
+            packed[lane] = 0
         upper = (packed_sum % _PAIR_SCALE) / _SHARE_SCALE
         sums[c, 0] = packed_sum // _PAIR_SCALE - upper
         sums[c, 1] = upper
-        pairs[:] = 0
 
 
 @compiled(fastmath=FUSE)
