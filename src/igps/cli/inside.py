@@ -29,7 +29,7 @@ def inside(meshes: list[Path], out: Path | None = None, **reading: Any) -> list[
     Args:
         meshes: a folder of bodies, or files.
         out: file ending in .csv or .parquet for the table: a row per body, with the columns file, part, name, class,
-            further columns of labels.csv, unit, volume, area, and all numbers.
+            further columns of labels.csv, unit, notes, the plain numbers of igps extract, and all numbers inside.
     """
     from igps.cli.feature_table import feature_table, write_table
     from igps.cli.reading import files_or_folder, print_failures
@@ -40,7 +40,7 @@ def inside(meshes: list[Path], out: Path | None = None, **reading: Any) -> list[
         defined = (None if number != number else number for number in numbers)
         rows.append({"name": name, **dict(zip(table.columns, defined, strict=True))})
     if out is not None:
-        metadata, measured = feature_table(dataset, table.rows[:, :0])
+        metadata, measured = feature_table(dataset, table.rows[:, :0], [])
         columns = {name: [row[name] for row in rows] for name in table.columns}
         out.parent.mkdir(parents=True, exist_ok=True)
         write_table(out, {**metadata, **measured, **columns})
