@@ -143,24 +143,6 @@ def comparison_folder(folder: Path) -> Path:
     return folder
 
 
-def robustness_folder(folder: Path) -> Path:
-    """What `igps robustness` writes."""
-    folder.mkdir(parents=True)
-    noise = {
-        "mean": 0.125,
-        "each": {NAMES[0]: 0.05, NAMES[1]: 0.2},
-        "notes": {NAMES[2]: "no surface left."},
-    }
-    pose = {"mean": None, "each": {}, "notes": {}}
-    summary = {
-        "disturbances": {"noise": "random"},
-        "movements": {"interior": {"noise": noise, "pose": pose}},
-        "config": {"n_eigenpairs": 20},
-    }
-    (folder / "robustness.json").write_text(json.dumps(summary))
-    return folder
-
-
 def surfaces(mesh: Mesh) -> dict[str, PageSurface]:
     """The mesh as a picture for all but the last but one of the names."""
     config = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=200)

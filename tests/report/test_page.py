@@ -20,7 +20,6 @@ from pages import (
     comparison_folder,
     distances_of,
     retrieval_folder,
-    robustness_folder,
     surfaces,
 )
 
@@ -197,14 +196,6 @@ def test_a_comparison_has_all_descriptors(tmp_path: Path) -> None:
     assert "gps it has no surface." in seen.text
     assert "all it is open." in seen.text
     assert "7 shapes in 3 classes, 2 descriptors" in seen.text
-
-
-def test_a_robustness_study_has_its_movements(tmp_path: Path) -> None:
-    seen = Elements(render_page(read_results(robustness_folder(tmp_path / "robustness")), {}))
-    assert [shape["name"] for shape in seen.data()["shapes"]] == list(NAMES[:3])
-    assert "interior 12.5 –" in seen.text
-    assert "noise: no surface left." in seen.text
-    assert "3 shapes, interior under disturbance" in seen.text
 
 
 def test_of_several_results_the_last_are_shown(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from pages import (
     DESCRIPTORS,
@@ -26,7 +27,6 @@ from pages import (
     comparison_folder,
     distances_of,
     retrieval_folder,
-    robustness_folder,
     surfaces,
     worst_by_a_loop,
 )
@@ -38,8 +38,10 @@ from igps.cli import main
 from igps.mesh.mesh import Mesh
 from igps.report.explanations import SurfaceExplanation
 from igps.report.page import render_page
-from igps.report.results import read_results
+from igps.report.results import Results, System, read_results
+from igps.report.surfaces import surface_of
 from igps.shapes import ArticulatedShapes
+from igps.signature.signature import SignatureConfig, compute_signature
 
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="playwright is not installed: it drives the browser"
@@ -76,7 +78,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = {
         "retrieve": retrieval_folder(root / "retrieve"),
         "compare": comparison_folder(root / "compare"),
-        "robustness": robustness_folder(root / "robustness"),
         "unlabelled": retrieval_folder(root / "unlabelled", labels=()),
         "answers": answers_folder(root / "answers"),
     }
@@ -152,12 +153,12 @@ def retrieval(browser: Any, folder: Path) -> Iterator[Visit]:
         yield visit
 
 
-@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled", "answers"])
+@pytest.mark.parametrize("kind", ["retrieve", "compare", "unlabelled", "answers"])
 def test_every_kind_opens_without_complaint_or_request(
     browser: Any, folder: Path, kind: str
 ) -> None:
     with Visit(browser, folder / f"{kind}.html") as visit:
-        assert len(visit.shown()) == (3 if kind == "robustness" else len(NAMES))
+        assert len(visit.shown()) == len(NAMES)
         visit.open(1).locator("#close").click()
         visit.page.locator("dialog[open]").wait_for(state="detached")
 
@@ -740,13 +741,6 @@ def test_confusion_and_sorted_scores(retrieval: Visit) -> None:
     assert table.locator("thead th[aria-sort=ascending]").inner_text().startswith("FT")
 
 
-def test_movements_of_a_mesh(browser: Any, folder: Path) -> None:
-    with Visit(browser, folder / "robustness.html") as visit:
-        dialog = visit.open(1)
-        assert dialog.locator("#moved-table tbody").inner_text().split() == ["interior", "20.0"]
-        assert dialog.locator("#ranking").is_hidden()
-
-
 def test_light_and_dark(browser: Any, folder: Path) -> None:
     def background(visit: Visit) -> float:
         colour = visit.page.evaluate("getComputedStyle(document.body).backgroundColor")
@@ -800,7 +794,7 @@ def violations() -> Callable[[Any], list[dict[str, Any]]]:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled", "answers"])
+@pytest.mark.parametrize("kind", ["retrieve", "compare", "unlabelled", "answers"])
 def test_nothing_serious_for_accessibility(
     browser: Any,
     folder: Path,
@@ -854,3 +848,67 @@ def test_the_demo_ends_with_its_page(
         assert visit.page.locator("h1").inner_text() == "4 shapes in 2 classes, pretrained"
         visit.wait_until(lambda: visit.page.locator("#shapes canvas.drawn").count() == 4)
         assert visit.open(0).locator("#ranking-list .shape").count() == 3
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of two organs of three scans in the frame of the patient, with a column of labels.csv."""
+    body = trimesh.creation.icosphere(subdivisions=3)
+    mesh: Mesh = as_mesh(body).annotated(frame="RAS", unit="mm")
+    signature = compute_signature(mesh, SignatureConfig(n_eigenpairs=8, resolution=6))
+    names = tuple(f"cohort_{i:02}.nii.gz#{part}" for part in ("1", "2") for i in range(3))
+    distances = torch.from_numpy(distances_of(0)[:6, :6])
+    labels = ("one", "one", "one", "two", "two", "two")
+    results = Results(
+        "retrieve",
+        names,
+        labels,
+        (System("interior", names, labels, distances),),
+        parts={name: name[-1] for name in names},
+        columns={"scanner": dict(zip(names, "xyxxyx", strict=True))},
+    )
+    path = tmp_path_factory.mktemp("scans") / "page.html"
+    page = render_page(results, dict.fromkeys(names, surface_of(mesh, signature, 300)))
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def test_columns_of_a_table_are_told_and_filter(browser: Any, scans: Path) -> None:
+    with Visit(browser, scans) as visit:
+        visit.page.locator("select.filter").select_option("=y")
+        assert visit.shown() == ["cohort_01.nii.gz#1", "cohort_01.nii.gz#2"]
+        dialog = visit.open(1)
+        facts = dialog.locator("#facts > div").all_text_contents()
+        assert "scannery" in facts
+
+
+def test_bodies_of_one_file_are_laid_together(browser: Any, scans: Path) -> None:
+    with Visit(browser, scans) as visit:
+        order = visit.page.locator("#order")
+        order.select_option("file")
+        headings = visit.page.locator("#shapes .class:visible h3").all_inner_texts()
+        assert headings == [f"cohort_0{i}.nii.gz" for i in range(3)]
+        assert visit.shown()[:2] == ["cohort_00.nii.gz#1", "cohort_00.nii.gz#2"]
+        order.select_option("class")
+        assert visit.shown()[:2] == ["cohort_00.nii.gz#1", "cohort_01.nii.gz#1"]
+
+
+def test_long_names_keep_their_ends(browser: Any, scans: Path) -> None:
+    with Visit(browser, scans) as visit:
+        name = visit.page.locator("#shapes .shape .name").first
+        assert name.evaluate(
+            "e => e.querySelector('.head').scrollWidth > e.querySelector('.head').clientWidth"
+        )
+        assert name.evaluate("e => e.scrollWidth <= e.clientWidth")
+
+
+def test_letters_of_the_patient_follow_the_turns(browser: Any, scans: Path) -> None:
+    """From the front, the patient's right is on the left; the right arrow key brings the side that was on the right."""
+    with Visit(browser, scans) as visit:
+        dialog = visit.open(0)
+        letters = dialog.locator("#turntable-sides span")
+        assert letters.all_inner_texts() == ["R", "L", "I", "S"]
+        dialog.locator("#turntable").focus()
+        for _ in range(9):
+            visit.page.keyboard.press("ArrowRight")
+        visit.wait_until(lambda: letters.all_inner_texts() == ["A", "P", "I", "S"])

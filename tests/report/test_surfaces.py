@@ -119,7 +119,7 @@ def test_written_and_read_again(tmp_path: Path) -> None:
     write_surfaces(path, {})
     assert read_surfaces(path) == {}
     np.savez(path, names=np.array(["a"]))
-    with pytest.raises(ValueError, match="igps-surfaces-2"):
+    with pytest.raises(ValueError, match="igps-surfaces-3"):
         read_surfaces(path)
 
 
@@ -167,3 +167,16 @@ def test_many_shapes_share_the_room() -> None:
     for n in (1, 400, 1000, 5000):
         assert n * fitting_vertices(n) * 19 * 4 / 3 < 21e6
     assert fitting_vertices(10**6) == 150
+
+
+def test_a_body_of_a_patient_has_its_left_on_the_right_of_the_page() -> None:
+    body = trimesh.creation.icosphere(subdivisions=3)
+    body.vertices[body.vertices[:, 0] < -0.9] *= 1.5  # in RAS this is the left
+    mesh = as_mesh(body).annotated(unit="mm", frame="RAS")
+    signature = compute_signature(mesh, SignatureConfig(n_eigenpairs=8, resolution=6))
+    surface = surface_of(mesh, signature, 300)
+    assert surface.frame == "RAS"
+    points = surface.vertices / 65535
+    from_centre = points - np.median(points, axis=0)
+    x, y, z = from_centre[np.linalg.norm(from_centre, axis=1).argmax()]
+    assert x > np.hypot(y, z)

@@ -13,9 +13,8 @@ from igps.analysis.superposition import movement
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
-from igps.report.drawing import axes_of
 from igps.report.results import System
-from igps.report.surfaces import STEPS, PageSurface, run_jobs
+from igps.report.surfaces import STEPS, PageSurface, page_axes, run_jobs
 from igps.signature.signature import SAMPLE_KINDS, Signature
 
 
@@ -109,7 +108,7 @@ def _vertex_values(
     mesh: Mesh, signature: Signature, shares: Shares, surface: PageSurface
 ) -> NDArray[np.uint8]:
     """Return the values (V,) of `SurfaceExplanation` at the vertices of a page surface."""
-    axes = axes_of(signature.surface.points)
+    axes = page_axes(mesh, signature.surface.points)
     samples = {kind: getattr(signature, kind).points @ axes for kind in SAMPLE_KINDS}
     vertices = mesh.vertices @ axes
     low, high = vertices.min(axis=0), vertices.max(axis=0)

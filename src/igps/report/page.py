@@ -76,7 +76,6 @@ def render_page(
         n_worst=N_WORST,
         plot=(_PLOT_WIDTH, _PLOT_HEIGHT),
         config=_config_rows(results.config),
-        disturbances=(results.robustness or {}).get("disturbances", {}),
         outliers=[
             {**row, "place": indices.get(row["name"])} for row in results.outliers[:N_OUTLIERS]
         ],
@@ -92,11 +91,9 @@ def _title(results: Results, data: Mapping[str, Any]) -> str:
     shapes = f"{len(results.names)} shape{'s' * (len(results.names) != 1)}"
     if data["classes"]:
         shapes += f" in {len(data['classes'])} class{'es' * (len(data['classes']) != 1)}"
-    names = [system.name for system in results.systems] or list(
-        (results.robustness or {}).get("movements", {})
-    )
+    names = [system.name for system in results.systems]
     descriptors = names[0] if len(names) == 1 else f"{len(names)} descriptors"
-    return f"{shapes}, {descriptors}" + (" under disturbance" if results.robustness else "")
+    return f"{shapes}, {descriptors}"
 
 
 def _curve(i: int, system: Mapping[str, Any]) -> dict[str, Any]:

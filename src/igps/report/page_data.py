@@ -21,6 +21,7 @@ N_WORST = 20
 _N_WRONG = 3  # shapes of other classes that are shown for each of these queries
 _MIN_RANKED = 48  # shortest ranking of a query
 _DECIMALS = 5
+_MAX_FILTERED = 30  # different values of a column, of which one can be chosen
 _QUERY_SCORES = ("nn", "ft", "st", "map")  # scores that are shown for each query
 _MIN_MAPPED, _MAX_MAPPED = (
     3,
@@ -48,8 +49,18 @@ def data_of(
             for title, column in results.columns.items()
         },
         "systems": [_system_data(system, index, classes, n_ranked) for system in results.systems],
-        "movements": finite((results.robustness or {}).get("movements", {})),
+        "filters": _filters(results),
     }
+
+
+def _filters(results: Results) -> dict[str, list[str]]:
+    """Return the values by which shapes can be chosen, by the column of labels.csv; none of a column of many values."""
+    filters = {}
+    for title, column in results.columns.items():
+        values = sorted({value for value in column.values() if value is not None})
+        if 1 < len(values) <= _MAX_FILTERED:
+            filters[title] = values
+    return filters
 
 
 def base64_text(content: bytes) -> str:
@@ -66,10 +77,10 @@ def _shapes(
     """Return the data of each body.
 
     Every body has its `name`, `label` (index of its class), and `notes`. A body with a surface has `surface` (index
-    among the surfaces, numbers of vertices and of faces), `mesh` (measures of the original mesh), `unit`, and the range
-    of the `potential`. One of several bodies in a file has its `part` and the indices of the others, `together`. An
-    explained body has `explained`: its nearest (`other`), the largest shares as text (`summary`), and the `values` of
-    the vertices of both surfaces.
+    among the surfaces, numbers of vertices and of faces), `mesh` (measures of the original mesh), `unit`, `frame`, and
+    the range of the `potential`. One of several bodies in a file has its `part` and the indices of the others,
+    `together`. An explained body has `explained`: its nearest (`other`), the largest shares as text (`summary`), and
+    the `values` of the vertices of both surfaces.
     """
     result, n_surfaces = [], 0
     files: dict[str, list[int]] = {}
@@ -91,6 +102,7 @@ def _shapes(
             measures = (_significant(surface.area), _significant(surface.volume))
             shape["mesh"] = [surface.n_vertices, surface.n_faces, *measures]
             shape["unit"] = surface.unit
+            shape["frame"] = surface.frame
             shape["potential"] = [_significant(value) for value in surface.potential_range]
             n_surfaces += 1
         if name in explanations:

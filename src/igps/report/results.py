@@ -21,7 +21,7 @@ from igps.signature.signature import SignatureConfig
 
 MESHES_FILE = "meshes.json"
 _FORMAT = "igps-meshes-1"
-_RETRIEVAL, _COMPARISON, _ROBUSTNESS = "distances.npz", "compare.json", "robustness.json"
+_RETRIEVAL, _COMPARISON = "distances.npz", "compare.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,6 @@ class Results:
     labels: tuple[str, ...] | None  # None if unknown
     systems: tuple[System, ...] = ()
     rows: tuple[Mapping[str, Any], ...] = ()  # table of `igps compare`, one row per descriptor
-    robustness: Mapping[str, Any] | None = None  # contents of robustness.json
     unused: tuple[Unused, ...] = ()
     notes: Mapping[str, Sequence[str]] = field(
         default_factory=dict
@@ -80,11 +79,10 @@ class Results:
 
 
 def read_results(folder: Path) -> Results:
-    """Read the results that `igps retrieve`, `compare` or `robustness` wrote to a folder; the latest, if several."""
+    """Read the results that `igps retrieve` or `compare` wrote to a folder; the latest, if several."""
     readers = {
         _RETRIEVAL: _read_retrieval,
         _COMPARISON: _read_comparison,
-        _ROBUSTNESS: _read_robustness,
     }
     times = {name: (folder / name).stat().st_mtime for name in readers if (folder / name).is_file()}
     if not times:
@@ -188,29 +186,6 @@ def _read_comparison(folder: Path) -> Results:
             label_of.update(zip(system.names, system.labels or (), strict=False))
     labels = tuple(label_of[name] for name in names) if label_of else None
     return Results("compare", tuple(names), labels, tuple(systems), rows=tuple(rows))
-
-
-def _read_robustness(folder: Path) -> Results:
-    summary = _read_json(folder / _ROBUSTNESS)
-    names: dict[str, None] = {}
-    unused: dict[tuple[str, str], Unused] = {}
-    for descriptor, movements in summary["movements"].items():
-        for column, movement in movements.items():
-            if (
-                column in summary["disturbances"]
-            ):  # the other columns have pairs of poses in place of meshes
-                names.update(dict.fromkeys([*movement["each"], *movement["notes"]]))
-            for file, reason in movement["notes"].items():
-                unused.setdefault((file, reason), Unused(file, f"{column}: {reason}", descriptor))
-    config = summary.get("config", {})
-    return Results(
-        "robustness",
-        tuple(names),
-        None,
-        robustness=summary,
-        unused=tuple(unused.values()),
-        config=config,
-    )
 
 
 def _read_system(path: Path, name: str, seconds: float | None = None) -> System:

@@ -20,15 +20,16 @@ from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import Mesh
+from igps.mesh.mesh import Frame, Mesh
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import compact, longest_side
 from igps.report.drawing import axes_of
+from igps.report.views import patient_views
 from igps.signature.signature import Signature
 
 logger = logging.getLogger(__name__)
 
-_FORMAT = "igps-surfaces-2"
+_FORMAT = "igps-surfaces-3"
 _MAX_VERTICES, _MIN_VERTICES = 1200, 150  # of one surface
 # Size of all surfaces of a page, and of one vertex, which has 19 bytes as text in base 64
 _MAX_BYTES, _BYTES_PER_VERTEX = 20e6, 19 * 4 / 3
@@ -41,9 +42,7 @@ _N_NEIGHBOURS = 4  # samples whose mean is the potential of a vertex
 class PageSurface:
     """The simplified surface of a body on the page."""
 
-    vertices: NDArray[
-        np.uint16
-    ]  # (V, 3) in the bounding cube, the longest principal axis along y, the next along x
+    vertices: NDArray[np.uint16]  # (V, 3) in the bounding cube, with axes by `page_axes`
     faces: NDArray[np.uint16]  # (F, 3), counter-clockwise seen from outside
     potential: NDArray[
         np.uint8
@@ -55,6 +54,7 @@ class PageSurface:
     volume: float  # length³
     key: str  # cache key of the Signature, which changes with the mesh file
     unit: str | None = None  # of length, such as "mm"; None if unknown
+    frame: Frame = None  # "RAS" if x points to the patient's left, y up and z to the front
 
     def packed(self) -> bytes:
         """Return the bytes of vertices, faces and potential, in this order and little-endian."""
@@ -127,7 +127,7 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
     weights = 1 / (distances + 1e-6 * mesh.diagonal)
     values = (weights * potential[nearest]).sum(axis=1) / weights.sum(axis=1)
     low, high = float(values.min()), float(values.max())
-    rotated = vertices @ axes_of(samples)
+    rotated = vertices @ page_axes(mesh, samples)
     lowest, highest = rotated.min(axis=0), rotated.max(axis=0)
     in_cube = (rotated - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
     return PageSurface(
@@ -141,7 +141,15 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
         mesh.volume,
         key,
         mesh.unit,
+        mesh.frame,
     )
+
+
+def page_axes(mesh: Mesh, samples: Floats) -> Floats:
+    """Return the axes (3, 3) of a body on the page: the view from the front of a patient, or its principal axes."""
+    if mesh.frame == "RAS":
+        return patient_views()[0].axes
+    return axes_of(samples)
 
 
 def write_surfaces(path: Path, surfaces: Mapping[str, PageSurface]) -> None:
@@ -154,6 +162,7 @@ def write_surfaces(path: Path, surfaces: Mapping[str, PageSurface]) -> None:
         names=np.array(list(surfaces), dtype=str),
         keys=np.array([s.key for s in values], dtype=str),
         units=np.array([s.unit or "" for s in values], dtype=str),
+        frames=np.array([s.frame or "" for s in values], dtype=str),
         vertices=np.concatenate([np.empty((0, 3), np.uint16), *(s.vertices for s in values)]),
         faces=np.concatenate([np.empty((0, 3), np.uint16), *(s.faces for s in values)]),
         potential=np.concatenate([np.empty(0, np.uint8), *(s.potential for s in values)]),
@@ -183,16 +192,27 @@ def read_surfaces(path: Path) -> dict[str, PageSurface]:
         for name, i in (("vertices", 0), ("faces", 1), ("potential", 0))
     ]
     columns += [
-        arrays[name].tolist() for name in ("names", "measures", "mesh_counts", "keys", "units")
+        arrays[name].tolist()
+        for name in ("names", "measures", "mesh_counts", "keys", "units", "frames")
     ]
     return {
         name: PageSurface(
-            vertices, faces, potential, (low, high), n_v, n_f, area, volume, key, unit or None
+            vertices,
+            faces,
+            potential,
+            (low, high),
+            n_v,
+            n_f,
+            area,
+            volume,
+            key,
+            unit or None,
+            frame or None,
         )
         for vertices, faces, potential, name, (low, high, area, volume), (
             n_v,
             n_f,
-        ), key, unit in zip(*columns, strict=True)
+        ), key, unit, frame in zip(*columns, strict=True)
     }
 
 

@@ -70,7 +70,8 @@ class Stage {
     this.scene.add(this.body);
   }
 
-  show(surface, values = null) {
+  show({ surface, frame }, values = null) {
+    this.frame = frame;
     this.body.geometry.dispose();
     this.body.geometry = geometryOf(surface, values);
     const { center, radius } = this.body.geometry.boundingSphere;
@@ -84,6 +85,34 @@ class Stage {
   draw() {
     this.renderer.render(this.scene, this.camera);
   }
+
+  // The sides of the patient at the left, right, lower and upper edge; none if they are not known.
+  sides() {
+    if (!this.frame) return [];
+    this.camera.updateMatrixWorld();
+    const axes = this.camera.matrixWorld.elements;
+    const right = [axes[0], axes[1], axes[2]];
+    const up = [axes[4], axes[5], axes[6]];
+    return [right.map((x) => -x), right, up.map((x) => -x), up].map(sideOf);
+  }
+}
+
+// The letter of the patient's side to which a direction points: surfaces of a patient have x to the left, y up, z to the front.
+function sideOf(direction) {
+  const axis = direction.map(Math.abs).reduce((best, size, i, sizes) => (size > sizes[best] ? i : best), 0);
+  return ["RL", "IS", "PA"][axis][Number(direction[axis] > 0)];
+}
+
+// Writes letters at the left, right, lower and upper edge of a square picture.
+function writeSides(canvas, sides) {
+  const context = canvas.getContext("2d");
+  const [size, margin] = [canvas.width, canvas.width / 14];
+  context.font = `${Math.round(size / 9)}px sans-serif`;
+  context.fillStyle = "#808080";
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  const places = [[margin, size / 2], [size - margin, size / 2], [size / 2, size - margin], [size / 2, margin]];
+  sides.forEach((letter, i) => context.fillText(letter, ...places[i]));
 }
 
 // A stage on a canvas; null if the browser has no WebGL.
@@ -123,7 +152,7 @@ class Pictures {
   // Draws a shape, coloured by values of its vertices, from the front or from behind.
   paint(canvas, shape, values, isBehind) {
     if (!this.stage) return;
-    this.stage.show(this.shapes[shape].surface, values);
+    this.stage.show(this.shapes[shape], values);
     if (isBehind) {
       this.stage.camera.position.multiply({ x: -1, y: 1, z: -1 });
       this.stage.camera.lookAt(0, 0, 0);
@@ -131,6 +160,7 @@ class Pictures {
     this.stage.draw();
     canvas.width = canvas.height = this.size;
     canvas.getContext("2d").drawImage(this.source, 0, 0);
+    writeSides(canvas, this.stage.sides());
     canvas.classList.add("drawn");
   }
 
@@ -170,13 +200,14 @@ class Pictures {
     if (!this.stage || !this.shapes[shape].surface) return;
     let picture = this.drawn.get(shape);
     if (!picture) {
-      this.stage.show(this.shapes[shape].surface);
+      this.stage.show(this.shapes[shape]);
       this.stage.draw();
       picture = this.source;
       this.drawn.set(shape, canvas);
     }
     canvas.width = canvas.height = this.size;
     canvas.getContext("2d").drawImage(picture, 0, 0);
+    if (picture === this.source) writeSides(canvas, this.stage.sides());
     canvas.classList.add("drawn");
     this.watcher.unobserve(canvas);
   }
@@ -184,21 +215,24 @@ class Pictures {
 
 // A body that can be rotated with the mouse, a finger or the arrow keys.
 class Turntable {
-  constructor(canvas) {
+  // `letters` are four elements at the left, right, lower and upper edge.
+  constructor(canvas, letters) {
     this.canvas = canvas;
+    this.letters = letters;
     this.stage = stageOn(canvas);
     if (!this.stage) return;
     this.controls = new THREE.OrbitControls(this.stage.camera, canvas);
     this.controls.enablePan = false;
-    this.controls.addEventListener("change", () => this.stage.draw());
+    this.controls.addEventListener("change", () => this.#draw());
     canvas.addEventListener("keydown", (event) => this.#pressed(event));
     new ResizeObserver(() => this.#fit()).observe(canvas);
   }
 
-  show(surface) {
-    this.canvas.hidden = !this.stage || !surface;
+  show(shape) {
+    this.canvas.hidden = !this.stage || !shape.surface;
+    this.letters.forEach((letter) => (letter.textContent = ""));
     if (this.canvas.hidden) return;
-    this.stage.show(surface);
+    this.stage.show(shape);
     this.controls.minDistance = 0.4 * this.stage.distance;
     this.controls.maxDistance = 2 * this.stage.distance;
     this.controls.target.set(0, 0, 0);
@@ -216,7 +250,13 @@ class Turntable {
     // In a narrow frame, the body must fit the width
     this.stage.camera.zoom = Math.min(1, this.stage.camera.aspect);
     this.stage.camera.updateProjectionMatrix();
+    this.#draw();
+  }
+
+  #draw() {
     this.stage.draw();
+    const sides = this.stage.sides();
+    this.letters.forEach((letter, i) => (letter.textContent = sides[i] ?? ""));
   }
 
   #pressed(event) {

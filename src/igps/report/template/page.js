@@ -79,6 +79,32 @@ function showChosenConfusion() {
 }
 
 const searchTexts = shapes.map((shape) => [shape.name, classes[shape.label] ?? "", ...shape.notes].join(" ").toLowerCase());
+const filters = [...document.querySelectorAll("select.filter")];
+const placeOf = new Map([...buttonOf].map(([shape, button]) => [shape, button.closest("ul")]));
+
+// The file of a shape: its name without the part.
+function fileOf({ name, part }) {
+  return part ? name.slice(0, -part.length - 1) : name;
+}
+
+// Lays the shapes of the wall by their classes, or those of one file together.
+function arrange(isByFile) {
+  byId("by-file").replaceChildren();
+  const lists = new Map();
+  for (const [shape, button] of buttonOf) {
+    let list = placeOf.get(shape);
+    if (isByFile) {
+      const file = fileOf(shapes[shape]);
+      if (!lists.has(file)) {
+        lists.set(file, element("ul", { class: "wall" }));
+        byId("by-file").append(element("section", { class: "class" }, element("h3", {}, file), lists.get(file)));
+      }
+      list = lists.get(file);
+    }
+    list.append(button.parentElement);
+  }
+  filter();
+}
 
 function filter() {
   const words = byId("search").value.toLowerCase().split(/\s+/).filter(Boolean);
@@ -87,6 +113,7 @@ function filter() {
   for (const [shape, button] of buttonOf) {
     const isShown =
       words.every((word) => searchTexts[shape].includes(word)) &&
+      filters.every(({ value, dataset }) => !value || data.columns[dataset.column][shape] === value.slice(1)) &&
       (only !== "missed" || isNearestRight(shape) === false) &&
       (only !== "found" || isNearestRight(shape) === true) &&
       (only !== "repaired" || shapes[shape].notes.length > 0);
@@ -112,6 +139,9 @@ function factsOf(shape) {
   const facts = [];
   if (part) facts.push(fact("part of the file", part));
   if (label >= 0) facts.push(fact("class", classes[label]));
+  for (const [title, values] of Object.entries(data.columns)) {
+    if (values[shape] != null) facts.push(fact(title, values[shape]));
+  }
   if (scores && row !== undefined && scores.nn[row] !== null) {
     facts.push(fact("first tier", `${percent(scores.ft[row])} %`));
     facts.push(fact("second tier", `${percent(scores.st[row])} %`));
@@ -135,7 +165,7 @@ function picture(shape) {
     "button",
     { type: "button", class: "shape", "data-shape": shape, title: shapes[shape].name },
     canvas,
-    element("span", { class: "name" }, shapes[shape].name),
+    element("span", { class: "name" }, element("span", { class: "head" }, shapes[shape].name.slice(0, -9)), shapes[shape].name.slice(-9)),
     element("span", { class: "about" }, classes[shapes[shape].label] ?? ""),
   );
   pictures.watch(canvas);
@@ -288,12 +318,9 @@ function openShape(shape) {
   byId("together").hidden = !together.length;
   byId("together-list").replaceChildren(...together.map((body) => element("li", {}, picture(body))));
   showExplained(shape);
-  const hasMovements = Object.keys(data.movements).length > 0;
-  byId("moved").hidden = !hasMovements;
-  if (hasMovements) showMovements(byId("moved-table"), shapes[shape].name, data.movements);
   if (!dialog.open) dialog.showModal();
-  turntable ??= new Turntable(byId("turntable"));
-  turntable.show(shapes[shape].surface);
+  turntable ??= new Turntable(byId("turntable"), [...byId("turntable-sides").children]);
+  turntable.show(shapes[shape]);
   byId("turntable-hint").textContent = byId("turntable").hidden
     ? "There is no picture of this body."
     : "Drag or use the arrow keys to rotate, the wheel or + and − to zoom.";
@@ -332,6 +359,8 @@ byId("theme").addEventListener("click", () => {
 });
 byId("search").addEventListener("input", filter);
 byId("only").addEventListener("change", filter);
+filters.forEach((select) => select.addEventListener("change", filter));
+byId("order")?.addEventListener("change", (event) => arrange(event.target.value === "file"));
 byId("controls").addEventListener("submit", (event) => event.preventDefault());
 byId("system")?.addEventListener("change", (event) => chooseSystem(Number(event.target.value)));
 byId("map-colour")?.addEventListener("change", colourMap);

@@ -1,5 +1,5 @@
 "use strict";
-// Tables of the selected descriptor: scores per class, confusion between classes, movements of a shape.
+// Tables of the selected descriptor: scores per class, confusion between classes.
 
 function element(name, attributes = {}, ...children) {
   const created = document.createElement(name);
@@ -74,22 +74,4 @@ function showConfusion(table, classes, counts) {
   });
   const corner = element("th", { scope: "col" }, "query");
   table.replaceChildren(element("thead", {}, element("tr", {}, corner, ...headings)), element("tbody", {}, ...rows));
-}
-
-// Movements of one mesh: a row per descriptor, a column per disturbance. A missing value has its reason as a tooltip.
-function showMovements(table, name, movements) {
-  const columns = Object.entries(Object.values(movements)[0] ?? {})
-    .filter(([, movement]) => name in movement.each || name in movement.notes)
-    .map(([column]) => column);
-  const headings = ["descriptor", ...columns].map((title) => element("th", { scope: "col" }, title));
-  const rows = Object.entries(movements).map(([descriptor, byColumn]) => {
-    const cells = columns.map((column) => {
-      const share = byColumn[column].each[name];
-      const cell = element("td", { title: byColumn[column].notes[name] }, percent(share));
-      tint(cell, Math.min(1, share));
-      return cell;
-    });
-    return element("tr", {}, element("th", { scope: "row" }, descriptor), ...cells);
-  });
-  table.replaceChildren(element("thead", {}, element("tr", {}, ...headings)), element("tbody", {}, ...rows));
 }
