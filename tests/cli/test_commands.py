@@ -214,6 +214,15 @@ def test_nobody_reading_the_output_is_no_error() -> None:
     assert process.returncode == 141
 
 
+def test_names_of_files_are_read_as_utf8_in_the_c_locale(tmp_path: Path) -> None:
+    (tmp_path / "é.stl").touch()
+    code = "import os, sys, igps.cli; igps.cli._start_in_utf8(); print(os.listdir(sys.argv[1]))"
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": str(SOURCE), "LC_ALL": "C", "PYTHONUTF8": "0"}
+    done = subprocess.run(command, capture_output=True, env=environment, check=True)
+    assert done.stdout.decode() == "['é.stl']\n"
+
+
 def test_ctrl_c_during_the_imports_is_a_line() -> None:
     """The signal comes while torch is imported, for which the first seconds of a command go."""
     code = "\n".join(

@@ -54,6 +54,7 @@ def main() -> None:
 
     The status is 130 after Ctrl-C, and 141 if nobody reads the output any more, as behind `| head`.
     """
+    _start_in_utf8()
     with errors_as_messages():
         logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
         command, options = parse(sys.argv[1:])
@@ -77,6 +78,18 @@ def main() -> None:
         sys.stdout.flush()  # a closed pipe shows here, not when Python ends
     if not verdict.is_good:
         sys.exit(1)
+
+
+def _start_in_utf8() -> None:
+    """Start Python again if it takes names of files for ASCII, as in the C locale.
+
+    Letters that the terminal does not have are printed as escapes.
+    """
+    if sys.getfilesystemencoding() != "utf-8":
+        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _with_attributes(

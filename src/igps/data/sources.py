@@ -413,7 +413,9 @@ def _files_in(folder: Path) -> list[Path]:
             if not name.startswith(".") and is_searched(Path(parent, name))
         ):
             if not _is_utf8(path):
-                logger.warning("%s: left out, its name is not UTF-8. Rename it.", os.fsencode(path))
+                remedy = "Rename it, or set PYTHONUTF8=1"
+                fault = f"{os.fsencode(path)!r}: left out, its name is not UTF-8"
+                logger.warning("%s. %s.", fault, remedy)
             elif os.path.isfile(path) or not os.path.exists(
                 path
             ):  # not a pipe, whose reading might never end
