@@ -24,6 +24,7 @@ BALL = compute_signature(
     SignatureConfig(n_eigenpairs=5, resolution=10, min_samples=0, n_surface_samples=20),
 )
 N = len(BALL.interior.points)
+TURNS = np.array([-0.8, -0.4, 0, 0.4, 0.8])
 SEPARATIONS = np.array([0, 1, 2, 3, 4, 5, 6.5, 9, 12.5, 17.5, 25, 37, 57, 89, 130])
 
 
@@ -65,12 +66,13 @@ def test_every_residue_counts_once_in_the_row_of_its_separation() -> None:
     separation = hats(np.abs(places[i] - places[j]), SEPARATIONS)[:, 2:]
     axes = (
         hats(distance, np.arange(2.5, 40, 5)),
-        hats((one * other).sum(axis=1), np.array([-0.66, 0, 0.66])),
-        hats(twist, np.array([-0.5, 0, 0.5])),
+        hats((one * other).sum(axis=1), TURNS),
+        hats(twist, TURNS),
     )
     wanted = np.einsum("ps,pd,pc,pt->sdct", separation, *axes, optimize=True)
-    weights = 1 / (1 + SEPARATIONS[2:] / 30)
-    weights /= weights.sum() * wanted.sum(axis=(1, 2, 3))
+    n_pairs = wanted.sum(axis=(1, 2, 3))
+    weights = n_pairs / (n_pairs + 2000) / (1 + SEPARATIONS[2:] / 20)
+    weights /= weights.sum() * n_pairs
     np.testing.assert_allclose(found, wanted * weights[:, None, None, None], atol=2e-6)
 
 
@@ -156,7 +158,7 @@ def test_directions_do_not_cross_gaps() -> None:
 
 
 def test_it_is_found_by_name_and_asks_for_a_trace() -> None:
-    assert igps.descriptor("fold").n_features == 13 * 8 * 9
+    assert igps.descriptor("fold").n_features == 13 * 8 * 25
     with pytest.raises(ValueError, match="needs signatures with trace"):
         fold()(collate([BALL]))
-    assert FoldHistogram(n_bins=5, n_samples=None).shape == (13, 5, 3, 3)
+    assert FoldHistogram(n_bins=5, n_samples=None).shape == (13, 5, 5, 5)

@@ -28,12 +28,14 @@ TRACE = "trace"
 _SEPARATIONS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 9.0, 12.5, 17.5, 25.0, 37.0, 57.0, 89.0, 130.0)
 _N_NEIGHBOURS = 2
 # The separation at which a class counts half as much as near ones: far residues move as domains move.
-_HALF_SEPARATION = 30.0
+_HALF_SEPARATION = 20.0
+# The number of pairs at which a class counts half as much as one of many pairs: few pairs tell little.
+_FEW_PAIRS = 2000.0
 _N_BINS = 8
 _REACH = 40.0  # Å
 # Centres of the classes of the angle and of the twist between two directions of the chain.
-_COSINES = (-0.66, 0.0, 0.66)
-_TWISTS = (-0.5, 0.0, 0.5)
+_COSINES = (-0.8, -0.4, 0.0, 0.4, 0.8)
+_TWISTS = (-0.8, -0.4, 0.0, 0.4, 0.8)
 _N_SAMPLES = 2000
 
 
@@ -91,8 +93,9 @@ class ChainTwist(_TraceAxis):
 class FoldHistogram(SampleHistogram):
     """Distances, angles and twists of pairs of residues, a histogram for each class of separation along the chain.
 
-    The histogram of a class does not depend on how many pairs it holds. Its weight falls from 1 to a half at a
-    separation of 30 residues. Every residue that is nearest to a sample counts once, however many samples are near it.
+    The weight of a class falls to a half at a separation of 20 residues, as far residues move with domains, and is a
+    half with 2000 pairs, as fewer pairs scatter more. The weights of all classes sum to 1. Every residue that is the
+    nearest of a sample counts once, however many samples are near it.
 
     Args:
         n_bins, reach: bins of the distance, see `ResidueDistance`.
@@ -128,7 +131,7 @@ class FoldHistogram(SampleHistogram):
         return replace(attribute_requirements(TRACE), eigenpairs=False)
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
-        """Return histograms (N, S, B, 3, 3) of the samples of N shapes; classes without a pair are 0."""
+        """Return histograms (N, S, B, 5, 5) of the samples of N shapes; classes without a pair are 0."""
         mask = features.samples.mask
         axes = [self.separation, *self.others]
         pairs = [axis.pairs(features, self.embedding) for axis in axes]
@@ -139,10 +142,13 @@ class FoldHistogram(SampleHistogram):
         rows = counts[:, 0, _N_NEIGHBOURS:].flatten(2)
         # The sums depend on the weights of the samples, but on no other input that may have gradients.
         sums = rows.sum(dim=2, keepdim=True).detach()
+        tiny = torch.finfo(sums.dtype).tiny
+        n_points = mask.sum(dim=1).view(-1, 1, 1)
+        n_pairs = sums * (n_points * (n_points - 1) / 2)
         separations = self.separation.centres()[_N_NEIGHBOURS:, None]
-        shares = (sums > 0) / (1 + separations / _HALF_SEPARATION)
-        shares = shares / shares.sum(dim=1, keepdim=True).clamp_min(torch.finfo(sums.dtype).tiny)
-        cells = rows / sums.clamp_min(torch.finfo(sums.dtype).tiny) * shares
+        shares = n_pairs / (n_pairs + _FEW_PAIRS) / (1 + separations / _HALF_SEPARATION)
+        shares = shares / shares.sum(dim=1, keepdim=True).clamp_min(tiny)
+        cells = rows / sums.clamp_min(tiny) * shares
         return cells.unflatten(2, counts.shape[3:])
 
 
