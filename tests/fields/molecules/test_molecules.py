@@ -17,7 +17,7 @@ from igps.fields.molecules.molecule import Molecule
 from igps.fields.molecules.residues import VOLUMES
 from igps.fields.molecules.structures import is_structure, read_molecule
 from igps.mesh.errors import MeshError
-from igps.mesh.loading import BodyRef, each_body
+from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mesh import Mesh
 
 pytest.importorskip("gemmi")
@@ -596,3 +596,69 @@ def test_completed_residues_are_told_on_the_terminal(
     main()
     told = "21 residues were completed: balls stand for missing atoms of side chains (in 2 of 2"
     assert told in capsys.readouterr().out
+
+
+def test_ranges_of_residues_are_bodies(tmp_path: Path) -> None:
+    text = "".join(residue(i) for i in range(1, 9)) + "".join(
+        residue(i, chain="B") for i in range(1, 4)
+    )
+    path = written(tmp_path, text)
+    for part in ("chain A:2-3,6-7", "A:2-3,6-7"):
+        found = molecule_of(BodyRef(path, part))
+        assert found.residue_labels == ("A 2", "A 3", "A 6", "A 7")
+        assert found.positions[found.residue_of == 2, 2] == pytest.approx(np.full(5, 3.8 * 6))
+        assert "residues 2-3,6-7 alone: 4 of 8" in found.notes
+    mesh = load_mesh(path, part="A:2-3")
+    assert mesh.vertices[:, 2].min() > 3.8 * 2 - 3
+    assert mesh.vertices[:, 2].max() < 3.8 * 3 + 3
+    with pytest.raises(MeshError, match=r"no residue is in 20-30; their numbers are 1 to 8"):
+        load_mesh(path, part="A:20-30")
+
+
+def test_coordinates_of_nine_characters_are_read(tmp_path: Path) -> None:
+    """Beyond ±1000 Å, lines of some programs grow by a character for each coordinate."""
+    lines = [Atom(i, "CA", 0, 0, 0, place=f"{i:>4} ").line() for i in range(3)]
+    wide = "-1234.567-2000.25012345.678"
+    text = "".join(line[:30] + wide + line[54:] for line in lines)
+    (molecule,) = read_molecule(written(tmp_path, text))
+    expected = [[-1234.57, -2000.25, 12345.68]] * 3
+    np.testing.assert_allclose(molecule.residue_positions, expected, atol=1e-9)
+    assert molecule.b_factors.tolist() == [20.0] * 3
+
+
+@pytest.mark.parametrize("kept", [4, 40, 60])
+def test_a_pdb_file_that_is_cut_short_is_told(tmp_path: Path, kept: int) -> None:
+    whole = residue(1)
+    last = whole.splitlines()[-1]
+    path = written(tmp_path, whole + last[:kept])
+    with pytest.raises(MeshError, match="cut short"):
+        read_molecule(path)
+
+
+def test_a_header_without_an_end_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        read_molecule(written(tmp_path, "HEADER    HYDROLASE\n" + residue(1) + "END\n"))
+        assert not caplog.text
+        read_molecule(written(tmp_path, "HEADER    HYDROLASE\n" + residue(1)))
+    assert "no END, so it may be cut short" in caplog.text
+
+
+def test_atoms_in_one_place_are_refused_and_one_atom_is_told(tmp_path: Path) -> None:
+    atoms = [(name, 0.0, 0.0) for name in ("N", "CA", "C")]
+    path = written(tmp_path, residue(1, atoms=atoms))
+    with pytest.raises(MeshError, match="all its atoms are in one place"):
+        load_mesh(path, part="chain A")
+    zinc = Atom(1, "ZN", 1, 2, 3, residue="ZN", record="HETATM", element="ZN").line()
+    mesh = load_mesh(written(tmp_path, zinc), part="chain A")
+    assert "a single atom: its surface is a ball" in mesh.notes
+
+
+def test_lipids_among_the_atoms_of_polymers_are_told(tmp_path: Path) -> None:
+    tail = [(f"C{i}", 1.5 * i, 8.0) for i in range(1, 6)]
+    (molecule,) = read_molecule(written(tmp_path, residue(1) + residue(2, "POP", tail)))
+    assert any("1 residues" in note and "lipids or detergents" in note for note in molecule.notes)
+
+
+def test_binary_cif_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"BinaryCIF is not read. Download .* as mmCIF"):
+        load_mesh(written(tmp_path, "x", "entry.bcif"))

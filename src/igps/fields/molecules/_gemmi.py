@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import gzip
 import itertools
+import logging
 import re
 import zlib
 from collections.abc import Iterator, Mapping
@@ -16,6 +17,8 @@ from igps.mesh.raw_body import distinct
 
 if TYPE_CHECKING:
     import gemmi
+
+logger = logging.getLogger(__name__)
 
 SUFFIXES = frozenset({".pdb", ".ent", ".cif", ".mmcif", ".pqr"})
 """Suffixes of structure files; ".gz" may follow."""
@@ -33,6 +36,11 @@ _REQUIRED_COLUMNS = (
     "Cartn_z",
 )
 _MODEL_LINE = re.compile(rb"^MODEL[ \t]+\d+[^\r\n]*", re.MULTILINE)
+# The start of a line up to its coordinates, which need not be in their columns
+_WIDE = re.compile(
+    rb"^((?:ATOM  |HETATM)[^\n]{24}) *(-?\d+\.\d{3}) *(-?\d+\.\d{3}) *(-?\d+\.\d{3})",
+    re.MULTILINE,
+)
 _END_LINE = re.compile(rb"^END[ \t]*$", re.MULTILINE)
 # The chain, number and insertion code of a residue in a PQR file, as in "A12B"; chain and code may be missing.
 _RESIDUE_NUMBER = re.compile(r"([A-Za-z]?)(-?\d+)([A-Za-z]?)")
@@ -54,7 +62,8 @@ def read_structures(path: Path) -> dict[str, gemmi.Structure]:
     gemmi = gemmi_module()
     try:
         if suffix_of(path) in (".pdb", ".ent"):
-            marked = _ATOM_LINE.sub(_mark_missing, text)
+            _check_end(text, path)
+            marked = _ATOM_LINE.sub(_mark_missing, _WIDE.sub(_narrowed, text))
             return {"": _pdb(_numbered_models(_frames_as_models(marked)))}
         document = gemmi.cif.read_string(text.decode("utf-8", "replace"))
         blocks = [block for block in document if block.find_values("_atom_site.id")] or [
@@ -124,6 +133,10 @@ def gemmi_module() -> Any:
 
 
 def _read_text(path: Path) -> bytes:
+    if suffix_of(path) == ".bcif":
+        raise MeshError(
+            f"{path}: BinaryCIF is not read. Download the same entry as mmCIF (.cif) or convert it."
+        )
     if suffix_of(path) not in SUFFIXES:
         raise MeshError(
             f"{path}: expected a structure in {', '.join(sorted(SUFFIXES))}, gzipped or not."
@@ -165,6 +178,25 @@ def _mark_missing(line: re.Match[bytes]) -> bytes:
             if len(text) >= 54:
                 text = text[:start].ljust(start) + b"nan".rjust(end - start) + text[end:]
     return text
+
+
+def _check_end(text: bytes, path: Path) -> None:
+    """Raise a ValueError if the last line of a PDB file is broken; warn if its END is missing."""
+    *_, before, last = b"\n", *text.rsplit(b"\n", 2)
+    if last.startswith(b"ATO") and len(last) < len(before):
+        raise ValueError("its last line is broken")
+    if text.startswith(b"HEADER") and not _END_LINE.search(text):
+        logger.warning(
+            "%s: it has a HEADER and no END, so it may be cut short. Download it again.", path
+        )
+
+
+def _narrowed(line: re.Match[bytes]) -> bytes:
+    """Return the start of a PDB line with coordinates of eight characters each: programs write nine beyond ±1000 Å."""
+    if len(line[0]) <= 54:
+        return line[0]
+    numbers = [b"%8.2f" % float(line[i]) for i in (2, 3, 4)]
+    return line[1] + b"".join(numbers)
 
 
 def _frames_as_models(text: bytes) -> bytes:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from igps.fields.molecules._gemmi import SUFFIXES, gemmi_module, parts_of, read_structures
 from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.fields.molecules.molecule import Molecule, joined
 from igps.fields.molecules.structures import MoleculeBodies, read_molecule
+from igps.mesh.errors import MeshError
 from igps.mesh.formats import Format, stat_key
 from igps.mesh.loading import BodyRef
+from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.mesh.raw_body import RawBody, deferred
 
@@ -19,7 +25,12 @@ if TYPE_CHECKING:
     import gemmi
 
 
-@lru_cache(maxsize=1)
+_RANGES = re.compile(r"(.*):(-?\d+--?\d+(?:,-?\d+--?\d+)*)")
+_RANGE = re.compile(r"(-?\d+)-(-?\d+)")
+_NUMBER = re.compile(r"(-?\d+)\D*$")  # of a residue, at the end of its label
+
+
+@lru_cache(maxsize=2)
 def molecules_by_part(
     path: Path, changed: tuple[int, int, int], bodies: MoleculeBodies
 ) -> dict[str, Molecule]:
@@ -33,19 +44,54 @@ def _part(name: str, path: Path) -> str:
 
 def _kind_of(part: str) -> MoleculeBodies:
     """Return the kind of body that a part names."""
-    words = part.split()  # in a file of several structures, the first is the name of a structure
-    kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
-    return next((kinds[word] for word in kinds if word in words), "models")
+    words = part.partition(":")[0].split()  # of several structures, the first is the name of one
+    if "assembly" in words:
+        return "assembly"
+    return "models" if part == "" or "model" in words[-2:] else "chains"
+
+
+def chosen(molecules: Mapping[str, Molecule], part: str) -> Molecule | None:
+    """Return the molecule of a part, or of ranges of its residues, as "A:10-120,150-160"; None if there is none.
+
+    Raises:
+        MeshError: the molecule has no residue in the ranges.
+    """
+    if part in molecules:
+        return molecules[part]
+    match = _RANGES.fullmatch(part)
+    base = part if match is None else match[1]
+    found = molecules.get(base, molecules.get(f"chain {base}"))
+    if found is None or match is None:
+        return found
+    numbers = np.array([_residue_number(label) for label in found.residue_labels])
+    is_chosen = np.zeros(len(numbers), dtype=bool)
+    for first, last in _RANGE.findall(match[2]):
+        is_chosen |= (numbers >= int(first)) & (numbers <= int(last))
+    if not is_chosen.any():
+        raise MeshError(
+            f"{found.name}: no residue is in {match[2]}; their numbers are {numbers.min()} to "
+            f"{numbers.max()}. Choose among them."
+        )
+    return found.subset(
+        is_chosen, f"residues {match[2]} alone: {is_chosen.sum()} of {len(numbers)}"
+    )
+
+
+def _residue_number(label: str) -> int:
+    match = _NUMBER.search(label)
+    assert match is not None
+    return int(match[1])
 
 
 def molecule_of(body: BodyRef) -> Molecule:
     """Return the atoms and residues of a body: of a chain, an assembly or a model, or of all models."""
     part = body.part or ""
     stamp = stat_key(body.path)
-    for kind in (_kind_of(part), "models"):
+    for kind in dict.fromkeys((_kind_of(part), "models")):
         molecules = molecules_by_part(body.path, stamp, kind)
-        if part in molecules:
-            return molecules[part]
+        found = chosen(molecules, part)
+        if found is not None:
+            return found
     return joined(list(molecules.values()))
 
 
@@ -58,11 +104,12 @@ def structure_of(body: BodyRef) -> gemmi.Structure:
             read_structures(body.path), _kind_of(body.part or ""), body.path
         )
     }
-    chosen = [parts[body.part]] if body.part in parts else list(parts.values())
+    base = (body.part or "").partition(":")[0]
+    names = [name for name in (base, f"chain {base}") if name in parts] or list(parts)
     structure = gemmi.Structure()
-    for number, chains in enumerate(chosen, 1):
+    for number, name in enumerate(names, 1):
         model = gemmi.Model(number)
-        for chain in chains:
+        for chain in parts[name]:
             model.add_chain(chain)
         structure.add_model(model)
     return structure
@@ -74,9 +121,27 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         options.bodies if options.bodies in ("chains", "assembly") else "models"
     )
     molecules = molecules_by_part(path, stat_key(path), bodies)
-    names = [name for name in molecules if part in (None, name)]
-    return [deferred(partial(molecular_surface, molecules[name]), name, "Å") for name in names]
+    if part is not None:
+        found = chosen(molecules, part)
+        molecules = {} if found is None else {part: found}
+    return [deferred(partial(_surface, each), name, "Å") for name, each in molecules.items()]
 
 
-_SUFFIXES = tuple(sorted(suffix + ending for suffix in SUFFIXES for ending in ("", ".gz")))
+def _surface(molecule: Molecule) -> Mesh:
+    """Return the surface of a molecule; raise a MeshError if all its atoms are in one place."""
+    places = molecule.positions
+    if len(places) > 1 and not np.ptp(places, axis=0).any():
+        raise MeshError(
+            f"{molecule.name}: all its atoms are in one place, {places[0].tolist()}. "
+            "Export the structure again, with its coordinates."
+        )
+    surface = molecular_surface(molecule)
+    if len(places) == 1:
+        return surface.annotated(notes=("a single atom: its surface is a ball",))
+    return surface
+
+
+_SUFFIXES = tuple(
+    sorted(suffix + ending for suffix in (*SUFFIXES, ".bcif") for ending in ("", ".gz"))
+)
 FORMAT = Format("a structure", _SUFFIXES, read, ("chains", "models", "assembly"), extra="molecules")

@@ -1,14 +1,16 @@
 """A molecule: balls and residues."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import chain, compress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from igps._arrays import Floats, Integers
+from igps._arrays import Booleans, Floats, Integers
 
 BETWEEN_CHAINS = 1000.0
 """Difference of the places of residues of two chains at least: more than that of any pair that is compared."""
@@ -51,6 +53,24 @@ class Molecule:
         if not self.residue_labels:
             labels = tuple(str(number + 1) for number in range(n_residues))
             object.__setattr__(self, "residue_labels", labels)
+
+    def subset(self, is_kept: Booleans, note: str) -> Molecule:
+        """Return the molecule of some of its residues, (R,), with a note of why."""
+        balls = is_kept[self.residue_of]
+        new_index = np.cumsum(is_kept) - 1
+        return replace(
+            self,
+            positions=self.positions[balls],
+            radii=self.radii[balls],
+            charges=self.charges[balls],
+            residue_of=new_index[self.residue_of[balls]],
+            residue_names=tuple(compress(self.residue_names, is_kept)),
+            residue_positions=self.residue_positions[is_kept],
+            b_factors=self.b_factors[is_kept],
+            places=self.places[is_kept],
+            residue_labels=tuple(compress(self.residue_labels, is_kept)),
+            notes=(*self.notes, note),
+        )
 
     def __repr__(self) -> str:
         return (

@@ -53,6 +53,8 @@ _NOTES = {
     "named": "{} atoms without an element: it was inferred from their names",
     "element": f"{{}} atoms of an unknown element: a radius of {_UNKNOWN_RADIUS} Å was used",
     "residue": "{} residues of an unknown name",
+    "stranger": "{} residues of an unknown name that are no amino acids, such as lipids or detergents: "
+    "they are part of the body; delete them from the file if they should not be",
     "side chain": "{} residues were completed: balls stand for missing atoms of side chains",
     "alpha": "{} residues of Cα alone: a ball of the residue's volume was used",
     "repeated": "{} residues repeat a number: all were kept",
@@ -198,7 +200,9 @@ class _Builder:
         if not atoms or not (in_polymer or self.ligands):
             self._count["ligand"] += bool(atoms)
             return False
-        self._count["residue"] += in_polymer and not is_known
+        if in_polymer and not is_known:
+            is_amino_acid = {"N", "CA", "C"} <= named
+            self._count["residue" if is_amino_acid else "stranger"] += 1
         positions = np.array([atom.pos.tolist() for atom in atoms])
         alpha = (
             next((i for i, atom in enumerate(atoms) if atom.name == "CA"), None)
