@@ -31,7 +31,11 @@ def main() -> None:
     root = Path(sys.argv[1])
     version = hashlib.sha256(igps.__file__.encode()).hexdigest()[:8]
     rich = importlib.import_module("igps.descriptors.rich").rich
-    descriptor: Any = rich(learnable=True, n_training_samples=N_SAMPLES).train()
+    options: Any = {"learnable": True, "n_training_samples": N_SAMPLES}
+    try:
+        descriptor: Any = igps.descriptor("rich", **options).train()
+    except TypeError:  # of an earlier version
+        descriptor = rich(**options).train()
     config = igps.SignatureConfig(
         n_eigenpairs=50,
         attributes=("depth", "electrostatic_potential", "surface_direction"),

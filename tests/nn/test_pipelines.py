@@ -39,8 +39,8 @@ MODULES: dict[str, Callable[[], DescriptionPart]] = {
     ),
     "learned": lambda: PairHistogram(
         [
-            Potential(2, learnable=True),
-            Attribute("depth", [0.2, 0.6], learnable=True),
+            Potential(2, soft=True, learnable=True),
+            Attribute("depth", [0.2, 0.6], soft=True, learnable=True),
             EuclideanDistance(3, learnable=True),
         ],
         filtered(),
@@ -51,7 +51,7 @@ MODULES: dict[str, Callable[[], DescriptionPart]] = {
     ),
     "twists": lambda: PairHistogram([PairTwist(4), InteriorDistance(4)], filtered()),
     "of points": lambda: PointHistogram(
-        [BallRadius("inside"), Potential(3, learnable=True)], filtered()
+        [BallRadius("inside"), Potential(3, soft=True, learnable=True)], filtered()
     ),
 }
 

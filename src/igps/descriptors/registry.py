@@ -2,7 +2,7 @@
 
 import importlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, get_args
@@ -13,6 +13,7 @@ from igps.descriptors.measures import Measures
 from igps.descriptors.size_and_side import SIDE, SIZE, Mirror, Size, SizeAndSide, keeps_size
 from igps.descriptors.with_attributes import WithAttributes
 from igps.nn.descriptor import Descriptor
+from igps.nn.layout import LayoutPart, layout_parts, with_layout
 
 # Where each descriptor of the library is made: a class, or a function without arguments.
 _LIBRARY: Mapping[str, str] = {
@@ -56,6 +57,8 @@ def descriptor(
     size: Size = "ignore",
     mirror: Mirror = "same",
     units: Sequence[str | None] | None = None,
+    learnable: bool | Collection[LayoutPart] = False,
+    n_training_samples: int | None = None,
 ) -> Descriptor:
     """Return a descriptor by its name or file, in evaluation mode; a descriptor is returned as it is.
 
@@ -73,9 +76,14 @@ def descriptor(
         size: "keep" compares size, see `SizeAndSide`; "auto" does so if all bodies have a unit.
         mirror: "distinct" distinguishes a body from its mirror image.
         units: units of length of the bodies, for size="auto", see `SignatureDataset.units`.
+        learnable: what of the layout is learned by gradients: any of "bins", "classes" and
+            "filter", or True for all. Until it is trained, descriptions are the same.
+        n_training_samples: number of samples of a body that are drawn at each step of training;
+            all that are used otherwise if None.
 
     Raises:
-        ValueError: no descriptor has this name, or the file is not valid, see `load`.
+        ValueError: no descriptor has this name, or the file is not valid, see `load`; or the
+            descriptor has no such layout to learn.
     """
     check_one_of(get_args(Size), size=size)
     check_one_of(get_args(Mirror), mirror=mirror)
@@ -88,6 +96,9 @@ def descriptor(
         suffixes = _SIZE_OR_SIDE.findall(which)
         which = _SIZE_OR_SIDE.sub("", which)
     base = _base_descriptor(which)
+    parts = layout_parts(learnable)
+    if parts or n_training_samples is not None:
+        base = with_layout(base, parts, n_training_samples)
     compares_size = size == "keep" if units is None else keeps_size(size, units)[0]
     with_size = compares_size or SIZE in suffixes
     with_side = mirror == "distinct" or SIDE in suffixes

@@ -22,6 +22,7 @@ from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.mesh.mesh import Mesh
 from igps.nn._kernels import blocks
+from igps.nn._kernels.gradients import on_one_thread
 from igps.nn.batch_features import BatchFeatures
 from igps.nn.heads.base import Head
 from igps.nn.histograms.base import DescriptionPart
@@ -289,7 +290,13 @@ class HistogramDescriptor(Descriptor):
                 [share * histogram(features).flatten(1) for share, histogram in shares], dim=1
             )
 
-        return blocks.map_by_size(concatenated, batch)
+        n_read = zip(*(part.n_read(self.training) for _, part in shares), strict=True)
+        interior, surface = map(max, n_read)
+
+        def described(bodies: SignatureBatch) -> Tensor:
+            return blocks.map_by_size(concatenated, bodies, (interior, surface))
+
+        return on_one_thread(described, batch, self)
 
 
 class EmbeddedDescriptor(Descriptor):

@@ -17,6 +17,7 @@ from igps.nn.embedding import (
 from igps.nn.histograms.pairs import joint_histogram, pair_histogram
 from igps.nn.histograms.points import point_histogram
 from igps.retrieval import chi_square
+from igps.retrieval.distances import square_root
 
 __all__ = [
     "ball_radii",
@@ -33,4 +34,5 @@ __all__ = [
     "soft_memberships",
     "spectral_embedding",
     "spectral_weights",
+    "square_root",
 ]

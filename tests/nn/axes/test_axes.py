@@ -61,7 +61,9 @@ def test_hard_classes_are_those_of_the_nearest_centre(axis: PointAxis) -> None:
     assert axis.n_classes == 4
 
 
-@pytest.mark.parametrize("options", [{}, {"soft": True}, {"learnable": True}])
+@pytest.mark.parametrize(
+    "options", [{}, {"soft": True}, {"learnable": True}, {"soft": True, "learnable": True}]
+)
 @pytest.mark.parametrize("depths", [[0.1, 0.35, 0.4, 0.95], [0.2, 0.3], [0.4]])
 def test_members_are_memberships_without_their_zeros(
     options: dict[str, bool], depths: list[float]
@@ -76,15 +78,29 @@ def test_members_are_memberships_without_their_zeros(
         axis.members(values, torch.ones_like(mask))
 
 
-@pytest.mark.parametrize("options", [{"soft": True}, {"learnable": True}])
-def test_soft_classes_are_hats(options: dict[str, bool]) -> None:
-    axis = Potential(3, 0.9, **options)
-    assert axis.soft
+@pytest.mark.parametrize("learnable", [False, True])
+def test_soft_classes_are_hats(learnable: bool) -> None:
+    axis = Potential(3, 0.9, soft=True, learnable=learnable)
     values = torch.linspace(0, 1.2, 30)
     np.testing.assert_allclose(
         axis.memberships(values).detach(), soft_classes(values, [0.15, 0.45, 0.75]), atol=1e-6
     )
-    assert len(list(axis.parameters())) == ("learnable" in options)
+    assert len(list(axis.parameters())) == learnable
+
+
+def test_learned_hard_classes_are_hard_and_have_the_derivative_of_soft_ones() -> None:
+    axes = {soft: Potential(3, 0.9, soft=soft, learnable=True) for soft in (False, True)}
+    values = torch.linspace(0, 1.2, 30, requires_grad=True)
+    upstream = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(axes[False].memberships(values), Potential(3, 0.9).memberships(values))
+    found, expected = (
+        torch.autograd.grad(
+            (axis.memberships(values) * upstream).sum(), [values, *axis.parameters()]
+        )
+        for axis in axes.values()
+    )
+    torch.testing.assert_close(found, expected)
+    assert all(bool(gradient.any()) for gradient in found)
 
 
 def test_values_of_points() -> None:

@@ -253,7 +253,10 @@ def learn(*modules: nn.Module) -> None:
 @pytest.mark.parametrize("with_cosines", [False, True])
 def test_learned_axes_equal_brute_force_loop(batch: SignatureBatch, with_cosines: bool) -> None:
     """The centres are wherever the parameters take them."""
-    potential, depth = Potential(2, learnable=True), Attribute("depth", DEPTH, learnable=True)
+    potential, depth = (
+        Potential(2, soft=True, learnable=True),
+        Attribute("depth", DEPTH, soft=True, learnable=True),
+    )
     interior, euclidean = InteriorDistance(4, learnable=True), EuclideanDistance(3, learnable=True)
     angles = PairCosines(3, learnable=True)
     axes = (
@@ -432,7 +435,7 @@ def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
         (lambda: [Potential(soft=True), InteriorDistance(8)], torch.nan),
         (
             lambda: [
-                Potential(learnable=True),
+                Potential(soft=True, learnable=True),
                 InteriorDistance(8, learnable=True),
                 EuclideanDistance(4),
             ],
@@ -440,7 +443,7 @@ def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
         ),
         (
             lambda: [
-                Potential(2, learnable=True),
+                Potential(2, soft=True, learnable=True),
                 InteriorDistance(4),
                 PairCosines(3, learnable=True),
             ],
@@ -478,7 +481,7 @@ def test_gradient_through_classes_and_layout() -> None:
     """By learned centres and by the embedding, whose norm is the potential; against finite differences."""
     embedding = some(9, seed=2)[0].requires_grad_()
     layer = PairHistogram(
-        [Potential(3, learnable=True), InteriorDistance(4, 2.0, learnable=True)]
+        [Potential(3, soft=True, learnable=True), InteriorDistance(4, 2.0, learnable=True)]
     ).double()
     names = ["axes.1.centres.log_gap", "axes.0.centres.log_gap"]
 
@@ -501,7 +504,7 @@ def test_gradient_of_learned_cosines_is_that_of_finite_differences() -> None:
     embedding, points, directions = some(7)
     angles = PairCosines(3, learnable=True)
     layer = PairHistogram(
-        [Potential(2, learnable=True), InteriorDistance(3, 4.0, learnable=True), angles]
+        [Potential(2, soft=True, learnable=True), InteriorDistance(3, 4.0, learnable=True), angles]
     ).double()
     weights = torch.randn(
         layer.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
@@ -542,7 +545,7 @@ def test_soft_classes_tend_to_hard_ones() -> None:
 def test_values_beyond_the_ranges_stay_in_the_last_cells() -> None:
     embedding, points, _ = some(50)
     axes = [
-        Potential(learnable=True),
+        Potential(soft=True, learnable=True),
         InteriorDistance(learnable=True),
         EuclideanDistance(4, learnable=True),
     ]
@@ -578,9 +581,7 @@ def test_learned_layout_starts_as_the_fixed_one(more: tuple[Callable[..., PairAx
     embedding, points, directions = (value[None].float() for value in some(30))
     attributes = {"depth": points[:, :, 0], "surface_direction": directions}
     batch = batch_of(embedding, None, points, attributes)
-    fixed, learned = (
-        two_layouts(options, *more)(batch) for options in ({"soft": True}, {"learnable": True})
-    )
+    fixed, learned = (two_layouts(options, *more)(batch) for options in ({}, {"learnable": True}))
     assert not fixed.requires_grad
     assert learned.requires_grad
     np.testing.assert_allclose(learned.detach(), fixed, atol=1e-6)
@@ -588,7 +589,9 @@ def test_learned_layout_starts_as_the_fixed_one(more: tuple[Callable[..., PairAx
 
 def test_training_moves_a_layout_and_keeps_its_order() -> None:
     batch = batch_of(some(60)[0].float()[None])
-    layer = PairHistogram([Potential(learnable=True), InteriorDistance(8, learnable=True)])
+    layer = PairHistogram(
+        [Potential(soft=True, learnable=True), InteriorDistance(8, learnable=True)]
+    )
     axes = [axis.centres for axis in layer.axes]
     start = [centres().detach() for centres in axes]
     optimiser = torch.optim.SGD(layer.parameters(), lr=10.0)
@@ -607,9 +610,9 @@ def test_training_moves_a_layout_and_keeps_its_order() -> None:
 
 def test_layout_survives_its_state() -> None:
     def made(reach: float) -> PairHistogram:
-        depth = Attribute("depth", [0.1, 0.3], learnable=True)
+        depth = Attribute("depth", [0.1, 0.3], soft=True, learnable=True)
         pairs = [InteriorDistance(6, reach, learnable=True), EuclideanDistance(5, learnable=True)]
-        return PairHistogram([Potential(learnable=True), depth, *pairs])
+        return PairHistogram([Potential(soft=True, learnable=True), depth, *pairs])
 
     layer, fresh = made(4.0), made(9.0)
     learn(layer)
@@ -626,7 +629,7 @@ def test_half_precision_and_autocast_count_in_single(device: str, cosines: bool)
     embedding = some(60)[0].to(device, torch.bfloat16)
     more = [EmbeddedPairCosines(3, learnable=True)] if cosines else []
     layer = PairHistogram(
-        [Potential(learnable=True), InteriorDistance(16, learnable=True), *more]
+        [Potential(soft=True, learnable=True), InteriorDistance(16, learnable=True), *more]
     ).to(device)
 
     def run(points: Tensor) -> tuple[Tensor, list[Tensor]]:

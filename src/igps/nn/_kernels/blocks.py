@@ -1,5 +1,6 @@
 """The choice between compiled loops and operations of PyTorch, and the number of bodies computed at once."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -43,20 +44,26 @@ def map_bodies(
     )
 
 
-def map_by_size(function: Callable[[SignatureBatch], Tensor], batch: SignatureBatch) -> Tensor:
+def map_by_size(
+    function: Callable[[SignatureBatch], Tensor],
+    batch: SignatureBatch,
+    n_read: tuple[float, float] = (math.inf, math.inf),
+) -> Tensor:
     """Apply a function to a batch, in groups of bodies of about one size, padded only to the largest of the group.
 
-    Otherwise, one large body would multiply the time and memory of all. Traced code processes all bodies at once, as it
-    cannot depend on their sizes.
+    Otherwise, one large body would multiply the time and memory of all. If the function reads at most `n_read` interior
+    and surface samples of each body, larger bodies count as of this size. Traced code processes all bodies at once, as
+    it cannot depend on their sizes.
     """
     if torch.compiler.is_compiling():
         return function(batch)
     sizes: list[list[int]] = torch.stack(
         [_last(kind.mask) for kind in (batch.interior, batch.surface)], dim=1
     ).tolist()
+    read = [[min(pair) for pair in zip(size, n_read, strict=True)] for size in sizes]
     groups: list[list[int]] = []
-    for i in sorted(range(len(sizes)), key=sizes.__getitem__, reverse=True):
-        pairs = zip(sizes[groups[-1][0]], sizes[i], strict=True) if groups else ()
+    for i in sorted(range(len(read)), key=read.__getitem__, reverse=True):
+        pairs = zip(read[groups[-1][0]], read[i], strict=True) if groups else ()
         if groups and all(
             abs(a - b) <= max(_MAX_PADDING * max(a, b), _FREE_PADDING) for a, b in pairs
         ):
@@ -65,7 +72,7 @@ def map_by_size(function: Callable[[SignatureBatch], Tensor], batch: SignatureBa
             groups.append([i])
     if len(groups) > 1 and uses_loops(batch.device):
         # One body is a view of the batch, but several are copied, which costs more than a call for a large body.
-        small = [group for group in groups if max(sizes[group[0]]) <= _FREE_PADDING]
+        small = [group for group in groups if max(read[group[0]]) <= _FREE_PADDING]
         groups = [*small, *([i] for group in groups if group not in small for i in group)]
 
     def cut_to(members: list[int]) -> SignatureBatch:

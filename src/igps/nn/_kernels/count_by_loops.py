@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from igps._arrays import Booleans
+from igps._arrays import Booleans, Floats
 from igps._threads import SERIAL, Result, Team
 from igps.nn._kernels.count_by_torch import count_by_torch
-from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Numbers
+from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Indices, Numbers
 from igps.nn._kernels.pair_loops import count_block, gradient_block
 from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
 from igps.nn._precision import full_precision
@@ -46,9 +46,13 @@ class CompiledCount(torch.autograd.Function):
     def forward(ctx: Any, layout: Layout, weights: Tensor, *tensors: Tensor) -> Tensor:
         ctx.shapes = shapes = _Shapes(layout, weights.detach(), tensors)
         ctx.save_for_backward(weights, *tensors)
+        ctx.products = [None] * len(weights)
+        has_gradient = any(ctx.needs_input_grad)
 
         def counts(number: int, team: Team) -> Tensor:
             shape = _Shape(shapes, number, tensors)
+            if has_gradient:
+                ctx.products[number] = shape.keep_products()
             [total] = _sum_shares(shape, shape.counts, team)
             return _add_corners_to_bins(total, shapes.bins)
 
@@ -74,6 +78,7 @@ class CompiledCount(torch.autograd.Function):
 
         def derivatives(number: int, team: Team) -> tuple[Tensor, list[Tensor]]:
             shape = _Shape(ctx.shapes, number, tensors, upstream[number])
+            shape.products = ctx.products[number]
             return shape.order, _sum_shares(shape, shape.gradients, team)
 
         for number, (order, sums) in enumerate(_map_shapes(derivatives, len(weights))):
@@ -120,8 +125,10 @@ class _Shapes:
         last = torch.iinfo(key.dtype).max  # sorts padding to the end
         self.order = torch.argsort(key.masked_fill(~layout.mask, last), dim=1, stable=True)
         by_order = self.order.unsqueeze(2).expand_as(layout.classes)
-        self.classes = layout.classes.gather(1, by_order).int().transpose(1, 2).contiguous().numpy()
-        self.weights = weights.gather(1, by_order).double().transpose(1, 2).contiguous().numpy()
+        classes = layout.classes.gather(1, by_order).int().transpose(1, 2).contiguous().numpy()
+        weights = weights.gather(1, by_order).double().transpose(1, 2).contiguous()
+        self.members = classes, weights.numpy()
+        self.members_to_count = _without_zeros(*self.members)
         self.n_points: list[int] = layout.mask.sum(dim=1).tolist()
         centres = [x.detach() for x in centres_of(with_tensors(layout.pairs, tensors))]
         self.bins, self.dtype = [len(x) for x in centres], centres[0].dtype
@@ -141,6 +148,14 @@ class _Shapes:
         self.axes = Axes(np.array(kinds), empty, empty, padded, np.array(self.bins), *gaps)
 
 
+def _without_zeros(classes: Indices, weights: Floats) -> tuple[Indices, Floats]:
+    """Return one class for each point in place of (N, M, P), if all weights are 0 or 1."""
+    largest = weights.max(axis=1, keepdims=True)
+    if weights.shape[1] == 1 or not (largest == 1).all():
+        return classes, weights
+    return np.take_along_axis(classes, weights.argmax(axis=1)[:, None], axis=1), largest
+
+
 class _Shape:
     """The arguments of the loops for one shape, without padding; for a gradient also the derivatives by its counts."""
 
@@ -153,9 +168,9 @@ class _Shape:
     ) -> None:
         self.shapes, self.n_points = shapes, (n_points := shapes.n_points[number])
         self.order = shapes.order[number, :n_points]
-        classes, weights = (
-            np.ascontiguousarray(x[number, :, :n_points]) for x in (shapes.classes, shapes.weights)
-        )
+        self.products: Tensor | None = None  # of `keep_products`
+        members = shapes.members_to_count if upstream is None else shapes.members
+        classes, weights = (np.ascontiguousarray(x[number, :, :n_points]) for x in members)
         self.members = classes, weights
         self.packs = shapes.can_pack and len(classes) == 1 and bool((weights == 1).all())
         own = [
@@ -198,6 +213,16 @@ class _Shape:
         if vectors:
             oriented = pad_sequence(vectors, batch_first=True).transpose(1, 2).contiguous()
         self.axes = shapes.axes._replace(norms=norms.numpy(), oriented=oriented.numpy())
+
+    def keep_products(self) -> Tensor | None:
+        """Return the inner products of a body of one axis and block, which its gradient needs again."""
+        is_one_block = [len(blocks) for blocks in self.shares] == [1]
+        if not is_one_block or self.shapes.n_values > 1 or self.centred[0] is None:
+            return None
+        products = self._view(self._buffer(1), 0, 0)
+        self._write_values(products, 0, 0)
+        self.products = products
+        return products
 
     def counts(self, blocks: Blocks) -> list[Tensor]:
         """Return the float64 counts (C(C+1)/2, cells·2^K) of blocks, for all corners of each cell."""
@@ -283,6 +308,9 @@ class _Shape:
 
     def _write_values(self, values: Tensor, row: int, column: int) -> None:
         """Write the values of a block, or the inner products for distances, as `count_block` takes them."""
+        if self.products is not None:
+            values.copy_(self.products)
+            return
         rows, columns = slice(row, row + values.shape[1]), slice(column, column + values.shape[2])
         matrices = iter(values)
         for pair, centred in zip(self.pairs, self.centred, strict=True):
@@ -342,6 +370,10 @@ def _add_by_points(
 ) -> None:
     """Add the derivatives by points (P, D) to a total, from the derivatives by squared distances (I, J)."""
     x, y = points[rows], points[columns]
+    if rows == columns:  # one product in place of two
+        both = by_squares + by_squares.T
+        total[rows] += 2 * (x * both.sum(dim=1, keepdim=True) - both @ x)
+        return
     total[rows] += 2 * (x * by_squares.sum(dim=1, keepdim=True) - by_squares @ y)
     total[columns] += 2 * (y * by_squares.sum(dim=0).unsqueeze(1) - by_squares.T @ x)
 

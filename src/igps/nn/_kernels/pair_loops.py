@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from igps._arrays import Floats
-from igps._compiled import compiled
+from igps._compiled import FUSE, compiled
 from igps.nn._kernels.pair_cells import (
     COSINES,
     DISTANCES,
@@ -167,6 +167,18 @@ def gradient_block(  # noqa: PLR0913 (the arguments of count_block, and the arra
         locate_row(values, i, axes, point, column, start, result)
         values[:, i, : min(first, n_columns)] = zero
         by_cosines[:, :, i, : min(first, n_columns)] = zero
+        if axes.kinds[0] == DISTANCES and n_axes == 1:
+            distance_gradient(
+                (values[0, i], cells, shares[0]),
+                (first, point, column),
+                axes,
+                classes,
+                weights,
+                upstream,
+                by_weights,
+                by_centres[0],
+            )
+            continue
         for j in range(first, n_columns):
             other = column + j
             slopes[:] = 0
@@ -217,6 +229,54 @@ def gradient_block(  # noqa: PLR0913 (the arguments of count_block, and the arra
                     values[r, i, j] = slopes[k]
                 k += 1
                 r += 1
+
+
+@compiled(fastmath=FUSE)
+def distance_gradient(
+    row: tuple[Numbers, Indices, Numbers],
+    place: tuple[int, int, int],
+    axes: Axes,
+    classes: Indices,
+    weights: Floats,
+    upstream: Numbers,
+    by_weights: Floats,
+    by_centres: Floats,
+) -> None:
+    """`gradient_block` for one row of distances and no other axis.
+
+    Args:
+        row: the distances (J,) to overwrite with the derivatives by their squares; their cells and shares.
+        place: the first column, the number of the row's point, and that of the first column's point.
+    """
+    values, cells, shares = row
+    first, point, column = place
+    n_members = len(classes)
+    n_classes = int(np.sqrt(2.0 * len(upstream)))
+    for j in range(first, len(cells)):
+        other = column + j
+        cell = np.uint32(2 * cells[j])
+        share = np.float64(shares[j])
+        slope = 0.0
+        for n in range(n_members):
+            column_weight = weights[n, other]
+            for m in range(n_members):
+                row_weight = weights[m, point]
+                if row_weight == 0 and column_weight == 0:
+                    continue
+                pair = np.uint32(pair_row(classes[m, point], classes[n, other], n_classes))
+                low = np.float64(upstream[pair, cell])
+                rise = np.float64(upstream[pair, cell + np.uint32(1)]) - low
+                mean = low + share * rise
+                slope += row_weight * column_weight * rise
+                by_weights[m, point] += column_weight * mean
+                by_weights[n, other] += row_weight * mean
+        q = np.uint32(cells[j])
+        is_inside = share < 1 and (share > 0 or q > 0)
+        gap = np.uint32(0) if axes.has_equal_gaps[0] else q
+        slope = slope * axes.inverse_gaps[0, gap] if is_inside else 0.0
+        by_centres[q] -= slope * (1 - share)
+        by_centres[q + np.uint32(1)] -= slope * share
+        values[j] = slope / (2 * values[j]) if values[j] > 0 else 0.0
 
 
 @compiled(inline="always")

@@ -64,6 +64,6 @@ class OrderedCentres(Specified):
             else first.clamp(max=0)
         )
         gaps = torch.cat([origin, self.start]).diff()
-        return origin + (
-            gaps * (_MIN_GAP + (1 - _MIN_GAP) / math.log(2) * softplus(self.log_gap))
-        ).cumsum(0)
+        # What is added to each gap, so that centres at the start are exact.
+        gain = softplus(self.log_gap) - softplus(torch.zeros_like(self.log_gap))
+        return self.start + (gaps * gain * ((1 - _MIN_GAP) / math.log(2))).cumsum(0)

@@ -29,13 +29,14 @@ class PointAxis(Specified, ABC):
         centres: (C,) of the classes, ascending.
         soft: whether a point belongs to the two classes whose centres surround its value, in linear proportion;
             otherwise it belongs only to the nearest class.
-        learnable: whether the centres are parameters; implies `soft`, as only soft classes have gradients.
+        learnable: whether the centres are parameters. Hard classes have no derivative; they are learned by that of
+            soft classes (straight-through estimator, Bengio, Léonard and Courville 2013).
     """
 
     def __init__(self, centres: Tensor | Sequence[float], soft: bool, learnable: bool) -> None:
         super().__init__()
         self.centres = OrderedCentres(centres, learnable)
-        self.soft = soft or learnable
+        self.soft, self.learnable = soft, learnable
 
     @property
     def n_classes(self) -> int:
@@ -58,8 +59,9 @@ class PointAxis(Specified, ABC):
     def members(self, values: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return the classes of values (..., P) and their weights, that is, `memberships` in sparse form.
 
-        Both are (..., P, M): integers, and weights of sum 1, with M = 2 for soft and M = 1 for hard classes. Raises a
-        ValueError if a value in the mask (..., P) is not finite.
+        Both are (..., P, M): integers, and weights of sum 1, with M = 2 for soft and M = 1 for hard classes. Hard
+        classes that are learned have M = 2, one of them with weight 0. Raises a ValueError if a value in the mask
+        (..., P) is not finite.
         """
         # Code traced by `torch.compile` cannot raise.
         if (
@@ -68,12 +70,17 @@ class PointAxis(Specified, ABC):
         ):
             raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
         centres = self.centres().to(values.dtype)
-        if not self.soft or len(centres) == 1:
-            boundaries = (centres.detach()[1:] + centres.detach()[:-1]) / 2
-            classes = torch.bucketize(values.detach(), boundaries, right=True).unsqueeze(-1)
-            return classes, torch.ones_like(classes, dtype=values.dtype)
+        boundaries = (centres.detach()[1:] + centres.detach()[:-1]) / 2
+        nearest = torch.bucketize(values.detach(), boundaries, right=True).unsqueeze(-1)
+        if len(centres) == 1 or not (self.soft or (self.learnable and torch.is_grad_enabled())):
+            return nearest, torch.ones_like(nearest, dtype=values.dtype)
         below, share = find_intervals(values, centres)
-        return torch.stack([below, below + 1], dim=-1), torch.stack([1 - share, share], dim=-1)
+        classes = torch.stack([below, below + 1], dim=-1)
+        shares = torch.stack([1 - share, share], dim=-1)
+        if self.soft:
+            return classes, shares
+        # The difference is zero; it has the derivative.
+        return classes, (classes == nearest) + (shares - shares.detach())
 
 
 class Potential(PointAxis):
@@ -118,6 +125,7 @@ class BallRadius(PointAxis):
         smallest, largest: centres of the first and last class, over √area. The centres form a geometric progression;
             a point belongs to two classes, in proportion to the logarithm of its radius.
         n_classes: C.
+        learnable: see `PointAxis`.
     """
 
     def __init__(
@@ -126,6 +134,8 @@ class BallRadius(PointAxis):
         smallest: float = 0.022,
         largest: float = 0.25,
         n_classes: int = 4,
+        *,
+        learnable: bool = False,
     ) -> None:
         check_one_of(_SIDES, side=side)
         check_at_least(2, n_classes=n_classes)
@@ -136,7 +146,7 @@ class BallRadius(PointAxis):
         super().__init__(
             torch.linspace(math.log(smallest), math.log(largest), n_classes),
             soft=True,
-            learnable=False,
+            learnable=learnable,
         )
         self.side = side
 

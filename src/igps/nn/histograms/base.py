@@ -12,7 +12,8 @@ from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn._kernels.blocks import map_by_size
-from igps.nn.axes.pairs import DistanceAxis, PairAxis
+from igps.nn._kernels.gradients import on_one_thread
+from igps.nn.axes.pairs import DistanceAxis, EmbeddedPairCosines, PairAxis
 from igps.nn.axes.points import PointAxis
 from igps.nn.batch_features import BatchFeatures, SampleFeatures
 from igps.nn.specification import Specified
@@ -42,6 +43,10 @@ class DescriptionPart(Specified, ABC):
     def of_features(self, features: BatchFeatures) -> Tensor:
         """Return the parts (N, ...) of N shapes."""
 
+    def n_read(self, training: bool) -> tuple[float, float]:
+        """The largest numbers of interior and surface samples of a body that are read, by default infinite."""
+        return math.inf, math.inf
+
     @property
     def n_cells(self) -> int:
         """The number of entries of the part of one body."""
@@ -55,9 +60,12 @@ class DescriptionPart(Specified, ABC):
         """
         if isinstance(batch, BatchFeatures):
             return self.of_features(batch)
-        return map_by_size(
-            lambda group: self.of_features(BatchFeatures(group, self.training)), batch
-        )
+
+        def of_group(group: SignatureBatch) -> Tensor:
+            return self.of_features(BatchFeatures(group, self.training))
+
+        n_read = self.n_read(self.training)
+        return on_one_thread(lambda bodies: map_by_size(of_group, bodies, n_read), batch, self)
 
 
 class SampleHistogram(DescriptionPart):
@@ -87,6 +95,15 @@ class SampleHistogram(DescriptionPart):
         self.samples: SampleKind = samples
         self.n_samples, self.n_training_samples = n_samples, n_training_samples
 
+    reads_both_kinds: bool = False  # whether it also reads all samples of the other kind
+
+    def n_read(self, training: bool) -> tuple[float, float]:
+        """The largest numbers of interior and surface samples of a body that are read."""
+        n_drawn = self.n_training_samples if training else None
+        own = n_drawn or self.n_samples or math.inf
+        others = math.inf if self.reads_both_kinds else 0
+        return (own, others) if self.samples == "interior" else (others, own)
+
     @property
     def requirements(self) -> Requirements:
         """The requirements of the embedding."""
@@ -105,6 +122,11 @@ class AxesHistogram(SampleHistogram):
     """A histogram along one or several axes."""
 
     axes: nn.ModuleList
+
+    @property
+    def reads_both_kinds(self) -> bool:  # type: ignore[override]
+        """Whether an axis also reads the samples of the other kind."""
+        return any(isinstance(axis, EmbeddedPairCosines) for axis in self.axes)
 
     @property
     def point_axes(self) -> list[PointAxis]:

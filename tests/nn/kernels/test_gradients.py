@@ -1,0 +1,95 @@
+"""Gradients through a descriptor are computed on one thread, and are those without this limit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import igps
+from batches import batch_of, two_bodies
+from conftest import torch_threads
+from igps.nn._kernels import gradients
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histograms.pairs import PairHistogram
+
+
+def learned() -> igps.HistogramDescriptor:
+    embedding = SpectralEmbedding(n_eigenpairs=7, n_knots=4)
+    parts = [PairHistogram(embedding=embedding), PairHistogram(["euclidean_distance"], embedding)]
+    descriptor = igps.descriptor(igps.HistogramDescriptor(parts), learnable=True)
+    assert isinstance(descriptor, igps.HistogramDescriptor)
+    return descriptor
+
+
+def test_backward_runs_on_one_thread_wherever_it_is_called() -> None:
+    descriptor, seen = learned(), []
+    descriptor.histograms[0].embedding.log_gain.register_hook(  # type: ignore[union-attr]
+        lambda gradient: seen.append(torch.get_num_threads())
+    )
+    weights = descriptor.histograms[0].embedding.weights
+
+    def watched(*arguments: torch.Tensor) -> torch.Tensor:
+        found = weights(*arguments)
+        found.register_hook(lambda gradient: seen.append(torch.get_num_threads()))
+        return found
+
+    descriptor.histograms[0].embedding.weights = watched  # type: ignore[assignment]
+    with torch_threads(2):
+        descriptor(two_bodies()).square().sum().backward()
+        assert torch.get_num_threads() == 2
+    assert 1 in seen
+
+
+def test_gradients_of_first_and_second_order_are_those_without_a_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    batch, descriptor = two_bodies(), learned()
+    points = batch.interior.points.clone().requires_grad_()
+    # Areas that depend on the points: each derivative must count once.
+    area = batch.area * (1 + points.square().mean().double())
+    moved = replace(batch, interior=replace(batch.interior, points=points), area=area)
+
+    def found() -> list[torch.Tensor]:
+        loss = descriptor(moved).square().sum()
+        inputs = [points, *descriptor.parameters()]
+        first = torch.autograd.grad(loss, inputs, create_graph=True)
+        size = sum(gradient.square().sum() for gradient in first)
+        return [*first, *torch.autograd.grad(size, inputs)]
+
+    limited = found()
+    monkeypatch.setattr(gradients, "uses_loops", lambda device: False)
+    for one, other in zip(limited, found(), strict=True):
+        assert bool(one.any())
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-7)
+
+
+def test_a_graph_that_is_retained_can_be_used_twice() -> None:
+    descriptor = learned()
+    loss = descriptor(two_bodies()).square().sum()
+    first, again = (
+        torch.autograd.grad(loss, list(descriptor.parameters()), retain_graph=True)
+        for _ in range(2)
+    )
+    torch.testing.assert_close(first, again)
+
+
+def test_bodies_drawn_to_one_number_are_counted_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    mask = torch.arange(1500) < torch.tensor([[1500], [700], [90]])
+    batch = batch_of(torch.randn(3, 1500, 4, generator=generator), mask)
+    histogram = PairHistogram(n_training_samples=50).train()
+    shapes = []
+    count = PairHistogram.of_samples
+
+    def watched(self: PairHistogram, features: object) -> torch.Tensor:
+        found = count(self, features)  # type: ignore[arg-type]
+        shapes.append(tuple(found.shape))
+        return found
+
+    monkeypatch.setattr(PairHistogram, "of_samples", watched)
+    histogram(batch)
+    assert shapes == [(3, 10, 64)]
+    histogram.eval()(batch)
+    assert len(shapes) > 2

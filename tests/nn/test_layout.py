@@ -1,0 +1,103 @@
+"""A layout that is learned starts as the fixed one, and only what was asked for is learned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import igps
+from batches import two_bodies
+from bodies import bumpy_sphere
+from igps.data.batch import SignatureBatch
+from igps.nn.axes import Attribute, InteriorDistance, PairTwist, Potential
+from igps.nn.histograms.pairs import PairHistogram
+
+PARTS = ("bins", "classes", "filter")
+# A description is a histogram of sum 1 or, by `pretrained`, made of vectors of length 1.
+HISTOGRAMS = ["interior", "gps", "multiscale", "rich", "interior+size", "rich+side", "pretrained"]
+
+
+@pytest.fixture(scope="module")
+def batch() -> SignatureBatch:
+    """A body with hollows and the same stretched, with what every descriptor of histograms needs."""
+    config = igps.SignatureConfig(n_surface_samples=150, resolution=10, min_samples=0)
+    for name in ("interior", "rich", "pretrained"):
+        config = igps.descriptor(name).requirements.apply_to(config)
+    vertices, faces = bumpy_sphere(3)
+    bodies = [igps.Mesh(vertices * [stretch, 1, 1], faces) for stretch in (1, 2)]
+    return igps.collate([igps.compute_signature(body, config) for body in bodies])
+
+
+@pytest.mark.parametrize("name", HISTOGRAMS)
+def test_a_learned_layout_starts_as_the_fixed_one(name: str, batch: SignatureBatch) -> None:
+    fixed = igps.descriptor(name)
+    learned = igps.descriptor(fixed, learnable=True)
+    found = learned(batch)  # with gradients, as in training
+    difference = (found.detach() - fixed(batch)).flatten(1).abs().sum(dim=1)
+    assert bool((difference <= 1e-6).all())
+    assert not list(fixed.parameters())
+    assert learned.name == fixed.name
+    assert not learned.training
+    (found * torch.rand(found.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
+    for path, parameter in learned.named_parameters():
+        assert parameter.grad is not None, path
+        assert bool(parameter.grad.isfinite().all() and parameter.grad.any()), path
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_only_what_is_named_is_learned(part: str) -> None:
+    learned = igps.descriptor("interior", learnable=[part])
+    [(name, parameter)] = learned.named_parameters()
+    assert (
+        name
+        == {
+            "classes": "histograms.0.axes.0.centres.log_gap",
+            "bins": "histograms.0.axes.1.centres.log_gap",
+            "filter": "histograms.0.embedding.log_gain",
+        }[part]
+    )
+    assert len(parameter) == {"classes": 4, "bins": 64, "filter": 12}[part]
+
+
+def test_a_learned_layout_is_saved(tmp_path: Path) -> None:
+    learned = igps.descriptor("interior", learnable=True, n_training_samples=20)
+    with torch.no_grad():
+        for parameter in learned.parameters():
+            parameter.add_(0.3)
+    learned.save(tmp_path / "mine.safetensors")
+    loaded = igps.load(tmp_path / "mine.safetensors")
+    assert loaded.histograms[0].n_training_samples == 20  # type: ignore[union-attr]
+    batch = two_bodies()
+    learned.requirements = loaded.requirements = type(loaded.requirements)()
+    assert torch.equal(loaded(batch), learned(batch))
+    assert not torch.equal(loaded(batch), igps.descriptor("interior").describe(batch))
+
+
+def test_names_of_axes_and_what_was_fitted_are_kept() -> None:
+    axis = Attribute("depth", quantiles=3)
+    axis.fit(torch.tensor([0.1, 0.2, 0.6, 0.9]))
+    own = igps.HistogramDescriptor(
+        [PairHistogram(["potential", "interior_distance"]), [PairHistogram([axis, PairTwist()])]]
+    )
+    own.scale, own.card = 0.3, {"author": "me"}
+    learned = igps.descriptor(own, learnable=True)
+    torch.testing.assert_close(learned(two_bodies()).detach(), own(two_bodies()))
+    assert (learned.scale, learned.card) == (0.3, {"author": "me"})
+    assert len(list(learned.parameters())) == 6
+
+
+def test_an_embedding_that_is_shared_stays_shared() -> None:
+    embedding = igps.SpectralEmbedding(n_eigenpairs=5)
+    axes = [Potential(2), InteriorDistance(4)]
+    own = igps.HistogramDescriptor([PairHistogram(axes, embedding), PairHistogram(axes, embedding)])
+    first, second = igps.descriptor(own, learnable=True).histograms
+    assert first.embedding is second.embedding is not embedding
+
+
+def test_what_has_no_layout_says_so() -> None:
+    with pytest.raises(ValueError, match=r"learnable: expected a descriptor whose .* got 'd2'"):
+        igps.descriptor("d2", learnable=True)
+    with pytest.raises(ValueError, match="learnable: expected one of bins, classes, filter, got"):
+        igps.descriptor("interior", learnable=["edges"])
