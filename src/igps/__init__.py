@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from igps.data.collation import collate
     from igps.data.dataset import SignatureDataset
     from igps.descriptors import descriptor, load
+    from igps.descriptors.by_name import describe
     from igps.learning import fit
     from igps.mesh.errors import MeshError
     from igps.mesh.loading import load_mesh
     from igps.mesh.mesh import Mesh
     from igps.mesh.objects import as_mesh
     from igps.mesh.options import LoadOptions
-    from igps.nn.description import describe
     from igps.nn.descriptor import BodyDescriptor, Descriptor, HistogramDescriptor
     from igps.nn.embedding import SpectralEmbedding
     from igps.nn.histograms.pairs import PairHistogram
@@ -50,7 +50,7 @@ _MODULES = {
     "as_mesh": "igps.mesh.objects",
     "collate": "igps.data.collation",
     "compute_signature": "igps.signature.signature",
-    "describe": "igps.nn.description",
+    "describe": "igps.descriptors.by_name",
     "descriptor": "igps.descriptors",
     "fit": "igps.learning",
     "inside": "igps.analysis.inside_objects",

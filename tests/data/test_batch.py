@@ -12,6 +12,7 @@ import trimesh
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from batches import two_bodies
 from igps.data import _shared_memory
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch
 from igps.data.collation import collate
@@ -229,7 +230,7 @@ def test_one_shape_of_a_batch_is_a_body(signatures: list[Signature]) -> None:
     numbers = (0, -1, np.int64(1), torch.tensor(2), np.array(0))
     assert [batch[i].id for i in numbers] == ["body 0", "body 2", "body 1", "body 2", "body 0"]  # type: ignore[index]
     np.testing.assert_array_equal(batch[2].eigenvalues, signatures[2].eigenvalues)
-    assert [body.id for body in batch] == list(batch.ids)  # type: ignore[attr-defined]
+    assert [body.id for body in batch.bodies()] == list(batch.ids)
     with pytest.raises(IndexError):
         batch[3]
     with pytest.raises(IndexError, match="mask: expected 3 entries"):
@@ -425,3 +426,21 @@ def test_batches_go_to_a_device_and_bodies_come_back(signatures: list[Signature]
         np.testing.assert_array_equal(
             body.interior.eigenfunctions, signature.interior.eigenfunctions
         )
+
+
+def test_a_batch_tells_in_a_line_what_it_is_and_does_not_unpack_to_two_bodies() -> None:
+    batch = two_bodies()
+    assert repr(batch) == (
+        "SignatureBatch(2 bodies: a, b; 12 eigenpairs, interior (2, 40), surface (2, 40) samples, 2 classes, cpu)"
+    )
+    with pytest.raises(TypeError, match="not iterable"):
+        x, y = batch  # type: ignore[misc]
+
+
+def test_a_batch_is_a_container_of_tensors_for_pytorch() -> None:
+    batch = two_bodies()
+    doubled = torch.utils._pytree.tree_map(lambda tensor: tensor[1:], batch)
+    assert isinstance(doubled, SignatureBatch)
+    assert torch.equal(doubled.interior.points, batch.interior.points[1:])
+    assert torch.equal(doubled.surface.attributes["depth"], batch.surface.attributes["depth"][1:])
+    assert doubled.ids == batch.ids

@@ -21,7 +21,7 @@ CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     for label in range(3):
-        for i in range(4):
+        for i in range(5):
             write_body(
                 tmp_path / "meshes" / f"class{label}" / f"{i}.off", 1.0 + 0.1 * i, 1.0 + label
             )
@@ -32,8 +32,8 @@ def test_loaders_give_the_parts_and_balanced_batches(root: Path, tmp_path: Path)
     module = SignatureDataModule(
         root,
         "seen",
-        n_train=3,
-        n_validation=1,
+        n_train=4,
+        n_validation=2,
         classes_per_batch=3,
         shapes_per_class=2,
         config=CONFIG,
@@ -59,8 +59,8 @@ def test_training_shapes_are_kept_in_memory_thinned(
 ) -> None:
     module = SignatureDataModule(
         root,
-        n_train=3,
-        n_validation=1,
+        n_train=2,
+        n_validation=0,
         classes_per_batch=3,
         shapes_per_class=2,
         config=CONFIG,
@@ -168,3 +168,8 @@ def test_nothing_to_validate_on_is_no_loader(root: Path, tmp_path: Path) -> None
 def test_without_a_configuration_a_checkpoint_keeps_nothing_of_the_data(root: Path) -> None:
     """Paths and configurations could be read only by running code."""
     assert SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG).hparams == {}
+
+
+def test_a_validation_part_without_pairs_is_refused_where_it_is_given(root: Path) -> None:
+    with pytest.raises(ValueError, match="n_validation: expected at least 2 bodies of a class"):
+        SignatureDataModule(root, n_train=3, n_validation=1, config=CONFIG)

@@ -602,3 +602,29 @@ def test_a_failure_names_its_file_once(dataset: SignatureDataset) -> None:
         == Failure.of(dataset.bodies, 2, f"{path}: bad")
         == expected
     )
+
+
+def test_a_dataset_has_the_names_of_torchvision_and_tells_in_a_line_what_it_is(
+    tmp_path: Path,
+) -> None:
+    for name in ("balls/1.off", "balls/2.off", "rods/1.off"):
+        write_body(tmp_path / name, 1.0, 2.0)
+    dataset = SignatureDataset(tmp_path, SignatureConfig(n_eigenpairs=9))
+    assert dataset.targets == [0, 0, 1]
+    assert dataset.class_to_idx == {"balls": 0, "rods": 1}
+    assert repr(dataset) == "SignatureDataset(3 bodies, 2 classes: balls, rods; 9 eigenpairs)"
+
+
+def test_a_disk_that_is_full_costs_only_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_body(tmp_path / "1.off", 1.0, 2.0)
+    config = SignatureConfig(n_eigenpairs=9, resolution=8, min_samples=0, n_surface_samples=20)
+    dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")
+
+    def full(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("igps.data.cache.Cache.put", full)
+    assert dataset[0].signature.eigenvalues.shape == (9,)
+    assert "a signature is not stored" in caplog.text

@@ -356,3 +356,17 @@ def test_coordinates_of_histograms_are_their_roots(batch: SignatureBatch) -> Non
     torch.testing.assert_close(paper().coordinates(histograms).square(), histograms.flatten(1))
     kept = EmbeddedDescriptor(paper(), WhitenedHead())
     assert kept.coordinates(histograms.flatten(1)).equal(histograms.flatten(1))
+
+
+@pytest.mark.parametrize("given", ["body.off", torch.zeros(3), two_bodies()[0]])
+def test_what_is_no_batch_is_refused_with_the_remedy(given: object) -> None:
+    with pytest.raises(TypeError, match=r"batch: expected a SignatureBatch, got .*igps.collate"):
+        HistogramDescriptor(PairHistogram())(given)
+
+
+def test_a_parameter_that_is_not_finite_is_blamed_and_not_the_samples() -> None:
+    descriptor = HistogramDescriptor(PairHistogram(embedding=SpectralEmbedding(n_knots=3)))
+    with torch.no_grad():
+        descriptor.histograms[0].embedding.log_gain[1] = torch.nan  # type: ignore[union-attr, index]
+    with pytest.raises(ValueError, match=r"histograms.0.embedding.log_gain: expected a finite par"):
+        descriptor(two_bodies())

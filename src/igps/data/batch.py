@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._pytree import MappingKey, register_pytree_node
 
 from igps._arrays import Floats, Singles
 from igps.data.indices import Indices, resolve_indices, scalar_index
@@ -167,7 +168,21 @@ class SignatureBatch:
     def __len__(self) -> int:
         return len(self.ids)
 
-    # No __iter__, because Lightning would infer the batch size from the bodies. Iteration works through __getitem__.
+    def __repr__(self) -> str:
+        samples = [f"{kind} {tuple(x.mask.shape)}" for kind, x in self._kinds().items()]
+        names = ", ".join(self.ids[:2]) + (", …" if len(self) > 2 else "")
+        n_classes = len(self.labels.unique())
+        return (
+            f"SignatureBatch({len(self)} bodies: {names}; {self.eigenvalues.shape[-1]} eigenpairs, "
+            f"{', '.join(samples)} samples, {n_classes} classes, {self.device})"
+        )
+
+    def _kinds(self) -> dict[str, SampleBatch]:
+        return {"interior": self.interior, "surface": self.surface}
+
+    # `for x, y in loader` would unpack two bodies; write `for batch in loader` and batch.labels, or batch.bodies().
+    __iter__ = None
+
     @overload
     def __getitem__(self, index: int) -> Body: ...
     @overload
@@ -318,3 +333,61 @@ def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:
         array(batch.eigenfunctions)[:, :n_eigenpairs],
         {name: array(values) for name, values in batch.attributes.items()},
     )
+
+
+@dataclass(frozen=True)
+class _Aside:
+    """What is no tensor of a batch. All are equal: an exported program takes batches of any names."""
+
+    ids: tuple[str, ...] = field(default=(), compare=False)
+    meshes: tuple[Mesh, ...] | None = field(default=None, compare=False)
+    units: tuple[str | None, ...] | None = field(default=None, compare=False)
+
+
+_TENSORS = ("eigenvalues", "interior", "surface", "area", "volume", "labels", "measures")
+_SAMPLE_TENSORS = ("points", "eigenfunctions", "mask", "attributes")
+
+
+def _flatten(batch: SignatureBatch) -> tuple[list[Any], _Aside]:
+    return [getattr(batch, name) for name in _TENSORS], _Aside(batch.ids, batch.meshes, batch.units)
+
+
+def _unflatten(values: Iterable[Any], aside: _Aside) -> SignatureBatch:
+    fields = dict(zip(_TENSORS, values, strict=True))
+    return SignatureBatch(**fields, ids=aside.ids, meshes=aside.meshes, units=aside.units)
+
+
+def _flatten_samples(samples: SampleBatch) -> tuple[list[Any], None]:
+    tensors = samples.points, samples.eigenfunctions, samples.mask
+    return [*tensors, dict(samples.attributes)], None
+
+
+# For `torch.export.export(descriptor, (batch,))` and `torch.func`. These two entries in PyTorch's table of containers
+# are of our own types, so nobody else's programs run otherwise.
+register_pytree_node(
+    SignatureBatch,
+    _flatten,
+    _unflatten,
+    serialized_type_name="igps.SignatureBatch",
+    to_dumpable_context=lambda aside: "",
+    from_dumpable_context=lambda text: _Aside(),
+    flatten_with_keys_fn=lambda batch: (
+        [(MappingKey(name), getattr(batch, name)) for name in _TENSORS],
+        _flatten(batch)[1],
+    ),
+)
+register_pytree_node(
+    SampleBatch,
+    _flatten_samples,
+    lambda values, _: SampleBatch(*values),
+    serialized_type_name="igps.SampleBatch",
+    to_dumpable_context=lambda _: "",
+    from_dumpable_context=lambda _: None,
+    flatten_with_keys_fn=lambda samples: (
+        [
+            (MappingKey(name), value)
+            for name, value in zip(_SAMPLE_TENSORS, _flatten_samples(samples)[0], strict=True)
+        ],
+        None,
+    ),
+)

@@ -39,8 +39,8 @@ class SignatureDataModule(LightningDataModule):
         >>> import tempfile
         >>> from igps import ArticulatedShapes
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     ArticulatedShapes(3, 5, n_vertices=600).write(folder)
-        ...     data = SignatureDataModule(folder, n_train=3, n_validation=1)
+        ...     ArticulatedShapes(3, 6, n_vertices=600).write(folder)
+        ...     data = SignatureDataModule(folder, n_train=4, n_validation=2)
         >>> len(data.split.train), len(data.split.validation), len(data.split.test)
         (6, 3, 6)
 
@@ -49,7 +49,7 @@ class SignatureDataModule(LightningDataModule):
         protocol: see `SplitProtocol`.
         n_train: number of shapes of each class ("seen") or of classes ("unseen") in training and validation together;
             a share if below 1.
-        n_validation: how many of these are for validation; a share if below 1.
+        n_validation: how many of these are for validation, 0 or at least 2 of a class; a share if below 1.
         n_test: number of test classes ("unseen" only); all other classes if None.
         split_seed: seed of the split.
         classes_per_batch, shapes_per_class: P and K of a training batch, in each process.
@@ -106,6 +106,12 @@ class SignatureDataModule(LightningDataModule):
         else:
             self.split = split_unseen(
                 labels, n_train, n_validation=n_validation, n_test=n_test, seed=split_seed
+            )
+        validation = labels[list(self.split.validation)]
+        if len(validation) and len(validation.unique()) == len(validation):
+            raise ValueError(
+                f"n_validation: expected at least 2 bodies of a class, which retrieve each other, got {n_validation}. "
+                "Give 2 or more, or 0 for no validation."
             )
 
     def prepare_data(self) -> None:

@@ -127,11 +127,27 @@ class SignatureDataset(Dataset[LabelledSignature]):
     @property
     def labels(self) -> Tensor:
         """(N,) int64 index of the class of each body in `classes`, −1 if unknown."""
-        index = {name: i for i, name in enumerate(self.classes)}
+        index = self.class_to_idx
         labels = (
             None if self.bodies.labels is None else [index[name] for name in self.bodies.labels]
         )
         return torch.tensor(labels or [-1] * len(self), dtype=torch.int64, device="cpu")
+
+    @property
+    def targets(self) -> list[int]:
+        """The `labels` as a list, by the name that torchvision's datasets use."""
+        targets: list[int] = self.labels.tolist()
+        return targets
+
+    @property
+    def class_to_idx(self) -> dict[str, int]:
+        """The index of each class by its name."""
+        return {name: i for i, name in enumerate(self.classes)}
+
+    def __repr__(self) -> str:
+        shown = ", ".join(self.classes[:5]) + (", …" if len(self.classes) > 5 else "")
+        classes = f", {len(self.classes)} classes: {shown}" if self.classes else ""
+        return f"SignatureDataset({len(self)} bodies{classes}; {self.config.n_kept} eigenpairs)"
 
     @property
     def sizes(self) -> Tensor:

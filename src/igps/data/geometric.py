@@ -6,16 +6,25 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from igps.data.batch import LabelledSignature
 from igps.signature.signature import SampleKind, Signature
 
 if TYPE_CHECKING:
     from torch_geometric.data import Data
 
 
-def to_pyg(signature: Signature, samples: SampleKind = "surface", label: int = -1) -> Data:
+def to_pyg(
+    body: LabelledSignature | Signature, samples: SampleKind = "surface", label: int = -1
+) -> Data:
     """Convert the samples of a body to `torch_geometric.data.Data` with P nodes and no edges.
 
-    The tensors are copies, so transforms may change them in place.
+    The tensors are copies, so transforms may change them in place. Lists of such bodies are what PyTorch Geometric's
+    loader takes: `DataLoader([to_pyg(item) for item in dataset], batch_size=4)`.
+
+    Args:
+        body: an item of a dataset, with its label, or a Signature.
+        samples: "interior" or "surface".
+        label: of a Signature.
 
     Returns:
         `pos` (P, 3); `eigenfunctions` (P, K); `mass` (P,), the share of each sample in the area of the surface or in
@@ -31,6 +40,10 @@ def to_pyg(signature: Signature, samples: SampleKind = "surface", label: int = -
         raise ImportError(
             'to_pyg: needs PyTorch Geometric: pip install "interior-gps[geometric]".'
         ) from error
+    if isinstance(body, LabelledSignature):
+        signature, label = body.signature, body.label
+    else:
+        signature = body
     chosen = getattr(signature, samples)
     measure = signature.area if samples == "surface" else signature.volume
     return Data(

@@ -1,6 +1,7 @@
 """Pipeline from the file of a body to its cached Signature, in this process or in a worker."""
 
 import importlib.metadata
+import logging
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,6 +31,8 @@ from igps.signature.signature import (
     compute_signature,
 )
 
+logger = logging.getLogger(__name__)
+
 
 class PreTransform(Protocol):
     """Picklable transform of every Signature before it is cached."""
@@ -53,6 +56,7 @@ class SignaturePipeline:
     pre_transform: PreTransform | None = None  # applied after the attributes are added, and cached
     # Bodies in memory, or their errors
     meshes: Mapping[BodyRef, Mesh | MeshError] = field(default_factory=dict)
+    needs_cache: bool = True  # if not, what cannot be stored is only computed
 
     def __post_init__(self) -> None:
         if self.pre_transform is not None and not getattr(self.pre_transform, "cache_tag", None):
@@ -128,7 +132,9 @@ class SignaturePipeline:
         if isinstance(found, Failed):
             raise MeshError(found.reason)
         cached = None if found is None else self.read(found)
-        return self._compute(body, content) if cached is None else cached
+        if cached is not None:
+            return cached
+        return replace(self, needs_cache=False)._compute(body, content)
 
     def hit(self, body: BodyRef, content: Content, mesh: Mesh | None = None) -> CacheHit:
         """Return the cache entry of a body, computed if missing; raise a MeshError if the body cannot be used."""
@@ -209,8 +215,17 @@ class SignaturePipeline:
             # Transforms seed random numbers by the name, so copies of a file get the same numbers only by its key
             changed = self.pre_transform(replace(signature, name=keys.key))
             signature = replace(changed, name=signature.name)
-            self.cache("signature").put(self._keys(body, content).key, encode(signature))
+            self._put("signature", self._keys(body, content).key, encode(signature))
         return signature
+
+    def _put(self, kind: Kind, key: str, record: Record) -> None:
+        """Store a record; if it cannot be stored, only warn where the cache is not needed."""
+        try:
+            self.cache(kind).put(key, record)
+        except OSError as error:
+            if self.needs_cache:
+                raise
+            logger.warning("%s: a %s is not stored (%s)", self.cache_dir, kind, error)
 
     def _without_attributes(
         self, body: BodyRef, content: Content, key: str, mesh: Mesh | None
@@ -228,7 +243,7 @@ class SignaturePipeline:
             except MeshError as error:
                 self._remember(body, content, error)
                 raise
-        cache.put(key, encode(signature))
+        self._put("signature", key, encode(signature))
         return signature
 
     def _beginning_of_longer(self, body: BodyRef, content: Content) -> Signature | None:
@@ -255,7 +270,7 @@ class SignaturePipeline:
         values: dict[Any, Singles] = {
             kind: getattr(checked, kind).attributes[name] for kind in SAMPLE_KINDS
         }
-        cache.put(key, Record(values))
+        self._put("attribute", key, Record(values))
         return values
 
     def _failure_key(self, body: BodyRef, content: Content) -> str:
@@ -268,7 +283,7 @@ class SignaturePipeline:
         if body in self.meshes or isinstance(error.__cause__, OSError):
             return
         record = Record({}, {"reason": str(error), "summary": error.summary})
-        self.cache("failure").put(self._failure_key(body, content), record)
+        self._put("failure", self._failure_key(body, content), record)
 
 
 def _values_of(record: Record) -> dict[SampleKind, Singles]:

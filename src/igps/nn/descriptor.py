@@ -123,7 +123,19 @@ class Descriptor(Specified, ABC):
         """Return finite descriptions (N, ...) of N shapes that meet the requirements."""
 
     def forward(self, batch: SignatureBatch) -> Tensor:
-        """Return descriptions (N, ...) of N shapes; raise a ValueError if the batch does not meet the requirements."""
+        """Return descriptions (N, ...) of N shapes.
+
+        Raises:
+            TypeError: something else than a batch.
+            ValueError: the batch does not meet the requirements, or a parameter is not finite.
+        """
+        if not isinstance(batch, SignatureBatch):
+            raise TypeError(
+                f"batch: expected a SignatureBatch, got {type(batch).__name__}. Give dataset.batch([0, 1]), or "
+                "igps.collate([item]) for an item or a Signature; igps.describe describes a whole dataset."
+            )
+        if blocks.uses_loops(batch.device):
+            _check_finite(self)
         self.requirements.check(batch)
         # On other devices, a limit on threads has no advantage; traced code runs later, without the limit.
         with one_thread() if blocks.uses_loops(batch.device) else contextlib.nullcontext():
@@ -162,6 +174,15 @@ class Descriptor(Specified, ABC):
         raise ValueError(
             f"shorten: expected a descriptor of vectors, such as pretrained, got {self.name!r}."
         )
+
+
+def _check_finite(module: nn.Module) -> None:
+    """Raise a ValueError that names a parameter with NaN or infinity, for which the samples would be blamed."""
+    for name, parameter in module.named_parameters():
+        if not bool(parameter.detach().isfinite().all()):
+            raise ValueError(
+                f"{name}: expected a finite parameter, got NaN or infinity. Lower the learning rate, or clip gradients."
+            )
 
 
 class BodyDescriptor(Descriptor):
