@@ -195,7 +195,7 @@ def equal(one: SignatureBatch, other: SignatureBatch) -> bool:
             and all(np.array_equal(x.attributes[name], y.attributes[name]) for name in y.attributes)
             for x, y in ((a.interior, b.interior), (a.surface, b.surface))
         )
-        for a, b in zip(one, other, strict=True)
+        for a, b in zip(one.bodies(), other.bodies(), strict=True)
     )
 
 
@@ -434,7 +434,7 @@ def test_a_batch_tells_in_a_line_what_it_is_and_does_not_unpack_to_two_bodies() 
         "SignatureBatch(2 bodies: a, b; 12 eigenpairs, interior (2, 40), surface (2, 40) samples, 2 classes, cpu)"
     )
     with pytest.raises(TypeError, match="not iterable"):
-        x, y = batch  # type: ignore[misc]
+        iter(batch)  # type: ignore[call-overload]
 
 
 def test_a_batch_is_a_container_of_tensors_for_pytorch() -> None:

@@ -430,7 +430,10 @@ def test_a_repeated_shape_counts_once(shapes: Path, tmp_path: Path) -> None:
 def test_the_configuration_trains_and_its_checkpoint_loads_without_running_code(
     shapes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    layout = tmp_path / "small.yaml"
+    layout.write_text("parts:\n  - axes: [potential, interior_distance]\n    eigenpairs: 20\n")
     values = {
+        "model.descriptor.init_args.which": layout,
         "data.root": shapes / "meshes",
         "data.cache_dir": shapes / "cache",
         "data.n_train": 4,
@@ -454,8 +457,7 @@ def test_the_configuration_trains_and_its_checkpoint_loads_without_running_code(
     (stored,) = tmp_path.rglob("config.yaml")
     configuration = yaml.safe_load(stored.read_text())
     assert configuration["data"]["split_seed"] == 0
-    histogram = configuration["model"]["descriptor"]["init_args"]["histograms"]["init_args"]
-    assert histogram["axes"][1]["init_args"]["n_bins"] == 64
+    assert configuration["model"]["descriptor"]["init_args"]["learnable"] is True
     checkpoint.rename(tmp_path / "moved.ckpt")  # away from the files beside it
     assert_same(RetrievalLearner.load_from_checkpoint(tmp_path / "moved.ckpt").state_dict(), state)
     module = SignatureDataModule.load_from_checkpoint(tmp_path / "moved.ckpt", weights_only=True)

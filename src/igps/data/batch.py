@@ -344,17 +344,21 @@ class _Aside:
     units: tuple[str | None, ...] | None = field(default=None, compare=False)
 
 
-_TENSORS = ("eigenvalues", "interior", "surface", "area", "volume", "labels", "measures")
+_TENSORS = ("eigenvalues", "interior", "surface", "area", "volume", "labels")
 _SAMPLE_TENSORS = ("points", "eigenfunctions", "mask", "attributes")
 
 
 def _flatten(batch: SignatureBatch) -> tuple[list[Any], _Aside]:
-    return [getattr(batch, name) for name in _TENSORS], _Aside(batch.ids, batch.meshes, batch.units)
+    tensors = [getattr(batch, name) for name in _TENSORS]
+    measures = [] if batch.measures is None else [batch.measures]
+    return [*tensors, measures], _Aside(batch.ids, batch.meshes, batch.units)
 
 
 def _unflatten(values: Iterable[Any], aside: _Aside) -> SignatureBatch:
-    fields = dict(zip(_TENSORS, values, strict=True))
-    return SignatureBatch(**fields, ids=aside.ids, meshes=aside.meshes, units=aside.units)
+    *tensors, measures = values
+    fields = dict(zip(_TENSORS, tensors, strict=True))
+    names = {"ids": aside.ids, "meshes": aside.meshes, "units": aside.units}
+    return SignatureBatch(**fields, **names, measures=measures[0] if measures else None)
 
 
 def _flatten_samples(samples: SampleBatch) -> tuple[list[Any], None]:
@@ -372,7 +376,10 @@ register_pytree_node(
     to_dumpable_context=lambda aside: "",
     from_dumpable_context=lambda text: _Aside(),
     flatten_with_keys_fn=lambda batch: (
-        [(MappingKey(name), getattr(batch, name)) for name in _TENSORS],
+        [
+            (MappingKey(name), value)
+            for name, value in zip((*_TENSORS, "measures"), _flatten(batch)[0], strict=True)
+        ],
         _flatten(batch)[1],
     ),
 )

@@ -47,11 +47,11 @@ def test_gradients_of_first_and_second_order_are_those_without_a_limit(
 ) -> None:
     batch, descriptor = two_bodies(), learned()
     points = batch.interior.points.clone().requires_grad_()
-    # Areas that depend on the points: each derivative must count once.
-    area = batch.area * (1 + points.square().mean().double())
-    moved = replace(batch, interior=replace(batch.interior, points=points), area=area)
 
     def found() -> list[torch.Tensor]:
+        # Areas that depend on the points: each derivative must count once.
+        area = batch.area * (1 + points.square().mean().double())
+        moved = replace(batch, interior=replace(batch.interior, points=points), area=area)
         loss = descriptor(moved).square().sum()
         inputs = [points, *descriptor.parameters()]
         first = torch.autograd.grad(loss, inputs, create_graph=True)

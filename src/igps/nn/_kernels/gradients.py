@@ -48,32 +48,48 @@ class _OnOneThread(torch.autograd.Function):
         learned: list[Tensor],
         *_: Tensor,
     ) -> Tensor:
-        aliases: list[Tensor] = []
-
-        def alias(tensor: Tensor) -> Tensor:
-            # A tensor of a batch may depend on another one; through an alias, it has only its own derivative.
-            if not tensor.requires_grad:
-                return tensor
-            aliases.append(tensor.view_as(tensor))
-            return aliases[-1]
-
-        with one_thread(), torch.enable_grad():
-            result = function(batch.map(alias))
-        ctx.result, ctx.inputs = result, [*learned, *aliases]
-        output = result.detach()
-        if not result.requires_grad:
+        ctx.function, ctx.batch, ctx.learned = function, batch, learned
+        ctx.random_state = torch.get_rng_state()
+        ctx.result, ctx.aliases = _with_graph(function, batch)
+        output: Tensor = ctx.result.detach()
+        if not ctx.result.requires_grad:
             ctx.mark_non_differentiable(output)
         return output
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        result, aliases = ctx.result, ctx.aliases
+        if torch.is_grad_enabled():
+            # Second derivatives free the graph of the first ones, so these need a graph of their own, of the same
+            # samples.
+            with torch.random.fork_rng(devices=[]):
+                torch.set_rng_state(ctx.random_state)
+                result, aliases = _with_graph(ctx.function, ctx.batch)
         with one_thread():
             gradients = torch.autograd.grad(
-                ctx.result,
-                ctx.inputs,
+                result,
+                [*ctx.learned, *aliases],
                 upstream,
                 retain_graph=True,  # it is freed with the result
                 create_graph=torch.is_grad_enabled(),
                 allow_unused=True,
             )
         return None, None, None, *gradients
+
+
+def _with_graph(
+    function: Callable[[SignatureBatch], Tensor], batch: SignatureBatch
+) -> tuple[Tensor, list[Tensor]]:
+    """Return the result of a function, with its graph, and the tensors of the batch by which it has derivatives."""
+    aliases: list[Tensor] = []
+
+    def alias(tensor: Tensor) -> Tensor:
+        # A tensor of a batch may depend on another one; through an alias, it has only its own derivative.
+        if not tensor.requires_grad:
+            return tensor
+        aliases.append(tensor.view_as(tensor))
+        return aliases[-1]
+
+    with one_thread(), torch.enable_grad():
+        result = function(batch.map(alias))
+    return result, aliases
