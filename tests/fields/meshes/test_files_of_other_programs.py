@@ -207,6 +207,17 @@ def test_other_parts_are_united(tmp_path: Path) -> None:
         assert load_mesh(path).volume == pytest.approx(VOLUME + 2.0)
 
 
+def test_items_that_are_not_to_be_printed_are_left_out(tmp_path: Path) -> None:
+    parts = f'<object id="1">{mesh_xml(BOX)}</object><object id="2">{mesh_xml(SMALL)}</object>'
+    items = '<item objectid="1"/><item objectid="2" printable="0"/>'
+    mesh = load_mesh(write_3mf(tmp_path / "box.3mf", model(parts, items)))
+    assert mesh.volume == pytest.approx(VOLUME)
+    assert mesh.notes == ("left out 1 item not to be printed",)
+    only = model(parts, '<item objectid="2" printable="0"/>')
+    with pytest.raises(MeshError, match="none of its items is to be printed"):
+        load_mesh(write_3mf(tmp_path / "none.3mf", only))
+
+
 def test_objects_of_type_support_are_left_out(tmp_path: Path) -> None:
     parts = f'<object id="1">{mesh_xml(BOX)}</object>'
     parts += f'<object id="2" type="support">{mesh_xml(SMALL)}</object>'
@@ -541,3 +552,23 @@ def test_a_byte_order_that_damage_has_changed_is_refused(tmp_path: Path) -> None
     (tmp_path / "ball.gii").write_bytes(content)
     with pytest.raises(MeshError, match=r"byte order .*, got 'LitLittleEndian'"):
         load_mesh(tmp_path / "ball.gii")
+
+
+@pytest.mark.parametrize(
+    ("name", "header"),
+    [
+        ("a.mha", "NDims = 3\nDimSize = 8 8 8\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n"),
+        (
+            "a.nrrd",
+            "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 8 8 8\nspacings: 1 1 nan\nencoding: raw\n\n",
+        ),
+    ],
+)
+def test_volumes_without_a_spacing_have_no_unit(name: str, header: str, tmp_path: Path) -> None:
+    mask = np.zeros((8, 8, 8), np.uint8)
+    mask[2:6, 2:6, 2:6] = 1
+    (tmp_path / name).write_bytes(header.encode() + mask.tobytes())
+    ((_, mesh),) = each_body(tmp_path / name)
+    assert isinstance(mesh, Mesh)
+    assert mesh.unit is None
+    assert any(note.endswith("voxels were taken as 1 × 1 × 1") for note in mesh.notes)

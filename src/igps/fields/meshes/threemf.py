@@ -119,6 +119,7 @@ class _Model:
         self._roles = _Roles.read(archive)
         self.objects: dict[Key, _Object] = {}
         self.items: list[_Placed] = []
+        self.n_not_printed = 0
         self._object = _Object("")
         members = [main]  # grows by the members to which those already read refer
         for self._member in members:
@@ -145,6 +146,8 @@ class _Model:
             self.objects[self._member, number] = self._object
         elif name == "component":
             self._object.components.append(self._placed(attributes))
+        elif name == "item" and attributes.get("printable", "1") in ("0", "false"):
+            self.n_not_printed += 1
         elif name == "item":
             self.items.append(self._placed(attributes))
         elif name == "model":
@@ -234,6 +237,8 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
             raise ValueError("no model in it")
         main = next((name for name in names if name.lower() == "3d/3dmodel.model"), names[0])
         model = _Model(archive, main)
+    if model.n_not_printed and not model.items:
+        raise ValueError("none of its items is to be printed")
     items = model.items or [
         _Placed(key, np.eye(4, 3)) for key, obj in model.objects.items() if obj.triangles
     ]
@@ -250,10 +255,14 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
             "nothing in it is material: all objects are supports, modifiers or negative"
         )
     n_left_out = len(bodies) - len(material)
-    if n_left_out and material:
+    notes = []
+    if n_left_out:
         objects = counted(n_left_out, "object")
-        note = f"left out {objects} without material, such as supports"
-        material[0] = replace(material[0], notes=(*material[0].notes, note))
+        notes.append(f"left out {objects} without material, such as supports")
+    if model.n_not_printed:
+        notes.append(f"left out {counted(model.n_not_printed, 'item')} not to be printed")
+    if material:
+        material[0] = replace(material[0], notes=(*material[0].notes, *notes))
     return material
 
 

@@ -42,6 +42,8 @@ _HAS_ORIENTATION = re.compile(
     rb"^space:\s*(left|right|[lr][ap]s)|^\s*(TransformMatrix|AnatomicalOrientation)\s*[=:]",
     re.MULTILINE | re.IGNORECASE,
 )
+_META_SPACING = re.compile(rb"^\s*Element(Spacing|Size)\s*[=:]", re.MULTILINE | re.IGNORECASE)
+_NRRD_SPACING = re.compile(rb"^(spacings|space directions):.*$", re.MULTILINE | re.IGNORECASE)
 # The line of a NRRD or MetaImage header that names the file of the voxels; ":" may stand for "=" in MetaImage.
 _DATA_FILE = re.compile(
     rb"(?:ElementDataFile[ \t]*[=:]|^data ?file:)[ \t]*(?:\./)?(.*?)[ \t]*\r?$",
@@ -207,6 +209,8 @@ def _simple_itk(path: Path) -> RawVolume:
     if suffix_of(path) in _NRRD:
         _check_directions(header, path)
         _apply_nrrd_unit(volume, header)
+    elif not _META_SPACING.search(header):
+        _leave_without_unit(volume, "no spacing")
     return volume
 
 
@@ -274,11 +278,14 @@ def _apply_nrrd_unit(volume: RawVolume, header: bytes) -> None:
 
     Without a unit, distances of voxels are taken for millimetres, as is usual; without distances there is no unit.
     """
-    if not re.search(rb"^(spacings|space directions):", header, re.MULTILINE | re.IGNORECASE):
-        volume.unit = None
+    spacing = _NRRD_SPACING.search(header)
+    if spacing is None:
         limits = re.search(rb"^axis ?(mins|maxs):", header, re.MULTILINE | re.IGNORECASE)
         source = "only axis minima and maxima, which are not read" if limits else "no spacing"
-        volume.notes.append(f"the header has {source}: voxels were taken as 1 × 1 × 1")
+        _leave_without_unit(volume, source)
+        return
+    if re.search(rb"\bnan\b", spacing[0], re.IGNORECASE):
+        _leave_without_unit(volume, "a spacing that is no number")
         return
     line = re.search(rb"^(?:space )?units:(.*)$", header, re.MULTILINE | re.IGNORECASE)
     text = line[1].decode("utf-8", "replace") if line else ""
@@ -294,6 +301,11 @@ def _apply_nrrd_unit(volume: RawVolume, header: bytes) -> None:
         return
     volume.unit_from = "header"
     volume.affine[:3] *= length
+
+
+def _leave_without_unit(volume: RawVolume, spacing: str) -> None:
+    volume.unit = None
+    volume.notes.append(f"the header has {spacing}: voxels were taken as 1 × 1 × 1")
 
 
 def _segments(metadata: dict[str, str]) -> list[tuple[str, int, int]]:
