@@ -71,7 +71,7 @@ def test_the_table_is_what_python_computes(
     assert rows["same"]["ct.moran"] == ""
     assert rows["rim"]["unit"] == "mm"
     assert "ct is constant in 1 of 3 bodies, such as same.nii.gz#same" in printed
-    assert "1 of 4 meshes could not be used" in printed
+    assert "1 of 4 bodies could not be used" in printed
     assert "has no value at" in printed
 
     sources = {"ct": attribute_source("ct/{file}", root)}
