@@ -66,9 +66,11 @@ def main() -> None:
         if command.name in COMMANDS:
             check_place("out", options.get("out"), ENDINGS.get(command.name))
             check_place("failures", options.get("failures"), ())
+        from tqdm.contrib.logging import logging_redirect_tqdm  # a warning clears the bar first
+
         # With --json, standard output holds the JSON alone
         place = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()
-        with place, _threads_of(command):
+        with place, logging_redirect_tqdm(), _threads_of(command):
             result = command.function(**options)
         verdict = result if isinstance(result, Verdict) else Verdict(result, True)
         if as_json:

@@ -13,10 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import get_args
 
-from tqdm import tqdm
-
 from igps._failures import Failed, Limits, MachineError
 from igps._parallel import run
+from igps._progress import Progress
 from igps._text import counted
 from igps._threads import n_cores
 from igps.data.cache import Kind
@@ -103,7 +102,7 @@ def fill(
         pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits()
     )
     n_found = len(bodies) - len(missing)
-    bar = tqdm(total=len(bodies), initial=n_found, desc="signatures", disable=not progress)
+    bar = Progress(total=len(bodies), initial=n_found, desc="signatures", disable=not progress)
     new: list[FileDigest] = []
     is_visible = False
     with bar, contextlib.closing(outcomes):

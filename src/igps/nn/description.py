@@ -10,11 +10,11 @@ from typing import get_args
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from igps._arrays import Singles
 from igps._failures import Failed
 from igps._parallel import on_threads, run
+from igps._progress import Progress
 from igps._threads import n_cores, one_thread
 from igps.data.attribute_sources import attribute_names
 from igps.data.cache import Record
@@ -94,7 +94,7 @@ def describe(
         results = _on_threads(dataset, descriptor, chunks, n_workers)
     with (
         evaluation_mode(descriptor),
-        tqdm(
+        Progress(
             desc="descriptions", total=len(dataset), initial=len(descriptions), disable=not progress
         ) as bar,
         contextlib.closing(results),

@@ -1,0 +1,35 @@
+"""The estimate of a bar, with a clock of the test's own."""
+
+from io import StringIO
+
+import pytest
+
+from igps._progress import Progress
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time in seconds that bars see."""
+    now = [0.0]
+    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
+    return now
+
+
+def test_the_first_result_does_not_count_in_the_estimate(clock: list[float]) -> None:
+    """Loops are compiled for 30 seconds, then each body takes 2: of 10 bodies, 7 are left after 34 seconds."""
+    text = StringIO()
+    with Progress(total=10, desc="bodies", file=text) as bar:
+        for seconds in (30, 32, 34):
+            clock[0] = seconds
+            bar.update()
+        assert bar.format_dict["n"] == 3
+        assert "2.00s/it" in str(bar)
+        assert "<00:14" in str(bar)
+    assert "the first takes longer" in text.getvalue()
+
+
+def test_a_bar_without_progress_prints_nothing() -> None:
+    text = StringIO()
+    with Progress(total=2, disable=True, file=text) as bar:
+        bar.update()
+    assert text.getvalue() == ""
