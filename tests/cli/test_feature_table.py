@@ -86,7 +86,7 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(
     extract(monkeypatch, root, tmp_path / "features.npz")
     with np.load(tmp_path / "features.npz") as archive:
         vectors = archive["features"].reshape(4, -1)
-    size = ["size.log_root_area", "size.log_cube_root_volume"]  # as there is a unit
+    size = ["size.log_area", "size.log_volume"]  # as there is a unit
     columns = [*(f"v{i}" for i in range(640)), *size]
     assert table.columns.tolist()[-642:] == columns
     assert np.array_equal(table[columns].to_numpy(np.float32), vectors)

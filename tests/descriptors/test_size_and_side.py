@@ -81,9 +81,9 @@ def test_distances_with_size_are_those_of_the_formula(
     plain, sized = from_body(name, signatures), from_body(f"{name}+size", signatures)
     for other in ("body", "centimetres", "mirrored"):
         assert sized[other] == pytest.approx(plain[other], rel=1e-2, abs=1e-3 * SCALES[name])
-    apart = 2 * np.log(1.1)  # in log √area and in log ∛volume
+    apart = 5 * np.log(1.1)  # in log area and in log volume
     n = SCALES[name] / 4
-    expected = plain["larger"] + 2 * (plain["larger"] + n) * apart / (0.3 + apart)
+    expected = plain["larger"] + (plain["larger"] + n) * apart / 0.5
     assert sized["larger"] == pytest.approx(expected, rel=1e-3)
 
 
