@@ -183,7 +183,7 @@ def test_negative_parts_are_cut_away(tmp_path: Path) -> None:
     ):
         mesh = load_mesh(path)
         assert mesh.volume == pytest.approx(CUT)
-        assert "cut away 1 negative parts" in mesh.notes
+        assert "cut away 1 negative part" in mesh.notes
 
 
 def test_modifiers_and_supports_are_left_out(tmp_path: Path) -> None:

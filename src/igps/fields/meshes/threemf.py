@@ -211,7 +211,7 @@ def _material(parts: list[_Part], name: str) -> RawBody | None:
         whole = trimesh.boolean.union(operands[: len(solid)], engine="manifold")
         cut = trimesh.boolean.difference([whole, *operands[len(solid) :]], engine="manifold")
         body = RawBody(np.asarray(cut.vertices, np.float64), np.asarray(cut.faces, np.int64))
-        notes.append(f"cut away {len(negative)} negative parts")
+        notes.append(f"cut away {counted(len(negative), 'negative part')}")
     return replace(body, part=name, notes=tuple(notes))
 
 
