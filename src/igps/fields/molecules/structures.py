@@ -211,7 +211,9 @@ class _Builder:
         )
         b_factor = np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms]))
         position = positions.mean(axis=0) if alpha is None else positions[alpha]
-        number = float(residue.seqid.num) if in_polymer else np.nan
+        number = np.nan
+        if in_polymer and residue.seqid.num is not None:
+            number = float(residue.seqid.num)
         label = f"{chain} {residue.seqid}".strip()
         self._residues.append((name, position, b_factor, number, chain, label))
         charged: dict[str, float] = {}
