@@ -164,7 +164,7 @@ def test_each_attribute_is_known_by_its_name() -> None:
     molecule = peptide("ASP", "ALA", "LYS", "TRP")
     for name in RESIDUE_ATTRIBUTES:
         values = residue_attribute(molecule, points(), name)
-        columns = {"residue_shares": (len(RESIDUE_KINDS),), "trace": (7,)}
+        columns = {"residue_shares": (len(RESIDUE_KINDS),), "trace": (7,), "composition": (26,)}
         assert values.shape == (7, *columns.get(name, ()))
         assert np.isfinite(values).all()
     with pytest.raises(
