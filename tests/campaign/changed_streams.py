@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import tempfile
 import time
 import warnings
@@ -11,10 +12,12 @@ from pathlib import Path
 import numpy as np
 from outcome import Row
 
-from damaged_streams import WRITERS, changed, start_of_stream, stored
 from igps.fields.volumes.label_volume import read_label_volume
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import read_surface
+
+sys.path.append(str(Path(__file__).parents[1]))
+from damaged_streams import WRITERS, changed, start_of_stream, stored
 
 SEED = 20261129
 KINDS = ("equal", "refused", "note", "wrong")
