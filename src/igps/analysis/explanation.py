@@ -47,7 +47,7 @@ class Explanation:
     def summary(self) -> str:
         """Return the three largest shares of histograms as text."""
         if not self.distance:
-            return "identical"
+            return "no significant difference" if self.places is None else "identical"
         by_size = sorted(self.parts.items(), key=lambda item: -abs(item[1]))
         largest = by_size[:3]
         return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)

@@ -158,7 +158,7 @@ def painted_figure(
         for axes, view in zip(row, views, strict=True):
             draw_view(axes, view, body.mesh, vertices, colours, reach)
             axes.set_title(view.title, fontsize=7)
-        row[0].set_title(f"{name}\n{views[0].title}", fontsize=7, loc="left")
+        row[0].set_title(f"{name}\n", fontsize=7, loc="left")
     bar = figure.colorbar(scale, cax=figure.add_axes((0.94, 0.2, 0.01, 0.6)))
     bar.ax.set_ylim(-largest if lowest < 0 else 0, largest)
     bar.ax.tick_params(labelsize=6)

@@ -19,7 +19,7 @@ from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.mesh.simplification import simplify
-from igps.mesh.surface import area_vectors, mean_of_neighbours, unit, vertex_normals
+from igps.mesh.surface import area_vectors, sums, undirected_edges, unit, vertex_normals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +39,7 @@ _MIN_SMOOTH = (
     0.75  # cosine between the normals of a face and a vertex; with less, their edge stays sharp
 )
 _MARGIN = 1.08  # of a picture, over the size of the body
-_FAIR_STEPS = (0.5, -0.53) * 10  # of Taubin's smoothing, which shrinks nothing
+_FAIR_STEPS = (0.5, -0.53) * 20  # of Taubin's smoothing, which shrinks nothing
 
 
 def paint(
@@ -88,8 +88,13 @@ def paint(
 
 def faired(vertices: Floats, faces: Integers) -> Floats:
     """Return vertices (V, 3) without the terraces of voxels, for drawing only (Taubin 1995)."""
+    edges, _ = undirected_edges(faces, len(vertices))
+    here = edges.ravel()
+    there = edges[:, ::-1].ravel()
+    counts = np.bincount(here, minlength=len(vertices))
     for step in _FAIR_STEPS:
-        vertices = vertices + step * (mean_of_neighbours(vertices, faces) - vertices)
+        means = sums(here, vertices[there], len(vertices)) / counts[:, None]
+        vertices = vertices + step * (means - vertices)
     return vertices
 
 

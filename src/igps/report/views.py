@@ -82,11 +82,11 @@ def common_views(
 ) -> tuple[list[View], list[Floats]]:
     """Return views from the same sides for bodies that are compared, and the vertices (V, 3) of each to draw.
 
-    In the frame of the patient, bodies lie as they are. Others are first moved onto the first body, without mirroring,
-    unless `superposed` has the vertices of all bodies after that.
+    In the frame of the patient, bodies lie as they are, without the terraces of voxels. Others are first moved onto the
+    first body, without mirroring.
     """
     if all(mesh.frame == "RAS" for mesh in meshes):
-        return patient_views(), [mesh.vertices for mesh in meshes]
+        return patient_views(), [faired(mesh.vertices, mesh.faces) for mesh in meshes]
     first = meshes[0]
     if superposed is not None:
         return numbered_views(axes_of(first.vertices)), list(superposed)
@@ -105,12 +105,12 @@ def draw_view(
         axis: where to draw.
         view: the side.
         mesh: the body, which gives the faces and the unit of length.
-        vertices: (V, 3) its vertices, which may have been moved.
+        vertices: (V, 3) its vertices by `common_views`.
         colour: see `paint`.
-        reach: see `paint`; bodies drawn with the same are in the same scale.
+        reach: see `paint`; bodies drawn with the same are in the same scale. By default the body fills the picture.
     """
-    if mesh.frame == "RAS":
-        vertices = faired(vertices, mesh.faces)
+    if reach is None:
+        reach = reach_of([view], [vertices])
     paint(axis, vertices @ view.axes, mesh.faces, colour, reach)
     for letter, (x, y) in zip(view.letters, _EDGES, strict=False):
         axis.text(
@@ -139,4 +139,4 @@ def reach_of(views: Sequence[View], bodies: Sequence[Floats]) -> float:
     sides = [
         np.ptp(vertices @ view.axes, axis=0)[:2].max() for view in views for vertices in bodies
     ]
-    return float(0.58 * max(sides))
+    return float(0.6 * max(sides))  # with room for the letters
