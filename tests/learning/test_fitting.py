@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+import trimesh
 from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 import igps
-from igps.learning.fitting import HeadName, classify
+from igps.learning.fitting import HeadName, classification_scores, classify
+from igps.learning.shortcuts import shortcuts
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, KernelHead, WhitenedHead
 from igps.nn.heads.classifier import folds
@@ -140,7 +144,8 @@ def test_too_little_to_fit_to_is_said(dataset: igps.SignatureDataset) -> None:
     with pytest.raises(ValueError, match="goal: expected one of known, new, got 'both'"):
         igps.fit(dataset, small_interior(), goal="both")  # type: ignore[arg-type]
     with pytest.raises(
-        ValueError, match="head: expected one of auto, classifier, whitened, as_is, got 'best'"
+        ValueError,
+        match="head: expected one of auto, classifier, linear, whitened, as_is, got 'best'",
     ):
         igps.fit(dataset, small_interior(), head="best")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="descriptions: expected histograms"):
@@ -161,6 +166,56 @@ def test_no_sizes_of_classes_are_too_uneven(
         # With a class held out, two classes of at least two bodies must remain
         detects_unknown = head != "whitened" and sum(n > 1 for n in sizes) >= 3
         assert ("unknown_auc" in model.card["held_out_scores"]) == detects_unknown
+
+
+def test_fit_takes_size_where_only_size_tells_the_classes_and_says_so(tmp_path: Path) -> None:
+    for i in range(16):
+        egg = trimesh.creation.icosphere(subdivisions=2)
+        egg.vertices *= [1, 1, 1 + 0.03 * (i // 2)]
+        egg.vertices *= 1 + i % 2
+        folder = tmp_path / "eggs" / ("small", "large")[i % 2]
+        folder.mkdir(parents=True, exist_ok=True)
+        egg.export(folder / f"{i}.off")
+    config = igps.SignatureConfig(
+        n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=30
+    )
+    dataset = igps.SignatureDataset(tmp_path / "eggs", config, tmp_path / "cache")
+    model = igps.fit(dataset, small_interior(), n_workers=1)
+    assert "size" in model.card["parts"]
+    assert model.card["held_out_scores"]["balanced_accuracy"] >= 0.9
+    assert model.card["held_out_scores"]["auc"] >= 0.9
+    by_parts = model.card["candidates"]
+    assert by_parts["linear of numbers, size, without prior"]["auc"] >= 0.9
+    assert by_parts["linear of form, without prior"]["auc"] < 0.9
+    assert model.card["shortcuts"] == []
+    model.save(tmp_path / "mine.safetensors")
+    found = classify(dataset, tmp_path / "mine.safetensors")  # type: ignore[arg-type]
+    assert found.probabilities.argmax(dim=1).tolist() == dataset.labels.tolist()
+
+
+def test_balanced_accuracy_and_area_count_small_classes_as_much_as_large_ones() -> None:
+    probabilities = torch.tensor([[0.9, 0.1], [0.8, 0.2], [0.6, 0.4], [0.7, 0.3]])
+    labels = torch.tensor([3, 3, 3, 8])
+    scores = classification_scores(probabilities, labels, torch.tensor([3, 8]))
+    assert scores["accuracy"] == 0.75
+    assert scores["balanced_accuracy"] == 0.5
+    # The body of the second class is more likely to be of it than two of the three others.
+    assert scores["auc"] == pytest.approx(2 / 3)
+
+
+def test_what_tells_the_classes_without_form_is_said(dataset: igps.SignatureDataset) -> None:
+    assert shortcuts(dataset) == []
+    scanners = tuple(
+        "A" if label in ("flat", "round") else label for label in dataset.bodies.labels or ()
+    )
+    told = copy.copy(dataset)
+    told.bodies = replace(
+        dataset.bodies, columns={"scanner": scanners, "age": tuple(map(str, range(16)))}
+    )
+    assert shortcuts(told) == []  # two of four classes have one scanner
+    two = told.subset([i for i in range(16) if i // 4 not in (0, 3)])
+    [sentence] = shortcuts(two)
+    assert sentence.startswith("the column 'scanner' tells the classes of 100% of the bodies")
 
 
 class Below(igps.Descriptor):

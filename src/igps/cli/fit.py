@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,6 +18,8 @@ _TITLES = {
     "ft": "FT",
     "dcg": "DCG",
     "accuracy": "classified correctly",
+    "balanced_accuracy": "classified correctly, mean over the classes",
+    "auc": "area under the curve, each class against the others",
     "calibration_error": "expected calibration error",
     "unknown_auc": "recognising a class that was left out as unknown, AUC",
 }
@@ -28,7 +31,7 @@ def fit(
     out: Path,
     descriptor: str = "pretrained",
     goal: Literal["known", "new"] = "known",
-    head: Literal["auto", "classifier", "whitened", "as_is"] = "auto",
+    head: Literal["auto", "classifier", "linear", "whitened", "as_is"] = "auto",
     no_prior: bool = False,
     n_workers: int | None = None,
     strict: bool = False,
@@ -44,7 +47,8 @@ def fit(
         out: file for the model, ending in .safetensors, or a folder to share.
         descriptor: a name, as in igps help descriptors, a file, or package.module:NAME of your own descriptor.
         goal: known to recognise the classes of the folder; new for a metric that also serves other classes.
-        head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
+        head: classifier, linear (also of plain numbers and size), whitened, or as_is for the descriptor itself; auto
+            takes the best on held-out bodies.
         no_prior: ignore the descriptor's own metric, and fit to its histograms alone
     """
     from igps.cli.reading import Folder, print_failures, signatures
@@ -162,11 +166,32 @@ for {use}. Scores in percent, means over held-out folds that neither the fit nor
 | | |
 |---|---|
 {scores}
-{_warning(sum(card["classes"].values()))}
+{_warning(sum(card["classes"].values()))}{_choice(card)}
 Fitted to {sum(card["classes"].values())} bodies of {len(card["classes"])} classes: {classes}.
 
 Signatures: `{json.dumps(card["signature"])}`. igps {card["version"]}.
 """
+
+
+def _choice(card: Mapping[str, Any]) -> str:
+    """Return the table of what could be chosen, and what tells the classes without form."""
+    text = ""
+    if card["candidates"]:
+        rows = [
+            f"| {name} | {', '.join(f'{_TITLES[key]} {100 * x:.1f}' for key, x in scores.items())} |"
+            for name, scores in card["candidates"].items()
+        ]
+        table = "\n".join(rows)
+        text += f"""
+Chosen on held-out bodies of the same folder: {", ".join(card["parts"])} by the head `{card["head"]}`. What each adds:
+
+| | |
+|---|---|
+{table}
+"""
+    for sentence in card["shortcuts"]:
+        text += f"\n**Warning**: {sentence}\n"
+    return text
 
 
 def _warning(n_bodies: int) -> str:

@@ -357,8 +357,8 @@ def _flatten(batch: SignatureBatch) -> tuple[list[Any], _Aside]:
 def _unflatten(values: Iterable[Any], aside: _Aside) -> SignatureBatch:
     *tensors, measures = values
     fields = dict(zip(_TENSORS, tensors, strict=True))
-    names = {"ids": aside.ids, "meshes": aside.meshes, "units": aside.units}
-    return SignatureBatch(**fields, **names, measures=measures[0] if measures else None)
+    batch = SignatureBatch(**fields, ids=aside.ids, meshes=aside.meshes, units=aside.units)
+    return replace(batch, measures=measures[0]) if measures else batch
 
 
 def _flatten_samples(samples: SampleBatch) -> tuple[list[Any], None]:

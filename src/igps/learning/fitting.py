@@ -3,7 +3,7 @@
 import copy
 import importlib.metadata
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Literal, get_args
@@ -18,19 +18,17 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
 from igps.descriptors.size_and_side import SizeAndSide
 from igps.descriptors.sized_histograms import SizedHistograms
+from igps.descriptors.with_numbers import N_NUMBERS, Numbers, WithNumbers
+from igps.learning.shortcuts import shortcuts
 from igps.nn.description import check_centres, describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
-from igps.nn.heads import ClassifierHead, Head, WhitenedHead
+from igps.nn.heads import ClassifierHead, ClassifyingHead, Head, LinearHead, WhitenedHead
 from igps.nn.heads.classifier import folds
+from igps.nn.heads.linear import LinearPart
 from igps.retrieval import chi_square, retrieval_scores
 
 Goal = Literal["known", "new"]
-HeadName = Literal["auto", "classifier", "whitened", "as_is"]
-# Heads that "auto" chooses from, by the goal
-_CANDIDATES: Mapping[Goal, tuple[HeadName, ...]] = {
-    "known": ("classifier", "whitened"),
-    "new": ("whitened", "as_is"),
-}
+HeadName = Literal["auto", "classifier", "linear", "whitened", "as_is"]
 # Weights of the prior beside a WhitenedHead: equal for new classes, smaller for classes that the head is fitted to
 _PRIOR_SHARES: Mapping[Goal, float] = {"new": 0.5, "known": 1 / 3}
 _N_FOLDS, _N_INNER_FOLDS = (
@@ -38,7 +36,21 @@ _N_FOLDS, _N_INNER_FOLDS = (
     3,
 )  # for the held-out scores, and within them for the choice of the head
 _N_BINS = 10  # of the expected calibration error
+_MIN_GAIN = 0.005  # in the mean of balanced accuracy and AUC, by which a later candidate is better
 _MAX_SCALE_BODIES = 1000  # bodies whose distances determine the scale
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A head that may be fitted: its name, whether it uses the prior, and the parts of descriptions that it uses."""
+
+    head: HeadName
+    prior: bool
+    parts: tuple[LinearPart, ...] = ("form",)
+
+    def __str__(self) -> str:
+        metric = "with" if self.prior else "without"
+        return f"{self.head} of {', '.join(self.parts)}, {metric} prior"
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +94,8 @@ def fit(
 ) -> Descriptor:
     """Fit a head to the classes of a dataset, and return the descriptor under this head.
 
-    The `card` of the result holds scores on folds that neither the fit nor the choice of the head has seen. The
-    returned head is fitted to all bodies.
+    The `card` of the result holds what was chosen, the scores of all candidates, and scores on folds that neither the
+    fit nor the choice has seen. The returned head is fitted to all bodies.
 
     Example:
         >>> import tempfile
@@ -101,9 +113,11 @@ def fit(
         descriptor: histograms, or histograms under a head, which is then the prior.
         goal: "known" to recognise the classes of the dataset, scored by holding out bodies of each class; "new" for a
             metric that also serves other classes, scored by holding out whole classes.
-        head: "classifier" (`ClassifierHead`), "whitened" (`WhitenedHead`), or "as_is" for the descriptor itself; "auto"
-            takes the head with the largest FT score on held-out bodies.
-        prior: whether the new head also uses the descriptor's own head.
+        head: "classifier" (`ClassifierHead`), "linear" (`LinearHead`, which also uses plain numbers and size),
+            "whitened" (`WhitenedHead`), or "as_is" for the descriptor itself. "auto" chooses on held-out bodies: for
+            known classes among classifiers, with the prior and without, of form, plain numbers and size, by balanced
+            accuracy and area under the curve; for new classes by FT.
+        prior: whether the new head may also use the descriptor's own head.
         failures: list to which bodies that cannot be described are appended; None raises for the first such body.
         n_workers: threads or processes that describe bodies; all cores if None.
         progress: whether to show a progress bar.
@@ -114,59 +128,33 @@ def fit(
     check_one_of(get_args(Goal), goal=goal)
     check_one_of(get_args(HeadName), head=head)
     module = descriptor_of(descriptor)
-    individual = {
-        "size": isinstance(module, SizedHistograms),
-        "side": False,
-    }  # numbers that bypass the head
+    # Numbers that bypass the head
+    individual = {"size": isinstance(module, SizedHistograms), "side": False}
     if isinstance(module, SizeAndSide):
         individual = {"size": module.keeps_size, "side": module.twists is not None}
         module = module.descriptor
     base, metric = split_head(module)
     check_centres(base)
     check_classes(dataset.bodies, goal)
-    base, metric = (
-        copy.deepcopy(base),
-        metric if prior else None,
-    )  # the caller's descriptor stays unchanged
-    histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
+    base = copy.deepcopy(base)  # the caller's descriptor stays unchanged
+    metric = metric if prior else None
+    rows, dataset = _descriptions(dataset, base, failures, n_workers, progress)
     check_classes(dataset.bodies, goal)  # without the bodies that could not be described
-    labels, counts = dataset.labels, Counter(dataset.bodies.labels)
+    labels = dataset.labels
+    counts = Counter(dataset.bodies.labels)
     names = tuple(dataset.classes[int(i)] for i in labels.unique())
-    cells = base.part_cells if isinstance(base, HistogramDescriptor) else None
-
-    def fit_head(name: HeadName, x: Tensor, y: Tensor, calibrate: bool = True) -> Head | None:
-        if name == "classifier":
-            return ClassifierHead(metric, names=names).fit(x, y, cells, calibrate=calibrate)
-        if name == "whitened":
-            return WhitenedHead(prior=metric, prior_share=_PRIOR_SHARES[goal]).fit(x, y, cells)
-        return metric
-
-    def choose_head(x: Tensor, y: Tensor) -> HeadName:
-        if head != "auto":
-            return head
-        masks = [
-            out
-            for out in _held_out(y, goal, _N_INNER_FOLDS)
-            if _has_pair(y[out]) and _has_pair(y[~out])
-        ]
-
-        def mean_ft(name: HeadName) -> float:
-            heads = ((fit_head(name, x[~out], y[~out], False), out) for out in masks)
-            return fmean(_retrieval_means(fitted, x[out], y[out])["ft"] for fitted, out in heads)
-
-        return max(_CANDIDATES[goal], key=mean_ft) if masks else _CANDIDATES[goal][0]
-
-    scores = _held_out_scores(histograms, labels, goal, choose_head, fit_head)
-    name = choose_head(histograms, labels)
-    new_head = fit_head(name, histograms, labels)
+    has_numbers = bool(rows[:, -1].isfinite().all())
+    fitting = _Fitting(base, metric, goal, names, has_numbers)
+    candidates = fitting.candidates(head)
+    held_out = fitting.held_out_scores(rows, labels, candidates)
+    chosen, scores = fitting.choose(rows, labels, candidates)
+    new_head = fitting.fit_head(chosen, rows, labels)
     model: Descriptor = base
     if new_head is not None:
-        model = EmbeddedDescriptor(base, new_head, name=f"{base.name}_{name}").eval()
-    first, first_labels = histograms[:_MAX_SCALE_BODIES], labels[:_MAX_SCALE_BODIES]
-    vectors = first if new_head is None else new_head(first)
-    # Only pairs of different classes, because the fit draws bodies of its classes closer together than later bodies
-    is_measured = first_labels[:, None] != first_labels
-    scale = float(model.distances(vectors, vectors)[is_measured].median()) / 5
+        described = WithNumbers(base) if chosen.head == "linear" else base
+        name = f"{base.name}_{chosen.head}"
+        model = EmbeddedDescriptor(described, new_head, name=name).eval()
+    scale = _scale(model, new_head, fitting.used(chosen, rows), labels)
     if any(individual.values()):
         model = SizeAndSide(model, scale=scale, **individual).eval()
     model.scale = scale
@@ -174,15 +162,223 @@ def fit(
         "scale": scale,
         "descriptor": descriptor if isinstance(descriptor, str) else descriptor.name,
         "goal": goal,
-        "head": name,
-        "prior": metric is not None,
+        "head": chosen.head,
+        "prior": chosen.prior,
+        "parts": list(chosen.parts),
+        "candidates": {str(one): score for one, score in scores.items()},
         "classes": {name: counts[name] for name in names},
-        "held_out_scores": scores,
+        "held_out_scores": held_out,
+        "shortcuts": shortcuts(dataset),
         "signature": dataset.config.as_dict(),
         "reading": dataset.reading.as_dict(),
         "version": importlib.metadata.version("interior-gps"),
     }
     return model
+
+
+def _scale(model: Descriptor, head: Head | None, rows: Tensor, labels: Tensor) -> float:
+    """Return the scale of a model, from its distances between bodies of different classes.
+
+    The fit draws bodies of its own classes closer together than later bodies.
+    """
+    first = rows[:_MAX_SCALE_BODIES]
+    first_labels = labels[:_MAX_SCALE_BODIES]
+    vectors = first if head is None else head(first)
+    is_measured = first_labels[:, None] != first_labels
+    return float(model.distances(vectors, vectors)[is_measured].median()) / 5
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitting:
+    """Fits and scores heads; rows (N, cells + numbers + 1) are those of `WithNumbers`."""
+
+    base: Descriptor
+    metric: Head | None
+    goal: Goal
+    names: tuple[str, ...]
+    has_numbers: bool
+
+    @property
+    def part_cells(self) -> tuple[int, ...] | None:
+        return self.base.part_cells if isinstance(self.base, HistogramDescriptor) else None
+
+    def candidates(self, head: HeadName) -> list[Candidate]:
+        """Return the candidates for a head, the plainest first."""
+        has_prior = self.metric is not None
+        priors = (True, False) if has_prior else (False,)
+        if head in ("classifier", "whitened", "as_is"):
+            return [Candidate(head, has_prior)]
+        if self.goal == "new" and head == "auto":
+            return [*(Candidate("whitened", x) for x in priors), Candidate("as_is", has_prior)]
+        linear = [Candidate("linear", has_prior)]
+        if self.has_numbers:
+            linear += [Candidate("linear", *parts) for parts in _parts_with_numbers(has_prior)]
+        if head == "linear":
+            return linear
+        return [*(Candidate("classifier", x) for x in priors), *linear]
+
+    def used(self, candidate: Candidate, rows: Tensor) -> Tensor:
+        """Return the columns of rows that a candidate's head takes."""
+        return rows if candidate.head == "linear" else rows[:, : -N_NUMBERS - 1]
+
+    def fit_head(
+        self, candidate: Candidate, rows: Tensor, labels: Tensor, calibrate: bool = True
+    ) -> Head | None:
+        """Fit the head of a candidate; None if the descriptor is used as it is, without a prior."""
+        x = self.used(candidate, rows)
+        prior = self.metric if candidate.prior else None
+        if candidate.head == "classifier":
+            kernel = ClassifierHead(prior, names=self.names)
+            return kernel.fit(x, labels, self.part_cells, calibrate=calibrate)
+        if candidate.head == "linear":
+            linear = LinearHead(prior, candidate.parts, N_NUMBERS, self.names)
+            return linear.fit(x, labels, calibrate=calibrate)
+        if candidate.head == "whitened":
+            share = _PRIOR_SHARES[self.goal]
+            return WhitenedHead(prior=prior, prior_share=share).fit(x, labels, self.part_cells)
+        return self.metric
+
+    def choose(
+        self, rows: Tensor, labels: Tensor, candidates: Sequence[Candidate]
+    ) -> tuple[Candidate, dict[Candidate, dict[str, float]]]:
+        """Return the best candidate on held-out bodies, and the scores of all; a later one only by a clear gain."""
+        if len(candidates) == 1:
+            return candidates[0], {}
+        folds_of = list(_held_out(labels, self.goal, _N_INNER_FOLDS))
+        if self.goal == "new":
+            folds_of = [
+                out for out in folds_of if _has_pair(labels[out]) and _has_pair(labels[~out])
+            ]
+        scores = {}
+        for candidate in candidates:
+            found = self._inner_scores(candidate, rows, labels, folds_of)
+            if found:
+                scores[candidate] = found
+        best = candidates[0]
+        for candidate, found in scores.items():
+            if (
+                best not in scores
+                or fmean(found.values()) > fmean(scores[best].values()) + _MIN_GAIN
+            ):
+                best = candidate
+        return best, scores
+
+    def _inner_scores(
+        self, candidate: Candidate, rows: Tensor, labels: Tensor, folds_of: Sequence[Tensor]
+    ) -> dict[str, float]:
+        if self.goal == "new":
+            fts = []
+            for out in folds_of:
+                head = self.fit_head(candidate, rows[~out], labels[~out], False)
+                x = self.used(candidate, rows)
+                fts.append(_retrieval_means(head, x[out], labels[out])["ft"])
+            return {"ft": fmean(fts)} if fts else {}
+        probabilities = []
+        targets = []
+        for out in folds_of:
+            head = self.fit_head(candidate, rows[~out], labels[~out], False)
+            assert isinstance(head, ClassifyingHead)
+            probabilities.append(_of_all_classes(head, self.used(candidate, rows)[out], labels))
+            targets.append(labels[out])
+        if not targets:
+            return {}
+        scores = classification_scores(
+            torch.cat(probabilities), torch.cat(targets), labels.unique()
+        )
+        return {name: scores[name] for name in ("balanced_accuracy", "auc") if name in scores}
+
+    def held_out_scores(
+        self, rows: Tensor, labels: Tensor, candidates: Sequence[Candidate]
+    ) -> dict[str, float]:
+        """Return the means over held-out folds of the retrieval scores and, for a classifier, classification scores."""
+        from torchmetrics.functional.classification import binary_auroc
+
+        retrieval: list[dict[str, float]] = []
+        probabilities = []
+        targets = []
+        unknown_aucs = []
+        classes = labels.unique()
+        for number, out in enumerate(_held_out(labels, self.goal, _N_FOLDS)):
+            chosen, _ = self.choose(rows[~out], labels[~out], candidates)
+            if chosen.head == "whitened" and not _has_pair(labels[~out]):
+                continue  # a WhitenedHead is fitted to pairs of one class
+            x = self.used(chosen, rows)
+            head = self.fit_head(chosen, rows[~out], labels[~out])
+            if _has_pair(labels[out]):
+                scores = _retrieval_means(head, x[out], labels[out])
+                retrieval.append({score: scores[score] for score in ("nn", "ft", "dcg")})
+            if not isinstance(head, ClassifyingHead):
+                continue
+            probabilities.append(_of_all_classes(head, x[out], labels))
+            targets.append(labels[out])
+            # Classes that are left out of the fit of a second classifier
+            is_new = torch.isin(labels, classes[number::_N_FOLDS])
+            unknown = out & is_new
+            known = out & ~is_new
+            fit_to = ~out & ~is_new
+            if bool(unknown.any() and known.any()) and len(labels[fit_to].unique()) > 1:
+                partial = self.fit_head(chosen, rows[fit_to], labels[fit_to], False)
+                assert isinstance(partial, ClassifyingHead)
+                strangeness = torch.cat([partial.strangeness(x[mask]) for mask in (unknown, known)])
+                is_unknown = torch.arange(len(strangeness)) < int(unknown.sum())
+                unknown_aucs.append(float(binary_auroc(strangeness, is_unknown.long())))
+        means = {
+            score: fmean(scores[score] for scores in retrieval)
+            for score in (retrieval[0] if retrieval else ())
+        }
+        if targets:
+            means |= classification_scores(torch.cat(probabilities), torch.cat(targets), classes)
+        if unknown_aucs:
+            means["unknown_auc"] = fmean(unknown_aucs)
+        return means
+
+
+def _parts_with_numbers(has_prior: bool) -> list[tuple[bool, tuple[LinearPart, ...]]]:
+    return [
+        (False, ("numbers",)),
+        (False, ("numbers", "size")),
+        (has_prior, ("form", "numbers")),
+        (has_prior, ("form", "numbers", "size")),
+    ]
+
+
+def _of_all_classes(head: ClassifyingHead, rows: Tensor, labels: Tensor) -> Tensor:
+    """Return probabilities (N, C) of all classes of the labels; 0 for classes that the head was not fitted to."""
+    classes = labels.unique()
+    probabilities = torch.zeros(len(rows), len(classes))
+    probabilities[:, torch.searchsorted(classes, head.classes)] = head.probabilities(rows)
+    return probabilities
+
+
+def classification_scores(
+    probabilities: Tensor, labels: Tensor, classes: Tensor
+) -> dict[str, float]:
+    """Return accuracy, balanced accuracy, area under the curve and calibration error of held-out bodies.
+
+    Balanced accuracy is the mean over the classes of the share of their bodies that is recognised; the area under the
+    curve is the mean over the classes, each against all others. Both count small classes as much as large ones.
+
+    Args:
+        probabilities: (N, C) of the classes.
+        labels: (N,) numbers of the true classes.
+        classes: (C,) numbers of all classes, ascending.
+    """
+    from sklearn.metrics import roc_auc_score
+    from torchmetrics.functional.classification import multiclass_calibration_error
+
+    targets = torch.searchsorted(classes, labels)
+    is_right = probabilities.argmax(dim=1) == targets
+    present = targets.unique().tolist()
+    error = multiclass_calibration_error(probabilities, targets, len(classes), _N_BINS)
+    scores = {
+        "accuracy": float(is_right.float().mean()),
+        "balanced_accuracy": fmean(float(is_right[targets == c].float().mean()) for c in present),
+        "calibration_error": float(error),
+    }
+    if len(present) > 1:
+        areas = [roc_auc_score(targets == c, probabilities[:, c]) for c in present]
+        scores["auc"] = fmean(map(float, areas))
+    return scores
 
 
 def check_classes(bodies: Bodies, goal: Goal) -> None:
@@ -229,15 +425,34 @@ def classify(
     )
 
 
-def classifier_of(model: str | Descriptor) -> tuple[Descriptor, ClassifierHead]:
+def classifier_of(model: str | Descriptor) -> tuple[Descriptor, ClassifyingHead]:
     """Return the descriptor of a model and its classifier; raise a ValueError if it has no classifier."""
     module = descriptor_of(model)
     module = module.descriptor if isinstance(module, SizeAndSide) else module
-    if not isinstance(module, EmbeddedDescriptor) or not isinstance(module.head, ClassifierHead):
+    if not isinstance(module, EmbeddedDescriptor) or not isinstance(module.head, ClassifyingHead):
         raise ValueError(
             f"model: expected a classifier, got {module.name}. Fit one with head='classifier'."
         )
     return module.descriptor, module.head
+
+
+def _descriptions(
+    dataset: SignatureDataset,
+    base: Descriptor,
+    failures: list[Failure] | None,
+    n_workers: int | None,
+    progress: bool,
+) -> tuple[Tensor, SignatureDataset]:
+    """Return the descriptions by `WithNumbers` of the bodies that can be described, and a dataset of these bodies.
+
+    The numbers are NaN if a body has none, as in files of an earlier version.
+    """
+    histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
+    try:
+        numbers = describe(dataset, Numbers(), n_workers=n_workers)
+    except ValueError:
+        numbers = torch.full((len(dataset), N_NUMBERS + 1), torch.nan)
+    return torch.cat([histograms, numbers], dim=1), dataset
 
 
 def _histograms(
@@ -278,58 +493,3 @@ def _retrieval_means(head: Head | None, histograms: Tensor, labels: Tensor) -> d
     vectors = histograms if head is None else head(histograms)
     distances = (chi_square if head is None else head.distances)(vectors, vectors)
     return retrieval_scores(distances, labels.tolist()).mean()
-
-
-def _held_out_scores(
-    histograms: Tensor,
-    labels: Tensor,
-    goal: Goal,
-    choose_head: Callable[[Tensor, Tensor], HeadName],
-    fit_head: Callable[..., Head | None],
-) -> dict[str, float]:
-    """Return the means over held-out folds of the retrieval scores and, for a classifier, classification scores."""
-    from torchmetrics.functional.classification import binary_auroc, multiclass_calibration_error
-
-    retrieval: list[dict[str, float]] = []
-    probabilities_of_folds, targets_of_folds, unknown_aucs = [], [], []
-    classes = labels.unique()
-    for number, out in enumerate(_held_out(labels, goal, _N_FOLDS)):
-        x, y = histograms[~out], labels[~out]
-        name = choose_head(x, y)
-        if name == "whitened" and not _has_pair(
-            y
-        ):  # a WhitenedHead is fitted to pairs of one class
-            continue
-        head = fit_head(name, x, y)
-        if _has_pair(labels[out]):
-            scores = _retrieval_means(head, histograms[out], labels[out])
-            retrieval.append({score: scores[score] for score in ("nn", "ft", "dcg")})
-        if isinstance(head, ClassifierHead):
-            probabilities_of_folds.append(head.probabilities(histograms[out]))
-            targets_of_folds.append(torch.searchsorted(head.classes, labels[out]))
-            is_new = torch.isin(
-                labels, classes[number::_N_FOLDS]
-            )  # left out of the fit of a second classifier
-            unknown, known, fit_to = out & is_new, out & ~is_new, ~out & ~is_new
-            if bool(unknown.any() and known.any()) and len(labels[fit_to].unique()) > 1:
-                partial = fit_head(name, histograms[fit_to], labels[fit_to], False)
-                assert isinstance(partial, ClassifierHead)
-                strangeness = [partial.strangeness(histograms[mask]) for mask in (unknown, known)]
-                targets = torch.cat(
-                    [torch.ones(len(strangeness[0])), torch.zeros(len(strangeness[1]))]
-                ).long()
-                unknown_aucs.append(float(binary_auroc(torch.cat(strangeness), targets)))
-    means = {
-        score: fmean(scores[score] for scores in retrieval)
-        for score in (retrieval[0] if retrieval else ())
-    }
-    if probabilities_of_folds:
-        probabilities, targets = torch.cat(probabilities_of_folds), torch.cat(targets_of_folds)
-        means["accuracy"] = float((probabilities.argmax(dim=1) == targets).float().mean())
-        n_classes = probabilities.shape[1]
-        means["calibration_error"] = float(
-            multiclass_calibration_error(probabilities, targets, n_classes, _N_BINS)
-        )
-    if unknown_aucs:
-        means["unknown_auc"] = fmean(unknown_aucs)
-    return means

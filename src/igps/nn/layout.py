@@ -25,9 +25,9 @@ def layout_parts(learnable: bool | Collection[LayoutPart]) -> frozenset[LayoutPa
     """Return the parts of a layout that are learned: all for True, none for False."""
     if isinstance(learnable, bool):
         return frozenset(get_args(LayoutPart) if learnable else ())
-    for part in [learnable] if isinstance(learnable, str) else learnable:
+    for part in learnable:
         check_one_of(get_args(LayoutPart), learnable=part)
-    return frozenset({learnable} if isinstance(learnable, str) else learnable)
+    return frozenset(learnable)
 
 
 def with_layout(

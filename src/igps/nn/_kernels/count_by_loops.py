@@ -125,9 +125,9 @@ class _Shapes:
         last = torch.iinfo(key.dtype).max  # sorts padding to the end
         self.order = torch.argsort(key.masked_fill(~layout.mask, last), dim=1, stable=True)
         by_order = self.order.unsqueeze(2).expand_as(layout.classes)
-        classes = layout.classes.gather(1, by_order).int().transpose(1, 2).contiguous().numpy()
-        weights = weights.gather(1, by_order).double().transpose(1, 2).contiguous()
-        self.members = classes, weights.numpy()
+        sorted_classes = layout.classes.gather(1, by_order).int().transpose(1, 2).contiguous()
+        in_order = weights.gather(1, by_order).double().transpose(1, 2).contiguous()
+        self.members = sorted_classes.numpy(), in_order.numpy()
         self.members_to_count = _without_zeros(*self.members)
         self.n_points: list[int] = layout.mask.sum(dim=1).tolist()
         centres = [x.detach() for x in centres_of(with_tensors(layout.pairs, tensors))]

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from typing import Self
 
@@ -15,9 +16,47 @@ from igps.nn.heads.closed_form import KernelHead
 _MAX_FOLDS = 5
 _TEMPERATURES = torch.logspace(-2.5, 0, 60)  # candidates of the calibration
 _N_NEAREST = 2  # training shapes of the predicted class that strangeness is computed from
-_FALSE_UNKNOWN_RATE = (
+FALSE_UNKNOWN_RATE = (
     0.05  # share of held-out shapes of known classes that are classified as unknown
 )
+
+
+class ClassifyingHead(Head):
+    """A head with probabilities of classes, which also tells bodies of other classes.
+
+    Attributes:
+        classes: (n_classes,) numbers of the classes, ascending.
+        names: of the classes.
+        strange_from: the strangeness from which on a body is of none of them.
+    """
+
+    classes: Tensor
+    strange_from: Tensor
+
+    def __init__(self, names: Sequence[str] = ()) -> None:
+        super().__init__()
+        self.names = tuple(names)
+        self.register_buffer("classes", torch.zeros(0, dtype=torch.long))
+        self.register_buffer("strange_from", torch.tensor(math.inf))
+
+    @abstractmethod
+    def fit(
+        self,
+        descriptions: Tensor,
+        labels: Tensor,
+        part_cells: Sequence[int] | None = None,
+        *,
+        calibrate: bool = True,
+    ) -> Self:
+        """Fit to the training shapes, see `Head.fit`; `calibrate` sets `strange_from`, which takes longer."""
+
+    @abstractmethod
+    def probabilities(self, descriptions: Tensor) -> Tensor:
+        """Return probabilities (N, n_classes) of descriptions (N, ...), in the order of `classes`."""
+
+    @abstractmethod
+    def strangeness(self, descriptions: Tensor) -> Tensor:
+        """Return the strangeness (N,) of descriptions; classes are unknown from `strange_from` on."""
 
 
 class ClassifierHead(KernelHead):
@@ -88,7 +127,7 @@ class ClassifierHead(KernelHead):
                 functional.cross_entropy(logits / t, targets) for t in _TEMPERATURES.to(logits)
             ]
             self.calibration.copy_(_TEMPERATURES[int(torch.stack(losses).argmin())])
-            self.strange_from.copy_(torch.cat(strangeness).quantile(1 - _FALSE_UNKNOWN_RATE))
+            self.strange_from.copy_(torch.cat(strangeness).quantile(1 - FALSE_UNKNOWN_RATE))
         return self
 
     def probabilities(self, descriptions: Tensor) -> Tensor:
@@ -125,3 +164,6 @@ def folds(labels: Tensor, n_folds: int = _MAX_FOLDS) -> Iterator[Tensor]:
     for number in range(n_folds):
         if bool((fold == number).any()):
             yield (fold == number).to(labels.device)
+
+
+ClassifyingHead.register(ClassifierHead)
