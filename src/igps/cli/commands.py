@@ -26,6 +26,7 @@ COMMANDS: Mapping[str, str] = {
     "outliers": "igps.cli.answers:outliers",
     "clusters": "igps.cli.clusters:clusters",
     "map": "igps.cli.clusters:map_bodies",
+    "trajectory": "igps.cli.trajectory:trajectory",
     "duplicates": "igps.cli.duplicates:duplicates",
     "doctor": "igps.cli.doctor:doctor",
     "report": "igps.cli.report:report",
