@@ -71,3 +71,17 @@ def test_bodies_without_numbers_are_refused() -> None:
     bare = replace(compute_signature(ellipsoid(1, 2, 3), CONFIG), measures={})
     with pytest.raises(ValueError, match=r"^measures: expected bodies with plain numbers"):
         igps.descriptor("measures")(collate([bare]))
+
+
+def test_columns_are_scaled_by_the_first_collection_and_by_no_other() -> None:
+    bodies = [ellipsoid(1, 2, height) for height in (1, 2, 4)]
+    numbers = [compute_signature(body, CONFIG).measures for body in bodies]
+    found = Measures()
+    assert found.fit_collection(numbers, [None] * 3)
+    batch = collate([compute_signature(body, CONFIG) for body in bodies])
+    spread = found(batch).std(dim=0)
+    column = found.columns.index("major_axis_length")
+    assert float(spread[column]) == pytest.approx(1, rel=1e-4)
+    before = found.spread.clone()
+    assert not found.fit_collection(numbers[:2], [None] * 2)
+    assert torch.equal(found.spread, before)

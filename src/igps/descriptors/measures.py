@@ -50,6 +50,7 @@ class Measures(Descriptor):
     source = "Zwanenburg et al. 2020 (IBSI); Hildebrand and Rüegsegger 1997"
     requirements = Requirements(eigenpairs=False)
     spread: Tensor
+    fitted: Tensor
 
     def __init__(self, *, size: bool = False) -> None:
         super().__init__()
@@ -59,6 +60,7 @@ class Measures(Descriptor):
         self.columns = tuple(COLUMNS) if size else tuple(COLUMNS)[:-1]
         spread = [COLUMNS[name] for name in self.columns]
         self.register_buffer("spread", torch.tensor(spread, dtype=torch.float64))
+        self.register_buffer("fitted", torch.tensor(False))
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, D) logarithms over their spread; a ValueError if the bodies have no measures."""
@@ -84,12 +86,16 @@ class Measures(Descriptor):
     def fit_collection(
         self, measures: Sequence[Mapping[str, float]], units: Sequence[str | None]
     ) -> bool:
-        """Set the spread of each column to that of N bodies; one that is the same in all of them keeps its spread."""
-        if len(measures) < 2 or not all(measures):
+        """Set the spread of each column to that of N bodies, unless it was set before; return whether it was set now.
+
+        A column that is the same in all bodies keeps its spread.
+        """
+        if bool(self.fitted) or len(measures) < 2 or not all(measures):
             return False
         rows = [[row.get(name, math.nan) for name in POWERS] for row in measures]
         spread = self.logarithms(torch.tensor(rows, dtype=torch.float64), units).std(dim=0)
         self.spread.copy_(torch.where(spread > _MIN_SPREAD, spread, self.spread))
+        self.fitted.fill_(True)
         return True
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
