@@ -1,4 +1,4 @@
-"""Does a learned layout help on classes that it was not trained on? The table of learn-the-layout.md.
+"""Does a learned layout help on classes that it was not trained on? A program to try it.
 
     python -m docs.benchmarks.layout FOLDER
 
