@@ -40,7 +40,7 @@ _N_VERTICES = 1500
 _N_NEAREST = 24  # vertices that move a point inside with them
 _N_WAVES = 50  # of a field of lumps
 _WAVELENGTH = 0.4  # about twice the length of a lump; a quadruped is about 2.5 long
-_N_DRAWS_OF_NUMBERS = 60  # draws in which each number is tested by itself
+_N_DRAWS_OF_NUMBERS = 20  # draws in which each number is tested by itself
 _NOISE = 0.5  # of each body's own lumps, in standard deviations of its signal
 
 
