@@ -19,7 +19,7 @@ from igps.mesh.surface import area_vectors, components, directed_edges, undirect
 from igps.signature.sampling import surface_points
 from igps.signature.voxels import interior_samples
 
-MEASURES_VERSION = 2
+MEASURES_VERSION = 3
 """Part of every cache key: raise it whenever the same mesh would give other numbers."""
 
 POWERS: Mapping[str, int] = {
@@ -57,7 +57,7 @@ _N_DIRECTIONS = 1000
 _N_DIAMETER_STEPS = 3
 # Interior points at which the thickness is measured, and steps by which balls grow: the last move a centre by less than
 # a hundredth of the radius.
-_N_THICKNESS_POINTS = 1000
+_N_THICKNESS_POINTS = 400
 _N_THICKNESS_STEPS = 10
 # Samples of the surface in which nearest points are looked for, over area³/volume², and their largest number.
 _SAMPLES_PER_THICKNESS = 8
