@@ -6,6 +6,7 @@ sequences are.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -110,19 +111,16 @@ class FoldHistogram(SampleHistogram):
     ) -> None:
         super().__init__("interior", n_samples)
         self.separation = ChainSeparation(_SEPARATIONS)
+        distances = interval_centres(n_bins, reach, "n_bins").tolist()
         self.others = torch.nn.ModuleList(
-            [
-                ResidueDistance(interval_centres(n_bins, reach, "n_bins").tolist()),
-                ChainCosine(_COSINES),
-                ChainTwist(_TWISTS),
-            ]
+            [ResidueDistance(distances), ChainCosine(_COSINES), ChainTwist(_TWISTS)]
         )
         self.embedding = SpectralEmbedding(n_eigenpairs=1)  # the axes use none
 
     @property
     def shape(self) -> tuple[int, ...]:
         """The number of classes of separation, of distance, of the cosine and of the twist."""
-        bins = [n for axis in self.others for n in axis.shape]
+        bins = [n for axis in self.others for n in cast(_TraceAxis, axis).shape]
         return (self.separation.shape[0] - _N_NEIGHBOURS, *bins)
 
     @property

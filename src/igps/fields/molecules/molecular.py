@@ -7,7 +7,7 @@ from igps.data.requirements import Requirements
 from igps.descriptors.sized_histograms import SizedHistograms
 from igps.fields.molecules.fold import FoldHistogram
 from igps.fields.molecules.residue_attributes import RESIDUE_KINDS
-from igps.nn.axes import Attribute, InteriorDistance, PointAxis, Potential
+from igps.nn.axes import Attribute, InteriorDistance, PairAxis, PointAxis, Potential
 from igps.nn.axes.points import attribute_requirements, largest_members
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.descriptor import HistogramDescriptor
@@ -100,7 +100,8 @@ def molecular(*, size: bool = True) -> HistogramDescriptor:
     embedding = SpectralEmbedding(n_eigenpairs=50)
 
     def charges(name: str) -> PairHistogram:
-        axes = [Attribute(name, _CENTRES[name], soft=True), InteriorDistance(_N_BINS)]
+        classes = Attribute(name, _CENTRES[name], soft=True)
+        axes: list[PointAxis | PairAxis] = [classes, InteriorDistance(_N_BINS)]
         return Charges(axes, embedding, n_samples=_N_SAMPLES)
 
     kind = SizedHistograms if size else HistogramDescriptor
