@@ -188,9 +188,8 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page: str, tmp_p
     (tmp_path / "page.py").write_text(code)
     printed = run(tmp_path, "page.py")
     shown = iter(printed.splitlines())
-    missing = [
-        line for line in expected.splitlines() if line not in shown
-    ]  # in this order, others between
+    # In this order, others between
+    missing = [line for line in expected.splitlines() if line not in shown]
     assert not missing, f"{page} shows {missing}, printed was\n{printed}"
     check = CHECKS.get(page)
     if check:

@@ -115,7 +115,8 @@ def test_a_column_of_a_table_is_a_list(paths: list[Path], features: VolumetricFe
 def test_a_file_of_several_bodies_is_no_row(tmp_path: Path) -> None:
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((12, 12, 12), np.uint8)
-    labels[1:6, 1:11, 1:11], labels[7:11, 1:11, 1:11] = 1, 2
+    labels[1:6, 1:11, 1:11] = 1
+    labels[7:11, 1:11, 1:11] = 2
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "a.nii.gz")
     features = VolumetricFeatures("interior", cache_dir=tmp_path, n_workers=1)
     with pytest.raises(
@@ -183,9 +184,8 @@ def test_columns_have_names_and_tables_have_them(
     assert isinstance(table, pandas.DataFrame)
     assert table.columns.tolist() == names.tolist()
     np.testing.assert_array_equal(table.to_numpy(), values)
-    union = make_union(clone(features), clone(features)).fit(
-        paths
-    )  # names of each have the name of the step before them
+    # Names of each have the name of the step before them
+    union = make_union(clone(features), clone(features)).fit(paths)
     assert len(set(union.get_feature_names_out())) == 2 * values.shape[1]
 
 

@@ -344,9 +344,10 @@ def test_a_training_step_is_computed_on_one_thread(blob: Mesh) -> None:
         "enable_checkpointing": False,
         "enable_progress_bar": False,
     }
+    # Type: ignore[arg-type]
     trainer = Trainer(
         max_epochs=1, accumulate_grad_batches=2, enable_model_summary=False, **options
-    )  # type: ignore[arg-type]
+    )
     with pytest.warns(UserWarning, match="val_dataloader"):
         trainer.fit(learner, DataLoader(items, batch_size=2, collate_fn=igps.collate))  # type: ignore[arg-type]
     assert described.seen.count(("gradient", 1)) == 2

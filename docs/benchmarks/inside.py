@@ -95,7 +95,8 @@ def at_rest(points: Floats, pose: Pose) -> Floats:
     distance, nearest = cKDTree(pose.bent).query(points, k=_N_NEAREST)
     weights = 1 / np.maximum(distance, 1e-9) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
-    bent, rest = pose.bent[nearest], pose.rest[nearest]
+    bent = pose.bent[nearest]
+    rest = pose.rest[nearest]
     from_centre = np.einsum("pk,pkd->pd", weights, bent)
     to_centre = np.einsum("pk,pkd->pd", weights, rest)
     covariance = np.einsum(
@@ -147,7 +148,8 @@ def patterns(n_bodies: int = 200, seed: int = 0) -> None:
                 scores = subject.signal(place, points, rest) + _NOISE * scores
             rows[pose].append(numbers_of(signature, scores))
         labels.append(place)
-    first, second = np.array(rows[0]), np.array(rows[1])
+    first = np.array(rows[0])
+    second = np.array(rows[1])
     free = [i for i, name in enumerate(COLUMNS) if not has_unit(name)]
     plain = [COLUMNS.index(name) for name in FIRST_ORDER]
     for title, chosen in (("all numbers without a unit", free), ("first-order", plain)):
@@ -190,7 +192,8 @@ def power(n_bodies: int = 200, n_each: int = 30, n_draws: int = 400, seed: int =
     for number in range(n_bodies):
         subject = Subject.draw(chosen, [seed, number])
         signature, points, rest = subject.posed(0)
-        lumps, rim = subject.lumps(points), subject.signal("rim", points, rest)
+        lumps = subject.lumps(points)
+        rim = subject.signal("rim", points, rest)
         own = 0.25 * np.random.default_rng([seed, number, 5]).normal()
         for name, strength in zip(rows, (0.0, 0.5, own, own + 0.125), strict=True):
             rows[name].append(numbers_of(signature, lumps + strength * rim))

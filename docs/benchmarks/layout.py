@@ -82,7 +82,8 @@ def main(folder: Path, seeds: tuple[int, ...] = SEEDS, n_steps: int = 40) -> Non
     for seed in seeds:
         order = torch.randperm(10, generator=torch.Generator().manual_seed(seed))
         is_train = torch.isin(labels, order[:5])
-        train_set, test_set = dataset[is_train], dataset[~is_train]
+        train_set = dataset[is_train]
+        test_set = dataset[~is_train]
         start = scores(fixed, train_set, test_set)
         print(f"{seed} fixed: plain {start[0]:.1f}, whitened {start[1]:.1f}", flush=True)
         for parts in LEARNED:

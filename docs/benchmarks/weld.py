@@ -58,9 +58,8 @@ def weld(mesh: Mesh, a: int, b: int) -> Mesh:
             if np.isin(mesh.faces[j], beside).any():
                 continue  # the tube would join an edge that already has two faces
             for turn in range(3):
-                other = mesh.faces[j][
-                    [turn, turn - 1, turn - 2]
-                ]  # reversed, as the rims face each other
+                # Reversed, as the rims face each other
+                other = mesh.faces[j][[turn, turn - 1, turn - 2]]
                 length = float(
                     np.linalg.norm(mesh.vertices[rim] - mesh.vertices[other], axis=1).sum()
                 )

@@ -10,6 +10,5 @@ Singles = NDArray[np.float32]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 Surface = tuple[Floats, Integers]  # vertices (V, 3) and faces (F, 3)
-Real = TypeVar(
-    "Real", np.float32, np.float64
-)  # element type of arrays in single or double precision
+# Element type of arrays in single or double precision
+Real = TypeVar("Real", np.float32, np.float64)

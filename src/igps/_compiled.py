@@ -19,14 +19,14 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 # Values of `fastmath`
+# Allows sums in any order, and thus vector instructions
 REASSOCIATE = {
     "contract",
     "reassoc",
     "nsz",
-}  # allows sums in any order, and thus vector instructions
-FUSE = {
-    "contract"
-}  # allows fused multiply-add: a product and its sum are rounded once instead of twice
+}
+# Allows fused multiply-add: a product and its sum are rounded once instead of twice
+FUSE = {"contract"}
 
 
 class Lazy:

@@ -27,9 +27,8 @@ class Failed:
     """The outcome of a job that failed."""
 
     reason: str  # in one sentence
-    summary: str = (
-        ""  # what the body is, if such failures are counted and not listed, see `MeshError.summary`
-    )
+    # What the body is, if such failures are counted and not listed, see `MeshError.summary`
+    summary: str = ""
 
     @staticmethod
     def of(error: Exception) -> "Failed":

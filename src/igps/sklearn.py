@@ -138,9 +138,8 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             )
         cells = features.flatten(1)
         if self.square_root and isinstance(chosen, HistogramDescriptor):
-            cells[
-                :, : sum(chosen.part_cells)
-            ].sqrt_()  # not the size of molecules, which follows the cells
+            # Not the size of molecules, which follows the cells
+            cells[:, : sum(chosen.part_cells)].sqrt_()
         sources = self._sources()
         if not sources:
             return cells.numpy()

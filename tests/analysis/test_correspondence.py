@@ -41,7 +41,8 @@ def test_curvatures_and_thickness_of_a_spheroid(attributes: tuple[AttributeName,
     measured = local_shape(collate([body]))
     x, y, z = body.surface.points.T
     slant = np.sqrt((x**2 + y**2) / RADIUS**4 + z**2 / HALF_LENGTH**4)
-    of_circles, of_meridians = 1 / (RADIUS**2 * slant), 1 / (RADIUS**2 * HALF_LENGTH**2 * slant**3)
+    of_circles = 1 / (RADIUS**2 * slant)
+    of_meridians = 1 / (RADIUS**2 * HALF_LENGTH**2 * slant**3)
     unit = np.sqrt(body.area)
     exact = np.sort(0.04 * unit * np.stack([of_circles, of_meridians], axis=1), axis=1)
     errors = measured[:, :2] / exact - 1
@@ -68,10 +69,8 @@ def test_a_rough_surface_is_no_thinner(attributes: tuple[AttributeName, ...]) ->
 def test_deviations_are_mahalanobis_distances_from_the_corresponding_samples() -> None:
     """To the covariance at a place, a hundredth of that of the whole body is added."""
     random = np.random.default_rng(0)
-    own, others = (
-        random.normal(size=(20, 3)),
-        random.normal(size=(50, 3)) @ random.normal(size=(3, 3)),
-    )
+    own = random.normal(size=(20, 3))
+    others = random.normal(size=(50, 3)) @ random.normal(size=(3, 3))
     nearest = random.integers(50, size=(20, 10))
     expected = []
     for row, indices in zip(own, nearest, strict=True):

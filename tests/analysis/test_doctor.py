@@ -42,7 +42,8 @@ def findings(root: Path, **options) -> dict[str, Finding]:  # type: ignore[no-un
 
 def test_each_fault_and_what_will_be_done(tmp_path: Path) -> None:
     write_clean(tmp_path / "clean.off")
-    soup, holed = write_soup(tmp_path / "soup.off"), write_holed(tmp_path / "holed.off")
+    soup = write_soup(tmp_path / "soup.off")
+    holed = write_holed(tmp_path / "holed.off")
     write_box(tmp_path / "box.off")
     write_crossing(tmp_path / "crossing.off")
     found = findings(tmp_path)

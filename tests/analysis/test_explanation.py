@@ -172,7 +172,8 @@ def test_shares_behind_a_head_are_those_of_small_steps(
     cells = torch.stack([chosen.descriptor(batch).detach().flatten().double() for batch in batches])
     units, _ = unit_shares(chosen, *cells)
     roots = cells.sqrt()
-    middle, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
+    middle = roots.mean(dim=0)
+    half = (roots[0] - roots[1]) / 2
     shares = units * (cells[0] - cells[1])
     order = shares.abs().argsort(descending=True)
     assert (shares[order[:51]] != 0).all()
@@ -229,15 +230,14 @@ def test_a_small_bump_or_dent_is_painted_in_another_pose(height: float) -> None:
     """An egg, bent, with a bump that is a fiftieth of the root of its area high, or such a dent."""
     straight = trimesh.creation.icosphere(subdivisions=4)
     straight.vertices *= [0.5, 0.65, 2.0]
-    bent, bump = (
-        straight.copy(),
-        straight.vertices[np.abs(straight.vertices - [0.45, 0, 0.8]).sum(axis=1).argmin()],
-    )
+    bent = straight.copy()
+    bump = straight.vertices[np.abs(straight.vertices - [0.45, 0, 0.8]).sum(axis=1).argmin()]
     away = np.linalg.norm(straight.vertices - bump, axis=1)
     bent.vertices += (
         height * np.clip(1 - (away / 0.4) ** 2, 0, 1)[:, None] ** 2 * straight.vertex_normals
     )
-    angle, along = bent.vertices[:, 2] / 4, 4 + bent.vertices[:, 0]
+    angle = bent.vertices[:, 2] / 4
+    along = 4 + bent.vertices[:, 0]
     bent.vertices = np.stack(
         [along * np.cos(angle), bent.vertices[:, 1], along * np.sin(angle)], axis=1
     )

@@ -28,7 +28,8 @@ def whitened_kernel(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     n, n_numbers = vectors.shape
     centred = vectors - vectors.mean(axis=0)
     scatter = centred.T @ centred
-    low, high = 1e-9 * np.trace(scatter), 1e9 * np.trace(scatter)
+    low = 1e-9 * np.trace(scatter)
+    high = 1e9 * np.trace(scatter)
     for _ in range(200):
         inverse = np.linalg.inv(scatter + (middle := (low * high) ** 0.5) * np.eye(n_numbers))
         low, high = (
@@ -52,9 +53,11 @@ def test_without_a_difference_one_test_in_twenty_rejects(
     random = np.random.default_rng(1)
     found = []
     for draw in range(1000):
-        vectors, given = random.normal(size=(24, n_numbers)), {}
+        vectors = random.normal(size=(24, n_numbers))
+        given = {}
         if is_confounded:
-            age, scanner = random.normal(size=24) + np.repeat([0, 1], 12), random.integers(0, 2, 24)
+            age = random.normal(size=24) + np.repeat([0, 1], 12)
+            scanner = random.integers(0, 2, 24)
             vectors[:, :2] += np.outer(age, [2, 1])
             vectors += 2 * scanner[:, None]
             given = {"covariates": age[:, None], "strata": [str(one) for one in scanner]}
@@ -77,7 +80,8 @@ def test_the_unit_of_a_covariate_does_not_matter() -> None:
 
 
 def test_strata_may_be_an_array() -> None:
-    vectors, strata = np.random.default_rng(4).normal(size=(24, 3)), np.tile(["x", "y"], 12)
+    vectors = np.random.default_rng(4).normal(size=(24, 3))
+    strata = np.tile(["x", "y"], 12)
     assert quick(vectors, strata=strata) == quick(vectors, strata=strata.tolist())
 
 
@@ -111,7 +115,8 @@ def test_power_grows_with_the_difference() -> None:
 
 def test_the_kernel_test_finds_a_small_direction_that_distances_drown() -> None:
     random = np.random.default_rng(9)
-    scales, shift = np.array([10.0, 5, 2, 1, 1]), np.outer(np.repeat([0, 1], 20), [0, 0, 0, 2.0, 0])
+    scales = np.array([10.0, 5, 2, 1, 1])
+    shift = np.outer(np.repeat([0, 1], 20), [0, 0, 0, 2.0, 0])
     tests = [
         quick(random.normal(size=(40, 5)) * scales + shift, ["a"] * 20 + ["b"] * 20, i)
         for i in range(60)
@@ -141,7 +146,8 @@ def test_statistics_are_those_of_the_textbook() -> None:
     random = np.random.default_rng(4)
     vectors = random.normal(size=(24, 3)) + np.repeat([0, 1], 12)[:, None]
     test = quick(vectors)
-    one, other = vectors[:12], vectors[12:]
+    one = vectors[:12]
+    other = vectors[12:]
     between = 12 * sum(
         ((part.mean(axis=0) - vectors.mean(axis=0)) ** 2).sum() for part in (one, other)
     )
@@ -160,7 +166,9 @@ def test_statistics_are_those_of_the_textbook() -> None:
 
 def test_the_interval_covers_the_effect() -> None:
     random = np.random.default_rng(5)
-    truth, covered = 0.25 / (0.25 + 2), []  # means 1 apart, two dimensions of variance 1
+    # means 1 apart, two dimensions of variance 1
+    truth = 0.25 / (0.25 + 2)
+    covered = []
     for draw in range(200):
         vectors = random.normal(size=(80, 2)) + np.outer(np.repeat([0, 1], 40), [1, 0])
         test = quick(vectors, ["a"] * 40 + ["b"] * 40, draw, n_permutations=1, n_bootstraps=400)
@@ -171,7 +179,8 @@ def test_the_interval_covers_the_effect() -> None:
 def test_matched_pairs_without_a_difference_show_no_effect() -> None:
     """Over 40 draws the mean AUC is near 0.5, the mean effect near 0, and intervals cover 0."""
     random = np.random.default_rng(10)
-    pairs, found = [str(i) for i in range(12)] * 2, []
+    pairs = [str(i) for i in range(12)] * 2
+    found = []
     for draw in range(40):
         vectors = random.normal(size=(24, 20)) + np.tile(3 * random.normal(size=(12, 20)), (2, 1))
         test = quick(vectors, seed=draw, strata=pairs, n_bootstraps=200, n_repeats=1)
@@ -188,10 +197,8 @@ def test_matched_pairs_without_a_difference_show_no_effect() -> None:
 def test_what_no_permutation_changes_has_a_probability_of_one() -> None:
     """If all bodies but one, or both groups, are equal, p = 1; for groups without scatter it is the least, 1 / 200."""
     random = np.random.default_rng(11)
-    one, twice = (
-        np.outer(np.arange(24) == 3, random.normal(size=5)),
-        np.tile(random.normal(size=(12, 3)), (2, 1)),
-    )
+    one = np.outer(np.arange(24) == 3, random.normal(size=5))
+    twice = np.tile(random.normal(size=(12, 3)), (2, 1))
     for vectors in (one, twice):
         test = quick(vectors)
         assert (test.permanova_p, test.kernel_p) == (1, 1)
@@ -218,7 +225,8 @@ def test_a_probability_is_that_of_all_arrangements() -> None:
 
     values = np.random.default_rng(6).normal(size=10) + np.repeat([0, 0.8], 5)
     kernel = whitened_kernel(values[:, None])
-    of_means, of_kernel = [], []
+    of_means = []
+    of_kernel = []
     for one in combinations(range(10), 5):  # the groups themselves first
         side = np.isin(np.arange(10), one)
         of_means.append(abs(values[side].mean() - values[~side].mean()))

@@ -65,7 +65,8 @@ def test_radius_in_a_ball_has_the_means_of_its_closed_form(ball: Signature) -> N
         """The mean radius between two shares of the volume."""
         return 0.75 * (high ** (4 / 3) - low ** (4 / 3)) / (high - low)
 
-    third, outer = 1 / 3, 2 / 3
+    third = 1 / 3
+    outer = 2 / 3
     for names, low, high in (
         (("deep", "core"), 0, third),
         (("mantle", "middle"), third, outer),
@@ -139,7 +140,8 @@ def test_variogram_and_moran_are_counted_by_a_loop(made: Signature) -> None:
     embedded = made.interior.eigenfunctions.astype(np.float64) / np.sqrt(made.eigenvalues)
     distance = np.linalg.norm(embedded[:, None] - embedded, axis=2)
     pairs = sorted((distance[i, j], i, j) for i in range(P) for j in range(i))
-    n_near, n_middle = round(0.05 * len(pairs)), round(0.5 * len(pairs))
+    n_near = round(0.05 * len(pairs))
+    n_middle = round(0.5 * len(pairs))
     numbers = inside_numbers(made, ["ct"])
     bounds = {"near": (0, n_near), "middle": (n_near, n_middle), "far": (n_middle, len(pairs))}
     for name, (start, end) in bounds.items():

@@ -118,7 +118,8 @@ def test_bodies_that_are_alike_are_one_cluster() -> None:
 
 
 def test_clusters_of_one_cloud_are_told_unstable() -> None:
-    random, found = np.random.default_rng(3), []
+    random = np.random.default_rng(3)
+    found = []
     for _ in range(5):
         points = random.normal(size=(80, 5))
         found += clusters_of(cdist(points, points), 6, linkage="complete").stability
@@ -149,7 +150,9 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves() -> None:
     points = np.random.default_rng(4).normal(size=(30, 2)) * [4, 1]
     found = clusters_of(cdist(points, points), 3, n_resamples=20, seed=5)
     first = [set(np.flatnonzero(found.labels == one).tolist()) for one in range(3)]
-    random, shares = np.random.default_rng(5), [[], [], []]  # type: ignore[var-annotated]
+    # type: ignore[var-annotated]
+    random = np.random.default_rng(5)
+    shares = [[], [], []]
     for _ in range(20):
         drawn = np.sort(random.choice(30, 15, replace=False))
         cut = fcluster(linkage(pdist(points[drawn]), "average"), 3, "maxclust")

@@ -52,7 +52,8 @@ def test_a_body_of_another_shape_comes_first() -> None:
 def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n: int, n_odd: int) -> None:
     """Thirty standard deviations off: an odd body is left out of what is taken to be a tail."""
     random = np.random.default_rng(n)
-    points, volumes = random.normal(size=(n, 4)), 0.1 * random.normal(size=n)
+    points = random.normal(size=(n, 4))
+    volumes = 0.1 * random.normal(size=n)
     volumes[:n_odd] += 3
     found = outliers(squared_distances(points) ** 0.5, ["a"] * n, {"volume": volumes})
     assert {one.body for one in found if one.is_outlier} == set(range(n_odd))
@@ -63,7 +64,8 @@ def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(
     n_subjects: int, n_organs: int
 ) -> None:
     """All lengths of one subject are doubled; the bodies of one subject must not be taken for a tail."""
-    random, n = np.random.default_rng(n_subjects), n_subjects * n_organs
+    random = np.random.default_rng(n_subjects)
+    n = n_subjects * n_organs
     labels = [f"organ {i % n_organs}" for i in range(n)]
     subjects = np.repeat(np.arange(n_subjects), n_organs)
     points = random.normal(size=(n, 6)) + np.tile(
@@ -267,7 +269,8 @@ def test_a_volume_is_read_once_for_all_its_labels(
         labels[at : at + 10, 4:16, 4:16] = label
     labels[39, 19, 19] = 4  # too small for a surface
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "all.nii.gz")
-    dataset, reads = SignatureDataset(tmp_path, cache_dir=tmp_path / "cache"), []
+    dataset = SignatureDataset(tmp_path, cache_dir=tmp_path / "cache")
+    reads = []
     read = volumes.read_raw
     monkeypatch.setattr(volumes, "read_raw", lambda path: reads.append(path) or read(path))
     found = measure_bodies(dataset, n_workers=1)

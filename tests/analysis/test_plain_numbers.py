@@ -46,7 +46,9 @@ def test_molecules_have_rows_of_composition_and_length(tmp_path: Path) -> None:
     for file, residues in names.items():
         lines = []
         for i, residue in enumerate(residues):
-            x, y, z = 2.3 * np.cos(1.75 * i), 2.3 * np.sin(1.75 * i), 1.5 * i
+            x = 2.3 * np.cos(1.75 * i)
+            y = 2.3 * np.sin(1.75 * i)
+            z = 1.5 * i
             place = f"{x:8.3f}{y:8.3f}{z:8.3f}"
             lines.append(
                 f"ATOM  {i + 1:5d}  CA  {residue} A{i + 1:4d}    {place}  1.00  0.00           C"

@@ -32,7 +32,8 @@ def test_a_ball_has_nothing_apart_no_hole_and_hardly_a_gap() -> None:
 
 
 def test_what_lies_apart_is_counted_whichever_comes_first() -> None:
-    large, small = ball(12, 28), np.roll(ball(6, 28), -20, axis=0)
+    large = ball(12, 28)
+    small = np.roll(ball(6, 28), -20, axis=0)
     assert stray_root(large | small) ** 2 == pytest.approx(1 / 9, rel=0.05)
 
 
@@ -77,7 +78,8 @@ def test_a_gap_does_not_depend_on_the_grid_and_not_on_the_unit() -> None:
 
 def test_a_cut_shows_unless_the_border_of_the_volume_made_it() -> None:
     half = ball(20, 20)[:, :, :26]
-    inside, at_border = np.zeros((3, 2), dtype=bool), np.zeros((3, 2), dtype=bool)
+    inside = np.zeros((3, 2), dtype=bool)
+    at_border = np.zeros((3, 2), dtype=bool)
     at_border[2, 1] = True
     assert cut_end(half, inside) == pytest.approx(
         (1 - 0.4**0.5) * (np.pi * (20**2 - 5**2)) ** 0.5, rel=0.05

@@ -647,9 +647,10 @@ def company(data: Path | None) -> dict[str, Figure]:
         for _ in range(2):
             stack.enter_context(busy())
         for task in COMPANY:
+            # Type: ignore[misc]
             seconds, reference = timed_by(
                 lambda task=task: ours(task), lambda task=task: single(task), 5
-            )  # type: ignore[misc]
+            )
             slowdown = seconds / reference
             note = f"{seconds:.2f} s beside two busy processes, {reference:.2f} s with one thread"
             figures[f"company_{task}"] = Figure(slowdown, "×", 1.5, "target", 1.5 / slowdown, note)

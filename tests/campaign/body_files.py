@@ -134,9 +134,8 @@ def _volume(generator: Generator) -> BodyFile:
         beside["x.csv"] = "\n".join(
             ["label,name", *(f"{label},{name}" for label, name in given.items())]
         ).encode()
-        is_repeated = (
-            fault == "names repeat"
-        )  # repeated names are followed by the number of the label
+        # Repeated names are followed by the number of the label
+        is_repeated = fault == "names repeat"
         expected = {
             f"liver ({k})" if is_repeated else given.get(int(k), k): v for k, v in expected.items()
         }

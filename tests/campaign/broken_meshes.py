@@ -74,9 +74,8 @@ def judge(broken: Broken, folder: Path, number: int) -> Verdict:
     path.write_bytes(broken.content)
     options, may_change = _options(number)
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # such as those of overflow in readers; the numbers are checked below
+        # Such as those of overflow in readers; the numbers are checked below
+        warnings.simplefilter("ignore")
         try:
             with _grid(number):
                 mesh = load_mesh(path, options)
@@ -114,9 +113,10 @@ def _options(number: int) -> tuple[LoadOptions, bool]:
     component: Component | None = "largest" if number % 7 == 1 else None
     mend = ("never", "auto", "never", "auto", "never", "auto", "never", "always")[number % 8]
     allow_open = number % 3 == 1 and mend != "always"
+    # Type: ignore[arg-type]
     return LoadOptions(
         mend=mend, component=component, allow_open=allow_open
-    ), mend != "never" or bool(component)  # type: ignore[arg-type]
+    ), mend != "never" or bool(component)
 
 
 def _grid(number: int) -> AbstractContextManager[object]:

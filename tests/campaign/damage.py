@@ -436,9 +436,8 @@ def _twins(
 def _seam(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
     """Give some or all faces separate vertices."""
     chosen = generator.random(len(faces)) < generator.choice([0.02, 0.5, 1.0])
-    chosen &= ((faces >= 0) & (faces < len(vertices))).all(
-        axis=1
-    )  # an earlier fault may have made invalid indices
+    # An earlier fault may have made invalid indices
+    chosen &= ((faces >= 0) & (faces < len(vertices))).all(axis=1)
     corners = faces[chosen].ravel()
     split = faces.copy()
     split[chosen] = len(vertices) + np.arange(len(corners)).reshape(-1, 3)

@@ -98,7 +98,8 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
 ) -> None:
     """Of eight subjects, the right egg is longer than the left one; only as pairs are they told apart so surely."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
-    place, rows = np.indices((24, 60, 24)) - 12, ["file,body,side,subject"]
+    place = np.indices((24, 60, 24)) - 12
+    rows = ["file,body,side,subject"]
     for i in range(8):
         labels = np.zeros((24, 60, 24), dtype=np.uint8)
         for label, at, length in ((17, 0, 6 + 0.2 * i), (53, 26, 10 + 0.2 * i)):
@@ -148,10 +149,8 @@ def test_volumes_are_compared_in_one_unit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Half of the eggs of each group are in metres."""
-    root, heights = (
-        tmp_path / "eggs",
-        {"low": (1.0, 1.02, 1.04, 1.06, 1.08), "high": (2.0, 2.02, 2.04, 2.06, 2.08)},
-    )
+    root = tmp_path / "eggs"
+    heights = {"low": (1.0, 1.02, 1.04, 1.06, 1.08), "high": (2.0, 2.02, 2.04, 2.06, 2.08)}
     for label, of_each in heights.items():
         for i, height in enumerate(of_each):
             write_egg(path := root / label / f"{i}.off", height, subdivisions=2)
@@ -191,9 +190,8 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(
     )
     assert found["permanova_f"] == pytest.approx(expected.permanova_f)
     assert found["permanova_p"] == expected.permanova_p
-    igps(
-        monkeypatch, root, *words, "--covariate", "site", "--json"
-    )  # a word that begins as NaN does
+    # A word that begins as NaN does
+    igps(monkeypatch, root, *words, "--covariate", "site", "--json")
     assert json.loads(capsys.readouterr().out)[0]["permanova_f"] == pytest.approx(
         expected.permanova_f
     )
@@ -261,7 +259,8 @@ def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(
 ) -> None:
     """The labels of a file, or the masks of a folder."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
-    random, place = np.random.default_rng(0), np.indices((40, 14, 14)) - 6.5
+    random = np.random.default_rng(0)
+    place = np.indices((40, 14, 14)) - 6.5
     for subject in range(10):
         labels = np.zeros((40, 14, 14), dtype=np.uint8)
         for label, (x, *half) in enumerate([(0, 4, 4, 4), (12, 6, 3, 3), (26, 6, 5, 3)], start=1):

@@ -29,7 +29,8 @@ def test_the_file_stands_for_the_folder(
             name = f"eggs/{label}/{i}.off" if labelled else f"eggs/{label}{i}.off"
             write_egg(tmp_path / name, height * (1 + 0.05 * i), subdivisions=2)
     (tmp_path / "eggs" / "bad.off").write_text("nothing") if not labelled else None
-    cache, out = ["--cache_dir", tmp_path / "cache"], tmp_path / "signatures.igps"
+    cache = ["--cache_dir", tmp_path / "cache"]
+    out = tmp_path / "signatures.igps"
     command = ["retrieve", "--json"] if labelled else ["query", tmp_path / "egg.off", "--json"]
     where = [] if labelled else ["--gallery"]
     write_egg(tmp_path / "egg.off", 2.0, subdivisions=2)
@@ -89,8 +90,11 @@ def test_lists_of_files_may_be_one_file_of_signatures_and_what_needs_meshes_says
             write_egg(
                 tmp_path / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2
             )
-    cache, out = ["--cache_dir", tmp_path / "cache"], tmp_path / "signatures.igps"
-    rich, model, small = ["--descriptor", "rich"], tmp_path / "mine.safetensors", SMALL[2:]
+    cache = ["--cache_dir", tmp_path / "cache"]
+    out = tmp_path / "signatures.igps"
+    rich = ["--descriptor", "rich"]
+    model = tmp_path / "mine.safetensors"
+    small = SMALL[2:]
     run(
         monkeypatch,
         "precompute",

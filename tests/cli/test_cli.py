@@ -369,7 +369,8 @@ def test_query_lists_the_nearest(
 def test_what_asks_a_file_of_signatures_is_described_as_they_are(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file, cache = tmp_path / "signatures.igps", ["--cache_dir", tmp_path / "cache"]
+    file = tmp_path / "signatures.igps"
+    cache = ["--cache_dir", tmp_path / "cache"]
     run(
         monkeypatch,
         "precompute",
@@ -475,7 +476,8 @@ def test_too_few_eigenpairs_are_refused_in_the_same_words_as_in_python(
 def test_a_compared_descriptor_retrieves(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, options = tmp_path / "out", ["--cache_dir", tmp_path / "cache", *SMALL]
+    out = tmp_path / "out"
+    options = ["--cache_dir", tmp_path / "cache", *SMALL]
     run(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", out, *options)
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     described = describe(dataset, D2(), n_workers=1)
@@ -631,7 +633,9 @@ def test_json_of_two_bodies_and_of_copies(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A body, its copy at twice the size, and another."""
-    ball, egg, larger = root / "ball" / "0.off", root / "egg" / "0.off", root / "egg" / "1.off"
+    ball = root / "ball" / "0.off"
+    egg = root / "egg" / "0.off"
+    larger = root / "egg" / "1.off"
     for path in sorted(root.rglob("*.off")):
         if path not in (ball, egg, larger):
             path.unlink()

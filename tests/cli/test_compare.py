@@ -51,7 +51,8 @@ def test_command_prints_and_writes_what_python_computes(
     for row, result in zip(
         rows, compare(dataset, chosen, n_workers=1, progress=False), strict=True
     ):
-        name, expected = result.descriptor.name, result.row()
+        name = result.descriptor.name
+        expected = result.row()
         assert row.pop("seconds_per_mesh") >= 0
         expected.pop("seconds_per_mesh")
         assert row == expected

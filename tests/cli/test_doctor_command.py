@@ -25,7 +25,8 @@ FEW = ["--signature.n_eigenpairs", "20", "--n_workers", "1"]
 def test_table_and_file_of_a_folder_that_can_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root, out = tmp_path / "meshes", tmp_path / "deep" / "doctor.csv"
+    root = tmp_path / "meshes"
+    out = tmp_path / "deep" / "doctor.csv"
     write_clean(root / "a" / "clean.off")
     write_soup(root / "a" / "soup.off")
     write_box(root / "b" / "box.off")
@@ -65,7 +66,8 @@ def test_status_is_1_if_a_file_cannot_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     without_collada(monkeypatch)
-    root, out = tmp_path / "meshes", tmp_path / "doctor.csv"
+    root = tmp_path / "meshes"
+    out = tmp_path / "doctor.csv"
     write_clean(root / "clean.off")
     sentences = write_unusable(root)
     with pytest.raises(SystemExit) as stopped:

@@ -101,7 +101,8 @@ def test_a_wide_table_has_a_row_for_each_file(
     read = pd.read_csv if suffix == "csv" else pd.read_parquet
     extract(monkeypatch, root, tmp_path / f"long.{suffix}")
     extract(monkeypatch, root, tmp_path / f"wide.{suffix}", "--wide")
-    long, wide = read(tmp_path / f"long.{suffix}"), read(tmp_path / f"wide.{suffix}")
+    long = read(tmp_path / f"long.{suffix}")
+    wide = read(tmp_path / f"wide.{suffix}")
     first = ["file", "class", "age", "unit", "liver.notes", "liver.voxel_volume_mm3"]
     assert wide.columns.tolist()[:6] == first
     assert len(wide.columns) == 4 + 2 * (1 + len(POWERS) + 642)
@@ -148,9 +149,8 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
     assert "file" not in wide
     assert wide["class"].tolist() == ["s0", "s1", "s2"]
     assert "wide.csv, rows: 3" in capsys.readouterr().out
-    extract(
-        monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide"
-    )  # of a single subject
+    # Of a single subject
+    extract(monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide")
     one = pd.read_csv(tmp_path / "one.csv")
     np.testing.assert_allclose(one[["bar.volume_mm3", "cube.volume_mm3"]], [[375, 512]], rtol=1e-3)
 

@@ -179,7 +179,8 @@ def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     without_collada(monkeypatch)
-    root, out = tmp_path / "meshes", tmp_path / "out"
+    root = tmp_path / "meshes"
+    out = tmp_path / "out"
     for label, height in (("ball", 1.0), ("egg", 2.0)):
         for i in range(2):
             write_clean(root / label / f"{i}.off", 1 + 0.1 * i, height)

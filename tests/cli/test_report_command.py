@@ -81,7 +81,8 @@ def test_retrieve_with_its_page(
 def test_a_page_afterwards_wherever_the_meshes_are(
     root: Path, retrieved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, page = retrieved, tmp_path / "pages" / "mine.html"
+    out = retrieved
+    page = tmp_path / "pages" / "mine.html"
     assert not (out / "report.html").exists()
     assert not (out / "surfaces.npz").exists()
     moved = root.rename(tmp_path / "moved")
@@ -149,7 +150,9 @@ def test_a_page_with_the_difference_of_each_body_from_its_nearest(
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     found = explain(small_interior(), dataset.batch([2]), dataset.batch([3]))
     assert kept[names[2]].summary == found.summary()
-    mesh, signature, values = dataset.mesh(3), dataset[3].signature, []
+    mesh = dataset.mesh(3)
+    signature = dataset[3].signature
+    values = []
     for vertex in mesh.vertices:  # so few that the picture has them all
         value = 0.0
         for kind, shares in found.places[1].items():  # type: ignore[index]
@@ -203,7 +206,8 @@ def test_bodies_named_by_a_table_elsewhere_have_pictures(
 ) -> None:
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
-    labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9] = 1, 2
+    labels[2:8, 3:12, 3:12] = 1
+    labels[11:22, 5:9, 5:9] = 2
     for subject in range(2):
         (tmp_path / "scans").mkdir(exist_ok=True)
         nibabel.save(

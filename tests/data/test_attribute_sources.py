@@ -37,7 +37,8 @@ SLOPE = np.array([0.7, -1.3, 2.1])
 # Turned, of unlike sides, and shifted: nothing agrees with the axes.
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
 AFFINE = np.eye(4)
-AFFINE[:3, :3], AFFINE[:3, 3] = TURN * [0.31, 0.23, 0.4], TURN @ [-3.1, -3.0, -3.3]
+AFFINE[:3, :3] = TURN * [0.31, 0.23, 0.4]
+AFFINE[:3, 3] = TURN @ [-3.1, -3.0, -3.3]
 SHAPE = (22, 27, 17)
 INSIDE = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
 
@@ -101,7 +102,8 @@ def test_an_image_may_have_the_whole_name_of_the_body(tmp_path: Path) -> None:
 def test_a_grid_gives_a_linear_function(body: BodyRef, suffix: str) -> None:
     grids = pytest.importorskip("gridData")
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
-    delta, origin = np.array([0.5, 0.25, 0.5]), np.array([-5.0, -3.0, -4.0])
+    delta = np.array([0.5, 0.25, 0.5])
+    origin = np.array([-5.0, -3.0, -4.0])
     grids.Grid(linear(index * delta + origin), origin=origin, delta=delta).export(
         str(body.path.with_name(f"a{suffix}"))
     )
@@ -113,14 +115,16 @@ def test_a_grid_gives_a_linear_function(body: BodyRef, suffix: str) -> None:
 def test_axes_of_a_map_in_another_order_are_put_right(body: BodyRef) -> None:
     mrcfile = pytest.importorskip("mrcfile")
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
-    delta, start = np.array([0.5, 0.25, 0.5]), np.array([-10, -12, -8])
+    delta = np.array([0.5, 0.25, 0.5])
+    start = np.array([-10, -12, -8])
     values = linear((index + start) * delta).astype(np.float32)
     with mrcfile.new(body.path.with_name("a.map")) as file:
-        file.set_data(
-            np.ascontiguousarray(values.transpose(1, 0, 2))
-        )  # columns along z, rows along x, sections along y
+        # Columns along z, rows along x, sections along y
+        file.set_data(np.ascontiguousarray(values.transpose(1, 0, 2)))
         file.voxel_size = tuple(delta)
-        file.header.mapc, file.header.mapr, file.header.maps = 3, 1, 2
+        file.header.mapc = 3
+        file.header.mapr = 1
+        file.header.maps = 2
         file.header.nxstart, file.header.nystart, file.header.nzstart = start[[2, 0, 1]]
     np.testing.assert_allclose(attribute_source("a.map")(body, INSIDE), linear(INSIDE), atol=1e-4)
 
@@ -193,7 +197,8 @@ def write_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
 
 def write_vtk_of_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     """With the notes that VTK writes behind arrays of a field."""
-    n, faces = len(values), len(mesh.faces)
+    n = len(values)
+    faces = len(mesh.faces)
     points, heights, triangles = (
         " ".join(map(str, a.ravel())) for a in (mesh.vertices, values, mesh.faces)
     )
@@ -326,10 +331,8 @@ def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(
 
 def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:
     """2 on the cavity, 1 outside; in the wall, mean values by an integral over directions, weighted by 1 / distance."""
-    ball, pit = (
-        trimesh.creation.icosphere(subdivisions=4),
-        trimesh.creation.icosphere(subdivisions=4, radius=0.5),
-    )
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    pit = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
     pit.invert()
     hollow = trimesh.util.concatenate([ball, pit])
     hollow.vertex_attributes["heat"] = np.where(
@@ -358,7 +361,8 @@ def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:
             reading=LoadOptions(cavities=cavities),
             attributes={"heat": VertexAttribute("{stem}.ply", tmp_path)},
         )
-        inside, surface = dataset[0].signature.interior, dataset[0].signature.surface
+        inside = dataset[0].signature.interior
+        surface = dataset[0].signature.surface
         radii = np.linalg.norm(inside.points, axis=1)
         expected = [in_wall(radius) if cavities == "keep" else 1.0 for radius in radii]
         np.testing.assert_allclose(inside.attributes["heat"], expected, atol=0.01)

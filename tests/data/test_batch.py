@@ -62,7 +62,8 @@ def test_bodies_are_the_signatures_without_padding(signatures: list[Signature]) 
         assert body.eigenvalues.dtype == np.float64
         np.testing.assert_array_equal(body.eigenvalues, signature.eigenvalues)
         for room in ("interior", "surface"):
-            found, expected = getattr(body, room), getattr(signature, room)
+            found = getattr(body, room)
+            expected = getattr(signature, room)
             np.testing.assert_allclose(found.points, centred(signature, room), atol=1e-6)
             np.testing.assert_array_equal(found.eigenfunctions, expected.eigenfunctions)
             assert found.attributes.keys() == expected.attributes.keys()
@@ -246,7 +247,8 @@ def test_lightning_finds_the_size_of_a_batch(signatures: list[Signature]) -> Non
 
 
 def test_batches_are_joined_and_cut_again(signatures: list[Signature]) -> None:
-    first, second = collate(signatures[:1]), collate(signatures[1:])
+    first = collate(signatures[:1])
+    second = collate(signatures[1:])
     joined = SignatureBatch.concatenate([first, second])
     assert equal(joined, collate(signatures))
     assert torch.equal(joined.eigenvalues, collate(signatures).eigenvalues)
@@ -258,7 +260,8 @@ def test_batches_are_joined_and_cut_again(signatures: list[Signature]) -> None:
 def test_batches_that_do_not_fit_are_not_joined(signatures: list[Signature]) -> None:
     box = trimesh.creation.box()
     mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
-    with_mesh, without = collate(signatures[:1], [mesh]), collate(signatures[1:])
+    with_mesh = collate(signatures[:1], [mesh])
+    without = collate(signatures[1:])
     assert SignatureBatch.concatenate([with_mesh, with_mesh]).meshes == (mesh, mesh)
     with pytest.raises(ValueError, match="batches: expected meshes in all batches or in none"):
         SignatureBatch.concatenate([with_mesh, without])

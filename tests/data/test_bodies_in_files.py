@@ -36,7 +36,8 @@ def egg(part: str, subject: float) -> trimesh.Trimesh:
 
 def write_subject(path: Path, subject: float, *broken: str) -> None:
     """The organs of a subject as objects of one file; the broken ones are single triangles."""
-    lines, first = [], 1
+    lines = []
+    first = 1
     for part in PARTS:
         body = egg(part, subject)
         lines.append(f"o {part}")
@@ -241,7 +242,8 @@ def test_each_has_the_signature_of_its_own_surface(
         assert reads == ["1.obj", "2.obj"]  # once for both of its bodies
         reads.clear()
     for i, name in enumerate(dataset.bodies.names):
-        part, subject = name.split("#")[1], 1.0 + 0.1 * int(name[0])
+        part = name.split("#")[1]
+        subject = 1.0 + 0.1 * int(name[0])
         body = egg(part, subject)
         expected = compute_signature(Mesh(body.vertices, body.faces), CONFIG)
         assert dataset[name].id == dataset[name].signature.name == name
@@ -279,10 +281,12 @@ def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path: Path) -> None:
 
 def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two subjects whose headers are alike, a table of names that is put right, and numbers of a scene beside it."""
-    sitk, nibabel = pytest.importorskip("SimpleITK"), pytest.importorskip("nibabel")
+    sitk = pytest.importorskip("SimpleITK")
+    nibabel = pytest.importorskip("nibabel")
     monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
     labels = np.zeros((20, 20, 20), dtype=np.uint8)
-    labels[2:8, 4:16, 4:16], labels[10:18, 4:16, 4:16] = 1, 2
+    labels[2:8, 4:16, 4:16] = 1
+    labels[10:18, 4:16, 4:16] = 2
 
     def volumes(folder: str, names: str | None = None) -> dict[str, int]:
         dataset = SignatureDataset(
@@ -311,9 +315,8 @@ def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.M
     for table, order in (("one.csv", (1, 2)), ("two.csv", (2, 1))):
         (tmp_path / table).write_text("label,name\n{},liver\n{},spleen\n".format(*order))
         os.utime(tmp_path / table, (1e9, 1e9))
-    (
-        tmp_path / "nifti" / "x.nii.gz"
-    ).touch()  # so that the tables tell nothing by their times and sizes
+    # So that the tables tell nothing by their times and sizes
+    (tmp_path / "nifti" / "x.nii.gz").touch()
     assert volumes("nifti", str(tmp_path / "one.csv"))["x.nii.gz#liver"] == 864
     assert volumes("nifti", str(tmp_path / "two.csv"))["x.nii.gz#liver"] == 1152
 

@@ -52,7 +52,8 @@ def test_round_trip_is_exact(tmp_path: Path, signature: Signature) -> None:
     assert restored.residual == signature.residual
     np.testing.assert_array_equal(restored.eigenvalues, signature.eigenvalues)
     for room in ("interior", "surface"):
-        before, after = getattr(signature, room), getattr(restored, room)
+        before = getattr(signature, room)
+        after = getattr(restored, room)
         np.testing.assert_array_equal(after.points, before.points)
         np.testing.assert_array_equal(after.eigenfunctions, before.eigenfunctions)
         np.testing.assert_array_equal(after.attributes["depth"], before.attributes["depth"])
@@ -148,7 +149,8 @@ def test_what_a_killed_run_left_is_removed_later(tmp_path: Path, signature: Sign
     cache = Cache(tmp_path, "signature")
     folder = cache.path(KEY).parent
     folder.mkdir(parents=True)
-    old, fresh = folder / "old.partial", folder / "fresh.partial"
+    old = folder / "old.partial"
+    fresh = folder / "fresh.partial"
     for path in (old, fresh):
         path.write_bytes(b"half of a file")
     os.utime(old, (time.time() - 2 * 24 * 3600,) * 2)

@@ -128,10 +128,12 @@ def test_a_damaged_signature_is_named_and_costs_no_other(
     content = bytearray(path.read_bytes())
     if where == "area":
         payload = json.dumps(before[1].signature.area)[-5:].encode()
-        at, number = content.index(payload), 1
+        at = content.index(payload)
+        number = 1
     else:
         payload = load_file(path)[where].tobytes()
-        at, number = content.index(payload), int(where[0])
+        at = content.index(payload)
+        number = int(where[0])
     content[at] ^= 1
     (tmp_path / "damaged.igps").write_bytes(content)
     damaged = SignatureDataset.from_file(tmp_path / "damaged.igps")

@@ -99,7 +99,8 @@ def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(
             **options,
         )
 
-    one, other = module(), module(n_loading_workers=2, evaluation_batch_size=4)
+    one = module()
+    other = module(n_loading_workers=2, evaluation_batch_size=4)
     one.prepare_data()
     other.prepare_data()
     (whole,), parts = list(one.test_dataloader()), list(other.test_dataloader())

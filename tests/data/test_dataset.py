@@ -102,7 +102,8 @@ def test_an_attribute_does_not_stand_in_for_one_of_the_library(root: Path, tmp_p
 
 
 def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) -> None:
-    first, second = dataset[0].signature, dataset[0].signature
+    first = dataset[0].signature
+    second = dataset[0].signature
     assert len(counted) == 1
     np.testing.assert_array_equal(first.interior.eigenfunctions, second.interior.eigenfunctions)
 
@@ -359,7 +360,8 @@ def test_after_precompute_the_meshes_are_not_needed(
 ) -> None:
     before = [dataset[i].signature for i in range(4)]
     assert dataset.precompute(n_workers=1, progress=False) == []
-    keys, notes = dataset.cached_keys(), dataset.all_notes()
+    keys = dataset.cached_keys()
+    notes = dataset.all_notes()
     counted.clear()
     shutil.rmtree(root)
     for part in (dataset, pickle.loads(pickle.dumps(dataset)), dataset.subset(range(4))):
@@ -411,7 +413,8 @@ def test_a_transform_is_applied_at_each_reading_and_not_kept(
         transform=FewerSamples(n_interior=5, n_surface=5),
     )
     torch.manual_seed(0)
-    first, second = changed[0].signature, changed[0].signature
+    first = changed[0].signature
+    second = changed[0].signature
     assert len(first.interior) == len(second.surface) == 5
     assert not np.array_equal(first.interior.points, second.interior.points)
     assert len(counted) == 1
@@ -464,7 +467,9 @@ class Image:
     """A linear function of space, as an image on a grid would be, with a checksum and a count of its readings."""
 
     def __init__(self, slope: float, n_channels: int | None = None) -> None:
-        self.slope, self.n_channels, self.read = slope, n_channels, 0
+        self.slope = slope
+        self.n_channels = n_channels
+        self.read = 0
 
     def cache_tag(self, body: BodyRef) -> str:
         return f"{body.path.parent.name} {self.slope} {self.n_channels}"

@@ -19,7 +19,8 @@ AFFINE = np.diag([-1.0, 1, 2, 1])
 
 
 def two_balls_and_a_speck() -> np.ndarray:
-    index, labels = np.indices((24, 24, 24)), np.zeros((24, 24, 24), dtype=np.uint8)
+    index = np.indices((24, 24, 24))
+    labels = np.zeros((24, 24, 24), dtype=np.uint8)
     labels[((index - 8) ** 2).sum(axis=0) < 40] = 2
     labels[((index - 17) ** 2).sum(axis=0) < 30] = 5
     labels[0, 0, :3] = 9

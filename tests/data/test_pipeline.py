@@ -83,7 +83,9 @@ def test_a_worker_gets_a_small_copy(pipeline: SignaturePipeline, path: Path) -> 
 def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
     pipeline: SignaturePipeline, path: Path, tmp_path: Path
 ) -> None:
-    copy, renamed, other = tmp_path / "copy.off", tmp_path / "egg.obj", tmp_path / "other.off"
+    copy = tmp_path / "copy.off"
+    renamed = tmp_path / "egg.obj"
+    other = tmp_path / "other.off"
     shutil.copy(path, copy)
     shutil.copy(path, renamed)
     write_body(other, 1.1, 1.6)
@@ -152,7 +154,8 @@ def test_another_version_makes_other_keys(
 def test_a_body_that_cannot_be_used_is_not_read_again_until_it_changes(
     pipeline: SignaturePipeline, tmp_path: Path
 ) -> None:
-    path, copy = tmp_path / "thin.off", tmp_path / "copy.off"
+    path = tmp_path / "thin.off"
+    copy = tmp_path / "copy.off"
     path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     shutil.copy(path, copy)
     with pytest.raises(MeshError) as first:
@@ -209,7 +212,8 @@ def test_fewer_eigenpairs_are_the_beginning_of_the_default_number(
     assert signature.notes == expected.notes
     np.testing.assert_allclose(signature.eigenvalues, expected.eigenvalues, rtol=1e-9)
     for kind in ("interior", "surface"):
-        one, other = getattr(signature, kind), getattr(expected, kind)
+        one = getattr(signature, kind)
+        other = getattr(expected, kind)
         np.testing.assert_allclose(one.points, other.points, atol=1e-12)
         sizes = np.abs(one.eigenfunctions), np.abs(other.eigenfunctions)
         np.testing.assert_allclose(*sizes, atol=1e-3)

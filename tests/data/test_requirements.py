@@ -18,10 +18,8 @@ from igps.signature.signature import SignatureConfig
 
 
 def test_together_is_what_both_need() -> None:
-    one, other = (
-        Requirements(5, ("depth", "surface_direction")),
-        Requirements(9, ("electrostatic_potential", "depth"), mesh=True),
-    )
+    one = Requirements(5, ("depth", "surface_direction"))
+    other = Requirements(9, ("electrostatic_potential", "depth"), mesh=True)
     assert one | other == Requirements(
         9, ("depth", "surface_direction", "electrostatic_potential"), mesh=True
     )

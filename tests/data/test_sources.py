@@ -113,9 +113,8 @@ def test_what_is_left_out_of_a_folder_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     touch(tmp_path, "cat/1.off", "dog/2.off", "alone.off")
-    (tmp_path / "cat" / "lost.off").symlink_to(
-        tmp_path / "not there.off"
-    )  # as of a file that was not fetched
+    # As of a file that was not fetched
+    (tmp_path / "cat" / "lost.off").symlink_to(tmp_path / "not there.off")
     (tmp_path / "elsewhere").mkdir()
     touch(tmp_path / "elsewhere", "5.off")
     (tmp_path / "linked").symlink_to(tmp_path / "elsewhere")

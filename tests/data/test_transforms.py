@@ -82,7 +82,8 @@ def test_without_a_seed_the_global_generator_draws(
     signature: Signature, transform: Transform
 ) -> None:
     torch.manual_seed(0)
-    first, second = transform(signature), transform(signature)
+    first = transform(signature)
+    second = transform(signature)
     torch.manual_seed(0)
     assert same(first, transform(signature))
     assert not same(first, second)
@@ -124,7 +125,8 @@ def test_noise_is_as_strong_as_it_says(signature: Signature) -> None:
 
 def test_scaled_is_the_signature_of_the_scaled_body(signature: Signature) -> None:
     """Computed from a mesh of twice the size; eigenfunctions to their signs, so that products of them are compared."""
-    scaled, expected = Scale(smallest=2.0, largest=2.0, seed=0)(signature), of_egg(2.0)
+    scaled = Scale(smallest=2.0, largest=2.0, seed=0)(signature)
+    expected = of_egg(2.0)
     np.testing.assert_allclose(scaled.eigenvalues, expected.eigenvalues, rtol=1e-6)
     assert (scaled.area, scaled.volume) == (
         pytest.approx(expected.area),
@@ -143,7 +145,8 @@ def test_signs_are_flipped_for_all_samples_alike_and_change_no_distance(
     signature: Signature,
 ) -> None:
     flipped = FlipSigns(seed=1)(signature)
-    inside, outside = signature.interior.eigenfunctions, signature.surface.eigenfunctions
+    inside = signature.interior.eigenfunctions
+    outside = signature.surface.eigenfunctions
     signs = flipped.interior.eigenfunctions / inside
     assert set(np.unique(signs)) == {-1.0, 1.0}
     assert (signs == signs[0]).all()

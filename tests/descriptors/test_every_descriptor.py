@@ -113,7 +113,8 @@ def test_descriptors_are_named_and_say_where_they_are_from() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_descriptions_are_finite_numbers_of_one_shape_and_repeat(name: str) -> None:
-    first, other = description(name, "rod"), description(name, "other")
+    first = description(name, "rod")
+    other = description(name, "other")
     assert first.dtype == other.dtype == torch.float32
     assert first.shape == other.shape
     assert first.ndim >= 2
@@ -126,7 +127,8 @@ def test_descriptions_are_finite_numbers_of_one_shape_and_repeat(name: str) -> N
 
 @pytest.mark.parametrize("name", NAMES)
 def test_padding_changes_no_description(name: str) -> None:
-    signatures, meshes = [], []
+    signatures = []
+    meshes = []
     for batch in (body("rod"), body("other")):
         (one,) = batch.bodies()
         signatures.append(signature(one.eigenvalues, one.interior, one.surface, one))
@@ -223,7 +225,8 @@ def test_a_batch_on_a_device_is_described_at_once(
 @pytest.mark.parametrize("name", ON_TENSORS)
 def test_any_number_of_bodies_goes_through_an_exported_program(name: str) -> None:
     rod, other = (body(kind) for kind in ("rod", "other"))
-    found, several = descriptor(name), SignatureBatch.concatenate([other, rod, other, body("pose")])
+    found = descriptor(name)
+    several = SignatureBatch.concatenate([other, rod, other, body("pose")])
     with torch.no_grad():
         program = exported(found, SignatureBatch.concatenate([rod, other]))
         for batch in (several, other):
@@ -318,7 +321,8 @@ def test_descriptors_not_claimed_pose_invariant_change_with_pose(name: str) -> N
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_batch_without_what_is_needed_is_refused(name: str) -> None:
-    found, whole = descriptor(name), body("rod")
+    found = descriptor(name)
+    whole = body("rod")
     (one,) = whole.bodies()
     if found.requirements.n_eigenpairs:
         n = found.requirements.n_eigenpairs - 1

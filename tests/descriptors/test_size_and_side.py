@@ -78,7 +78,8 @@ def from_body(name: str, signatures: dict[str, Signature]) -> dict[str, float]:
 def test_distances_with_size_are_those_of_the_formula(
     name: str, signatures: dict[str, Signature]
 ) -> None:
-    plain, sized = from_body(name, signatures), from_body(f"{name}+size", signatures)
+    plain = from_body(name, signatures)
+    sized = from_body(f"{name}+size", signatures)
     for other in ("body", "centimetres", "mirrored"):
         assert sized[other] == pytest.approx(plain[other], rel=1e-2, abs=1e-3 * SCALES[name])
     apart = 5 * np.log(1.1)  # in log area and in log volume
@@ -114,7 +115,8 @@ def test_short_vectors_keep_the_numbers_of_size_and_side(signatures: dict[str, S
 def test_a_mirror_image_is_the_body_unless_it_is_distinct(
     name: str, signatures: dict[str, Signature]
 ) -> None:
-    same, distinct = from_body(name, signatures), from_body(f"{name}+side", signatures)
+    same = from_body(name, signatures)
+    distinct = from_body(f"{name}+side", signatures)
     assert same["mirrored"] < 0.1 * SCALES[name]
     assert distinct["mirrored"] > SCALES[name] / 2
     assert distinct["larger"] < 0.2 * distinct["mirrored"]  # to sampling noise the body itself
@@ -142,9 +144,8 @@ def test_a_body_that_is_turned_is_far_nearer_than_its_mirror_image(seed: int) ->
     body = ball * (1 + heights)[:, None] * [1, 1.3, 0.8]
     turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
     turn *= np.linalg.det(turn)
-    meshes = [
-        Mesh(body @ one, SURFACE.faces) for one in (np.eye(3), turn, -np.eye(3), -turn)
-    ]  # turned outwards again
+    # Turned outwards again
+    meshes = [Mesh(body @ one, SURFACE.faces) for one in (np.eye(3), turn, -np.eye(3), -turn)]
     descriptor = igps.descriptor("interior+side")
     found = descriptor(collate([compute_signature(one, CONFIG) for one in meshes]))
     _, turned, *mirrored = descriptor.distances(found[:1], found)[0].tolist()
@@ -154,7 +155,8 @@ def test_a_body_that_is_turned_is_far_nearer_than_its_mirror_image(seed: int) ->
 def bent(mirrored: bool = False, turn: np.ndarray | None = None) -> Mesh:
     """A limb that grows thicker and bends to one side, and to another at its end."""
     x, y, z = SURFACE.vertices.T
-    wide, along = 0.45 * (1 + 0.5 * z), 2 * z
+    wide = 0.45 * (1 + 0.5 * z)
+    along = 2 * z
     points = np.stack(
         [wide * x + 0.35 * along**2, wide * y + 0.6 * np.maximum(along, 0) ** 2, along], axis=1
     )

@@ -35,15 +35,13 @@ def test_the_ten_lines_work_with_every_descriptor(
         r"^```python\n(.*?)^```", README.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
     )
     assert match is not None
-    lines = [
-        line for line in match[1].splitlines() if ".write(" not in line
-    ]  # the shapes are there
+    # The shapes are there
+    lines = [line for line in match[1].splitlines() if ".write(" not in line]
     example = "\n".join(lines).replace('"interior"', repr(name))
     assert repr(name) in example
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(
-        "igps._parallel.n_cores", lambda: 1
-    )  # starting processes would take longer than all the rest
+    # Starting processes would take longer than all the rest
+    monkeypatch.setattr("igps._parallel.n_cores", lambda: 1)
     exec(compile(example, str(README), "exec"), {})
     scores, nearest = capsys.readouterr().out.splitlines()
     assert ast.literal_eval(scores)["nn"] >= 0.5  # by chance 0.4

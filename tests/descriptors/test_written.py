@@ -77,8 +77,11 @@ def bodies(tmp_path: Path) -> SignatureDataset:
 def test_a_descriptor_of_the_library_written_down_gives_the_same_numbers(
     bodies: SignatureDataset, tmp_path: Path, text: str, named: object
 ) -> None:
-    own, theirs = igps.descriptor(write(tmp_path, text)), named().eval()  # type: ignore[operator]
-    found, expected = describe(bodies, own), describe(bodies, theirs)
+    # type: ignore[operator]
+    own = igps.descriptor(write(tmp_path, text))
+    theirs = named().eval()
+    found = describe(bodies, own)
+    expected = describe(bodies, theirs)
     assert torch.equal(found.flatten(1), expected.flatten(1))
     assert own.name == "mine"
 

@@ -43,7 +43,8 @@ def bumpy(amplitude: float, n: int = 2000, seed: int = 0) -> SurfaceSamples:
     """The surface r = 1 + a·P₄(cos θ), P₄ of Legendre, with the normals of its level set."""
     directions = even_directions(n, seed)
     z = directions[:, 2]
-    value, slope = (35 * z**4 - 30 * z**2 + 3) / 8, (140 * z**3 - 60 * z) / 8
+    value = (35 * z**4 - 30 * z**2 + 3) / 8
+    slope = (140 * z**3 - 60 * z) / 8
     radius = 1 + amplitude * value
     # ∇(|x| − a·P₄(z/|x|)) = u − a·P₄′·(e_z − z·u)/r
     normals = directions - amplitude * (slope / radius)[:, None] * (
@@ -65,7 +66,8 @@ def moved(samples: SurfaceSamples, seed: int, mirror: bool, scale: float) -> Sur
 )
 def test_a_motion_a_mirror_and_a_scale_leave_nothing(seed: int, mirror: bool, scale: float) -> None:
     """Of a body without any symmetry: two ellipsoids beside each other."""
-    one, other = ellipsoid((1.0, 0.6, 0.4)), ellipsoid((0.5, 0.3, 0.7), 500, seed=4)
+    one = ellipsoid((1.0, 0.6, 0.4))
+    other = ellipsoid((0.5, 0.3, 0.7), 500, seed=4)
     beside = other.points + np.array([0.9, 0.5, 0.3])
     body = SurfaceSamples.of(
         np.concatenate([one.points, beside]), np.concatenate([one.normals, other.normals]), 1.0
@@ -76,7 +78,8 @@ def test_a_motion_a_mirror_and_a_scale_leave_nothing(seed: int, mirror: bool, sc
 
 
 def test_other_samples_of_one_surface_are_nearer_than_the_gaps_between_them() -> None:
-    one, other = ellipsoid((1.0, 0.6, 0.4), seed=1), ellipsoid((1.0, 0.6, 0.4), seed=2)
+    one = ellipsoid((1.0, 0.6, 0.4), seed=1)
+    other = ellipsoid((1.0, 0.6, 0.4), seed=2)
     assert surface_distance(one, other) < 0.1 * one.gap
 
 
@@ -98,7 +101,8 @@ def test_a_rotated_body_with_equal_principal_axes_is_aligned() -> None:
 
 def rough(amplitude: float, n: int, seed: int) -> tuple[Array, Array]:
     """Points and normals of an ellipsoid that is ruffled along one axis, by waves much shorter than a patch."""
-    axes, wave = np.array([1.0, 0.7, 0.45]), 0.02
+    axes = np.array([1.0, 0.7, 0.45])
+    wave = 0.02
     directions = even_directions(n, seed)
     smooth = directions / axes
     steepness = np.linalg.norm(smooth, axis=1, keepdims=True)
@@ -141,10 +145,8 @@ def test_the_surface_itself_tells_more_than_samples() -> None:
 def test_nearest_points_of_a_surface() -> None:
     """Against trimesh's loop over all triangles, and above the middle of each face, where its normal stands."""
     vertices, faces = triangles((1.0, 0.6, 0.4), 2)
-    surface, body = (
-        TriangleSurface(vertices, faces),
-        trimesh.Trimesh(vertices, faces, process=False),
-    )
+    surface = TriangleSurface(vertices, faces)
+    body = trimesh.Trimesh(vertices, faces, process=False)
     anywhere = np.random.default_rng(0).uniform(-1, 1, (40, 3))
     expected, _, _ = trimesh.proximity.closest_point_naive(body, anywhere)
     np.testing.assert_allclose(
@@ -187,7 +189,8 @@ def wheel(thinned: float, seed: int) -> SurfaceSamples:
     z, angle = np.random.default_rng(seed).uniform([-0.3, 0], [0.3, 2 * np.pi], size=(6000, 2)).T
     bumps = np.cos(5 * angle) * (1 + np.exp(-20 * (1 - np.cos(angle))))
     slope = np.gradient(bumps[np.argsort(angle)], np.sort(angle))[np.argsort(np.argsort(angle))]
-    radius, turning = 1 + 0.06 * bumps, 0.06 * slope
+    radius = 1 + 0.06 * bumps
+    turning = 0.06 * slope
     points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
     normals = np.column_stack(
         [
@@ -203,7 +206,8 @@ def wheel(thinned: float, seed: int) -> SurfaceSamples:
 
 def test_misleading_principal_axes_do_not_decide_the_alignment() -> None:
     """The principal axes lead to a local minimum, in which the high bump lies on a low one."""
-    one, other = wheel(0.0, 1), wheel(2 * np.pi / 5, 2)
+    one = wheel(0.0, 1)
+    other = wheel(2 * np.pi / 5, 2)
     steps = [samples.extents[1:] / samples.extents[:-1] for samples in (one, other)]
     assert min(map(min, steps)) > 1.1
     assert surface_distance(one, other) < 0.05 * one.gap
@@ -228,13 +232,15 @@ def test_thin_sheets_of_other_widths_are_told_apart() -> None:
 
 
 def test_the_search_ends_where_it_is_enough() -> None:
-    one, other = ellipsoid((1.0, 0.6, 0.4)), ellipsoid((1.0, 0.5, 0.4), seed=2)
+    one = ellipsoid((1.0, 0.6, 0.4))
+    other = ellipsoid((1.0, 0.5, 0.4), seed=2)
     best = surface_distance(one, other)
     assert best <= surface_distance(one, other, stop_at=2 * best) <= 2 * best
 
 
 def test_what_is_hopeless_stays_beyond_that() -> None:
-    one, other = ellipsoid((1.0, 0.6, 0.4)), ellipsoid((1.0, 0.3, 0.3), seed=2)
+    one = ellipsoid((1.0, 0.6, 0.4))
+    other = ellipsoid((1.0, 0.3, 0.3), seed=2)
     far = surface_distance(one, other)
     assert surface_distance(one, other, hopeless=far / 4) > far / 4
     assert surface_distance(one, other, hopeless=4 * far) == far
@@ -248,7 +254,8 @@ def test_samples_that_do_not_fit_are_refused() -> None:
 
 
 def test_what_is_farther_than_asked_for_is_told_to_be() -> None:
-    one, other = bumpy(0.0), bumpy(0.1, seed=5)
+    one = bumpy(0.0)
+    other = bumpy(0.1, seed=5)
     far = surface_distance(one, other)
     assert far / 3 < surface_distance(one, other, max_distance=far / 3) <= far
     assert surface_distance(one, other, max_distance=1.01 * far) == far

@@ -126,7 +126,8 @@ def test_what_is_no_calibration_is_refused(text: str, tmp_path: Path) -> None:
 
 
 def test_the_shipped_one_is_of_the_shipped_descriptor() -> None:
-    found, module = Calibration.load(), descriptor("pretrained")
+    found = Calibration.load()
+    module = descriptor("pretrained")
     found.check("pretrained", module, module.requirements.apply_to(SignatureConfig()))
     medians = [found.distances[kind][LEVELS.index(0.5)] for kind in KINDS]
     assert medians == sorted(medians)

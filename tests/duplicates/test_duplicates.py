@@ -58,8 +58,10 @@ def bar(subdivisions: int, bend: float = 0.0) -> trimesh.Trimesh:
     body = ball(subdivisions)
     x, y, z = (body.vertices * [3.0, 0.8, 0.5]).T
     if bend:
-        angle, radius = x / 6 * bend, 6 / bend + z
-        x, z = radius * np.sin(angle), radius * np.cos(angle)
+        angle = x / 6 * bend
+        radius = 6 / bend + z
+        x = radius * np.sin(angle)
+        z = radius * np.cos(angle)
     body.vertices = np.column_stack([x, y, z])
     return body
 
@@ -160,13 +162,15 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
         ) ** 2 / 10**2 < 1
         return np.select([one, other], [1, 2]).astype(np.uint8)
 
-    given, turn = labels(1.0), np.zeros((4, 4))
+    given = labels(1.0)
+    turn = np.zeros((4, 4))
+    # Of indices: the first axis runs back, and comes second
     turn[[0, 1, 2, 3], [1, 2, 0, 3]] = (
         -1,
         1,
         1,
         1,
-    )  # of indices: the first axis runs back, and comes second
+    )
     turn[0, 3] = len(given) - 1
     inner = given[2:, 1:-1, 3:]
     nibabel.save(nibabel.Nifti1Image(given, np.eye(4)), tmp_path / "given.nii.gz")
@@ -226,7 +230,8 @@ def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path: Path) -> None:
         body.export(tmp_path / f"{name}.off")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     coarse, longer_one, one = range(3)
-    surfaces, calibration = Surfaces(dataset), Calibration.load()
+    surfaces = Surfaces(dataset)
+    calibration = Calibration.load()
     assert (
         surfaces.distance(coarse, one, calibration)
         < surfaces.distance(coarse, longer_one, calibration)
@@ -272,7 +277,8 @@ def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None
         body.export(tmp_path / f"{name}.off")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     a_ball, a_cut, a_ring, turned = range(4)
-    surfaces, calibration = Surfaces(dataset), Calibration.load()
+    surfaces = Surfaces(dataset)
+    calibration = Calibration.load()
     assert any(note.startswith("filled") for note in dataset.mesh(a_cut).notes)
     assert surfaces.limit(a_ball, a_ring, calibration) == 0
     assert surfaces.limit(a_ring, turned, calibration) > 0
@@ -460,7 +466,8 @@ def test_other_lengths_are_no_candidates(tmp_path: Path) -> None:
         body = trimesh.creation.icosphere(subdivisions=subdivisions)
         body.apply_scale([1.3, 1.0, 0.8 * stretch])
         body.export(tmp_path / f"{name}.off")
-    dataset, most = SignatureDataset(tmp_path, CONFIG, tmp_path), Calibration.load().same.distance
+    dataset = SignatureDataset(tmp_path, CONFIG, tmp_path)
+    most = Calibration.load().same.distance
     moments, failures = Surfaces(dataset).moments(most, 1)
     assert not failures
     # in order of names: ball, copy, longer

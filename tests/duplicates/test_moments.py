@@ -37,7 +37,8 @@ def lump(
 
 
 def test_moments_of_a_box_are_its_closed_forms() -> None:
-    sides, area = np.array([1.0, 2.0, 3.0]), 22.0
+    sides = np.array([1.0, 2.0, 3.0])
+    area = 22.0
     body = trimesh.creation.box(sides)
     body.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9])))
     body.apply_translation([3.0, -2.0, 1.0])
@@ -62,7 +63,8 @@ def test_moments_of_a_tetrahedron_are_those_of_its_points() -> None:
     density *= abs(np.linalg.det(corners[1:] - corners[0])) / body.area**1.5
     points -= density @ points / density.sum()
     square = np.square(points).sum(axis=1)
-    volume, second = density.sum(), np.linalg.eigvalsh((density[:, None] * points).T @ points)
+    volume = density.sum()
+    second = np.linalg.eigvalsh((density[:, None] * points).T @ points)
     third = np.linalg.norm((density * square) @ points) * volume**0.5 / second.sum() ** 1.5
     np.testing.assert_allclose(
         of(body)[0], [*np.log([volume, *second, density @ square**2]), third], rtol=1e-9
@@ -87,11 +89,10 @@ def test_the_lower_bound_does_not_exceed_the_displacement(
 ) -> None:
     """Normal displacements by polynomials, scaled to a known root mean square; bodies with and without symmetry."""
     body = lump(stretch, bumps)
-    normals, weights = (
-        np.asarray(body.vertex_normals),
-        np.bincount(body.faces.ravel(), np.repeat(body.area_faces, 3)),
-    )
-    places, told = body.vertices / np.abs(body.vertices).max(axis=0), []
+    normals = np.asarray(body.vertex_normals)
+    weights = np.bincount(body.faces.ravel(), np.repeat(body.area_faces, 3))
+    places = body.vertices / np.abs(body.vertices).max(axis=0)
+    told = []
     for powers in product(range(4), repeat=3):
         if sum(powers) <= 4:
             move = np.prod(places**powers, axis=1)
@@ -107,15 +108,13 @@ def test_the_lower_bound_does_not_exceed_the_displacement(
 def test_the_lower_bound_is_tight_for_displacements_along_gradients() -> None:
     """Gradients of scale-invariant combinations of moments, by finite differences at each vertex."""
     body = lump((0.7, 0.5, 1.5), 0.05)
-    body.vertices[:, :2] *= np.exp(
-        -0.65 * body.vertices[:, 2:]
-    )  # one end is thick, so that the middle moves
-    vertices, faces, normals = (
-        body.vertices / body.area**0.5,
-        np.asarray(body.faces),
-        body.vertex_normals,
-    )
-    gradients, step = np.zeros((len(vertices), 6)), 1e-4
+    # One end is thick, so that the middle moves
+    body.vertices[:, :2] *= np.exp(-0.65 * body.vertices[:, 2:])
+    vertices = body.vertices / body.area**0.5
+    faces = np.asarray(body.faces)
+    normals = body.vertex_normals
+    gradients = np.zeros((len(vertices), 6))
+    step = 1e-4
     for i, normal in enumerate(normals):
         moved = [vertices.copy(), vertices.copy()]
         moved[0][i] -= step * normal

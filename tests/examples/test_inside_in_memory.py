@@ -21,7 +21,8 @@ SPACING = (1.0, 0.8, 1.5)
 # Turned about the third axis, and moved
 TURN = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
 AFFINE = np.eye(4)
-AFFINE[:3, :3], AFFINE[:3, 3] = TURN * SPACING, [-30.0, 12.0, 5.0]
+AFFINE[:3, :3] = TURN * SPACING
+AFFINE[:3, 3] = [-30.0, 12.0, 5.0]
 
 
 def world(affine: np.ndarray = AFFINE, shape: tuple[int, ...] = SHAPE) -> np.ndarray:

@@ -189,7 +189,8 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    index, mesh = tmp_path / "g.igps", root / "egg" / "1.off"
+    index = tmp_path / "g.igps"
+    mesh = root / "egg" / "1.off"
     Gallery.build(index, dataset, INTERIOR, n_workers=1)
     query = ["query", mesh, "--gallery", index, "--cache_dir", tmp_path / "cache"]
     for options, words in (
@@ -318,7 +319,8 @@ def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(
     cache = tmp_path / "cache"
     dataset = SignatureDataset(root, CONFIG, cache)
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
-    scan, access = os.scandir, os.access
+    scan = os.scandir
+    access = os.access
 
     def refused(path: str) -> Any:
         if Path(path).name == "egg":
@@ -381,7 +383,8 @@ def test_sync_notices_a_table_of_names_that_was_edited(
     """With its two names swapped the rows have the same names, and the bodies of each other."""
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
-    labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9] = 1, 2
+    labels[2:8, 3:12, 3:12] = 1
+    labels[11:22, 5:9, 5:9] = 2
     (tmp_path / "scans").mkdir()
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "scan.nii.gz")
     table = tmp_path / "names.json"
@@ -487,7 +490,9 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path: Path) -> 
     """When the file can be read again, bodies that it no longer holds are removed, and the others described again."""
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
-    labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9], labels[11:22, 11:15, 5:9] = 1, 2, 3
+    labels[2:8, 3:12, 3:12] = 1
+    labels[11:22, 5:9, 5:9] = 2
+    labels[11:22, 11:15, 5:9] = 3
     (tmp_path / "scans").mkdir()
     scan = tmp_path / "scans" / "scan.nii.gz"
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), scan)
@@ -524,7 +529,8 @@ def test_numbers_stay_as_they_are_written_in_a_column_of_text(root: Path, tmp_pa
 
 
 def test_what_labels_tell_no_more_sync_empties(root: Path, tmp_path: Path) -> None:
-    table, cache = root / "labels.csv", tmp_path / "cache"
+    table = root / "labels.csv"
+    cache = tmp_path / "cache"
     table.write_text("file,label,age,scanner\nball/0.off,ball,41,A\negg/0.off,egg,3,B\n")
     gallery, _ = Gallery.build(
         tmp_path / "g", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1
@@ -560,7 +566,8 @@ def test_a_gallery_remembers_the_table_of_names(
     """As how files are read; another one may be given, as where it was moved to."""
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
-    labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9] = 1, 2
+    labels[2:8, 3:12, 3:12] = 1
+    labels[11:22, 5:9, 5:9] = 2
     (tmp_path / "scans").mkdir()
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "scan.nii.gz")
     (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')

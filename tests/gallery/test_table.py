@@ -334,7 +334,8 @@ def _answers(path: Path) -> list[list[int]]:
 def test_several_processes_read_while_one_adds(tmp_path: Path) -> None:
     rows = units(1500)
     table = written(tmp_path / "g.igps", rows[:1300], "cosine")
-    opened, before = BodyTable(table.path), _answers(table.path)
+    opened = BodyTable(table.path)
+    before = _answers(table.path)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         futures = [pool.submit(_answers, table.path) for _ in range(6)]
         table.add(rows[1300:], [told(i) for i in range(1300, 1500)], {})
@@ -383,7 +384,8 @@ def killed_writers(folder: Path, n_kills: int, longest: float = 0.25) -> int:
     between these changes is whole.
     """
     written(folder, units(50, seed=1), "cosine", mark="still")
-    wrong, generator = 0, random.Random(0)
+    wrong = 0
+    generator = random.Random(0)
     words = _WRITER.format(tests=str(Path(__file__).parent), folder=str(folder))
     for _ in range(n_kills):
         both = [

@@ -76,8 +76,11 @@ def test_a_classifier_without_names_tells_numbers(dataset: igps.SignatureDataset
 def test_held_out_scores_are_of_what_was_held_out(dataset: igps.SignatureDataset) -> None:
     """Accuracy by hand, of a kernel head that is fitted without each fold in turn."""
     model = igps.fit(dataset, small_interior(), head="classifier")
-    cells, labels = histograms(dataset), dataset.labels
-    hits, sure, areas = [], [], []
+    cells = histograms(dataset)
+    labels = dataset.labels
+    hits = []
+    sure = []
+    areas = []
     for number, out in enumerate(folds(labels, 2)):  # of four bodies two
         head = ClassifierHead().fit(cells[~out], labels[~out])
         hits += (head.predict(cells[out]) == labels[out]).tolist()
@@ -114,10 +117,11 @@ def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(
     model = igps.fit(dataset, small_interior(), goal="new")
     assert set(model.card["held_out_scores"]) == {"nn", "ft", "dcg"}
     assert model.card["head"] in ("whitened", "as_is")
+    # Type: ignore[arg-type]
     said = {
         name: igps.fit(dataset, small_interior(), goal="new", head=name).card
         for name in ("whitened", "as_is")
-    }  # type: ignore[arg-type]
+    }
     best = max(card["held_out_scores"]["ft"] for card in said.values())
     assert said[model.card["head"]]["held_out_scores"]["ft"] == pytest.approx(best, abs=0.1)
     with pytest.raises(ValueError, match="model: expected a classifier, got interior"):

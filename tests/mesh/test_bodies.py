@@ -145,9 +145,10 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path: Pat
     bodies = load_bodies(tmp_path / "boxes.ply", PIECES)
     np.testing.assert_allclose([body.volume for body in bodies], [1, 27, 8], rtol=1e-6)
     assert all("left out 1 speck" in body.notes for body in bodies)
+    # Used by no face
     text = "".join(
         "v {} {} {}\n".format(*place) for place in [*whole.vertices.tolist(), [1e9, 0, 0]]
-    )  # used by no face
+    )
     text += "".join("f {} {} {}\n".format(*face) for face in (whole.faces + 1).tolist())
     (tmp_path / "boxes.obj").write_text(text)
     assert parts(tmp_path / "boxes.obj", PIECES) == ["piece 1", "piece 2", "piece 3"]
@@ -216,7 +217,9 @@ def test_solids_of_a_step_file_are_bodies_in_millimetres(
 def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path: Path) -> None:
     """Two boxes of voxels that touch, beside a label of seven voxels; the whole is both boxes."""
     labels = np.zeros((20, 20, 12), dtype=np.uint8)
-    labels[2:8, 2:14, 2:10], labels[8:14, 2:14, 2:10], labels[18, 18, 2:9] = 1, 5, 9
+    labels[2:8, 2:14, 2:10] = 1
+    labels[8:14, 2:14, 2:10] = 5
+    labels[18, 18, 2:9] = 9
     nibabel.save(
         nibabel.Nifti1Image(labels, np.diag([1.0, 1.0, 2.0, 1.0])), tmp_path / "organs.nii.gz"
     )

@@ -325,9 +325,8 @@ def test_the_largest_component_of_loose_triangles_is_what_they_make_together(
 ) -> None:
     small = trimesh.creation.box((1, 1, 1))
     large = trimesh.creation.box((1, 2, 3))
-    beside = trimesh.creation.box((1, 1, 1)).apply_translation(
-        [0, 1.5, 0]
-    )  # it touches the large one
+    # It touches the large one
+    beside = trimesh.creation.box((1, 1, 1)).apply_translation([0, 1.5, 0])
     vertices = np.concatenate([small.triangles + 9, large.triangles]).reshape(-1, 3)
     path = write_off(tmp_path / "loose.off", vertices, np.arange(len(vertices)).reshape(-1, 3))
     assert load_mesh(path, LoadOptions(component="largest")).volume == pytest.approx(6)

@@ -44,10 +44,11 @@ def test_parts_that_do_not_touch_or_are_open_are_left_to_the_grid():
 def with_wall():
     """A body of two boxes of one size, with the wall between them still there."""
     vertices, faces = box([0, 0, 0], [1, 1, 1])
+    # The same triangles on both sides of the wall
     mirrored = (
         vertices * [-1, 1, 1] + [2, 0, 0],
         faces[:, ::-1],
-    )  # the same triangles on both sides of the wall
+    )
     return together((vertices, faces), mirrored)
 
 

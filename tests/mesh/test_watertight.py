@@ -215,9 +215,8 @@ def test_parts_that_share_an_edge_are_one() -> None:
 
 def test_a_wall_inside_that_lies_on_points_of_the_grid_is_filled() -> None:
     left = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
-    right = left.copy().apply_translation(
-        [1, 0, 0]
-    )  # whose squares in the wall are cut along the other diagonal
+    # Whose squares in the wall are cut along the other diagonal
+    right = left.copy().apply_translation([1, 0, 0])
     mesh = watertight(*arrays(left, right))
     assert mesh.genus == 0
     assert mesh.area == pytest.approx(10, rel=0.03)

@@ -35,9 +35,10 @@ def test_nearest_directions_are_those_of_a_loop() -> None:
     mask = torch.ones(20, dtype=torch.bool)
     found = nearest_directions(points, targets, mask, n_nearest=3)
     for point, direction in zip(points, found, strict=True):
+        # Type: ignore[misc]
         nearest = sorted(targets, key=lambda target, point=point: float((target - point).norm()))[
             :3
-        ]  # type: ignore[misc]
+        ]
         torch.testing.assert_close(
             direction, normalize(torch.stack(nearest).mean(dim=0) - point, dim=0)
         )
@@ -51,7 +52,9 @@ def test_nearest_directions_are_those_of_a_loop() -> None:
 
 def test_an_embedding_is_computed_once() -> None:
     batch = two_bodies()
-    features, embedding, other = BatchFeatures(batch, training=False), Counting(), Counting()
+    features = BatchFeatures(batch, training=False)
+    embedding = Counting()
+    other = Counting()
     for _ in range(3):
         samples = features.of("interior", None, None)
         assert samples.embedded(embedding) is samples.embedded(embedding)
@@ -64,7 +67,8 @@ def test_an_embedding_is_computed_once() -> None:
 
 
 def test_positions_do_not_change_with_scale() -> None:
-    batch, large = two_bodies(), scaled(two_bodies(), 8.0)
+    batch = two_bodies()
+    large = scaled(two_bodies(), 8.0)
     expected = SampleFeatures(batch, "interior", batch.interior).positions()
     torch.testing.assert_close(
         SampleFeatures(large, "interior", large.interior).positions(), expected
@@ -75,7 +79,8 @@ def test_positions_do_not_change_with_scale() -> None:
 
 @pytest.mark.parametrize("kind", ["interior", "surface"])
 def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind: str) -> None:
-    batch, embedding = two_bodies(), SpectralEmbedding(n_eigenpairs=4)
+    batch = two_bodies()
+    embedding = SpectralEmbedding(n_eigenpairs=4)
     directions = SampleFeatures(batch, kind, getattr(batch, kind)).embedded_directions(embedding)  # type: ignore[arg-type]
     for i, n in enumerate(N_POINTS):
         inside, surface = (embedded(batch, i, where, 4) for where in ("interior", "surface"))
@@ -84,14 +89,16 @@ def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind: st
         expected = sign * normalize(other[nearest].mean(dim=1) - own, dim=1)
         np.testing.assert_allclose(directions[i, :n], expected, atol=1e-4)
         single = alone(batch, i)
+        # Type: ignore[arg-type]
         unpadded = SampleFeatures(single, kind, getattr(single, kind)).embedded_directions(
             embedding
-        )  # type: ignore[arg-type]
+        )
         torch.testing.assert_close(unpadded[0], directions[i, :n])
 
 
 def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding() -> None:
-    batch, embedding = two_bodies(), SpectralEmbedding(n_eigenpairs=4)
+    batch = two_bodies()
+    embedding = SpectralEmbedding(n_eigenpairs=4)
     samples = SampleFeatures(batch, "surface", batch.surface)
     found = samples.neighbours(embedding)
     assert samples.neighbours(embedding) is found
@@ -120,18 +127,20 @@ def test_subsets() -> None:
 def test_nearest_points_are_those_of_a_loop() -> None:
     points = torch.randn(30, 4, generator=torch.Generator().manual_seed(3))
     for i, found in enumerate(nearest_neighbours(points, 5).tolist()):
+        # Type: ignore[misc]
         others = sorted(
             (j for j in range(30) if j != i),
             key=lambda j, i=i: float((points[j] - points[i]).norm()),
-        )  # type: ignore[misc]
+        )
         assert found == others[:5]
     assert nearest_neighbours(points[:3], 5).shape == (3, 2)
     few = torch.arange(30) % 10 == 4
     for i, found in enumerate(nearest_neighbours(points, 5, few).tolist()):
+        # Type: ignore[misc]
         others = sorted(
             (j for j in (4, 14, 24) if j != i),
             key=lambda j, i=i: float((points[j] - points[i]).norm()),
-        )  # type: ignore[misc]
+        )
         assert found == [*others, *[i] * 5][:5]
     with pytest.raises(ValueError, match="samples: expected at least one of each body, got none"):
         nearest_neighbours(torch.zeros(0, 3), 4)

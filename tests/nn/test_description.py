@@ -102,7 +102,8 @@ def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(
     class Looking(torch.nn.Module):
         def __init__(self) -> None:
             super().__init__()
-            self.frozen, self.trained = torch.nn.Dropout().eval(), torch.nn.Dropout()
+            self.frozen = torch.nn.Dropout().eval()
+            self.trained = torch.nn.Dropout()
 
         def forward(self, batch: SignatureBatch) -> Tensor:
             modes.extend(one.training for one in self.modules())

@@ -166,7 +166,8 @@ def test_a_single_histogram_keeps_its_shape_and_a_list_of_one_is_flat(
     batch: SignatureBatch,
 ) -> None:
     histogram = PairHistogram()
-    single, listed = HistogramDescriptor(histogram)(batch), HistogramDescriptor([histogram])(batch)
+    single = HistogramDescriptor(histogram)(batch)
+    listed = HistogramDescriptor([histogram])(batch)
     assert torch.equal(single, histogram(batch))
     assert torch.equal(listed, single.flatten(1))
 
@@ -209,7 +210,8 @@ class Counting(SpectralEmbedding):
 
 
 def test_what_histograms_share_is_computed_once(batch: SignatureBatch) -> None:
-    embedding, other = Counting(n_eigenpairs=5), Counting(n_eigenpairs=5)
+    embedding = Counting(n_eigenpairs=5)
+    other = Counting(n_eigenpairs=5)
     first = PairHistogram([Potential(2), InteriorDistance(8)], embedding)
     second = PairHistogram([InteriorDistance(6), InteriorDistance(4, embedding=other)], embedding)
     third = PairHistogram([Potential(3), InteriorDistance(5, embedding=embedding)], other)
@@ -245,7 +247,8 @@ def test_subset_of_samples_is_the_same_in_any_batch(batch: SignatureBatch) -> No
 def test_training_draws_another_subset_each_time(batch: SignatureBatch) -> None:
     descriptor = HistogramDescriptor([small(5, 2, n_training_samples=5), small(5, 1)])
     torch.manual_seed(0)
-    one, other = descriptor(batch), descriptor(batch)
+    one = descriptor(batch)
+    other = descriptor(batch)
     first = descriptor.part_cells[0]
     assert not torch.equal(one[:, :first], other[:, :first])
     assert torch.equal(one[:, first:], other[:, first:])
@@ -299,7 +302,8 @@ class Extent(BodyDescriptor):
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
         assert body.mesh is body.surface_mesh
-        points, functions = body.interior.points, body.interior.eigenfunctions
+        points = body.interior.points
+        functions = body.interior.eigenfunctions
         return np.array([len(points), functions.shape[1], np.abs(points).max(), body.area])
 
 

@@ -29,9 +29,10 @@ def spectrum() -> tuple[Tensor, Tensor]:
 def embed(
     kind: str, time: float | None, functions: Tensor, values: Tensor, area: float = AREA
 ) -> Tensor:
+    # Type: ignore[arg-type]
     return spectral_embedding(
         functions, values, torch.tensor(area, dtype=torch.float64), kind=kind, time=time
-    )  # type: ignore[arg-type]
+    )
 
 
 def learned(kind: str, time: float | None) -> SpectralEmbedding:
@@ -90,7 +91,8 @@ def test_padding_has_no_weight(
     functions, values = spectrum
     module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
     padded_values = torch.full((2, 12), math.inf, dtype=torch.float64)
-    padded_values[0], padded_values[1, :5] = values, values[:5]
+    padded_values[0] = values
+    padded_values[1, :5] = values[:5]
     padded_functions = functions.repeat(2, 1, 1)
     padded_functions[1, :, 5:] = 0
     area = torch.tensor([AREA, 3.1], dtype=torch.float64)
@@ -157,7 +159,8 @@ def test_gradient_of_the_filter(spectrum: tuple[Tensor, Tensor]) -> None:
 
 
 def test_learned_filter_survives_its_state(spectrum: tuple[Tensor, Tensor]) -> None:
-    module, fresh = learned("biharmonic", None), SpectralEmbedding("biharmonic", n_knots=9)
+    module = learned("biharmonic", None)
+    fresh = SpectralEmbedding("biharmonic", n_knots=9)
     fresh.load_state_dict(module.state_dict())
     area = torch.tensor(AREA)
     assert torch.equal(fresh(*spectrum, area), module(*spectrum, area))

@@ -24,7 +24,8 @@ def learnable() -> HistogramDescriptor:
 
 def trained(model: nn.Module) -> float:
     """The loss after some steps over that before."""
-    batch, labels = two_bodies(), torch.tensor([0, 1])
+    batch = two_bodies()
+    labels = torch.tensor([0, 1])
     optimizer = torch.optim.Adam(model.parameters(), lr=0.02)
     losses = []
     for _ in range(25):
@@ -58,7 +59,8 @@ def test_one_call_builds_a_classifier() -> None:
 
 
 def test_a_classifier_is_as_precise_as_its_layers() -> None:
-    model, batch = Classifier(learnable(), 2).eval(), two_bodies()
+    model = Classifier(learnable(), 2).eval()
+    batch = two_bodies()
     expected = model(batch).double()
     double = copy.deepcopy(model).double()(batch.to(torch.float64))
     assert double.dtype == torch.float64

@@ -81,7 +81,8 @@ def test_names_of_axes_and_what_was_fitted_are_kept() -> None:
     own = igps.HistogramDescriptor(
         [PairHistogram(["potential", "interior_distance"]), [PairHistogram([axis, PairTwist()])]]
     )
-    own.scale, own.card = 0.3, {"author": "me"}
+    own.scale = 0.3
+    own.card = {"author": "me"}
     learned = igps.descriptor(own, learnable=True)
     torch.testing.assert_close(learned(two_bodies()).detach(), own(two_bodies()))
     assert (learned.scale, learned.card) == (0.3, {"author": "me"})

@@ -131,13 +131,15 @@ def test_training_moves_bins_filter_and_head_and_is_reproducible(
 
 
 def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes: Path, tmp_path: Path) -> None:
-    module, model = data(shapes), learner()
+    module = data(shapes)
+    model = learner()
     run = trainer(1, tmp_path)
     run.limit_val_batches = 0
     # Saved at the end of an epoch that is not validated, and before the end of the fit.
+    # Type: ignore[attr-defined]
     run.callbacks.append(
         ModelCheckpoint(tmp_path, filename="last", every_n_epochs=1, save_on_train_epoch_end=True)
-    )  # type: ignore[attr-defined]
+    )
     run.fit(model, module)
     state = torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]
     fresh = learner()
@@ -254,7 +256,8 @@ def test_any_loader_of_labelled_batches_trains(
 def test_saving_a_checkpoint_changes_nothing(
     items: list[LabelledSignature], tmp_path: Path, make: type[torch.nn.Module]
 ) -> None:
-    model, run = learner(make()), trainer(1, tmp_path)
+    model = learner(make())
+    run = trainer(1, tmp_path)
     seen: list[bool] = []
 
     class Save(Callback):
@@ -263,7 +266,8 @@ def test_saving_a_checkpoint_changes_nothing(
         def on_train_batch_end(
             self, trainer: Trainer, module: RetrievalLearner, *_: object
         ) -> None:  # type: ignore[override]
-            before, modes = state_of(module), [one.training for one in module.modules()]
+            before = state_of(module)
+            modes = [one.training for one in module.modules()]
             generator = torch.get_rng_state()
             trainer.save_checkpoint(tmp_path / "now.ckpt")
             assert_same(state_of(module), before)
@@ -314,7 +318,8 @@ def test_a_precision_that_would_write_into_batches_is_refused_with_the_remedy(
 def test_a_checkpoint_that_names_a_foreign_class_is_refused(
     items: list[LabelledSignature], tmp_path: Path
 ) -> None:
-    model, run = learner(), trainer(1, tmp_path)
+    model = learner()
+    run = trainer(1, tmp_path)
     run.fit(model, loader(items))
     run.save_checkpoint(tmp_path / "own.ckpt")
     made = {"descriptor": bins(), "distance": BlendedDistance(ProjectionHead(width=8, n_hidden=16))}

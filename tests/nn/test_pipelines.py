@@ -80,7 +80,8 @@ def test_what_is_compiled_does_not_grow_with_the_samples(
 ) -> None:
     """Thousands of samples are counted in many blocks: unrolled they would take minutes to compile."""
     monkeypatch.setattr(count_by_torch, "_BLOCK", 1)
-    batch, nodes = two_bodies(), []
+    batch = two_bodies()
+    nodes = []
     twice = {
         kind: getattr(batch, kind).map(lambda one: torch.cat([one, one], dim=1))
         for kind in ("interior", "surface")
@@ -100,7 +101,9 @@ def test_what_is_compiled_does_not_grow_with_the_samples(
 @pytest.mark.parametrize("name", ["hard", "learned", "in space"])
 def test_a_compiled_program_serves_any_number_of_bodies(name: str) -> None:
     """With fullgraph=True PyTorch compiles eight times and then raises."""
-    descriptor, batch, programs = HistogramDescriptor(MODULES[name]()).eval(), two_bodies(), []
+    descriptor = HistogramDescriptor(MODULES[name]()).eval()
+    batch = two_bodies()
+    programs = []
 
     def backend(program: torch.fx.GraphModule, _: object) -> Callable[..., object]:
         programs.append(program)
@@ -133,7 +136,8 @@ def test_a_description_of_a_padded_batch_is_exported() -> None:
 def test_an_exported_program_takes_any_number_of_bodies_and_samples(
     module: DescriptionPart,
 ) -> None:
-    descriptor, batch = HistogramDescriptor(module).eval(), two_bodies()
+    descriptor = HistogramDescriptor(module).eval()
+    batch = two_bodies()
     fewer = {
         kind: getattr(batch, kind).map(lambda one: one[:, :30]) for kind in ("interior", "surface")
     }
@@ -187,7 +191,8 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
     module: DescriptionPart,
 ) -> None:
     """Finite differences at the largest entry; the gradient at padding is 0, also at its infinite eigenvalues."""
-    batch, module = two_bodies().to(torch.float64), module.double()
+    batch = two_bodies().to(torch.float64)
+    module = module.double()
     interior, surface = (
         one.points.clone().requires_grad_() for one in (batch.interior, batch.surface)
     )
@@ -220,7 +225,8 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
             else leaf.isinf()
         )
         assert not gradient[padding].any()
-        entry, moved = int(gradient.abs().argmax()), []
+        entry = int(gradient.abs().argmax())
+        moved = []
         with torch.no_grad():
             for step in (1e-6, -2e-6):
                 leaf.view(-1)[entry] += step
@@ -239,7 +245,8 @@ def test_padding_leaves_second_derivatives_as_they_are(module: DescriptionPart) 
         pytest.skip(
             "first derivatives only: between points of many coordinates PyTorch has no others"
         )
-    batch, module = two_bodies().to(torch.float64), module.double()
+    batch = two_bodies().to(torch.float64)
+    module = module.double()
     upstream = torch.randn(
         module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
     )
@@ -275,7 +282,8 @@ def test_a_state_is_read_back_to_the_last_key(module: DescriptionPart) -> None:
 def test_functions_stand_beside_the_modules() -> None:
     """The mathematics of a module from its parts: the paper's histogram of a body."""
     batch = two_bodies()
-    real, known = batch.interior.mask[1], torch.isfinite(batch.eigenvalues[1])
+    real = batch.interior.mask[1]
+    known = torch.isfinite(batch.eigenvalues[1])
     embedding = functional.spectral_embedding(
         batch.interior.eigenfunctions[1, real][:, known], batch.eigenvalues[1, known], batch.area[1]
     )

@@ -39,7 +39,8 @@ def test_a_folder_to_share_has_the_model_and_its_card(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By the names that hubs of models expect; a folder that is called as a descriptor of the library hides none."""
-    descriptor, batch = learnable(), two_bodies()
+    descriptor = learnable()
+    batch = two_bodies()
     monkeypatch.chdir(tmp_path)
     for folder in ("shared", "rich"):
         descriptor.save(folder, {"author": "me", "classes": ["cat", "dog"]})
@@ -95,7 +96,8 @@ def test_every_descriptor_of_the_library_comes_back(name: str, tmp_path: Path) -
 
 
 def test_trained_parameters_and_what_is_shared_come_back(tmp_path: Path) -> None:
-    descriptor, batch = learnable(), two_bodies()
+    descriptor = learnable()
+    batch = two_bodies()
     with torch.no_grad():
         for parameter in descriptor.parameters():
             parameter += 0.1 * torch.randn(
@@ -249,7 +251,8 @@ def test_a_head_whose_sizes_do_not_fit_is_refused(
 def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.safetensors"
     learnable().save(path)
-    content, state = path.read_bytes(), load_file(path)
+    content = path.read_bytes()
+    state = load_file(path)
     for wrong in (
         b"",
         b"nothing",

@@ -41,7 +41,8 @@ def test_the_worst_are_those_of_a_loop(n: int, n_classes: int, spread: float) ->
 
 def test_a_wrong_nearest_comes_before_a_right_one() -> None:
     """By hand: on a line, b is far from its class; the a's are wrong only where b takes a place in their first tier."""
-    names, labels = ("a0", "a1", "a2", "b0", "b1"), ("a", "a", "a", "b", "b")
+    names = ("a0", "a1", "a2", "b0", "b1")
+    labels = ("a", "a", "a", "b", "b")
     places = np.array([0.0, 1.0, 5.0, 2.5, 9.0])
     found = worst_of(np.abs(places[:, None] - places[None]).astype(np.float32), labels, names)
     # b0 finds a1, a0 and a2 (2.5 both, in this order), then b1; b1 finds a2 (4), then b0; a2 finds b0, then a1.

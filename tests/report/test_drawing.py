@@ -56,7 +56,8 @@ def test_ranked_results_show_each_class_with_hits_and_misses(
 def test_turned_body_is_drawn_alike() -> None:
     body = trimesh.creation.cone(radius=0.4, height=2.0, sections=24)
     turned = body.vertices @ trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3].T
-    straight, back = drawing.front_view(body.vertices), drawing.front_view(turned)
+    straight = drawing.front_view(body.vertices)
+    back = drawing.front_view(turned)
     np.testing.assert_allclose(np.ptp(back, axis=0)[1], np.ptp(straight, axis=0)[1], rtol=1e-6)
     for view in (straight, back):
         tip = view[np.argmax(np.linalg.norm(view - view.mean(axis=0), axis=1))]

@@ -84,7 +84,8 @@ def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:
     data = data_of(read_results(retrieval_folder(tmp_path)), {})
     assert data["classes"] == sorted(set(LABELS))
     (system,) = data["systems"]
-    distances, n = distances_of(0), len(NAMES)
+    distances = distances_of(0)
+    n = len(NAMES)
     assert system["shapes"] == list(range(n))
     assert system["top"] == n - 1
     ranked = np.frombuffer(base64.b64decode(system["ranked"]), "<u4").reshape(n, n - 1)
@@ -102,7 +103,8 @@ def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:
     assert nearest.sum() == n
     scores = retrieval_scores(torch.from_numpy(distances), LABELS)
     assert system["scores"] == pytest.approx(scores.mean(), abs=1e-5)
-    alone, egg = data["classes"].index("alone"), data["classes"].index("egg")
+    alone = data["classes"].index("alone")
+    egg = data["classes"].index("egg")
     assert system["per_class"][alone] is None
     assert system["per_class"][egg]["ft"] == pytest.approx(
         scores.per_class()["egg"]["ft"], abs=1e-5

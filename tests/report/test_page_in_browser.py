@@ -74,7 +74,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     body = trimesh.creation.icosphere(subdivisions=3)
     body.vertices *= [1.0, 0.6 + 0.3 * (body.vertices[:, 2] > 0).mean(), 2.2]
     mesh: Mesh = as_mesh(body)
-    root, pictures = tmp_path_factory.mktemp("pages"), surfaces(mesh)
+    root = tmp_path_factory.mktemp("pages")
+    pictures = surfaces(mesh)
     made = {
         "retrieve": retrieval_folder(root / "retrieve"),
         "compare": comparison_folder(root / "compare"),
@@ -235,7 +236,9 @@ def test_a_brush_selects_what_lies_in_it(answers: Visit) -> None:
     places = places_on_the_map(answers)
     order = places[:, 0].argsort()
     middle = (places[order[2], 0] + places[order[3], 0]) / 2
-    mouse, low, high = answers.page.mouse, places.min(axis=0) - 6, places.max(axis=0) + 6
+    mouse = answers.page.mouse
+    low = places.min(axis=0) - 6
+    high = places.max(axis=0) + 6
     mouse.move(*low)
     mouse.down()
     mouse.move(middle, high[1], steps=4)
@@ -256,7 +259,8 @@ def test_a_brush_selects_what_lies_in_it(answers: Visit) -> None:
 
 
 def test_the_map_is_walked_through_by_the_keyboard(answers: Visit) -> None:
-    page, places = answers.page, places_on_the_map(answers)
+    page = answers.page
+    places = places_on_the_map(answers)
     assert page.locator('[data-point][tabindex="0"]').count() == 1
     page.locator('[data-point="0"]').focus()
     assert NAMES[0] in page.locator("#map-tip").inner_text()
@@ -293,9 +297,11 @@ def test_the_map_is_walked_through_by_the_keyboard(answers: Visit) -> None:
 
 
 def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answers: Visit) -> None:
-    page, distances = answers.page, np.asarray(distances_of(0), dtype=float)
+    page = answers.page
+    distances = np.asarray(distances_of(0), dtype=float)
     distances = (distances + distances.T) / 2
-    groups, expected = {frozenset([i]) for i in range(len(NAMES))}, []
+    groups = {frozenset([i]) for i in range(len(NAMES))}
+    expected = []
     while len(groups) > 1:  # by hand: the two groups that are nearest in the mean
         apart = {
             pair: distances[np.ix_(*map(sorted, pair))].mean()
@@ -481,7 +487,8 @@ def test_pictures_are_drawn(retrieval: Visit) -> None:
 
 
 def test_a_click_shows_the_ranking(retrieval: Visit) -> None:
-    query, distances = 3, distances_of(0)
+    query = 3
+    distances = distances_of(0)
     dialog = retrieval.open(query)
     order = sorted((j for j in range(len(NAMES)) if j != query), key=lambda j: distances[query, j])
     cards = dialog.locator("#ranking-list .shape")
@@ -543,13 +550,15 @@ def test_search_and_filter(retrieval: Visit) -> None:
 
 
 def test_a_body_turns(retrieval: Visit) -> None:
-    dialog, page = retrieval.open(0), retrieval.page
+    dialog = retrieval.open(0)
+    page = retrieval.page
     canvas = dialog.locator("#turntable")
     canvas.wait_for()
     before = canvas.screenshot()
     box = canvas.bounding_box()
     assert box is not None
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    x = box["x"] + box["width"] / 2
+    y = box["y"] + box["height"] / 2
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x + 120, y + 40, steps=4)
@@ -620,7 +629,8 @@ def test_a_link_leads_to_a_shape(browser: Any, folder: Path) -> None:
 def test_another_descriptor_ranks_otherwise(browser: Any, folder: Path) -> None:
     with Visit(browser, folder / "compare.html") as visit:
         page = visit.page
-        query, found = 0, {}
+        query = 0
+        found = {}
         for seed, name in enumerate(DESCRIPTORS):
             page.locator("#system").select_option(str(seed))
             assert name in page.locator("#confusion-heading").inner_text()

@@ -51,7 +51,8 @@ def test_the_potential_is_that_of_the_nearest_samples() -> None:
     mesh = as_mesh(egg())
     signature = compute_signature(mesh, CONFIG)
     one = surface_of(mesh, signature, 1000)
-    heights, potential = one.vertices[:, 1] / 65535 - 0.5, one.potential / 255
+    heights = one.vertices[:, 1] / 65535 - 0.5
+    potential = one.potential / 255
     assert potential[np.abs(heights) > 0.45].min() > 0.7
     assert potential[np.abs(heights) < 0.1].max() < 0.3
     assert potential.min() == 0

@@ -54,7 +54,8 @@ def test_agrees_with_another_library(
     n_gallery: int,
     cells: tuple[int, ...],
 ) -> None:
-    queries, gallery = histograms(n_queries, cells, seed=1), histograms(n_gallery, cells, seed=2)
+    queries = histograms(n_queries, cells, seed=1)
+    gallery = histograms(n_gallery, cells, seed=2)
     expected = ORACLES[distance](queries.flatten(1).numpy(), gallery.flatten(1).numpy())
     result = distance(queries.to(dtype), gallery.to(dtype))
     assert result.shape == (n_queries, n_gallery)
@@ -96,7 +97,8 @@ def test_near_vectors_keep_their_cosine_distance() -> None:
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
 def test_cosine_ignores_length_even_at_the_ends_of_the_dtype(scale: float) -> None:
-    a, b = torch.tensor([[1.0, 1.0]]), torch.tensor([[1.0, 0.0]])
+    a = torch.tensor([[1.0, 1.0]])
+    b = torch.tensor([[1.0, 0.0]])
     assert cosine(scale * a, scale * b).item() == pytest.approx(1 - 0.5**0.5, rel=1e-6)
 
 
@@ -107,7 +109,8 @@ def test_threads_change_no_bit(
 ) -> None:
     monkeypatch.setattr(threads, "n_cores", lambda: 8)
     monkeypatch.setattr(distances, "_TRIPLES_PER_THREAD", 0)
-    queries, gallery = histograms(n_queries, (40,), seed=21), histograms(n_gallery, (40,), seed=22)
+    queries = histograms(n_queries, (40,), seed=21)
+    gallery = histograms(n_gallery, (40,), seed=22)
     found = []
     for n_threads in (1, 2, 3):
         with torch_threads(n_threads):
@@ -135,14 +138,16 @@ def test_half_precision_is_computed_in_float32() -> None:
 
 @pytest.mark.usefixtures("either_device")
 def test_cells_that_are_multiplied_in_both_weigh_so_much_in_chi_square() -> None:
-    queries, gallery = histograms(4, (3, 8), seed=5), histograms(6, (3, 8), seed=6)
+    queries = histograms(4, (3, 8), seed=5)
+    gallery = histograms(6, (3, 8), seed=6)
     for shape in [(3, 8), (3, 1), (8,), ()]:
         weights = 2 * torch.rand(
             shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64
         )
         expected = np.zeros((4, 6))
         for q, g, i, j in np.ndindex(4, 6, 3, 8):
-            a, b = float(queries[q, i, j]), float(gallery[g, i, j])
+            a = float(queries[q, i, j])
+            b = float(gallery[g, i, j])
             if a + b > 0:
                 expected[q, g] += (
                     0.5 * float(weights.broadcast_to(3, 8)[i, j]) * (a - b) ** 2 / (a + b)
@@ -154,11 +159,10 @@ def test_cells_that_are_multiplied_in_both_weigh_so_much_in_chi_square() -> None
 
 @pytest.mark.parametrize("distance", ALL)
 def test_gradients_agree_with_finite_differences(distance: Distance) -> None:
-    queries, gallery = (
-        histograms(3, (2, 5), seed=8, filled=2),
-        histograms(4, (2, 5), seed=9, filled=2),
-    )
-    queries, gallery = (10 * queries + 0.1).requires_grad_(), (10 * gallery + 0.1).requires_grad_()
+    queries = histograms(3, (2, 5), seed=8, filled=2)
+    gallery = histograms(4, (2, 5), seed=9, filled=2)
+    queries = (10 * queries + 0.1).requires_grad_()
+    gallery = (10 * gallery + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(distance, (queries, gallery))
 
 
@@ -183,10 +187,8 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(
 ) -> None:
     both = [histograms(3, (40,), seed=25), histograms(2, (40,), seed=26)]
     both[1][1] = both[0][2]  # at distance zero
-    along, upstream = (
-        histograms(len(both[side]), (40,), seed=29, filled=2),
-        histograms(3, (2,), seed=30, filled=2),
-    )
+    along = histograms(len(both[side]), (40,), seed=29, filled=2)
+    upstream = histograms(3, (2,), seed=30, filled=2)
     leaf = both[side].requires_grad_()
     expected = (torch.autograd.grad((distance(*both) * upstream).sum(), leaf)[0] * along).sum()
 
@@ -211,10 +213,8 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(
 def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_differences(
     distance: Distance,
 ) -> None:
-    queries, gallery = (
-        histograms(3, (20,), seed=31, filled=2),
-        histograms(4, (20,), seed=32, filled=2),
-    )
+    queries = histograms(3, (20,), seed=31, filled=2)
+    gallery = histograms(4, (20,), seed=32, filled=2)
     along = histograms(3, (20,), seed=33, filled=2)
     gradient = torch.func.grad(lambda rows: distance(rows, gallery).square().sum())
     found = torch.func.jvp(gradient, (queries,), (along,))[1]
@@ -223,14 +223,13 @@ def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_diffe
 
 
 def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula() -> None:
-    queries, gallery = (
-        histograms(40, (9000,), seed=10, filled=2),
-        histograms(30, (9000,), seed=11, filled=2),
-    )
+    queries = histograms(40, (9000,), seed=10, filled=2)
+    gallery = histograms(30, (9000,), seed=11, filled=2)
     upstream = torch.rand(40, 30, generator=torch.Generator().manual_seed(13), dtype=torch.float64)
     arguments = [tensor.requires_grad_() for tensor in (queries, gallery)]
     gradients = torch.autograd.grad((chi_square(*arguments) * upstream).sum(), arguments)
-    a, b = queries[:, None], gallery[None]
+    a = queries[:, None]
+    b = gallery[None]
     plain = ((a - b) ** 2 / (a + b)).sum(-1) / 2
     for ours, expected in zip(
         gradients, torch.autograd.grad((plain * upstream).sum(), arguments), strict=True
@@ -239,10 +238,8 @@ def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_form
 
 
 def test_chi_square_has_second_derivatives_and_none_at_empty_cells() -> None:
-    queries, gallery = (
-        histograms(3, (6,), seed=27, filled=2),
-        histograms(4, (6,), seed=28, filled=2),
-    )
+    queries = histograms(3, (6,), seed=27, filled=2)
+    gallery = histograms(4, (6,), seed=28, filled=2)
     leaves = [one.requires_grad_() for one in (queries, gallery)]
     assert torch.autograd.gradgradcheck(chi_square, leaves)
     empty = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
@@ -290,7 +287,8 @@ def test_an_empty_set_of_queries_gives_an_empty_matrix(distance: Distance) -> No
 
 @pytest.mark.parametrize("distance", ALL)
 def test_inputs_are_left_as_they_were(distance: Distance) -> None:
-    queries, gallery = histograms(5, (6,), seed=19), histograms(4, (6,), seed=20)
+    queries = histograms(5, (6,), seed=19)
+    gallery = histograms(4, (6,), seed=20)
     before = queries.clone(), gallery.clone()
     distance(queries, gallery)
     assert torch.equal(queries, before[0])

@@ -129,7 +129,8 @@ def test_classes_that_scatter_are_found_better() -> None:
 
 
 def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points: Tensor) -> None:
-    queries, gallery = points[:3], points[3:]
+    queries = points[:3]
+    gallery = points[3:]
     whole = search(queries, gallery, top=len(gallery), distance=euclidean)
     found = rerank_candidates(queries, whole, lambda indices: gallery[indices], euclidean, top=5)
     for i, query in enumerate(queries):
@@ -148,7 +149,8 @@ def test_a_query_is_put_in_order_by_its_nearest_alone() -> None:
     scattered = torch.randn(12, 1, 20, generator=generator) + torch.randn(
         12, 20, 20, generator=generator
     )
-    points, queries = scattered.flatten(0, 1), torch.arange(0, 240, 7)
+    points = scattered.flatten(0, 1)
+    queries = torch.arange(0, 240, 7)
     precision = []
     for n_near in (20, 60, 100, 240):
         near = search(points[queries], points, top=n_near, distance=euclidean)

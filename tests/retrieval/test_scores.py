@@ -56,7 +56,8 @@ def scores_by_loops(relevant: list[bool]) -> dict[str, float]:
         gain += discount * rel
         ideal += discount * (k <= n_relevant)
     seen = min(32, len(relevant))
-    precision, recall = hits(seen) / seen, hits(seen) / n_relevant
+    precision = hits(seen) / seen
+    recall = hits(seen) / n_relevant
     with_self = [True, *relevant]
     return {
         "nn": float(relevant[0]),
@@ -98,7 +99,8 @@ def test_hand_worked_leave_one_out_ranking() -> None:
 
 
 def test_distances_may_be_an_array_as_a_file_gives_them() -> None:
-    labels, distances = ["a", "a", "a", "a", "b", "b", "b"], line_distances([1, 4, 2, 5, 6, 3], 7)
+    labels = ["a", "a", "a", "a", "b", "b", "b"]
+    distances = line_distances([1, 4, 2, 5, 6, 3], 7)
     assert (
         retrieval_scores(distances.numpy(), labels).mean()
         == retrieval_scores(distances, labels).mean()
@@ -110,8 +112,10 @@ def test_distances_may_be_an_array_as_a_file_gives_them() -> None:
 
 
 def test_another_default_device_changes_no_score() -> None:
-    labels, distances = ["a", "a", "a", "a", "b", "b", "b"], line_distances([1, 4, 2, 5, 6, 3], 7)
-    expected, curve = retrieval_scores(distances, labels), precision_recall_curve(distances, labels)
+    labels = ["a", "a", "a", "a", "b", "b", "b"]
+    distances = line_distances([1, 4, 2, 5, 6, 3], 7)
+    expected = retrieval_scores(distances, labels)
+    curve = precision_recall_curve(distances, labels)
     with torch.device("meta"):  # whose tensors have no numbers to go on with
         found = retrieval_scores(distances, labels)
         assert found.mean() == expected.mean()
@@ -188,9 +192,8 @@ def test_the_query_is_removed_by_its_index_whatever_its_distance() -> None:
 
 def test_ties_break_by_index() -> None:
     labels = [0, 1, 0, 1]
-    scores = retrieval_scores(
-        torch.zeros(4, 4), labels
-    )  # every query ranks the others 0, 1, 2, 3 without itself
+    # Every query ranks the others 0, 1, 2, 3 without itself
+    scores = retrieval_scores(torch.zeros(4, 4), labels)
     assert scores.nn.tolist() == [0.0, 0.0, 1.0, 0.0]
     assert scores.map.tolist() == pytest.approx([1 / 2, 1 / 3, 1.0, 1 / 2])
 
@@ -325,7 +328,9 @@ def test_precision_recall_curve_agrees_with_loops() -> None:
         best = []
         for query in range(40):
             relevant = ranked_relevance(distances, labels.tolist(), query)
-            n_relevant, hits, candidates = sum(relevant), 0, []
+            n_relevant = sum(relevant)
+            hits = 0
+            candidates = []
             for k, rel in enumerate(relevant, start=1):
                 hits += rel
                 if Fraction(hits, n_relevant) >= Fraction(level).limit_denominator(100) and hits:
@@ -372,7 +377,8 @@ def test_metric_starts_afresh_after_reset() -> None:
 
 
 def test_metric_compares_by_chi_square_unless_told() -> None:
-    shapes, labels = torch.tensor([[0.4, 0.0], [0.0, 0.0], [0.2, 0.2]]), torch.tensor([0, 0, 1])
+    shapes = torch.tensor([[0.4, 0.0], [0.0, 0.0], [0.2, 0.2]])
+    labels = torch.tensor([0, 0, 1])
     metric = RetrievalScoresMetric()
     metric.update(shapes, labels)
     expected = retrieval_scores(chi_square(shapes, shapes), labels).mean()
@@ -435,7 +441,8 @@ def test_metric_counts_a_shape_once_over_processes(with_ids: bool, tmp_path: Pat
 
 def test_metric_drops_repetitions_of_one_process() -> None:
     descriptors, labels = seven_shapes()
-    once, twice = RetrievalScoresMetric(euclidean), RetrievalScoresMetric(euclidean)
+    once = RetrievalScoresMetric(euclidean)
+    twice = RetrievalScoresMetric(euclidean)
     once.update(descriptors, labels)
     ids = [str(i) for i in range(7)]
     twice.update(descriptors, labels, ids)

@@ -26,7 +26,8 @@ def test_features_order_as_chi_square_does() -> None:
     rows = histograms(120, 500)
     vectors = VectorMap.fit(rows, "chi_square")(rows)
     assert vectors.shape[1] <= 256
-    a, b = rows[:, None].astype(float), rows[None].astype(float)
+    a = rows[:, None].astype(float)
+    b = rows[None].astype(float)
     expected = ((a - b) ** 2 / np.maximum(a + b, 1e-300)).sum(axis=2) / 2
     apart = ~np.eye(120, dtype=bool)
     found = cdist(vectors, vectors)[apart] ** 2 / 2

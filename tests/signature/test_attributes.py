@@ -62,7 +62,8 @@ def test_potential_in_a_charged_ball_is_constant(sphere: Mesh) -> None:
 
 def test_potential_in_a_box_is_the_surface_integral(box: Mesh) -> None:
     point = np.array([0.1, -0.3, 0.6])
-    size, total = np.array([1.0, 2.0, 3.0]), 0.0
+    size = np.array([1.0, 2.0, 3.0])
+    total = 0.0
     for axis in range(3):
         u, v = (i for i in range(3) if i != axis)
         for side in (-0.5, 0.5):
@@ -94,7 +95,8 @@ def test_potential_does_not_depend_on_the_triangles(n_subdivisions: int) -> None
     cylinder = trimesh.creation.cylinder(0.2, 4, sections=300)
     for _ in range(n_subdivisions):
         cylinder = cylinder.subdivide()
-    side, caps = 2 * np.pi * 0.2 * 2 * np.arcsinh(2 / 0.2), 2 * 2 * np.pi * (np.hypot(0.2, 2) - 2)
+    side = 2 * np.pi * 0.2 * 2 * np.arcsinh(2 / 0.2)
+    caps = 2 * 2 * np.pi * (np.hypot(0.2, 2) - 2)
     expected = (side + caps) / np.sqrt(2 * np.pi * 0.2 * (4 + 0.2))
     value = electrostatic_potential(Mesh(cylinder.vertices, cylinder.faces), np.zeros((1, 3)))
     np.testing.assert_allclose(value, expected, rtol=1e-4)

@@ -104,7 +104,8 @@ def test_surface_points_are_interpolated_also_where_most_of_the_surface_is_far()
     vertices, faces = bumpy_sphere(4)
     functions = smooth_functions(vertices)
     rng = np.random.default_rng(5)
-    chosen, barycentric = rng.integers(len(faces), size=60), rng.dirichlet(np.ones(3), size=60)
+    chosen = rng.integers(len(faces), size=60)
+    barycentric = rng.dirichlet(np.ones(3), size=60)
     points = np.einsum("pi,pix->px", barycentric, vertices[faces[chosen]])
     expected = np.einsum("pi,pik->pk", barycentric, functions[faces[chosen]])
     result = extend(vertices, faces, functions, points, accuracy=1e-2, dtype=np.float64)
@@ -115,7 +116,8 @@ def test_surface_points_are_interpolated_also_where_most_of_the_surface_is_far()
 @pytest.mark.parametrize("accuracy", [7e-3, 1e-3])
 def test_small_clusters_keep_the_accuracy(accuracy: float) -> None:
     mesh = torus(80, 30)
-    points, functions = interior_points(mesh, 250), smooth_functions(mesh[0])
+    points = interior_points(mesh, 250)
+    functions = smooth_functions(mesh[0])
     exact, near = (
         pdist(extend(*mesh, functions, points, accuracy=each)) for each in (None, accuracy)
     )
@@ -124,10 +126,10 @@ def test_small_clusters_keep_the_accuracy(accuracy: float) -> None:
 
 def test_clusters_turn_with_the_mesh() -> None:
     vertices, faces = bumpy_sphere(4)
-    vertices = vertices + 1e-3 * np.random.default_rng(0).normal(
-        size=vertices.shape
-    )  # no mirror symmetry, no ties
-    points, functions = interior_points((vertices, faces), 400), smooth_functions(vertices)
+    # No mirror symmetry, no ties
+    vertices = vertices + 1e-3 * np.random.default_rng(0).normal(size=vertices.shape)
+    points = interior_points((vertices, faces), 400)
+    functions = smooth_functions(vertices)
     rotation = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix().T
     exact, still, turned = (
         extend(
@@ -202,7 +204,8 @@ def test_near_pairs_equal_all_distances_and_have_no_series() -> None:
     surface, vertices = scaled_surface(bumpy_sphere(3))
     x = np.ascontiguousarray(interior_points(bumpy_sphere(3), 50).T) / 2
     for chosen in (np.arange(642), np.arange(17, 600, 3)):
-        weights, near = np.empty((len(chosen), 50)), np.empty((len(chosen) + 1, 50), bool)
+        weights = np.empty((len(chosen), 50))
+        near = np.empty((len(chosen) + 1, 50), bool)
         fill_hats(x, chosen, surface.hats, 1.5, weights, near)
         ratios = cdist(surface.hats[chosen, :3], x.T) / surface.hats[chosen, 3:4]
         np.testing.assert_array_equal(near[:-1], ratios < 1.5)
@@ -279,7 +282,8 @@ def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(
 ) -> None:
     """Error constants that are too small stand for such a mesh; the sampled error must trigger a second evaluation."""
     mesh = bumpy_sphere(5)
-    points, functions = interior_points(mesh, 250), smooth_functions(mesh[0])
+    points = interior_points(mesh, 250)
+    functions = smooth_functions(mesh[0])
     exact = extend(*mesh, functions, points)
     caplog.set_level(logging.INFO, logger=coordinates.logger.name)
 
@@ -303,7 +307,8 @@ def test_where_no_approximation_serves_the_closed_form_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     mesh = bumpy_sphere(5)
-    points, functions = interior_points(mesh, 60), smooth_functions(mesh[0])
+    points = interior_points(mesh, 60)
+    functions = smooth_functions(mesh[0])
     settings = []
 
     def never(*_: object) -> float:
@@ -318,7 +323,8 @@ def test_where_no_approximation_serves_the_closed_form_does(
 
 def test_the_sampled_error_is_that_of_the_distances() -> None:
     mesh = bumpy_sphere(4)
-    points, functions = interior_points(mesh, 100), smooth_functions(mesh[0])
+    points = interior_points(mesh, 100)
+    functions = smooth_functions(mesh[0])
     extension = Extension(*mesh, functions, dtype=np.float64)
     x = coordinates._scaled(*mesh, points)[2] @ extension._surface.axes
     exact = extend(*mesh, functions, points)

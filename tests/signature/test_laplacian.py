@@ -75,7 +75,8 @@ def test_obtuse_triangle_shares_by_hand() -> None:
 
 
 def _angle(corners: np.ndarray, i: int) -> float:
-    a, b = corners[(i + 1) % 3] - corners[i], corners[(i + 2) % 3] - corners[i]
+    a = corners[(i + 1) % 3] - corners[i]
+    b = corners[(i + 2) % 3] - corners[i]
     return float(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
 
 

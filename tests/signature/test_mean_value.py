@@ -37,7 +37,8 @@ def published_loop(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) -
     units = (vertices - point) / distances[:, None]
     weights = np.zeros(len(vertices))
     for face in faces:
-        u, d = units[face], distances[face]
+        u = units[face]
+        d = distances[face]
         lengths = [np.linalg.norm(u[(i + 1) % 3] - u[(i + 2) % 3]) for i in range(3)]
         theta = [2 * math.asin(min(1.0, length / 2)) for length in lengths]
         h = sum(theta) / 2
@@ -59,7 +60,8 @@ def published_loop(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) -
         if min(abs(value) for value in s) <= eps:  # in the plane of the face, outside it
             continue
         for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
+            j = (i + 1) % 3
+            k = (i + 2) % 3
             weights[face[i]] += (theta[i] - c[j] * theta[k] - c[k] * theta[j]) / (
                 d[i] * math.sin(theta[j]) * s[k]
             )
@@ -137,7 +139,8 @@ def test_points_in_the_planes_of_faces_are_exact(subdivisions: int, offset: floa
         np.meshgrid(*[[-2.0, -1.0 + offset, -0.51, 0.0, 1.0 + offset, 1.53]] * 3), -1
     ).reshape(-1, 3)
     turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix().T
-    vertices, points = box.vertices @ turn, grid @ turn
+    vertices = box.vertices @ turn
+    points = grid @ turn
     weights = mean_value_coordinates(vertices, box.faces, points)
     np.testing.assert_allclose(weights @ vertices, points, atol=1e-7)
     np.testing.assert_allclose(
@@ -231,7 +234,8 @@ def test_angles_over_lengths_are_those_of_numpy() -> None:
         [angle, np.pi - angle, [0.0, np.pi / 8, np.pi / 4, np.pi / 2, 3 * np.pi / 4]]
     )
     length = 10.0 ** generator.uniform(-9, 9, len(angle))
-    y, x = length * np.sin(angle), length * np.cos(angle)
+    y = length * np.sin(angle)
+    x = length * np.cos(angle)
     found = y**2
     loops.divide_angles(found, x)
     y = np.maximum(y, 1e-150)
@@ -264,14 +268,16 @@ def test_the_cheapest_precision_that_keeps_the_accuracy_is_taken(
 
 
 def test_no_points_give_no_rows() -> None:
-    mesh, none = cube(), np.zeros((0, 3))
+    mesh = cube()
+    none = np.zeros((0, 3))
     assert mean_value_coordinates(*mesh, none).shape == (0, 8)
     assert extend(*mesh, np.ones((8, 3)), none, accuracy=1e-3).shape == (0, 3)
 
 
 def test_read_only_and_single_precision_input_is_accepted_and_kept() -> None:
     vertices, faces = cube()
-    points, functions = np.array([[0.1, 0.2, 0.3]]), np.ones((8, 2), np.float32)
+    points = np.array([[0.1, 0.2, 0.3]])
+    functions = np.ones((8, 2), np.float32)
     arrays = vertices.astype(np.float32), faces.astype(np.int32), functions, points
     for array in arrays:
         array.setflags(write=False)
@@ -324,10 +330,8 @@ def test_invalid_arguments_are_named(change: dict[str, object], message: str) ->
 def test_functions_are_divided_on_the_way(accuracy: float | None) -> None:
     mesh = bumpy_sphere(3)
     generator = np.random.default_rng(5)
-    functions, points = (
-        generator.standard_normal((len(mesh[0]), 4)),
-        generator.uniform(-0.4, 0.4, (30, 3)),
-    )
+    functions = generator.standard_normal((len(mesh[0]), 4))
+    points = generator.uniform(-0.4, 0.4, (30, 3))
     divisors = np.array([0.5, 1.0, 3.0, 7.0])
     result = extend(*mesh, functions, points, divisors=divisors, accuracy=accuracy)
     assert np.array_equal(result, extend(*mesh, functions / divisors, points, accuracy=accuracy))
@@ -348,7 +352,8 @@ def test_weights_without_a_sum_raise() -> None:
 
 def test_coarse_meshes_are_evaluated_more_accurately(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = bumpy_sphere(3)
-    points, functions = interior_points(mesh, 100), smooth_functions(mesh[0])
+    points = interior_points(mesh, 100)
+    functions = smooth_functions(mesh[0])
     exact = extend(*mesh, functions, points)
 
     def error(few_vertices: int) -> float:

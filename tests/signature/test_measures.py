@@ -54,7 +54,9 @@ def of_ball(r: float) -> dict[str, float]:
 def of_ellipsoid(a: float, b: float, c: float) -> dict[str, float]:
     """The area and the integral of the mean curvature by sums over a fine grid of the parameters."""
     u, v = np.meshgrid(np.linspace(0, np.pi, 2001), np.linspace(0, 2 * np.pi, 2001), indexing="ij")
-    x, y, z = np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)
+    x = np.sin(u) * np.cos(v)
+    y = np.sin(u) * np.sin(v)
+    z = np.cos(u)
     element = np.sin(u) * np.sqrt((b * c * x) ** 2 + (a * c * y) ** 2 + (a * b * z) ** 2)
     squares = (x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2
     position = (a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2

@@ -60,9 +60,10 @@ def test_places_go_with_the_points_and_leave_signs_and_bases_alone() -> None:
     turned = functions.copy()
     turned[:, 7:10] = functions[:, 7:10] @ turn
     np.testing.assert_allclose(ordering_keys(turned, eigenvalues, 1.0), expected, rtol=1e-12)
+    # Three times as large
     np.testing.assert_allclose(
         ordering_keys(functions / 3, eigenvalues / 9, 9.0), expected, rtol=1e-12
-    )  # three times as large
+    )
 
 
 def test_points_of_one_potential_have_different_places() -> None:
@@ -218,7 +219,8 @@ def test_the_order_of_form_keeps_the_surface(blob: Mesh) -> None:
 def test_the_order_of_form_does_not_depend_on_place_and_scale(blob: Mesh) -> None:
     turn = Rotation.from_rotvec([0.3, 1.1, -0.7]).as_matrix()
     moved = replace(blob, vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2])
-    expected, found = in_canonical_order(blob), in_canonical_order(moved)
+    expected = in_canonical_order(blob)
+    found = in_canonical_order(moved)
     np.testing.assert_array_equal(found.faces, expected.faces)
     np.testing.assert_allclose(
         found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12

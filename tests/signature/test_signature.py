@@ -25,9 +25,10 @@ CONFIG = SignatureConfig(
 
 
 def histogram(signature: Signature, samples: str = "interior") -> np.ndarray:
+    # Type: ignore[arg-type]
     return PairHistogram([Potential(4), InteriorDistance(64)], samples=samples)(
         collate([signature])
-    )[0].numpy()  # type: ignore[arg-type]
+    )[0].numpy()
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +37,8 @@ def signature(blob: Mesh) -> Signature:
 
 
 def test_another_default_device_changes_nothing(signature: Signature) -> None:
-    mesh = as_mesh(
-        trimesh.creation.icosphere(subdivisions=4)
-    )  # eigenpairs by the solver for large meshes
+    # Eigenpairs by the solver for large meshes
+    mesh = as_mesh(trimesh.creation.icosphere(subdivisions=4))
     expected = compute_signature(mesh, CONFIG)
     with torch.device("meta"):  # whose tensors have no numbers to go on with
         found = compute_signature(mesh, CONFIG)
@@ -164,7 +164,8 @@ def test_surface_values_are_interpolated_linearly(blob: Mesh, signature: Signatu
 
 def test_simplified_mesh_gives_a_near_descriptor(sphere: Mesh) -> None:
     config = replace(CONFIG, max_vertices=700)
-    small, full = compute_signature(sphere, config), compute_signature(sphere, CONFIG)
+    small = compute_signature(sphere, config)
+    full = compute_signature(sphere, CONFIG)
     assert any("simplified" in note for note in small.notes)
     assert small.eigenvalues[0] == pytest.approx(full.eigenvalues[0], rel=0.02)
 
@@ -233,7 +234,8 @@ def test_a_trimesh_has_the_signature_of_its_mesh(blob: Mesh, signature: Signatur
 
 def test_attributes_are_added_to_samples_and_nothing_else_changes(signature: Signature) -> None:
     samples = signature.interior
-    height, away = samples.points[:, 2], samples.points - samples.points.mean(axis=0)
+    height = samples.points[:, 2]
+    away = samples.points - samples.points.mean(axis=0)
     more = samples.with_attributes({"height": height, "away": away}).with_attributes(
         {"height": 2 * height}
     )
@@ -288,7 +290,8 @@ def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs:
     """Samples, their order and the eigenvalues; the eigenfunctions but for the sign, which a single one has free."""
     exact = replace(CONFIG, n_eigenpairs=n_eigenpairs)
     more = replace(exact, n_eigenpairs=250)
-    alone, whole = compute_signature(blob, exact), compute_signature(blob, more)
+    alone = compute_signature(blob, exact)
+    whole = compute_signature(blob, more)
     found = whole.truncated(exact)
     assert found.config == exact
     assert (found.area, found.volume, found.notes) == (alone.area, alone.volume, alone.notes)
@@ -348,6 +351,7 @@ def test_real_model(homer: Mesh) -> None:
     exact = compute_signature(homer, replace(SignatureConfig.paper(), accuracy=None))
     np.testing.assert_allclose(histogram(signature), histogram(exact), atol=2e-4)
     # The barycentroid of a standing figure lies in its trunk: between a third and two thirds of its height.
-    low, high = homer.vertices.min(axis=0), homer.vertices.max(axis=0)
+    low = homer.vertices.min(axis=0)
+    high = homer.vertices.max(axis=0)
     height = int(np.argmax(high - low))
     assert 1 / 3 < (signature.barycentroid[height] - low[height]) / (high - low)[height] < 2 / 3

@@ -20,9 +20,8 @@ def by_quadrature(triangle: np.ndarray, point: np.ndarray) -> float:
     total = 0.0
     for p, q in ((a, b), (b, c), (c, a)):
         along = (q - p) / np.linalg.norm(q - p)
-        distance = np.cross(along, normal) @ (
-            p - foot
-        )  # of the side's line from the foot, positive inside
+        # Of the side's line from the foot, positive inside
+        distance = np.cross(along, normal) @ (p - foot)
         if abs(distance) < 1e-14:
             continue
         angles = [np.arctan2((end - foot) @ along, abs(distance)) for end in (p, q)]
@@ -81,13 +80,10 @@ def test_quadrature_itself_is_that_of_a_double_integral() -> None:
 
 
 def test_square_from_its_centre_side_and_corner() -> None:
-    square, faces = (
-        np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float),
-        np.array([[0, 1, 2], [0, 2, 3]]),
-    )
-    points = np.array(
-        [[0.5, 0.5, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]]
-    )  # on the diagonal, and at its ends or not
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    # On the diagonal, and at its ends or not
+    points = np.array([[0.5, 0.5, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])
     expected = np.log(1 + np.sqrt(2)) * np.array([4, 2, 2, 2])
     np.testing.assert_allclose(surface_potential(square, faces, points), expected, rtol=1e-12)
     # A side's middle sees two rectangles of 1 × ½.

@@ -15,10 +15,13 @@ def cotangent_problem(mesh: trimesh.Trimesh) -> Problem:
     n_vertices = len(mesh.vertices)
     stiffness = sparse.csr_array((n_vertices, n_vertices))
     for corner in range(3):
-        one, two = (corner + 1) % 3, (corner + 2) % 3
-        a, b = corners[:, one] - corners[:, corner], corners[:, two] - corners[:, corner]
+        one = (corner + 1) % 3
+        two = (corner + 2) % 3
+        a = corners[:, one] - corners[:, corner]
+        b = corners[:, two] - corners[:, corner]
         weight = 0.5 * (a * b).sum(1) / np.linalg.norm(np.cross(a, b), axis=1)
-        i, j = mesh.faces[:, one], mesh.faces[:, two]
+        i = mesh.faces[:, one]
+        j = mesh.faces[:, two]
         entries = np.r_[weight, weight, -weight, -weight], (np.r_[i, j, i, j], np.r_[i, j, j, i])
         stiffness = stiffness + sparse.csr_array(
             sparse.coo_array(entries, shape=(n_vertices, n_vertices))

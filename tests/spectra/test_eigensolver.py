@@ -41,7 +41,8 @@ def torus_oracle(torus_problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 def assert_pairs(spectrum: Spectrum, problem: Problem, tolerance: float = 1e-7) -> None:
     stiffness, mass, _ = problem
-    values, functions = spectrum.eigenvalues, spectrum.eigenfunctions
+    values = spectrum.eigenvalues
+    functions = spectrum.eigenfunctions
     assert np.all(np.diff(values) >= 0)
     residual = stiffness @ functions - mass[:, None] * functions * values
     assert (
@@ -94,7 +95,8 @@ def copies_of_a_patch(n_copies: int, side: int) -> Problem:
     copies = sparse.coo_array(sparse.kron(sparse.eye_array(n_copies), grid))
     tips = 1 + side**2 * np.arange(n_copies)
     hub = np.zeros_like(tips)
-    rows, columns = np.r_[copies.coords[0] + 1, hub, tips], np.r_[copies.coords[1] + 1, tips, hub]
+    rows = np.r_[copies.coords[0] + 1, hub, tips]
+    columns = np.r_[copies.coords[1] + 1, tips, hub]
     n_vertices = 1 + n_copies * side**2
     adjacency = sparse.csr_array(
         (np.ones(len(rows)), (rows, columns)), shape=(n_vertices, n_vertices)
@@ -378,10 +380,8 @@ def test_wrong_pairs_are_not_returned(
     torus_problem: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stiffness, mass, _ = torus_problem
-    values, vectors = (
-        np.arange(1.0, 11),
-        np.linalg.qr(np.random.default_rng(0).normal(size=(len(mass), 10)))[0],
-    )
+    values = np.arange(1.0, 11)
+    vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(len(mass), 10)))[0]
     monkeypatch.setattr(eigensolver, "lanczos", lambda *arguments: (values, vectors))
     monkeypatch.setattr(eigensolver, "_arpack", lambda *arguments: (values, vectors))
     monkeypatch.setattr(eigensolver, "_prove_complete", lambda *arguments: None)
@@ -395,7 +395,8 @@ def test_wrong_pairs_are_not_returned(
 def test_the_residual_is_that_of_the_worst_pair(n_eigenpairs: int, torus_problem: Problem) -> None:
     stiffness, mass, positions = torus_problem
     spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions, tolerance=1e-4)
-    values, functions = spectrum.eigenvalues, spectrum.eigenfunctions
+    values = spectrum.eigenvalues
+    functions = spectrum.eigenfunctions
     defect = stiffness @ functions - mass[:, None] * functions * values
     expected = np.linalg.norm(defect / np.sqrt(mass)[:, None], axis=0) / values
     assert spectrum.residual == pytest.approx(expected.max(), rel=1e-2, abs=1e-12)
@@ -418,13 +419,13 @@ def test_mass_may_be_a_diagonal_matrix(
 def test_takes_the_matrices_of_other_libraries() -> None:
     """LaPy's and libigl's, as they give them; LaPy solves with them as the oracle."""
     mesh = torus(32, 16)
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    vertices = np.array(mesh.vertices)
+    faces = np.array(mesh.faces)
     solver = lapy.Solver(lapy.TriaMesh(vertices, faces), lump=True, use_cholmod=False)
     values = solver.eigs(25)[0][1:]
     of_lapy = eigenpairs(solver.stiffness, solver.mass, 24)
-    np.testing.assert_allclose(
-        of_lapy.eigenvalues, values, rtol=1e-5
-    )  # LaPy computes in single precision
+    # LaPy computes in single precision
+    np.testing.assert_allclose(of_lapy.eigenvalues, values, rtol=1e-5)
     of_igl = eigenpairs(-igl.cotmatrix(vertices, faces), igl.massmatrix(vertices, faces, 0), 24)
     np.testing.assert_allclose(of_igl.eigenvalues, values, rtol=1e-5)
 

@@ -73,7 +73,8 @@ def backward_error(
 
 def eliminations(factors: Factors) -> list[np.ndarray]:
     """E of every node that has one."""
-    structure, found = factors.tree.structure, []
+    structure = factors.tree.structure
+    found = []
     starts = structure.block_start
     for node, n_own in enumerate(np.diff(structure.own_start)):
         block = factors.blocks[starts[node] : starts[node + 1]]

@@ -40,10 +40,8 @@ def smallest_cut(graph: np.ndarray, places: np.ndarray, part: np.ndarray) -> int
 @pytest.mark.parametrize("n", [1, 2, 17, 300, 0])
 def test_every_separator_is_the_smallest_and_separates(n: int, leaf_size: int) -> None:
     if n:
-        graph, places = (
-            random_graph(n, seed=n),
-            np.random.default_rng(n).integers(0, 9, (n, 2)).astype(float),
-        )
+        graph = random_graph(n, seed=n)
+        places = np.random.default_rng(n).integers(0, 9, (n, 2)).astype(float)
     else:
         graph, places = mesh_graph()
     node, n_levels = ordering.nested_dissection(graph, places, leaf_size)

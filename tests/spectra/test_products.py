@@ -33,7 +33,9 @@ def test_a_product_in_tiles(shape: tuple[int, int, int], transposed: bool, keep:
     """Between other numbers, which stay as they are."""
     m, n, k = shape
     rng = np.random.default_rng(0)
-    a, x, source = rng.normal(size=(k, m)), rng.normal(size=(k, n + 2)), rng.normal(size=(m, n + 1))
+    a = rng.normal(size=(k, m))
+    x = rng.normal(size=(k, n + 2))
+    source = rng.normal(size=(m, n + 1))
     before = rng.normal(size=(m + 2, n + 5))
     out = before.copy()
     laid_out = np.ascontiguousarray(a.T) if transposed else a
@@ -54,7 +56,9 @@ def test_a_product_in_tiles(shape: tuple[int, int, int], transposed: bool, keep:
 
 def test_a_product_of_whole_tiles_may_be_added_in_place() -> None:
     rng = np.random.default_rng(0)
-    a, x, out = rng.normal(size=(5, 9)), rng.normal(size=(5, 24)), rng.normal(size=(9, 24))
+    a = rng.normal(size=(5, 9))
+    x = rng.normal(size=(5, 24))
+    out = rng.normal(size=(9, 24))
     expected = out + a.T @ x
     whole = out.ravel(), 0, 24
     product((9, 24, 5), 1.0, (a.ravel(), 0, 9, 1), (x.ravel(), 0, 24), True, whole, whole)
@@ -71,7 +75,8 @@ def rows(n: int, seed: int) -> np.ndarray:
 def test_overlaps_are_the_products_of_the_rows(
     n_rows: tuple[int, int], piece: tuple[int, int]
 ) -> None:
-    a, b = rows(n_rows[0], seed=0), rows(n_rows[1], seed=1)
+    a = rows(n_rows[0], seed=0)
+    b = rows(n_rows[1], seed=1)
     columns = slice(*piece)
     found = overlaps(torch.from_numpy(a), torch.from_numpy(b), columns)
     np.testing.assert_allclose(found.numpy(), a[:, columns] @ b[:, columns].T, rtol=0, atol=1e-11)
@@ -83,10 +88,12 @@ def test_overlaps_are_the_products_of_the_rows(
 def test_subtract_takes_the_product_from_a_piece(
     n_rows: tuple[int, int], piece: tuple[int, int], precision: type, error: float
 ) -> None:
-    before, others = rows(n_rows[0], seed=0), rows(n_rows[1], seed=1).astype(precision)
+    before = rows(n_rows[0], seed=0)
+    others = rows(n_rows[1], seed=1).astype(precision)
     factors = np.random.default_rng(2).standard_normal(n_rows).astype(precision)
     found = before.copy()
-    expected, columns = before.copy(), slice(*piece)
+    expected = before.copy()
+    columns = slice(*piece)
     subtract(torch.from_numpy(found), torch.from_numpy(factors), torch.from_numpy(others), columns)
     expected[:, columns] -= factors.astype(np.float64) @ others[:, columns].astype(np.float64)
     np.testing.assert_allclose(found, expected, rtol=0, atol=error * np.abs(expected).max())
@@ -99,8 +106,11 @@ def test_subtract_takes_the_product_from_a_piece(
 def test_subtraction_by_single_precision_factors_keeps_double_rows() -> None:
     """A component of 1e-9 is removed from unit rows down to 1e-15, although the factors are rounded to single."""
     basis = np.linalg.qr(rows(20, seed=3).T)[0].T.copy()
-    old, new = basis[:16], basis[16:] + 1e-9 * basis[:4]
-    everywhere, of_new, of_old = slice(0, N_COLUMNS), torch.from_numpy(new), torch.from_numpy(old)
+    old = basis[:16]
+    new = basis[16:] + 1e-9 * basis[:4]
+    everywhere = slice(0, N_COLUMNS)
+    of_new = torch.from_numpy(new)
+    of_old = torch.from_numpy(old)
     lost = overlaps(of_new, of_old, everywhere)
     subtract(of_new, lost.float(), of_old.float(), everywhere)
     assert float(lost.abs().max()) > 0.9e-9

@@ -65,9 +65,8 @@ def test_hole_is_one_patch_of_the_wanted_area(sphere: Mesh) -> None:
 
 def test_hole_does_not_cut_the_body_in_two() -> None:
     mesh = horseshoe()
-    whole = [
-        hole(mesh, 0.3, seed=seed) for seed in range(8)
-    ]  # a Mesh of two pieces would have been refused
+    # A Mesh of two pieces would have been refused
+    whole = [hole(mesh, 0.3, seed=seed) for seed in range(8)]
     lost = np.array([1 - holed.area / mesh.area for holed in whole])
     assert (lost > 0).all()
     assert (lost <= 0.3).all()
@@ -82,9 +81,8 @@ def test_clip_takes_a_cap_off_a_ball(sphere: Mesh) -> None:
     assert sphere.volume - cut.volume == pytest.approx(
         np.pi * height**2 * (3 - height) / 3, rel=0.02
     )
-    lost_area = 2 * np.pi * height - np.pi * height * (
-        2 - height
-    )  # a spherical cap, closed by a disc
+    # A spherical cap, closed by a disc
+    lost_area = 2 * np.pi * height - np.pi * height * (2 - height)
     assert sphere.area - cut.area == pytest.approx(lost_area, rel=0.05)
     # All that remains is where it was.
     np.testing.assert_allclose(

@@ -56,9 +56,8 @@ def test_poses_of_individuals_are_bodies_that_names_tell_apart(shapes: GradedSha
         f"{name}/00/{one:02d}" for name in shapes.class_names for one in range(N_INDIVIDUALS)
     ]
     assert len({body_of(name) for name in shapes.names}) == 2
-    more = GradedShapes(3, 2, 3, seed=3, n_vertices=(1500, 1800), n_individuals=5)[
-        7
-    ]  # whatever else there is
+    # Whatever else there is
+    more = GradedShapes(3, 2, 3, seed=3, n_vertices=(1500, 1800), n_individuals=5)[7]
     assert (more.name, made.name) == (shapes.names[5], shapes.names[11])
     assert np.array_equal(shapes[5].vertices, more.vertices)
 

@@ -24,7 +24,8 @@ def test_points_of_a_moved_body_are_moved_back() -> None:
 
 def test_values_of_all_bodies_have_the_same_histogram() -> None:
     random = np.random.default_rng(0)
-    first, second = random.normal(size=300), random.gamma(1.0, size=300) * 1000
+    first = random.normal(size=300)
+    second = random.gamma(1.0, size=300) * 1000
     values = equal_histogram(first)
     np.testing.assert_allclose(np.sort(values), np.sort(equal_histogram(second)))
     np.testing.assert_array_equal(values.argsort(), first.argsort())

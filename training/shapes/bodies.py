@@ -73,9 +73,8 @@ class Body:
     genus: int  # number of handles of the surface
     motion: Motion
     warp: Callable[[Floats], Floats]  # deformation of the surface at rest
-    relief: tuple[
-        float, float, int
-    ]  # amplitude and wavelength of bumps, and the seed of their positions
+    # Amplitude and wavelength of bumps, and the seed of their positions
+    relief: tuple[float, float, int]
 
     @property
     def placed(self) -> list[Placed]:

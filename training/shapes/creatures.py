@@ -113,11 +113,12 @@ def beast(g: np.random.Generator, pairs: int, stance: str, head: str, tail: str)
 def chain(g: np.random.Generator, n: int, link: str, end: str) -> Skeleton:
     """Build a row of `n` links with joints between them."""
     radius = g.uniform(0.22, 0.3)
+    # Their edges must not meet when the chain bends
     is_stiff = link in (
         "boxes",
         "plates",
         "tubes",
-    )  # their edges must not meet when the chain bends
+    )
     gap = g.uniform(0.08, 0.2) + {"boxes": 0.12, "plates": 0.16, "tubes": 0.14}.get(link, 0.0)
     bow = g.uniform(-8.0, 8.0) if is_stiff else g.uniform(-16.0, 16.0)
     side = g.uniform(0.0, 0.25)

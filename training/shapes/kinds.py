@@ -50,9 +50,8 @@ LOOK_ALIKE_FAMILIES = {
 class Kind(NamedTuple):
     """A family of classes with the same builder."""
 
-    build: Callable[
-        ..., Skeleton
-    ]  # builder, called with a random generator and the choices of a structure
+    # Builder, called with a random generator and the choices of a structure
+    build: Callable[..., Skeleton]
     structures: Sequence[tuple[Any, ...]]  # valid combinations of structural choices
     loose: int | None  # position of the choice that varies within a class; None if there is none
     motion: Callable[[tuple[Any, ...]], Motion]  # motion of the bodies of a structure

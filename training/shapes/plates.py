@@ -21,9 +21,8 @@ Hole = tuple[float, float, float]
 class Plate(Solid):
     """A plate in the x-y plane, its outline a union of bars and discs, with round holes."""
 
-    bars: tuple[
-        Bar, ...
-    ]  # coordinates (x, y) and (x, y) of the ends, and half widths there; a disc has length 0
+    # Coordinates (x, y) and (x, y) of the ends, and half widths there; a disc has length 0
+    bars: tuple[Bar, ...]
     holes: tuple[Hole, ...]  # coordinates (x, y), and radius
     thick: float  # thickness
     loops: int = 0  # number of handles that bars form; holes are counted separately

@@ -130,7 +130,8 @@ def bind(vertices: Floats, faces: Integers, rig: Rig, placed: Sequence[Placed]) 
         if not len(own):
             continue
         arc_lengths = projected(rod, vertices[own])
-        values[own, number], values[own, n_rods + number] = 1.0, arc_lengths
+        values[own, number] = 1.0
+        values[own, n_rods + number] = arc_lengths
         width[own] = np.interp(arc_lengths, rod.arc_lengths, rod.radii)
     diffused = _diffused(vertices, faces, values, _DIFFUSION_WIDTH * width)
     weights = np.maximum(diffused[:, :n_rods], 0.0)

@@ -25,9 +25,8 @@ from igps.retrieval.scores import SCORE_NAMES, RetrievalScores, retrieval_scores
 logger = logging.getLogger(__name__)
 
 _Description = tuple[Singles, float]  # a description (1, ...), and the seconds that it took
-_BLOCK_ENTRIES = (
-    2**26
-)  # queries × bodies × entries of a description, which some descriptors hold in memory at once
+# Queries × bodies × entries of a description, which some descriptors hold in memory at once
+_BLOCK_ENTRIES = 2**26
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,17 +34,14 @@ class Result:
     """Results of one descriptor on a collection."""
 
     descriptor: Descriptor
-    names: tuple[
-        str, ...
-    ]  # the N meshes that the descriptor could describe, in the order of the collection
+    # The N meshes that the descriptor could describe, in the order of the collection
+    names: tuple[str, ...]
     labels: tuple[str, ...]  # classes of these meshes
     distances: Tensor | None  # (N, N), rows are queries; None if they could not be computed
-    scores: (
-        RetrievalScores | None
-    )  # leave-one-out; None without distances, or if no two meshes share a class
-    seconds_per_mesh: (
-        float | None
-    )  # mean processor time without that of the signature; None if N is 0
+    # Leave-one-out; None without distances, or if no two meshes share a class
+    scores: RetrievalScores | None
+    # Mean processor time without that of the signature; None if N is 0
+    seconds_per_mesh: float | None
     failures: tuple[Failure, ...]  # meshes that the descriptor could not describe
     error: str | None  # reason for missing scores
 
@@ -94,11 +90,11 @@ def compare(
             "dataset: expected meshes with classes, got none. Give labels, or a folder per class."
         )
     check_descriptors(descriptors, dataset)
-    n, cpu = len(dataset), torch.device("cpu")
+    n = len(dataset)
+    cpu = torch.device("cpu")
     jobs = [(descriptor, dataset.subset([i]), cpu) for descriptor in descriptors for i in range(n)]
-    pending: dict[
-        int, _Description | Failure
-    ] = {}  # outcomes of descriptors that are not complete, by job
+    # Outcomes of descriptors that are not complete, by job
+    pending: dict[int, _Description | Failure] = {}
     n_done = 0
     with (
         tqdm(total=len(jobs), desc="descriptions", disable=not progress) as bar,
@@ -164,7 +160,8 @@ def pair_distances(
     descriptor: Descriptor, descriptions: Tensor, *, progress: bool = False
 ) -> Tensor:
     """Return the distances (N, N) of descriptions (N, ...), computed in blocks of queries to limit memory."""
-    n_queries, blocks = max(1, _BLOCK_ENTRIES // max(1, descriptions.numel())), []
+    n_queries = max(1, _BLOCK_ENTRIES // max(1, descriptions.numel()))
+    blocks = []
     bar = tqdm(
         total=len(descriptions), desc=f"distances by {descriptor.name}", disable=not progress
     )

@@ -46,9 +46,8 @@ class Finding:
     fault: str | None = None  # why the surface in the file does not bound a body; None if it does
     steps: tuple[Step, ...] = ()  # steps that mend it
     notes: tuple[str, ...] = ()  # the same steps as sentences
-    n_vertices: int | None = (
-        None  # of the surface in the file, or made from it; None if it cannot be read
-    )
+    # Of the surface in the file, or made from it; None if it cannot be read
+    n_vertices: int | None = None
     n_vertices_after: int | None = None  # of the mended body; None if it cannot be used
     seconds: float | None = None  # expected processor time from file to signature
     memory: float | None = None  # expected peak memory, bytes

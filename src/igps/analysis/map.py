@@ -15,9 +15,8 @@ from igps._parameters import check_one_of
 Layout = Literal["mds", "umap"]
 
 _MAX_ITERATIONS = 300  # of SMACOF
-_MAX_ENTRIES = (
-    10**9
-)  # of the distance matrix times the iterations of SMACOF, which then take seconds
+# Of the distance matrix times the iterations of SMACOF, which then take seconds
+_MAX_ENTRIES = 10**9
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +82,8 @@ def body_map(distances: Floats, layout: Layout = "mds", *, seed: int = 0) -> Bod
 
 
 def _classical_mds(distances: Floats) -> Floats:
-    squares, n = distances**2, len(distances)
+    squares = distances**2
+    n = len(distances)
     means = squares.mean(axis=0)
     products = (means[:, None] + means - means.mean() - squares) / 2
     # ARPACK restarts from a random vector if the matrix has low rank or is zero
@@ -119,7 +119,8 @@ def _umap(distances: Floats, seed: int) -> Floats:
 
 
 def _stress(distances: Floats, points: Floats) -> float:
-    expected, mapped = squareform(distances, checks=False), pdist(points)
+    expected = squareform(distances, checks=False)
+    mapped = pdist(points)
     if not expected.any():
         return 0.0
     mapped = mapped * ((expected @ mapped) / max(float(mapped @ mapped), 1e-300))

@@ -82,12 +82,10 @@ class Outlier:
     body: int  # index of the body
     label: str  # class of the body
     score: float  # root of the sum of squares of the positive `scores`
-    scores: Mapping[
-        str, float
-    ]  # robust standard deviations from the other bodies of the class, by measure
-    nearer_class: (
-        str | None
-    )  # another class whose members are nearer than those of the own class, if any
+    # Robust standard deviations from the other bodies of the class, by measure
+    scores: Mapping[str, float]
+    # Another class whose members are nearer than those of the own class, if any
+    nearer_class: str | None
     reason: str  # explanation as text
 
     @property
@@ -220,9 +218,11 @@ def flat_share(mesh: Mesh) -> float:
     # A large flat side has many faces, so a regular subset of about 200 faces contains some of them
     for normal in normals[:: max(1, len(normals) // 200)]:
         is_parallel = normals @ normal > 0.99
-        heights, weights = centres[is_parallel] @ normal, areas[is_parallel]
+        heights = centres[is_parallel] @ normal
+        weights = areas[is_parallel]
         order = np.argsort(heights)
-        heights, sums = heights[order], np.append(0, np.cumsum(weights[order]))
+        heights = heights[order]
+        sums = np.append(0, np.cumsum(weights[order]))
         largest = max(
             largest,
             float((sums[np.searchsorted(heights, heights + thickness, "right")] - sums[:-1]).max()),
@@ -253,19 +253,19 @@ def _measure(
     values["volume"] = np.log(mesh.volume * length**3)
     if raw.voxels is None:
         values["spacing"] = np.log(mesh.area * length**2 / len(mesh.faces)) / 2
-        values["handles"], values["flat"] = mesh.genus, flat_share(mesh)
+        values["handles"] = mesh.genus
+        values["flat"] = flat_share(mesh)
         return list(values.values()), None
     voxels = raw.voxels()
-    mask, low, grid = voxels.mask, voxels.low, voxels.grid
+    mask = voxels.mask
+    low = voxels.low
+    grid = voxels.grid
     sides = np.linalg.norm(voxels.affine[:3, :3], axis=0)
-    values["spacing"] = (
-        np.log(sides.prod()) / 3
-    )  # faces do not tell: the surface of a label adapts them to the shape
-    values["stray"], values["cavity"], values["hole"] = (
-        stray_root(mask),
-        cavity_root(mask),
-        hole_root(mask),
-    )
+    # Faces do not tell: the surface of a label adapts them to the shape
+    values["spacing"] = np.log(sides.prod()) / 3
+    values["stray"] = stray_root(mask)
+    values["cavity"] = cavity_root(mask)
+    values["hole"] = hole_root(mask)
     values["gap"] = gap_root(mask, sides)
     values["cut"] = cut_end(mask, np.stack([low == 0, low + mask.shape == grid], axis=1))
     key = body.path.parent, grid, voxels.affine.tobytes()
@@ -274,8 +274,11 @@ def _measure(
 
 def _class_distances(distances: Floats, codes: Integers) -> tuple[Floats, Floats, Integers]:
     """Return the log mean distances to the nearest bodies of the own and of the nearest other class; and that class."""
-    n, n_classes = len(codes), int(codes.max()) + 1
-    own, other, nearest = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=np.int64)
+    n = len(codes)
+    n_classes = int(codes.max()) + 1
+    own = np.full(n, np.nan)
+    other = np.full(n, np.nan)
+    nearest = np.zeros(n, dtype=np.int64)
     members = [np.flatnonzero(codes == code) for code in range(n_classes)]
     for i, own_code in enumerate(codes):
         k = min(_N_NEIGHBOURS, max(1, len(members[own_code]) - 1))
@@ -313,7 +316,9 @@ def _deviations(
     if this is above 1. The level of the quantile is 95 %, or lower if one subject has more than a twentieth of the
     bodies, so that the bodies of a single subject do not determine it.
     """
-    n, min_scatter, is_known = len(values), _MIN_SCATTER[name], np.isfinite(values)
+    n = len(values)
+    min_scatter = _MIN_SCATTER[name]
+    is_known = np.isfinite(values)
     members = [np.setdiff1d(np.flatnonzero(is_known & (codes == codes[i])), i) for i in range(n)]
     usual = np.array([np.median(values[own]) if len(own) else np.nan for own in members])
     differences = values - usual
@@ -323,9 +328,11 @@ def _deviations(
     }
     result = np.full(n, np.nan)
     for i in np.flatnonzero(is_known).tolist():
-        deviations, own = [], values[members[i]]
+        deviations = []
+        own = values[members[i]]
         if len(own):
-            n_own, own_scatter = len(own), _scatter(own, 0, use_tail=False)
+            n_own = len(own)
+            own_scatter = _scatter(own, 0, use_tail=False)
             variance = (n_own * own_scatter**2 + _PRIOR_WEIGHT * pooled**2) / (
                 n_own + _PRIOR_WEIGHT
             )

@@ -15,9 +15,8 @@ from igps.mesh.loading import BodyRef
 # On 111 chains with one or two domains turned by 20 to 60 degrees, and the rest bent by 0.8 Å, 95 % of the squared
 # displacements are in the domains; 78 % after a superposition of all points alike.
 _WIDTH = 1.5  # distance with a quarter of the full weight, over the median distance
-_STEP = (
-    0.8  # the width falls by this factor at most, so that the largest part is found from far away
-)
+# The width falls by this factor at most, so that the largest part is found from far away
+_STEP = 0.8
 _MAX_STEPS = 200
 _ROUNDING = 1e-4  # of coordinates in a file, over the size of the body
 

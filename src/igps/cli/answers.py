@@ -323,9 +323,8 @@ def explain(
         if group is not None or body is not None:
             raise ValueError("group, body: expected a folder with them, got files. Leave them out.")
         check_files(source)
-    without_head(
-        descriptor_of(descriptor)
-    )  # raises for other descriptors before anything is computed
+    # Raises for other descriptors before anything is computed
+    without_head(descriptor_of(descriptor))
     moved = None
     if isinstance(source, Folder):
         check = partial(_two_groups, group=group)
@@ -337,15 +336,15 @@ def explain(
         parts_found = len(set(dataset.bodies.parts))
         if body is None and parts_found > 1:
             print(f"{parts_found} kinds of bodies are taken together; --body NAME chooses one")
-        inner, n_workers = without_head(module), describing.get("n_workers")
+        inner = without_head(module)
+        n_workers = describing.get("n_workers")
         descriptions = describe(
             dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True
         )
         members = [np.flatnonzero(labels == name) for name in sorted(set(labels))]
         squares = squared_distances(inner.coordinates(descriptions).double().numpy())
-        pair = [
-            int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members
-        ]  # the medoids
+        # The medoids
+        pair = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]
         batches = [dataset.batch([i]) for i in pair]
         first, second = (descriptions[own] for own in members)
         explanation, is_significant = explain_groups(module, first, second, batches, level=level)
@@ -361,8 +360,10 @@ def explain(
             level=level,
         )
     else:
-        result, pair = described(source, descriptor, **{**describing, "strict": True}), [0, 1]
-        dataset, module = result.dataset, result.descriptor
+        result = described(source, descriptor, **{**describing, "strict": True})
+        pair = [0, 1]
+        dataset = result.dataset
+        module = result.descriptor
         if len(dataset) != 2:
             listed = ", ".join(dataset.bodies.names[:4])
             raise ValueError(

@@ -55,7 +55,8 @@ def clusters(
 
     dataset, distances, labels = _distances(root, check_number, descriptor, **describing)
     result = clusters_of(distances, n_clusters, linkage=linkage, n_resamples=n_resamples, seed=seed)
-    names, table = dataset.bodies.names, list[dict[str, Any]]()
+    names = dataset.bodies.names
+    table = list[dict[str, Any]]()
     print(f"{'cluster':>7}{'bodies':>8}{'stability':>11}  medoid (classes)")
     for number, (medoid, stability) in enumerate(
         zip(result.medoids, result.stability, strict=True)
@@ -134,7 +135,8 @@ def map_bodies(
     if layout == "umap":
         import_umap()
     dataset, distances, labels = _distances(root, column_values, descriptor, **describing)
-    result, bodies = body_map(distances, layout, seed=seed), dataset.bodies
+    result = body_map(distances, layout, seed=seed)
+    bodies = dataset.bodies
     values: list[str] | list[float]
     if colour == "class":
         values = labels

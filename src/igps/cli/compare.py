@@ -116,7 +116,8 @@ def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) ->
     last = results[-1]
     if last.distances is not None:
         path = out / "distances" / f"{last.descriptor.name}.npz"
-        names, labels = np.array(last.names), np.array(last.labels)
+        names = np.array(last.names)
+        labels = np.array(last.labels)
         np.savez_compressed(path, distances=last.distances.numpy(), names=names, labels=labels)
     rows = [("all", failure.id, failure.error) for failure in failures]
     for result in results:

@@ -118,7 +118,8 @@ def _print_groups(result: Duplicates, poses: bool) -> None:
         print(f"mirror image: {'  '.join(pair)}")
     for pair, distance in result.nearly.items():
         print(f"nearly: {'  '.join(pair)}  {distance:.3%} of the square root of the area apart")
-    calibration, n_grouped = Calibration.load(), sum(map(len, result.groups))
+    calibration = Calibration.load()
+    n_grouped = sum(map(len, result.groups))
     threshold, kind = (calibration.pose, "poses") if poses else (calibration.detail, "copies")
     grades = "".join(
         f"; {counted(n, 'pair')} {grade}"

@@ -109,12 +109,11 @@ def gallery_options(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, A
     from igps.descriptors.size_and_side import SIDE, SIZE
     from igps.gallery.about import about_of, check_alike
 
-    options, check = dict(reading), partial(check_alike, gallery.path, gallery.about)
-    size, mirror, name = (
-        options.pop("size", "auto"),
-        options.pop("mirror", "auto"),
-        gallery.about["descriptor"],
-    )
+    options = dict(reading)
+    check = partial(check_alike, gallery.path, gallery.about)
+    size = options.pop("size", "auto")
+    mirror = options.pop("mirror", "auto")
+    name = gallery.about["descriptor"]
     if size != "auto":
         check({"descriptor": name.replace(SIZE, "") + SIZE * (size == "keep")})
     if mirror == "distinct":

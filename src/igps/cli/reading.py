@@ -46,9 +46,8 @@ class Folder:
     root: Path
     labelled: bool = False  # whether classes are required
     needs_meshes: bool = False  # whether the meshes are required, besides their signatures
-    check: Callable[[Bodies], object] | None = (
-        None  # called before any computation; raises for unsuitable bodies
-    )
+    # Called before any computation; raises for unsuitable bodies
+    check: Callable[[Bodies], object] | None = None
     body: str | None = None  # only bodies of this name in their files, such as an organ
 
 
@@ -60,9 +59,8 @@ class Described:
     descriptions: Tensor  # (N, ...)
     failures: list[Failure]  # the other bodies
     descriptor: Descriptor
-    name: (
-        str | None
-    )  # name that loads the descriptor; None where its centres were fitted to the collection
+    # Name that loads the descriptor; None where its centres were fitted to the collection
+    name: str | None
 
     def vectors(self, short: bool = False) -> Singles:
         """Return the descriptions (N, ...), or their short vectors, see `Descriptor.shorten`."""
@@ -105,9 +103,8 @@ def signatures(
         reduce(or_, (d.requirements for d in descriptors), Requirements()) if descriptors else None
     )
     dataset = dataset_from_options(source, requirements, **collection)
-    is_file = (
-        isinstance(source, Folder) and not source.root.is_dir()
-    )  # `from_file` has checked its attributes
+    # `from_file` has checked its attributes
+    is_file = isinstance(source, Folder) and not source.root.is_dir()
     for descriptor in () if is_file else descriptors:
         check_attributes(descriptor, {*dataset.config.attributes, *dataset.pipeline.attributes})
     failures = dataset.precompute(
@@ -233,10 +230,8 @@ def with_size(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
     is_kept, warning = keeps_size(size, () if size == "ignore" else dataset.units())
     can_keep = isinstance(module, Measures) or scale_of(module) is not None
     if is_kept and size == "auto" and not can_keep:
-        is_kept, warning = (
-            False,
-            f"size is ignored: set the attribute `scale` of {descriptor} to keep it",
-        )
+        is_kept = False
+        warning = f"size is ignored: set the attribute `scale` of {descriptor} to keep it"
     if warning:
         print(warning)
     return descriptor + SIZE * is_kept
@@ -293,7 +288,8 @@ def dataset_from_options(
         raise ValueError(
             "paper: expected no other parameters of the signatures with it. Leave one of them out."
         )
-    config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**load)
+    config = SignatureConfig.paper() if paper else signature
+    reading = LoadOptions(**load)
     if isinstance(source, Folder) and source.root.is_file() and not is_searched(source.root.name):
         if (
             config != SignatureConfig()

@@ -33,7 +33,8 @@ def report(
 
     if meshes is not None and not meshes.is_dir():
         raise FileNotFoundError(f"meshes: {meshes}: no such folder. Check the path.")
-    dataset, contents = read_sources(results, meshes), read_results(results)
+    dataset = read_sources(results, meshes)
+    contents = read_results(results)
     stored = results / "surfaces.npz"
     surfaces = (
         read_surfaces(stored)

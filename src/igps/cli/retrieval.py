@@ -213,7 +213,8 @@ def query(
             f"where: expected a gallery, {gallery} is a folder of meshes. See igps gallery build."
         )
     else:
-        known, n_missing = described(Folder(gallery), descriptor or "pretrained", **describing), 0
+        known = described(Folder(gallery), descriptor or "pretrained", **describing)
+        n_missing = 0
         # The query is described with the options of the folder, which may be a file of signatures
         options = {
             "paper": False,
@@ -221,7 +222,8 @@ def query(
             **asdict(known.dataset.reading),
         }
         description = _describe_body(mesh, known.descriptor, **{**describing, **options})
-        bodies, distance = known.dataset.bodies, known.descriptor.distances
+        bodies = known.dataset.bodies
+        distance = known.descriptor.distances
         n_listed = min(top, len(bodies))
         n_candidates = min(max(top, N_RERANKED), len(bodies)) if rerank else n_listed
         ranking = search(description, known.descriptions, top=n_candidates, distance=distance)
@@ -272,7 +274,8 @@ def _check_scored(bodies: Bodies) -> None:
 
 
 def _summary(result: Described, scores: RetrievalScores) -> dict[str, Any]:
-    n_used, n_refused = len(result.dataset), len(result.failures)
+    n_used = len(result.dataset)
+    n_refused = len(result.failures)
     return {
         **scores.mean(),
         "n_queries": scores.n_queries,
@@ -299,7 +302,8 @@ def _write_retrieval(
     from igps.retrieval import rank
 
     out.mkdir(parents=True, exist_ok=True)
-    names, labels = result.dataset.bodies.names, result.dataset.bodies.labels or ()
+    names = result.dataset.bodies.names
+    labels = result.dataset.bodies.labels or ()
     (out / "scores.json").write_text(json.dumps(summary, indent=2) + "\n")
     arrays: dict[str, Any] = {name: values.numpy() for name, values in distances.items()}
     np.savez_compressed(
@@ -308,9 +312,8 @@ def _write_retrieval(
 
     def ranking() -> Iterator[tuple[Any, ...]]:
         for i, order in enumerate(tqdm(rank(distances["distances"]), desc="rankings")):
-            row = distances["distances"][
-                i
-            ].tolist()  # much faster than access to single entries of a tensor
+            # Much faster than access to single entries of a tensor
+            row = distances["distances"][i].tolist()
             for place, j in enumerate(order[order != i].tolist(), 1):
                 yield names[i], place, names[j], f"{row[j]:.6g}", int(labels[i] == labels[j])
 

@@ -32,7 +32,8 @@ class _Block:
         self.handle = os.memfd_create("igps-batch")
         os.ftruncate(self.handle, _ALIGNMENT + n_bytes)
         self.memory = mmap.mmap(self.handle, _ALIGNMENT + n_bytes)
-        self.start, self.n_bytes = self.lend().ctypes.data, n_bytes
+        self.start = self.lend().ctypes.data
+        self.n_bytes = n_bytes
 
     def lend(self) -> NDArray[np.uint8]:
         array = np.frombuffer(self.memory, np.uint8, offset=_ALIGNMENT)

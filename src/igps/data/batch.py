@@ -36,9 +36,8 @@ class SampleBatch:
     points: Tensor  # (N, P, 3) float32, unit of length, relative to the mean of the samples of each shape
     eigenfunctions: Tensor  # (N, P, K) float32, 1/length; zero where padded
     mask: Tensor  # (N, P) bool, false where padded
-    attributes: Mapping[
-        str, Tensor
-    ]  # by name, each (N, P) or (N, P, C) float32; a direction has C = 3
+    # By name, each (N, P) or (N, P, C) float32; a direction has C = 3
+    attributes: Mapping[str, Tensor]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SampleBatch:
         """Return the batch with a function applied to each of its tensors."""
@@ -101,9 +100,8 @@ def _random_start(seed: int) -> float:
     return torch.rand(1, generator=generator, dtype=torch.float64, device="cpu").item()
 
 
-_START_OF_SEED_0 = _random_start(
-    0
-)  # the seed of all descriptors; `torch.compile` cannot trace a generator
+# The seed of all descriptors; `torch.compile` cannot trace a generator
+_START_OF_SEED_0 = _random_start(0)
 
 
 @dataclass(frozen=True, eq=False)

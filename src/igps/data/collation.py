@@ -75,7 +75,8 @@ def collate(
         )
         for samples in samples_by_kind
     )
-    ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
+    ids = tuple(item.id for item in labelled)
+    units = tuple(s.unit for s in signatures)
     surfaces = None if meshes is None else tuple(meshes)
     measures = rows if all(s.measures for s in signatures) else None
     return SignatureBatch(

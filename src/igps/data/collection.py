@@ -38,9 +38,8 @@ class Contents:
     def to_json(self) -> str:
         """Return the contents as JSON, without paths."""
         bodies = {name: value for name, value in vars(self.bodies).items() if name != "paths"}
-        labels = (
-            None if self.bodies.labels is None else list(map(str, self.bodies.labels))
-        )  # users may give numbers
+        # Users may give numbers
+        labels = None if self.bodies.labels is None else list(map(str, self.bodies.labels))
         names = {"labels": labels, "classes": list(map(str, self.classes)), "keys": self.keys}
         return json.dumps(
             {**bodies, **names, "reading": asdict(self.reading), "config": asdict(self.config)}
@@ -50,18 +49,17 @@ class Contents:
     def from_json(text: str) -> Contents:
         """Parse the text of `to_json`; raise a ValueError, KeyError or TypeError if it is invalid."""
         data: dict[str, Any] = json.loads(text)
-        names, parts, columns = (
-            _strings(data["names"]),
-            tuple(data["parts"]),
-            dict(data.get("columns", {})),
-        )
+        names = _strings(data["names"])
+        parts = tuple(data["parts"])
+        columns = dict(data.get("columns", {}))
         labels = None if data["labels"] is None else _strings(data["labels"])
         columns = {name: tuple(values) for name, values in columns.items()}
         paths = tuple(
             Path(file_name_of(name, part)) for name, part in zip(names, parts, strict=True)
         )
         bodies = Bodies(paths, names, labels, parts, columns)
-        classes, keys = _strings(data["classes"]), _strings(data["keys"])
+        classes = _strings(data["classes"])
+        keys = _strings(data["keys"])
         if len(keys) != len(names) or len(parts) != len(names) or len(set(names)) < len(names):
             raise ValueError("its names are not unique, or differ in number from its parts or keys")
         optional_strings = [*parts, *(value for values in columns.values() for value in values)]
@@ -95,9 +93,8 @@ def write_collection(path: Path, about: Contents, signature: Callable[[int], Sig
         raise ValueError(
             f"{path}: expected unique names, got {duplicate} twice. Give each body once."
         )
-    arrays: list[
-        dict[str, tuple[str, tuple[int, ...], int]]
-    ] = []  # dtype, shape, bytes of each Signature's arrays
+    # Dtype, shape, bytes of each Signature's arrays
+    arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []
     all_metadata = []
     for i in range(n):
         record = encode(signature(i))

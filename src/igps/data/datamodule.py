@@ -93,12 +93,12 @@ class SignatureDataModule(LightningDataModule):
         directory = Path(cache_dir or default_cache_dir())
         bodies = find_bodies(root, reading, labelled=True, cache_dir=directory)
         self.dataset = SignatureDataset(bodies, config, directory, reading=reading)
-        self.classes_per_batch, self.shapes_per_class = classes_per_batch, shapes_per_class
-        self.n_samples_in_memory, self.evaluation_batch_size = (
-            n_samples_in_memory,
-            evaluation_batch_size,
-        )
-        self.n_workers, self.n_loading_workers = n_workers, n_loading_workers
+        self.classes_per_batch = classes_per_batch
+        self.shapes_per_class = shapes_per_class
+        self.n_samples_in_memory = n_samples_in_memory
+        self.evaluation_batch_size = evaluation_batch_size
+        self.n_workers = n_workers
+        self.n_loading_workers = n_loading_workers
         self._in_memory: SignatureDataset | None = None
         labels = self.dataset.labels
         if protocol == "seen":
@@ -141,9 +141,8 @@ class SignatureDataModule(LightningDataModule):
         if self._in_memory is None:
             n = self.n_samples_in_memory
             self._in_memory = part.to_memory(FewerSamples(n_interior=n, n_surface=n, seed=0))
-        return self._loader(
-            self._in_memory, n_batch, sampler, 0
-        )  # no workers, because there is nothing to read
+        # No workers, because there is nothing to read
+        return self._loader(self._in_memory, n_batch, sampler, 0)
 
     def val_dataloader(self) -> DataLoader[LabelledSignature] | list[DataLoader[LabelledSignature]]:
         """Return a loader of the validation part in order; an empty list if the part is empty."""

@@ -87,17 +87,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
         pre_transform: PreTransform | None = None,
         transform: Callable[[Signature], Signature] | None = None,
     ) -> None:
-        config, reading, attributes = (
-            config or SignatureConfig(),
-            reading or LoadOptions(),
-            attributes or {},
-        )
+        config = config or SignatureConfig()
+        reading = reading or LoadOptions()
+        attributes = attributes or {}
         if descriptor is not None:
             requirements = requirements_of(descriptor)
-            config, attributes = (
-                requirements.apply_to(config),
-                {**requirements.sources, **attributes},
-            )
+            config = requirements.apply_to(config)
+            attributes = {**requirements.sources, **attributes}
         sources, self._functions = split_attributes(attributes)
         meshes: Mapping[BodyRef, Mesh | MeshError] = {}
         if isinstance(root_or_paths, Mapping):
@@ -114,7 +110,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
                 "pre_transform: expected attributes with a cache_tag, got a function without one. "
                 'Give it one, such as height.cache_tag = "height 1".'
             )
-        self.config, self.reading = config.resolved(), reading
+        self.config = config.resolved()
+        self.reading = reading
         self.pipeline = SignaturePipeline(
             self.config, reading, directory, sources, pre_transform, meshes
         )
@@ -203,7 +200,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
     def mesh(self, index: int) -> Mesh:
         """Return a mesh, read and checked as for its Signature; raise a MeshError if it cannot be used."""
         if isinstance(self._loaded, CollectionFile):
-            name, file = self.bodies.names[index], self._loaded.path
+            name = self.bodies.names[index]
+            file = self._loaded.path
             raise MeshError(
                 f"{name}: {file} holds signatures and no meshes. Use a dataset of the folder of meshes."
             )
@@ -323,7 +321,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         SignatureDataset.__init__(
             dataset, about.bodies, about.config, cache_dir, reading=about.reading
         )
-        dataset.classes, dataset._loaded = about.classes, file
+        dataset.classes = about.classes
+        dataset._loaded = file
         dataset._hits = file.hits()
         return dataset
 

@@ -41,7 +41,8 @@ def to_pyg(
             'to_pyg: needs PyTorch Geometric: pip install "interior-gps[geometric]".'
         ) from error
     if isinstance(body, LabelledSignature):
-        signature, label = body.signature, body.label
+        signature = body.signature
+        label = body.label
     else:
         signature = body
     chosen = getattr(signature, samples)

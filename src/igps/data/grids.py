@@ -73,7 +73,8 @@ def grid_of(image: Any, spacing: Sequence[float] | None = None) -> Grid:
         values, affine = _of_simpleitk(image)
     elif hasattr(image, "affine"):
         content = image.dataobj if hasattr(image, "dataobj") else image.data
-        values, affine = np.asarray(content), np.asarray(image.affine, dtype=np.float64)
+        values = np.asarray(content)
+        affine = np.asarray(image.affine, dtype=np.float64)
     elif isinstance(image, np.ndarray) or hasattr(image, "__array__"):
         sides = (1.0, 1.0, 1.0) if spacing is None else spacing
         return Grid(_one_channel(np.asarray(image)), np.diag([*sides, 1.0]))

@@ -23,9 +23,8 @@ class Requirements:
     attributes: tuple[AttributeName, ...] = ()  # of the samples, see `SignatureConfig`
     mesh: bool = False  # whether the mesh is needed
     eigenpairs: bool = True  # whether any are needed, and not plain numbers or samples alone
-    whole_spectrum: bool = (
-        False  # whether all eigenpairs are used, so that more would give another descriptor
-    )
+    # Whether all eigenpairs are used, so that more would give another descriptor
+    whole_spectrum: bool = False
     # Sources of additional attributes by name, which the `attributes` of a SignatureDataset override
     sources: Mapping[str, AttributeSource] = field(default_factory=dict, hash=False)
 

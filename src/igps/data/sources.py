@@ -33,13 +33,11 @@ class Bodies:
     """Bodies in files, with names, classes and further columns."""
 
     paths: tuple[Path, ...]  # file of each body
-    names: tuple[
-        str, ...
-    ]  # unique: path of the file relative to the searched folder, and `#part` if it has a part
+    # Unique: path of the file relative to the searched folder, and `#part` if it has a part
+    names: tuple[str, ...]
     labels: tuple[str, ...] | None = None  # class of each body; None if there are no classes
-    parts: tuple[
-        str | None, ...
-    ] = ()  # name of each body in its file; None if the file is one body
+    # Name of each body in its file; None if the file is one body
+    parts: tuple[str | None, ...] = ()
     # Further columns of `labels.csv` by name, with one value for each body; None if a value is missing (empty, NA, ...)
     columns: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict, hash=False)
 
@@ -333,9 +331,8 @@ def _from_labels_file(root: Path, listing: Listing) -> Bodies:
         for _, row in rows
     ]
     bodies = _bodies_in_files(files, listing, columns)
-    counts = Counter(
-        keys := [(os.path.abspath(body.path), body.part) for body in bodies]
-    )  # ./1.off is 1.off
+    # ./1.off is 1.off
+    counts = Counter(keys := [(os.path.abspath(body.path), body.part) for body in bodies])
     if duplicates := sorted(
         name for name, key in zip(bodies.names, keys, strict=True) if counts[key] > 1
     ):

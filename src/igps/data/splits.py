@@ -33,7 +33,9 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
     """
     _check(n_validation, n_train)
     generator = torch.Generator().manual_seed(seed)
-    train, validation, test = list[int](), list[int](), list[int]()
+    train = list[int]()
+    validation = list[int]()
+    test = list[int]()
     for label in labels.unique().tolist():
         members = torch.nonzero(labels == label).flatten()
         n_fit = _count(n_train, len(members), 3, 2)

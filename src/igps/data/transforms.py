@@ -75,10 +75,8 @@ class FewerSamples(Transform):
             attributes = {name: values[chosen] for name, values in samples.attributes.items()}
             return Samples(samples.points[chosen], samples.eigenfunctions[chosen], attributes)
 
-        interior, surface = (
-            fewer(signature.interior, self.n_interior),
-            fewer(signature.surface, self.n_surface),
-        )
+        interior = fewer(signature.interior, self.n_interior)
+        surface = fewer(signature.surface, self.n_surface)
         return replace(signature, interior=interior, surface=surface)
 
 
@@ -101,15 +99,15 @@ class Noise(Transform):
     """Gaussian noise on positions and on eigenfunctions."""
 
     points: float = 0.0  # standard deviation of the noise, divided by √area
-    eigenfunctions: float = (
-        0.0  # standard deviation times √area; the mean square of an eigenfunction is 1/area
-    )
+    # Standard deviation times √area; the mean square of an eigenfunction is 1/area
+    eigenfunctions: float = 0.0
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         length = np.sqrt(signature.area)
 
         def noisy(samples: Samples) -> Samples:
-            points, values = samples.points, samples.eigenfunctions
+            points = samples.points
+            values = samples.eigenfunctions
             if self.points:
                 points = points + self.points * length * generator.standard_normal(points.shape)
             if self.eigenfunctions:
@@ -138,7 +136,8 @@ class Scale(Transform):
             values = samples.eigenfunctions / np.float32(factor)
             return replace(samples, points=samples.points * factor, eigenfunctions=values)
 
-        area, volume = signature.area * factor**2, signature.volume * factor**3
+        area = signature.area * factor**2
+        volume = signature.volume * factor**3
         rescaled = replace(
             signature,
             eigenvalues=signature.eigenvalues / factor**2,

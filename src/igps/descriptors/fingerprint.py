@@ -27,9 +27,8 @@ def name_of(descriptor: str | Path | Descriptor) -> str:
 def fingerprint(descriptor: nn.Module) -> str:
     """Return a checksum of a descriptor: of its saved tensors, and of classes and plain attributes of its modules."""
     checksum = hashlib.sha256()
-    common = vars(
-        nn.Module()
-    )  # attributes of every module; they differ between versions of PyTorch
+    # Attributes of every module; they differ between versions of PyTorch
+    common = vars(nn.Module())
     for name, module in descriptor.named_modules():
         plain = {k: v for k, v in sorted(vars(module).items()) if k not in common and _is_plain(v)}
         checksum.update(f"{name} {type(module).__qualname__} {plain!r}\0".encode())

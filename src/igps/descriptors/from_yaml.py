@@ -28,9 +28,8 @@ HISTOGRAMS: Mapping[str, type[DescriptionPart]] = {
 """Classes of histograms by their names in YAML files."""
 
 _MAX_BYTES = 100_000  # of a file
-_MAX_INTEGER = (
-    10_000  # of any number in a file: files are untrusted, and must not ask for huge histograms
-)
+# Of any number in a file: files are untrusted, and must not ask for huge histograms
+_MAX_INTEGER = 10_000
 
 
 def load_yaml(path: str | Path) -> HistogramDescriptor:

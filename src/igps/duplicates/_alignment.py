@@ -25,7 +25,10 @@ _GAP = 2.5  # lateral distance of the nearest sample that does not count, in ste
 _AMBIGUITY = 1.1
 _N_ROTATIONS = 300
 _N_SCORED, _N_FITTED = 60, 250  # samples
-_N_STARTS, _N_COARSE_STEPS, _N_FINE_STEPS, _N_LAST_STEPS = 12, 6, 4, 10
+_N_STARTS = 12
+_N_COARSE_STEPS = 6
+_N_FINE_STEPS = 4
+_N_LAST_STEPS = 10
 # Poses that fit up to this factor worse than the best by samples alone are fitted to the surface itself
 _CLOSE_FIT = 1.5
 # After the fine steps, `hopeless` is divided by this factor. With 0.03, it is then 0.02, while 99 % of the copies of
@@ -73,9 +76,8 @@ class SurfaceSamples:
     @cached_property
     def tree(self) -> KDTree:
         """Tree of the samples, with positions and weighted normals as six coordinates."""
-        return KDTree(
-            _with_normals(self), leafsize=50
-        )  # twice as fast as the default in six dimensions
+        # Twice as fast as the default in six dimensions
+        return KDTree(_with_normals(self), leafsize=50)
 
     @cached_property
     def extents(self) -> Floats:
@@ -307,9 +309,8 @@ def _scores(samples: SurfaceSamples, target: SurfaceSamples, starts: Floats) -> 
         np.einsum("sij,nj->sni", starts, array) for array in (samples.points, samples.normals)
     )
     rotated = SurfaceSamples(points.reshape(-1, 3), normals.reshape(-1, 3))
-    distances, _ = target.tree.query(
-        _with_normals(rotated), eps=0.5
-    )  # precise enough to order the starts
+    # Precise enough to order the starts
+    distances, _ = target.tree.query(_with_normals(rotated), eps=0.5)
     return np.asarray(np.square(distances).reshape(len(starts), -1).mean(axis=1))
 
 
@@ -394,9 +395,12 @@ def _min_extent_ratio(samples: SurfaceSamples) -> float:
 def _uniform_starts() -> Floats:
     """Return rotations (600, 3, 3) spread evenly, half of them with a reflection (super-Fibonacci, Alexa 2022)."""
     s = np.arange(_N_ROTATIONS) + 0.5
-    phi, psi = math.sqrt(2), 1.533751168755204288118041
-    r, big_r = np.sqrt(s / _N_ROTATIONS), np.sqrt(1 - s / _N_ROTATIONS)
-    alpha, beta = 2 * math.pi * s / phi, 2 * math.pi * s / psi
+    phi = math.sqrt(2)
+    psi = 1.533751168755204288118041
+    r = np.sqrt(s / _N_ROTATIONS)
+    big_r = np.sqrt(1 - s / _N_ROTATIONS)
+    alpha = 2 * math.pi * s / phi
+    beta = 2 * math.pi * s / psi
     quaternions = np.column_stack(
         [r * np.sin(alpha), r * np.cos(alpha), big_r * np.sin(beta), big_r * np.cos(beta)]
     )

@@ -15,13 +15,11 @@ from igps.mesh.surface import area_vectors, directed_edges, face_areas
 
 # Quadrature with six nodes, exact for polynomials of degree four on a triangle (Dunavant 1985)
 _INNER, _OUTER = 0.445948490915965, 0.091576213509771
-_NODES = np.concatenate(
-    [np.full((3, 3), x) + np.eye(3) * (1 - 3 * x) for x in (_INNER, _OUTER)]
-)  # barycentric
+# Barycentric
+_NODES = np.concatenate([np.full((3, 3), x) + np.eye(3) * (1 - 3 * x) for x in (_INNER, _OUTER)])
 _WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
-_SECOND_ORDER = (
-    0.03  # over first-order terms: a move of √area / 100 where the radius of curvature is √area / 3
-)
+# Over first-order terms: a move of √area / 100 where the radius of curvature is √area / 3
+_SECOND_ORDER = 0.03
 
 
 def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
@@ -41,7 +39,8 @@ def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
         cones = np.column_stack(
             [end[is_open], start[is_open], np.full(is_open.sum(), len(vertices))]
         )
-        vertices, faces = np.vstack([vertices, centroid]), np.vstack([faces, cones])
+        vertices = np.vstack([vertices, centroid])
+        faces = np.vstack([faces, cones])
     vectors = area_vectors(vertices, faces)
     x = np.einsum("qk,fkd->fqd", _NODES, vertices[faces])
     # Flux of x through each node's part of the surface. The flux of x f gives ∫ f dV by the divergence theorem.
@@ -51,8 +50,10 @@ def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
     flux = np.einsum("fqd,fd,q->fq", x.reshape(-1, 6, 3), vectors, _WEIGHTS).ravel()
     second = np.einsum("p,pi,pj->ij", flux, x, x) / 5
     along, axes = np.linalg.eigh(second)
-    square, total = np.einsum("pi,pi->p", x, x), along.sum()
-    third, fourth = (flux * square) @ x / 6, flux @ square**2 / 7
+    square = np.einsum("pi,pi->p", x, x)
+    total = along.sum()
+    third = (flux * square) @ x / 6
+    fourth = flux @ square**2 / 7
     even = np.array([volume, *along, fourth])
     if not even.min() > 0:
         return np.zeros((7, 6))
@@ -62,7 +63,8 @@ def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
         / even
     )
     h_third = x * square[:, None] - x @ (total * np.eye(3) + 2 * second) / volume
-    length, scale = max(float(np.linalg.norm(third)), 1e-9), volume**0.5 / total**1.5
+    length = max(float(np.linalg.norm(third)), 1e-9)
+    scale = volume**0.5 / total**1.5
     h_length = scale * (
         h_third @ third / length + length * (h_even[:, 0] / 2 - 1.5 * square / total)
     )
@@ -80,7 +82,8 @@ def distance_bounds(one: Tensor, other: Tensor) -> Tensor:
 
     def bounds(own: Tensor, others: Tensor) -> Tensor:
         """Return the bounds by the maps of the first bodies."""
-        own_moments, maps = own[:, 0], own[:, 1:].movedim(1, 0)
+        own_moments = own[:, 0]
+        maps = own[:, 1:].movedim(1, 0)
         return sum(
             ((row @ others[:, 0].T) - (row * own_moments).sum(1, keepdim=True)).square()
             for row in maps

@@ -14,9 +14,8 @@ from igps.mesh.mesh import millimetres
 from igps.retrieval.distances import Distance
 
 _ROWS = 256  # of the matrix of distances in memory at once
-_FIRST_TOP = (
-    32  # neighbours in a gallery that are searched first; four times as many if all are near
-)
+# Neighbours in a gallery that are searched first; four times as many if all are near
+_FIRST_TOP = 32
 # Bodies of one size differ by less in the logarithm of √area; levels of detail of a body differ by up to half of this
 _SIZE_TOLERANCE = 0.05
 

@@ -66,13 +66,11 @@ class Calibration:
 
     descriptor: str  # name
     model: str  # `fingerprint` of the descriptor
-    signatures: Mapping[
-        str, int
-    ]  # version of the Signatures, and the parameters that distances depend on
+    # Version of the Signatures, and the parameters that distances depend on
+    signatures: Mapping[str, int]
     made_of: str  # the bodies that were measured, in words
-    distances: Mapping[
-        str, Sequence[float]
-    ]  # quantiles at `LEVELS` of the descriptor's distance, for each of `KINDS`
+    # Quantiles at `LEVELS` of the descriptor's distance, for each of `KINDS`
+    distances: Mapping[str, Sequence[float]]
     n_pairs: Mapping[str, int]  # for each of `KINDS`
     near: (
         float  # limit of the descriptor's distance for candidates: twice the largest between copies

@@ -50,9 +50,8 @@ class Duplicates:
     # of the length if known
     largest: dict[tuple[str, str], tuple[float, float, str | None]]
     mirrored: frozenset[tuple[str, str]]  # of these pairs; the others agree without a reflection
-    nearly: dict[
-        tuple[str, str], float
-    ]  # distances over √area of pairs that are not copies, but within the tolerance
+    # Distances over √area of pairs that are not copies, but within the tolerance
+    nearly: dict[tuple[str, str], float]
     n_files: int  # that were compared
     failures: tuple[Failure, ...]  # files that could not be compared
 

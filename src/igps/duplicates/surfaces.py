@@ -43,9 +43,8 @@ from igps.signature.signature import Signature
 _N_CACHED_SAMPLES, _N_CACHED_MESHES = 512, 64
 _NORMALS: AttributeName = "surface_direction"
 # Lengths are over √area.
-_HOPELESS = (
-    0.03  # distance at which an alignment is given up; a tenth of it is large between copies
-)
+# Distance at which an alignment is given up; a tenth of it is large between copies
+_HOPELESS = 0.03
 _MAX_STRETCH = 0.1  # difference of log extents above which bodies are not aligned; copies differ by up to 0.045
 MAX_TOLERANCE = 0.02
 """Largest `tolerance`, over √area."""
@@ -59,9 +58,8 @@ Grade = Literal["same file", "same mesh", "same surface", "same at another level
 
 # A body is chiral if its mirror image is this many times as far from it as from its copy.
 _CHIRAL = 2.0
-_MIN_CHANGED = (
-    0.01  # smallest share of the flat places that tells a changed body, see `changed_share`
-)
+# Smallest share of the flat places that tells a changed body, see `changed_share`
+_MIN_CHANGED = 0.01
 
 _HANDLE_PRESERVING: set[Step] = {"welded", "smoothed", "subdivided"}  # steps of mending
 
@@ -140,8 +138,10 @@ class Surfaces:
     def distance(self, i: int, j: int, calibration: Calibration) -> float:
         """Return the distance of two bodies over √area, or infinity if they differ or one of them cannot be read."""
         with contextlib.suppress(MeshError):  # recorded in `failures`
-            one, other = self._cached_samples(i), self._cached_samples(j)
-            max_distance, limit = max(calibration.same.distance, self._tolerance), 0.0
+            one = self._cached_samples(i)
+            other = self._cached_samples(j)
+            max_distance = max(calibration.same.distance, self._tolerance)
+            limit = 0.0
             distance = distance_if_alike(
                 one, other, stop_at=calibration.same.distance, max_distance=max_distance
             )
@@ -164,7 +164,8 @@ class Surfaces:
         The deviation is that of vertices for the same mesh, and that of samples otherwise. Raises a MeshError if a body
         cannot be read.
         """
-        one, other = self._dataset.bodies[i], self._dataset.bodies[j]
+        one = self._dataset.bodies[i]
+        other = self._dataset.bodies[j]
         with contextlib.suppress(OSError):
             if one.part == other.part and filecmp.cmp(one.path, other.path, shallow=False):
                 return "same file", 0.0
@@ -180,7 +181,8 @@ class Surfaces:
 
     def is_mirrored(self, i: int, j: int) -> bool:
         """Return whether one of two copies is the mirror image of the other, and not also the other itself."""
-        one, other = self._cached_samples(i), self._cached_samples(j)
+        one = self._cached_samples(i)
+        other = self._cached_samples(j)
         distance = partial(surface_distance, one, other, stop_at=_SAME_SURFACE, hopeless=_HOPELESS)
         return distance(side="same") > max(_CHIRAL * distance(side="mirrored"), _ROUNDING)
 

@@ -120,7 +120,8 @@ def head_of(schema: Any) -> dict[str, Any]:
     if b"embedding_functions" in schema.metadata:
         raise ValueError("it names models to load")
     head: dict[str, Any] = json.loads(schema.metadata[_HEAD])
-    length, shape = schema.field("vector").type.list_size, tuple(head["shape"])
+    length = schema.field("vector").type.list_size
+    shape = tuple(head["shape"])
     if length != np.prod(shape) + 1:
         raise ValueError(f"descriptions of {length} numbers, not of shape {shape}")
     return head

@@ -51,7 +51,8 @@ _INDEX_INTERVAL = 32  # versions after which new rows are added to the indices
 _ROWS_PER_PARTITION = 4096  # of the index
 # At least this share of the partitions is searched, and at least this many of them; more, if too few rows there satisfy
 # a condition
-_MIN_SHARE, _MIN_PROBES = 1 / 12, 20
+_MIN_SHARE = 1 / 12
+_MIN_PROBES = 20
 _BATCH_SIZE = 1024  # rows
 _SOURCE_LOCATION = re.compile(r", /\S+\.rs:.*")  # at the end of LanceDB's error messages
 

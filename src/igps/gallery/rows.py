@@ -159,14 +159,13 @@ def thumbnail(signature: Signature) -> bytes:
     )
     centred = points - points.mean(axis=0)
     along_axes = centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
-    width, depth = (
-        np.abs(along_axes[:, :2]).max(initial=1e-300),
-        np.abs(along_axes[:, 2]).max(initial=1e-300),
-    )
+    width = np.abs(along_axes[:, :2]).max(initial=1e-300)
+    depth = np.abs(along_axes[:, 2]).max(initial=1e-300)
     columns, rows = (
         np.rint((along_axes[:, :2] / width + 1) * (_THUMBNAIL_SIZE - 1) / 2).astype(int).T
     )
-    image, file = np.zeros((_THUMBNAIL_SIZE, _THUMBNAIL_SIZE)), io.BytesIO()
+    image = np.zeros((_THUMBNAIL_SIZE, _THUMBNAIL_SIZE))
+    file = io.BytesIO()
     np.maximum.at(image, (rows, columns), 0.6 + 0.4 * along_axes[:, 2] / depth)
     imsave(file, image, cmap="gray", vmin=0, vmax=1, origin="lower", format="png")
     return file.getvalue()

@@ -38,16 +38,14 @@ def sync(
     """
     dataset = each_body_once(dataset)
     kinds = further_columns(dataset.bodies, gallery.columns)
-    cleared = dict.fromkeys(
-        gallery.columns.keys() - KNOWN.keys()
-    )  # columns that the folder no longer has
+    # Columns that the folder no longer has
+    cleared = dict.fromkeys(gallery.columns.keys() - KNOWN.keys())
     current = [{**cleared, **row} for row in known_rows(dataset.bodies, kinds, dataset.reading)]
     columns = [name for name in ("checksum", *current[0]) if name in gallery.columns]
     known = {row["id"]: row for row in gallery.rows(*columns)}
     new: list[int] = []
-    changed: dict[
-        str, dict[str, Any]
-    ] = {}  # rows of the same content with other metadata, such as a class
+    # Rows of the same content with other metadata, such as a class
+    changed: dict[str, dict[str, Any]] = {}
     for i, row in enumerate(current):
         before = known.get(row["id"], {})
         differences = {name for name, value in row.items() if before.get(name) != value}
@@ -72,9 +70,8 @@ def sync(
         name for name in known.keys() - {row["id"] for row in current} if name.startswith(prefix)
     ]
     failed = {failure.id for failure in failures}
-    unread = {
-        row["file"] for row in current if row["part"] is None and row["name"] in failed
-    }  # their parts may exist
+    # Their parts may exist
+    unread = {row["file"] for row in current if row["part"] is None and row["name"] in failed}
     gone = [
         name
         for name in gone

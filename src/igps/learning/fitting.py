@@ -31,10 +31,11 @@ Goal = Literal["known", "new"]
 HeadName = Literal["auto", "classifier", "linear", "whitened", "as_is"]
 # Weights of the prior beside a WhitenedHead: equal for new classes, smaller for classes that the head is fitted to
 _PRIOR_SHARES: Mapping[Goal, float] = {"new": 0.5, "known": 1 / 3}
+# For the held-out scores, and within them for the choice of the head
 _N_FOLDS, _N_INNER_FOLDS = (
     5,
     3,
-)  # for the held-out scores, and within them for the choice of the head
+)
 _N_BINS = 10  # of the expected calibration error
 _MIN_GAIN = 0.005  # in the mean of balanced accuracy and AUC, by which a later candidate is better
 _MAX_SCALE_BODIES = 1000  # bodies whose distances determine the scale
@@ -383,7 +384,8 @@ def classification_scores(
 
 def check_classes(bodies: Bodies, goal: Goal) -> None:
     """Raise a ValueError if there are too few classes, or no class of two bodies."""
-    counts, min_classes = Counter(bodies.labels), 2 if goal == "known" else 4
+    counts = Counter(bodies.labels)
+    min_classes = 2 if goal == "known" else 4
     if len(counts) < min_classes or max(counts.values()) < 2:
         raise ValueError(
             f"classes: expected at least {min_classes}, one of them of two bodies, got {dict(counts)}."
@@ -463,7 +465,8 @@ def _histograms(
     progress: bool,
 ) -> tuple[Tensor, SignatureDataset]:
     """Return the histograms (M, cells) of the M bodies that can be described, and a dataset of these bodies."""
-    tag, n_earlier = cache_tag(base), len(failures or ())
+    tag = cache_tag(base)
+    n_earlier = len(failures or ())
     histograms = describe(
         dataset, base, failures=failures, cache_tag=tag, n_workers=n_workers, progress=progress
     )
@@ -478,7 +481,8 @@ def _held_out(labels: Tensor, goal: Goal, n_folds: int) -> Iterator[Tensor]:
         largest = int(labels.unique(return_counts=True)[1].max())
         yield from folds(labels, max(2, min(n_folds, largest // 2)))
         return
-    classes, generator = labels.unique(), torch.Generator().manual_seed(0)
+    classes = labels.unique()
+    generator = torch.Generator().manual_seed(0)
     for _ in range(n_folds):
         half = torch.randperm(len(classes), generator=generator)[: len(classes) // 2]
         yield torch.isin(labels, classes[half])

@@ -39,16 +39,14 @@ class Format:
     suffixes: tuple[str, ...]  # lower case, with the dot; the longest that ends a file name wins
     read: Callable[[Path, LoadOptions, str | None], Sequence[RawBody]]
     bodies: tuple[BodyKind, ...] = ("whole",)  # supported `LoadOptions.bodies`, the default first
-    is_searched: bool = (
-        True  # whether a search of folders takes files with these suffixes for bodies
-    )
+    # Whether a search of folders takes files with these suffixes for bodies
+    is_searched: bool = True
     ignored: tuple[str, ...] = ()  # suffixes of files of this format that hold no surface
     extra: str | None = None  # the extra of this package that installs the modules `read` needs
     # tells a file of this format whose name ends with no known suffix
     recognises: Callable[[Path], bool] | None = None
-    beside: Callable[[Path, LoadOptions], Sequence[Path]] | None = (
-        None  # finds other files on which the bodies depend
-    )
+    # Finds other files on which the bodies depend
+    beside: Callable[[Path, LoadOptions], Sequence[Path]] | None = None
     # makes bodies of an object in memory, and returns None for an object that it does not know
     in_memory: Callable[[Any, str, LoadOptions], Sequence[RawBody] | None] | None = None
 

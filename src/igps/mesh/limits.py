@@ -61,9 +61,8 @@ def expected_faces(path: Path) -> int:
     if suffix == ".stl":
         count = int.from_bytes(head[80:84], "little")
         n_faces = count if size == 84 + 50 * count else size // _TEXT_STL_BYTES
-    return min(
-        n_faces, size // 2
-    )  # a header may be damaged; a triangle takes at least two bytes in any format
+    # A header may be damaged; a triangle takes at least two bytes in any format
+    return min(n_faces, size // 2)
 
 
 def available_memory() -> int | None:

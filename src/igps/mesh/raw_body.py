@@ -39,9 +39,8 @@ class RawBody:
     """A surface as it was read, not yet checked; a point cloud has no faces."""
 
     vertices: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (V, 3) length
-    faces: Integers = field(
-        default_factory=lambda: np.zeros((0, 3), dtype=np.int64)
-    )  # (F, 3) vertex indices
+    # (F, 3) vertex indices
+    faces: Integers = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
     part: str | None = None  # name among the bodies of the file; None if the file is a single body
     unit: str | None = None  # unit of length, such as "mm"; None if the file does not state it
     unit_from: UnitSource = "format"  # what states the unit, if there is one
@@ -50,9 +49,8 @@ class RawBody:
     fault: MeshError | None = None  # why this body has no surface, while others of its file may
     make: Callable[[], RawBody] | None = None  # computes the surface if that takes time; see `made`
     voxels: Callable[[], LabelVoxels] | None = None  # returns the voxels of a label
-    denoise: bool = (
-        True  # whether the surface may be noisy; False if it was computed from voxels or atoms
-    )
+    # Whether the surface may be noisy; False if it was computed from voxels or atoms
+    denoise: bool = True
     frame: Frame = None  # see `Mesh`
     fine_area: float | None = None  # see `Mesh`
     given: Mapping[str, float] = field(default_factory=dict)  # see `Mesh`
@@ -129,9 +127,8 @@ def pieces(whole: RawBody) -> list[RawBody]:
     if not len(faces):
         return [whole]
     check_arrays(vertices, faces, "the whole")
-    vertices, faces = compact(
-        vertices, faces
-    )  # unused vertices would widen the bounding box, which scales `places`
+    # Unused vertices would widen the bounding box, which scales `places`
+    vertices, faces = compact(vertices, faces)
     # Triangles need not share vertices: they are connected by position
     owner, areas = face_parts(vertices, places(vertices)[faces])
     small = are_specks(areas)

@@ -81,7 +81,8 @@ class SampleFeatures:
     def neighbours(self, embedding: nn.Module) -> Tensor:
         """Return the `nearest_neighbours` (N, P, k) of each sample in the embedding."""
         if embedding not in self._neighbours:
-            points, mask = self.embedded(embedding), self.samples.mask
+            points = self.embedded(embedding)
+            mask = self.samples.mask
             self._neighbours[embedding] = map_bodies(
                 lambda x, m: nearest_neighbours(x, mask=m), points, mask
             )

@@ -231,7 +231,8 @@ class _DescriptionStore:
     """Access to the cached descriptions of a dataset; a cache that cannot be written only causes a warning."""
 
     def __init__(self, dataset: SignatureDataset, cache_tag: str) -> None:
-        self._dataset, self._tag = dataset, cache_tag
+        self._dataset = dataset
+        self._tag = cache_tag
         self._keys = dataset.cached_keys()
         self._cache = dataset.pipeline.cache("description")
         self._cache.remove_abandoned()

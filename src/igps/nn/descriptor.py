@@ -262,7 +262,9 @@ class HistogramDescriptor(Descriptor):
             if isinstance(histograms, DescriptionPart)
             else tuple(len(group) for group in groups)
         )
-        self.name, self.source, self.invariant_to = name, source, tuple(invariant_to)
+        self.name = name
+        self.source = source
+        self.invariant_to = tuple(invariant_to)
         self.requirements = reduce(
             or_, (histogram.requirements for group in groups for histogram in group)
         )
@@ -342,8 +344,10 @@ class EmbeddedDescriptor(Descriptor):
         invariant_to: Sequence[str] | None = None,
     ) -> None:
         super().__init__()
-        self.descriptor, self.head = descriptor, head
-        self.name, self.source = name, source
+        self.descriptor = descriptor
+        self.head = head
+        self.name = name
+        self.source = source
         self.invariant_to = descriptor.invariant_to if invariant_to is None else tuple(invariant_to)
         self.requirements = descriptor.requirements
 

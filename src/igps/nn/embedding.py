@@ -11,9 +11,8 @@ from igps.nn.specification import Specified
 from igps.retrieval.distances import row_distances
 
 EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
-_KINDS = get_args(
-    EmbeddingKind
-)  # not in `_check_kind`, as older versions of torch.compile cannot trace get_args
+# Not in `_check_kind`, as older versions of torch.compile cannot trace get_args
+_KINDS = get_args(EmbeddingKind)
 
 # Range of λ·area: from below the smallest of elongated bodies to beyond the 250th of any body (4π·250, Weyl's law).
 _FILTER_RANGE = (2.0, 5000.0)
@@ -124,7 +123,8 @@ class SpectralEmbedding(Specified):
                 f"n_knots: expected 0 for a fixed filter or at least 2, got {n_knots}."
             )
         self.kind: EmbeddingKind = kind
-        self.time, self.n_eigenpairs = time, n_eigenpairs
+        self.time = time
+        self.n_eigenpairs = n_eigenpairs
         self.log_gain = nn.Parameter(torch.zeros(n_knots)) if n_knots else None
 
     def weights(self, eigenvalues: Tensor, area: Tensor) -> Tensor:

@@ -88,9 +88,13 @@ class RetrievalLearner(LightningModule):
         self.save_hyperparameters(
             ignore=() if has_configuration() else ("descriptor", "distance", "loss", "miner")
         )
-        self.descriptor, self.distance, self.miner = descriptor, distance, miner
+        self.descriptor = descriptor
+        self.distance = distance
+        self.miner = miner
         self.loss = _supervised_contrastive() if loss is None else loss
-        self.learning_rate, self.bin_rate, self.weight_decay = learning_rate, bin_rate, weight_decay
+        self.learning_rate = learning_rate
+        self.bin_rate = bin_rate
+        self.weight_decay = weight_decay
         self.part_cells = (
             descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
         )
@@ -192,7 +196,8 @@ class RetrievalLearner(LightningModule):
     @one_thread()
     def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
         """Return the loss of one P×K batch."""
-        embeddings, labels = self._head(self(batch)), _known_labels(batch)
+        embeddings = self._head(self(batch))
+        labels = _known_labels(batch)
         mined = () if self.miner is None else (self.miner(embeddings, labels),)
         loss: Tensor = self.loss(embeddings, labels, *mined)
         self.log("train_loss", loss, batch_size=len(batch), prog_bar=True)

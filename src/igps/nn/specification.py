@@ -117,7 +117,8 @@ def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
     def build(spec: Mapping[str, Any]) -> nn.Module:
         if set(spec) == {"same_as"}:
             return modules[spec["same_as"]]
-        path, arguments = spec["class_path"], spec.get("init_args", {})
+        path = spec["class_path"]
+        arguments = spec.get("init_args", {})
         if (
             not set(spec) <= {"class_path", "init_args"}
             or not _CLASS.fullmatch(path)
@@ -136,9 +137,8 @@ def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
         ):
             raise ValueError(f"{name} of {sizes} is too large")
         position = len(modules)
-        modules.append(
-            nn.Identity()
-        )  # placeholder, as the arguments may contain modules with later positions
+        # Placeholder, as the arguments may contain modules with later positions
+        modules.append(nn.Identity())
         modules[position] = cls(**{name: decode(x) for name, x in arguments.items()})
         return modules[position]
 
@@ -186,7 +186,8 @@ def _check_unchanged(module: nn.Module, rebuilt: nn.Module) -> None:
     """Raise a ValueError if an attribute was changed after construction, as a file would not preserve the change."""
     rebuilt_modules = dict(rebuilt.named_modules())
     for path, submodule in module.named_modules():
-        original, changed = rebuilt_modules.get(path), [""]
+        original = rebuilt_modules.get(path)
+        changed = [""]
         if type(original) is type(submodule):
             public = {
                 name: x

@@ -52,7 +52,8 @@ class Painted:
 
 LEVEL = 0.05
 """Largest false discovery rate of bodies that are marked as significant."""
-_SIGNIFICANT, _OTHER = PALETTE[0], "#777777"
+_SIGNIFICANT = PALETTE[0]
+_OTHER = "#777777"
 
 
 def write_analysis(
@@ -189,13 +190,12 @@ def map_figure(body_map: BodyMap, values: Sequence[str] | Sequence[float], title
     axes = figure.add_subplot()
     x, y = body_map.points.T
     if isinstance(values[0], str):
-        names, handles = sorted(set(map(str, values))), []
+        names = sorted(set(map(str, values)))
+        handles = []
         for number, name in enumerate(names):
             own = [value == name for value in values]
-            marker, colour = (
-                _MAP_MARKERS[number // len(PALETTE) % len(_MAP_MARKERS)],
-                PALETTE[number % len(PALETTE)],
-            )
+            marker = _MAP_MARKERS[number // len(PALETTE) % len(_MAP_MARKERS)]
+            colour = PALETTE[number % len(PALETTE)]
             handles.append(
                 axes.scatter(
                     x[own], y[own], s=20, label=name, linewidths=0.8, marker=marker, color=colour
@@ -204,7 +204,8 @@ def map_figure(body_map: BodyMap, values: Sequence[str] | Sequence[float], title
         if any(
             names
         ):  # with explicit handles, because Matplotlib skips labels that begin with an underscore
-            labels, n_columns = list(map(shortened, names)), 1 + len(names) // 30
+            labels = list(map(shortened, names))
+            n_columns = 1 + len(names) // 30
             figure.legend(
                 handles, labels, loc="outside right upper", title=title, fontsize=7, ncols=n_columns
             )
@@ -243,8 +244,10 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
     figure = new_figure(8.5, 5.2)
     axes = figure.add_subplot()
     for i, (name, curve) in enumerate(curves.items()):
-        colour, line = PALETTE[i % len(PALETTE)], _STYLES[i // len(PALETTE) % len(_STYLES)]
-        recall, precision = 100 * curve.recall.numpy(), 100 * curve.precision.numpy()
+        colour = PALETTE[i % len(PALETTE)]
+        line = _STYLES[i // len(PALETTE) % len(_STYLES)]
+        recall = 100 * curve.recall.numpy()
+        precision = 100 * curve.precision.numpy()
         marker = _MARKERS[i % len(_MARKERS)]
         axes.plot(
             recall,
@@ -260,7 +263,8 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
     axes.set_xlabel("recall: share of the query's class that is retrieved (%)")
     axes.set_ylabel("precision: share of the query's class among the retrieved (%)")
     n_queries = [curve.n_queries for curve in curves.values()]
-    low, high = min(n_queries), max(n_queries)
+    low = min(n_queries)
+    high = max(n_queries)
     axes.set_title(
         f"leave-one-out, mean over {high if low == high else f'{low} to {high}'} queries"
     )
@@ -271,7 +275,8 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
 
 
 # Curves of precision and recall beyond the first round of colours differ by line style and marker
-_STYLES, _MARKERS = ("-", "--", ":"), ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
+_STYLES = ("-", "--", ":")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 _MAP_MARKERS = ("o", "s", "^", "x", "+", "D")
 _BLUE, _WHITE, _RED = np.array([[0.0, 0.35, 0.7], [0.9, 0.9, 0.9], [0.84, 0.25, 0.0]])
 _PALE = 0.3  # strength of the colours where values do not count

@@ -29,15 +29,15 @@ PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 """Colours that remain distinct for colour-blind readers (Okabe and Ito 2008)."""
 _DPI = 200  # of surfaces within an SVG file
 GREY = (0.86, 0.88, 0.92)
-_RELEVANT, _IRRELEVANT, _QUERY = PALETTE[1], PALETTE[0], "#444444"
-_THUMBNAIL_VERTICES = (
-    800  # enough for the detail of a thumbnail; drawing time grows with the number of faces
-)
+_RELEVANT = PALETTE[1]
+_IRRELEVANT = PALETTE[0]
+_QUERY = "#444444"
+# Enough for the detail of a thumbnail; drawing time grows with the number of faces
+_THUMBNAIL_VERTICES = 800
 _MAX_NAME_LENGTH = 60  # characters
 _LIGHT: Floats = np.array([0.35, 0.45, 0.82])
-_MIN_SMOOTH = (
-    0.75  # cosine between the normals of a face and a vertex; with less, their edge stays sharp
-)
+# Cosine between the normals of a face and a vertex; with less, their edge stays sharp
+_MIN_SMOOTH = 0.75
 _MARGIN = 1.08  # of a picture, over the size of the body
 _FAIR_STEPS = (0.5, -0.53) * 20  # of Taubin's smoothing, which shrinks nothing
 
@@ -106,7 +106,8 @@ def axes_of(points: Floats) -> Floats:
     centred = points - points.mean(axis=0)
     axes: Floats = np.linalg.svd(centred, full_matrices=False)[2][:2]
     signs = np.where(((centred @ axes.T) ** 3).mean(axis=0) < 0, -1, 1)
-    up, right = -signs[0] * axes[0], signs[1] * axes[1]
+    up = -signs[0] * axes[0]
+    right = signs[1] * axes[1]
     return np.stack([right, up, np.cross(right, up)], axis=1)
 
 

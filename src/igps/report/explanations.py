@@ -24,9 +24,8 @@ class SurfaceExplanation:
 
     other: str  # name of the nearest body
     summary: str  # the largest shares of the distance, as text
-    values: tuple[
-        NDArray[np.uint8], NDArray[np.uint8]
-    ]  # (V,) of both surfaces: 128 for no share, larger for a share
+    # (V,) of both surfaces: 128 for no share, larger for a share
+    values: tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 def keep_explanations(
@@ -111,7 +110,8 @@ def _vertex_values(
     axes = page_axes(mesh, signature.surface.points)
     samples = {kind: getattr(signature, kind).points @ axes for kind in SAMPLE_KINDS}
     vertices = mesh.vertices @ axes
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
     points = surface.vertices / STEPS - 0.5
     values = share_density(shares, samples, points * (high - low).max() + (low + high) / 2)
     largest = float(np.quantile(np.abs(values), 0.98)) or 1.0

@@ -55,7 +55,8 @@ def render_page(
         f"default-src 'none'; script-src {' '.join(map(_source_hash, scripts))}; style-src {_source_hash(style)}; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-    classes, indices = data["classes"], {name: i for i, name in enumerate(results.names)}
+    classes = data["classes"]
+    indices = {name: i for i, name in enumerate(results.names)}
     members: list[list[int]] = [[] for _ in classes] or [[]]
     for i, shape in enumerate(data["shapes"]):
         members[shape["label"] if classes else 0].append(i)

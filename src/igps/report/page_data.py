@@ -23,10 +23,11 @@ _MIN_RANKED = 48  # shortest ranking of a query
 _DECIMALS = 5
 _MAX_FILTERED = 30  # different values of a column, of which one can be chosen
 _QUERY_SCORES = ("nn", "ft", "st", "map")  # scores that are shown for each query
+# Shapes of a map; more take too long to lay out and to draw in a browser
 _MIN_MAPPED, _MAX_MAPPED = (
     3,
     3000,
-)  # shapes of a map; more take too long to lay out and to draw in a browser
+)
 
 
 def data_of(
@@ -38,9 +39,8 @@ def data_of(
     classes = sorted(set(results.labels or ()))
     index = {name: i for i, name in enumerate(results.names)}
     sizes = Counter(results.labels or ())
-    n_ranked = max(
-        _MIN_RANKED, 2 * max(sizes.values(), default=0)
-    )  # covers the second tier of every class
+    # Covers the second tier of every class
+    n_ranked = max(_MIN_RANKED, 2 * max(sizes.values(), default=0))
     return {
         "classes": classes,
         "shapes": _shapes(results, surfaces, classes, explanations or {}),
@@ -82,7 +82,8 @@ def _shapes(
     `together`. An explained body has `explained`: its nearest (`other`), the largest shares as text (`summary`), and
     the `values` of the vertices of both surfaces.
     """
-    result, n_surfaces = [], 0
+    result = []
+    n_surfaces = 0
     files: dict[str, list[int]] = {}
     for i, name in enumerate(results.names):
         if name in results.parts:
@@ -165,7 +166,8 @@ def _map(system: System) -> dict[str, Any] | None:
     distances = system.distances.double().numpy()
     if not _MIN_MAPPED <= len(distances) <= _MAX_MAPPED or not np.isfinite(distances).all():
         return None
-    layout, clusters = body_map(distances), clusters_of(distances, n_resamples=50)
+    layout = body_map(distances)
+    clusters = clusters_of(distances, n_resamples=50)
     extent = float(np.ptp(layout.points, axis=0).max()) or 1.0
     return {
         "points": ((layout.points - layout.points.min(axis=0)) / extent).round(4).tolist(),

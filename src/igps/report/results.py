@@ -32,9 +32,8 @@ class System:
     names: tuple[str, ...]  # of the meshes
     labels: tuple[str, ...] | None  # None if unknown
     distances: Tensor  # (N, N), rows are queries
-    seconds_per_mesh: float | None = (
-        None  # mean processor time of a description; None if it was not measured
-    )
+    # Mean processor time of a description; None if it was not measured
+    seconds_per_mesh: float | None = None
 
     def ranked(self) -> Integers:
         """Return the indices (N, N − 1) of the other meshes, nearest first, ties in the order of the meshes."""
@@ -62,19 +61,15 @@ class Results:
     systems: tuple[System, ...] = ()
     rows: tuple[Mapping[str, Any], ...] = ()  # table of `igps compare`, one row per descriptor
     unused: tuple[Unused, ...] = ()
-    notes: Mapping[str, Sequence[str]] = field(
-        default_factory=dict
-    )  # notes on the mending of meshes, by name
+    # Notes on the mending of meshes, by name
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
-    parts: Mapping[str, str] = field(
-        default_factory=dict
-    )  # parts of bodies that share their file, by name
-    columns: Mapping[str, Mapping[str, str | None]] = field(
-        default_factory=dict
-    )  # by column and name of the body
-    groups: tuple[
-        Mapping[str, Any], ...
-    ] = ()  # results of `igps groups` in the same folder, one row per body
+    # Parts of bodies that share their file, by name
+    parts: Mapping[str, str] = field(default_factory=dict)
+    # By column and name of the body
+    columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
+    # Results of `igps groups` in the same folder, one row per body
+    groups: tuple[Mapping[str, Any], ...] = ()
     outliers: tuple[Mapping[str, Any], ...] = ()  # results of `igps outliers` in the same folder
 
 
@@ -90,11 +85,9 @@ def read_results(folder: Path) -> Results:
             f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve` and "
             "`igps compare` write with --out."
         )
-    sources, notes, unused = (
-        _read_json(folder / MESHES_FILE),
-        dict[str, list[str]](),
-        list[Unused](),
-    )
+    sources = _read_json(folder / MESHES_FILE)
+    notes = dict[str, list[str]]()
+    unused = list[Unused]()
     for name, note in map(dict.values, _read_rows(folder / "notes.csv")):
         notes.setdefault(name, []).append(note)
     for *descriptor, name, error in map(dict.values, _read_rows(folder / "failures.csv")):
@@ -118,7 +111,9 @@ def read_results(folder: Path) -> Results:
 
 def write_sources(folder: Path, dataset: SignatureDataset) -> None:
     """Write meshes.json: names, paths, parts and columns of the bodies, reading options, configuration, and cache."""
-    pipeline, bodies, names = dataset.pipeline, dataset.bodies, dataset.pipeline.reading.names
+    pipeline = dataset.pipeline
+    bodies = dataset.bodies
+    names = dataset.pipeline.reading.names
     summary = {
         "format": _FORMAT,
         "meshes": [
@@ -155,10 +150,8 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
                 meshes / file_name_of(name, part) for name, part in zip(names, parts, strict=True)
             )
         columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
-        bodies, reading = (
-            Bodies(paths, names, None, parts, columns),
-            LoadOptions(**summary["reading"]),
-        )
+        bodies = Bodies(paths, names, None, parts, columns)
+        reading = LoadOptions(**summary["reading"])
         return SignatureDataset(
             bodies, SignatureConfig(**summary["signature"]), summary["cache_dir"], reading=reading
         )
@@ -176,7 +169,8 @@ def _read_retrieval(folder: Path) -> Results:
 
 def _read_comparison(folder: Path) -> Results:
     rows = json.loads((folder / _COMPARISON).read_text())
-    systems, label_of = [], dict[str, str]()
+    systems = []
+    label_of = dict[str, str]()
     names: dict[str, None] = {}
     for row in rows:
         path = folder / "distances" / f"{row['descriptor']}.npz"

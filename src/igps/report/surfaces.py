@@ -32,7 +32,8 @@ logger = logging.getLogger(__name__)
 _FORMAT = "igps-surfaces-3"
 _MAX_VERTICES, _MIN_VERTICES = 1200, 150  # of one surface
 # Size of all surfaces of a page, and of one vertex, which has 19 bytes as text in base 64
-_MAX_BYTES, _BYTES_PER_VERTEX = 20e6, 19 * 4 / 3
+_MAX_BYTES = 20e6
+_BYTES_PER_VERTEX = 19 * 4 / 3
 STEPS = 2**16 - 1
 """Number of steps along each axis of the cube in which vertices are quantised."""
 _N_NEIGHBOURS = 4  # samples whose mean is the potential of a vertex
@@ -44,9 +45,8 @@ class PageSurface:
 
     vertices: NDArray[np.uint16]  # (V, 3) in the bounding cube, with axes by `page_axes`
     faces: NDArray[np.uint16]  # (F, 3), counter-clockwise seen from outside
-    potential: NDArray[
-        np.uint8
-    ]  # (V,) barycentroid potential, 0 at its minimum on the surface, 255 at its maximum
+    # (V,) barycentroid potential, 0 at its minimum on the surface, 255 at its maximum
+    potential: NDArray[np.uint8]
     potential_range: tuple[float, float]  # minimum and maximum of the potential, no unit
     n_vertices: int  # of the original mesh, as the following fields
     n_faces: int
@@ -78,7 +78,8 @@ def keep_surfaces(
     mesh that cannot be read and is not in the archive is logged and left out.
     """
     stored = read_surfaces(path)
-    names, bodies = dataset.bodies.names, dataset.bodies
+    names = dataset.bodies.names
+    bodies = dataset.bodies
     missing = [
         i
         for i, name in enumerate(names)
@@ -97,7 +98,8 @@ def run_jobs(
     work: Callable[[Job], Result], jobs: Mapping[str, Job], what: str, n_workers: int | None
 ) -> dict[str, Result]:
     """Run jobs in parallel and return their results by name; a failed job is logged as "no `what`" and left out."""
-    names, results = list(jobs), dict[str, Result]()
+    names = list(jobs)
+    results = dict[str, Result]()
     with contextlib.closing(run(work, list(jobs.values()), n_workers=n_workers)) as outcomes:
         for number, outcome in tqdm(outcomes, total=len(jobs), desc=f"{what}s"):
             if isinstance(outcome, Failed):
@@ -115,7 +117,8 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
     """Return a surface of at most `n_vertices` vertices, with the potential interpolated from surface samples."""
     try:
         simplified = simplify(mesh, n_vertices)
-        vertices, faces = simplified.vertices, simplified.faces
+        vertices = simplified.vertices
+        faces = simplified.faces
     except MeshError:  # a surface whose handles close is good enough for display
         vertices, faces = clustered(mesh.vertices, mesh.faces, n_vertices)
     samples = signature.surface.points
@@ -123,12 +126,15 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
         np.square(signature.surface.eigenfunctions, dtype=np.float64) @ (1 / signature.eigenvalues)
     )
     distances, nearest = cKDTree(samples).query(vertices, min(_N_NEIGHBOURS, len(samples)))
-    distances, nearest = distances.reshape(len(vertices), -1), nearest.reshape(len(vertices), -1)
+    distances = distances.reshape(len(vertices), -1)
+    nearest = nearest.reshape(len(vertices), -1)
     weights = 1 / (distances + 1e-6 * mesh.diagonal)
     values = (weights * potential[nearest]).sum(axis=1) / weights.sum(axis=1)
-    low, high = float(values.min()), float(values.max())
+    low = float(values.min())
+    high = float(values.max())
     rotated = vertices @ page_axes(mesh, samples)
-    lowest, highest = rotated.min(axis=0), rotated.max(axis=0)
+    lowest = rotated.min(axis=0)
+    highest = rotated.max(axis=0)
     in_cube = (rotated - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
     return PageSurface(
         np.rint(STEPS * in_cube).astype(np.uint16),
@@ -231,7 +237,8 @@ def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Float
 
     Handles and gaps may close, so the result is suitable only for display.
     """
-    low, extent = vertices.min(axis=0), longest_side(vertices)
+    low = vertices.min(axis=0)
+    extent = longest_side(vertices)
     resolution = max(2, int(np.sqrt(n_vertices)))
     while True:
         cells = np.minimum((vertices - low) * (resolution / extent), resolution - 1).astype(
@@ -247,8 +254,7 @@ def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Float
         [np.bincount(cell_of, vertices[:, axis]) / counts for axis in range(3)], axis=1
     )
     clusters = cell_of[faces]
-    clusters = clusters[
-        (clusters != np.roll(clusters, 1, axis=1)).all(axis=1)
-    ]  # without collapsed faces
+    # Without collapsed faces
+    clusters = clusters[(clusters != np.roll(clusters, 1, axis=1)).all(axis=1)]
     _, first = np.unique(np.sort(clusters, axis=1), axis=0, return_index=True)
     return compact(means, clusters[np.sort(first)])

@@ -18,7 +18,8 @@ def fill(
     for begin in range(0, len(gallery), TILE):
         for q in range(len(queries)):
             for g in range(begin, min(begin + TILE, len(gallery))):
-                a, b = queries[q], gallery[g]
+                a = queries[q]
+                b = gallery[g]
                 distances[q, g] = chi_square(a, b) if is_chi_square else square(a, b)
 
 

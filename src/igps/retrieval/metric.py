@@ -66,11 +66,13 @@ class RetrievalScoresMetric(Metric):
 
     def compute(self) -> dict[str, Tensor]:
         """Return the mean scores by name; a ValueError if no two descriptors share a label."""
-        descriptors, labels = dim_zero_cat(self.descriptors), dim_zero_cat(self.labels)
+        descriptors = dim_zero_cat(self.descriptors)
+        labels = dim_zero_cat(self.labels)
         if len(self.ids):
             _, first = np.unique(dim_zero_cat(self.ids).cpu().numpy(), return_index=True)
             unique = torch.from_numpy(np.sort(first)).to(labels.device)
-            descriptors, labels = descriptors[unique], labels[unique]
+            descriptors = descriptors[unique]
+            labels = labels[unique]
         scores = retrieval_scores(self.distance(descriptors, descriptors), labels)
         return {
             name: torch.tensor(value, device=descriptors.device)

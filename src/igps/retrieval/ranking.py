@@ -27,9 +27,8 @@ def rank(distances: Tensor) -> Tensor:
             f"distances: expected a real matrix (Q, G), got shape {tuple(distances.shape)} of {distances.dtype}; "
             "compute it with a function of igps.retrieval.distances"
         )
-    smallest = (
-        distances.detach().amin().item() if distances.numel() else 0.0
-    )  # NaN if any entry is NaN
+    # NaN if any entry is NaN
+    smallest = distances.detach().amin().item() if distances.numel() else 0.0
     if smallest != smallest:
         raise ValueError(
             "distances: expected numbers, got NaN, which has no rank; look for the descriptor with NaN"

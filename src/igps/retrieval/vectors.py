@@ -28,9 +28,8 @@ class VectorMap:
     """
 
     searched_by: SearchDistance  # the distance of the descriptions
-    mean: Singles | None = (
-        None  # (F,) of the descriptions or their features; None if descriptions stay as they are
-    )
+    # (F,) of the descriptions or their features; None if descriptions stay as they are
+    mean: Singles | None = None
     components: Singles | None = None  # (D, F) principal directions, orthonormal
 
     @classmethod

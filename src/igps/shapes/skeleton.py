@@ -31,9 +31,8 @@ class Part:
     group: str = "body"  # parts of one group share their proportions
     bend: Vector = ORIGIN  # limits of the joint (raise, swing, twist), degrees
     at: Vector = ORIGIN  # position of the joint in the frame of the parent
-    turn: Floats = field(
-        default_factory=lambda: np.eye(3)
-    )  # frame of the joint at rest, in that of the parent
+    # Frame of the joint at rest, in that of the parent
+    turn: Floats = field(default_factory=lambda: np.eye(3))
     blend: float = 0.06  # distance within which the union with other solids is smooth
     lift: float = 0.0  # distance of the origin of the solid from the joint, along z
     children: tuple[Part, ...] = ()

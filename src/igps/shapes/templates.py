@@ -88,7 +88,9 @@ def quadruped() -> Skeleton:
         radii=[0.1, 0.09, 0.08],
         bends=[(20, 25)],
     ).joined((0, 0.62, 0.1), heading=(0, 1, 0.1))
-    bones, radii, bends = ([0.42, 0.42], [0.15, 0.11, 0.1], [(22, 6), (22, 0)])
+    bones = [0.42, 0.42]
+    radii = [0.15, 0.11, 0.1]
+    bends = [(22, 6), (22, 0)]
     pairs = [
         (
             limb(
@@ -172,7 +174,8 @@ def spider() -> Skeleton:
 
 
 def hand() -> Skeleton:
-    radii, bends = ([0.115, 0.105, 0.1, 0.095], [(16, 4), (22, 0)])
+    radii = [0.115, 0.105, 0.1, 0.095]
+    bends = [(16, 4), (22, 0)]
     fingers = []
     for x, k in ((-0.45, 0.9), (-0.15, 1.1), (0.15, 1.15), (0.45, 0.95)):
         finger = limb(

@@ -8,9 +8,8 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 
-_TINY = (
-    math.ulp(1.0) ** 2
-)  # keeps the logarithm of a side finite at points on the side, where its factor is 0
+# Keeps the logarithm of a side finite at points on the side, where its factor is 0
+_TINY = math.ulp(1.0) ** 2
 
 
 class PatchTree(NamedTuple):
@@ -50,27 +49,32 @@ def fill_potentials(
     """
     patches, min_distances, level_starts, branching, squared_limits, faces = tree
     n_levels = len(level_starts) - 1
-    x, is_far = np.empty((3, block)), np.empty(block)
+    x = np.empty((3, block))
+    is_far = np.empty(block)
     # The stack holds at most all patches of the coarsest level, and the children of one patch for each level below.
     stack = np.empty(
         (level_starts[n_levels] - level_starts[n_levels - 1] + branching * n_levels, 2), np.int64
     )
     for start in range(0, len(points), block):
         n = min(block, len(points) - start)
-        low, high = points[start].copy(), points[start].copy()
+        low = points[start].copy()
+        high = points[start].copy()
         for i in range(n):
             for axis in range(3):
                 x[axis, i] = points[start + i, axis]
                 low[axis], high[axis] = min(low[axis], x[axis, i]), max(high[axis], x[axis, i])
-        block_points, sums = x[:, :n], out[start : start + n]
+        block_points = x[:, :n]
+        sums = out[start : start + n]
         sums[:] = 0
         n_stacked = 0
         for patch in range(level_starts[n_levels - 1], level_starts[n_levels]):
-            stack[n_stacked, 0], stack[n_stacked, 1] = patch, n_levels - 1
+            stack[n_stacked, 0] = patch
+            stack[n_stacked, 1] = n_levels - 1
             n_stacked += 1
         while n_stacked > 0:
             n_stacked -= 1
-            patch, level = stack[n_stacked, 0], stack[n_stacked, 1]
+            patch = stack[n_stacked, 0]
+            level = stack[n_stacked, 1]
             squared_gap = 0.0
             for axis in range(3):
                 gap = patches[patch, axis] - min(max(patches[patch, axis], low[axis]), high[axis])
@@ -81,7 +85,8 @@ def fill_potentials(
             elif level > 0:
                 children = level_starts[level - 1] + branching * (patch - level_starts[level])
                 for child in range(children, min(children + branching, level_starts[level])):
-                    stack[n_stacked, 0], stack[n_stacked, 1] = child, level - 1
+                    stack[n_stacked, 0] = child
+                    stack[n_stacked, 1] = level - 1
                     n_stacked += 1
             else:
                 add_face(
@@ -107,10 +112,16 @@ def add_series(
     c1 = patch[1] + share * (target[1] - patch[1])
     c2 = patch[2] + share * (target[2] - patch[2])
     area = patch[3] * scale**2
-    f0, f1, f2 = patch[4] * scale**4, patch[5] * scale**4, patch[6] * scale**4
-    f3, f4, f5 = patch[7] * scale**4, patch[8] * scale**4, patch[9] * scale**4
+    f0 = patch[4] * scale**4
+    f1 = patch[5] * scale**4
+    f2 = patch[6] * scale**4
+    f3 = patch[7] * scale**4
+    f4 = patch[8] * scale**4
+    f5 = patch[9] * scale**4
     for i in range(points.shape[1]):
-        a, b, c = c0 - points[0, i], c1 - points[1, i], c2 - points[2, i]
+        a = c0 - points[0, i]
+        b = c1 - points[1, i]
+        c = c2 - points[2, i]
         # A patch at the point itself is never far, so its term is multiplied by 0 below.
         inverse = 1 / max(a * a + b * b + c * c, 1e-24)
         second = a * (f0 * a + f3 * b + f4 * c) + b * (f1 * b + f5 * c) + f2 * c * c
@@ -124,7 +135,9 @@ def add_face(
     """Add the potential of one face at points (3, n): by the series of its quarters, or near it in closed form."""
     n_far = 0
     for i in range(points.shape[1]):
-        a, b, c = patch[0] - points[0, i], patch[1] - points[1, i], patch[2] - points[2, i]
+        a = patch[0] - points[0, i]
+        b = patch[1] - points[1, i]
+        c = patch[2] - points[2, i]
         if a * a + b * b + c * c < squared_limit:
             is_far[i] = 0
             sums[i] += near_potential(face, points[0, i], points[1, i], points[2, i])
@@ -153,7 +166,9 @@ def near_potential(face: Floats, x: float, y: float, z: float) -> float:
     a = (face[0] - x, face[1] - y, face[2] - z)
     b = (face[3] - x, face[4] - y, face[5] - z)
     c = (face[6] - x, face[7] - y, face[8] - z)
-    r, s, t = math.sqrt(dot(a, a)), math.sqrt(dot(b, b)), math.sqrt(dot(c, c))
+    r = math.sqrt(dot(a, a))
+    s = math.sqrt(dot(b, b))
+    t = math.sqrt(dot(c, c))
     potential = dot((face[12], face[13], face[14]), a) * logarithm(r + s, face[21])
     potential += dot((face[15], face[16], face[17]), b) * logarithm(s + t, face[22])
     potential += dot((face[18], face[19], face[20]), c) * logarithm(t + r, face[23])

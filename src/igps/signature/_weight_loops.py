@@ -15,12 +15,10 @@ from igps._compiled import FUSE, compiled
 SurfaceArrays = tuple[Integers, Floats, Integers, Integers]
 """Faces, table, face_starts and incident_faces of a `HatSurface`."""
 
-_N_PAIRS = (
-    128  # pairs of a face and a point computed at a time: their data stay in the first-level cache
-)
-_ON_SURFACE = (
-    2e-9  # half-diagonals; points closer than this are on the surface, or in the plane of a face
-)
+# Pairs of a face and a point computed at a time: their data stay in the first-level cache
+_N_PAIRS = 128
+# Half-diagonals; points closer than this are on the surface, or in the plane of a face
+_ON_SURFACE = 2e-9
 _TAN = math.tan(math.pi / 8)
 # Coefficients of arctan(√q)/√q for √q ≤ tan π/8, accurate to rounding, from the highest power down.
 _ARCTAN = tuple(
@@ -43,16 +41,19 @@ def find_far_clusters(
     n_hats: int,
 ) -> tuple[Integers, Integers]:
     """Return the clusters that are `ratio` or more radii from a box, and the hats in none of these, ascending."""
-    clusters, hats = np.empty(len(radii), np.int64), np.empty(n_hats, np.int64)
+    clusters = np.empty(len(radii), np.int64)
+    hats = np.empty(n_hats, np.int64)
     n_clusters, n_near, n_stacked = 0, 0, 0
     n_levels = len(starts) - 1
     stack = np.empty((starts[n_levels] - starts[n_levels - 1] + 4 * n_levels, 2), np.int64)
     for cluster in range(starts[n_levels] - 1, starts[n_levels - 1] - 1, -1):
-        stack[n_stacked, 0], stack[n_stacked, 1] = cluster, n_levels - 1
+        stack[n_stacked, 0] = cluster
+        stack[n_stacked, 1] = n_levels - 1
         n_stacked += 1
     while n_stacked > 0:
         n_stacked -= 1
-        cluster, level = stack[n_stacked, 0], stack[n_stacked, 1]
+        cluster = stack[n_stacked, 0]
+        level = stack[n_stacked, 1]
         squared_gap = 0.0
         for axis in range(3):
             centre = centres[cluster, axis]
@@ -64,7 +65,8 @@ def find_far_clusters(
         elif level > 0:
             children = starts[level - 1] + 4 * number
             for child in range(min(children + 4, starts[level]) - 1, children - 1, -1):
-                stack[n_stacked, 0], stack[n_stacked, 1] = child, level - 1
+                stack[n_stacked, 0] = child
+                stack[n_stacked, 1] = level - 1
                 n_stacked += 1
         else:
             for hat in range(leaf * number, min(leaf * number + leaf, n_hats)):
@@ -82,14 +84,35 @@ def fill_hats(
     squared = np.empty(n)
     for k in range(len(chosen)):
         p = hats[chosen[k]]
-        p0, p1, p2, limit = p[0], p[1], p[2], (ratio * p[3]) ** 2
-        f, f0, f1, f2 = p[4], p[5], p[6], p[7]
-        s, s0, s1, s2 = p[8], p[9], p[10], p[11]
-        s00, s01, s02, s11, s12, s22 = p[12], p[13], p[14], p[15], p[16], p[17]
-        b00, b01, b02, b11, b12, b22 = p[18], p[19], p[20], p[21], p[22], p[23]
+        p0 = p[0]
+        p1 = p[1]
+        p2 = p[2]
+        limit = (ratio * p[3]) ** 2
+        f = p[4]
+        f0 = p[5]
+        f1 = p[6]
+        f2 = p[7]
+        s = p[8]
+        s0 = p[9]
+        s1 = p[10]
+        s2 = p[11]
+        s00 = p[12]
+        s01 = p[13]
+        s02 = p[14]
+        s11 = p[15]
+        s12 = p[16]
+        s22 = p[17]
+        b00 = p[18]
+        b01 = p[19]
+        b02 = p[20]
+        b11 = p[21]
+        b12 = p[22]
+        b22 = p[23]
         row = weights[k]
         for i in range(n):
-            a, b, c = p0 - x[0, i], p1 - x[1, i], p2 - x[2, i]
+            a = p0 - x[0, i]
+            b = p1 - x[1, i]
+            c = p2 - x[2, i]
             distance = a * a + b * b + c * c
             inverse = 1 / distance
             linear = f + f0 * a + f1 * b + f2 * c
@@ -113,43 +136,48 @@ def fill_clusters(
 ) -> None:
     """Fill the terms (19 c, n) of the chosen clusters (c,): |e|² times e, its products of two, and of three."""
     for k in range(len(chosen)):
-        c0, c1, c2, radius = (
-            centres[chosen[k], 0],
-            centres[chosen[k], 1],
-            centres[chosen[k], 2],
-            radii[chosen[k]],
-        )
+        c0 = centres[chosen[k], 0]
+        c1 = centres[chosen[k], 1]
+        c2 = centres[chosen[k], 2]
+        radius = radii[chosen[k]]
         out = terms[19 * k : 19 * k + 19]
         for i in range(x.shape[1]):
-            a, b, c = c0 - x[0, i], c1 - x[1, i], c2 - x[2, i]
+            a = c0 - x[0, i]
+            b = c1 - x[1, i]
+            c = c2 - x[2, i]
             inverse = radius / (a * a + b * b + c * c)
-            a, b, c = a * inverse, b * inverse, c * inverse
+            a = a * inverse
+            b = b * inverse
+            c = c * inverse
             scale = radius * inverse
-            sa, sb, sc = scale * a, scale * b, scale * c
-            aa, ab, ac, bb, bc, cc = sa * a, sa * b, sa * c, sb * b, sb * c, sc * c
-            out[0, i], out[1, i], out[2, i] = sa, sb, sc
-            out[3, i], out[4, i], out[5, i], out[6, i], out[7, i], out[8, i] = (
-                aa,
-                ab,
-                ac,
-                bb,
-                bc,
-                cc,
-            )
-            out[9, i], out[10, i], out[11, i], out[12, i], out[13, i] = (
-                aa * a,
-                aa * b,
-                aa * c,
-                ab * b,
-                ab * c,
-            )
-            out[14, i], out[15, i], out[16, i], out[17, i], out[18, i] = (
-                ac * c,
-                bb * b,
-                bb * c,
-                bc * c,
-                cc * c,
-            )
+            sa = scale * a
+            sb = scale * b
+            sc = scale * c
+            aa = sa * a
+            ab = sa * b
+            ac = sa * c
+            bb = sb * b
+            bc = sb * c
+            cc = sc * c
+            out[0, i] = sa
+            out[1, i] = sb
+            out[2, i] = sc
+            out[3, i] = aa
+            out[4, i] = ab
+            out[5, i] = ac
+            out[6, i] = bb
+            out[7, i] = bc
+            out[8, i] = cc
+            out[9, i] = aa * a
+            out[10, i] = aa * b
+            out[11, i] = aa * c
+            out[12, i] = ab * b
+            out[13, i] = ab * c
+            out[14, i] = ac * c
+            out[15, i] = bb * b
+            out[16, i] = bb * c
+            out[17, i] = bc * c
+            out[18, i] = cc * c
 
 
 class Touched(NamedTuple):
@@ -169,7 +197,8 @@ def add_near_faces(
     weights are replaced: by the barycentric coordinates in their face, and by zero elsewhere.
     """
     faces, table, face_starts, incident_faces = surface
-    n, n_chosen = x.shape[1], len(chosen)
+    n = x.shape[1]
+    n_chosen = len(chosen)
     hat_weights = weights[len(weights) - n_chosen :]
     row_of = np.empty(len(face_starts) - 1, np.int64)
     row_of[:] = n_chosen
@@ -191,7 +220,8 @@ def add_near_faces(
                     row_1, row_2 = row_of[faces[face, corner]], row_1
             for i in range(n):
                 if near[k, i] and not near[row_1, i] and not near[row_2, i]:
-                    pairs[0, n_pairs], pairs[1, n_pairs] = face, i
+                    pairs[0, n_pairs] = face
+                    pairs[1, n_pairs] = i
                     n_pairs += 1
             if n_pairs >= _N_PAIRS:
                 add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, touched)
@@ -234,16 +264,21 @@ def add_faces(
     because N_l = λ_l n + h n̂×e_l. The length of N_l is taken from this identity, too: all terms agree near a side.
     """
     n_pairs = pairs.shape[1]
-    projections, squares, cosines = (
-        np.empty((n_pairs, 4)),
-        np.empty(3 * n_pairs),
-        np.empty(3 * n_pairs),
-    )
+    projections = np.empty((n_pairs, 4))
+    squares = np.empty(3 * n_pairs)
+    cosines = np.empty(3 * n_pairs)
     for m in range(n_pairs):
-        row, i = table[pairs[0, m]], pairs[1, m]
-        a0, a1, a2 = row[0] - x[0, i], row[1] - x[1, i], row[2] - x[2, i]
-        b0, b1, b2 = row[3] - x[0, i], row[4] - x[1, i], row[5] - x[2, i]
-        c0, c1, c2 = row[6] - x[0, i], row[7] - x[1, i], row[8] - x[2, i]
+        row = table[pairs[0, m]]
+        i = pairs[1, m]
+        a0 = row[0] - x[0, i]
+        a1 = row[1] - x[1, i]
+        a2 = row[2] - x[2, i]
+        b0 = row[3] - x[0, i]
+        b1 = row[4] - x[1, i]
+        b2 = row[5] - x[2, i]
+        c0 = row[6] - x[0, i]
+        c1 = row[7] - x[1, i]
+        c2 = row[8] - x[2, i]
         height = row[9] * a0 + row[10] * a1 + row[11] * a2
         # λ |n|: twice the areas of the triangles that the projection spans with each side.
         area_0 = -(row[12] * b0 + row[13] * b1 + row[14] * b2)
@@ -255,17 +290,19 @@ def add_faces(
         cosines[3 * m] = b0 * c0 + b1 * c1 + b2 * c2
         cosines[3 * m + 1] = c0 * a0 + c1 * a1 + c2 * a2
         cosines[3 * m + 2] = a0 * b0 + a1 * b1 + a2 * b2
-        projections[m, 0], projections[m, 1], projections[m, 2], projections[m, 3] = (
-            area_0,
-            area_1,
-            area_2,
-            height,
-        )
+        projections[m, 0] = area_0
+        projections[m, 1] = area_1
+        projections[m, 2] = area_2
+        projections[m, 3] = height
     divide_angles(squares, cosines)
     for m in range(n_pairs):
-        face, i = pairs[0, m], pairs[1, m]
-        row, areas, height = table[face], projections[m], projections[m, 3]
-        g, sides = squares[3 * m : 3 * m + 3], table[face, 18:21]
+        face = pairs[0, m]
+        i = pairs[1, m]
+        row = table[face]
+        areas = projections[m]
+        height = projections[m, 3]
+        g = squares[3 * m : 3 * m + 3]
+        sides = table[face, 18:21]
         half = (sides[0] + sides[1] + sides[2]) / 2
         s = g[0] * areas[0] + g[1] * areas[1] + g[2] * areas[2]
         # In the plane of a face but outside the face, s vanishes like h² and s/h like h: only rounding errors are left.
@@ -273,7 +310,9 @@ def add_faces(
         on_face = abs(height) <= _ON_SURFACE and touched.face_at[i] < 0
         total_area = 0.0
         for corner in range(3):
-            left, right, k = (corner + 2) % 3, (corner + 1) % 3, row_of[faces[face, corner]]
+            left = (corner + 2) % 3
+            right = (corner + 1) % 3
+            k = row_of[faces[face, corner]]
             if near[k, i]:
                 second = (
                     g[corner] * sides[corner]
@@ -293,9 +332,11 @@ def add_faces(
 def divide_angles(squares: Floats, cosines: Floats) -> None:
     """Replace squared lengths by angles over lengths, arctan2(length, cosine) / length, accurate to rounding."""
     for m in range(len(squares)):
-        y, cosine = max(math.sqrt(squares[m]), 1e-150), cosines[m]
+        y = max(math.sqrt(squares[m]), 1e-150)
+        cosine = cosines[m]
         x = abs(cosine)
-        small, large = min(x, y), max(x, y)
+        small = min(x, y)
+        large = max(x, y)
         steep = small > _TAN * large
         z = (small - large if steep else small) / (small + large if steep else large)
         q = z * z
@@ -319,31 +360,48 @@ def fill_cluster_terms(
     each of three ways.
     """
     for hat in range(len(hats)):
-        p, out, centre, scale = hats[hat], terms[hat], centres[hat // size], 1 / radii[hat // size]
-        s0, s1, s2 = (
-            scale * (p[0] - centre[0]),
-            scale * (p[1] - centre[1]),
-            scale * (p[2] - centre[2]),
-        )
-        cubed, squared = scale * scale * scale, scale * scale
-        f0, f1, f2 = cubed * p[5], cubed * p[6], cubed * p[7]
+        p = hats[hat]
+        out = terms[hat]
+        centre = centres[hat // size]
+        scale = 1 / radii[hat // size]
+        s0 = scale * (p[0] - centre[0])
+        s1 = scale * (p[1] - centre[1])
+        s2 = scale * (p[2] - centre[2])
+        cubed = scale * scale * scale
+        squared = scale * scale
+        f0 = cubed * p[5]
+        f1 = cubed * p[6]
+        f2 = cubed * p[7]
         # S is −4 dᵀTd, and B is 12 dᵀCd; entries off the diagonal count twice.
-        tilt, spread = -squared * squared / 4, squared / 12
-        t00, t01, t02 = tilt * p[12], tilt * p[13], tilt * p[14]
-        t11, t12, t22 = tilt * p[15], tilt * p[16], tilt * p[17]
-        e00, e11, e22 = spread * p[18] + s0 * s0, spread * p[21] + s1 * s1, spread * p[23] + s2 * s2
-        e01, e02, e12 = (
-            spread * p[19] + 2 * s0 * s1,
-            spread * p[20] + 2 * s0 * s2,
-            spread * p[22] + 2 * s1 * s2,
-        )
-        out[0], out[1], out[2] = f0, f1, f2
-        n00, n11, n22 = t00 + f0 * s0, t11 + f1 * s1, t22 + f2 * s2
+        tilt = -squared * squared / 4
+        spread = squared / 12
+        t00 = tilt * p[12]
+        t01 = tilt * p[13]
+        t02 = tilt * p[14]
+        t11 = tilt * p[15]
+        t12 = tilt * p[16]
+        t22 = tilt * p[17]
+        e00 = spread * p[18] + s0 * s0
+        e11 = spread * p[21] + s1 * s1
+        e22 = spread * p[23] + s2 * s2
+        e01 = spread * p[19] + 2 * s0 * s1
+        e02 = spread * p[20] + 2 * s0 * s2
+        e12 = spread * p[22] + 2 * s1 * s2
+        out[0] = f0
+        out[1] = f1
+        out[2] = f2
+        n00 = t00 + f0 * s0
+        n11 = t11 + f1 * s1
+        n22 = t22 + f2 * s2
         trace = n00 + n11 + n22
-        out[3], out[6], out[8] = trace - 4 * n00, trace - 4 * n11, trace - 4 * n22
-        out[4], out[5] = -4 * (t01 + f0 * s1 + f1 * s0), -4 * (t02 + f0 * s2 + f2 * s0)
+        out[3] = trace - 4 * n00
+        out[6] = trace - 4 * n11
+        out[8] = trace - 4 * n22
+        out[4] = -4 * (t01 + f0 * s1 + f1 * s0)
+        out[5] = -4 * (t02 + f0 * s2 + f2 * s0)
         out[7] = -4 * (t12 + f1 * s2 + f2 * s1)
-        trace_t, trace_e = t00 + t11 + t22, e00 + e11 + e22
+        trace_t = t00 + t11 + t22
+        trace_e = e00 + e11 + e22
         g0 = 2 * trace_t * s0 + trace_e * f0 + 2 * (2 * t00 * s0 + t01 * s1 + t02 * s2)
         g1 = 2 * trace_t * s1 + trace_e * f1 + 2 * (t01 * s0 + 2 * t11 * s1 + t12 * s2)
         g2 = 2 * trace_t * s2 + trace_e * f2 + 2 * (t02 * s0 + t12 * s1 + 2 * t22 * s2)
@@ -351,9 +409,15 @@ def fill_cluster_terms(
         g1 += e01 * f0 + 2 * e11 * f1 + e12 * f2
         g2 += e02 * f0 + e12 * f1 + 2 * e22 * f2
         # 12 (F·e) eᵀEe + 24 (s·e) eᵀTe − 2 (g·e) |e|²
-        f0, f1, f2 = 12 * f0, 12 * f1, 12 * f2
-        s0, s1, s2 = 24 * s0, 24 * s1, 24 * s2
-        g0, g1, g2 = 2 * g0, 2 * g1, 2 * g2
+        f0 = 12 * f0
+        f1 = 12 * f1
+        f2 = 12 * f2
+        s0 = 24 * s0
+        s1 = 24 * s1
+        s2 = 24 * s2
+        g0 = 2 * g0
+        g1 = 2 * g1
+        g2 = 2 * g2
         out[9] = f0 * e00 + s0 * t00 - g0
         out[10] = f0 * e01 + f1 * e00 + s0 * t01 + s1 * t00 - g1
         out[11] = f0 * e02 + f2 * e00 + s0 * t02 + s2 * t00 - g2

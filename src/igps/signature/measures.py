@@ -202,9 +202,8 @@ class _NearestPoints:
         offsets = points[:, None] - self._corners[faces, 0]
         others = np.einsum("pkci,pki->pkc", self._weights[faces], offsets)
         weights = np.concatenate([1 - others.sum(axis=2, keepdims=True), others], axis=2)
-        weights = np.maximum(
-            weights, 0
-        )  # a point of the face near the nearest, which may be outside of it
+        # A point of the face near the nearest, which may be outside of it
+        weights = np.maximum(weights, 0)
         weights /= weights.sum(axis=2, keepdims=True)
         in_faces = np.einsum("pkc,pkci->pki", weights, self._corners[faces])
         candidates = np.concatenate([in_faces, self._samples[nearest[:, :1]]], axis=1)

@@ -78,7 +78,8 @@ def in_canonical_order(mesh: Mesh) -> Mesh:
 
 def _keys(embedding: Floats, tie_breakers: Floats | float) -> Floats:
     keys = np.linalg.norm(embedding, axis=1) + _TIE_BREAKER_WEIGHT * tie_breakers
-    anchor, nearest = int(np.argmax(keys)), np.full(len(keys), np.inf)
+    anchor = int(np.argmax(keys))
+    nearest = np.full(len(keys), np.inf)
     for weight in _ANCHOR_WEIGHTS:
         distance = np.linalg.norm(embedding - embedding[anchor], axis=1)
         keys += weight * distance

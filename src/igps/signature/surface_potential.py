@@ -22,9 +22,8 @@ from igps.signature.ordering import spatial_order
 
 _BLOCK_SIZE = 32  # points for which the same patches are far
 _BRANCHING = 8  # patches that are merged into one of the next level
-_MIN_HEIGHT = (
-    1e-14  # of a face, relative to its longest side: flatter faces have no numerical normal
-)
+# Of a face, relative to its longest side: flatter faces have no numerical normal
+_MIN_HEIGHT = 1e-14
 
 
 def surface_potential(
@@ -36,7 +35,8 @@ def surface_potential(
     26 bodies with and without needles: the remainders of patches have different signs.
     """
     corners = vertices[faces]
-    centre, scale = corners.mean(axis=(0, 1)), longest_side(vertices)
+    centre = corners.mean(axis=(0, 1))
+    scale = longest_side(vertices)
     corners = (corners - centre) / scale
     corners = corners[_relative_heights(corners) > _MIN_HEIGHT]
     x = (np.asarray(points, np.float64) - centre) / scale

@@ -14,7 +14,8 @@ MAX_SINGLE_ENTRIES = 2**28
 # larger basis it costs more to wait for them.
 MAX_HUGE_PAGE_ENTRIES = 2**24
 # Smallest piece of the columns, and largest number of pieces; a thread works on one piece at a time.
-MIN_PIECE_COLUMNS, MAX_PIECES = 2**12, 8
+MIN_PIECE_COLUMNS = 2**12
+MAX_PIECES = 8
 
 
 class Basis:
@@ -46,7 +47,8 @@ class Basis:
         shape = n_rows, n_columns
         self._memory = np.empty(shape if self.overwrites_basis else (0, n_columns))
         if self.overwrites_basis:
-            self._basis, self._single = torch.from_numpy(self._memory), None
+            self._basis = torch.from_numpy(self._memory)
+            self._single = None
         elif n_rows * n_columns <= MAX_HUGE_PAGE_ENTRIES:
             self._basis, self._single = (
                 torch.from_numpy(np.empty(shape, dtype)) for dtype in (np.float64, np.float32)
@@ -70,7 +72,9 @@ class Basis:
         stop = self._stop + n_rows
         if stop > len(self._basis):
             capacity = len(self._basis) * 3 // 2 + n_rows
-            basis, single, projected = self._basis, self._single, self._projected
+            basis = self._basis
+            single = self._single
+            projected = self._projected
             self._allocate(capacity, basis.shape[1])
             self._basis[: self._stop] = basis[: self._stop]
             if self._single is not None and single is not None:

@@ -106,7 +106,8 @@ def checked_stiffness(
 
 def _significant(stiffness: sparse.csr_array) -> sparse.csr_array:
     """Return the matrix without entries that are rounding errors of zero, which would connect components."""
-    entries, diagonal = stiffness.tocoo(), stiffness.diagonal()
+    entries = stiffness.tocoo()
+    diagonal = stiffness.diagonal()
     large = np.abs(entries.data) > ROUNDING * np.minimum(
         diagonal[entries.row], diagonal[entries.col]
     )

@@ -16,9 +16,12 @@ def assemble(
     node: int, tree: Structure, values: Floats, shift: float, updates: Floats, scratch: Scratch
 ) -> None:
     """Write the upper triangle of a node's front (S + B, S + B), including the Schur complements of its children."""
-    own_start, boundary_start = tree.own_start, tree.boundary_start
-    boundary_row, front = scratch.boundary_row, scratch.front
-    own_begin, own_end = own_start[node], own_start[node + 1]
+    own_start = tree.own_start
+    boundary_start = tree.boundary_start
+    boundary_row = scratch.boundary_row
+    front = scratch.front
+    own_begin = own_start[node]
+    own_end = own_start[node + 1]
     n_own = own_end - own_begin
     width = n_own + boundary_start[node + 1] - boundary_start[node]
     for k in range(boundary_start[node], boundary_start[node + 1]):
@@ -37,7 +40,8 @@ def assemble(
         child = tree.children[node, side]
         if child < 0:
             continue
-        base, size = boundary_start[child], boundary_start[child + 1] - boundary_start[child]
+        base = boundary_start[child]
+        size = boundary_start[child + 1] - boundary_start[child]
         for i in range(size):
             row = tree.parent_row[base + i] * width
             source = tree.update_start[child] + i * size
@@ -62,18 +66,14 @@ def eliminate(
     taken in another order. The front of that node is assembled.
     """
     n_negative = 0
-    own_start, boundary_start, front, inverse = (
-        tree.own_start,
-        tree.boundary_start,
-        scratch.front,
-        scratch.inverse,
-    )
+    own_start = tree.own_start
+    boundary_start = tree.boundary_start
+    front = scratch.front
+    inverse = scratch.inverse
     for node in range(nodes[0], nodes[1]):
         assemble(node, tree, values, shift, updates, scratch)
-        n_own, n_boundary = (
-            own_start[node + 1] - own_start[node],
-            boundary_start[node + 1] - boundary_start[node],
-        )
+        n_own = own_start[node + 1] - own_start[node]
+        n_boundary = boundary_start[node + 1] - boundary_start[node]
         width = n_own + n_boundary
         if n_own > max_own:
             return n_negative, node
@@ -82,18 +82,21 @@ def eliminate(
         if n_new < 0:
             return n_negative, node
         n_negative += n_new
-        begin, update_begin = tree.block_start[node], tree.update_start[node]
+        begin = tree.block_start[node]
+        update_begin = tree.update_start[node]
         for i in range(n_own):
             for j in range(n_own):
                 blocks[begin + i * width + j] = inverse[j * padded + i]
         if n_boundary == 0:
             continue
-        coupling, elimination = (front, n_own, width), (blocks, begin + n_own, width)
+        coupling = (front, n_own, width)
+        elimination = (blocks, begin + n_own, width)
         shape = (n_own, n_boundary, n_own)
         product(shape, -1.0, (inverse, ZERO, ONE, padded), coupling, ZERO, elimination, elimination)
         # Compute the upper triangle of the Schur complement, a few rows at a time.
         for i in range(0, n_boundary, ROWS):
-            n_rows, skipped = min(ROWS, n_boundary - i), max(0, min(i, n_boundary - COLUMNS))
+            n_rows = min(ROWS, n_boundary - i)
+            skipped = max(0, min(i, n_boundary - COLUMNS))
             product(
                 (n_rows, n_boundary - skipped, n_own),
                 1.0,
@@ -110,7 +113,8 @@ def eliminate(
 def add_row(target: Floats, target_row: int, source: Floats, source_row: Any, b: int) -> None:
     """Add a row of one flat array to a row of another; both have rows of b numbers."""
     # Unsigned indices spare Numba the check for negative ones.
-    first, source_first = np.uint64(target_row * b), np.uint64(source_row * b)
+    first = np.uint64(target_row * b)
+    source_first = np.uint64(source_row * b)
     for c in range(np.uint64(b)):
         target[first + c] += source[source_first + c]
 
@@ -130,15 +134,18 @@ def forward(
     The right-hand sides are (b, V).
     """
     b = len(right)
-    order, own_start, boundary_start = tree.order, tree.own_start, tree.boundary_start
-    children, parent_row, carried_start = tree.children, tree.parent_row, tree.carried_start
+    order = tree.order
+    own_start = tree.own_start
+    boundary_start = tree.boundary_start
+    children = tree.children
+    parent_row = tree.parent_row
+    carried_start = tree.carried_start
     rows = np.empty(max_rows * b)
     for node in range(nodes[0], nodes[1]):
-        n_own, n_boundary = (
-            own_start[node + 1] - own_start[node],
-            boundary_start[node + 1] - boundary_start[node],
-        )
-        width, own_x = n_own + n_boundary, x[own_start[node] * b :]
+        n_own = own_start[node + 1] - own_start[node]
+        n_boundary = boundary_start[node + 1] - boundary_start[node]
+        width = n_own + n_boundary
+        own_x = x[own_start[node] * b :]
         for i in range(n_own):
             vertex = np.uint64(order[own_start[node] + i])
             for c in range(np.uint64(b)):
@@ -147,15 +154,16 @@ def forward(
         for side in range(2):
             child = children[node, side]
             if child >= 0:
-                source, base = carried[carried_start[child] * b :], boundary_start[child]
-                k = np.int64(
-                    0
-                )  # a plain 0 has another type, for which Numba would compile `add_row` again
+                source = carried[carried_start[child] * b :]
+                base = boundary_start[child]
+                # A plain 0 has another type, for which Numba would compile `add_row` again
+                k = np.int64(0)
                 while k < boundary_start[child + 1] - base and parent_row[base + k] < n_own:
                     add_row(own_x, parent_row[base + k], source, k, b)
                     k += 1
         # D is symmetric: one product with the transposed block gives both D x and Eᵀ x.
-        block, product_rows = (blocks, tree.block_start[node], width, ONE), (rows, ZERO, b)
+        block = (blocks, tree.block_start[node], width, ONE)
+        product_rows = (rows, ZERO, b)
         product(
             (width, b, n_own),
             1.0,
@@ -170,7 +178,8 @@ def forward(
         for side in range(2):
             child = children[node, side]
             if child >= 0:
-                source, base = carried[carried_start[child] * b :], boundary_start[child]
+                source = carried[carried_start[child] * b :]
+                base = boundary_start[child]
                 k = boundary_start[child + 1] - base - 1
                 while k >= 0 and parent_row[base + k] >= n_own:
                     add_row(rows, parent_row[base + k], source, k, b)
@@ -186,28 +195,25 @@ def backward(
 ) -> None:
     """Pass downwards through a range of nodes: x, (V, b) flat, becomes D x + E x_boundary, the solution (b, V)."""
     b = len(solution)
-    order, own_start, boundary_start, boundary = (
-        tree.order,
-        tree.own_start,
-        tree.boundary_start,
-        tree.boundary,
-    )
-    boundary_x, rows = np.empty(max_rows * b), np.empty(max_rows * b)
+    order = tree.order
+    own_start = tree.own_start
+    boundary_start = tree.boundary_start
+    boundary = tree.boundary
+    boundary_x = np.empty(max_rows * b)
+    rows = np.empty(max_rows * b)
     for node in range(nodes[1] - 1, nodes[0] - 1, -1):
-        n_own, n_boundary = (
-            own_start[node + 1] - own_start[node],
-            boundary_start[node + 1] - boundary_start[node],
-        )
-        own_x, width = x[own_start[node] * b :], n_own + n_boundary
+        n_own = own_start[node + 1] - own_start[node]
+        n_boundary = boundary_start[node + 1] - boundary_start[node]
+        own_x = x[own_start[node] * b :]
+        width = n_own + n_boundary
         for k in range(n_boundary):
-            row, source = (
-                np.uint64(k * b),
-                np.uint64(boundary[boundary_start[node] + k]) * np.uint64(b),
-            )
+            row = np.uint64(k * b)
+            source = np.uint64(boundary[boundary_start[node] + k]) * np.uint64(b)
             for c in range(np.uint64(b)):
                 boundary_x[row + c] = x[source + c]
         elimination = (blocks, tree.block_start[node] + n_own, ONE, width)
-        shape, product_rows = (n_own, b, n_boundary), (rows, ZERO, b)
+        shape = (n_own, b, n_boundary)
+        product_rows = (rows, ZERO, b)
         product(
             shape,
             1.0,

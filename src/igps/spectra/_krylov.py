@@ -35,12 +35,10 @@ class RitzPairs:
     """Eigenpairs of the projected problem, ordered by eigenvalue."""
 
     eigenvalues: torch.Tensor  # (m,) of A
-    residuals: (
-        torch.Tensor
-    )  # (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator
-    coefficients: (
-        torch.Tensor
-    )  # (m + b, m) of these vectors, not normalised, in the basis including its next block
+    # (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator
+    residuals: torch.Tensor
+    # (m + b, m) of these vectors, not normalised, in the basis including its next block
+    coefficients: torch.Tensor
     below_shift: torch.Tensor  # (m,) whether θ < 0
 
     def leading(self, n_below: int, tolerance: float) -> torch.Tensor:
@@ -71,7 +69,9 @@ class Krylov(Basis):
         team: Team = SERIAL,
     ) -> None:
         super().__init__(zero_mode, capacity, team)
-        self._factors, self._generator, self._block_size = factors, generator, block_size
+        self._factors = factors
+        self._generator = generator
+        self._block_size = block_size
         # Rows _previous:_current and _current:_stop of the basis are the last two blocks; the last awaits `expand`.
         self._previous = self._current = 1
         self._interval = INTERVAL
@@ -163,11 +163,13 @@ class Krylov(Basis):
     ) -> np.ndarray:
         """Return the same eigenvectors (V, K), written over the basis, which is lost; see `overwrites_basis`."""
         coefficients = _coefficients(ritz, index)
-        n_vertices, n_vectors = self._basis.shape[1], coefficients.shape[1]
+        n_vertices = self._basis.shape[1]
+        n_vectors = coefficients.shape[1]
         for piece in self._small_pieces():
             self._basis[:n_vectors, piece] = coefficients.T @ self._basis[1 : self._stop, piece]
         rows = self._memory
-        self._basis, self._memory = self._basis.new_empty(0, n_vertices), np.empty((0, n_vertices))
+        self._basis = self._basis.new_empty(0, n_vertices)
+        self._memory = np.empty((0, n_vertices))
         # Release the rest of the memory; no other array refers to it any more.
         rows.resize((n_vectors, n_vertices), refcheck=False)
         vectors = np.empty((n_vertices, n_vectors))
@@ -195,13 +197,15 @@ class Krylov(Basis):
         the time. The error of the projection is then the square of the loss (Simon 1984), which is below rounding. A
         loss up to MAX_SINGLE_LOSS is removed in single precision; the rows are mostly still orthonormal afterwards.
         """
-        old, new = self._basis[: self._n_orthogonal], self._basis[self._n_orthogonal : self._stop]
+        old = self._basis[: self._n_orthogonal]
+        new = self._basis[self._n_orthogonal : self._stop]
         if not len(new):
             return 0.0
         (overlap,) = self._sum_pieces(lambda piece: (overlaps(new, old, piece),))
         loss = float(overlap.abs().max())
         if self._single is not None and loss <= MAX_SINGLE_LOSS:
-            old, overlap = self._single[: self._n_orthogonal], overlap.float()
+            old = self._single[: self._n_orthogonal]
+            overlap = overlap.float()
 
         def remove(piece: slice) -> tuple[torch.Tensor]:
             subtract(new, overlap, old, piece)
@@ -226,7 +230,8 @@ class Krylov(Basis):
         for rows in (self._basis[near : self._stop], self._basis[: self._stop]):
             block = torch.addmm(block, (rows @ block.T).T, rows, alpha=-1)
             block, factor = self._factor_rows(block, scale)
-            coupling, scale = factor @ coupling, 1.0
+            coupling = factor @ coupling
+            scale = 1.0
         return block, coupling
 
     def _factor_rows(self, block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor]:

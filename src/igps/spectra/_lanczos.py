@@ -24,7 +24,10 @@ SHIFT_RANK = 0.55
 SHIFT_BELOW = -1.0
 # Number of vectors in a block. Small blocks make a small basis, large ones fast products. Small ones are better for few
 # eigenpairs, and for results with very many numbers, where the basis takes gigabytes.
-SMALL_BLOCK, LARGE_BLOCK, MAX_SMALL_BLOCK_PAIRS, MAX_LARGE_BLOCK_RESULT = 8, 12, 128, 2**27
+SMALL_BLOCK = 8
+LARGE_BLOCK = 12
+MAX_SMALL_BLOCK_PAIRS = 128
+MAX_LARGE_BLOCK_RESULT = 2**27
 # Basis size at which usually all pairs have converged, as measured on bodies of 11,000 vertices: vectors per eigenpair
 # with the shift inside or below, plus a number of blocks, which grows with the decades of the number of eigenpairs and
 # with the digits of the tolerance beyond seven.
@@ -80,7 +83,8 @@ def lanczos(
                 tree, matrix, zero_mode, n_eigenpairs, tolerance, team
             )
         else:
-            shift, factors = SHIFT_BELOW, tree.factorize(matrix, SHIFT_BELOW, team)
+            shift = SHIFT_BELOW
+            factors = tree.factorize(matrix, SHIFT_BELOW, team)
         n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
         krylov = Krylov(
             factors, zero_mode, block_size, first_size + 3 * block_size, generator, team
@@ -98,7 +102,8 @@ def lanczos(
                 if (
                     krylov.overwrites_basis
                 ):  # count first: if some are missing, the basis is still needed
-                    vectors, n_negative = None, count()
+                    vectors = None
+                    n_negative = count()
                 else:  # count and compute the vectors in parallel
                     vectors, fill_steps = krylov.eigenvectors(ritz, wanted, order)
                     steps: list[Callable[[], Any]] = [count, *fill_steps]

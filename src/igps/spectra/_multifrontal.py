@@ -101,7 +101,8 @@ class Tree:
         n_updates = (
             self.structure.update_start + np.diff(self.structure.boundary_start) ** 2
         ).max()
-        values, updates = matrix.data.astype(np.float64, copy=False), np.empty(n_updates)
+        values = matrix.data.astype(np.float64, copy=False)
+        updates = np.empty(n_updates)
 
         def eliminate(nodes: Nodes) -> int:
             return self._eliminate_range(nodes, values, float(shift), updates, blocks, team)
@@ -137,12 +138,11 @@ class Tree:
             n_negative += n_new
             if node == end:
                 return n_negative
-            n_own, n_boundary = int(own_sizes[node - begin]), int(boundary_sizes[node - begin])
+            n_own = int(own_sizes[node - begin])
+            n_boundary = int(boundary_sizes[node - begin])
             width = n_own + n_boundary
-            block, update = (
-                blocks[structure.block_start[node] :],
-                updates[structure.update_start[node] :],
-            )
+            block = blocks[structure.block_start[node] :]
+            update = updates[structure.update_start[node] :]
             n_negative += _eliminate_node(
                 torch.from_numpy(front[: width**2].reshape(width, width)),
                 torch.from_numpy(block[: n_own * width].reshape(n_own, width)),
@@ -162,15 +162,14 @@ class Factors:
 
     def solve(self, right_hand_sides: torch.Tensor, team: Team = SERIAL) -> torch.Tensor:
         """Return the solutions (V, b) for right-hand sides (V, b), float64, both preferably stored by columns."""
-        tree, structure = self.tree, self.tree.structure
+        tree = self.tree
+        structure = self.tree.structure
         n_vertices, b = right_hand_sides.shape
         right = right_hand_sides.T.contiguous().numpy()
         solution = torch.empty(b, n_vertices, dtype=torch.float64, device="cpu")
         n_boundary = np.diff(structure.boundary_start)
-        x, carried = (
-            np.empty(n_vertices * b),
-            np.empty((structure.carried_start + n_boundary).max() * b),
-        )
+        x = np.empty(n_vertices * b)
+        carried = np.empty((structure.carried_start + n_boundary).max() * b)
         max_rows = int((np.diff(structure.own_start) + n_boundary).max())
 
         def forward(nodes: Nodes) -> None:
@@ -214,11 +213,14 @@ def _eliminate_node(
     front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team
 ) -> int:
     """Write D, E and the complement, from a front: both upper triangles. Return the number of negative pivots."""
-    n_own, n_boundary = len(block), len(update)
-    pivot, coupling = front[:n_own, :n_own].triu(), front[:n_own, n_own:]
+    n_own = len(block)
+    n_boundary = len(update)
+    pivot = front[:n_own, :n_own].triu()
+    coupling = front[:n_own, n_own:]
     inverse, n_negative = _invert(pivot + pivot.triu(1).T)
     block[:, :n_own] = inverse
-    elimination, trailing = block[:, n_own:], front[n_own:, n_own:]
+    elimination = block[:, n_own:]
+    trailing = front[n_own:, n_own:]
     pieces = [slice(begin, begin + PIECE_SIZE) for begin in range(0, n_boundary, PIECE_SIZE)]
 
     def eliminate(piece: slice) -> None:

@@ -140,7 +140,9 @@ def _dissect(
 ) -> None:
     """Fill in the node of each vertex. The orders (d, V), vertices sorted by each coordinate, are overwritten."""
     n_coordinates, n_vertices = orders.shape
-    begin, end, node = scratch.begin, scratch.end, scratch.node
+    begin = scratch.begin
+    end = scratch.end
+    node = scratch.node
     for level in range(depth):
         # The halves of a part take the places of itself and of a part behind it, which was divided before.
         for part in range((1 << level) - 1, -1, -1):

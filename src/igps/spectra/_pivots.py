@@ -72,7 +72,8 @@ def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np
             return -1
         n_negative += negative
         # Multiply the eliminated rows by the inverse of their pivot block.
-        eliminated, scaled = (matrix, k * width, width), (rows, ZERO, width)
+        eliminated = (matrix, k * width, width)
+        scaled = (rows, ZERO, width)
         product(
             (size, width, size), 1.0, (pivot, ZERO, STEP, ONE), eliminated, ZERO, scaled, scaled
         )
@@ -84,7 +85,8 @@ def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np
                 columns[i * STEP + j] = matrix[i * width + k + j]
                 matrix[i * width + k + j] = 0.0
         for begin, end in ((0, k), (k + size, n)):
-            shape, others = (end - begin, width, size), (matrix, begin * width, width)
+            shape = (end - begin, width, size)
+            others = (matrix, begin * width, width)
             product(shape, -1.0, (columns, begin * STEP, ONE, STEP), scaled, ONE, others, others)
         for i in range(size * width):
             matrix[k * width + i] = rows[i]
@@ -153,7 +155,8 @@ def invert_front(scratch: Scratch, n: int, front_width: int, width: int) -> int:
             if is_reversed:
                 for i in range(n // 2 + n % 2):
                     for j in range(n if i < n // 2 else n // 2):
-                        k, mirrored = i * width + j, (n - 1 - i) * width + n - 1 - j
+                        k = i * width + j
+                        mirrored = (n - 1 - i) * width + n - 1 - j
                         inverse[k], inverse[mirrored] = inverse[mirrored], inverse[k]
             return n_negative
     return -1

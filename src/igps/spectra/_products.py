@@ -29,7 +29,8 @@ ROWS, COLUMNS = 6, 8
 # Number of columns of a few rows that the second-level cache holds.
 CHUNK = 4096
 # Arguments of `product`. A plain 0, 1, True or False would be part of the argument's type, and Numba compile for each.
-ZERO, ONE = cast(int, np.int64(0)), cast(int, np.int64(1))
+ZERO = cast(int, np.int64(0))
+ONE = cast(int, np.int64(1))
 
 Rows = tuple[np.ndarray, int, int]
 """A matrix in a flat array: the array, the start of the matrix, and the step between rows."""
@@ -75,7 +76,8 @@ def _tile(n_columns: int) -> Any:
     from numba.core import cgutils
     from numba.extending import intrinsic
 
-    real, integer = ir.DoubleType(), ir.IntType(64)
+    real = ir.DoubleType()
+    integer = ir.IntType(64)
     vector = ir.VectorType(real, n_columns) if n_columns > 1 else real
     fused = ("contract",)
 
@@ -289,16 +291,28 @@ def four_by_six(
 
     The compiler keeps sums in registers only if each has a name.
     """
-    last, last_b = len(a) - 1, len(b) - 1
-    a0, a1, a2, a3 = a[i], a[min(i + 1, last)], a[min(i + 2, last)], a[min(i + 3, last)]
-    b0, b1, b2 = b[j], b[min(j + 1, last_b)], b[min(j + 2, last_b)]
-    b3, b4, b5 = b[min(j + 3, last_b)], b[min(j + 4, last_b)], b[min(j + 5, last_b)]
+    last = len(a) - 1
+    last_b = len(b) - 1
+    a0 = a[i]
+    a1 = a[min(i + 1, last)]
+    a2 = a[min(i + 2, last)]
+    a3 = a[min(i + 3, last)]
+    b0 = b[j]
+    b1 = b[min(j + 1, last_b)]
+    b2 = b[min(j + 2, last_b)]
+    b3 = b[min(j + 3, last_b)]
+    b4 = b[min(j + 4, last_b)]
+    b5 = b[min(j + 5, last_b)]
     s0 = s1 = s2 = s3 = s4 = s5 = (0.0, 0.0, 0.0, 0.0)
     # Unsigned indices spare Numba the check for negative ones.
     for v in range(np.uint64(begin), np.uint64(end)):
         x = a0[v], a1[v], a2[v], a3[v]
-        s0, s1, s2 = added(s0, x, b0[v]), added(s1, x, b1[v]), added(s2, x, b2[v])
-        s3, s4, s5 = added(s3, x, b3[v]), added(s4, x, b4[v]), added(s5, x, b5[v])
+        s0 = added(s0, x, b0[v])
+        s1 = added(s1, x, b1[v])
+        s2 = added(s2, x, b2[v])
+        s3 = added(s3, x, b3[v])
+        s4 = added(s4, x, b4[v])
+        s5 = added(s5, x, b5[v])
     return s0, s1, s2, s3, s4, s5
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from igps._arrays import Integers
 
 # Smallest number of unknowns that are worth a thread of their own, and log₂ of the largest number of subtrees.
-MIN_SUBTREE, MAX_SUBTREE_DEPTH = 2**13, 3
+MIN_SUBTREE = 2**13
+MAX_SUBTREE_DEPTH = 3
 
 Nodes = tuple[int, int]
 """A range of nodes: the first, and the one after the last."""
@@ -30,9 +31,8 @@ class Structure(NamedTuple):
     parent_row: np.ndarray  # row of each boundary entry in the front of the node's parent
     block_start: np.ndarray  # (N + 1,) start of each node's block [D E] in the array of blocks
     update_start: np.ndarray  # (N,) start of its Schur complement on the stack of complements
-    carried_start: (
-        np.ndarray
-    )  # (N,) start of its contribution to the right-hand sides on their stack
+    # (N,) start of its contribution to the right-hand sides on their stack
+    carried_start: np.ndarray
 
 
 def tree_structure(
@@ -44,12 +44,14 @@ def tree_structure(
     """
     n_nodes = 2**n_levels - 1
     node_at = np.full(n_nodes, n_nodes - 1)  # node at each place of the heap
-    children, parent = np.full((n_nodes, 2), -1), np.full(n_nodes, -1)
+    children = np.full((n_nodes, 2), -1)
+    parent = np.full(n_nodes, -1)
     for level in range(n_levels - 1):
         parents = np.arange(2**level - 1, 2 ** (level + 1) - 1)
         right = node_at[parents] - 1
         left = right - (2 ** (n_levels - level - 1) - 1)  # the whole right subtree lies between
-        node_at[2 * parents + 1], node_at[2 * parents + 2] = left, right
+        node_at[2 * parents + 1] = left
+        node_at[2 * parents + 2] = right
         children[node_at[parents]] = np.stack([left, right], axis=1)
         parent[left] = parent[right] = node_at[parents]
     node_of = node_at[node]
@@ -62,7 +64,8 @@ def tree_structure(
     boundary_start, boundary, rows = _boundaries(
         own_start, parent, depth, position, indptr, indices
     )
-    n_own, n_boundary = np.diff(own_start), np.diff(boundary_start)
+    n_own = np.diff(own_start)
+    n_boundary = np.diff(boundary_start)
     subtrees = parallel_subtrees(n_levels, len(node))
     in_subtrees = {n for begin, end in subtrees for n in range(begin, end)}
     above = [(n, n + 1) for n in range(n_nodes) if n not in in_subtrees]
@@ -100,7 +103,8 @@ def _boundaries(
     The boundary of a node consists of the unknowns that its edges reach and of its children's boundaries, without the
     unknowns that it owns.
     """
-    n_nodes, n_vertices = len(parent), len(position)
+    n_nodes = len(parent)
+    n_vertices = len(position)
 
     def after(node: Integers, reached: Integers) -> Integers:
         """Return the pairs whose unknown comes after those of the node, as numbers that sort by node."""
@@ -110,7 +114,8 @@ def _boundaries(
     owner = np.repeat(np.arange(n_nodes), np.diff(own_start))
     from_edges = after(owner[position].repeat(np.diff(indptr)), position[indices])
     level_of_edge = depth[from_edges // n_vertices]
-    inherited, levels = from_edges[:0], []
+    inherited = from_edges[:0]
+    levels = []
     for level in reversed(range(depth.max() + 1)):
         levels.append(np.union1d(inherited, from_edges[level_of_edge == level]))
         node, reached = np.divmod(levels[-1], n_vertices)
@@ -137,12 +142,12 @@ def parallel_subtrees(n_levels: int, n_unknowns: int) -> list[Nodes]:
     They depend only on the matrix and not on the number of threads, and so do rounding errors.
     """
     depth = min(MAX_SUBTREE_DEPTH, n_levels - 1, max(0, int(n_unknowns / MIN_SUBTREE).bit_length()))
-    subtrees, begin = [], 0
+    subtrees = []
+    begin = 0
     for number in range(1, 2**depth + 1):
         subtrees.append((begin, begin + 2 ** (n_levels - depth) - 1))
-        begin = (
-            subtrees[-1][1] + (number & -number).bit_length() - 1
-        )  # skips the parents that it completes
+        # Skips the parents that it completes
+        begin = subtrees[-1][1] + (number & -number).bit_length() - 1
     return subtrees
 
 
@@ -152,11 +157,9 @@ def stack_starts(children: np.ndarray, sizes: np.ndarray, ranges: list[Nodes]) -
     Each range of nodes has its own stack. A result stays there until its parent is computed: the results of both
     children are then on top, and the parent's result replaces them.
     """
-    starts, lengths, left_child = (
-        np.zeros(len(sizes), dtype=np.int64),
-        sizes.tolist(),
-        children[:, 0].tolist(),
-    )
+    starts = np.zeros(len(sizes), dtype=np.int64)
+    lengths = sizes.tolist()
+    left_child = children[:, 0].tolist()
     end = 0
     for first, last in ranges:
         top = end

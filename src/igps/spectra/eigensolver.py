@@ -266,12 +266,15 @@ def _defects(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return squared lengths (K,) of A y − λ y and its products (K,) with y, for a csr matrix A and vectors (V, K)."""
     n_vertices, n_vectors = vectors.shape
-    defect, squares, products = np.empty(n_vectors), np.zeros(n_vectors), np.zeros(n_vectors)
+    defect = np.empty(n_vectors)
+    squares = np.zeros(n_vectors)
+    products = np.zeros(n_vectors)
     for i in range(n_vertices):
         for c in range(n_vectors):
             defect[c] = -eigenvalues[c] * vectors[i, c]
         for k in range(indptr[i], indptr[i + 1]):
-            value, j = values[k], indices[k]
+            value = values[k]
+            j = indices[k]
             for c in range(n_vectors):
                 defect[c] += value * vectors[j, c]
         for c in range(n_vectors):

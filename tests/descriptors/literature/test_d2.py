@@ -23,7 +23,8 @@ def round_body(sphere: Mesh) -> Body:
 
 def test_d2_of_a_sphere_has_the_density_of_its_chords(round_body: Body) -> None:
     """On the unit sphere the length of a random chord has the density l/2 on [0, 2]: l²/4 is its distribution."""
-    n_bins, reach = 40, 2 / np.sqrt(4 * np.pi)
+    n_bins = 40
+    reach = 2 / np.sqrt(4 * np.pi)
     histogram = D2(n_bins=n_bins, reach=reach).describe_body(round_body)
     edges = np.linspace(0, 1, n_bins + 1)
     np.testing.assert_allclose(np.cumsum(histogram), edges[1:] ** 2, atol=0.01)
@@ -63,7 +64,8 @@ def test_d2_counts_each_pair_once_and_what_lies_beyond_in_the_last_bin() -> None
 
 
 def test_d2_distance_is_half_the_l1_norm() -> None:
-    one, two = torch.tensor([[0.5, 0.5, 0.0]]), torch.tensor([[0.0, 0.25, 0.75], [0.5, 0.5, 0.0]])
+    one = torch.tensor([[0.5, 0.5, 0.0]])
+    two = torch.tensor([[0.0, 0.25, 0.75], [0.5, 0.5, 0.0]])
     torch.testing.assert_close(D2().distances(one, two), torch.tensor([[0.75, 0.0]]))
 
 

@@ -101,7 +101,8 @@ def _tube(angle: float) -> Mesh:
     x, y, z = surface.vertices.T
     if angle == 0:
         return as_mesh(surface)
-    radius, turn = 6 / angle, z * angle / 6
+    radius = 6 / angle
+    turn = z * angle / 6
     return Mesh(
         np.stack([(radius + x) * np.cos(turn), y, (radius + x) * np.sin(turn)], axis=1),
         surface.faces,
@@ -109,7 +110,8 @@ def _tube(angle: float) -> Mesh:
 
 
 def test_distances_are_chi_square() -> None:
-    a, b = np.array([[0.9, 0.3]], dtype=np.float32), np.array([[0.5, 0.1]], dtype=np.float32)
+    a = np.array([[0.9, 0.3]], dtype=np.float32)
+    b = np.array([[0.5, 0.1]], dtype=np.float32)
     expected = (0.4**2 / 1.4 + 0.2**2 / 0.4) / 2
     found = (
         GeodesicSpectral(n_eigenvalues=2).distances(torch.from_numpy(a), torch.from_numpy(b)).item()

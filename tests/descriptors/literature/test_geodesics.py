@@ -24,7 +24,9 @@ def corner_distances(points: np.ndarray) -> np.ndarray:
     """From (0, 0, 0) to points of the cube's surface, by unfolding two neighbouring faces into a plane."""
     distances = np.full(len(points), np.inf)
     for i in range(3):
-        u, v, w = points[:, i], points[:, (i + 1) % 3], points[:, (i + 2) % 3]
+        u = points[:, i]
+        v = points[:, (i + 1) % 3]
+        w = points[:, (i + 2) % 3]
         here = np.where(u == 0, np.hypot(v, w), np.inf)
         across = np.where(u == 1, np.minimum(np.hypot(1 + v, w), np.hypot(1 + w, v)), np.inf)
         distances = np.minimum(distances, np.minimum(here, across))
@@ -33,7 +35,8 @@ def corner_distances(points: np.ndarray) -> np.ndarray:
 
 def exact(mesh: Mesh, source: int) -> np.ndarray:
     none = np.array([], dtype=np.int64)
-    vertices, faces = np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces)
+    vertices = np.asfortranarray(mesh.vertices)
+    faces = np.asfortranarray(mesh.faces)
     return igl.exact_geodesic(
         vertices, faces, np.array([source]), none, np.arange(len(vertices)), none
     )

@@ -40,7 +40,8 @@ def links_by_looking(points: np.ndarray) -> np.ndarray:
     # Steps that never land on the border between two cells.
     steps = (np.arange(100) + 0.5) / 100
     for i, j in zip(*np.nonzero(cdist(points, points, "chebyshev") <= 2), strict=True):
-        p, q = points[i], points[j]
+        p = points[i]
+        q = points[j]
         offset = np.abs(q - p).astype(int)
         if gcd(*(int(k) for k in offset)) != 1:
             continue
@@ -62,7 +63,8 @@ def test_bound_is_that_of_the_98_directions() -> None:
 
 def test_box_has_euclidean_distances_within_the_bound() -> None:
     points = block(9, 7, 12) * 0.3 + [1.0, -2.0, 5.0]
-    inner, straight = every(points), cdist(points, points)
+    inner = every(points)
+    straight = cdist(points, points)
     assert (inner >= straight - 1e-12).all()
     assert (inner <= METRICATION * straight + 1e-12).all()
     np.testing.assert_allclose(inner, inner.T, atol=1e-12)
@@ -79,7 +81,8 @@ def test_random_cells_equal_floyd_and_warshall() -> None:
 def test_path_goes_round_the_corner_of_an_l() -> None:
     whole = block(21, 21, 3)
     points = whole[(whole[:, 0] <= 2) | (whole[:, 1] <= 2)]
-    a, b = index_of(points, (20, 2, 1)), index_of(points, (2, 20, 1))
+    a = index_of(points, (20, 2, 1))
+    b = index_of(points, (2, 20, 1))
     exact = 2 * np.hypot(17.5, 0.5)  # by way of the edge at (2.5, 2.5)
     length = inner_distances(points, np.array([a]))[0, b]
     assert exact <= length <= METRICATION * exact
@@ -89,7 +92,8 @@ def test_path_goes_round_the_corner_of_an_l() -> None:
 def test_path_goes_round_both_corners_of_a_u() -> None:
     whole = block(13, 21, 3)
     points = whole[(whole[:, 0] <= 2) | (whole[:, 0] >= 10) | (whole[:, 1] <= 2)]
-    a, b = index_of(points, (2, 20, 1)), index_of(points, (10, 20, 1))
+    a = index_of(points, (2, 20, 1))
+    b = index_of(points, (10, 20, 1))
     exact = 2 * np.hypot(0.5, 17.5) + 7  # by way of the edges at (2.5, 2.5) and (9.5, 2.5)
     assert exact <= inner_distances(points, np.array([a]))[0, b] <= METRICATION * exact
 
@@ -124,10 +128,12 @@ def test_samples_off_a_grid_are_refused(points: np.ndarray, message: str) -> Non
 
 
 def test_histogram_equals_a_loop_over_all_pairs() -> None:
-    points, area = block(4, 3, 5) * 0.5, 9.0
+    points = block(4, 3, 5) * 0.5
+    area = 9.0
     descriptor = InnerDistance(n_bins=8, max_distance=0.8, n_sources=1000)
     lengths = floyd_warshall(links_by_looking((points / 0.5).round())) * 0.5
-    expected, n_beyond = np.zeros(8), 0
+    expected = np.zeros(8)
+    n_beyond = 0
     for i, j in product(range(len(points)), repeat=2):
         if i == j:
             continue

@@ -52,7 +52,8 @@ def test_local_diameter_of_a_sphere_is_its_mean_chord(sphere: Mesh, angle: float
 def test_local_diameter_of_a_long_cylinder() -> None:
     # Chords of the infinite cylinder of radius 1, in random directions of the cone: 2 cos t / (cos²t + sin²t cos²f).
     generator = np.random.default_rng(0)
-    cosine, azimuth = generator.uniform(0.5, 1, 200_000), generator.uniform(0, 2 * np.pi, 200_000)
+    cosine = generator.uniform(0.5, 1, 200_000)
+    azimuth = generator.uniform(0, 2 * np.pi, 200_000)
     chords = 2 * cosine / (cosine**2 + (1 - cosine**2) * np.cos(azimuth) ** 2)
     expected = chords[np.abs(chords - np.median(chords)) <= chords.std()].mean()
     mesh = tube(1.0, 20.0, 64, 60)
@@ -65,9 +66,8 @@ def test_local_diameter_of_a_long_cylinder() -> None:
 def test_rays_that_leave_through_a_hole_do_not_count(sphere: Mesh) -> None:
     # The lower half of the sphere: seen from near the pole, the narrow cone leads out through the opening.
     height = sphere.vertices[sphere.faces, 2].mean(axis=1)
-    faces = sphere.faces[np.argsort(height)][
-        : (height < 0.3).sum()
-    ]  # the last one faces upwards, along the rays
+    # The last one faces upwards, along the rays
+    faces = sphere.faces[np.argsort(height)][: (height < 0.3).sum()]
     used, index = np.unique(faces, return_inverse=True)
     bowl = Mesh(sphere.vertices[used], index.reshape(-1, 3), allow_open=True)
     height = bowl.vertices[bowl.faces].mean(axis=1)[:, 2]
@@ -94,7 +94,8 @@ def test_centricity_of_a_sphere_is_a_quarter_of_its_circumference(sphere: Mesh) 
 
 def test_centricity_of_a_thin_tube_rises_from_a_quarter_to_half_its_length() -> None:
     mesh = tube(0.1, 20.0, 12, 300)
-    values, z = centricity(mesh, 200), mesh.vertices[:, 2]
+    values = centricity(mesh, 200)
+    z = mesh.vertices[:, 2]
     # The mean distance from a point z of a stick of length L is L/4 + z²/L.
     np.testing.assert_allclose(values, 5 + z**2 / 20, rtol=0.03)
 
@@ -136,7 +137,8 @@ def test_values_beyond_the_range_go_to_the_last_bins(sphere: Mesh) -> None:
 
 def test_histogram_equals_a_loop_over_the_samples() -> None:
     generator = np.random.default_rng(0)
-    first, second = generator.uniform(0, 1.3, 50), generator.uniform(0, 1.1, 50)
+    first = generator.uniform(0, 1.3, 50)
+    second = generator.uniform(0, 1.1, 50)
     expected = np.zeros((8, 5))
     for x, y in zip(first * 8 - 0.5, second * 5 - 0.5, strict=True):
         for i in range(8):

@@ -47,7 +47,8 @@ def test_slope_is_that_of_least_squares() -> None:
 
 
 def test_shape_dna_distance_is_euclidean() -> None:
-    one, two = torch.tensor([[1.0, 2.0]]), torch.tensor([[4.0, 6.0], [1.0, 2.0]])
+    one = torch.tensor([[1.0, 2.0]])
+    two = torch.tensor([[4.0, 6.0], [1.0, 2.0]])
     torch.testing.assert_close(ShapeDNA(2).distances(one, two), torch.tensor([[5.0, 0.0]]))
 
 

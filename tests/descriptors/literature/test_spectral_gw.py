@@ -87,7 +87,8 @@ def test_interior_kernel_of_the_ball(round_signature: Signature) -> None:
     points = round_signature.interior.points
     assert len(kernel) == len(points)
     radius = np.linalg.norm(points, axis=1)
-    centre, outermost = int(np.argmin(radius)), int(np.argmax(radius))
+    centre = int(np.argmin(radius))
+    outermost = int(np.argmax(radius))
     assert kernel[centre, centre] == pytest.approx(1, abs=0.05)
     assert 1.5 < kernel[outermost, outermost] < sphere_kernel(np.ones(1), 1.0)[0]
 
@@ -100,7 +101,8 @@ def test_quantile_means_by_hand() -> None:
 
 def test_quantiles_give_the_wasserstein_distance() -> None:
     generator = np.random.default_rng(0)
-    first, second = generator.gamma(2.0, size=300), generator.normal(size=120)
+    first = generator.gamma(2.0, size=300)
+    second = generator.normal(size=120)
     exact = wasserstein_distance(first, second)
     for n_quantiles in (10, 600):  # 600 is a multiple of both sizes
         estimate = np.abs(quantiles(first, n_quantiles) - quantiles(second, n_quantiles)).mean()

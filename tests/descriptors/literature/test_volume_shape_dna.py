@@ -26,7 +26,8 @@ def revolved(profile: list[tuple[float, float]]) -> Mesh:
 
 def two_balls(second: float, neck: float) -> Mesh:
     """A ball of radius 1 and another, joined by a neck."""
-    gap, up = 0.2, np.linspace(0, np.pi, 25)
+    gap = 0.2
+    up = np.linspace(0, np.pi, 25)
     lower = [(np.sin(t), -np.cos(t)) for t in up if t <= np.pi - np.arcsin(neck)]
     upper = [
         (second * np.sin(t), 1 + gap + second - second * np.cos(t))
@@ -105,7 +106,8 @@ def test_turned_cube_is_still_a_cube(boundary: Boundary) -> None:
 
 def test_walls_lie_between_the_cells_where_the_surface_is() -> None:
     # Walls half a cell beyond the last centre inside, as in a body of whole voxels, would be wrong by more than 1 %.
-    cube, generator = trimesh.creation.box((1, 1, 1)), np.random.default_rng(0)
+    cube = trimesh.creation.box((1, 1, 1))
+    generator = np.random.default_rng(0)
     for _ in range(4):
         turn, _ = np.linalg.qr(generator.standard_normal((3, 3)))
         first = volume_spectrum(

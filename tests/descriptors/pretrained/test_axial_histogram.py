@@ -39,8 +39,10 @@ def test_it_is_the_share_of_samples_in_each_cell() -> None:
     n_bins = (5, 4, 3, 2)
     found = AxialHistogram(EMBEDDING, n_bins=n_bins)(batch)
     assert found.shape == (2, 3, *n_bins)
-    along, beside = np.linspace(-2.2, 2.2, 5).tolist(), np.linspace(0, 2.2, 4).tolist()
-    cosine, outward = np.linspace(-1, 1, 3).tolist(), np.linspace(-1, 1, 2).tolist()
+    along = np.linspace(-2.2, 2.2, 5).tolist()
+    beside = np.linspace(0, 2.2, 4).tolist()
+    cosine = np.linspace(-1, 1, 3).tolist()
+    outward = np.linspace(-1, 1, 2).tolist()
     for i in range(2):
         real = batch.surface.mask[i]
         points = batch.surface.points[i, real].double().numpy()
@@ -71,7 +73,8 @@ def test_it_is_the_share_of_samples_in_each_cell() -> None:
 
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored: bool) -> None:
-    batch, histogram = two_bodies(), AxialHistogram(EMBEDDING)
+    batch = two_bodies()
+    histogram = AxialHistogram(EMBEDDING)
     motion = torch.from_numpy(Rotation.random(random_state=0).as_matrix()).float() * (
         -1 if mirrored else 1
     )
@@ -81,7 +84,8 @@ def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored: bool) -> No
 
 
 def test_padding_changes_nothing() -> None:
-    batch, histogram = two_bodies(), AxialHistogram(EMBEDDING)
+    batch = two_bodies()
+    histogram = AxialHistogram(EMBEDDING)
     found = histogram(batch)
     torch.testing.assert_close(found.flatten(1).sum(dim=1), torch.ones(2))
     for i in range(2):
@@ -112,7 +116,8 @@ def test_a_limb_that_moves_hardly_turns_the_axes() -> None:
     )
     limb = torch.rand(400, 1, generator=generator, dtype=torch.float64) * 2
     weights = torch.cat([torch.full((600,), 0.4), torch.full((400,), 1.0)]).double() ** -4
-    axes, plain = [], []
+    axes = []
+    plain = []
     for direction in ([1.0, 1.0, 0.0], [1.0, -0.2, 0.0]):
         points = torch.cat([trunk, limb * torch.tensor(direction)])
         axes.append(principal_axes(points[None], weights[None])[1][0, :, 0])

@@ -40,9 +40,11 @@ def joined(coordinates: np.ndarray) -> list[set[int]]:
 
 
 def pieces_of(kept: set[int], graph: list[set[int]]) -> list[set[int]]:
-    left, found = set(kept), []
+    left = set(kept)
+    found = []
     while left:
-        piece, front = set(), {left.pop()}
+        piece = set()
+        front = {left.pop()}
         while front:
             piece |= front
             front = {k for point in front for k in graph[point]} & left
@@ -82,20 +84,20 @@ def test_pieces_count_by_their_sizes_and_lengths() -> None:
     batch = two_bodies()
     found = PieceHistogram(LEVELS, EMBEDDING, n_bins=(4, 3))(batch)
     assert found.shape == (2, 3, 4, 3)
-    sizes, lengths = np.linspace(-6, -0.5, 4).tolist(), np.linspace(-1, 2.5, 3).tolist()
+    sizes = np.linspace(-6, -0.5, 4).tolist()
+    lengths = np.linspace(-1, 2.5, 3).tolist()
     for i in range(2):
         points = batch.surface.points[i, batch.surface.mask[i]].numpy() / np.sqrt(
             float(batch.area[i])
         )
         coordinates = embedded(batch, i, "surface", 5).numpy()
-        graph, order = (
-            joined(coordinates),
-            np.argsort(-np.linalg.norm(coordinates, axis=1)).tolist(),
-        )
+        graph = joined(coordinates)
+        order = np.argsort(-np.linalg.norm(coordinates, axis=1)).tolist()
         expected = np.zeros((3, 4, 3))
         for level, share in enumerate(LEVELS):
             for piece in pieces_of(set(order[: round(share * len(order))]), graph):
-                size, places = len(piece) / len(order), points[sorted(piece)]
+                size = len(piece) / len(order)
+                places = points[sorted(piece)]
                 length = 2.0**-9
                 if len(piece) >= 4:
                     length = float(
@@ -143,7 +145,8 @@ def test_pieces_of_a_star_are_its_arms() -> None:
 
 @BOTH
 def test_padding_and_scale_change_nothing(make: Maker) -> None:
-    batch, histogram = two_bodies(), make(embedding=EMBEDDING)
+    batch = two_bodies()
+    histogram = make(embedding=EMBEDDING)
     found = histogram(batch)
     assert found.shape == (2, *histogram.shape)
     torch.testing.assert_close(found.flatten(1).sum(dim=1), torch.ones(2))
@@ -154,7 +157,8 @@ def test_padding_and_scale_change_nothing(make: Maker) -> None:
 
 @BOTH
 def test_the_order_of_samples_changes_nothing(make: Maker) -> None:
-    batch, histogram = alone(two_bodies(), 0), make(embedding=EMBEDDING)
+    batch = alone(two_bodies(), 0)
+    histogram = make(embedding=EMBEDDING)
     order = torch.randperm(40, generator=torch.Generator().manual_seed(5))
     surface = batch.surface
     other = replace(
@@ -236,7 +240,8 @@ def test_gradients_are_those_of_differences() -> None:
 
 @BOTH
 def test_a_program_is_compiled_around_them(make: Maker) -> None:
-    batch, module = two_bodies(), make(embedding=EMBEDDING)
+    batch = two_bodies()
+    module = make(embedding=EMBEDDING)
     torch.compiler.reset()
     torch.testing.assert_close(
         torch.compile(module, backend="aot_eager")(batch), module(batch), rtol=0, atol=1e-6
@@ -245,7 +250,8 @@ def test_a_program_is_compiled_around_them(make: Maker) -> None:
 
 @BOTH
 def test_another_default_device_changes_nothing_of_weighted_samples(make: Maker) -> None:
-    batch, histogram = two_bodies(), make(embedding=EMBEDDING)
+    batch = two_bodies()
+    histogram = make(embedding=EMBEDDING)
     weights = torch.rand(batch.surface.mask.shape, generator=torch.Generator().manual_seed(3))
     surface = replace(batch.surface, attributes={**batch.surface.attributes, "weight": weights})
     batch = replace(batch, surface=surface)

@@ -18,7 +18,8 @@ from igps.nn.batch_features import nearest_neighbours
 def components(neighbours: Tensor, kept: np.ndarray) -> np.ndarray:
     """Of each point the number of its component among those kept; −1 for the others."""
     n = len(neighbours)
-    rows, columns = np.repeat(np.arange(n), neighbours.shape[1]), neighbours.numpy().ravel()
+    rows = np.repeat(np.arange(n), neighbours.shape[1])
+    columns = neighbours.numpy().ravel()
     both = kept[rows] & kept[columns]
     graph = coo_array((np.ones(both.sum()), (rows[both], columns[both])), shape=(n, n))
     return np.where(kept, connected_components(graph, directed=False)[1], -1)
@@ -34,7 +35,8 @@ def random_graph(seed: int, n: int = 80, k: int = 3) -> tuple[Tensor, Tensor]:
 def test_as_many_branches_live_at_each_level_as_there_are_components(seed: int) -> None:
     values, neighbours = random_graph(seed)
     tree = merge_tree(values, neighbours)
-    peaks, saddles = values[tree.peaks], values[tree.saddles]
+    peaks = values[tree.peaks]
+    saddles = values[tree.saddles]
     lowest = values.min()
     for level in values.tolist():
         # a branch that joins none lives down to the lowest point
@@ -94,9 +96,8 @@ def test_points_outside_the_mask_are_not_there() -> None:
     numbers = mask.nonzero()[:, 0]
     place = torch.full((80,), -1)
     place[numbers] = torch.arange(len(numbers))
-    own = torch.where(
-        mask[neighbours], neighbours, torch.arange(80)[:, None]
-    )  # without those that are not there
+    # Without those that are not there
+    own = torch.where(mask[neighbours], neighbours, torch.arange(80)[:, None])
     expected = merge_tree(values[mask], place[own[mask]], [5, 20])
     tree = merge_tree(values.masked_fill(~mask, torch.nan), neighbours, [5, 20], mask)
     assert torch.equal(tree.peaks, numbers[expected.peaks])

@@ -130,10 +130,8 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
     torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
     from_mean = torch.stack([one[:, :-1].square().sum(dim=1) for one in bodies]).mean(dim=0).sqrt()
     shorter = (torch.outer(from_mean, from_mean).sqrt() / (0.5 / 2**0.5)).sqrt()
-    exponent, between = (
-        torch.zeros(4, 4, dtype=torch.float64),
-        torch.ones(4, 4, dtype=torch.float64),
-    )
+    exponent = torch.zeros(4, 4, dtype=torch.float64)
+    between = torch.ones(4, 4, dtype=torch.float64)
     for one, scale, power in zip(bodies, scales, exponents, strict=True):
         apart = torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist")
         exponent += (apart * shorter / scale) ** 20
@@ -168,7 +166,8 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
     Of another seed than those that it was fitted to, and without the twelve templates, which all descriptors tell.
     """
     GradedShapes(8, 3, 1, seed=3, n_vertices=(1500, 2000), look_alikes=False).write(tmp_path)
-    module, plain = pretrained(), rich()
+    module = pretrained()
+    plain = rich()
     config = (module.requirements | plain.requirements).apply_to(SignatureConfig(n_eigenpairs=90))
     dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")
     assert not dataset.precompute(n_workers=1)
@@ -176,7 +175,8 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
     def first_tier(distances: Tensor) -> float:
         return retrieval_scores(distances, dataset.labels).mean()["ft"]
 
-    own, others = describe(dataset, module.descriptor), describe(dataset, plain)
+    own = describe(dataset, module.descriptor)
+    others = describe(dataset, plain)
     embedded = module.head(own)
     learned = first_tier(module.distances(embedded, embedded))
     assert learned > first_tier(chi_square(others, others)) + 0.1
@@ -202,12 +202,14 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_nu
     dataset: SignatureDataset,
 ) -> None:
     """By the places of samples; `torch.cdist` has none of them, and pieces of one sample have no spread."""
-    batch, pretrained = dataset.batch([0]).to(torch.float64), igps.descriptor("pretrained").double()
+    batch = dataset.batch([0]).to(torch.float64)
+    pretrained = igps.descriptor("pretrained").double()
     batch = replace(
         batch, interior=batch.interior.subset(200, 0), surface=batch.surface.subset(200, 0)
     )
     generator = torch.Generator().manual_seed(2)
-    places, along = batch.surface.points, torch.randn(1, 200, 3, generator=generator).double()
+    places = batch.surface.points
+    along = torch.randn(1, 200, 3, generator=generator).double()
     upstream = torch.randn(pretrained.n_features, generator=generator).double()
 
     def loss(points: Tensor) -> Tensor:

@@ -20,9 +20,8 @@ def test_shares_are_those_of_a_loop() -> None:
     assert found.shape == (2, 7)
     assert found.dtype == torch.float32
     for i in range(2):
-        radius = (3 * float(batch.volume[i]) / (4 * math.pi)) ** (
-            1 / 3
-        )  # of the ball of this volume
+        # Of the ball of this volume
+        radius = (3 * float(batch.volume[i]) / (4 * math.pi)) ** (1 / 3)
         shares = [float(batch.eigenvalues[i, k - 1]) * radius**2 / (2 * k) / 6 for k in range(1, 7)]
         torch.testing.assert_close(found[i], torch.tensor([*shares, 1 - sum(shares)]))
 
@@ -39,7 +38,8 @@ def test_a_spectrum_that_follows_weyl_has_equal_shares() -> None:
 
 
 def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off() -> None:
-    batch, part = two_bodies(), SpectrumShares(min(N_EIGENPAIRS))
+    batch = two_bodies()
+    part = SpectrumShares(min(N_EIGENPAIRS))
     found = part(replace(batch, eigenvalues=1e3 * batch.eigenvalues))
     expected = part(batch)[:, :-1]
     torch.testing.assert_close(found[:, :-1], expected / expected.sum(dim=1, keepdim=True))
@@ -47,7 +47,8 @@ def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off() -> None:
 
 
 def test_padding_and_scale_change_nothing() -> None:
-    batch, histogram = two_bodies(), SpectrumShares(min(N_EIGENPAIRS))
+    batch = two_bodies()
+    histogram = SpectrumShares(min(N_EIGENPAIRS))
     found = histogram(batch)
     torch.testing.assert_close(found.sum(dim=1), torch.ones(2))
     for i in range(2):

@@ -256,9 +256,8 @@ def test_a_binary_stl_with_a_wrong_count_gives_what_is_there(tmp_path: Path) -> 
 
 def test_corners_in_one_place_are_one_vertex_in_the_order_in_which_they_come() -> None:
     generator = np.random.default_rng(0)
-    corners = generator.integers(-1, 2, (300, 3)) * generator.choice(
-        [1.0, -1.0], (300, 3)
-    )  # zeros of both signs
+    # Zeros of both signs
+    corners = generator.integers(-1, 2, (300, 3)) * generator.choice([1.0, -1.0], (300, 3))
     vertices, faces = merged(corners)
     np.testing.assert_array_equal(vertices[faces.ravel()], corners)
     places = list(dict.fromkeys(map(tuple, corners.tolist())))
@@ -294,9 +293,8 @@ def test_volumes_of_cells_give_the_surface_around_them(tmp_path: Path) -> None:
 def test_a_strip_of_a_ply_file_turns_its_triangles_alike(tmp_path: Path) -> None:
     head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     head += "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
-    (tmp_path / "a.ply").write_text(
-        head + "0 0 0\n1 0 0\n0 1 0\n0 0 1\n9 1 0 2 3 1 0 -1 0 1\n"
-    )  # the last is none
+    # The last is none
+    (tmp_path / "a.ply").write_text(head + "0 0 0\n1 0 0\n0 1 0\n0 0 1\n9 1 0 2 3 1 0 -1 0 1\n")
     mesh = load_mesh(tmp_path / "a.ply", LoadOptions(mend="never"))
     strip = trimesh.util.triangle_strips_to_faces([[1, 0, 2, 3, 1, 0]])
     np.testing.assert_array_equal(mesh.faces, strip)

@@ -117,11 +117,9 @@ def test_residues_of_other_kinds_change_nothing() -> None:
         return residue_attribute(molecule, points @ motion, "trace")
 
     turn = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))[0]
-    one, other, turned = (
-        traced("GLY", np.eye(3)),
-        traced("TRP", np.eye(3)),
-        traced("GLY", turn),
-    )
+    one = traced("GLY", np.eye(3))
+    other = traced("TRP", np.eye(3))
+    turned = traced("GLY", turn)
     np.testing.assert_array_equal(one, other)
     wanted = [one[:, :3] @ turn, one[:, 3:6] @ turn, one[:, 6]]
     np.testing.assert_allclose(turned, np.column_stack(wanted), atol=1e-9)
@@ -153,7 +151,8 @@ def test_directions_do_not_cross_gaps() -> None:
         "gaps", positions, none, none, np.arange(6), ("ALA",) * 6, positions, none, places=places
     )
     found = residue_attribute(molecule, positions, "trace")[:, 3:6]
-    x, y = [1, 0, 0], [0, 1, 0]
+    x = [1, 0, 0]
+    y = [0, 1, 0]
     np.testing.assert_allclose(found, [x, x, y, y, y, [0, 0, 0]], atol=1e-12)
 
 

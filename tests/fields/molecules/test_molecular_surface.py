@@ -95,9 +95,8 @@ def test_a_speck_is_left_out_with_a_note_but_not_what_all_is_made_of(
     found = molecular_surface(molecule([[0, 0, 0], [14, 0, 0]], [8.0, 0.9]))
     assert "left out 1 speck" in found.notes
     assert found.volume == pytest.approx(4 / 3 * np.pi * 8**3, rel=0.01)
-    monkeypatch.setattr(
-        "igps.fields.molecules.molecular_surface.SPECK_VOLUME", 0.2
-    )  # as if there were some hundreds
+    # As if there were some hundreds
+    monkeypatch.setattr("igps.fields.molecules.molecular_surface.SPECK_VOLUME", 0.2)
     found = molecular_surface(molecule([[9.0 * i, 0, 0] for i in range(6)], [1.7] * 6), spacing=0.5)
     assert found.volume == pytest.approx(6 * 4 / 3 * np.pi * 1.7**3, rel=0.02)
 

@@ -79,9 +79,8 @@ def test_atoms_have_the_radii_of_their_elements(tmp_path: Path) -> None:
     (molecule,) = read_molecule(
         written(tmp_path, residue(1) + residue(2, "MET", [*ALANINE, *SULFUR]))
     )
-    np.testing.assert_allclose(
-        molecule.radii[:5], [1.55, 1.70, 1.70, 1.52, 1.70], atol=1e-6
-    )  # Bondi 1964
+    # Bondi 1964
+    np.testing.assert_allclose(molecule.radii[:5], [1.55, 1.70, 1.70, 1.52, 1.70], atol=1e-6)
     assert molecule.radii[-1] == pytest.approx(1.80)
     assert molecule.residue_names == ("ALA", "MET")
     assert molecule.residue_of.tolist() == [0] * 5 + [1] * 8
@@ -338,7 +337,8 @@ def test_a_cut_side_chain_gets_what_it_lacks_at_its_last_atom(
     assert whole.notes == ()
     assert cut.notes == (COMPLETED.format(1),)
     assert cut.charges.sum() == whole.charges.sum() == 1
-    ball, radius = cut.positions[0], cut.radii[0]
+    ball = cut.positions[0]
+    radius = cut.radii[0]
     share = (5 - n_present) / 5
     assert 4 / 3 * np.pi * radius**3 == pytest.approx(share * (VOLUMES["LYS"] - VOLUMES["GLY"]))
     alpha = np.array([1.46, 0, 3.8])
@@ -551,9 +551,10 @@ def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> Non
         for row in residue(1, "GLN", atoms).splitlines()
     ]
     (molecule,) = read_molecule(written(tmp_path, "\n".join(rows)))
+    # Bondi 1964
     np.testing.assert_allclose(
         molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.7, 1.52, 1.55], atol=1e-6
-    )  # Bondi 1964
+    )
     # And calcium, which some write as an atom of the polymer, is no residue.
     ion = Atom(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA").line()
     (molecule,) = read_molecule(written(tmp_path, residue(1) + ion))

@@ -234,7 +234,8 @@ def test_a_body_at_the_border_is_closed() -> None:
 
 def test_neighbours_that_touch_meet_in_the_middle_between_their_voxels() -> None:
     labels = np.zeros((24, 20, 20), dtype=int)
-    labels[3:12, 3:17, 3:17], labels[12:21, 3:17, 3:17] = 1, 2
+    labels[3:12, 3:17, 3:17] = 1
+    labels[12:21, 3:17, 3:17] = 2
     one, two = (Mesh(*voxel_surface(labels == label)[:2]) for label in (1, 2))
     for mesh in (one, two):
         near = np.linalg.norm(mesh.vertices[:, 1:] - 9.5, axis=1) < 5

@@ -99,18 +99,14 @@ def write_segmentation(path: Path, masks: NDArray[Any], names: list[str], *kind:
         plane.StudyInstanceUID = study
         plane.SeriesInstanceUID = series
         plane.FrameOfReferenceUID = frame
-        plane.PatientID, plane.PatientName, plane.PatientBirthDate, plane.PatientSex = (
-            "1",
-            "A^B",
-            "",
-            "",
-        )
-        plane.StudyDate, plane.StudyTime, plane.StudyID, plane.AccessionNumber = (
-            "20200101",
-            "000000",
-            "1",
-            "",
-        )
+        plane.PatientID = "1"
+        plane.PatientName = "A^B"
+        plane.PatientBirthDate = ""
+        plane.PatientSex = ""
+        plane.StudyDate = "20200101"
+        plane.StudyTime = "000000"
+        plane.StudyID = "1"
+        plane.AccessionNumber = ""
         plane.ReferringPhysicianName = ""
         plane.SeriesNumber = 1
         plane.InstanceNumber = k + 1
@@ -122,11 +118,9 @@ def write_segmentation(path: Path, masks: NDArray[Any], names: list[str], *kind:
         plane.ImageOrientationPatient = [*(lps[:3, 0] / spacing[0]), *(lps[:3, 1] / spacing[1])]
         plane.ImagePositionPatient = list(lps[:3, 3] + k * lps[:3, 2])
         plane.BitsAllocated = plane.BitsStored = 16
-        plane.SamplesPerPixel, plane.PhotometricInterpretation, plane.PixelRepresentation = (
-            1,
-            "MONOCHROME2",
-            0,
-        )
+        plane.SamplesPerPixel = 1
+        plane.PhotometricInterpretation = "MONOCHROME2"
+        plane.PixelRepresentation = 0
         planes.append(plane)
     described = [
         SegmentDescription(number, name, codes.SCT.Organ, codes.SCT.Organ, "MANUAL")
@@ -523,9 +517,8 @@ def test_names_of_fsleyes_are_the_rest_of_the_line_and_colours_are_none(tmp_path
         "2 0.0 1.0 0.5 3rd ventricle\n3  0.80392 0.24314 0. Left Caudate\n"
     )
     assert read_label_names(tmp_path / "x.lut") == {2: "3rd ventricle", 3: "Left Caudate"}
-    (tmp_path / "teeth.lut").write_text(
-        "2 11 10 20 30 255\n3 21 10 20 30\n"
-    )  # index, name, colours
+    # Index, name, colours
+    (tmp_path / "teeth.lut").write_text("2 11 10 20 30 255\n3 21 10 20 30\n")
     assert read_label_names(tmp_path / "teeth.lut") == {2: "11", 3: "21"}
 
 
@@ -651,7 +644,8 @@ def test_labels_as_floating_point_numbers_take_no_more_memory_than_is_asked_for(
     order: Literal["C", "F"],
 ) -> None:
     labels = np.zeros((120, 120, 120), order=order)
-    labels[20:90, 30:80, 10:100], labels[100:110] = 7, 300.004
+    labels[20:90, 30:80, 10:100] = 7
+    labels[100:110] = 300.004
     tracemalloc.start()
     volume = volume_in_memory(labels, (1, 1, 1))
     peak = tracemalloc.get_traced_memory()[1]

@@ -144,7 +144,8 @@ def test_directions_are_no_classes() -> None:
 
 
 def test_needs() -> None:
-    fine, coarse = SpectralEmbedding(n_eigenpairs=9), SpectralEmbedding(n_eigenpairs=2)
+    fine = SpectralEmbedding(n_eigenpairs=9)
+    coarse = SpectralEmbedding(n_eigenpairs=2)
     assert Potential().requirements(fine) == Requirements(n_eigenpairs=9)
     assert InteriorDistance().requirements(fine) == Requirements(n_eigenpairs=9)
     assert InteriorDistance(embedding=coarse).requirements(fine) == Requirements(n_eigenpairs=2)

@@ -36,10 +36,8 @@ def test_folds_hold_out_each_shape_once_and_leave_every_class() -> None:
 
 def test_scores_are_those_of_the_kernel_head_and_probabilities_their_softmax() -> None:
     histograms, labels = drawn(4, 8)
-    head, kernel = (
-        ClassifierHead().fit(histograms, labels, PARTS),
-        KernelHead().fit(histograms, labels, PARTS),
-    )
+    head = ClassifierHead().fit(histograms, labels, PARTS)
+    kernel = KernelHead().fit(histograms, labels, PARTS)
     new, _ = drawn(4, 5, seed=1)
     torch.testing.assert_close(head.scores(new), kernel.scores(new), rtol=0, atol=1e-6)
     torch.testing.assert_close(head(new), kernel(new), rtol=0, atol=1e-6)
@@ -53,7 +51,8 @@ def test_scores_are_those_of_the_kernel_head_and_probabilities_their_softmax() -
 def test_the_temperature_is_the_likeliest_on_what_is_held_out() -> None:
     histograms, labels = drawn(4, 8, noise=1.5)
     head = ClassifierHead().fit(histograms, labels, PARTS)
-    scores, truth = [], []
+    scores = []
+    truth = []
     for out in folds(labels):
         kernel = KernelHead().fit(histograms[~out], labels[~out], PARTS)
         scores.append(kernel.scores(histograms[out]))
@@ -78,7 +77,8 @@ def test_strangeness_is_what_its_formula_says() -> None:
         score, taken_for = head.scores(new)[i].max(dim=0)
         distances = torch.zeros(len(histograms))
         start = 0
-        roots, theirs = new.sqrt(), histograms.sqrt()
+        roots = new.sqrt()
+        theirs = histograms.sqrt()
         for part, share in enumerate(head.shares[:-1]):
             one = head.whitened.whitened_parts(roots)[part]
             other = head.whitened.whitened_parts(theirs)[part]

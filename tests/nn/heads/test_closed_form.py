@@ -48,9 +48,8 @@ def test_whitening_is_the_inverse_root_of_the_covariance(collection: tuple[Tenso
         [roots[labels == c] - roots[labels == c].mean(axis=0) for c in range(8)]
     )
     within = residuals.T @ residuals
-    within /= (
-        within.trace() / 40
-    )  # the mean of the 40 eigenvalues that the residuals of 48 shapes of 8 classes allow
+    # The mean of the 40 eigenvalues that the residuals of 48 shapes of 8 classes allow
+    within /= within.trace() / 40
     values, vectors = np.linalg.eigh(within + 0.5 * np.eye(N_CELLS))
     expected = (roots - roots.mean(axis=0)) @ vectors / np.sqrt(values) @ vectors.T
     head = WhitenedHead(n_directions=40, shrinkage=0.5).fit(histograms, labels)
@@ -141,7 +140,8 @@ def test_order_of_the_training_shapes_does_not_matter(collection: tuple[Tensor, 
 
 def test_kernel_head_is_kernel_ridge_regression(collection: tuple[Tensor, Tensor]) -> None:
     histograms, labels = collection
-    train, test = slice(0, 48, 2), slice(1, 48, 2)
+    train = slice(0, 48, 2)
+    test = slice(1, 48, 2)
     head = KernelHead(ridge=0.1).fit(histograms[train], labels[train])
     whitened = WhitenedHead().fit(histograms[train], labels[train])(histograms).double().numpy()
     distances = 1 - whitened @ whitened[train].T
@@ -316,7 +316,8 @@ def test_whitened_distance_is_the_weighted_mean_with_the_priors(
 ) -> None:
     """With the prior's own distance, where it has one; the cosine distance of the vectors is that with its cosines."""
     histograms, labels = collection
-    own, other = WhitenedHead().fit(histograms, labels)(histograms), prior(histograms)
+    own = WhitenedHead().fit(histograms, labels)(histograms)
+    other = prior(histograms)
     for given, of_prior in ((prior, cosine(other, other)), (squared, cosine(other, other) ** 2)):
         head = WhitenedHead(prior=given, prior_share=0.3).fit(histograms, labels)
         beside = head(histograms)
@@ -336,7 +337,8 @@ def test_parts_beside_a_prior_are_weighted_by_fishers_discriminant(
     """Means and variances over all pairs, by `statistics`; the last part separates shapes, but not classes."""
     histograms, labels = collection
     backwards = histograms.roll(1, dims=0).view(8, 6, N_CELLS).transpose(0, 1).reshape(48, N_CELLS)
-    descriptions, cells = torch.cat([histograms, backwards], dim=1), (5, 55, 60)
+    descriptions = torch.cat([histograms, backwards], dim=1)
+    cells = (5, 55, 60)
     train = torch.arange(48)[labels < 5]
     apart = [
         1 - vectors @ vectors.T
@@ -364,7 +366,8 @@ class Stretched(Head):
 
     def __init__(self, head: WhitenedHead, n_cells: int) -> None:
         super().__init__()
-        self.head, self.n_cells = head, n_cells
+        self.head = head
+        self.n_cells = n_cells
 
     def fit(
         self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None
@@ -401,7 +404,8 @@ def test_the_priors_kernel_is_one_more(
 ) -> None:
     """By the prior's own distance, where it has one."""
     histograms, labels = collection
-    train, test = slice(0, 48, 2), slice(1, 48, 2)
+    train = slice(0, 48, 2)
+    test = slice(1, 48, 2)
     kernels = []
     parts = histograms.split([20, 40], dim=1)
     heads = [WhitenedHead().fit(part[train], labels[train])(part) for part in parts]

@@ -14,7 +14,10 @@ from igps.nn.heads.two_level import TwoLevelHead
 from igps.nn.heads.wccn import WCCNHead
 from igps.retrieval import cosine, retrieval_scores
 
-N_CLASSES, N_BODIES, N_POSES, N_CELLS = 16, 4, 5, 40
+N_CLASSES = 16
+N_BODIES = 4
+N_POSES = 5
+N_CELLS = 40
 
 
 @pytest.fixture
@@ -95,7 +98,8 @@ def test_with_lengths_distances_are_those_of_mahalanobis(
     found = head(histograms.double())
     assert found.shape == (len(histograms), 11)
     torch.testing.assert_close(found.norm(dim=1), torch.ones(len(found), dtype=torch.float64))
-    own, theirs = torch.pdist(found[:, :10]), torch.pdist(expected)
+    own = torch.pdist(found[:, :10])
+    theirs = torch.pdist(expected)
     torch.testing.assert_close(own / own.median(), theirs / theirs.median(), atol=1e-6, rtol=1e-6)
     assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
 
@@ -105,9 +109,8 @@ def test_shapes_far_from_the_training_shapes_have_unit_vectors(
 ) -> None:
     histograms, _, bodies = collection
     head = WCCNHead(n_directions=10, lengths=True).fit(histograms, bodies)
-    alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(
-        1.0
-    )  # one cell each; training shapes fill all 40 cells
+    # One cell each; training shapes fill all 40 cells
+    alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(1.0)
     torch.testing.assert_close(head(alone).norm(dim=1), torch.ones(N_CELLS), atol=1e-5, rtol=0)
 
 
@@ -137,10 +140,8 @@ def test_the_distance_is_what_the_formula_says(
         for one in (y, z)
     )
     apart = first**0.3 * second**0.7
-    usual, from_mean = (
-        0.5 / 2**0.5,
-        ((y[:, :-1].norm(dim=1) ** 2 + z[:, :-1].norm(dim=1) ** 2) / 2).sqrt(),
-    )
+    usual = 0.5 / 2**0.5
+    from_mean = ((y[:, :-1].norm(dim=1) ** 2 + z[:, :-1].norm(dim=1) ** 2) / 2).sqrt()
     shorter = (torch.outer(from_mean, from_mean).sqrt() / usual).sqrt()
     by_class = 1 - x @ x.T
     all_near = torch.exp(
@@ -170,14 +171,14 @@ def test_body_heads_can_have_shapes_of_their_own(collection: tuple[Tensor, Tenso
     head = TwoLevelHead().fit(
         histograms[:200], classes[:200], bodies=bodies[200:], body_descriptions=histograms[200:]
     )
-    of_class, of_body = WCCNHead(), WCCNHead(n_directions=64, shrinkage=0.3, lengths=True)
+    of_class = WCCNHead()
+    of_body = WCCNHead(n_directions=64, shrinkage=0.3, lengths=True)
     of_class.fit(histograms[:200], classes[:200])
     of_body.fit(histograms[200:], bodies[200:])
     expected = 0.5**0.5 * torch.cat([of_class(histograms), of_body(histograms)], dim=1)
     torch.testing.assert_close(head(histograms), expected)
-    _, _, axes = np.linalg.svd(
-        expected[:200].double().numpy(), full_matrices=False
-    )  # of the shapes of classes
+    # Of the shapes of classes
+    _, _, axes = np.linalg.svd(expected[:200].double().numpy(), full_matrices=False)
     short = head.shorten(head(histograms))
     projected = torch.from_numpy(expected.double().numpy() @ axes.T)
     torch.testing.assert_close(
@@ -224,7 +225,8 @@ def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to
     of_bodies = torch.randn(12, 2, 1, 1, 4, generator=generator) @ torch.randn(
         4, N_CELLS, generator=generator
     )
-    of_poses, of_individuals = torch.zeros(*shape, N_CELLS), torch.zeros(*shape, N_CELLS)
+    of_poses = torch.zeros(*shape, N_CELLS)
+    of_individuals = torch.zeros(*shape, N_CELLS)
     of_poses[..., :10] = torch.randn(*shape, 10, generator=generator)
     of_individuals[..., 30:] = torch.randn(12, 2, 3, 1, 10, generator=generator)
     cells = (
@@ -232,7 +234,8 @@ def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to
     )
     histograms = cells / cells.sum(dim=1, keepdim=True)
     individuals = torch.arange(72).repeat_interleave(4)
-    bodies, classes = individuals // 3, individuals // 6
+    bodies = individuals // 3
+    classes = individuals // 6
     seen = classes < 6
     found = []
     for fitted_to in (bodies, individuals):
@@ -278,7 +281,9 @@ def test_both_levels_score_better_than_with_the_other_head_alone(
     seen = classes < N_CLASSES // 2
     head = TwoLevelHead().fit(histograms[seen], classes[seen], bodies=bodies[seen])
     assert isinstance(head, Head)
-    rest, of_class, of_body = histograms[~seen], classes[~seen], bodies[~seen]
+    rest = histograms[~seen]
+    of_class = classes[~seen]
+    of_body = bodies[~seen]
     vectors = head(rest)
     distances = head.distances(vectors, vectors)
     found = {

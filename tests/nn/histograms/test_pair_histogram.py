@@ -44,7 +44,8 @@ DEVICES = [
         "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
     ),
 ]
-FINE, COARSE = SpectralEmbedding(n_eigenpairs=6), SpectralEmbedding(n_eigenpairs=2)
+FINE = SpectralEmbedding(n_eigenpairs=6)
+COARSE = SpectralEmbedding(n_eigenpairs=2)
 DEPTH = (0.2, 0.5, 0.9)
 ANGLES = equal_bins(3, 2.0)
 
@@ -86,13 +87,15 @@ class Look:
         return [(values, [angle - 1 for angle in ANGLES]) for values in features]
 
     def in_embedding(self) -> list[Axis]:
-        own, sign = self.embedding(), 1 if self.kind == "interior" else -1
+        own = self.embedding()
+        sign = 1 if self.kind == "interior" else -1
         other = self.embedding(kind="surface" if self.kind == "interior" else "interior")
         directions = []
         for point in own:
+            # Type: ignore[misc]
             nearest = sorted(other, key=lambda target, point=point: float((target - point).norm()))[
                 :8
-            ]  # type: ignore[misc]
+            ]
             directions.append(sign * normalize(torch.stack(nearest).mean(dim=0) - point, dim=0))
         return [
             (values, [a - 1 for a in ANGLES]) for values in cosines(own, torch.stack(directions))
@@ -253,11 +256,10 @@ def learn(*modules: nn.Module) -> None:
 @pytest.mark.parametrize("with_cosines", [False, True])
 def test_learned_axes_equal_brute_force_loop(batch: SignatureBatch, with_cosines: bool) -> None:
     """The centres are wherever the parameters take them."""
-    potential, depth = (
-        Potential(2, soft=True, learnable=True),
-        Attribute("depth", DEPTH, soft=True, learnable=True),
-    )
-    interior, euclidean = InteriorDistance(4, learnable=True), EuclideanDistance(3, learnable=True)
+    potential = Potential(2, soft=True, learnable=True)
+    depth = Attribute("depth", DEPTH, soft=True, learnable=True)
+    interior = InteriorDistance(4, learnable=True)
+    euclidean = EuclideanDistance(3, learnable=True)
     angles = PairCosines(3, learnable=True)
     axes = (
         [potential, depth, interior, angles]
@@ -275,7 +277,8 @@ def test_learned_axes_equal_brute_force_loop(batch: SignatureBatch, with_cosines
         )
         pairs = [(look.interior(2)[0], interior.centres().tolist())]
         if with_cosines:
-            towards, between = angles.towards_centres().tolist(), angles.between_centres().tolist()
+            towards = angles.towards_centres().tolist()
+            between = angles.between_centres().tolist()
             pairs += [
                 (look.in_space()[k][0], centres)
                 for k, centres in enumerate((towards, towards, between))
@@ -381,7 +384,8 @@ def test_needs_are_those_of_all_axes() -> None:
 
 def test_summing_a_dimension_out_leaves_the_rest(batch: SignatureBatch) -> None:
     """Whatever the algorithm that counts it."""
-    interior, euclidean = InteriorDistance(32), EuclideanDistance(16)
+    interior = InteriorDistance(32)
+    euclidean = EuclideanDistance(16)
     joint = PairHistogram([Potential(4), interior, euclidean])(batch)
     torch.testing.assert_close(
         joint.sum(dim=3), PairHistogram([Potential(4), interior])(batch), atol=1e-6, rtol=0
@@ -409,7 +413,8 @@ def test_batch_equals_single_shapes_whatever_the_padding() -> None:
     generator = torch.Generator().manual_seed(3)
     embedding = torch.randn(90, 6, generator=generator, dtype=torch.float64) * 0.7
     mask = torch.zeros(2, 90, dtype=torch.bool)
-    mask[0], mask[1, ::3] = True, True
+    mask[0] = True
+    mask[1, ::3] = True
     padded = embedding.repeat(2, 1, 1)
     padded[~mask] = torch.nan
     result = PairHistogram()(batch_of(padded, mask))
@@ -458,8 +463,10 @@ def test_padding_changes_neither_result_nor_gradient_of_the_samples(
 ) -> None:
     embedding, points, directions = some(40)
     mask = torch.zeros(2, 40, dtype=torch.bool)
-    mask[0], mask[1, ::3] = True, True
-    padded, places = embedding.repeat(2, 1, 1), points.repeat(2, 1, 1)
+    mask[0] = True
+    mask[1, ::3] = True
+    padded = embedding.repeat(2, 1, 1)
+    places = points.repeat(2, 1, 1)
     padded[~mask] = places[~mask] = padding
     padded.requires_grad_()
     layer = PairHistogram(make())
@@ -614,7 +621,8 @@ def test_layout_survives_its_state() -> None:
         pairs = [InteriorDistance(6, reach, learnable=True), EuclideanDistance(5, learnable=True)]
         return PairHistogram([Potential(soft=True, learnable=True), depth, *pairs])
 
-    layer, fresh = made(4.0), made(9.0)
+    layer = made(4.0)
+    fresh = made(9.0)
     learn(layer)
     fresh.load_state_dict(layer.state_dict())
     embedding, points, _ = some(30)

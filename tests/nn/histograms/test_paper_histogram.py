@@ -23,7 +23,8 @@ def by_loops(
         for j in range(i):
             position = math.dist(embedding[i], embedding[j]) / (d_max / b) - 0.5
             position = min(max(position, 0.0), b - 1.0)
-            row, lower = rows[tuple(sorted((level[i], level[j])))], int(position)
+            row = rows[tuple(sorted((level[i], level[j])))]
+            lower = int(position)
             histogram[row, lower] += 1 - (position - lower)
             if lower + 1 < b:
                 histogram[row, lower + 1] += position - lower
@@ -95,7 +96,8 @@ def test_bad_input_is_refused(
 
 
 def test_half_precision_is_counted_in_single(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
-    embedding, potential = cloud[0].bfloat16(), cloud[0].bfloat16().float().norm(dim=1)
+    embedding = cloud[0].bfloat16()
+    potential = cloud[0].bfloat16().float().norm(dim=1)
     with torch.autocast("cpu", torch.bfloat16):
         result = pair_histogram(embedding, potential)
     assert result.dtype == torch.float32

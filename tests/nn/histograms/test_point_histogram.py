@@ -54,7 +54,8 @@ def test_it_is_the_share_of_samples_in_each_cell() -> None:
 
 
 def test_padding_and_scale_change_nothing() -> None:
-    batch, histogram = two_bodies(), layout()
+    batch = two_bodies()
+    histogram = layout()
     found = histogram(batch)
     torch.testing.assert_close(found.flatten(1).sum(dim=1), torch.ones(2))
     for i in range(2):
@@ -95,7 +96,9 @@ def test_what_it_cannot_count_is_named() -> None:
 
 def test_the_function_counts_memberships_by_masks_and_weights() -> None:
     random = np.random.default_rng(0)
-    one, other, weights = random.random((2, 5, 3)), random.random((2, 5, 2)), random.random((2, 5))
+    one = random.random((2, 5, 3))
+    other = random.random((2, 5, 2))
+    weights = random.random((2, 5))
     mask = np.array([[True] * 5, [True, True, False, True, False]])
     expected = (
         np.einsum("npc,npd,np->ncd", one, other, mask * weights) / mask.sum(axis=1)[:, None, None]

@@ -65,9 +65,11 @@ def test_radii_are_those_of_the_definition(ball_radii: Radii) -> None:
 
 def test_near_points_keep_their_digits_in_single_precision(ball_radii: Radii) -> None:
     """Of a lens beside the origin, whose two sides are near each other."""
-    generator, axes = torch.Generator().manual_seed(0), torch.tensor([0.3, 0.3, 0.02])
+    generator = torch.Generator().manual_seed(0)
+    axes = torch.tensor([0.3, 0.3, 0.02])
     ball = normalize(torch.randn(400, 3, generator=generator), dim=1)
-    points, directions = ball * axes + 0.4, normalize(ball / axes, dim=1)
+    points = ball * axes + 0.4
+    directions = normalize(ball / axes, dim=1)
     found = ball_radii(points, directions)
     for side, column in ((1, 0), (-1, 1)):
         expected = by_definition(points, directions, side)
@@ -113,7 +115,8 @@ def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii: Radi
 
 
 def test_three_samples_are_enough_and_two_are_not(ball_radii: Radii) -> None:
-    points, outward = torch.eye(3), torch.tensor([0.0, 0.0, 1.0])
+    points = torch.eye(3)
+    outward = torch.tensor([0.0, 0.0, 1.0])
     assert ball_radii(points, outward.expand(3, 3)).tolist() == [[10.0, 10.0]] * 3
     with pytest.raises(
         ValueError, match="samples: expected at least 3 of each body for its balls, got 2"

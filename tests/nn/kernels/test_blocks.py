@@ -46,7 +46,8 @@ def test_groups_are_padded_to_their_largest_body(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda device: on_cpu)
-    batch, found = bodies(*copies), []
+    batch = bodies(*copies)
+    found = []
 
     def sums(group: SignatureBatch) -> Tensor:
         found.append(tuple(group.interior.mask.shape))
@@ -57,7 +58,8 @@ def test_groups_are_padded_to_their_largest_body(
 
 
 def test_large_bodies_are_not_copied() -> None:
-    batch, found = bodies(1, 50, 2, 45), []
+    batch = bodies(1, 50, 2, 45)
+    found = []
 
     def addresses(group: SignatureBatch) -> Tensor:
         found.extend(group.interior.eigenfunctions.data_ptr() for _ in group.ids if len(group) == 1)
@@ -104,7 +106,8 @@ def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several: bo
 
 
 def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body() -> None:
-    descriptor, batch = HistogramDescriptor(PairHistogram(["interior_distance"])), bodies(1, 20, 2)
+    descriptor = HistogramDescriptor(PairHistogram(["interior_distance"]))
+    batch = bodies(1, 20, 2)
 
     def second_derivatives(batch: SignatureBatch) -> Tensor:
         functions = batch.interior.eigenfunctions.double().requires_grad_()

@@ -24,7 +24,8 @@ def learned() -> igps.HistogramDescriptor:
 
 
 def test_backward_runs_on_one_thread_wherever_it_is_called() -> None:
-    descriptor, seen = learned(), []
+    descriptor = learned()
+    seen = []
     descriptor.histograms[0].embedding.log_gain.register_hook(  # type: ignore[union-attr]
         lambda gradient: seen.append(torch.get_num_threads())
     )
@@ -45,7 +46,8 @@ def test_backward_runs_on_one_thread_wherever_it_is_called() -> None:
 def test_gradients_of_first_and_second_order_are_those_without_a_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    batch, descriptor = two_bodies(), learned()
+    batch = two_bodies()
+    descriptor = learned()
     points = batch.interior.points.clone().requires_grad_()
 
     def found() -> list[torch.Tensor]:

@@ -30,7 +30,9 @@ from loops import Axis, cosines, distances, pair_histogram_by_loops, twists
 FEW = [0.3, 0.5, 0.52, 1.9]
 EQUAL = [0.25, 0.75, 1.25, 1.75, 2.25]
 MANY = [0.1, 0.4, 0.401, 0.4012, 0.4013, 0.7, 0.9, 1.0, 1.1, 1.15, 1.3, 1.5, 1.6, 1.9, 2.2, 2.9]
-TOWARDS, AMONG, TWISTS = [-0.7, 0.1, 0.6], [-0.5, 0.3], [-0.4, 0.0, 0.4]
+TOWARDS = [-0.7, 0.1, 0.6]
+AMONG = [-0.5, 0.3]
+TWISTS = [-0.4, 0.0, 0.4]
 BACK_ENDS = [
     "compiled",
     "torch",
@@ -360,10 +362,8 @@ def test_no_cell_of_cosines_is_negative(device: str) -> None:
     directions = torch.stack([both.cos(), both.sin(), torch.zeros_like(both)], dim=2)
     points = torch.zeros(800, 2, 3)
     points[:, 1, 0] = (0.75 - below).expand(-1, 20).flatten()
-    angles, bins = (
-        (torch.arange(5) * 0.4 - 0.8).to(device),
-        (torch.arange(6) * 0.5 + 0.25).to(device),
-    )
+    angles = (torch.arange(5) * 0.4 - 0.8).to(device)
+    bins = (torch.arange(6) * 0.5 + 0.25).to(device)
     pairs = [
         euclidean_distances(points.to(device), bins),
         oriented_pairs(points.to(device), directions.to(device), angles, angles),
@@ -394,7 +394,8 @@ def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """700 points, several blocks for each share, and the gradient."""
     monkeypatch.setattr(threads, "n_cores", lambda: 8)
     given = {name: value.requires_grad_() for name, value in some(700).items()}
-    upstream, results = None, []
+    upstream = None
+    results = []
     for n_threads in (1, 2, 5):
         with torch_threads(n_threads):
             histogram = counted(["many", "cosines"], given)
@@ -580,7 +581,8 @@ def test_bad_points_are_refused(
 
 @pytest.mark.parametrize("layout", [[0.5, 0.5, 1.0], [0.5, torch.inf], [torch.nan, 1.0], [1.0], []])
 def test_bad_centres_are_refused(layout: list[float]) -> None:
-    points, bins = torch.rand(5, 3), torch.tensor(layout)
+    points = torch.rand(5, 3)
+    bins = torch.tensor(layout)
     for pairs in (
         [euclidean_distances(points, bins)],
         [oriented_pairs(points, points, bins, torch.rand(2).sort()[0])],
@@ -592,7 +594,8 @@ def test_bad_centres_are_refused(layout: list[float]) -> None:
 
 
 def test_directions_are_of_the_shape_of_the_points() -> None:
-    points, layout = torch.rand(10, 3), torch.tensor([0.0, 1.0])
+    points = torch.rand(10, 3)
+    layout = torch.tensor([0.0, 1.0])
     with pytest.raises(
         ValueError, match=r"directions: expected the shape of the points, \(10, 3\), got \(10, 2\)"
     ):

@@ -42,9 +42,8 @@ class CanonicalForm(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        check_at_least(
-            2, max_order=self.max_order
-        )  # moments of lower order are the same for all bodies
+        # Moments of lower order are the same for all bodies
+        check_at_least(2, max_order=self.max_order)
         if not _DIMENSION < self.n_samples <= self.max_vertices:
             raise ValueError(
                 f"n_samples: expected {_DIMENSION + 1} to max_vertices = {self.max_vertices}, got {self.n_samples}."

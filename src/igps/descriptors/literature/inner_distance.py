@@ -44,9 +44,8 @@ class InnerDistance(BodyDescriptor):
     requirements = Requirements()
 
     n_bins: int = 64  # distance bins, with a linear kernel
-    max_distance: float = (
-        3.0  # upper end of the last bin, in units of √area; larger distances go into this bin
-    )
+    # Upper end of the last bin, in units of √area; larger distances go into this bin
+    max_distance: float = 3.0
     n_sources: int = 200  # samples from which paths start; all samples if there are fewer
     seed: int = 0  # of the choice of the sources
 

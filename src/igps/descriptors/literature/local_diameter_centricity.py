@@ -38,9 +38,8 @@ class LocalDiameterCentricity(BodyDescriptor):
 
     n_diameter_bins: int = 32  # with a linear kernel
     n_centricity_bins: int = 32  # with a linear kernel
-    max_diameter: float = (
-        0.45  # upper end of the last bin, in units of √area; larger values go into this bin
-    )
+    # Upper end of the last bin, in units of √area; larger values go into this bin
+    max_diameter: float = 0.45
     max_centricity: float = 2.0  # the same for the centricity
     n_samples: int = 2000  # area-weighted random points of the surface
     n_rays: int = 30  # per sample

@@ -52,9 +52,8 @@ class SpectralGromovWasserstein(BodyDescriptor):
     times: tuple[float, ...] = TIMES  # in units of A/8π
     n_samples: int = 500  # at most, at equal steps along the order of the samples
     n_quantiles: int = 200  # steps of the quantile functions
-    n_eigenpairs: int = (
-        100  # of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
-    )
+    # Of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
+    n_eigenpairs: int = 100
     seed: int = 0  # of the offset of the steps along the order of the samples
 
     def __post_init__(self) -> None:

@@ -58,9 +58,8 @@ class VolumeShapeDNA(BodyDescriptor):
     invariant_to = ("motion", "scale")
     requirements = Requirements(mesh=True)
 
-    boundary: Boundary = (
-        "dirichlet"  # zero on the surface; or "neumann": no flux through the surface
-    )
+    # Zero on the surface; or "neumann": no flux through the surface
+    boundary: Boundary = "dirichlet"
     n_eigenvalues: int = 12  # without the first zero under Neumann conditions
     n_voxels: int = 4000  # a cell has 1/`n_voxels` of the volume, but its side is at least 1/128 of the longest side
 

@@ -28,7 +28,8 @@ PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 """The file of the parameters of `pretrained`."""
 
 # Indices into `pretrained_parts`. Body heads use parts that bending leaves as they are.
-BODY_PARTS, CLASS_PARTS = (0, 8), (1, 2, 3, 4, 5, 6, 7)
+BODY_PARTS = (0, 8)
+CLASS_PARTS = (1, 2, 3, 4, 5, 6, 7)
 # Scales of the body heads, in units in which the median distance between training shapes is 0.5
 _SCALES = (0.13, 0.14)
 # Eigenvalues and the volume are more exact than distances between samples.

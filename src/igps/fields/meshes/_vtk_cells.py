@@ -7,7 +7,12 @@ from igps.mesh.polygons import flat_triangles, strip_triangles, triangles
 
 # Types of cells by VTK's numbers.
 LINES = LINE, POLY_LINE = 3, 4
-TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, TETRAHEDRON = 5, 6, 7, 8, 9, 10
+TRIANGLE = 5
+STRIP = 6
+POLYGON = 7
+PIXEL = 8
+QUAD = 9
+TETRAHEDRON = 10
 # Faces of tetrahedra, voxels, hexahedra, wedges and pyramids, outward, as indices of their corners in VTK's order.
 _SIDES: dict[int, tuple[tuple[int, ...], ...]] = {
     TETRAHEDRON: ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)),

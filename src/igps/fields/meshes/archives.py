@@ -74,9 +74,8 @@ def _unpack(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str, P
     with _members(path, options) as members:
         for name, stream in members:
             member = PurePosixPath(name.replace("\\", "/"))
-            target = (
-                folder / member
-            )  # outside of the folder if the name begins with a slash, or a drive of Windows
+            # Outside of the folder if the name begins with a slash, or a drive of Windows
+            target = folder / member
             # Parts with a leading dot are "..", or hidden: macOS adds hidden files with the suffixes of the others
             is_inside = target.is_relative_to(folder) and not any(
                 part.startswith(".") for part in member.parts

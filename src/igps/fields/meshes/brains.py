@@ -25,9 +25,8 @@ _TYPES = {
 _POINTS, _TRIANGLES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
 _MAX_AXES = 6
 _MAGIC = b"\xff\xff\xfe"
-_SCANNER_TAG = np.array(
-    [2, 1], ">i4"
-).tobytes()  # behind the triangles if the points are in the coordinates of images
+# Behind the triangles if the points are in the coordinates of images
+_SCANNER_TAG = np.array([2, 1], ">i4").tobytes()
 # Lines at the end of a FreeSurfer file: axes and centre of the volume from which the surface was made.
 _VOLUME_AXES = re.compile(rb"^[xyzc]ras\s*=\s*(\S+)\s+(\S+)\s+(\S+)", re.MULTILINE)
 # The axes of that volume in the coordinates of the surface.

@@ -19,10 +19,11 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     coordinates: list[str] = []
     polygons: list[str] = []
     n_before: list[int] = []  # vertices above each polygon: negative indices count back from there
+    # Of objects and groups: first polygon, and name
     starts: dict[str, list[tuple[int, str]]] = {
         "o": [],
         "g": [],
-    }  # of objects and groups: first polygon, and name
+    }
     has_lines = False
     for line in text_of(path).replace("\\\n\n", " ").replace("\\\n", " ").split("\n"):
         word, _, fields = line.lstrip().replace("\t", " ").partition(" ")

@@ -49,9 +49,8 @@ _XML_CELLS = {
     "Lines": _vtk_cells.POLY_LINE,
 }
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
-Cells = tuple[
-    Integers, Integers, Integers
-]  # corners laid end to end; corner counts of cells; types of cells
+# Corners laid end to end; corner counts of cells; types of cells
+Cells = tuple[Integers, Integers, Integers]
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,9 +312,8 @@ class _Xml:
             )
         else:
             values = np.frombuffer(self._decode("".join(text.split()).encode(), False), kind)
-        self._n_unpacked += (
-            values.nbytes
-        )  # a sum, as thousands of arrays may refer to the same bytes
+        # A sum, as thousands of arrays may refer to the same bytes
+        self._n_unpacked += values.nbytes
         check_unpacked(self._n_unpacked, self._path, self._options.max_unpacked)
         return values
 

@@ -34,9 +34,8 @@ from igps.mesh.surface import connected, face_areas, signed_volume, stacked, sum
 
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 
-_MARGIN = (
-    2.5  # cells around the balls, and on both sides of the surface, in which distances are computed
-)
+# Cells around the balls, and on both sides of the surface, in which distances are computed
+_MARGIN = 2.5
 _MAX_CELLS = 2**28
 _MAX_STEP = 0.3  # maximal step of vertices towards the surface, in cells
 # Maximal share of the area that threads between pieces add, and maximal width of a thread's end over its triangle's.
@@ -257,9 +256,8 @@ def _shortest_links(parts: Sequence[Floats]) -> list[tuple[int, int]]:
     trees = [cKDTree(points) for points in parts]
     links = []
     starts = np.cumsum([0, *map(len, parts)]).tolist()
-    best = dict.fromkeys(
-        range(1, len(parts)), (np.inf, 0, 0)
-    )  # shortest link of each part that is not yet in the tree
+    # Shortest link of each part that is not yet in the tree
+    best = dict.fromkeys(range(1, len(parts)), (np.inf, 0, 0))
     new = 0
     while best:
         for j in best:

@@ -31,9 +31,8 @@ class Molecule:
     radii: Floats  # (A,) van der Waals radii, Å
     charges: Floats  # (A,) elementary charges
     residue_of: Integers  # (A,) index of the residue of each ball
-    residue_names: tuple[
-        str, ...
-    ]  # codes of three letters; a modified amino acid has the code of its parent
+    # Codes of three letters; a modified amino acid has the code of its parent
+    residue_names: tuple[str, ...]
     residue_positions: (
         Floats  # (R, 3) Å, positions of Cα, or of a residue without Cα the mean of its atoms
     )

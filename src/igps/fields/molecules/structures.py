@@ -40,9 +40,8 @@ logger = logging.getLogger(__name__)
 
 MoleculeBodies = Literal["chains", "models", "assembly"]
 
-_INFERRED_ELEMENTS = frozenset(
-    "HCNOSP"
-)  # by the first letter of an atom's name, if the file states no element
+# By the first letter of an atom's name, if the file states no element
+_INFERRED_ELEMENTS = frozenset("HCNOSP")
 # Elements of residues with standard names; selenium is that of selenomethionine.
 _STANDARD_ELEMENTS = frozenset({*_INFERRED_ELEMENTS, "D", "Se"})
 _UNKNOWN_RADIUS = 1.7  # Å, of atoms of unknown elements: that of carbon

@@ -26,10 +26,11 @@ _STIFFNESS = (1.0, 0.1)
 # Excess of the first solution's Laplacian over its surroundings: up to the first value a place is smooth, from the
 # second on it is an edge. An edge bends more than the faces beside it; a thin round body bends everywhere.
 _BEND_LIMITS = (0.05, 0.2)
+# Standard deviations of the means of the Laplacian and of its surroundings, voxels
 _WINDOW, _WIDE_WINDOW = (
     0.7,
     3.0,
-)  # standard deviations of the means of the Laplacian and of its surroundings, voxels
+)
 # Weight of the deviation from a signed distance to the voxels of the other side; the second derivatives have weight 1.
 _DISTANCE_WEIGHT = 0.01
 _RELAXATION = 1.4

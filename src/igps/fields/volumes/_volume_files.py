@@ -58,9 +58,8 @@ class RawVolume:
     layers: list[NDArray[Any]]  # (X, Y, Z) of any type
     affine: Floats  # (4, 4) from voxel indices to the world
     names: dict[int, str] = field(default_factory=dict)  # of the values of a single layer
-    segments: list[tuple[str, int, int]] = field(
-        default_factory=list
-    )  # (name, layer, value), if the file lists them
+    # (name, layer, value), if the file lists them
+    segments: list[tuple[str, int, int]] = field(default_factory=list)
     unit: str | None = "mm"  # of length; None if the file states no lengths
     frame: Frame = "RAS"  # None if the file does not say how the patient lies
     unit_from: UnitSource = "default"  # what states the unit

@@ -15,6 +15,7 @@ from igps.mesh.errors import MeshError
 
 _GRIDS = (".dx", ".mrc", ".map", ".ccp4")
 SUFFIXES = (*_volume_files.READERS, *_GRIDS)
+# Of a value, by the mode of an MRC map (MRC2014)
 _MODE_BYTES = {
     0: 1,
     1: 2,
@@ -22,7 +23,7 @@ _MODE_BYTES = {
     4: 8,
     6: 2,
     12: 2,
-}  # of a value, by the mode of an MRC map (MRC2014)
+}
 
 
 @lru_cache(maxsize=1)

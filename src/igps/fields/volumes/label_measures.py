@@ -66,9 +66,8 @@ def thinnest_part(mask: Booleans) -> int:
     cubes = ndimage.maximum_filter(ndimage.minimum_filter(mask, cube), cube)
     if np.count_nonzero(cubes) >= _MIN_COVERED * n_voxels:
         return _MAX_DIAMETER
-    parts = (
-        2 if mask.size < _MIN_WHOLE_VOXELS else 1
-    )  # an even thickness has its middle between voxels
+    # An even thickness has its middle between voxels
+    parts = 2 if mask.size < _MIN_WHOLE_VOXELS else 1
     for axis in range(3):
         mask = np.repeat(mask, parts, axis=axis)
     radii = [float(d) if parts == 2 else (d + 1) / 2 for d in range(2, _MAX_DIAMETER + 1)]

@@ -270,9 +270,8 @@ def _coarsen(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Single
         is_halved = sides < 1.5 * sides.min()
         if not _is_thick(mask, is_halved):
             break
-        coarse = block_reduce(
-            share, tuple(np.where(is_halved, 2, 1)), np.mean
-        )  # exact in single precision
+        # Exact in single precision
+        coarse = block_reduce(share, tuple(np.where(is_halved, 2, 1)), np.mean)
         # Drop small pieces that were connected only by threads too thin for the coarse grid.
         label, island, size = _islands(coarse >= 0.5)
         if np.count_nonzero(size) - len(island) != n_pieces:

@@ -37,12 +37,10 @@ from igps.mesh.raw_body import LabelVoxels, RawBody, UnitSource, deferred
 # Volumes with more values than _MAX_LABELS are refused as images. So are those with more than _MAX_UNCHECKED values if
 # less than a share _MIN_EQUAL of adjacent voxels are equal; labels as thin as two voxels have a share of one half.
 _MAX_LABELS, _MAX_UNCHECKED, _MIN_EQUAL = 20_000, 50, 0.3
-_LABEL_TOLERANCE = (
-    0.01  # distance of a label from a whole number: NIfTI may store labels as scaled integers
-)
-_VOLUME_TOLERANCE = (
-    0.005  # share of its voxels' volume by which a surface may differ without a note
-)
+# Distance of a label from a whole number: NIfTI may store labels as scaled integers
+_LABEL_TOLERANCE = 0.01
+# Share of its voxels' volume by which a surface may differ without a note
+_VOLUME_TOLERANCE = 0.005
 _SIDES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))  # RAS
 
 Box = tuple[slice, slice, slice]
@@ -75,9 +73,8 @@ class LabelVolume:
         MeshError: no labels, labels other than whole numbers from 0, ambiguous names, or a singular affine.
     """
 
-    layers: tuple[
-        NDArray[Any], ...
-    ]  # (X, Y, Z) whole numbers, 0 is the background; several if segments overlap
+    # (X, Y, Z) whole numbers, 0 is the background; several if segments overlap
+    layers: tuple[NDArray[Any], ...]
     affine: Floats  # (4, 4) from voxel indices to the world
     name: str = "volume"  # used in messages, usually the path
     names: dict[int, str] | None = None  # of labels

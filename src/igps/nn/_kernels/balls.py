@@ -38,7 +38,8 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
         ValueError: a shape has fewer than three points, or values are not finite.
     """
     dtype = torch.promote_types(points.dtype, torch.float32)
-    points, directions = points.to(dtype), directions.to(dtype)
+    points = points.to(dtype)
+    directions = directions.to(dtype)
     if not torch.compiler.is_compiling():
         if (n_points := int(mask.sum(dim=1).min())) < _RANK:
             raise ValueError(
@@ -99,10 +100,16 @@ def write_curvatures(
     min_normal = one * _MIN_NORMAL
     row = np.empty(n, points.dtype)
     for i in range(n):
-        x, y, z = points[0, i], points[1, i], points[2, i]
-        a, b, c = directions[0, i], directions[1, i], directions[2, i]
+        x = points[0, i]
+        y = points[1, i]
+        z = points[2, i]
+        a = directions[0, i]
+        b = directions[1, i]
+        c = directions[2, i]
         for j in range(n):
-            u, v, w = x - points[0, j], y - points[1, j], z - points[2, j]
+            u = x - points[0, j]
+            v = y - points[1, j]
+            w = z - points[2, j]
             square = u * u + v * v + w * w
             depth = a * u + b * v + c * w
             counts = depth * depth > min_square * square

@@ -21,11 +21,13 @@ from igps.nn._precision import full_precision
 
 # Maximum numbers of values and of columns in a block, which then stays in a core's second-level cache. A larger block
 # could overflow the integers of `pair_sums`.
-_BLOCK_SIZE, _MAX_COLUMNS = 2**18, 2048
+_BLOCK_SIZE = 2**18
+_MAX_COLUMNS = 2048
 _STRIP_ROWS = 128  # rows of a block whose inner products are computed by one matrix product
 # Number of shares of the blocks, which threads process in parallel. Each share has its own counts; with more counts
 # than the maximum, there is only one share, as several would take gigabytes.
-_N_SHARES, _MAX_COUNTS = 4, 2**24
+_N_SHARES = 4
+_MAX_COUNTS = 2**24
 
 Blocks = Sequence[tuple[int, int]]
 
@@ -63,7 +65,8 @@ class CompiledCount(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         weights, *tensors = ctx.saved_tensors
         if torch.is_grad_enabled():  # for second derivatives, which the loops do not have
-            layout, needed = ctx.shapes.layout, ctx.needs_input_grad[1:]
+            layout = ctx.shapes.layout
+            needed = ctx.needs_input_grad[1:]
             counts = count_by_torch(
                 layout.classes, layout.n_classes, layout.pairs, layout.mask, weights, *tensors
             )
@@ -83,7 +86,8 @@ class CompiledCount(torch.autograd.Function):
 
         for number, (order, sums) in enumerate(_map_shapes(derivatives, len(weights))):
             by_weights, by_centres, *by_inputs = sums
-            axes, inputs = iter(by_centres), iter(by_inputs)
+            axes = iter(by_centres)
+            inputs = iter(by_inputs)
             gradients = [by_weights.T]
             for pair in ctx.shapes.layout.pairs:
                 gradients += [next(inputs) for _ in pair.inputs]
@@ -131,16 +135,15 @@ class _Shapes:
         self.members_to_count = _without_zeros(*self.members)
         self.n_points: list[int] = layout.mask.sum(dim=1).tolist()
         centres = [x.detach() for x in centres_of(with_tensors(layout.pairs, tensors))]
-        self.bins, self.dtype = [len(x) for x in centres], centres[0].dtype
+        self.bins = [len(x) for x in centres]
+        self.dtype = centres[0].dtype
         self.n_counts = (
             layout.n_classes * (layout.n_classes + 1) // 2,
             math.prod(self.bins) << len(self.bins),
         )
         kinds = [kind for pair in layout.pairs for kind in pair.kinds]
-        self.n_values, self.n_oriented = (
-            sum(kind != COSINES for kind in kinds),
-            kinds.count(COSINES),
-        )
+        self.n_values = sum(kind != COSINES for kind in kinds)
+        self.n_oriented = kinds.count(COSINES)
         self.can_pack = kinds in ([VALUES], [DISTANCES]) and self.dtype == torch.float32
         padded = pad_sequence(centres, batch_first=True).numpy()
         empty = np.empty(0)  # in place of the norms and vectors of each shape
@@ -199,7 +202,8 @@ class _Shape:
             if upstream is None
             else _copy_bins_to_corners(upstream.to(shapes.dtype)).numpy()
         )
-        norms, row = torch.zeros(shapes.n_values, n_points, dtype=shapes.dtype, device="cpu"), 0
+        norms = torch.zeros(shapes.n_values, n_points, dtype=shapes.dtype, device="cpu")
+        row = 0
         for pair, centred in zip(self.pairs, self.centred, strict=True):
             if centred is not None:
                 norms[row] = centred.square().sum(dim=1)
@@ -241,15 +245,11 @@ class _Shape:
         by_weights = torch.zeros(self.members[1].shape, dtype=torch.float64, device="cpu")
         by_centres = torch.zeros(self.axes.centres.shape, dtype=torch.float64, device="cpu")
         by_inputs = [[torch.zeros_like(x) for x in pair.inputs] for pair in self.pairs]
-        value_buffer, cosine_buffer = (
-            self._buffer(self.shapes.n_values),
-            self._buffer(4 * self.shapes.n_oriented),
-        )
+        value_buffer = self._buffer(self.shapes.n_values)
+        cosine_buffer = self._buffer(4 * self.shapes.n_oriented)
         for row, column in blocks:
-            values, by_cosines = (
-                self._view(value_buffer, row, column),
-                self._view(cosine_buffer, row, column),
-            )
+            values = self._view(value_buffer, row, column)
+            by_cosines = self._view(cosine_buffer, row, column)
             self._write_values(values, row, column)
             gradient_block(
                 values.numpy(),
@@ -262,11 +262,10 @@ class _Shape:
                 by_weights.numpy(),
                 by_centres.numpy(),
             )
-            rows, columns = (
-                slice(row, row + values.shape[1]),
-                slice(column, column + values.shape[2]),
-            )
-            next_value, next_cosine = iter(values), iter(by_cosines)
+            rows = slice(row, row + values.shape[1])
+            columns = slice(column, column + values.shape[2])
+            next_value = iter(values)
+            next_cosine = iter(by_cosines)
             for pair, centred, totals in zip(self.pairs, self.centred, by_inputs, strict=True):
                 if centred is not None:
                     _add_by_points(
@@ -311,7 +310,8 @@ class _Shape:
         if self.products is not None:
             values.copy_(self.products)
             return
-        rows, columns = slice(row, row + values.shape[1]), slice(column, column + values.shape[2])
+        rows = slice(row, row + values.shape[1])
+        columns = slice(column, column + values.shape[2])
         matrices = iter(values)
         for pair, centred in zip(self.pairs, self.centred, strict=True):
             if centred is not None:
@@ -326,10 +326,8 @@ class _Shape:
 
 def _inverse_gaps(centres: Numbers, bins: Sequence[int]) -> tuple[Numbers, Booleans]:
     """Return `inverse_gaps` (K, B − 1) and `has_equal_gaps` (K,) of `Axes`, for centres (K, B)."""
-    inverse, is_equal = (
-        np.zeros((len(bins), centres.shape[1] - 1), centres.dtype),
-        np.zeros(len(bins), bool),
-    )
+    inverse = np.zeros((len(bins), centres.shape[1] - 1), centres.dtype)
+    is_equal = np.zeros(len(bins), bool)
     for k, n in enumerate(bins):
         gaps = np.diff(centres[k, :n])
         inverse[k, : n - 1] = 1 / gaps
@@ -360,7 +358,8 @@ def _write_products(points: Tensor, rows: slice, columns: slice, out: Tensor) ->
     In a block on the diagonal, half of the pairs are not counted, and products take more time than the loops.
     """
     for row in range(rows.start, rows.stop, _STRIP_ROWS):
-        end, first = min(row + _STRIP_ROWS, rows.stop), max(row, columns.start)
+        end = min(row + _STRIP_ROWS, rows.stop)
+        first = max(row, columns.start)
         part = out[row - rows.start : end - rows.start, first - columns.start :]
         torch.mm(points[row:end], points[first : columns.stop].T, out=part)
 
@@ -369,7 +368,8 @@ def _add_by_points(
     by_squares: Tensor, points: Tensor, rows: slice, columns: slice, total: Tensor
 ) -> None:
     """Add the derivatives by points (P, D) to a total, from the derivatives by squared distances (I, J)."""
-    x, y = points[rows], points[columns]
+    x = points[rows]
+    y = points[columns]
     if rows == columns:  # one product in place of two
         both = by_squares + by_squares.T
         total[rows] += 2 * (x * both.sum(dim=1, keepdim=True) - both @ x)

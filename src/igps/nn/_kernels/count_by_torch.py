@@ -34,7 +34,8 @@ def count_by_torch(
     bins = [len(centres) for centres in centres_of(pairs)]
     n_cells = n_classes * math.prod(bins)
     total = torch.zeros(n_shapes, n_classes, n_cells, dtype=torch.float64, device=classes.device)
-    n_rows, firsts = n_points, range(1)
+    n_rows = n_points
+    firsts = range(1)
     # A program for any number of shapes or points has one block, as a number of blocks would be fixed by tracing.
     if not any(isinstance(n, torch.SymInt) for n in (n_shapes, n_points)):
         n_rows = max(1, _BLOCK // (n_shapes * max(n_cells, n_points * n_members * 2 ** len(bins))))

@@ -48,7 +48,9 @@ class _OnOneThread(torch.autograd.Function):
         learned: list[Tensor],
         *_: Tensor,
     ) -> Tensor:
-        ctx.function, ctx.batch, ctx.learned = function, batch, learned
+        ctx.function = function
+        ctx.batch = batch
+        ctx.learned = learned
         ctx.random_state = torch.get_rng_state()
         ctx.result, ctx.aliases = _with_graph(function, batch)
         output: Tensor = ctx.result.detach()
@@ -58,7 +60,8 @@ class _OnOneThread(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        result, aliases = ctx.result, ctx.aliases
+        result = ctx.result
+        aliases = ctx.aliases
         if torch.is_grad_enabled():
             # Second derivatives free the graph of the first ones, so these need a graph of their own, of the same
             # samples.

@@ -21,10 +21,8 @@ def smallest(values: Tensor, n: int) -> tuple[Tensor, Tensor]:
         return top.values, top.indices
     # Faster than PyTorch, which copies and partly sorts each row.
     rows = values.contiguous().numpy().reshape(-1, values.shape[-1])
-    entries, columns = (
-        np.full((len(rows), n), np.inf, rows.dtype),
-        np.zeros((len(rows), n), np.int64),
-    )
+    entries = np.full((len(rows), n), np.inf, rows.dtype)
+    columns = np.zeros((len(rows), n), np.int64)
     if n:
         keep_smallest(rows, entries, columns)
     shape = (*values.shape[:-1], n)
@@ -43,4 +41,5 @@ def keep_smallest(values: NDArray[Real], entries: NDArray[Real], columns: Intege
                 while k > 0 and entries[i, k - 1] > value:
                     entries[i, k], columns[i, k] = entries[i, k - 1], columns[i, k - 1]
                     k -= 1
-                entries[i, k], columns[i, k] = value, j
+                entries[i, k] = value
+                columns[i, k] = j

@@ -84,7 +84,8 @@ def locate_row(
 @compiled()
 def distances(products: Numbers, norm: Any, norms: Numbers) -> None:
     """Replace inner products (n,) of a point and other points by distances, from the squared lengths of all."""
-    two, zero = products.dtype.type(2), products.dtype.type(0)
+    two = products.dtype.type(2)
+    zero = products.dtype.type(0)
     for j in range(len(products)):
         products[j] = np.sqrt(max(norm + norms[j] - two * products[j], zero))
 
@@ -99,18 +100,25 @@ def cosines(
     the directions (see `point_pair_features`), 1 / length of the line, and the cosine of the point's own direction with
     the line. Points and directions are (D, P).
     """
-    minus_one, zero, one = features.dtype.type(-1), features.dtype.type(0), features.dtype.type(1)
+    minus_one = features.dtype.type(-1)
+    zero = features.dtype.type(0)
+    one = features.dtype.type(1)
     # Slices of single rows: in a slice of the matrix, the compiler would not know that rows are contiguous.
-    larger, smaller, between = features[0, start:], features[1, start:], features[2, start:]
-    length, own = features[3, start:], features[4, start:]
+    larger = features[0, start:]
+    smaller = features[1, start:]
+    between = features[2, start:]
+    length = features[3, start:]
+    own = features[4, start:]
     n = len(length)
     length[:] = zero
     larger[:] = zero
     smaller[:] = zero
     between[:] = zero
     for d in range(len(points)):
-        x, u = points[d, point], directions[d, point]
-        xs, us = points[d, column + start :], directions[d, column + start :]
+        x = points[d, point]
+        u = directions[d, point]
+        xs = points[d, column + start :]
+        us = directions[d, column + start :]
         for j in range(
             n
         ):  # separate loops, as the compiler does not vectorise loops over many arrays
@@ -123,7 +131,8 @@ def cosines(
             between[j] += u * us[j]
     for j in range(n):
         inverse = one / np.sqrt(length[j]) if length[j] > zero else zero
-        own[j], length[j] = min(max(larger[j] * inverse, minus_one), one), inverse
+        own[j] = min(max(larger[j] * inverse, minus_one), one)
+        length[j] = inverse
     for j in range(n):
         other = min(max(smaller[j] * length[j], minus_one), one)
         larger[j], smaller[j] = max(own[j], other), min(own[j], other)
@@ -132,12 +141,19 @@ def cosines(
 @compiled()
 def locate(values: Numbers, axes: Axes, k: Any, start: int, result: Row) -> None:
     """Find the intervals of values (n,) along axis k, from column ``start`` on, and subdivide the cells by them."""
-    centres, inverse_gaps = axes.centres[k, : axes.n_centres[k]], axes.inverse_gaps[k]
-    cell, share, interval = result.cells[start:], result.shares[k, start:], result.interval[start:]
-    zero, one, end = values.dtype.type(0), values.dtype.type(1), values.dtype.type(len(centres) - 1)
-    width, last = np.int32(len(centres)), np.int32(len(centres) - 2)
+    centres = axes.centres[k, : axes.n_centres[k]]
+    inverse_gaps = axes.inverse_gaps[k]
+    cell = result.cells[start:]
+    share = result.shares[k, start:]
+    interval = result.interval[start:]
+    zero = values.dtype.type(0)
+    one = values.dtype.type(1)
+    end = values.dtype.type(len(centres) - 1)
+    width = np.int32(len(centres))
+    last = np.int32(len(centres) - 2)
     if axes.has_equal_gaps[k]:
-        origin, scale = centres[0], inverse_gaps[0]
+        origin = centres[0]
+        scale = inverse_gaps[0]
         for j in range(len(values)):
             position = (values[j] - origin) * scale
             position = position if position > zero else zero

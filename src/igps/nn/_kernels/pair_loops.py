@@ -60,7 +60,8 @@ def count_block(
         total: (C(C+1)/2, cells·2^K) to add to; among the corners, the last axis varies fastest.
     """
     n_rows, n_columns = values.shape[1:]
-    n_axes, n_members = len(axes.n_centres), len(classes)
+    n_axes = len(axes.n_centres)
+    n_members = len(classes)
     n_corners = 1 << n_axes
     n_cells = total.shape[1] // n_corners
     n_classes = int(np.sqrt(2.0 * len(total)))
@@ -98,12 +99,15 @@ def count_block(
                 )
                 lowest, highest = empty_range
         locate_row(values, i, axes, point, column, start, result)
-        cell, shares = result.cells[first:], result.shares
+        cell = result.cells[first:]
+        shares = result.shares
         if n_members > 1:
             for j in range(len(cell)):
-                lowest, highest = min(lowest, cell[j]), max(highest, cell[j])
+                lowest = min(lowest, cell[j])
+                highest = max(highest, cell[j])
         for m in range(n_members):
-            home_m, weight = home[m, first:], weights[m, column + first :]
+            home_m = home[m, first:]
+            weight = weights[m, column + first :]
             if packs:
                 pack_pairs(
                     result.cells[start:],
@@ -153,11 +157,14 @@ def gradient_block(  # noqa: PLR0913 (the arguments of count_block, and the arra
         by_weights, by_centres: (M, P) and (K, B) to add to.
     """
     n_rows, n_columns = values.shape[1:]
-    n_axes, n_members = len(axes.n_centres), len(classes)
+    n_axes = len(axes.n_centres)
+    n_members = len(classes)
     n_corners = 1 << n_axes
     n_classes = int(np.sqrt(2.0 * len(upstream)))
     result = new_row(axes, n_columns, values)
-    cells, shares, features = result.cells, result.shares, result.features
+    cells = result.cells
+    shares = result.shares
+    features = result.features
     slopes = np.empty(n_axes)
     zero = values.dtype.type(0)
     for i in range(n_rows):
@@ -197,11 +204,12 @@ def gradient_block(  # noqa: PLR0913 (the arguments of count_block, and the arra
                     by_weights[n, other] += row_weight * mean
             cell: Any = cells[j]
             for k in range(n_axes - 1, -1, -1):
-                share, width = np.float64(shares[k, j]), np.uint32(axes.n_centres[k])
-                q, cell = np.uint32(cell % width), np.uint32(cell // width)
-                is_inside = share < 1 and (
-                    share > 0 or q > 0
-                )  # on a centre, the slope of the interval above is taken
+                share = np.float64(shares[k, j])
+                width = np.uint32(axes.n_centres[k])
+                q = np.uint32(cell % width)
+                cell = np.uint32(cell // width)
+                # On a centre, the slope of the interval above is taken
+                is_inside = share < 1 and (share > 0 or q > 0)
                 gap = np.uint32(0) if axes.has_equal_gaps[k] else q
                 slope = slopes[k] * axes.inverse_gaps[k, gap] if is_inside else 0.0
                 by_centres[k, q] -= slope * (1 - share)
@@ -210,12 +218,15 @@ def gradient_block(  # noqa: PLR0913 (the arguments of count_block, and the arra
             k = r = s = 0
             for kind in axes.kinds:
                 if kind == COSINES:
-                    own_cosine, inverse = features[s, 4, j], features[s, 3, j]
-                    by_row, by_column = slopes[k] * inverse, slopes[k + 1] * inverse
+                    own_cosine = features[s, 4, j]
+                    inverse = features[s, 3, j]
+                    by_row = slopes[k] * inverse
+                    by_column = slopes[k + 1] * inverse
                     by_square = slopes[k] * features[s, 0, j] + slopes[k + 1] * features[s, 1, j]
                     if own_cosine != features[s, 0, j]:  # the larger cosine is that of the column
                         by_row, by_column = by_column, by_row
-                    by_cosines[s, 0, i, j], by_cosines[s, 1, i, j] = by_row, by_column
+                    by_cosines[s, 0, i, j] = by_row
+                    by_cosines[s, 1, i, j] = by_column
                     by_cosines[s, 2, i, j] = slopes[k + 2]
                     by_cosines[s, 3, i, j] = -by_square * inverse * inverse / 2
                     k += 3
@@ -291,16 +302,23 @@ def interpolate(
     """
     n_outer = len(shares) - 2
     if n_outer < 0:
-        low, high = np.float64(upstream[start]), np.float64(upstream[start + np.uint32(1)])
+        low = np.float64(upstream[start])
+        high = np.float64(upstream[start + np.uint32(1)])
         slopes[0] += weight * (high - low)
         return low + shares[0, j] * (high - low)
-    mean, one, two = 0.0, np.float64(shares[n_outer, j]), np.float64(shares[n_outer + 1, j])
+    mean = 0.0
+    one = np.float64(shares[n_outer, j])
+    two = np.float64(shares[n_outer + 1, j])
     for corner in range(1 << n_outer):
         i = start + np.uint32(4 * corner)
-        p, q = np.float64(upstream[i]), np.float64(upstream[i + np.uint32(1)])
-        r, s = np.float64(upstream[i + np.uint32(2)]), np.float64(upstream[i + np.uint32(3)])
-        below, above = p + two * (q - p), r + two * (s - r)
-        inner_mean, outer_share = below + one * (above - below), 1.0
+        p = np.float64(upstream[i])
+        q = np.float64(upstream[i + np.uint32(1)])
+        r = np.float64(upstream[i + np.uint32(2)])
+        s = np.float64(upstream[i + np.uint32(3)])
+        below = p + two * (q - p)
+        above = r + two * (s - r)
+        inner_mean = below + one * (above - below)
+        outer_share = 1.0
         for k in range(n_outer):
             other_shares = 1.0
             for other in range(n_outer):

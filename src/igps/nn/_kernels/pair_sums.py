@@ -13,7 +13,8 @@ from igps.nn._kernels.pair_cells import Indices, Numbers
 
 # Scales of shares and of the number of pairs, which are packed in one integer. The shares of 2¹⁸ pairs, the maximum of
 # a block, do not overflow into the number. Shares in single precision lose no digit, except in the first interval.
-_SHARE_SCALE, _PAIR_SCALE = 2**24, 2**44
+_SHARE_SCALE = 2**24
+_PAIR_SCALE = 2**44
 # Copies of each cell. Consecutive pairs often fall into the same cell, but into different copies, so that no addition
 # waits for the previous one.
 LANES = 4
@@ -87,7 +88,8 @@ def quarters(weight: float, first: float, second: float) -> tuple[float, float, 
     """Share a weight between the four corners of two axes; no part is negative."""
     upper = weight * first
     lower = weight - upper
-    upper_second, lower_second = upper * second, lower * second
+    upper_second = upper * second
+    lower_second = lower * second
     return lower - lower_second, lower_second, upper - upper_second, upper_second
 
 
@@ -96,12 +98,10 @@ def add_four_axes(
     cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats
 ) -> None:
     """`add_axes` for four axes, as of a distance and three cosines; a single pass takes half of the time."""
-    one, two, three, four = (
-        shares[0, first:],
-        shares[1, first:],
-        shares[2, first:],
-        shares[3, first:],
-    )
+    one = shares[0, first:]
+    two = shares[1, first:]
+    three = shares[2, first:]
+    four = shares[3, first:]
     for j in range(len(cell)):
         i = np.uint32(cell[j] + home[j])
         inner = quarters(1.0, np.float64(three[j]), np.float64(four[j]))
@@ -155,7 +155,8 @@ def add_axes(
 @compiled(inline="always")
 def pair_row(first: int, second: int, n_classes: int) -> int:
     """Return the row of a histogram in which pairs of two classes count, see `class_pairs`."""
-    a, b = min(first, second), max(first, second)
+    a = min(first, second)
+    b = max(first, second)
     return a * n_classes - a * (a - 1) // 2 + b - a
 
 

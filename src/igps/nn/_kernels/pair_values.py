@@ -19,15 +19,13 @@ class PairValues:
     A value must not depend on the order of the two points.
     """
 
-    inputs: tuple[
-        Tensor, ...
-    ]  # (N, P, ...) or (P, ...) each, finite: the values are computed from them
+    # (N, P, ...) or (P, ...) each, finite: the values are computed from them
+    inputs: tuple[Tensor, ...]
     centres: tuple[Tensor, ...]  # (B,) ascending, for each of the k values
     # Differentiable function from inputs (N, I, ...) of I points and (N, J, ...) of J points to values (N, k, I, J)
     between: Callable[[Inputs, Inputs], Tensor]
-    kinds: tuple[
-        int, ...
-    ] = ()  # how compiled loops obtain the values, see `pair_cells`; by default from `between`
+    # How compiled loops obtain the values, see `pair_cells`; by default from `between`
+    kinds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.kinds:
@@ -82,11 +80,10 @@ def cosine_factors(points: Tensor, directions: Tensor) -> list[tuple[Tensor, Ten
     Each matrix is the product of its first factor for the rows (x, u) with its transposed second factor for the columns
     (y, v).
     """
-    own, ones = (directions * points).sum(dim=-1, keepdim=True), torch.ones_like(points[..., :1])
-    extended_points, extended_directions = (
-        torch.cat([points, ones], dim=-1),
-        torch.cat([directions, -own], dim=-1),
-    )
+    own = (directions * points).sum(dim=-1, keepdim=True)
+    ones = torch.ones_like(points[..., :1])
+    extended_points = torch.cat([points, ones], dim=-1)
+    extended_directions = torch.cat([directions, -own], dim=-1)
     return [
         (extended_directions, extended_points),
         (extended_points, extended_directions),
@@ -115,7 +112,8 @@ def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Ten
 
 def _distances(rows: Inputs, columns: Inputs) -> Tensor:
     centre = rows[0].detach().mean(dim=-2, keepdim=True)  # preserves digits in the squares
-    x, y = rows[0] - centre, columns[0] - centre
+    x = rows[0] - centre
+    y = columns[0] - centre
     squares = (
         x.square().sum(dim=-1).unsqueeze(-1) + y.square().sum(dim=-1).unsqueeze(-2) - 2 * x @ y.mT
     )

@@ -172,7 +172,8 @@ def check_pairs(pairs: Sequence[PairValues], mask: Tensor) -> None:
     """
     for x in (x for pair in pairs for x in pair.inputs):
         if x.shape[:2] != mask.shape:
-            n, shape = mask.shape[1], tuple(x.shape[1:])
+            n = mask.shape[1]
+            shape = tuple(x.shape[1:])
             raise ValueError(f"points: expected values for each of {n} points, got shape {shape}.")
     if torch.compiler.is_compiling():
         return

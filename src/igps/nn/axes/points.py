@@ -36,7 +36,8 @@ class PointAxis(Specified, ABC):
     def __init__(self, centres: Tensor | Sequence[float], soft: bool, learnable: bool) -> None:
         super().__init__()
         self.centres = OrderedCentres(centres, learnable)
-        self.soft, self.learnable = soft, learnable
+        self.soft = soft
+        self.learnable = learnable
 
     @property
     def n_classes(self) -> int:
@@ -196,7 +197,8 @@ class Attribute(PointAxis):
             soft,
             learnable,
         )
-        self.name, self.quantiles = name, quantiles
+        self.name = name
+        self.quantiles = quantiles
         if quantiles is not None:
             self.register_buffer("fitted", torch.tensor(False))
 
@@ -253,7 +255,8 @@ def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:
     """
     # Position of a value between each centre and the next, from 0 to 1; the hats are differences of these positions.
     position = ((values.unsqueeze(-1) - centres[:-1]) / centres.diff()).clamp(0, 1)
-    ones, zeros = torch.ones_like(values).unsqueeze(-1), torch.zeros_like(values).unsqueeze(-1)
+    ones = torch.ones_like(values).unsqueeze(-1)
+    zeros = torch.zeros_like(values).unsqueeze(-1)
     return torch.cat([ones, position], dim=-1) - torch.cat([position, zeros], dim=-1)
 
 

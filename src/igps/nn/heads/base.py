@@ -10,9 +10,8 @@ from torch import Tensor
 from igps.nn.specification import Specified
 from igps.retrieval.distances import cosine, square_root
 
-_MIN_RELATIVE_SQUARE = (
-    1e-10  # directions with smaller sums of squares, over the largest sum, are rounding errors
-)
+# Directions with smaller sums of squares, over the largest sum, are rounding errors
+_MIN_RELATIVE_SQUARE = 1e-10
 
 
 class Head(Specified, ABC):
@@ -147,11 +146,11 @@ def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """
     n_rows, width = rows.shape
     is_wide = width > n_rows
-    squares, axes = torch.linalg.eigh(
-        rows @ rows.T if is_wide else rows.T @ rows
-    )  # of the smaller matrix
+    # Of the smaller matrix
+    squares, axes = torch.linalg.eigh(rows @ rows.T if is_wide else rows.T @ rows)
     n = min(n, int((squares > _MIN_RELATIVE_SQUARE * squares[-1]).sum()))
-    squares, axes = squares.flip(0)[:n], axes.flip(1)[:, :n]
+    squares = squares.flip(0)[:n]
+    axes = axes.flip(1)[:, :n]
     return (axes.T @ rows) / squares.sqrt()[:, None] if is_wide else axes.T, squares
 
 

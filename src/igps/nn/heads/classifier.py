@@ -16,9 +16,8 @@ from igps.nn.heads.closed_form import KernelHead
 _MAX_FOLDS = 5
 _TEMPERATURES = torch.logspace(-2.5, 0, 60)  # candidates of the calibration
 _N_NEAREST = 2  # training shapes of the predicted class that strangeness is computed from
-FALSE_UNKNOWN_RATE = (
-    0.05  # share of held-out shapes of known classes that are classified as unknown
-)
+# Share of held-out shapes of known classes that are classified as unknown
+FALSE_UNKNOWN_RATE = 0.05
 
 
 class ClassifyingHead(Head):
@@ -112,7 +111,9 @@ class ClassifierHead(KernelHead):
         Raises:
             ValueError: the shapes of tensors do not match, or there are fewer than two classes.
         """
-        scores, strangeness, classes = [], [], []
+        scores = []
+        strangeness = []
+        classes = []
         for held_out in folds(check_labels(descriptions, labels)) if calibrate else ():
             head = copy.deepcopy(self)
             head.fit(descriptions[~held_out], labels[~held_out], part_cells, calibrate=False)
@@ -122,7 +123,8 @@ class ClassifierHead(KernelHead):
         super().fit(descriptions, labels, part_cells)
         self.members = torch.searchsorted(self.classes, labels.to(self.classes))
         if classes:
-            logits, targets = torch.cat(scores), torch.cat(classes)
+            logits = torch.cat(scores)
+            targets = torch.cat(classes)
             losses = [
                 functional.cross_entropy(logits / t, targets) for t in _TEMPERATURES.to(logits)
             ]

@@ -21,9 +21,8 @@ from igps.nn.heads.base import (
 )
 from igps.retrieval.distances import cosine
 
-_MIN_CLASS_SIZE = (
-    6  # with fewer training shapes per class on average, the temperature of the softmax is raised
-)
+# With fewer training shapes per class on average, the temperature of the softmax is raised
+_MIN_CLASS_SIZE = 6
 _MIN_VARIANCE = 1e-8  # smaller variances of distances are rounding errors
 
 
@@ -77,7 +76,9 @@ class WhitenedHead(Head):
         check_at_least(1, n_directions=n_directions)
         check_positive(shrinkage=shrinkage)
         check_fraction(prior_share=prior_share)
-        self.n_directions, self.shrinkage, self.prior = n_directions, shrinkage, prior
+        self.n_directions = n_directions
+        self.shrinkage = shrinkage
+        self.prior = prior
         self.register_buffer("prior_share", torch.tensor(prior_share))
         self.register_buffer("mean", torch.zeros(0))
         self.register_buffer("directions", torch.zeros(n_directions, 0))
@@ -98,9 +99,8 @@ class WhitenedHead(Head):
         for part, directions, gains in zip(
             residuals, self.parts(self.directions), self.gains, strict=True
         ):
-            rank = len(roots) - len(
-                means
-            )  # the maximum for residuals of N shapes in C classes: N − C
+            # The maximum for residuals of N shapes in C classes: N − C
+            rank = len(roots) - len(means)
             own_directions, own_gains = within_class_whitening(
                 part, rank, self.shrinkage, self.n_directions
             )
@@ -219,7 +219,9 @@ class KernelHead(Head):
         check_positive(ridge=ridge, temperature=temperature)
         check_fraction(prior_share=prior_share)
         self.whitened = WhitenedHead(n_directions, shrinkage)
-        self.prior, self.ridge, self.prior_share = prior, ridge, prior_share
+        self.prior = prior
+        self.ridge = ridge
+        self.prior_share = prior_share
         self.register_buffer("temperature", torch.tensor(temperature))
         self.register_buffer("anchors", torch.zeros(0, 0))
         self.register_buffer("medians", torch.ones(0))
@@ -290,7 +292,8 @@ class KernelHead(Head):
 
     def _distances(self, vectors: Tensor) -> Tensor:
         """Return distances (kernels, N, n_shapes) to the training shapes: cosine for each part, then the prior's."""
-        sizes, both = self.whitened._noted["part_cells"], (vectors, self.anchors.to(vectors.dtype))
+        sizes = self.whitened._noted["part_cells"]
+        both = (vectors, self.anchors.to(vectors.dtype))
         parts, anchors = (x.split([*sizes, x.shape[1] - sum(sizes)], dim=1) for x in both)
         distances = [1 - parts[k] @ anchors[k].T for k in range(len(sizes))]
         if self.prior is not None:
@@ -302,6 +305,7 @@ def _discriminant(vectors: Tensor, members: Tensor) -> Tensor:
     """Return the discriminant (Fisher 1936) ≥ 0 between cosine distances of unit vectors within and between classes."""
     distances = 1 - vectors @ vectors.T
     is_same = members[:, None] == members
-    between, within = distances[~is_same], distances[is_same.fill_diagonal_(False)]
+    between = distances[~is_same]
+    within = distances[is_same.fill_diagonal_(False)]
     variance = within.var(correction=0) + between.var(correction=0)
     return ((between.mean() - within.mean()) / variance.clamp_min(_MIN_VARIANCE)).clamp_min(0)

@@ -63,7 +63,9 @@ class LinearHead(ClassifyingHead):
             check_one_of(get_args(LinearPart), parts=part)
         if not parts:
             raise ValueError("parts: expected at least one of form, numbers and size, got none.")
-        self.prior, self.parts, self.n_numbers = prior, tuple(parts), n_numbers
+        self.prior = prior
+        self.parts = tuple(parts)
+        self.n_numbers = n_numbers
         self.register_buffer("mean", torch.zeros(0))
         self.register_buffer("projection", torch.zeros(0, 0))
         self.register_buffer("weights", torch.zeros(0, 0))

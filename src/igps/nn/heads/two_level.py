@@ -19,12 +19,10 @@ _STEEPNESS = 20  # exponent of the factors that rise from 0 to 1
 _SAME_CLASS = 0.55  # nearly all poses of a scanned body have smaller distances by the class head
 _SAME_BODY = 0.1  # nearly all pairs of poses of an unseen generated body are nearer
 _WEIGHT = 0.05  # of the term that orders bodies that are nearly alike
-_MIN_DISTANCE = (
-    1e-7  # shorter distances are rounding errors, and fractional powers have no derivative at 0
-)
-_MAX_RATIO = (
-    16  # of a distance to its scale: greater ones could overflow, and the factor is 1 long before
-)
+# Shorter distances are rounding errors, and fractional powers have no derivative at 0
+_MIN_DISTANCE = 1e-7
+# Of a distance to its scale: greater ones could overflow, and the factor is 1 long before
+_MAX_RATIO = 16
 
 
 class TwoLevelHead(Head):
@@ -179,8 +177,10 @@ class TwoLevelHead(Head):
         """Return distances (Q, G), from 0 to 2, between embeddings (Q, D) and (G, D)."""
         n = self.class_head.n_numbers
         classes = cosine(queries[:, :n], gallery[:, :n])
-        query_bodies, gallery_bodies = self._compared(queries), self._compared(gallery)
-        exponent, bodies = torch.zeros_like(classes), torch.ones_like(classes)
+        query_bodies = self._compared(queries)
+        gallery_bodies = self._compared(gallery)
+        exponent = torch.zeros_like(classes)
+        bodies = torch.ones_like(classes)
         compared = zip(query_bodies, gallery_bodies, self.scales, self.exponents, strict=True)
         for query, other, scale, power in compared:
             distances = euclidean(query, other).clamp_min(_MIN_DISTANCE)

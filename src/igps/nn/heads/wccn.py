@@ -60,7 +60,8 @@ class WCCNHead(Head):
         super().__init__()
         check_at_least(1, n_directions=n_directions)
         check_positive(shrinkage=shrinkage)
-        self.n_directions, self.shrinkage = n_directions, shrinkage
+        self.n_directions = n_directions
+        self.shrinkage = shrinkage
         self._parts = None if parts is None else tuple(parts)
         self.register_buffer("mean", torch.zeros(0))
         self.register_buffer("directions", torch.zeros(n_directions, 0))
@@ -124,7 +125,8 @@ class WCCNHead(Head):
         principal, _ = principal_directions(part, _N_PRINCIPAL)
         projected = part @ principal.T
         means = class_means(projected, members)
-        rank, width = min(len(projected) - len(means), len(principal)), len(principal)
+        rank = min(len(projected) - len(means), len(principal))
+        width = len(principal)
         whitening = within_class_whitening(projected - means[members], rank, self.shrinkage, width)
         between_classes, _ = principal_directions(damped(means, *whitening), self.n_directions)
         return damped(between_classes, *whitening) @ principal

@@ -93,7 +93,8 @@ class SampleHistogram(DescriptionPart):
         check_one_of(SAMPLE_KINDS, samples=samples)
         check_at_least(2, n_samples=n_samples, n_training_samples=n_training_samples)
         self.samples: SampleKind = samples
-        self.n_samples, self.n_training_samples = n_samples, n_training_samples
+        self.n_samples = n_samples
+        self.n_training_samples = n_training_samples
 
     reads_both_kinds: bool = False  # whether it also reads all samples of the other kind
 
