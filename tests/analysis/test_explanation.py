@@ -92,7 +92,7 @@ def test_all_shares_add_up_to_the_distance(name: str, batches: list[SignatureBat
 
 
 def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures: list[Signature]) -> None:
-    """Twice as large: |Δ log √area| + |Δ log ∛volume| is 2 log 2, and every place has the same of it."""
+    """Twice as large: |Δ log area| + |Δ log volume| is 5 log 2, and every place has the same of it."""
     one = signatures[0]
     larger = replace(
         one,
@@ -111,8 +111,9 @@ def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures: list[Signat
         ),
     )
     found = explain(descriptor("interior+size"), *(collate([each]) for each in (one, larger)))
-    apart = 2 * np.log(2)
-    assert found.distance == pytest.approx(0.017 / 4 * 2 * apart / (0.3 + apart), rel=1e-5)
+    apart = 5 * np.log(2)
+    nearness = 0.017 / 4  # a quarter of the scale of `interior`
+    assert found.distance == pytest.approx(nearness * apart / 0.5, rel=1e-5)
     assert found.parts["size"] == pytest.approx(found.distance, rel=1e-5)
     for shares in (values for of_body in found.samples for values in of_body.values()):
         np.testing.assert_allclose(shares, found.distance / 4 / len(shares), rtol=1e-3)

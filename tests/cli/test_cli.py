@@ -22,6 +22,7 @@ from igps.cli.commands import COMMANDS, ENDINGS, load_command
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.literature.d2 import D2
+from igps.descriptors.registry import FIELD_NAMES
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.retrieval import chi_square, rerank, retrieval_scores
@@ -81,6 +82,7 @@ def test_retrieve_prints_and_writes_what_python_computes(
         "n_queries",
         "per_class",
         "config",
+        "plain_numbers",
     } | {
         "n_given",
         "n_used",
@@ -353,7 +355,7 @@ def test_query_lists_the_nearest(
         *SMALL,
     )
     header, *lines = capsys.readouterr().out.splitlines()
-    assert header.split() == ["rank", "distance", "mesh", "class"]
+    assert header.split() == ["rank", "distance", "body", "class"]
     assert len(lines) == 4
     assert lines[0].split() == ["1", "0", "egg/1.off", "egg"]
     histograms = describe(SignatureDataset(root, CONFIG, tmp_path / "cache"), small_interior())
@@ -405,7 +407,7 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
         (["retrieve", "ROOT/egg"], "no classes found"),
         (
             ["retrieve", "ROOT", "--descriptor", "best"],
-            f"expected one of {', '.join(NAMES)}, fold, molecular, or .*, got 'best'",
+            f"expected one of {', '.join([*NAMES, *FIELD_NAMES])}, or .*, got 'best'",
         ),
         (
             ["retrieve", "ROOT"],
@@ -736,11 +738,11 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         ),
         (
             ["explain", "BALL"],
-            "meshes: expected two files, or a folder of two classes, got 1 files.",
+            "meshes: expected two files, or a folder of two groups, got 1 files.",
         ),
         (
             ["explain", "BALL", "BALL", "BALL"],
-            "meshes: expected two files, or a folder of two classes, got 3 files.",
+            "meshes: expected two files, or a folder of two groups, got 3 files.",
         ),
         (["explain", "ROOT", "ROOT"], "ROOT: expected a file, got a folder."),
         (["query", "none.off", "--gallery", "ROOT"], "none.off: no such file."),

@@ -15,6 +15,7 @@ from commands import run
 from igps.analysis.comparison import compare
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
+from igps.descriptors.registry import FIELD_NAMES
 from igps.shapes import ArticulatedShapes
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior, write_egg
@@ -162,6 +163,7 @@ def test_unknown_descriptor_is_named_before_anything_is_computed(
             tmp_path / "cache",
         )
     error = capsys.readouterr().err
-    assert f"expected one of {', '.join(NAMES)}, fold, molecular, or package.module:NAME" in error
+    known = ", ".join([*NAMES, *FIELD_NAMES])
+    assert f"expected one of {known}, or package.module:NAME" in error
     assert "got 'd5'" in error
     assert not (tmp_path / "cache").exists()

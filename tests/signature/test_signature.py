@@ -268,7 +268,7 @@ def test_too_few_vertices_say_so(blob: Mesh) -> None:
 @pytest.mark.parametrize(
     "field",
     [
-        {"n_eigenpairs": 0},
+        {"n_eigenpairs": -1},
         {"resolution": 0},
         {"min_samples": -1},
         {"n_surface_samples": 0},

@@ -30,7 +30,7 @@ def inside(image: Any, label: Any, spacing: Sequence[float] | None = None) -> li
         >>> x, y, z = np.indices((20, 20, 20)) - 9.5
         >>> radius = np.sqrt(x**2 + y**2 + z**2)
         >>> rows = inside(radius, radius < 8, spacing=(1, 1, 1))
-        >>> [row["label"] for row in rows], rows[0]["image.rim.contrast"] > 1
+        >>> [row["label"] for row in rows], bool(rows[0]["image.rim.contrast"] > 1)
         (['1'], True)
 
     Args:

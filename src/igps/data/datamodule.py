@@ -42,7 +42,7 @@ class SignatureDataModule(LightningDataModule):
         ...     ArticulatedShapes(3, 6, n_vertices=600).write(folder)
         ...     data = SignatureDataModule(folder, n_train=4, n_validation=2)
         >>> len(data.split.train), len(data.split.validation), len(data.split.test)
-        (6, 3, 6)
+        (6, 6, 6)
 
     Args:
         root: folder with classes, see `find_bodies`.

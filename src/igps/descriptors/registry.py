@@ -32,9 +32,9 @@ _LIBRARY: Mapping[str, str] = {
     "canonical_form": "igps.descriptors.literature.canonical_form:CanonicalForm",
     "geodesic_spectral": "igps.descriptors.literature.geodesic_spectral:GeodesicSpectral",
     "spectral_gw": "igps.descriptors.literature.spectral_gw:SpectralGromovWasserstein",
-    "fold": "igps.fields.molecules.fold:fold",
     "measures": "igps.descriptors.measures:Measures",
     "composition": "igps.fields.molecules.composition:Composition",
+    "fold": "igps.fields.molecules.fold:fold",
     "molecular": "igps.fields.molecules.molecular:molecular",
 }
 

@@ -221,7 +221,9 @@ class _Shape:
     def keep_products(self) -> Tensor | None:
         """Return the inner products of a body of one axis and block, which its gradient needs again."""
         is_one_block = [len(blocks) for blocks in self.shares] == [1]
-        if not is_one_block or self.shapes.n_values > 1 or self.centred[0] is None:
+        # With cosines, the gradient has smaller blocks.
+        is_one_axis = self.shapes.n_values == 1 and self.shapes.n_oriented == 0
+        if not is_one_block or not is_one_axis or self.centred[0] is None:
             return None
         products = self._view(self._buffer(1), 0, 0)
         self._write_values(products, 0, 0)
