@@ -15,7 +15,7 @@ from igps.descriptors import NAMES
 from igps.descriptors.literature.d2 import D2
 from igps.signature.signature import SignatureConfig
 
-THIRTEEN = (
+FOURTEEN = (
     "interior",
     "gps",
     "multiscale",
@@ -29,6 +29,7 @@ THIRTEEN = (
     "canonical_form",
     "geodesic_spectral",
     "spectral_gw",
+    "measures",
 )
 
 OWN = """
@@ -72,12 +73,12 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return f"{package}.shapes"
 
 
-def test_names_are_the_thirteen() -> None:
-    assert NAMES == THIRTEEN
+def test_names_are_the_fourteen() -> None:
+    assert NAMES == FOURTEEN
 
 
 def test_a_wrong_name_lists_all() -> None:
-    names = ", ".join((*THIRTEEN, "fold", "molecular"))
+    names = ", ".join((*FOURTEEN, "composition", "fold", "molecular"))
     with pytest.raises(
         ValueError, match=f"^descriptor: expected one of {names}, or .*, got 'best'"
     ):

@@ -24,7 +24,7 @@ from igps.retrieval import chi_square, retrieval_scores
 from igps.shapes import ArticulatedShapes
 
 PROJECT = CONFIG.parents[1]
-SMALL = {"n_eigenpairs": 40, "resolution": 15, "min_samples": 0}
+SMALL = {"n_eigenpairs": 250, "resolution": 15, "min_samples": 0}
 COLUMNS = ("ft", "nn", "dcg", "st", "adr", "map")
 
 

@@ -29,10 +29,11 @@ ROTATION = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
 
 
 def trace(seed: int, bend: float, n: int = 60) -> Molecule:
-    """Balls of residues of a random sequence along a bent coil."""
+    """Balls of residues of a random sequence along a bent coil; the seed gives sequence and pitch."""
     names = tuple(np.random.default_rng(seed).choice(sorted(VOLUMES), n).tolist())
     t = np.arange(n)
-    coil = np.stack([1.5 * t, 5 * np.cos(1.3 * t), 5 * np.sin(1.3 * t)], axis=1)
+    turn = (1.1 + 0.2 * seed) * t
+    coil = np.stack([1.5 * t, 5 * np.cos(turn), 5 * np.sin(turn)], axis=1)
     if bend:
         radius = 1.5 * n / bend
         angle = coil[:, 0] * bend / (1.5 * n)

@@ -46,7 +46,7 @@ def write_frames(
         import MDAnalysis
     except ImportError as error:
         raise ImportError(
-            'Trajectories need MDAnalysis: pip install "interior-gps[molecules]" MDAnalysis.'
+            'Trajectories need MDAnalysis: pip install "interior-gps[molecules,trajectories]".'
         ) from error
     try:
         universe = MDAnalysis.Universe(str(topology), *map(str, frames))
