@@ -151,7 +151,9 @@ def local_thickness(mesh: Mesh, points: Floats) -> Floats:
     away from the nearest point of the surface, by its radius at first, for as long as the ball grows and contains the
     point. The thickness at a point is the largest diameter of all such balls that contain it.
     """
-    points = points[:: math.ceil(len(points) / _N_THICKNESS_POINTS)]
+    # By their distance from the middle, so that a turned grid gives the same selection
+    order = np.argsort(np.linalg.norm(points - points.mean(axis=0), axis=1), kind="stable")
+    points = points[order[:: math.ceil(len(points) / _N_THICKNESS_POINTS)]]
     surface = _NearestPoints(mesh)
     centres = points.copy()
     radii, away = surface.distances(centres)
