@@ -430,7 +430,7 @@ _ON_MOLECULES: dict[str, Callable[[Generator, list[str]], Change]] = {
         _each_atom(
             lines, lambda line, i: line if line[17:20] == "GLY" else f"{line[:17]}XQZ{line[20:]}"
         ),
-        {},
+        {"chain A": None, "chain B": None},  # what an unknown residue lacks is not known either
     ),
     "no elements": lambda g, lines: (_each_atom(lines, lambda line, i: line[:76]), {}),
     "hydrogens": lambda g, lines: (
