@@ -1,7 +1,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,7 +42,7 @@ def test_importing_a_compiled_loop_imports_no_compiler():
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
-def test_loops_of_an_earlier_version_are_compiled_anew(tmp_path: Path) -> None:
+def test_loops_of_an_earlier_version_are_compiled_anew(tmp_path):
     """Numba's index of what lies on disk names the types of arguments, and is read before it is found to be stale."""
     for name, factor in (("Old", 2), ("New", 3)):
         (tmp_path / "loops.py").write_text(
@@ -63,7 +62,7 @@ def test_loops_of_an_earlier_version_are_compiled_anew(tmp_path: Path) -> None:
         )
 
 
-def test_of_several_processes_one_compiles(tmp_path: Path) -> None:
+def test_of_several_processes_one_compiles(tmp_path):
     (tmp_path / "loops.py").write_text(
         "from igps._compiled import compiled\n@compiled()\ndef twice(x):\n    return 2 * x\n"
     )

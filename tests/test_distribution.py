@@ -36,7 +36,7 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return wheel, source
 
 
-def test_archives_hold_what_the_package_needs(archives: tuple[Path, Path]) -> None:
+def test_archives_hold_what_the_package_needs(archives):
     wheel, source = archives
     package = PROJECT / "src" / "igps"
     wanted = {path.relative_to(package.parent).as_posix() for path in package.rglob("*.py")}
@@ -52,7 +52,7 @@ def test_archives_hold_what_the_package_needs(archives: tuple[Path, Path]) -> No
     assert {f"src/{name}" for name in wanted} <= inside
 
 
-def test_the_installed_wheel_works(archives: tuple[Path, Path], tmp_path: Path) -> None:
+def test_the_installed_wheel_works(archives, tmp_path):
     """In an environment of its own, without this tree; what it depends on is borrowed from the one of the tests."""
     venv.create(tmp_path / "venv", with_pip=False)
     python = tmp_path / "venv" / "bin" / "python"
@@ -85,15 +85,15 @@ def test_the_installed_wheel_works(archives: tuple[Path, Path], tmp_path: Path) 
     assert done.stdout.splitlines()[-1] == "works"
 
 
-def test_the_version_is_the_same_everywhere() -> None:
+def test_the_version_is_the_same_everywhere():
     citation = (PROJECT / "CITATION.cff").read_text()
-    assert re.search(r"^version: (.*)$", citation, flags=re.MULTILINE).group(1) == VERSION  # type: ignore[union-attr]
+    assert re.search(r"^version: (.*)$", citation, flags=re.MULTILINE).group(1) == VERSION
     newest = re.search(r"^## (.*)$", (PROJECT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
     assert newest is not None
     assert newest.group(1) == VERSION
 
 
-def test_the_citation_has_the_address_that_the_package_names() -> None:
+def test_the_citation_has_the_address_that_the_package_names():
     urls = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["urls"]
     doi = re.search(r"^    doi: (.*)$", (PROJECT / "CITATION.cff").read_text(), flags=re.MULTILINE)
     assert doi is not None

@@ -1,7 +1,5 @@
 """The examples in public docstrings run, and print what they say."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 from pathlib import Path
@@ -19,12 +17,12 @@ MODULES = sorted(
 
 
 @pytest.mark.parametrize("name", igps.__all__)
-def test_every_public_name_has_an_example(name: str) -> None:
+def test_every_public_name_has_an_example(name):
     assert ">>> " in (getattr(igps, name).__doc__ or "")
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_examples_of_a_module(name: str) -> None:
+def test_examples_of_a_module(name):
     module = importlib.import_module(name)
     found = doctest.testmod(module, optionflags=doctest.NORMALIZE_WHITESPACE)
     assert found.attempted > 0

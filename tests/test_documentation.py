@@ -119,12 +119,12 @@ def histograms_by_loops(dataset: SignatureDataset) -> list[np.ndarray]:
     ]
 
 
-def test_readme_is_short_and_has_its_example() -> None:
+def test_readme_is_short_and_has_its_example():
     assert len(TEXT["README.md"].split()) <= 450
     assert len(python("README.md")) == 1
 
 
-def test_the_ten_lines_print_scores_and_the_nearest(tmp_path: Path) -> None:
+def test_the_ten_lines_print_scores_and_the_nearest(tmp_path):
     example = python("README.md")[0].text
     (tmp_path / "example.py").write_text(example)
     assert len([line for line in example.splitlines() if line]) <= 10
@@ -143,7 +143,7 @@ def test_the_ten_lines_print_scores_and_the_nearest(tmp_path: Path) -> None:
     assert expected[0] == dataset.bodies.names[0]
 
 
-def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path: Path) -> None:
+def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path):
     mine = next(
         block for block in python("docs/how-to/add-descriptor.md") if block.title == "mine.py"
     )
@@ -178,7 +178,7 @@ def runs_here(page: str) -> bool:
 
 
 @pytest.mark.parametrize("page", [page for page in TEXT if runs_here(page)])
-def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page: str, tmp_path: Path) -> None:
+def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page, tmp_path):
     code, expected = program(page, tmp_path)
     assert code
     if "MDAnalysis" in code:
@@ -301,12 +301,7 @@ def commands_told() -> dict[str, list[tuple[str, list[str]]]]:
 
 
 @pytest.mark.parametrize(("command", "lines"), commands_told().items())
-def test_what_igps_is_told_exists(
-    command: str,
-    lines: list[tuple[str, list[str]]],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_igps_is_told_exists(command, lines, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["igps", *command.split(), "--help"])
     with pytest.raises(SystemExit, match="0"):
         main()
@@ -319,7 +314,7 @@ def test_what_igps_is_told_exists(
 
 
 @pytest.mark.parametrize("page", [page for page in TEXT if shell_lines(page)])
-def test_what_the_shell_is_told_exists(page: str) -> None:
+def test_what_the_shell_is_told_exists(page):
     targets = re.findall(r"^([a-z0-9-]+):", (PROJECT / "Makefile").read_text(), flags=re.MULTILINE)
     extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
@@ -362,7 +357,7 @@ def test_what_the_shell_is_told_exists(page: str) -> None:
             }, line
 
 
-def test_descriptors_and_commands_are_named() -> None:
+def test_descriptors_and_commands_are_named():
     for name in NAMES:
         assert f"`{name}`" in TEXT["docs/index.md"], name
     extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"][
@@ -383,12 +378,12 @@ def anchors(text: str) -> set[str]:
 
 
 @pytest.mark.parametrize("name", re.findall(r"^::: (\S+)", TEXT["docs/api.md"], re.MULTILINE))
-def test_the_reference_names_what_is_there(name: str) -> None:
+def test_the_reference_names_what_is_there(name):
     assert pydoc.locate(name) is not None, f"docs/api.md: nothing is called {name}"
 
 
 @pytest.mark.parametrize("page", TEXT)
-def test_links_lead_somewhere(page: str) -> None:
+def test_links_lead_somewhere(page):
     here = PROJECT / page
     prose = re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE)
     for target in re.findall(r"\]\(([^)\s]+)\)", prose):
@@ -407,7 +402,7 @@ def outside_code(page: str) -> list[str]:
 
 
 @pytest.mark.parametrize("page", TEXT)
-def test_tables_are_whole_and_prose_is_wrapped(page: str) -> None:
+def test_tables_are_whole_and_prose_is_wrapped(page):
     """Each row of a table has as many cells as its head, and a rule below that; text has lines that can be read."""
     head, place = 0, 0
     for line in outside_code(page):
@@ -441,7 +436,7 @@ def table_rows(page: str, heading: str) -> dict[str, dict[str, str]]:
     return rows
 
 
-def test_the_figures_of_the_descriptors_are_those_that_were_measured() -> None:
+def test_the_figures_of_the_descriptors_are_those_that_were_measured():
     shown = table_rows("docs/index.md", "## Which descriptor")
     measured = json.loads(
         (PROJECT / "docs" / "benchmarks" / "results" / "shrec07.json").read_text("utf-8")
@@ -456,6 +451,6 @@ def test_the_figures_of_the_descriptors_are_those_that_were_measured() -> None:
             assert row[score] == rows[name][score], name
 
 
-def test_pictures_are_small() -> None:
+def test_pictures_are_small():
     for path in (PROJECT / "docs").rglob("*.png"):
         assert path.stat().st_size < 400_000, path

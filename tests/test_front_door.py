@@ -55,7 +55,7 @@ DISTRIBUTIONS = {
 }
 
 
-def test_front_door_has_these_names_and_no_others() -> None:
+def test_front_door_has_these_names_and_no_others():
     assert sorted(igps.__all__) == sorted(NAMES)
     assert len(set(NAMES)) == len(NAMES) <= 25
     rooms = {path.stem for path in PACKAGE.iterdir()}
@@ -65,12 +65,12 @@ def test_front_door_has_these_names_and_no_others() -> None:
     )
 
 
-def test_every_name_opens() -> None:
+def test_every_name_opens():
     for name in NAMES:
         assert getattr(igps, name).__module__.startswith("igps."), name
 
 
-def test_import_loads_nothing_heavy() -> None:
+def test_import_loads_nothing_heavy():
     heavy = (
         "torch",
         "numpy",
@@ -90,7 +90,7 @@ def test_import_loads_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_lazy_names_do_load_what_they_need() -> None:
+def test_lazy_names_do_load_what_they_need():
     words = "import sys, igps; igps.RetrievalLearner; print('pytorch_lightning' in sys.modules)"
     environment = {"PYTHONPATH": str(PACKAGE.parent), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
@@ -131,7 +131,7 @@ def normal(name: str) -> str:
 BROUGHT_ALONG = {"llvmlite": "numba"}
 
 
-def test_what_is_brought_along_is_required_by_what_brings_it() -> None:
+def test_what_is_brought_along_is_required_by_what_brings_it():
     for name, parent in BROUGHT_ALONG.items():
         assert name in declared(importlib.metadata.requires(parent) or [])
 
@@ -143,7 +143,7 @@ def declared(requirements: list[str]) -> set[str]:
     }
 
 
-def test_every_import_is_declared() -> None:
+def test_every_import_is_declared():
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     core = declared(project["dependencies"])
     extras = {
@@ -169,7 +169,7 @@ def test_every_import_is_declared() -> None:
     assert optional - extras["formats"] - extras["cad"] <= used
 
 
-def test_modules_that_import_at_once_need_no_extra() -> None:
+def test_modules_that_import_at_once_need_no_extra():
     """What a file imports at its top must be a dependency, unless the file is the door of an extra."""
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     core = declared(project["dependencies"])
@@ -185,7 +185,7 @@ def test_modules_that_import_at_once_need_no_extra() -> None:
                 )
 
 
-def test_distributions_are_called_so() -> None:
+def test_distributions_are_called_so():
     """The names above are those under which the modules are installed."""
     installed = importlib.metadata.packages_distributions()
     for module, distribution in DISTRIBUTIONS.items():

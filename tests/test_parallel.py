@@ -9,8 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +28,7 @@ needs_proc = pytest.mark.skipif(
 )
 
 
-def all_of(*arguments, **options) -> dict:  # type: ignore[no-untyped-def]
+def all_of(*arguments, **options) -> dict:
     """Results by number; none comes twice."""
     results = list(run(*arguments, **options))
     assert len(dict(results)) == len(results)
@@ -57,7 +56,7 @@ OF_SQUARES = {
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> dict:  # type: ignore[type-arg]
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict:
     """Of two workers, whose parent has other settings: squares, two that die, two that tell of themselves."""
     others = [
         partial(jobs.die_at_zero, 0),
@@ -75,7 +74,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict:  # type: ignore[t
 
 
 @pytest.fixture(scope="module")
-def limited() -> dict:  # type: ignore[type-arg]
+def limited() -> dict:
     """Of one worker with limits: two that tell of themselves, large and small, three of one size, slow and quick."""
     found = [partial(jobs.process, 0)] * 2
     found += [partial(jobs.allocate, size) for size in (1000, 2 * GIB, 2000)]
@@ -86,28 +85,28 @@ def limited() -> dict:  # type: ignore[type-arg]
     )
 
 
-def test_every_job_has_its_result_in_this_process_and_in_others(results: dict[int, object]) -> None:
+def test_every_job_has_its_result_in_this_process_and_in_others(results):
     assert all_of(jobs.call, SQUARES, n_workers=1) == OF_SQUARES
     assert {number: results[number] for number in OF_SQUARES} == OF_SQUARES
 
 
-def test_a_job_that_kills_its_process_is_named(results: dict[int, object]) -> None:
+def test_a_job_that_kills_its_process_is_named(results):
     killed = results[6]
     assert isinstance(killed, Failed)
     assert killed.reason.startswith("its process was killed twice. It may need more memory")
 
 
-def test_a_job_that_is_killed_once_is_tried_again(results: dict[int, object]) -> None:
+def test_a_job_that_is_killed_once_is_tried_again(results):
     assert results[7] == "marker"
 
 
-def test_workers_leave_an_interruption_to_their_parent(results: dict[int, object]) -> None:
+def test_workers_leave_an_interruption_to_their_parent(results):
     """A terminal sends Ctrl-C to all processes; only the parent may report it."""
     assert results[10] == 7
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals cannot be blocked")
-def test_workers_leave_it_to_their_parent_while_they_start(tmp_path: Path) -> None:
+def test_workers_leave_it_to_their_parent_while_they_start(tmp_path):
     """They import what the script does, for seconds."""
     script = tmp_path / "script.py"
     script.write_text(
@@ -129,31 +128,29 @@ def test_workers_leave_it_to_their_parent_while_they_start(tmp_path: Path) -> No
     assert "KeyboardInterrupt" in done.stderr
 
 
-def test_workers_have_one_thread(results: dict[int, tuple[int, str]]) -> None:
+def test_workers_have_one_thread(results):
     assert {results[number][1] for number in (8, 9)} == {"1"}
 
 
-def test_nothing_to_do() -> None:
+def test_nothing_to_do():
     assert all_of(jobs.square, [], n_workers=4) == {}
     assert all_of(jobs.square, [], n_workers=4, limits=Limits(seconds=1)) == {}
 
 
 @pytest.mark.parametrize("n_workers", [0, -1])
-def test_fewer_than_one_worker_is_refused(n_workers: int) -> None:
+def test_fewer_than_one_worker_is_refused(n_workers):
     """0 took all cores, and -1, which elsewhere stands for all, took one."""
     with pytest.raises(ValueError, match=rf"n_workers: expected at least 1, got {n_workers}\."):
         all_of(jobs.square, [1, 2], n_workers=n_workers)
 
 
-def test_one_worker_is_this_process_unless_there_are_limits(
-    limited: dict[int, tuple[int, str]],
-) -> None:
+def test_one_worker_is_this_process_unless_there_are_limits(limited):
     assert all_of(jobs.process, [0, 0], n_workers=1)[1][0] == os.getpid()
     assert limited[0][0] == limited[1][0] != os.getpid()
 
 
 @pytest.mark.skipif(not LINUX, reason="Linux alone enforces a memory limit")
-def test_a_job_that_needs_too_much_memory_is_named(limited: dict[int, object]) -> None:
+def test_a_job_that_needs_too_much_memory_is_named(limited):
     expected = [1000, Failed("it needs more than the memory_limit of 1024 MiB."), 2000]
     assert [limited[number] for number in (2, 3, 4)] == expected
 
@@ -166,18 +163,18 @@ def test_a_job_that_needs_too_much_memory_is_named(limited: dict[int, object]) -
     reason="the system hands out huge pages, of which there are few",
 )
 @pytest.mark.skipif(not LINUX, reason="Linux alone enforces a memory limit")
-def test_a_limit_below_what_python_itself_takes_is_to_be_raised() -> None:
+def test_a_limit_below_what_python_itself_takes_is_to_be_raised():
     with pytest.raises(MachineError, match="raise the memory_limit"):
         all_of(jobs.call, [len], n_workers=1, limits=Limits(memory=2**20))
 
 
-def test_a_worker_keeps_the_memory_of_one_body_for_the_next(limited: dict[int, int]) -> None:
+def test_a_worker_keeps_the_memory_of_one_body_for_the_next(limited):
     first, second, third = (limited[number] for number in (5, 6, 7))
     assert first > 0.9 * PAGES / mmap.PAGESIZE
     assert max(second, third) < first / 10
 
 
-def test_a_job_that_takes_too_long_is_ended(limited: dict[int, object]) -> None:
+def test_a_job_that_takes_too_long_is_ended(limited):
     expected = [0.1, Failed("it took longer than the time_limit of 5 s."), 0.2]
     assert [limited[number] for number in (8, 9, 10)] == expected
 
@@ -196,9 +193,7 @@ def test_a_job_that_takes_too_long_is_ended(limited: dict[int, object]) -> None:
     ],
     ids=["disk", "files", "memory", "library"],
 )
-def test_the_machine_is_not_the_jobs_fault(
-    where: str, job: Callable[[], None], message: str
-) -> None:
+def test_the_machine_is_not_the_jobs_fault(where, job, message):
     """It is told once, and not of every job."""
     with ThreadPoolExecutor(1) as pool, pytest.raises(MachineError, match=message):
         list(
@@ -212,7 +207,7 @@ def test_the_machine_is_not_the_jobs_fault(
         )
 
 
-def test_other_errors_of_the_system_are_those_of_a_job() -> None:
+def test_other_errors_of_the_system_are_those_of_a_job():
     failed = Failed("FileNotFoundError: [Errno 2] ENOENT")
     assert all_of(jobs.fail_with, [errno.ENOENT], n_workers=1) == {0: failed}
 
@@ -224,13 +219,13 @@ def test_other_errors_of_the_system_are_those_of_a_job() -> None:
         lambda: ProcessPoolExecutor(1, multiprocessing.get_context("spawn")),
     ],
 )
-def test_another_executor_does_the_work(make: Callable[[], Executor]) -> None:
+def test_another_executor_does_the_work(make):
     with make() as pool:
         results = all_of(jobs.square, [4, -2, 6], executor=pool)
     assert results == {0: 16, 1: Failed("x: expected a natural number, got -2."), 2: 36}
 
 
-def test_an_executor_that_breaks_is_the_machine() -> None:
+def test_an_executor_that_breaks_is_the_machine():
     with (
         ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool,
         pytest.raises(MachineError, match="the executor broke"),
@@ -238,7 +233,7 @@ def test_an_executor_that_breaks_is_the_machine() -> None:
         list(run(jobs.die_at_zero, [1, 0, 2], executor=pool))
 
 
-def test_an_executor_has_limits_of_its_own() -> None:
+def test_an_executor_has_limits_of_its_own():
     with (
         ThreadPoolExecutor(1) as pool,
         pytest.raises(ValueError, match="limits: expected None with an executor"),
@@ -246,7 +241,7 @@ def test_an_executor_has_limits_of_its_own() -> None:
         list(run(jobs.square, [1], executor=pool, limits=Limits(seconds=1)))
 
 
-def test_a_caller_that_takes_its_time_costs_no_job_its_result() -> None:
+def test_a_caller_that_takes_its_time_costs_no_job_its_result():
     found = []
     for number, result in run(jobs.sleep, [0.1, 0.6], n_workers=2, limits=Limits(seconds=1)):
         found.append((number, result))
@@ -257,12 +252,12 @@ def test_a_caller_that_takes_its_time_costs_no_job_its_result() -> None:
 @pytest.mark.parametrize(
     ("name", "options"), [("time_limit", {"seconds": 0}), ("memory_limit", {"memory": -5})]
 )
-def test_impossible_limits_are_refused(name: str, options: dict[str, int]) -> None:
+def test_impossible_limits_are_refused(name, options):
     with pytest.raises(ValueError, match=f"{name}: expected None or a positive number"):
         Limits(**options)
 
 
-def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
+def test_a_script_without_a_main_guard_is_told(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "from igps._failures import Limits\n"
@@ -278,7 +273,7 @@ def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
 
 
 @needs_proc
-def test_no_process_is_left_when_the_caller_stops_early() -> None:
+def test_no_process_is_left_when_the_caller_stops_early():
     results = run(jobs.process, [0] * 20, n_workers=2)
     _, (first, _) = next(results)
     results.close()
@@ -287,7 +282,7 @@ def test_no_process_is_left_when_the_caller_stops_early() -> None:
 
 
 @needs_proc
-def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+def test_workers_end_with_a_killed_parent(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(
         "import os, signal, sys\n"

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 CODE = """
 import gc
@@ -51,7 +50,7 @@ assert not changed, [(name, before[name], after[name]) for name in changed]
 """
 
 
-def test_a_description_leaves_the_process_as_it_was(tmp_path: Path) -> None:
+def test_a_description_leaves_the_process_as_it_was(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(CODE)
     done = subprocess.run([sys.executable, script], capture_output=True, text=True)

@@ -15,7 +15,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def test_the_first_result_does_not_count_in_the_estimate(clock: list[float]) -> None:
+def test_the_first_result_does_not_count_in_the_estimate(clock):
     """Loops are compiled for 30 seconds, then each body takes 2: of 10 bodies, 7 are left after 34 seconds."""
     text = StringIO()
     with Progress(total=10, desc="bodies", file=text) as bar:
@@ -28,7 +28,7 @@ def test_the_first_result_does_not_count_in_the_estimate(clock: list[float]) -> 
     assert "the first takes longer" in text.getvalue()
 
 
-def test_a_bar_without_progress_prints_nothing() -> None:
+def test_a_bar_without_progress_prints_nothing():
     text = StringIO()
     with Progress(total=2, disable=True, file=text) as bar:
         bar.update()

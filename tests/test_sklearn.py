@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, Self
@@ -56,9 +55,7 @@ def features(tmp_path: Path) -> VolumetricFeatures:
     )
 
 
-def test_features_are_the_roots_of_the_histograms(
-    paths: list[Path], features: VolumetricFeatures, tmp_path: Path
-) -> None:
+def test_features_are_the_roots_of_the_histograms(paths, features, tmp_path):
     histograms = (
         describe(SignatureDataset(paths, CONFIG, tmp_path), interior(n_eigenpairs=20))
         .flatten(1)
@@ -71,24 +68,24 @@ def test_features_are_the_roots_of_the_histograms(
     )
 
 
-def test_meshes_give_what_their_files_give(paths: list[Path], features: VolumetricFeatures) -> None:
+def test_meshes_give_what_their_files_give(paths, features):
     meshes = [load_mesh(path) for path in paths[:2]]
     np.testing.assert_allclose(features.transform(meshes), features.transform(paths[:2]), atol=1e-6)
 
 
-def test_rich_features_bring_their_attributes(paths: list[Path], tmp_path: Path) -> None:
+def test_rich_features_bring_their_attributes(paths, tmp_path):
     rich = VolumetricFeatures("rich", cache_dir=tmp_path, n_workers=1).transform(paths[:1])
     assert rich.shape == (1, 27420)
     np.testing.assert_allclose((rich**2).sum(), 1, rtol=1e-4)
 
 
-def test_pipeline_classifies(paths: list[Path], features: VolumetricFeatures) -> None:
+def test_pipeline_classifies(paths, features):
     labels = [path.parent.name for path in paths]
     pipeline = make_pipeline(features, KNeighborsClassifier(1)).fit(paths[::2], labels[::2])
     assert pipeline.score(paths[1::2], labels[1::2]) == 1
 
 
-def test_other_input_is_refused(features: VolumetricFeatures) -> None:
+def test_other_input_is_refused(features):
     with pytest.raises(TypeError, match="X: expected paths of mesh files, or meshes, got int"):
         features.transform([1, 2])
     with pytest.raises(TypeError, match=r"expected a list of paths .*, got 'a\.off' alone"):
@@ -96,14 +93,14 @@ def test_other_input_is_refused(features: VolumetricFeatures) -> None:
     with pytest.raises(
         ValueError, match=r"expected one column of paths or meshes, got an array of shape \(1, 2\)"
     ):
-        features.transform(np.array([["a.off", "b.off"]]))  # type: ignore[arg-type]
+        features.transform(np.array([["a.off", "b.off"]]))
     with pytest.raises(TypeError, match="got nothing"):
         features.fit([])
     with pytest.raises(ValueError, match="descriptor: expected one of interior"):
-        VolumetricFeatures("unknown").fit(["a.off"])  # type: ignore[arg-type]
+        VolumetricFeatures("unknown").fit(["a.off"])
 
 
-def test_a_column_of_a_table_is_a_list(paths: list[Path], features: VolumetricFeatures) -> None:
+def test_a_column_of_a_table_is_a_list(paths, features):
     """As ColumnTransformer hands it over; its one column was taken for a file."""
     pandas = pytest.importorskip("pandas")
     expected = features.transform(paths[:2])
@@ -112,7 +109,7 @@ def test_a_column_of_a_table_is_a_list(paths: list[Path], features: VolumetricFe
         np.testing.assert_array_equal(features.transform(given), expected)
 
 
-def test_a_file_of_several_bodies_is_no_row(tmp_path: Path) -> None:
+def test_a_file_of_several_bodies_is_no_row(tmp_path):
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((12, 12, 12), np.uint8)
     labels[1:6, 1:11, 1:11] = 1
@@ -125,7 +122,7 @@ def test_a_file_of_several_bodies_is_no_row(tmp_path: Path) -> None:
         features.transform([tmp_path / "a.nii.gz"])
 
 
-def test_a_name_is_a_descriptor_with_its_needs(paths: list[Path], tmp_path: Path) -> None:
+def test_a_name_is_a_descriptor_with_its_needs(paths, tmp_path):
     few = VolumetricFeatures("interior", config=CONFIG, cache_dir=tmp_path, n_workers=1)
     for given in (paths[:1], [load_mesh(paths[0])]):
         with pytest.raises(
@@ -136,18 +133,16 @@ def test_a_name_is_a_descriptor_with_its_needs(paths: list[Path], tmp_path: Path
         VolumetricFeatures("mine.nothing:Here").fit(paths)
 
 
-def test_descriptions_that_are_no_histograms_are_given_as_they_are(
-    paths: list[Path], tmp_path: Path
-) -> None:
+def test_descriptions_that_are_no_histograms_are_given_as_they_are(paths, tmp_path):
     features = VolumetricFeatures(D2(), config=CONFIG, cache_dir=tmp_path, n_workers=1)
     expected = describe(SignatureDataset(paths[:2], CONFIG, tmp_path), D2(), n_workers=1)
     np.testing.assert_allclose(features.transform(paths[:2]), expected, atol=1e-6)
 
 
-def test_size_behind_histograms_is_no_histogram(paths: list[Path], tmp_path: Path) -> None:
+def test_size_behind_histograms_is_no_histogram(paths, tmp_path):
     sized = SizedHistograms([PairHistogram(embedding=SpectralEmbedding(n_eigenpairs=20))])
     options = {"config": CONFIG, "cache_dir": tmp_path, "n_workers": 1}
-    found = VolumetricFeatures(sized, **options).fit(paths)  # type: ignore[arg-type]
+    found = VolumetricFeatures(sized, **options).fit(paths)
     values = found.transform(paths[:1])
     assert values.shape == (1, len(found.get_feature_names_out()))
     ball = trimesh.load(paths[0])
@@ -155,7 +150,7 @@ def test_size_behind_histograms_is_no_histogram(paths: list[Path], tmp_path: Pat
     np.testing.assert_allclose(np.square(values[0, :-2]).sum(), 1, rtol=1e-5)
 
 
-def test_reading_is_passed_on(paths: list[Path], tmp_path: Path) -> None:
+def test_reading_is_passed_on(paths, tmp_path):
     """A surface with a hole is closed, unless nothing is to be mended."""
     path = tmp_path / "torn.off"
     whole = trimesh.load(paths[0], process=False)
@@ -170,9 +165,7 @@ def test_reading_is_passed_on(paths: list[Path], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("descriptor", [DISTANCES, interior(n_eigenpairs=3)])
-def test_columns_have_names_and_tables_have_them(
-    paths: list[Path], tmp_path: Path, descriptor: Descriptor
-) -> None:
+def test_columns_have_names_and_tables_have_them(paths, tmp_path, descriptor):
     features = VolumetricFeatures(descriptor, config=CONFIG, cache_dir=tmp_path, n_workers=1)
     with pytest.raises(NotFittedError):
         features.get_feature_names_out()
@@ -189,7 +182,7 @@ def test_columns_have_names_and_tables_have_them(
     assert len(set(union.get_feature_names_out())) == 2 * values.shape[1]
 
 
-def test_parameters_are_searched(paths: list[Path], features: VolumetricFeatures) -> None:
+def test_parameters_are_searched(paths, features):
     labels = [path.parent.name for path in paths]
     pipeline = make_pipeline(features, KNeighborsClassifier(1))
     grid = {"volumetricfeatures__square_root": [True, False]}
@@ -245,7 +238,7 @@ def mesh_of_row(row: bytes) -> Mesh:
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.SkipTestWarning")
-def test_conventions_of_scikit_learn() -> None:
+def test_conventions_of_scikit_learn():
     """All its checks of a transformer, on meshes that are made of the rows of its tables."""
     known = {
         "check_parameters_default_constructible": "its defaults are objects; see the test below for the real ones"
@@ -298,5 +291,5 @@ def test_conventions_of_scikit_learn() -> None:
         estimator_checks.check_do_not_raise_errors_in_init_or_set_params,
     ],
 )
-def test_conventions_that_need_no_input(check: Callable[..., None]) -> None:
+def test_conventions_that_need_no_input(check):
     check("VolumetricFeatures", VolumetricFeatures())

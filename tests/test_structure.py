@@ -105,7 +105,7 @@ def circle(root: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("floor", "room"), [(floor, room) for floor, rooms in enumerate(FLOORS) for room in rooms]
 )
-def test_imports_run_one_way(floor: int, room: str) -> None:
+def test_imports_run_one_way(floor, room):
     below = {name for rooms in FLOORS[:floor] for name in rooms}
     files = [PACKAGE / f"{room}.py"] if room in FILES else sorted((PACKAGE / room).rglob("*.py"))
     assert files
@@ -113,14 +113,14 @@ def test_imports_run_one_way(floor: int, room: str) -> None:
         assert imported_rooms(file) <= {room} | below, file
 
 
-def test_every_room_has_its_floor() -> None:
+def test_every_room_has_its_floor():
     rooms = {file.parent.name for file in PACKAGE.glob("*/__init__.py")}
     files = {file.stem for file in PACKAGE.glob("*.py")} - {"__init__", "__main__"}
     assert files == set(FILES)
     assert rooms | files == {room for rooms in FLOORS for room in rooms}
 
 
-def test_nobody_enters_by_the_front_door() -> None:
+def test_nobody_enters_by_the_front_door():
     """`import igps` inside the package would be a ring: rooms name the rooms they use."""
     for file in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(file.read_text())):
@@ -132,17 +132,17 @@ def test_nobody_enters_by_the_front_door() -> None:
                     assert all((PACKAGE / alias.name).is_dir() for alias in node.names), file
 
 
-def test_a_wrong_arrow_would_be_seen(tmp_path: Path) -> None:
+def test_a_wrong_arrow_would_be_seen(tmp_path):
     source = "from igps.cli.demo import demo\nimport igps.nn.axes as axes\nfrom igps import data\nimport numpy\n"
     (tmp_path / "room.py").write_text(source)
     assert imported_rooms(tmp_path / "room.py") == {"cli", "nn", "data"}
 
 
-def test_no_module_imports_itself_by_way_of_others() -> None:
+def test_no_module_imports_itself_by_way_of_others():
     assert circle(PACKAGE) == []
 
 
-def test_a_circle_would_be_seen_even_if_an_import_is_deferred(tmp_path: Path) -> None:
+def test_a_circle_would_be_seen_even_if_an_import_is_deferred(tmp_path):
     package = tmp_path / "house"
     package.mkdir()
     (package / "__init__.py").write_text("from house import first\n")
@@ -185,7 +185,7 @@ print(*sorted(name for name in sys.modules if name.startswith("igps.")))
 """
 
 
-def test_the_core_runs_without_the_rooms_around_it(tmp_path: Path) -> None:
+def test_the_core_runs_without_the_rooms_around_it(tmp_path):
     """From the arrays of a mesh to a signature, a histogram, a distance and a fitted head."""
     ignored = shutil.ignore_patterns("__pycache__", *AROUND)
     shutil.copytree(PACKAGE, tmp_path / "igps", ignore=ignored)

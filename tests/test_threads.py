@@ -6,7 +6,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from igps._parallel import on_threads
 from igps._threads import Team, n_cores, n_threads, one_thread
 from igps.cli import main
 from igps.data.batch import LabelledSignature
-from igps.mesh.mesh import Mesh
 from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.signature.signature import SignatureConfig
 
@@ -61,7 +59,7 @@ def many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads_module, "n_cores", lambda: 8)
 
 
-def test_cores_are_at_most_those_of_the_machine_and_of_the_affinity() -> None:
+def test_cores_are_at_most_those_of_the_machine_and_of_the_affinity():
     seen = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     assert 1 <= n_cores() <= seen
 
@@ -69,9 +67,7 @@ def test_cores_are_at_most_those_of_the_machine_and_of_the_affinity() -> None:
 @pytest.mark.parametrize(
     ("quota", "cores"), [("50000 100000", 1), ("150000 100000", 2), ("max 100000", 64)]
 )
-def test_cores_are_those_that_the_container_grants(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, quota: str, cores: int
-) -> None:
+def test_cores_are_those_that_the_container_grants(monkeypatch, tmp_path, quota, cores):
     """The quota of control groups of version 2, as a container sees its own."""
     (tmp_path / "cpu.max").write_text(quota + "\n")
     monkeypatch.setattr(threads_module, "CPU_QUOTA", tmp_path / "cpu.max")
@@ -81,7 +77,7 @@ def test_cores_are_those_that_the_container_grants(
 
 
 @needs_affinity
-def test_on_one_core_a_body_is_computed_on_one_thread() -> None:
+def test_on_one_core_a_body_is_computed_on_one_thread():
     """A process of its own, as the affinity is that of all threads."""
     program = (
         "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
@@ -100,7 +96,7 @@ def test_on_one_core_a_body_is_computed_on_one_thread() -> None:
     assert output.split() == ["1", "1", "2.0"]
 
 
-def test_settings_are_one_inside_and_as_before_outside(many_cores: None) -> None:
+def test_settings_are_one_inside_and_as_before_outside(many_cores):
     before = settings()
     assert before[:2] == (3, 3)
     environment = dict(os.environ)
@@ -113,14 +109,14 @@ def test_settings_are_one_inside_and_as_before_outside(many_cores: None) -> None
     assert os.environ == environment
 
 
-def test_settings_are_restored_after_an_exception() -> None:
+def test_settings_are_restored_after_an_exception():
     before = settings()
     with pytest.raises(KeyError), one_thread():
         raise KeyError
     assert settings() == before
 
 
-def test_threads_that_overlap_leave_each_other_as_they_were() -> None:
+def test_threads_that_overlap_leave_each_other_as_they_were():
     """Each begins within the one before and ends after it, which is where settings of the process get lost."""
     before = settings()
     entered = [threading.Event() for _ in range(4)]
@@ -151,7 +147,7 @@ def test_threads_that_overlap_leave_each_other_as_they_were() -> None:
     assert (torch.get_num_threads(), blas()) == (before[0], before[2])
 
 
-def test_the_last_context_lifts_a_limit_set_by_another_thread() -> None:
+def test_the_last_context_lifts_a_limit_set_by_another_thread():
     """Two overlapping contexts: the settings are restored when the later one ends, whichever thread made the limit."""
     before = settings()
     entered = threading.Event()
@@ -238,14 +234,14 @@ assert torch.get_float32_matmul_precision() == "medium"
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_no_child_hangs_that_is_forked_beside_busy_threads(tmp_path: Path) -> None:
+def test_no_child_hangs_that_is_forked_beside_busy_threads(tmp_path):
     """They hold the locks of settings and of the compiler most of the time. A child has its parent's settings."""
     script = tmp_path / "forking.py"
     script.write_text(FORKING)
     subprocess.run([sys.executable, str(script), "40"], check=True, timeout=240)
 
 
-def test_no_more_threads_than_torch_had_or_there_are_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_more_threads_than_torch_had_or_there_are_cores(monkeypatch):
     for cores, expected in ((8, 3), (2, 2), (1, 1)):
         monkeypatch.setattr(threads_module, "n_cores", lambda cores=cores: cores)
         assert n_threads() == expected
@@ -256,7 +252,7 @@ def test_no_more_threads_than_torch_had_or_there_are_cores(monkeypatch: pytest.M
     assert n_threads() == 1
 
 
-def test_jobs_on_threads_have_one_thread_each_and_start_no_more(many_cores: None) -> None:
+def test_jobs_on_threads_have_one_thread_each_and_start_no_more(many_cores):
     before = settings()
 
     def job(i: int) -> tuple[int, int, int, int]:
@@ -269,7 +265,7 @@ def test_jobs_on_threads_have_one_thread_each_and_start_no_more(many_cores: None
 
 
 @pytest.mark.parametrize("n", [1, 3])
-def test_jobs_that_fail_or_are_left_undone_leave_no_setting(many_cores: None, n: int) -> None:
+def test_jobs_that_fail_or_are_left_undone_leave_no_setting(many_cores, n):
     before = settings()
     with pytest.raises(ZeroDivisionError):
         list(on_threads(lambda i: 1 / i, [1, 0, 2], n))
@@ -281,7 +277,7 @@ def test_jobs_that_fail_or_are_left_undone_leave_no_setting(many_cores: None, n:
     assert settings() == before
 
 
-def test_calls_on_a_body_leave_the_settings(blob: Mesh) -> None:
+def test_calls_on_a_body_leave_the_settings(blob):
     before = settings()
     signature = igps.compute_signature(blob, CONFIG)
     igps.descriptor("d2")(igps.collate([signature]))
@@ -296,7 +292,7 @@ def test_calls_on_a_body_leave_the_settings(blob: Mesh) -> None:
     assert settings() == before
 
 
-def test_a_body_is_computed_on_one_thread(blob: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_body_is_computed_on_one_thread(blob, monkeypatch):
     seen: list[tuple[int, set[int]]] = []
     original = igps.signature.signature.eigenpairs
 
@@ -309,7 +305,7 @@ def test_a_body_is_computed_on_one_thread(blob: Mesh, monkeypatch: pytest.Monkey
     assert seen == [(1, {1})]
 
 
-def test_one_thread_gives_the_numbers_of_many(blob: Mesh) -> None:
+def test_one_thread_gives_the_numbers_of_many(blob):
     many = igps.compute_signature(blob, CONFIG)
     torch.set_num_threads(1)
     one = igps.compute_signature(blob, CONFIG)
@@ -332,7 +328,7 @@ class Watched(torch.nn.Module):
         return self.scale * batch.interior.eigenfunctions.abs().mean(dim=1).softmax(dim=1)
 
 
-def test_a_training_step_is_computed_on_one_thread(blob: Mesh) -> None:
+def test_a_training_step_is_computed_on_one_thread(blob):
     before = settings()
     signature = igps.compute_signature(blob, CONFIG)
     items = [LabelledSignature(signature, i // 2, str(i)) for i in range(4)]
@@ -349,15 +345,13 @@ def test_a_training_step_is_computed_on_one_thread(blob: Mesh) -> None:
         max_epochs=1, accumulate_grad_batches=2, enable_model_summary=False, **options
     )
     with pytest.warns(UserWarning, match="val_dataloader"):
-        trainer.fit(learner, DataLoader(items, batch_size=2, collate_fn=igps.collate))  # type: ignore[arg-type]
+        trainer.fit(learner, DataLoader(items, batch_size=2, collate_fn=igps.collate))
     assert described.seen.count(("gradient", 1)) == 2
     assert set(described.seen) == {("value", 1), ("gradient", 1)}
     assert settings() == before
 
 
-def test_a_command_leaves_the_settings(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_leaves_the_settings(monkeypatch, capsys):
     before = settings()
     seen: list[int] = []
 
@@ -375,7 +369,7 @@ def test_a_command_leaves_the_settings(
 
 
 @pytest.mark.parametrize("max_threads", [1, 2, 5])
-def test_a_team_does_every_job_once_and_in_order(max_threads: int) -> None:
+def test_a_team_does_every_job_once_and_in_order(max_threads):
     done: list[int] = []
 
     def square(number: int) -> tuple[int, int]:
@@ -392,7 +386,7 @@ def test_a_team_does_every_job_once_and_in_order(max_threads: int) -> None:
             assert sorted(done) == list(range(size))
 
 
-def test_the_calling_thread_works_in_its_team(many_cores: None) -> None:
+def test_the_calling_thread_works_in_its_team(many_cores):
     together = threading.Barrier(3, timeout=20)
     with one_thread(), Team() as team:
         assert team.n_threads == 3
@@ -401,7 +395,7 @@ def test_the_calling_thread_works_in_its_team(many_cores: None) -> None:
     assert threading.current_thread().name in names
 
 
-def test_a_blocked_thread_of_a_team_does_not_delay_other_callers() -> None:
+def test_a_blocked_thread_of_a_team_does_not_delay_other_callers():
     released = threading.Event()
     held = threading.Barrier(3, timeout=20)
     ended_jobs: list[int] = []
@@ -423,7 +417,7 @@ def test_a_blocked_thread_of_a_team_does_not_delay_other_callers() -> None:
             other.join()
 
 
-def test_what_a_job_of_a_team_raises_is_raised_when_no_job_runs_any_more() -> None:
+def test_what_a_job_of_a_team_raises_is_raised_when_no_job_runs_any_more():
     running = threading.Semaphore(0)
 
     def fail(number: int) -> None:
@@ -442,7 +436,7 @@ def test_what_a_job_of_a_team_raises_is_raised_when_no_job_runs_any_more() -> No
 
 
 @pytest.mark.parametrize("inference", [True, False])
-def test_a_team_computes_in_the_mode_of_who_asks(inference: bool) -> None:
+def test_a_team_computes_in_the_mode_of_who_asks(inference):
     together = threading.Barrier(2, timeout=20)
 
     def add(number: int) -> bool:

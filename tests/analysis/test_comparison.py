@@ -46,7 +46,7 @@ def run(dataset: SignatureDataset, *chosen: Descriptor, n_workers: int = 1) -> d
     return {result.descriptor.name: result for result in results}
 
 
-def test_result_is_what_heights_give(dataset: SignatureDataset) -> None:
+def test_result_is_what_heights_give(dataset):
     result = run(dataset, Height("tall"))["tall"]
     heights = torch.tensor([1.0, 1.1, 2.3, 2.2, 2.4, 2.6]) * 2
     assert result.distances is not None
@@ -68,9 +68,7 @@ def test_result_is_what_heights_give(dataset: SignatureDataset) -> None:
 @pytest.mark.parametrize(
     ("fault", "reason"), [("raise", "a height of 4.8 is too much"), ("nan", "not finite")]
 )
-def test_a_mesh_that_one_descriptor_cannot_describe_is_its_failure_alone(
-    dataset: SignatureDataset, fault: str, reason: str
-) -> None:
+def test_a_mesh_that_one_descriptor_cannot_describe_is_its_failure_alone(dataset, fault, reason):
     results = run(dataset, Height("picky", "egg/1.off", fault), Height("fine"))
     (failure,) = results["picky"].failures
     assert failure.id == "egg/1.off"
@@ -83,7 +81,7 @@ def test_a_mesh_that_one_descriptor_cannot_describe_is_its_failure_alone(
     assert results["fine"].row()["n_models"] == 6
 
 
-def test_strict_stops_at_the_first_failure(dataset: SignatureDataset) -> None:
+def test_strict_stops_at_the_first_failure(dataset):
     chosen = [Height("fine"), Height("picky", "egg/1.off")]
     results = compare(dataset, chosen, n_workers=1, strict=True, progress=False)
     assert next(results).descriptor.name == "fine"
@@ -99,9 +97,7 @@ def test_strict_stops_at_the_first_failure(dataset: SignatureDataset) -> None:
         (Height("hopeless", "egg/1.off", "shape"), 6, "shape"),
     ],
 )
-def test_a_descriptor_without_scores_does_not_stop_the_others(
-    dataset: SignatureDataset, hopeless: Height, described: int, reason: str
-) -> None:
+def test_a_descriptor_without_scores_does_not_stop_the_others(dataset, hopeless, described, reason):
     results = run(dataset, hopeless, Height("fine"))
     row = results["hopeless"].row()
     assert list(row) == KEYS
@@ -111,15 +107,13 @@ def test_a_descriptor_without_scores_does_not_stop_the_others(
     assert results["fine"].scores is not None
 
 
-def test_seconds_are_the_processor_time_of_a_description(dataset: SignatureDataset) -> None:
+def test_seconds_are_the_processor_time_of_a_description(dataset):
     seconds = run(dataset.subset([0, 1]), Slow("slow"))["slow"].seconds_per_mesh
     assert seconds is not None
     assert 0.05 <= seconds < 0.3
 
 
-def test_distances_by_blocks_are_the_same(
-    dataset: SignatureDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_distances_by_blocks_are_the_same(dataset, monkeypatch):
     whole = run(dataset, Height("tall"))["tall"].distances
     sizes: list[tuple[int, int]] = []
     plain = Height.distances
@@ -137,9 +131,7 @@ def test_distances_by_blocks_are_the_same(
     torch.testing.assert_close(parts, whole, rtol=0, atol=0)
 
 
-def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_each(
-    dataset: SignatureDataset,
-) -> None:
+def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_each(dataset):
     chosen = [Height("fine"), Height("deadly", "0.off", "kill")]
     results = run(dataset, *chosen, n_workers=2)
     assert [failure.id for failure in results["deadly"].failures] == ["ball/0.off", "egg/0.off"]
@@ -151,16 +143,14 @@ def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_ea
     torch.testing.assert_close(results["fine"].distances, expected, rtol=0, atol=0)
 
 
-def test_signatures_without_what_a_descriptor_needs_are_refused_before_work(
-    dataset: SignatureDataset,
-) -> None:
+def test_signatures_without_what_a_descriptor_needs_are_refused_before_work(dataset):
     with pytest.raises(
         ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 20"
     ):
         next(compare(dataset, [Height(), descriptor("interior")], progress=False))
 
 
-def test_two_of_one_name_are_refused(dataset: SignatureDataset) -> None:
+def test_two_of_one_name_are_refused(dataset):
     """They would be one row of a table, and one file."""
     with pytest.raises(
         ValueError, match=r"descriptors: expected different names, got d2 more than once"
@@ -168,7 +158,7 @@ def test_two_of_one_name_are_refused(dataset: SignatureDataset) -> None:
         next(compare(dataset, [D2(), Height(), D2(n_bins=8)], progress=False))
 
 
-def test_collection_without_classes_is_refused(root: Path) -> None:
+def test_collection_without_classes_is_refused(root):
     plain = SignatureDataset([root / "egg" / "0.off"], CONFIG, root.parent / "cache")
     with pytest.raises(ValueError, match="classes"):
         next(compare(plain, [Height("tall")]))

@@ -22,7 +22,7 @@ NORMALS: dict[str, tuple[AttributeName, ...]] = {
 
 @pytest.fixture(params=NORMALS.values(), ids=NORMALS)
 def attributes(request: pytest.FixtureRequest) -> tuple[AttributeName, ...]:
-    return request.param  # type: ignore[no-any-return]
+    return request.param
 
 
 def spheroid(attributes: tuple[AttributeName, ...], subdivisions: int, n_samples: int) -> Signature:
@@ -35,7 +35,7 @@ def spheroid(attributes: tuple[AttributeName, ...], subdivisions: int, n_samples
     return compute_signature(as_mesh(body), config)
 
 
-def test_curvatures_and_thickness_of_a_spheroid(attributes: tuple[AttributeName, ...]) -> None:
+def test_curvatures_and_thickness_of_a_spheroid(attributes):
     """A ball inside that touches at a point is centred on the axis, where the normal meets it."""
     body = spheroid(attributes, subdivisions=5, n_samples=6000)
     measured = local_shape(collate([body]))
@@ -55,7 +55,7 @@ def test_curvatures_and_thickness_of_a_spheroid(attributes: tuple[AttributeName,
     )  # normals of flat faces
 
 
-def test_a_rough_surface_is_no_thinner(attributes: tuple[AttributeName, ...]) -> None:
+def test_a_rough_surface_is_no_thinner(attributes):
     """Neighbours a little below the tangent plane make no ball small."""
     body = spheroid(attributes, subdivisions=4, n_samples=2000)
     step = (
@@ -66,7 +66,7 @@ def test_a_rough_surface_is_no_thinner(attributes: tuple[AttributeName, ...]) ->
     assert thickness[1] == pytest.approx(thickness[0], abs=0.6)
 
 
-def test_deviations_are_mahalanobis_distances_from_the_corresponding_samples() -> None:
+def test_deviations_are_mahalanobis_distances_from_the_corresponding_samples():
     """To the covariance at a place, a hundredth of that of the whole body is added."""
     random = np.random.default_rng(0)
     own = random.normal(size=(20, 3))

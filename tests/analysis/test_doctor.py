@@ -33,14 +33,14 @@ from igps.signature.signature import SignatureConfig
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 
 
-def findings(root: Path, **options) -> dict[str, Finding]:  # type: ignore[no-untyped-def]
+def findings(root: Path, **options) -> dict[str, Finding]:
     files = find_bodies(root)
     found = examine(files, config=CONFIG, n_workers=1, progress=False, **options)
     assert tuple(finding.id for finding in found) == files.names
     return {finding.id: finding for finding in found}
 
 
-def test_each_fault_and_what_will_be_done(tmp_path: Path) -> None:
+def test_each_fault_and_what_will_be_done(tmp_path):
     write_clean(tmp_path / "clean.off")
     soup = write_soup(tmp_path / "soup.off")
     holed = write_holed(tmp_path / "holed.off")
@@ -76,9 +76,7 @@ def test_each_fault_and_what_will_be_done(tmp_path: Path) -> None:
     assert found["crossing.off"].steps[0] == "united"
 
 
-def test_what_cannot_be_used_costs_the_others_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_used_costs_the_others_nothing(tmp_path, monkeypatch):
     without_collada(monkeypatch)
     write_clean(tmp_path / "clean.off")
     sentences = write_unusable(tmp_path)
@@ -103,7 +101,7 @@ def test_what_cannot_be_used_costs_the_others_nothing(
     }
 
 
-def test_the_reading_decides(tmp_path: Path) -> None:
+def test_the_reading_decides(tmp_path):
     holed = write_holed(tmp_path / "holed.off")
     never = findings(tmp_path, reading=LoadOptions("never"))["holed.off"]
     assert never.error == never.fault
@@ -115,13 +113,13 @@ def test_the_reading_decides(tmp_path: Path) -> None:
     assert (allowed.fault, allowed.error, allowed.steps) == (None, None, ())
 
 
-def test_a_file_that_takes_too_long_is_told(tmp_path: Path) -> None:
+def test_a_file_that_takes_too_long_is_told(tmp_path):
     write_clean(tmp_path / "clean.off")
     found = findings(tmp_path, limits=Limits(seconds=1e-6))["clean.off"]
     assert "time_limit" in str(found.error)
 
 
-def test_the_cost_grows_with_vertices_and_eigenpairs() -> None:
+def test_the_cost_grows_with_vertices_and_eigenpairs():
     costs = [expected_cost(n, k) for k in (50, 250) for n in (1_000, 10_000, 100_000)]
     for few, many in zip(costs[:3], costs[3:], strict=True):
         assert all(a < b for a, b in zip(few, many, strict=True))
@@ -129,7 +127,7 @@ def test_the_cost_grows_with_vertices_and_eigenpairs() -> None:
         assert costs[0][part] < costs[1][part] < costs[2][part]
 
 
-def test_the_cost_is_that_of_the_mesh_that_is_simplified(tmp_path: Path) -> None:
+def test_the_cost_is_that_of_the_mesh_that_is_simplified(tmp_path):
     write_clean(tmp_path / "clean.off")
     files = find_bodies(tmp_path)
     (full,) = examine(files, config=CONFIG, n_workers=1, progress=False)
@@ -141,7 +139,7 @@ def test_the_cost_is_that_of_the_mesh_that_is_simplified(tmp_path: Path) -> None
     assert simplified.memory == expected_cost(60, 20)[1]
 
 
-def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path: Path) -> None:
+def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path):
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     labels = np.zeros((30, 20, 20), dtype=np.uint8)
     labels[2:14, 4:16, 4:16] = labels[16:17, 2:3, 2:3] = 1  # a cube, and a voxel apart
@@ -173,14 +171,14 @@ def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("thickness", [1, 2, 3, 4, 7])
-def test_the_thinnest_part_is_measured_in_voxels(thickness: int) -> None:
+def test_the_thinnest_part_is_measured_in_voxels(thickness):
     mask = np.zeros((30, 30, 30), dtype=bool)
     mask[3:27, 4:26, 5 : 5 + thickness] = True
     mask[8:20, 8:20, 5:15] = True
     assert thinnest_part(mask) == thickness
 
 
-def test_the_thinnest_part_of_a_large_label_needs_little_memory() -> None:
+def test_the_thinnest_part_of_a_large_label_needs_little_memory():
     """As a whole it took 60 bytes a voxel: 20 GB of a jaw of a mouse in 700³ voxels. It took minutes, too."""
     mask = np.zeros((260, 260, 90), dtype=bool)
     mask[:, :, 40:46] = mask[100:108, 90:98] = True
@@ -193,14 +191,14 @@ def test_the_thinnest_part_of_a_large_label_needs_little_memory() -> None:
 
 
 @pytest.mark.parametrize("most", [2, 9, 91, 300])
-def test_squared_distances_are_those_of_a_transform_up_to_the_most(most: int) -> None:
+def test_squared_distances_are_those_of_a_transform_up_to_the_most(most):
     mask = ndimage.gaussian_filter(np.random.default_rng(most).normal(size=(40, 7, 31)), 2) > -0.1
     expected = np.minimum(np.rint(ndimage.distance_transform_edt(mask) ** 2), most)
     np.testing.assert_array_equal(_squared_distances(mask, most), expected)
     assert (_squared_distances(np.ones((3, 4, 5), dtype=bool), most) == most).all()
 
 
-def test_a_body_that_is_not_in_its_file_is_told(tmp_path: Path) -> None:
+def test_a_body_that_is_not_in_its_file_is_told(tmp_path):
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     nibabel.save(
         nibabel.Nifti1Image(np.ones((9, 9, 9), dtype=np.uint8), np.eye(4)), tmp_path / "x.nii"
@@ -211,7 +209,7 @@ def test_a_body_that_is_not_in_its_file_is_told(tmp_path: Path) -> None:
     assert "has no such body" in str(found["x.nii#liver"].error)
 
 
-def test_what_a_colleague_would_say_of_a_body(tmp_path: Path) -> None:
+def test_what_a_colleague_would_say_of_a_body(tmp_path):
     """Half of a box at the border of an image, a box without its bottom, and two boxes apart, in metres."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     mask = np.zeros((20, 20, 20), dtype=np.uint8)

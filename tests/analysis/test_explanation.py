@@ -73,7 +73,7 @@ def described_by(name: str) -> Descriptor:
         "pretrained+side+size",
     ],
 )
-def test_all_shares_add_up_to_the_distance(name: str, batches: list[SignatureBatch]) -> None:
+def test_all_shares_add_up_to_the_distance(name, batches):
     chosen = described_by(name)
     with torch.no_grad():
         distance = float(chosen.distances(*(chosen(batch) for batch in batches)))
@@ -91,7 +91,7 @@ def test_all_shares_add_up_to_the_distance(name: str, batches: list[SignatureBat
     assert "%" in found.summary()
 
 
-def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures: list[Signature]) -> None:
+def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures):
     """Twice as large: |Δ log area| + |Δ log volume| is 5 log 2, and every place has the same of it."""
     one = signatures[0]
     larger = replace(
@@ -119,9 +119,7 @@ def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures: list[Signat
         np.testing.assert_allclose(shares, found.distance / 4 / len(shares), rtol=1e-3)
 
 
-def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(
-    batches: list[SignatureBatch],
-) -> None:
+def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(batches):
     """Interior distances alone: each pair falls into two bins, and gives each of its ends half of what it counts."""
     chosen = HistogramDescriptor(PairHistogram(["interior_distance"]))
     found = explain(chosen, *batches)
@@ -140,7 +138,7 @@ def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(
         assert not shares["surface"].any()
 
 
-def test_shares_of_a_squared_euclidean_distance_are_products(batches: list[SignatureBatch]) -> None:
+def test_shares_of_a_squared_euclidean_distance_are_products(batches):
     class Squared(HistogramDescriptor):
         def distances(self, queries: torch.Tensor, gallery: torch.Tensor) -> torch.Tensor:
             matrix = torch.linspace(
@@ -161,9 +159,7 @@ def test_shares_of_a_squared_euclidean_distance_are_products(batches: list[Signa
 
 
 @pytest.mark.parametrize("name", ["pretrained", "whitened"])
-def test_shares_behind_a_head_are_those_of_small_steps(
-    name: str, batches: list[SignatureBatch]
-) -> None:
+def test_shares_behind_a_head_are_those_of_small_steps(name, batches):
     """Along the line on which the roots come apart, the distance grows step by step: in one cell alone, by differences.
 
     The cells with the largest shares, and others; and the one that differs most, whose share may be 0.
@@ -192,9 +188,7 @@ def test_shares_behind_a_head_are_those_of_small_steps(
         assert float(shares[cell]) == pytest.approx(share, rel=0.02, abs=1e-8)
 
 
-def test_the_share_of_a_sample_is_the_derivative_by_its_weight(
-    batches: list[SignatureBatch],
-) -> None:
+def test_the_share_of_a_sample_is_the_derivative_by_its_weight(batches):
     """Of one histogram: the derivative by the weight of a sample, over the two samples of a pair, by differences."""
     chosen = descriptor("interior")
     found = explain(chosen, *batches)
@@ -215,19 +209,17 @@ def test_the_share_of_a_sample_is_the_derivative_by_its_weight(
 
 
 @pytest.mark.parametrize("name", ["interior", "rich"])
-def test_a_bump_is_painted_where_it_is(
-    name: str, signatures: list[Signature], batches: list[SignatureBatch]
-) -> None:
+def test_a_bump_is_painted_where_it_is(name, signatures, batches):
     found = explain(descriptor(name), *batches)
     places = {kind: getattr(signatures[1], kind).points for kind in ("interior", "surface")}
     points = places["surface"]
-    values = share_density(found.samples[1], places, points)  # type: ignore[arg-type]
+    values = share_density(found.samples[1], places, points)
     at_bump = np.linalg.norm(points - points[points[:, 0].argmax()], axis=1) < 0.25
     assert values[at_bump].mean() > 2 * abs(values[~at_bump].mean())
 
 
 @pytest.mark.parametrize("height", [0.08, -0.08])
-def test_a_small_bump_or_dent_is_painted_in_another_pose(height: float) -> None:
+def test_a_small_bump_or_dent_is_painted_in_another_pose(height):
     """An egg, bent, with a bump that is a fiftieth of the root of its area high, or such a dent."""
     straight = trimesh.creation.icosphere(subdivisions=4)
     straight.vertices *= [0.5, 0.65, 2.0]
@@ -249,23 +241,23 @@ def test_a_small_bump_or_dent_is_painted_in_another_pose(height: float) -> None:
     true = np.linalg.norm(points - bent.vertices[away.argmin()], axis=1) < 0.4
     places = {"interior": pair[1].interior.points, "surface": points}
     assert found.places is not None
-    assert roc_auc_score(true, share_density(found.places[1], places, points)) > 0.9  # type: ignore[arg-type]
+    assert roc_auc_score(true, share_density(found.places[1], places, points)) > 0.9
 
 
 @pytest.mark.parametrize("name", ["interior", "pretrained"])
-def test_equal_bodies_have_nothing_to_share(name: str, batches: list[SignatureBatch]) -> None:
+def test_equal_bodies_have_nothing_to_share(name, batches):
     found = explain(descriptor(name), batches[0], batches[0])
     assert found.distance == 0
     assert not any(values.any() for of_body in found.samples for values in of_body.values())
     assert found.summary() == "identical"
 
 
-def test_what_knows_no_samples_is_refused(batches: list[SignatureBatch]) -> None:
+def test_what_knows_no_samples_is_refused(batches):
     with pytest.raises(ValueError, match=r"expected histograms of samples .*, got 'd2'"):
         explain(descriptor("d2"), *batches)
 
 
-def test_without_a_difference_one_test_in_twenty_finds_a_cell() -> None:
+def test_without_a_difference_one_test_in_twenty_finds_a_cell():
     random = torch.Generator().manual_seed(0)
     any_held = [
         bool(
@@ -281,7 +273,7 @@ def test_without_a_difference_one_test_in_twenty_finds_a_cell() -> None:
     assert significant_cells(*rows, n_permutations=999).nonzero().flatten().tolist() == [7]
 
 
-def test_groups_are_explained_by_the_cells_that_are_held(batches: list[SignatureBatch]) -> None:
+def test_groups_are_explained_by_the_cells_that_are_held(batches):
     chosen = descriptor("interior")
     rows = torch.cat([chosen(batch) for batch in batches]).flatten(1)
     noise = 1 + 0.05 * torch.rand(2, 8, rows.shape[1], generator=torch.Generator().manual_seed(1))
@@ -295,7 +287,7 @@ def test_groups_are_explained_by_the_cells_that_are_held(batches: list[Signature
         explain_groups(chosen, groups[0, :3], groups[1, :3], batches)
 
 
-def test_groups_that_differ_in_size_alone_differ_in_size(batches: list[SignatureBatch]) -> None:
+def test_groups_that_differ_in_size_alone_differ_in_size(batches):
     chosen = descriptor("interior+side+size")
     with torch.no_grad():
         contents = without_head(chosen)(batches[0]).repeat(16, 1)

@@ -17,7 +17,7 @@ def quick(
     vectors: NDArray[np.float64], groups: list[str] = PAIR, seed: int = 0, **given: object
 ) -> GroupTest:
     options = {"n_permutations": 199, "n_bootstraps": 0, "n_repeats": 0, **given}
-    return group_test(vectors, groups, seed=seed, **options)  # type: ignore[arg-type]
+    return group_test(vectors, groups, seed=seed, **options)
 
 
 def whitened_kernel(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -46,9 +46,7 @@ def whitened_kernel(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize(("is_confounded", "n_numbers"), [(False, 6), (True, 6), (True, 40)])
-def test_without_a_difference_one_test_in_twenty_rejects(
-    is_confounded: bool, n_numbers: int
-) -> None:
+def test_without_a_difference_one_test_in_twenty_rejects(is_confounded, n_numbers):
     """Of 1,000 draws; also where a covariate that differs between the groups, and the strata, cause a difference."""
     random = np.random.default_rng(1)
     found = []
@@ -67,7 +65,7 @@ def test_without_a_difference_one_test_in_twenty_rejects(
     assert ((rejected >= 0.03) & (rejected <= 0.07)).all(), rejected
 
 
-def test_the_unit_of_a_covariate_does_not_matter() -> None:
+def test_the_unit_of_a_covariate_does_not_matter():
     """Down to one in which all values lie below rounding of numbers about 1; a constant explains nothing."""
     random = np.random.default_rng(3)
     age = random.normal(size=24) + 7
@@ -79,13 +77,13 @@ def test_the_unit_of_a_covariate_does_not_matter() -> None:
         assert found.permanova_p == usual.permanova_p
 
 
-def test_strata_may_be_an_array() -> None:
+def test_strata_may_be_an_array():
     vectors = np.random.default_rng(4).normal(size=(24, 3))
     strata = np.tile(["x", "y"], 12)
     assert quick(vectors, strata=strata) == quick(vectors, strata=strata.tolist())
 
 
-def test_numbers_that_are_none_are_refused() -> None:
+def test_numbers_that_are_none_are_refused():
     vectors = np.random.default_rng(0).normal(size=(24, 3))
     with pytest.raises(ValueError, match="n_permutations: expected at least 1, got -3"):
         quick(vectors, n_permutations=-3)
@@ -95,7 +93,7 @@ def test_numbers_that_are_none_are_refused() -> None:
         quick(np.where(np.arange(24)[:, None] == 2, np.inf, vectors))
 
 
-def test_power_grows_with_the_difference() -> None:
+def test_power_grows_with_the_difference():
     random = np.random.default_rng(2)
     powers = []
     for shift in (0.0, 0.7, 1.4, 2.8):
@@ -113,7 +111,7 @@ def test_power_grows_with_the_difference() -> None:
     assert min(powers[-1]) > 0.95
 
 
-def test_the_kernel_test_finds_a_small_direction_that_distances_drown() -> None:
+def test_the_kernel_test_finds_a_small_direction_that_distances_drown():
     random = np.random.default_rng(9)
     scales = np.array([10.0, 5, 2, 1, 1])
     shift = np.outer(np.repeat([0, 1], 20), [0, 0, 0, 2.0, 0])
@@ -128,7 +126,7 @@ def test_the_kernel_test_finds_a_small_direction_that_distances_drown() -> None:
     assert shares[0] < 0.2 < 0.9 < shares[1], shares
 
 
-def test_a_covariate_that_causes_all_the_difference_explains_it() -> None:
+def test_a_covariate_that_causes_all_the_difference_explains_it():
     random = np.random.default_rng(3)
     age = random.normal(size=60) + np.repeat([0, 2], 30)
     vectors = np.outer(age, [1.0, 0.5, 0, 0]) + 0.3 * random.normal(size=(60, 4))
@@ -142,7 +140,7 @@ def test_a_covariate_that_causes_all_the_difference_explains_it() -> None:
     assert (explained.effect or 1) < 0.05
 
 
-def test_statistics_are_those_of_the_textbook() -> None:
+def test_statistics_are_those_of_the_textbook():
     random = np.random.default_rng(4)
     vectors = random.normal(size=(24, 3)) + np.repeat([0, 1], 12)[:, None]
     test = quick(vectors)
@@ -164,7 +162,7 @@ def test_statistics_are_those_of_the_textbook() -> None:
     assert test.effect == pytest.approx(apart / 4 / (apart / 4 + sum(variances) / 2))
 
 
-def test_the_interval_covers_the_effect() -> None:
+def test_the_interval_covers_the_effect():
     random = np.random.default_rng(5)
     # means 1 apart, two dimensions of variance 1
     truth = 0.25 / (0.25 + 2)
@@ -176,7 +174,7 @@ def test_the_interval_covers_the_effect() -> None:
     assert 0.88 < np.mean(covered) < 0.99
 
 
-def test_matched_pairs_without_a_difference_show_no_effect() -> None:
+def test_matched_pairs_without_a_difference_show_no_effect():
     """Over 40 draws the mean AUC is near 0.5, the mean effect near 0, and intervals cover 0."""
     random = np.random.default_rng(10)
     pairs = [str(i) for i in range(12)] * 2
@@ -194,7 +192,7 @@ def test_matched_pairs_without_a_difference_show_no_effect() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_no_permutation_changes_has_a_probability_of_one() -> None:
+def test_what_no_permutation_changes_has_a_probability_of_one():
     """If all bodies but one, or both groups, are equal, p = 1; for groups without scatter it is the least, 1 / 200."""
     random = np.random.default_rng(11)
     one = np.outer(np.arange(24) == 3, random.normal(size=5))
@@ -208,7 +206,7 @@ def test_what_no_permutation_changes_has_a_probability_of_one() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_small_groups_have_an_interval() -> None:
+def test_small_groups_have_an_interval():
     """A bootstrap sample may consist of one body drawn six times, which has no scatter."""
     random = np.random.default_rng(6)
     vectors = random.normal(size=(12, 3)) + np.repeat([0, 1], 6)[:, None]
@@ -219,7 +217,7 @@ def test_small_groups_have_an_interval() -> None:
         assert found.effect_low < found.effect_high < 1
 
 
-def test_a_probability_is_that_of_all_arrangements() -> None:
+def test_a_probability_is_that_of_all_arrangements():
     """Ten numbers in two groups of five: 252 arrangements, counted one by one."""
     from itertools import combinations
 
@@ -254,16 +252,16 @@ def test_a_probability_is_that_of_all_arrangements() -> None:
         ({"covariates": np.random.default_rng(0).normal(size=(24, 21))}, "too few"),
     ],
 )
-def test_what_makes_no_sense_is_refused(given: dict[str, object], why: str) -> None:
+def test_what_makes_no_sense_is_refused(given, why):
     vectors = np.random.default_rng(7).normal(size=(24, 3))
-    test = quick(**{"vectors": vectors, **given})  # type: ignore[arg-type]
+    test = quick(**{"vectors": vectors, **given})
     assert test.permanova_p is test.kernel_p is test.effect is None
     assert why in (test.refused or "")
     with pytest.raises(ValueError, match="strata: expected one for each of 24 bodies, got 2"):
         quick(vectors, strata=["a", "b"])
 
 
-def test_discovery_rates_are_over_what_was_tested() -> None:
+def test_discovery_rates_are_over_what_was_tested():
     tests = [
         GroupTest(str(i), {}, permanova_p=p, kernel_p=p) for i, p in enumerate((0.01, 0.04, 0.03))
     ]
@@ -276,7 +274,7 @@ def test_discovery_rates_are_over_what_was_tested() -> None:
     assert [one.permanova_p for one in same] == [0.01, 0.04, 0.03]
 
 
-def test_three_groups_are_tested_together() -> None:
+def test_three_groups_are_tested_together():
     random = np.random.default_rng(8)
     vectors = random.normal(size=(45, 3)) + np.outer(np.repeat([0, 0, 3], 15), [1, 0, 0])
     test = quick(vectors, ["a"] * 15 + ["b"] * 15 + ["c"] * 15, n_repeats=1)

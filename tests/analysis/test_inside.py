@@ -50,14 +50,14 @@ def made() -> Signature:
     return Signature(eigenvalues, samples, samples, 1.0, 1.0, SignatureConfig(n_eigenpairs=K))
 
 
-def test_names_are_those_of_the_numbers(made: Signature) -> None:
+def test_names_are_those_of_the_numbers(made):
     names = column_names(["ct", "pet"])
     assert list(inside_numbers(made, ["ct", "pet"])) == names
     assert len(set(names)) == len(names)
     assert "ct.core.mean" in names
 
 
-def test_radius_in_a_ball_has_the_means_of_its_closed_form(ball: Signature) -> None:
+def test_radius_in_a_ball_has_the_means_of_its_closed_form(ball):
     radius = np.linalg.norm(ball.interior.points, axis=1)
     numbers = inside_numbers(with_values(ball, r=radius), ["r"])
 
@@ -79,7 +79,7 @@ def test_radius_in_a_ball_has_the_means_of_its_closed_form(ball: Signature) -> N
     assert numbers["r.axis1.outward"] > 0.99
 
 
-def test_height_in_a_ball_lies_along_its_first_axis_however_it_is_turned(ball: Signature) -> None:
+def test_height_in_a_ball_lies_along_its_first_axis_however_it_is_turned(ball):
     for direction in np.eye(3)[1:]:
         height = ball.interior.points @ direction
         numbers = inside_numbers(with_values(ball, h=height), ["h"])
@@ -87,7 +87,7 @@ def test_height_in_a_ball_lies_along_its_first_axis_however_it_is_turned(ball: S
         assert abs(numbers["h.rim.contrast"]) < 0.05
 
 
-def test_neither_signs_nor_bases_of_multiplets_matter(made: Signature) -> None:
+def test_neither_signs_nor_bases_of_multiplets_matter(made):
     functions = made.interior.eigenfunctions.copy()
     functions[:, [0, 3, 5]] *= -1
     turn = np.array([[np.cos(1), -np.sin(1)], [np.sin(1), np.cos(1)]])
@@ -99,7 +99,7 @@ def test_neither_signs_nor_bases_of_multiplets_matter(made: Signature) -> None:
     assert inside_numbers(turned, ["ct", "pet"]) == pytest.approx(expected, abs=1e-4)
 
 
-def test_other_units_change_only_the_numbers_that_have_a_unit(made: Signature) -> None:
+def test_other_units_change_only_the_numbers_that_have_a_unit(made):
     ct = made.interior.attributes["ct"].astype(np.float64)
     numbers = inside_numbers(made, ["ct"])
     changed = inside_numbers(with_values(made, ct=3 * ct - 1000), ["ct"])
@@ -109,7 +109,7 @@ def test_other_units_change_only_the_numbers_that_have_a_unit(made: Signature) -
         assert changed[name] == pytest.approx(expected, rel=1e-3, abs=1e-3), name
 
 
-def test_classes_are_counted_by_a_loop(made: Signature) -> None:
+def test_classes_are_counted_by_a_loop(made):
     ct = made.interior.attributes["ct"].astype(np.float64)
     embedded = made.interior.eigenfunctions / np.sqrt(made.eigenvalues)
     numbers = inside_numbers(made, ["ct"])
@@ -135,7 +135,7 @@ def test_classes_are_counted_by_a_loop(made: Signature) -> None:
                 assert numbers[f"ct.{name}.{key}"] == pytest.approx(number, rel=1e-5), (name, key)
 
 
-def test_variogram_and_moran_are_counted_by_a_loop(made: Signature) -> None:
+def test_variogram_and_moran_are_counted_by_a_loop(made):
     ct = made.interior.attributes["ct"].astype(np.float64)
     embedded = made.interior.eigenfunctions.astype(np.float64) / np.sqrt(made.eigenvalues)
     distance = np.linalg.norm(embedded[:, None] - embedded, axis=2)
@@ -158,7 +158,7 @@ def test_variogram_and_moran_are_counted_by_a_loop(made: Signature) -> None:
     assert numbers["ct.moran"] == pytest.approx(above / below, abs=2e-3)
 
 
-def test_two_attributes_are_compared_at_the_same_samples(made: Signature) -> None:
+def test_two_attributes_are_compared_at_the_same_samples(made):
     ct = made.interior.attributes["ct"].astype(np.float64)
     same = inside_numbers(with_values(made, twice=2 * ct, minus=-(ct**3)), ["ct", "twice", "minus"])
     assert same["ct_and_twice.correlation"] == pytest.approx(1)
@@ -171,7 +171,7 @@ def test_two_attributes_are_compared_at_the_same_samples(made: Signature) -> Non
     assert unrelated["ct_and_pet.information"] < 0.1
 
 
-def test_a_constant_has_no_numbers_that_compare_its_values(made: Signature) -> None:
+def test_a_constant_has_no_numbers_that_compare_its_values(made):
     numbers = inside_numbers(with_values(made, ct=np.full(P, 7.0)), ["ct", "pet"])
     for name, number in numbers.items():
         if name.startswith("pet"):
@@ -182,7 +182,7 @@ def test_a_constant_has_no_numbers_that_compare_its_values(made: Signature) -> N
             assert np.isnan(number), name
 
 
-def test_equal_values_share_the_brightest_tenth() -> None:
+def test_equal_values_share_the_brightest_tenth():
     np.testing.assert_allclose(brightest(np.arange(20.0)), [0] * 18 + [1, 1])
     np.testing.assert_allclose(brightest(np.array([1.0] * 5 + [0] * 15)), [0.4] * 5 + [0] * 15)
     np.testing.assert_allclose(
@@ -190,12 +190,12 @@ def test_equal_values_share_the_brightest_tenth() -> None:
     )
 
 
-def test_bright_shares_of_a_classification_add_up_to_one(made: Signature) -> None:
+def test_bright_shares_of_a_classification_add_up_to_one(made):
     numbers = inside_numbers(made, ["ct"])
     assert sum(numbers[f"ct.{name}.bright"] for name in CLASSES) == pytest.approx(2)
 
 
-def test_a_missing_attribute_and_one_of_several_values_are_refused(made: Signature) -> None:
+def test_a_missing_attribute_and_one_of_several_values_are_refused(made):
     with pytest.raises(ValueError, match="expected 'mr', got ct, depth, pet"):
         inside_numbers(made, ["mr"])
     with pytest.raises(ValueError, match="got 3"):

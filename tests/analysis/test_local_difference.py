@@ -14,7 +14,7 @@ def ball(radius: float, unit: str | None = None) -> Mesh:
     return Mesh(body.vertices + np.array([3.0, -2, 1]), body.faces, unit=unit, frame="RAS")
 
 
-def test_a_larger_ball_lies_outside_by_the_difference_of_the_radii() -> None:
+def test_a_larger_ball_lies_outside_by_the_difference_of_the_radii():
     reference = ball(10.0, "mm")
     found = offsets(ball(12.0, "mm"), reference)
     np.testing.assert_allclose(found, 2.0, atol=0.08)
@@ -25,7 +25,7 @@ def test_a_larger_ball_lies_outside_by_the_difference_of_the_radii() -> None:
     assert misfit(found[None], reference) == pytest.approx(expected, rel=0.03)
 
 
-def test_a_bump_is_found_at_its_place_on_a_turned_body() -> None:
+def test_a_bump_is_found_at_its_place_on_a_turned_body():
     body = trimesh.creation.icosphere(subdivisions=4)
     body.vertices *= [30.0, 20.0, 14.0]
     reference = Mesh(body.vertices, body.faces, unit="mm", frame="RAS")
@@ -39,7 +39,7 @@ def test_a_bump_is_found_at_its_place_on_a_turned_body() -> None:
     assert np.abs(found[weight < 0.01]).max() < 0.5
 
 
-def test_the_difference_is_the_coefficient_of_the_group_in_a_regression() -> None:
+def test_the_difference_is_the_coefficient_of_the_group_in_a_regression():
     random = np.random.default_rng(0)
     groups = np.array(["a", "b"])[random.integers(0, 2, 40)]
     age = random.normal(size=40) + (groups == "b")
@@ -54,7 +54,7 @@ def test_the_difference_is_the_coefficient_of_the_group_in_a_regression() -> Non
     assert np.flatnonzero(found.is_significant).tolist() == [0, 1, 2]
 
 
-def test_groups_of_nothing_differ_somewhere_in_one_of_twenty_draws() -> None:
+def test_groups_of_nothing_differ_somewhere_in_one_of_twenty_draws():
     random = np.random.default_rng(1)
     groups = ["a"] * 10 + ["b"] * 10
     n_rejected = 0
@@ -65,6 +65,6 @@ def test_groups_of_nothing_differ_somewhere_in_one_of_twenty_draws() -> None:
     assert 2 <= n_rejected <= 20  # binomial with mean 10, both ends beyond 2.5 standard deviations
 
 
-def test_other_than_two_groups_are_refused() -> None:
+def test_other_than_two_groups_are_refused():
     with pytest.raises(ValueError, match="expected two, got 3: a, b, c"):
         local_difference(np.zeros((3, 4)), ["a", "b", "c"])

@@ -20,7 +20,7 @@ def blobs(n_each: int, centres: list[list[float]], scatter: float, seed: int = 0
 
 
 @pytest.mark.parametrize("n", [5, 60])
-def test_points_of_a_plane_keep_all_their_distances(n: int) -> None:
+def test_points_of_a_plane_keep_all_their_distances(n):
     points = np.random.default_rng(0).normal(size=(n, 2)) * [3, 1]
     distances = cdist(points, points)
     found = body_map(distances)
@@ -33,7 +33,7 @@ def test_points_of_a_plane_keep_all_their_distances(n: int) -> None:
     )
 
 
-def test_the_improved_map_has_less_stress_than_the_classical_one() -> None:
+def test_the_improved_map_has_less_stress_than_the_classical_one():
     points = np.random.default_rng(0).normal(size=(40, 6))
     distances = cdist(points, points)
     centring = np.eye(40) - 1 / 40
@@ -51,20 +51,20 @@ def test_the_improved_map_has_less_stress_than_the_classical_one() -> None:
 
 
 @pytest.mark.parametrize("n", [4, 12, 600])
-def test_alike_bodies_lie_in_one_point(n: int) -> None:
+def test_alike_bodies_lie_in_one_point(n):
     found = body_map(np.zeros((n, n)))
     assert not found.points.any()
     assert found.stress == 0
 
 
-def test_umap_puts_clusters_apart() -> None:
+def test_umap_puts_clusters_apart():
     pytest.importorskip("umap", reason="umap-learn is not installed")
     points = blobs(15, [[0, 0, 0], [9, 0, 0]], 0.5)
     found = body_map(cdist(points, points), "umap").points
     assert cdist(found[:15], found[:15]).max() < cdist(found[:15], found[15:]).min()
 
 
-def test_without_umap_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_umap_the_remedy_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "umap", None)
     with pytest.raises(ImportError, match="umap-learn"):
         body_map(np.ones((4, 4)), "umap")
@@ -78,18 +78,18 @@ def test_without_umap_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
         (np.full((4, 4), np.nan), "finite"),
     ],
 )
-def test_what_are_no_distances_is_refused(distances: np.ndarray, match: str) -> None:
+def test_what_are_no_distances_is_refused(distances, match):
     with pytest.raises(ValueError, match=match):
         body_map(distances)
     with pytest.raises(ValueError, match=match):
         clusters_of(distances)
 
 
-def test_words_and_numbers_that_are_none_are_refused() -> None:
+def test_words_and_numbers_that_are_none_are_refused():
     with pytest.raises(ValueError, match="mds, umap"):
-        body_map(np.ones((4, 4)), "tsne")  # type: ignore[arg-type]
+        body_map(np.ones((4, 4)), "tsne")
     with pytest.raises(ValueError, match="average"):
-        clusters_of(np.ones((4, 4)), linkage="ward")  # type: ignore[arg-type]
+        clusters_of(np.ones((4, 4)), linkage="ward")
     with pytest.raises(ValueError, match="1 to 4, got 9"):
         clusters_of(np.ones((4, 4)), 9)
     with pytest.raises(ValueError, match="n_resamples: expected at least 0, got -1"):
@@ -97,11 +97,11 @@ def test_words_and_numbers_that_are_none_are_refused() -> None:
 
 
 @pytest.mark.parametrize("linkage", ["average", "complete", "single"])
-def test_clusters_that_were_put_in_are_found_and_stable(linkage: str) -> None:
+def test_clusters_that_were_put_in_are_found_and_stable(linkage):
     points = np.concatenate(
         [blobs(20, [[0, 0, 0]], 0.4), blobs(12, [[9, 0, 0], [0, 9, 0]], 0.4, seed=1)]
     )
-    found = clusters_of(cdist(points, points), linkage=linkage)  # type: ignore[arg-type]
+    found = clusters_of(cdist(points, points), linkage=linkage)
     assert found.labels[:20].tolist() == [0] * 20
     assert sorted(found.labels[20:].tolist()) == [1] * 12 + [2] * 12
     assert np.ptp(found.labels[20:32]) == np.ptp(found.labels[32:]) == 0
@@ -111,13 +111,13 @@ def test_clusters_that_were_put_in_are_found_and_stable(linkage: str) -> None:
         assert np.allclose(points[middle], own[cdist(own, own).sum(axis=1).argmin()])
 
 
-def test_bodies_that_are_alike_are_one_cluster() -> None:
+def test_bodies_that_are_alike_are_one_cluster():
     for apart in (0.0, 1.0):  # all of them, or each from each other by the same
         for n in (3, 4, 6):
             assert clusters_of(apart * (np.ones((n, n)) - np.eye(n))).labels.tolist() == [0] * n
 
 
-def test_clusters_of_one_cloud_are_told_unstable() -> None:
+def test_clusters_of_one_cloud_are_told_unstable():
     random = np.random.default_rng(3)
     found = []
     for _ in range(5):
@@ -127,7 +127,7 @@ def test_clusters_of_one_cloud_are_told_unstable() -> None:
     assert np.mean(np.array(found) >= STABLE) < 0.05
 
 
-def test_a_body_alone_has_no_stability() -> None:
+def test_a_body_alone_has_no_stability():
     """A cluster of one body has stability NaN; under 70 % of chance clusters of two bodies count as stable."""
     points = np.concatenate([blobs(20, [[0, 0, 0]], 0.4), [[50.0, 0, 0]]])
     assert np.isnan(clusters_of(cdist(points, points), 2).stability[1])
@@ -142,7 +142,7 @@ def test_a_body_alone_has_no_stability() -> None:
     assert np.mean(pairs) < 0.7
 
 
-def test_stability_is_the_mean_largest_jaccard_index_of_halves() -> None:
+def test_stability_is_the_mean_largest_jaccard_index_of_halves():
     """Against a loop over sets, on the same halves."""
     from scipy.cluster.hierarchy import fcluster, linkage
     from scipy.spatial.distance import pdist
@@ -150,7 +150,7 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves() -> None:
     points = np.random.default_rng(4).normal(size=(30, 2)) * [4, 1]
     found = clusters_of(cdist(points, points), 3, n_resamples=20, seed=5)
     first = [set(np.flatnonzero(found.labels == one).tolist()) for one in range(3)]
-    # type: ignore[var-annotated]
+
     random = np.random.default_rng(5)
     shares = [[], [], []]
     for _ in range(20):
@@ -163,6 +163,6 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves() -> None:
     assert found.stability == pytest.approx([np.mean(of) for of in shares])
 
 
-def test_too_few_bodies_have_no_stability() -> None:
+def test_too_few_bodies_have_no_stability():
     points = np.random.default_rng(6).normal(size=(4, 2))
     assert np.isnan(clusters_of(cdist(points, points), 3).stability).all()

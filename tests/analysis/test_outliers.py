@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -24,23 +22,23 @@ def usual(seed: int = 0) -> np.ndarray:
 
 
 def found_of(vectors: np.ndarray, **given: object) -> list:
-    return outliers(squared_distances(vectors) ** 0.5, LABELS, **given)  # type: ignore[arg-type]
+    return outliers(squared_distances(vectors) ** 0.5, LABELS, **given)
 
 
-def test_what_is_usual_is_no_outlier() -> None:
+def test_what_is_usual_is_no_outlier():
     found = [one for seed in range(20) for one in found_of(usual(seed))]
     assert np.mean([one.is_outlier for one in found]) < 0.02
     assert {one.nearer_class for one in found} == {None}
 
 
-def test_a_body_alone_in_its_class_is_told_not_to_be_judged() -> None:
+def test_a_body_alone_in_its_class_is_told_not_to_be_judged():
     found = outliers(squared_distances(usual()) ** 0.5, ["alone", *LABELS[1:]])
     assert [
         one.label for one in found if one.reason == "shape not assessed: the only body of its class"
     ] == ["alone"]
 
 
-def test_a_body_of_another_shape_comes_first() -> None:
+def test_a_body_of_another_shape_comes_first():
     vectors = usual()
     vectors[3, 0] += 14
     first = found_of(vectors)[0]
@@ -49,7 +47,7 @@ def test_a_body_of_another_shape_comes_first() -> None:
 
 
 @pytest.mark.parametrize(("n", "n_odd"), [(10, 1), (11, 1), (12, 1), (20, 1), (40, 2)])
-def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n: int, n_odd: int) -> None:
+def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n, n_odd):
     """Thirty standard deviations off: an odd body is left out of what is taken to be a tail."""
     random = np.random.default_rng(n)
     points = random.normal(size=(n, 4))
@@ -60,9 +58,7 @@ def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n: int, n_odd: 
 
 
 @pytest.mark.parametrize(("n_subjects", "n_organs"), [(10, 5), (14, 5), (10, 20)])
-def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(
-    n_subjects: int, n_organs: int
-) -> None:
+def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(n_subjects, n_organs):
     """All lengths of one subject are doubled; the bodies of one subject must not be taken for a tail."""
     random = np.random.default_rng(n_subjects)
     n = n_subjects * n_organs
@@ -82,7 +78,7 @@ def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(
     assert len(odd) <= n_organs + 0.05 * n
 
 
-def test_a_wrong_label_is_told() -> None:
+def test_a_wrong_label_is_told():
     vectors = usual()
     vectors[20] = vectors[:12].mean(axis=0)
     first = found_of(vectors)[0]
@@ -104,7 +100,7 @@ def test_a_wrong_label_is_told() -> None:
         ("cut", 9.0, "its last slice is as large as those before it"),
     ],
 )
-def test_each_measure_is_a_reason(name: str, value: float, told: str) -> None:
+def test_each_measure_is_a_reason(name, value, told):
     values = (
         0.01 * np.random.default_rng(1).normal(size=24)
         if name in ("volume", "spacing")
@@ -116,7 +112,7 @@ def test_each_measure_is_a_reason(name: str, value: float, told: str) -> None:
     assert told in first.reason
 
 
-def test_a_leak_lies_in_another_class() -> None:
+def test_a_leak_lies_in_another_class():
     overlap = np.zeros((24, 24))
     overlap[2, 20] = 0.08
     first, second = found_of(usual(), measures={"overlap": overlap})[:2]
@@ -124,7 +120,7 @@ def test_a_leak_lies_in_another_class() -> None:
     assert second.scores["overlap"] == 0
 
 
-def test_of_a_pair_the_odd_one_is_found() -> None:
+def test_of_a_pair_the_odd_one_is_found():
     labels = ["left and right"] * 2 + [f"pair {i // 2}" for i in range(22)]
     handles = np.zeros(24)
     handles[1] = 2
@@ -134,7 +130,7 @@ def test_of_a_pair_the_odd_one_is_found() -> None:
     assert scores[1] > LIMIT
 
 
-def test_a_coarse_single_body_is_found_beside_a_class_of_finer_ones() -> None:
+def test_a_coarse_single_body_is_found_beside_a_class_of_finer_ones():
     """A third of all bodies is finer; a class of one that is coarse is odd all the same."""
     labels = ["fine"] * 8 + [f"single {i}" for i in range(16)]
     spacing = np.log(np.repeat([1.0, 3.0], [8, 16]))
@@ -142,14 +138,14 @@ def test_a_coarse_single_body_is_found_beside_a_class_of_finer_ones() -> None:
     assert outliers(squared_distances(usual()) ** 0.5, labels, {"spacing": spacing})[0].body == 20
 
 
-def test_a_repair_that_few_needed_is_a_reason() -> None:
+def test_a_repair_that_few_needed_is_a_reason():
     notes = [["smoothed 3 times"]] * 24
     notes[7] = ["smoothed 4 times", "dropped 1 piece apart of 40 voxels, 0.5% of the label"]
     first = found_of(usual(), notes=notes)[0]
     assert (first.body, "dropped 1 piece apart" in first.reason) == (7, True)
 
 
-def test_what_is_repaired_in_labels_is_measured_in_their_voxels() -> None:
+def test_what_is_repaired_in_labels_is_measured_in_their_voxels():
     notes = [["smoothed 3 times"]] * 24
     notes[7] = ["dropped 1 small piece apart of 9 voxels, 0.1% of the label"]
     stray = np.where(np.arange(24) == 7, 0.001**0.5, 0.0)
@@ -159,7 +155,7 @@ def test_what_is_repaired_in_labels_is_measured_in_their_voxels() -> None:
     assert scores[7]["repairs"] == 0 < scores[7]["stray"]
 
 
-def test_classes_of_one_and_measures_that_are_missing_are_borne() -> None:
+def test_classes_of_one_and_measures_that_are_missing_are_borne():
     labels = ["alone", *LABELS[1:]]
     volume = np.full(24, np.nan)
     found = outliers(squared_distances(usual()) ** 0.5, labels, {"volume": volume})
@@ -167,7 +163,7 @@ def test_classes_of_one_and_measures_that_are_missing_are_borne() -> None:
     assert {one.score for one in found if one.label == "alone"} == {0.0}
 
 
-def test_the_flat_share_is_that_of_the_flat_sides() -> None:
+def test_the_flat_share_is_that_of_the_flat_sides():
     box = trimesh.creation.box([1, 1, 2])
     for _ in range(4):
         box = box.subdivide()
@@ -176,7 +172,7 @@ def test_the_flat_share_is_that_of_the_flat_sides() -> None:
     assert flat_share(as_mesh(ball)) < 0.03
 
 
-def test_measures_are_those_of_the_meshes(tmp_path: object) -> None:
+def test_measures_are_those_of_the_meshes(tmp_path):
     path = f"{tmp_path}/torus.off"
     torus = trimesh.creation.torus(2.0, 0.7, major_sections=48, minor_sections=24)
     torus.export(path)
@@ -193,7 +189,7 @@ def test_measures_are_those_of_the_meshes(tmp_path: object) -> None:
     assert all(np.isnan(values[1]) for values in measures.values())
 
 
-def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path: Path) -> None:
+def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path):
     """Which its surface hides: a ball has as many faces on a grid that is twice as coarse."""
     nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     for name, side in (("fine", 1.0), ("coarse", 2.0)):
@@ -209,7 +205,7 @@ def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path: Path) -> Non
     assert np.exp(spacing) == pytest.approx([1, 2], rel=0.01)
 
 
-def test_labels_are_measured_in_their_grid(tmp_path: Path) -> None:
+def test_labels_are_measured_in_their_grid(tmp_path):
     """Two balls that share a cap, one cut by a plane, one by the border of the volume, one with an island."""
     nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     x, y, z = np.indices((60, 40, 40))
@@ -243,7 +239,7 @@ def test_labels_are_measured_in_their_grid(tmp_path: Path) -> None:
     assert found["cut"][2] > 3 * max(found["cut"][[0, 1, 3]])
 
 
-def test_labels_of_other_subjects_in_the_same_standard_space_do_not_overlap(tmp_path: Path) -> None:
+def test_labels_of_other_subjects_in_the_same_standard_space_do_not_overlap(tmp_path):
     """A file for each subject, all on the grid of an atlas: the ball of one lies in the block of the other."""
     nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     x, y, z = np.indices((40, 24, 24))
@@ -260,9 +256,7 @@ def test_labels_of_other_subjects_in_the_same_standard_space_do_not_overlap(tmp_
     ].any()
 
 
-def test_a_volume_is_read_once_for_all_its_labels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_volume_is_read_once_for_all_its_labels(tmp_path, monkeypatch):
     nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     labels = np.zeros((40, 20, 20), dtype=np.uint8)
     for label, at in ((1, 2), (2, 14), (3, 26)):

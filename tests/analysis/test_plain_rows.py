@@ -1,9 +1,5 @@
 """The rows of plain numbers that stand beside a claim."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -16,9 +12,7 @@ from igps.retrieval import retrieval_scores
 SPHERE = trimesh.creation.icosphere(subdivisions=3)
 
 
-def test_size_alone_tells_small_balls_from_large_ones_and_the_table_says_so(
-    tmp_path: Path,
-) -> None:
+def test_size_alone_tells_small_balls_from_large_ones_and_the_table_says_so(tmp_path):
     bodies = {}
     labels = []
     generator = np.random.default_rng(0)
@@ -40,7 +34,7 @@ def test_size_alone_tells_small_balls_from_large_ones_and_the_table_says_so(
     assert "measures, measures+size find these classes as well as pretrained or better" in table
 
 
-def test_molecules_have_rows_of_composition_and_length(tmp_path: Path) -> None:
+def test_molecules_have_rows_of_composition_and_length(tmp_path):
     pytest.importorskip("gemmi", reason="the extra [molecules]")
     names = {"a": ["ALA", "GLY"] * 6, "b": ["ALA", "GLY"] * 6, "c": ["LEU"] * 12, "d": ["LEU"] * 12}
     for file, residues in names.items():

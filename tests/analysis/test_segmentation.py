@@ -25,33 +25,33 @@ def drilled(radius: float, of_hole: float, half: int = 24) -> np.ndarray:
     return ball(radius, half) & ~((x - y) ** 2 / 2 + z**2 <= of_hole**2)
 
 
-def test_a_ball_has_nothing_apart_no_hole_and_hardly_a_gap() -> None:
+def test_a_ball_has_nothing_apart_no_hole_and_hardly_a_gap():
     whole = ball(20)
     assert stray_root(whole) == cavity_root(whole) == hole_root(whole) == 0
     assert gap_root(whole, ONES) ** 2 < 0.005
 
 
-def test_what_lies_apart_is_counted_whichever_comes_first() -> None:
+def test_what_lies_apart_is_counted_whichever_comes_first():
     large = ball(12, 28)
     small = np.roll(ball(6, 28), -20, axis=0)
     assert stray_root(large | small) ** 2 == pytest.approx(1 / 9, rel=0.05)
 
 
-def test_a_cavity_is_the_ball_that_is_missing() -> None:
+def test_a_cavity_is_the_ball_that_is_missing():
     hollow = ball(20) & ~ball(8)
     assert cavity_root(hollow) ** 2 == pytest.approx(8**3 / (20**3 - 8**3), rel=0.05)
     assert cavity_root(drilled(20, 5)) == 0
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_tunnel_along_an_axis_is_a_hole_in_the_slices_that_go_around_it(axis: int) -> None:
+def test_a_tunnel_along_an_axis_is_a_hole_in_the_slices_that_go_around_it(axis):
     """2 π r² √(R² - r²) of the ball, whose tunnel leaves 4/3 π (R² - r²)^(3/2)."""
     x, y, _ = np.moveaxis(offsets(24), axis + 1, 3)
     mask = np.moveaxis(ball(20) & (x**2 + y**2 > 5**2), 2, axis)
     assert hole_root(mask) ** 2 == pytest.approx(1.5 * 5**2 / (20**2 - 5**2), rel=0.05)
 
 
-def test_a_bowl_has_a_hole_in_slices_and_no_cavity() -> None:
+def test_a_bowl_has_a_hole_in_slices_and_no_cavity():
     """Its hollow is a half ball of half its radius: an eighth of the whole bowl, which lacks that eighth."""
     bowl = ball(20) & ~ball(10) & (offsets(24)[2] <= 0)
     assert hole_root(bowl) ** 2 == pytest.approx(1 / 7, rel=0.05)
@@ -59,14 +59,14 @@ def test_a_bowl_has_a_hole_in_slices_and_no_cavity() -> None:
 
 
 @pytest.mark.parametrize("of_hole", [3, 4, 5])
-def test_a_tunnel_is_a_gap_of_its_volume(of_hole: float) -> None:
+def test_a_tunnel_is_a_gap_of_its_volume(of_hole):
     """A cylinder through the middle takes 4/3 π (R³ - (R² - r²)^(3/2)) from a ball."""
     missing = 20**3 - (20**2 - of_hole**2) ** 1.5
     found = gap_root(drilled(20, of_hole), ONES) ** 2
     assert found == pytest.approx(missing / (20**3 - missing), rel=0.15)
 
 
-def test_a_gap_does_not_depend_on_the_grid_and_not_on_the_unit() -> None:
+def test_a_gap_does_not_depend_on_the_grid_and_not_on_the_unit():
     mask = drilled(20, 5)
     usual = gap_root(mask, ONES)
     assert gap_root(mask, 3 * ONES) == pytest.approx(usual)
@@ -76,7 +76,7 @@ def test_a_gap_does_not_depend_on_the_grid_and_not_on_the_unit() -> None:
     )  # put on a coarser grid
 
 
-def test_a_cut_shows_unless_the_border_of_the_volume_made_it() -> None:
+def test_a_cut_shows_unless_the_border_of_the_volume_made_it():
     half = ball(20, 20)[:, :, :26]
     inside = np.zeros((3, 2), dtype=bool)
     at_border = np.zeros((3, 2), dtype=bool)

@@ -1,7 +1,5 @@
 """Corresponding points are superposed by the part that moves as one, whatever the others do."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from igps.analysis.superposition import superposition
 
 
-def test_the_largest_rigid_part_is_superposed() -> None:
+def test_the_largest_rigid_part_is_superposed():
     """Of 100 points, 60 move as one, and 40 by another motion."""
     random = np.random.default_rng(0)
     points = random.normal(size=(100, 3))
@@ -26,7 +24,7 @@ def test_the_largest_rigid_part_is_superposed() -> None:
     assert found.distances[~away].max() < 1e-4
 
 
-def test_equal_errors_of_all_points_are_those_of_least_squares() -> None:
+def test_equal_errors_of_all_points_are_those_of_least_squares():
     random = np.random.default_rng(1)
     points = random.normal(size=(50, 3))
     others = points + 0.01 * random.normal(size=(50, 3))

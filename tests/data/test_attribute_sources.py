@@ -29,7 +29,7 @@ from igps.fields.molecules.residue_attributes import ResidueAttribute
 from igps.fields.volumes.image_attribute import ImageAttribute
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
-from igps.mesh.options import BodyKind, LoadOptions
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
@@ -81,15 +81,13 @@ def body(tmp_path: Path) -> BodyRef:
     ("suffix", "write"),
     [(".nii.gz", write_nifti), (".nii", write_nifti), (".nrrd", write_itk), (".mha", write_itk)],
 )
-def test_an_image_gives_a_linear_function_wherever_it_lies(
-    body: BodyRef, suffix: str, write: Callable[[Path, np.ndarray], None]
-) -> None:
+def test_an_image_gives_a_linear_function_wherever_it_lies(body, suffix, write):
     write(body.path.with_name(f"egg{suffix}"), image())
     source = attribute_source(f"{{stem}}{suffix}")
     np.testing.assert_allclose(source(body, INSIDE), linear(INSIDE), atol=1e-5)
 
 
-def test_an_image_may_have_the_whole_name_of_the_body(tmp_path: Path) -> None:
+def test_an_image_may_have_the_whole_name_of_the_body(tmp_path):
     (tmp_path / "ct").mkdir()
     write_nifti(tmp_path / "ct" / "egg.nii.gz", image())
     source = attribute_source("ct/{file}", tmp_path)
@@ -99,7 +97,7 @@ def test_an_image_may_have_the_whole_name_of_the_body(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".dx", ".mrc"])
-def test_a_grid_gives_a_linear_function(body: BodyRef, suffix: str) -> None:
+def test_a_grid_gives_a_linear_function(body, suffix):
     grids = pytest.importorskip("gridData")
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
     delta = np.array([0.5, 0.25, 0.5])
@@ -112,7 +110,7 @@ def test_a_grid_gives_a_linear_function(body: BodyRef, suffix: str) -> None:
     )
 
 
-def test_axes_of_a_map_in_another_order_are_put_right(body: BodyRef) -> None:
+def test_axes_of_a_map_in_another_order_are_put_right(body):
     mrcfile = pytest.importorskip("mrcfile")
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
     delta = np.array([0.5, 0.25, 0.5])
@@ -130,7 +128,7 @@ def test_axes_of_a_map_in_another_order_are_put_right(body: BodyRef) -> None:
 
 
 @pytest.mark.parametrize("told", ["origin", "start", "both"])
-def test_a_map_is_placed_by_its_origin_or_else_by_its_start(told: str, body: BodyRef) -> None:
+def test_a_map_is_placed_by_its_origin_or_else_by_its_start(told, body):
     """If both are given, only the origin counts, as in Chimera, EMAN and IMP. The oracle is a linear function."""
     mrcfile = pytest.importorskip("mrcfile")
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
@@ -152,9 +150,7 @@ def test_a_map_is_placed_by_its_origin_or_else_by_its_start(told: str, body: Bod
         (np.ones((9, 9, 9), np.complex64), 0.5, "complex numbers"),
     ],
 )
-def test_a_map_of_no_use_is_refused(
-    values: np.ndarray, size: float, message: str, body: BodyRef
-) -> None:
+def test_a_map_of_no_use_is_refused(values, size, message, body):
     mrcfile = pytest.importorskip("mrcfile")
     with mrcfile.new(body.path.with_name("a.mrc")) as file:
         file.set_data(values)
@@ -165,7 +161,7 @@ def test_a_map_of_no_use_is_refused(
         attribute_source("a.mrc")(body, INSIDE)
 
 
-def test_a_map_that_was_cut_short_is_to_be_exported_again(body: BodyRef) -> None:
+def test_a_map_that_was_cut_short_is_to_be_exported_again(body):
     mrcfile = pytest.importorskip("mrcfile")
     path = body.path.with_name("a.mrc")
     with mrcfile.new(path) as file:
@@ -234,9 +230,7 @@ def write_freesurfer(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> N
         ("lh.thickness", write_freesurfer),
     ],
 )
-def test_values_at_vertices_give_the_same_linear_function_inside(
-    body: BodyRef, name: str, write: Callable[[Path, trimesh.Trimesh, np.ndarray], None]
-) -> None:
+def test_values_at_vertices_give_the_same_linear_function_inside(body, name, write):
     mesh = trimesh.load(body.path, process=False)
     write(body.path.with_name(name.partition("#")[0]), mesh, linear(mesh.vertices))
     values = VertexAttribute(name)(body, INSIDE)
@@ -252,9 +246,7 @@ def test_values_at_vertices_give_the_same_linear_function_inside(
 
 @pytest.mark.filterwarnings("ignore:Unknown extension code")
 @pytest.mark.parametrize("head", [[2, 0, 20], [20], [2, 1, 20], None])
-def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(
-    tmp_path: Path, head: list[int] | None
-) -> None:
+def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path, head):
     """Its origin is in the middle of the image, and its axes are not the world's, unless the file says otherwise."""
     nibabel = pytest.importorskip("nibabel")
     made = nibabel.MGHImage(image().astype(np.float32), AFFINE)
@@ -286,7 +278,7 @@ def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(
     np.testing.assert_allclose(found, linear(INSIDE), atol=1e-4)
 
 
-def test_values_at_vertices_survive_mending(tmp_path: Path) -> None:
+def test_values_at_vertices_survive_mending(tmp_path):
     """A ball with a triangle missing: the hole is closed, and a linear function stays one."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     open_ball = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
@@ -296,9 +288,7 @@ def test_values_at_vertices_survive_mending(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bodies", ["pieces", "objects"])
-def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(
-    bodies: BodyKind, tmp_path: Path
-) -> None:
+def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(bodies, tmp_path):
     """Two balls in one file, whose values jump between them; then values of the second ball alone."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     away = trimesh.Trimesh(ball.vertices + np.array([5, 0, 0]), ball.faces, process=False)
@@ -329,7 +319,7 @@ def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(
         replace(source, path="few.ply#height")(BodyRef(tmp_path / "two.obj", parts[0]), INSIDE)
 
 
-def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:
+def test_values_at_the_vertices_of_a_cavity_count(tmp_path):
     """2 on the cavity, 1 outside; in the wall, mean values by an integral over directions, weighted by 1 / distance."""
     ball = trimesh.creation.icosphere(subdivisions=4)
     pit = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
@@ -371,7 +361,7 @@ def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:
         np.testing.assert_allclose(surface.attributes["heat"], 1.0 + on_cavity, atol=1e-5)
 
 
-def test_tetrahedra_give_a_linear_function_inside_and_nothing_far_outside(body: BodyRef) -> None:
+def test_tetrahedra_give_a_linear_function_inside_and_nothing_far_outside(body):
     meshio = pytest.importorskip("meshio")
     from scipy.spatial import Delaunay
 
@@ -388,9 +378,7 @@ def test_tetrahedra_give_a_linear_function_inside_and_nothing_far_outside(body: 
         source(body, INSIDE + 5)
 
 
-def test_what_is_missing_is_taken_from_beside_and_told_or_refused(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog):
     points = np.arange(40.0)[:, None] * [1, 0, 0]
     values = np.arange(40.0)
     for fill in (np.nan, np.inf, 7e18):
@@ -410,7 +398,7 @@ def test_what_is_missing_is_taken_from_beside_and_told_or_refused(
             fill_missing(given, points, "here")
 
 
-def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body: BodyRef) -> None:
+def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body):
     values = image()
     values[:, :, :8] = 7e18
     values[:10] = np.nan
@@ -426,7 +414,7 @@ def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body: BodyRef)
     assert np.abs(found[known]).max() < 10
 
 
-def test_an_image_of_another_subject_and_a_grid_beside_the_body_are_refused(body: BodyRef) -> None:
+def test_an_image_of_another_subject_and_a_grid_beside_the_body_are_refused(body):
     write_nifti(body.path.with_name("egg.nii"), image())
     with pytest.raises(
         MeshError,
@@ -440,7 +428,7 @@ def test_an_image_of_another_subject_and_a_grid_beside_the_body_are_refused(body
 @pytest.mark.parametrize(
     "suffix", [".nii.gz", ".nrrd", ".dx", ".mrc", ".ply", ".vtk", ".vtu", ".gii", ".thickness"]
 )
-def test_files_cut_short_are_one_sentence(body: BodyRef, suffix: str) -> None:
+def test_files_cut_short_are_one_sentence(body, suffix):
     path = body.path.with_name(f"a{suffix}")
     mesh = trimesh.load(body.path, process=False)
     if suffix == ".nii.gz":
@@ -462,7 +450,7 @@ def test_files_cut_short_are_one_sentence(body: BodyRef, suffix: str) -> None:
             attribute_source(path.name)(body, INSIDE)
 
 
-def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path: Path) -> None:
+def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path):
     write_body(tmp_path / "root" / "ball" / "one.scan.off", 1, 1)
     body = BodyRef(tmp_path / "root" / "ball" / "one.scan.off", "../../x")
     for place in ("images/one.nii", "ct/ball/one.scan.off.nii", "ball/x.nii"):
@@ -492,7 +480,7 @@ def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path: Path) -> Non
         file("none.nii")
 
 
-def test_a_body_that_is_a_link_has_the_attribute_of_its_own_name(tmp_path: Path) -> None:
+def test_a_body_that_is_a_link_has_the_attribute_of_its_own_name(tmp_path):
     """As git-annex keeps files: all in one store, under other names; and folders that are links."""
     write_body(tmp_path / "root" / "store" / "KEY.off", 1, 1)
     for name in ("cat", "dog"):
@@ -518,9 +506,7 @@ def test_a_body_that_is_a_link_has_the_attribute_of_its_own_name(tmp_path: Path)
     ("suffix", "content"),
     [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12)), ("nrrd", b"x")],
 )
-def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(
-    body: BodyRef, suffix: str, content: bytes
-) -> None:
+def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(body, suffix, content):
     body.path.with_suffix(f".{suffix}").write_bytes(content)
     with pytest.raises(MeshError) as error:
         attribute_source(f"{{stem}}.{suffix}")(body, INSIDE)
@@ -530,7 +516,7 @@ def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(
 
 
 @pytest.mark.parametrize("is_absolute", [False, True])
-def test_images_among_bodies_are_no_bodies(tmp_path: Path, is_absolute: bool) -> None:
+def test_images_among_bodies_are_no_bodies(tmp_path, is_absolute):
     for name in ("ball", "cube"):
         (tmp_path / name).mkdir()
         trimesh.creation.icosphere(subdivisions=1).export(tmp_path / name / "x.off")
@@ -542,7 +528,7 @@ def test_images_among_bodies_are_no_bodies(tmp_path: Path, is_absolute: bool) ->
     dataset = SignatureDataset(tmp_path, cache_dir=tmp_path / ".cache", attributes={"ct": images})
     assert dataset.bodies.names == ("ball/x.off", "cube/x.off")
     assert dataset.classes == ("ball", "cube")
-    files = [images.file(body)[0] for body in dataset.bodies]  # type: ignore[attr-defined]
+    files = [images.file(body)[0] for body in dataset.bodies]
     assert files == [tmp_path / "ct" / name / "x.off.nii.gz" for name in ("ball", "cube")]
     # What is itself a body's file stays one.
     own = {"thickness": attribute_source("{file}#thickness", tmp_path / "ball")}
@@ -551,7 +537,7 @@ def test_images_among_bodies_are_no_bodies(tmp_path: Path, is_absolute: bool) ->
     ).bodies.names == ("x.off",)
 
 
-def test_words_of_the_command_line_become_sources() -> None:
+def test_words_of_the_command_line_become_sources():
     found = attribute_sources(
         ["ct=a/{stem}.nii.gz", "q=charge", "t={file}#t", "e=a.vtu"], Path("root")
     )
@@ -574,15 +560,15 @@ def test_words_of_the_command_line_become_sources() -> None:
 
 
 def test_an_image_is_added_to_a_cached_collection_without_eigenpairs_and_again_when_it_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     for name in ("one", "two"):
         write_body(tmp_path / "bodies" / f"{name}.off", 1.1, 1.3)
         write_nifti(tmp_path / "bodies" / f"{name}.nii.gz", image())
 
     def dataset(**options: object) -> SignatureDataset:
         files = [tmp_path / "bodies" / f"{name}.off" for name in ("one", "two")]
-        return SignatureDataset(files, CONFIG, tmp_path / "cache", **options)  # type: ignore[arg-type]
+        return SignatureDataset(files, CONFIG, tmp_path / "cache", **options)
 
     dataset().precompute(n_workers=1, progress=False)
     monkeypatch.setattr(
@@ -607,7 +593,7 @@ def test_an_image_is_added_to_a_cached_collection_without_eigenpairs_and_again_w
     np.testing.assert_allclose(found.attributes["ct"], linear(found.points) + 1, atol=1e-5)
 
 
-def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path: Path) -> None:
+def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path):
     pytest.importorskip("gemmi")
     line = "ATOM  {:5d} {:<4} {:3} {}{:4d}    {:8.3f}{:8.3f}{:8.3f}  1.00 {:5.2f}           {}\n"
     rows = [("N", 0.0, 1.4), ("CA", 0.0, 0.0), ("C", 1.5, 0.0), ("O", 2.0, 1.0)]
@@ -652,9 +638,7 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "name", ["ct.mha", "header.mhd"]
 )  # the latter has its voxels in another file
-def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(
-    name: str, tmp_path: Path
-) -> None:
+def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(name, tmp_path):
     itk = pytest.importorskip("SimpleITK")
     for value in (1.0, 2.0):
         itk.WriteImage(itk.GetImageFromArray(np.full((9, 9, 9), value)), str(tmp_path / name))
@@ -663,9 +647,7 @@ def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(
         np.testing.assert_allclose(found, value)
 
 
-def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(
-    tmp_path: Path,
-) -> None:
+def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(tmp_path):
     pytest.importorskip("gemmi")
     body = BodyRef(tmp_path / "one.pdb", "chain A")
     for name, charge in (("ASP", -1.0), ("LYS", 1.0)):
@@ -676,9 +658,7 @@ def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(
         np.testing.assert_allclose(ResidueAttribute("charge")(body, np.zeros((1, 3))), charge)
 
 
-def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_words(
-    tmp_path: Path,
-) -> None:
+def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_words(tmp_path):
     pytest.importorskip("gemmi")
     atom = "ATOM      1  P    DA A   1       2.000   3.000   4.000  1.00 20.00           P\n"
     (tmp_path / "dna.pdb").write_text(atom)
@@ -691,7 +671,7 @@ def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_w
         ResidueAttribute("hydropathy")(body, INSIDE)
 
 
-def test_names_of_blocks_do_not_tell_what_a_body_is(tmp_path: Path) -> None:
+def test_names_of_blocks_do_not_tell_what_a_body_is(tmp_path):
     pytest.importorskip("gemmi")
     columns = "id type_symbol label_atom_id label_alt_id label_comp_id label_asym_id auth_seq_id"
     places = ("Cartn_x", "Cartn_y", "Cartn_z", "pdbx_PDB_model_num")
@@ -719,9 +699,7 @@ def with_functions(folder: Path, **functions: Callable[..., np.ndarray]) -> Sign
 
 
 @pytest.mark.parametrize("tag", [None, "stem and height 1"])
-def test_a_function_of_body_and_points_gives_an_attribute(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tag: str | None
-) -> None:
+def test_a_function_of_body_and_points_gives_an_attribute(tmp_path, monkeypatch, tag):
     """Two copies of one file, which their names tell apart."""
     if tag is not None:
         monkeypatch.setattr(stem_and_height, "cache_tag", tag, raising=False)
@@ -738,7 +716,7 @@ def test_a_function_of_body_and_points_gives_an_attribute(
 
 
 @pytest.mark.parametrize("takes_body", [True, False])
-def test_values_of_a_function_are_cached_under_its_tag(tmp_path: Path, takes_body: bool) -> None:
+def test_values_of_a_function_are_cached_under_its_tag(tmp_path, takes_body):
     write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
     calls: list[int] = []
 
@@ -754,13 +732,13 @@ def test_values_of_a_function_are_cached_under_its_tag(tmp_path: Path, takes_bod
         list(with_functions(tmp_path, along=function))
     assert len(calls) == 4
     calls.clear()
-    function.cache_tag = "along 1"  # type: ignore[attr-defined]
+    function.cache_tag = "along 1"
     for _ in range(2):
         dataset = with_functions(tmp_path, along=function)
         list(dataset)
     assert len(calls) == 1
     first = dataset.cached_keys()
-    function.cache_tag = "along 2"  # type: ignore[attr-defined]
+    function.cache_tag = "along 2"
     dataset = with_functions(tmp_path, along=function)
     list(dataset)
     assert len(calls) == 2
@@ -769,17 +747,17 @@ def test_values_of_a_function_are_cached_under_its_tag(tmp_path: Path, takes_bod
 
 
 @pytest.mark.parametrize("tag", ["", 1])
-def test_a_tag_that_is_no_text_is_refused(tmp_path: Path, tag: object) -> None:
+def test_a_tag_that_is_no_text_is_refused(tmp_path, tag):
     def height(points: np.ndarray) -> np.ndarray:
         return points[:, 2]
 
-    height.cache_tag = tag  # type: ignore[attr-defined]
+    height.cache_tag = tag
     write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
     with pytest.raises(ValueError, match="expected a text, or a method, as cache_tag of height"):
         with_functions(tmp_path, height=height)
 
 
-def test_a_body_of_all_models_has_the_residues_of_all(tmp_path: Path) -> None:
+def test_a_body_of_all_models_has_the_residues_of_all(tmp_path):
     pytest.importorskip("gemmi")
     atom = "ATOM      1  CA  {} A   1    {:8.3f}   0.000   0.000  1.00 20.00           C"
     lines = [("MODEL        1", "LYS", 0.0), ("MODEL        2", "ASP", 60.0)]

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import FrozenInstanceError, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,7 +49,7 @@ def centred(signature: Signature, room: str) -> np.ndarray:
     return points - points.mean(axis=0)
 
 
-def test_bodies_are_the_signatures_without_padding(signatures: list[Signature]) -> None:
+def test_bodies_are_the_signatures_without_padding(signatures):
     batch = collate(signatures)
     assert batch.eigenvalues.shape == (3, 8)
     assert batch.interior.points.shape == (3, 15, 3)
@@ -71,7 +69,7 @@ def test_bodies_are_the_signatures_without_padding(signatures: list[Signature]) 
                 np.testing.assert_array_equal(found.attributes[name], values)
 
 
-def test_padding_is_marked(signatures: list[Signature]) -> None:
+def test_padding_is_marked(signatures):
     batch = collate(signatures)
     assert batch.interior.mask.sum(dim=1).tolist() == [12, 7, 15]
     assert torch.isfinite(batch.eigenvalues).sum(dim=1).tolist() == [5, 8, 3]
@@ -81,10 +79,10 @@ def test_padding_is_marked(signatures: list[Signature]) -> None:
             assert (values[~part.mask] == 0).all()
 
 
-def test_collate_pads_without_changing_any_description(signatures: list[Signature]) -> None:
+def test_collate_pads_without_changing_any_description(signatures):
     batch = collate(signatures)
     for kind in ("interior", "surface"):
-        histogram = PairHistogram(samples=kind)  # type: ignore[arg-type]
+        histogram = PairHistogram(samples=kind)
         together = histogram(batch)
         alone = torch.cat([histogram(collate([signature])) for signature in signatures])
         assert together.shape == (3, 10, 64)
@@ -92,7 +90,7 @@ def test_collate_pads_without_changing_any_description(signatures: list[Signatur
         torch.testing.assert_close(together.sum(dim=(1, 2)), torch.ones(3))
 
 
-def test_labels_and_names(signatures: list[Signature]) -> None:
+def test_labels_and_names(signatures):
     items = [
         LabelledSignature(signatures[0], 4, "a"),
         LabelledSignature(signatures[2], 0, "b"),
@@ -104,7 +102,7 @@ def test_labels_and_names(signatures: list[Signature]) -> None:
     assert len(batch) == 3
 
 
-def test_meshes_go_with_their_bodies(signatures: list[Signature]) -> None:
+def test_meshes_go_with_their_bodies(signatures):
     box = trimesh.creation.box()
     meshes = [
         Mesh(np.asarray(box.vertices) * s, np.asarray(box.faces), name=str(s))
@@ -122,7 +120,7 @@ def test_meshes_go_with_their_bodies(signatures: list[Signature]) -> None:
         collate(signatures, meshes[:2])
 
 
-def test_points_are_centred_before_they_lose_digits() -> None:
+def test_points_are_centred_before_they_lose_digits():
     generator = np.random.default_rng(1)
     near = samples(generator, 20, 2)
     far = replace(near, points=near.points + 1e6)
@@ -134,7 +132,7 @@ def test_points_are_centred_before_they_lose_digits() -> None:
     np.testing.assert_allclose(batch.interior.points.mean(dim=1), 0, atol=1e-6)
 
 
-def test_nothing_and_unlike_attributes_are_refused(signatures: list[Signature]) -> None:
+def test_nothing_and_unlike_attributes_are_refused(signatures):
     with pytest.raises(ValueError, match="at least one"):
         collate([])
     bare = replace(signatures[0].interior, attributes={})
@@ -154,7 +152,7 @@ def of_samples(batch: SampleBatch, i: int) -> set[tuple[float, ...]]:
 
 
 @pytest.mark.parametrize("seed", [None, 0])
-def test_subset_takes_real_samples_each_once(signatures: list[Signature], seed: int | None) -> None:
+def test_subset_takes_real_samples_each_once(signatures, seed):
     batch = collate(signatures).interior
     some = batch.subset(10, seed)
     assert some.mask.sum(dim=1).tolist() == [10, 7, 10]
@@ -170,7 +168,7 @@ def test_subset_takes_real_samples_each_once(signatures: list[Signature], seed: 
     assert (some.eigenfunctions[~some.mask] == 0).all()
 
 
-def test_subset_with_a_seed_depends_on_nothing_but_the_shape(signatures: list[Signature]) -> None:
+def test_subset_with_a_seed_depends_on_nothing_but_the_shape(signatures):
     together = collate(signatures).interior.subset(6, seed=3)
     for i, signature in enumerate(signatures):
         single = collate([signature]).interior.subset(6, seed=3)
@@ -215,9 +213,7 @@ def equal(one: SignatureBatch, other: SignatureBatch) -> bool:
         (slice(0, 0), []),
     ],
 )
-def test_some_shapes_of_a_batch_are_the_batch_of_them(
-    signatures: list[Signature], index: slice | list[int] | torch.Tensor, chosen: list[int]
-) -> None:
+def test_some_shapes_of_a_batch_are_the_batch_of_them(signatures, index, chosen):
     items = [
         LabelledSignature(signature, 4 - i, f"number {i}") for i, signature in enumerate(signatures)
     ]
@@ -226,10 +222,10 @@ def test_some_shapes_of_a_batch_are_the_batch_of_them(
     assert not chosen or equal(some, collate([items[i] for i in chosen]))
 
 
-def test_one_shape_of_a_batch_is_a_body(signatures: list[Signature]) -> None:
+def test_one_shape_of_a_batch_is_a_body(signatures):
     batch = collate(signatures)
     numbers = (0, -1, np.int64(1), torch.tensor(2), np.array(0))
-    assert [batch[i].id for i in numbers] == ["body 0", "body 2", "body 1", "body 2", "body 0"]  # type: ignore[index]
+    assert [batch[i].id for i in numbers] == ["body 0", "body 2", "body 1", "body 2", "body 0"]
     np.testing.assert_array_equal(batch[2].eigenvalues, signatures[2].eigenvalues)
     assert [body.id for body in batch.bodies()] == list(batch.ids)
     with pytest.raises(IndexError):
@@ -239,14 +235,14 @@ def test_one_shape_of_a_batch_is_a_body(signatures: list[Signature]) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:Trying to infer the `batch_size`")
-def test_lightning_finds_the_size_of_a_batch(signatures: list[Signature]) -> None:
+def test_lightning_finds_the_size_of_a_batch(signatures):
     """For `self.log` in a LightningModule of one's own."""
     from pytorch_lightning.utilities.data import extract_batch_size
 
     assert extract_batch_size(collate(signatures)) == len(signatures)
 
 
-def test_batches_are_joined_and_cut_again(signatures: list[Signature]) -> None:
+def test_batches_are_joined_and_cut_again(signatures):
     first = collate(signatures[:1])
     second = collate(signatures[1:])
     joined = SignatureBatch.concatenate([first, second])
@@ -257,7 +253,7 @@ def test_batches_are_joined_and_cut_again(signatures: list[Signature]) -> None:
     assert equal(joined[1:], second)
 
 
-def test_batches_that_do_not_fit_are_not_joined(signatures: list[Signature]) -> None:
+def test_batches_that_do_not_fit_are_not_joined(signatures):
     box = trimesh.creation.box()
     mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
     with_mesh = collate(signatures[:1], [mesh])
@@ -285,9 +281,7 @@ class Several(Dataset[Signature]):
         return self.signatures[index]
 
 
-def test_workers_give_the_batches_of_this_process_in_one_piece_of_memory(
-    signatures: list[Signature],
-) -> None:
+def test_workers_give_the_batches_of_this_process_in_one_piece_of_memory(signatures):
     """Of like shapes, which are written as they are, and of others, which are padded in every dimension."""
     (batch,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate)
     expected = collate(signatures)
@@ -308,24 +302,20 @@ def test_workers_give_the_batches_of_this_process_in_one_piece_of_memory(
     batch.interior.points.zero_()  # writable, as any batch is
 
 
-def test_a_batch_is_fixed(signatures: list[Signature]) -> None:
+def test_a_batch_is_fixed(signatures):
     batch = collate(signatures)
     with pytest.raises(FrozenInstanceError):
-        batch.area = batch.area.double()  # type: ignore[misc]
+        batch.area = batch.area.double()
 
 
-def test_a_batch_is_saved_and_loaded_without_trust(
-    signatures: list[Signature], tmp_path: Path
-) -> None:
+def test_a_batch_is_saved_and_loaded_without_trust(signatures, tmp_path):
     torch.save(collate(signatures), tmp_path / "batch.pt")
     with torch.serialization.safe_globals([SampleBatch, SignatureBatch]):
         loaded = torch.load(tmp_path / "batch.pt", weights_only=True)
     assert equal(loaded, collate(signatures))
 
 
-def test_a_worker_takes_memory_again_only_when_its_batch_is_gone(
-    signatures: list[Signature],
-) -> None:
+def test_a_worker_takes_memory_again_only_when_its_batch_is_gone(signatures):
     """Batches of other sizes, kept, dropped, or in part kept, hold what this process makes of the same bodies."""
     order = [[0, 1], [2], [1, 2, 0], [0], [2, 1], [0, 0, 0]] * 6
     expected = [collate([signatures[i] for i in some]) for some in order]
@@ -363,9 +353,7 @@ def numbered(items: list[Signature]) -> SignatureBatch:
 
 
 @pytest.mark.parametrize("make", [thinned, numbered])
-def test_a_worker_hands_over_what_its_user_makes_of_a_batch(
-    signatures: list[Signature], make: Callable[[list[Signature]], SignatureBatch]
-) -> None:
+def test_a_worker_hands_over_what_its_user_makes_of_a_batch(signatures, make):
     loader = DataLoader(Several(signatures), batch_size=2, num_workers=1, collate_fn=make)
     for batch, right in zip(loader, map(make, (signatures[:2], signatures[2:])), strict=True):
         assert equal(batch, right)
@@ -384,7 +372,7 @@ def with_blocks(items: list[Signature]) -> tuple[SignatureBatch, int]:
 @pytest.mark.skipif(
     not hasattr(os, "memfd_create"), reason="only Linux has memory that is a file without a name"
 )
-def test_a_worker_does_not_gather_memory(signatures: list[Signature]) -> None:
+def test_a_worker_does_not_gather_memory(signatures):
     loader = DataLoader(
         Several(signatures * 10),
         batch_size=2,
@@ -396,9 +384,7 @@ def test_a_worker_does_not_gather_memory(signatures: list[Signature]) -> None:
     assert max(n_blocks for _, n_blocks in loader) <= 5
 
 
-def test_numbers_of_samples_take_another_type_and_all_others_stay(
-    signatures: list[Signature],
-) -> None:
+def test_numbers_of_samples_take_another_type_and_all_others_stay(signatures):
     batch = collate(signatures)
     other = batch.to(torch.float16)
     for one, before in ((other.interior, batch.interior), (other.surface, batch.surface)):
@@ -412,7 +398,7 @@ def test_numbers_of_samples_take_another_type_and_all_others_stay(
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_batches_go_to_a_device_and_bodies_come_back(signatures: list[Signature]) -> None:
+def test_batches_go_to_a_device_and_bodies_come_back(signatures):
     (pinned,) = DataLoader(
         Several(signatures), batch_size=3, num_workers=1, collate_fn=collate, pin_memory=True
     )
@@ -431,16 +417,16 @@ def test_batches_go_to_a_device_and_bodies_come_back(signatures: list[Signature]
         )
 
 
-def test_a_batch_tells_in_a_line_what_it_is_and_does_not_unpack_to_two_bodies() -> None:
+def test_a_batch_tells_in_a_line_what_it_is_and_does_not_unpack_to_two_bodies():
     batch = two_bodies()
     assert repr(batch) == (
         "SignatureBatch(2 bodies: a, b; 12 eigenpairs, interior (2, 40), surface (2, 40) samples, 2 classes, cpu)"
     )
     with pytest.raises(TypeError, match="not iterable"):
-        iter(batch)  # type: ignore[call-overload]
+        iter(batch)
 
 
-def test_a_batch_is_a_container_of_tensors_for_pytorch() -> None:
+def test_a_batch_is_a_container_of_tensors_for_pytorch():
     batch = two_bodies()
     doubled = torch.utils._pytree.tree_map(lambda tensor: tensor[1:], batch)
     assert isinstance(doubled, SignatureBatch)

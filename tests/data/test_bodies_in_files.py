@@ -63,7 +63,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     for name in ("each_body", "load_mesh"):
         function = getattr(pipeline_module, name)
 
-        def reading(path, *arguments, function=function, **options):  # type: ignore[no-untyped-def]
+        def reading(path, *arguments, function=function, **options):
             names.append(path.name)
             return function(path, *arguments, **options)
 
@@ -71,7 +71,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def test_bodies_are_found_by_file_and_part(root: Path) -> None:
+def test_bodies_are_found_by_file_and_part(root):
     bodies = find_bodies(root, OBJECTS)
     assert bodies.names == ("1.obj#liver", "1.obj#spleen", "2.obj#liver", "2.obj#spleen")
     assert list(bodies)[1] == bodies[1] == BodyRef(root / "1.obj", "spleen")
@@ -83,7 +83,7 @@ def test_bodies_are_found_by_file_and_part(root: Path) -> None:
     assert given.labels == ("second", "second")
 
 
-def test_the_class_is_the_folder_the_part_or_the_file(root: Path) -> None:
+def test_the_class_is_the_folder_the_part_or_the_file(root):
     assert find_bodies(root, OBJECTS, classes="body").labels == (
         "liver",
         "spleen",
@@ -106,10 +106,10 @@ def test_the_class_is_the_folder_the_part_or_the_file(root: Path) -> None:
     with pytest.raises(
         ValueError, match="classes: expected 'folder', 'body' or 'file', got 'organ'"
     ):
-        find_bodies(root, classes="organ")  # type: ignore[arg-type]
+        find_bodies(root, classes="organ")
 
 
-def test_an_empty_mask_among_organs_costs_no_other_its_class(tmp_path: Path) -> None:
+def test_an_empty_mask_among_organs_costs_no_other_its_class(tmp_path):
     """As TotalSegmentator writes them: a file for each organ, of which some are out of view."""
     nibabel = pytest.importorskip("nibabel")
     for subject, organ, value in (
@@ -130,7 +130,7 @@ def test_an_empty_mask_among_organs_costs_no_other_its_class(tmp_path: Path) -> 
     assert dataset.usable(failures).bodies.labels == ("liver", "liver", "spleen")
 
 
-def test_a_table_names_bodies_and_may_tell_more(root: Path) -> None:
+def test_a_table_names_bodies_and_may_tell_more(root):
     (root / "labels.csv").write_text("file,age,body,label\n2.obj,30,spleen,ill\n1.obj,40,,well\n")
     bodies = find_bodies(root, OBJECTS)
     assert bodies.names == ("2.obj#spleen", "1.obj#liver", "1.obj#spleen")
@@ -142,7 +142,7 @@ def test_a_table_names_bodies_and_may_tell_more(root: Path) -> None:
 
 
 @pytest.mark.parametrize("value", ["", "NA", "n/a", "NaN"])
-def test_a_missing_value_is_none_but_a_class_may_have_its_name(root: Path, value: str) -> None:
+def test_a_missing_value_is_none_but_a_class_may_have_its_name(root, value):
     (root / "labels.csv").write_text(f"file,label,sex\n2.obj,ill,f\n1.obj,well,{value}\n")
     bodies = find_bodies(root)
     assert bodies.columns == {"sex": ("f", None)}
@@ -156,7 +156,7 @@ def test_a_missing_value_is_none_but_a_class_may_have_its_name(root: Path, value
             find_bodies(root)
 
 
-def test_further_columns_stay_with_their_bodies(root: Path, tmp_path: Path) -> None:
+def test_further_columns_stay_with_their_bodies(root, tmp_path):
     table = "file,age,body,label,scanner\n2.obj,30,spleen,ill,A\n1.obj, 41.5 ,,well,\n"
     (root / "labels.csv").write_text(table)
     bodies = find_bodies(root, OBJECTS)
@@ -183,7 +183,7 @@ def test_further_columns_stay_with_their_bodies(root: Path, tmp_path: Path) -> N
     }
 
 
-def test_a_session_is_no_number(root: Path) -> None:
+def test_a_session_is_no_number(root):
     """To Python 01_02 is 102."""
     (root / "labels.csv").write_text("file,session\n1.obj,01_02\n2.obj,03_04\n")
     bodies = find_bodies(root)
@@ -191,7 +191,7 @@ def test_a_session_is_no_number(root: Path) -> None:
         bodies.numbers("session")
 
 
-def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
+def test_a_table_of_columns_alone_tells_no_classes(root):
     (root / "labels.csv").write_text("file,age\n1.obj,30\n2.obj\n")
     bodies = find_bodies(root, OBJECTS)
     assert (bodies.labels, bodies.columns) == (None, {"age": ("30", "30", None, None)})
@@ -207,9 +207,7 @@ def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
     )
 
 
-def test_many_bodies_of_a_file_are_reported_some_at_a_time(
-    tmp_path: Path, reads: list[str]
-) -> None:
+def test_many_bodies_of_a_file_are_reported_some_at_a_time(tmp_path, reads):
     """Of 65 labels of a volume the first 64 are reported before the last is computed, for which it is read again."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     labels = np.zeros((65 * 7, 8, 8), dtype=np.uint8)
@@ -227,15 +225,13 @@ def test_many_bodies_of_a_file_are_reported_some_at_a_time(
     assert len(reads) == 2
 
 
-def test_counts_that_do_not_fit_are_refused() -> None:
+def test_counts_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="names: expected one for each of 1 files, got 2"):
         Bodies((Path("a"),), ("a", "b"))
 
 
 @pytest.mark.parametrize("how", ["at once", "on first touch"])
-def test_each_has_the_signature_of_its_own_surface(
-    root: Path, tmp_path: Path, reads: list[str], how: str
-) -> None:
+def test_each_has_the_signature_of_its_own_surface(root, tmp_path, reads, how):
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", reading=OBJECTS)
     if how == "at once":
         assert dataset.precompute(n_workers=1, progress=False) == []
@@ -256,7 +252,7 @@ def test_each_has_the_signature_of_its_own_surface(
         assert reads == [f"{1 + i // 2}.obj" for i in range(4)]  # for the meshes alone
 
 
-def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path: Path) -> None:
+def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path):
     """Headers that stop the search for what is read beside them; again when the others are known."""
     pytest.importorskip("SimpleITK")
     header = "ObjectType = Image\nNDims = 3\nDimSize = 9 9 9\nElementType = MET_UCHAR\nElementDataFile = .\n"
@@ -279,7 +275,7 @@ def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path: Path) -> None:
         assert dataset.usable(failures)[0].signature.volume == pytest.approx(ball.volume)
 
 
-def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_read_beside_a_file_counts(tmp_path, monkeypatch):
     """Two subjects whose headers are alike, a table of names that is put right, and numbers of a scene beside it."""
     sitk = pytest.importorskip("SimpleITK")
     nibabel = pytest.importorskip("nibabel")
@@ -337,7 +333,7 @@ def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("how", ["here", "by two workers"])
-def test_a_bad_body_costs_no_other_of_its_file(root: Path, tmp_path: Path, how: str) -> None:
+def test_a_bad_body_costs_no_other_of_its_file(root, tmp_path, how):
     write_subject(root / "1.obj", 1.1, "liver")
     (root / "3.obj").write_text("nothing")
     table = "file,body,label\n1.obj,liver,a\n1.obj,spleen,a\n2.obj,liver,b\n2.obj,heart,b\n2.obj,spleen,b\n3.obj,x,c\n"
@@ -345,7 +341,7 @@ def test_a_bad_body_costs_no_other_of_its_file(root: Path, tmp_path: Path, how: 
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", reading=OBJECTS)
     with ThreadPoolExecutor(2) as pool:
         workers = {"n_workers": 1} if how == "here" else {"executor": pool, "n_workers": 2}
-        failures = dataset.precompute(**workers, progress=False)  # type: ignore[arg-type]
+        failures = dataset.precompute(**workers, progress=False)
     assert [failure.id for failure in failures] == ["1.obj#liver", "2.obj#heart", "3.obj#x"]
     assert [failure.path.name for failure in failures] == ["1.obj", "2.obj", "3.obj"]
     for failure, words in zip(
@@ -370,16 +366,14 @@ class Fragile(ThreadPoolExecutor):
         return lost
 
 
-def test_where_a_job_of_several_bodies_is_lost_each_is_tried_alone(
-    root: Path, tmp_path: Path
-) -> None:
+def test_where_a_job_of_several_bodies_is_lost_each_is_tried_alone(root, tmp_path):
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", reading=OBJECTS)
     with Fragile(1) as executor:
         assert dataset.precompute(executor, n_workers=1, progress=False) == []
     assert len(list((tmp_path / "cache" / "signatures").rglob("*.safetensors"))) == 4
 
 
-def test_a_name_that_is_too_long_for_a_file_costs_no_other(tmp_path: Path) -> None:
+def test_a_name_that_is_too_long_for_a_file_costs_no_other(tmp_path):
     trimesh.creation.icosphere(2).export(tmp_path / "a.off")
     (tmp_path / "labels.csv").write_text(f"file,label\na.off,one\n{'x' * 300}.off,one\n")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
@@ -397,7 +391,7 @@ def write_labels(path: Path, *values: int) -> None:
     nibabel.Nifti1Image(labels, np.eye(4)).to_filename(path)
 
 
-def test_a_single_label_among_subjects_with_several_is_named_like_theirs(tmp_path: Path) -> None:
+def test_a_single_label_among_subjects_with_several_is_named_like_theirs(tmp_path):
     write_labels(tmp_path / "a.nii.gz", 1, 2)
     write_labels(tmp_path / "b.nii.gz", 1, 2)
     write_labels(tmp_path / "c.nii.gz", 1)
@@ -407,7 +401,7 @@ def test_a_single_label_among_subjects_with_several_is_named_like_theirs(tmp_pat
     assert load_mesh(tmp_path / "c.nii.gz", part="1").volume == pytest.approx(64, rel=0.01)
 
 
-def test_masks_of_organs_are_named_after_their_files(tmp_path: Path) -> None:
+def test_masks_of_organs_are_named_after_their_files(tmp_path):
     for name in ("liver", "spleen"):
         write_labels(tmp_path / f"{name}.nii.gz", 1)
     write_labels(tmp_path / "all.nii.gz", 1, 2)
@@ -415,7 +409,7 @@ def test_masks_of_organs_are_named_after_their_files(tmp_path: Path) -> None:
     assert names == ("all.nii.gz#1", "all.nii.gz#2", "liver.nii.gz#liver", "spleen.nii.gz#spleen")
 
 
-def test_a_folder_for_each_subject(tmp_path: Path) -> None:
+def test_a_folder_for_each_subject(tmp_path):
     write_labels(tmp_path / "one" / "seg.nii.gz", 1, 2)
     write_labels(tmp_path / "two" / "seg.nii.gz", 1, 2)
     write_labels(tmp_path / "three" / "seg.nii.gz", 1)
@@ -423,9 +417,7 @@ def test_a_folder_for_each_subject(tmp_path: Path) -> None:
     assert sorted(labels) == ["1", "1", "1", "2", "2"]
 
 
-def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(tmp_path, caplog, monkeypatch):
     root = tmp_path / "masks"
     root.mkdir()
     for name, n in {"liver": 8, "spleen": 7, "rib_1": 0, "rib_2": 0, "rib_3": 0, "lung": 1}.items():

@@ -38,7 +38,7 @@ def signature() -> Signature:
     )
 
 
-def test_round_trip_is_exact(tmp_path: Path, signature: Signature) -> None:
+def test_round_trip_is_exact(tmp_path, signature):
     cache = Cache(tmp_path, "signature")
     assert KEY not in cache
     assert cache.get(KEY, decode) is None
@@ -82,9 +82,7 @@ def belongs_to_another_key(path: Path) -> None:
 @pytest.mark.parametrize(
     "damage", [truncate, overwrite, empty, replace_by_foreign, belongs_to_another_key]
 )
-def test_damaged_or_foreign_file_is_noticed(
-    tmp_path: Path, signature: Signature, damage, caplog: pytest.LogCaptureFixture
-) -> None:  # type: ignore[no-untyped-def]
+def test_damaged_or_foreign_file_is_noticed(tmp_path, signature, damage, caplog):
     cache = Cache(tmp_path, "signature")
     cache.put(KEY, encode(signature))
     damage(cache.path(KEY))
@@ -99,9 +97,7 @@ def test_damaged_or_foreign_file_is_noticed(
 @pytest.mark.parametrize(
     "what", ["surface.eigenfunctions", "interior.points", "eigenvalues", "area"]
 )
-def test_damaged_payload_is_noticed(
-    tmp_path: Path, signature: Signature, what: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damaged_payload_is_noticed(tmp_path, signature, what, caplog):
     """One bit or digit of what has no structure that could show it."""
     cache = Cache(tmp_path, "signature")
     cache.put(KEY, encode(signature))
@@ -118,7 +114,7 @@ def test_damaged_payload_is_noticed(
     assert cache.get(KEY, decode) is not None
 
 
-def test_file_without_a_checksum_is_not_trusted(tmp_path: Path, signature: Signature) -> None:
+def test_file_without_a_checksum_is_not_trusted(tmp_path, signature):
     cache = Cache(tmp_path, "signature")
     cache.put(KEY, encode(signature))
     path = cache.path(KEY)
@@ -131,9 +127,7 @@ def test_file_without_a_checksum_is_not_trusted(tmp_path: Path, signature: Signa
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions are those of POSIX")
 @pytest.mark.parametrize(("umask", "expected"), [(0o002, 0o664), (0o027, 0o640)])
-def test_umask_says_who_may_read(
-    tmp_path: Path, signature: Signature, umask: int, expected: int
-) -> None:
+def test_umask_says_who_may_read(tmp_path, signature, umask, expected):
     before = os.umask(umask)
     try:
         Cache(tmp_path / "cache", "signature").put(KEY, encode(signature))
@@ -145,7 +139,7 @@ def test_umask_says_who_may_read(
         assert stat.S_IMODE(folder.stat().st_mode) == 0o777 & ~umask
 
 
-def test_what_a_killed_run_left_is_removed_later(tmp_path: Path, signature: Signature) -> None:
+def test_what_a_killed_run_left_is_removed_later(tmp_path, signature):
     cache = Cache(tmp_path, "signature")
     folder = cache.path(KEY).parent
     folder.mkdir(parents=True)
@@ -161,18 +155,14 @@ def test_what_a_killed_run_left_is_removed_later(tmp_path: Path, signature: Sign
     )  # another process may still write the fresh one
 
 
-def test_older_algorithm_is_not_trusted(
-    tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_older_algorithm_is_not_trusted(tmp_path, signature, monkeypatch):
     cache = Cache(tmp_path, "signature")
     cache.put(KEY, encode(signature))
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
     assert cache.get(KEY, decode) is None
 
 
-def test_failed_write_leaves_nothing(
-    tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_write_leaves_nothing(tmp_path, signature, monkeypatch):
     def fail(*_: object, **__: object) -> None:
         raise OSError("disk full")
 
@@ -183,14 +173,12 @@ def test_failed_write_leaves_nothing(
     assert not list(tmp_path.rglob("*.*"))
 
 
-def test_default_directory_follows_the_convention(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_default_directory_follows_the_convention(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert default_cache_dir() == tmp_path / "igps"
 
 
-def test_a_user_without_a_home_is_told_what_to_give(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_user_without_a_home_is_told_what_to_give(monkeypatch):
     def no_home() -> None:
         raise RuntimeError("Could not determine home directory.")
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -104,9 +104,7 @@ def stored(cache: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in cache.rglob("*.safetensors")}
 
 
-def test_a_cluster_leaves_the_bytes_of_this_machine(
-    cluster: Cluster, root: Path, tmp_path: Path
-) -> None:
+def test_a_cluster_leaves_the_bytes_of_this_machine(cluster, root, tmp_path):
     (root / "bad.off").write_text("nothing")
     with dask_executor(cluster.address) as executor:
         (failure,) = SignatureDataset(root, CONFIG, tmp_path / "there").precompute(
@@ -123,9 +121,7 @@ def test_a_cluster_leaves_the_bytes_of_this_machine(
     assert len(stored(tmp_path / "here")) == 13  # with the failure
 
 
-def test_a_worker_that_is_killed_costs_nothing(
-    cluster: Cluster, root: Path, tmp_path: Path
-) -> None:
+def test_a_worker_that_is_killed_costs_nothing(cluster, root, tmp_path):
     """In the middle of its work: the others do that."""
     dataset = SignatureDataset(root, CONFIG, tmp_path / "there")
     with dask_executor(cluster.address) as executor, ThreadPoolExecutor(1) as beside:
@@ -141,13 +137,7 @@ def test_a_worker_that_is_killed_costs_nothing(
     }
 
 
-def test_the_command_and_what_it_says_of_no_scheduler(
-    cluster: Cluster,
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_and_what_it_says_of_no_scheduler(cluster, root, tmp_path, monkeypatch, capsys):
     words = ["igps", "precompute", str(root), "--cache_dir", str(tmp_path / "cache"), *SMALL]
     words += ["--descriptors", "own_descriptors:small_interior"]
     monkeypatch.setattr(
@@ -166,9 +156,7 @@ def test_the_command_and_what_it_says_of_no_scheduler(
     assert len(stored(tmp_path / "cache")) == 12
 
 
-def test_shards_have_all_files_once(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_shards_have_all_files_once(root, tmp_path, monkeypatch, capsys):
     for n in (1, 7, 64, 300):
         numbers = [i for k in range(1, n + 1) for i in of_shard(100, f"{k}/{n}")]
         assert sorted(numbers) == list(range(100))
@@ -229,15 +217,13 @@ class Nowhere:
     ("executor", "words"),
     [(Broken(1), "the executor cancelled a job"), (Elsewhere(1), "signatures do not appear there")],
 )
-def test_a_cluster_that_fails_is_told(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor: Executor, words: str
-) -> None:
+def test_a_cluster_that_fails_is_told(root, tmp_path, monkeypatch, executor, words):
     monkeypatch.setattr("igps.data.filling._MAX_DELAY", 0.2)
     with pytest.raises(MachineError, match=words):
         SignatureDataset(root, CONFIG, tmp_path / "cache").precompute(executor, progress=False)
 
 
-def test_a_worker_of_another_version_is_refused(root: Path, tmp_path: Path) -> None:
+def test_a_worker_of_another_version_is_refused(root, tmp_path):
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     with pytest.raises(
         MachineError, match=r"has igps .*, signatures \d+, but 9\.9, signatures 9 is required"

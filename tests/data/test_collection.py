@@ -46,7 +46,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[SignatureDataset,
     return kept, folder / "signatures.igps"
 
 
-def test_it_comes_back_to_the_bit_without_meshes(written: tuple[SignatureDataset, Path]) -> None:
+def test_it_comes_back_to_the_bit_without_meshes(written):
     before, path = written
     after = SignatureDataset.from_file(path)
     assert after.bodies.names == before.bodies.names
@@ -82,7 +82,7 @@ def test_it_comes_back_to_the_bit_without_meshes(written: tuple[SignatureDataset
         after.mesh(0)
 
 
-def test_it_is_read_by_any_reader_of_tensors(written: tuple[SignatureDataset, Path]) -> None:
+def test_it_is_read_by_any_reader_of_tensors(written):
     before, path = written
     found = load_file(path)
     np.testing.assert_array_equal(
@@ -91,9 +91,7 @@ def test_it_is_read_by_any_reader_of_tensors(written: tuple[SignatureDataset, Pa
     assert str(path.parent).encode() not in path.read_bytes()[:100_000]  # no path of the machine
 
 
-def test_parts_of_it_are_written_again_and_go_to_other_processes(
-    written: tuple[SignatureDataset, Path], tmp_path: Path
-) -> None:
+def test_parts_of_it_are_written_again_and_go_to_other_processes(written, tmp_path):
     before, path = written
     part = SignatureDataset.from_file(path)[["egg/2.off", "ball/1.off"]]
     sent = pickle.dumps(part)
@@ -108,7 +106,7 @@ def test_parts_of_it_are_written_again_and_go_to_other_processes(
         )
 
 
-def test_what_a_descriptor_requires_is_asked_of_it(written: tuple[SignatureDataset, Path]) -> None:
+def test_what_a_descriptor_requires_is_asked_of_it(written):
     SignatureDataset.from_file(written[1], descriptor=Requirements(13, ("depth",)))
     with pytest.raises(
         ValueError,
@@ -121,9 +119,7 @@ def test_what_a_descriptor_requires_is_asked_of_it(written: tuple[SignatureDatas
     "where",
     ["0.interior.points", "3.surface.eigenfunctions", "2.interior.attributes.depth", "area"],
 )
-def test_a_damaged_signature_is_named_and_costs_no_other(
-    written: tuple[SignatureDataset, Path], tmp_path: Path, where: str
-) -> None:
+def test_a_damaged_signature_is_named_and_costs_no_other(written, tmp_path, where):
     before, path = written
     content = bytearray(path.read_bytes())
     if where == "area":
@@ -148,9 +144,7 @@ def test_a_damaged_signature_is_named_and_costs_no_other(
 
 
 @pytest.mark.parametrize("word", [b"egg/2.off", b"ball"])
-def test_a_damaged_name_is_noticed(
-    written: tuple[SignatureDataset, Path], tmp_path: Path, word: bytes
-) -> None:
+def test_a_damaged_name_is_noticed(written, tmp_path, word):
     content = bytearray(written[1].read_bytes())
     content[content.index(word) + 1] ^= 1
     (tmp_path / "damaged.igps").write_bytes(content)
@@ -189,17 +183,13 @@ def told(path: Path, target: Path, **changes: object) -> Path:
         {"reading": [1]},
     ],
 )
-def test_a_file_that_tells_nonsense_is_refused(
-    written: tuple[SignatureDataset, Path], tmp_path: Path, changes: dict[str, object]
-) -> None:
+def test_a_file_that_tells_nonsense_is_refused(written, tmp_path, changes):
     path = told(written[1], tmp_path / "told.igps", **changes)
     with pytest.raises(ValueError, match=r"told\.igps.*Export it again"):
         SignatureDataset.from_file(path)
 
 
-def test_what_is_no_collection_is_refused(
-    written: tuple[SignatureDataset, Path], tmp_path: Path
-) -> None:
+def test_what_is_no_collection_is_refused(written, tmp_path):
     content = written[1].read_bytes()
     huge = (2**40).to_bytes(8, "little") + content[8:]
     for i, wrong in enumerate(
@@ -213,12 +203,12 @@ def test_what_is_no_collection_is_refused(
         SignatureDataset.from_file(tmp_path / "gone.igps")
 
 
-def test_labels_may_be_numbers_and_each_body_is_there_once(tmp_path: Path) -> None:
+def test_labels_may_be_numbers_and_each_body_is_there_once(tmp_path):
     """What is written can be read: it was not, where labels were numbers, or a file was given twice."""
     paths = [tmp_path / f"{i}.off" for i in range(3)]
     for i, path in enumerate(paths):
         write_body(path, 1.0, 1.5 + 0.1 * i)
-    dataset = SignatureDataset(paths, CONFIG, tmp_path / "cache", labels=np.array([10, 2, 10]))  # type: ignore[arg-type]
+    dataset = SignatureDataset(paths, CONFIG, tmp_path / "cache", labels=np.array([10, 2, 10]))
     assert dataset.labels.tolist() == [1, 0, 1]
     dataset.to_file(tmp_path / "signatures.igps")
     found = SignatureDataset.from_file(tmp_path / "signatures.igps")
@@ -230,7 +220,7 @@ def test_labels_may_be_numbers_and_each_body_is_there_once(tmp_path: Path) -> No
     assert not (tmp_path / "twice.igps").exists()
 
 
-def test_a_failed_export_leaves_what_was_there(tmp_path: Path) -> None:
+def test_a_failed_export_leaves_what_was_there(tmp_path):
     write_body(tmp_path / "meshes" / "1.off", 1.1, 1.5)
     (tmp_path / "meshes" / "2.off").write_text("nothing")
     (tmp_path / "signatures.igps").write_bytes(b"before")

@@ -28,7 +28,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "meshes"
 
 
-def test_loaders_give_the_parts_and_balanced_batches(root: Path, tmp_path: Path) -> None:
+def test_loaders_give_the_parts_and_balanced_batches(root, tmp_path):
     module = SignatureDataModule(
         root,
         "seen",
@@ -49,14 +49,12 @@ def test_loaders_give_the_parts_and_balanced_batches(root: Path, tmp_path: Path)
         (module.val_dataloader(), module.split.validation),
         (module.test_dataloader(), module.split.test),
     ):
-        ids = [name for batch in loader for name in batch.ids]  # type: ignore[union-attr]
+        ids = [name for batch in loader for name in batch.ids]
         assert ids == [names[i] for i in part]
 
 
 @pytest.mark.parametrize("n_samples", [20, None])
-def test_training_shapes_are_kept_in_memory_thinned(
-    root: Path, tmp_path: Path, n_samples: int | None
-) -> None:
+def test_training_shapes_are_kept_in_memory_thinned(root, tmp_path, n_samples):
     module = SignatureDataModule(
         root,
         n_train=2,
@@ -85,9 +83,7 @@ def test_training_shapes_are_kept_in_memory_thinned(
         assert len(list(module.train_dataloader())) == 1
 
 
-def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(
-    root: Path, tmp_path: Path
-) -> None:
+def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(root, tmp_path):
     def module(**options: int) -> SignatureDataModule:
         return SignatureDataModule(
             root,
@@ -111,12 +107,12 @@ def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(
         module(evaluation_batch_size=0)
 
 
-def test_a_single_sample_in_memory_is_refused(root: Path) -> None:
+def test_a_single_sample_in_memory_is_refused(root):
     with pytest.raises(ValueError, match="n_samples_in_memory: expected at least 2, got -3"):
         SignatureDataModule(root, n_samples_in_memory=-3)
 
 
-def test_a_bad_mesh_stops_training(root: Path, tmp_path: Path) -> None:
+def test_a_bad_mesh_stops_training(root, tmp_path):
     (root / "class1" / "9.off").write_text("nothing")
     module = SignatureDataModule(
         root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1
@@ -125,19 +121,19 @@ def test_a_bad_mesh_stops_training(root: Path, tmp_path: Path) -> None:
         module.prepare_data()
 
 
-def test_needs_classes(root: Path) -> None:
+def test_needs_classes(root):
     with pytest.raises(ValueError, match="no classes found"):
         SignatureDataModule(root / "class0")
 
 
-def test_impossible_protocols_are_refused(root: Path) -> None:
+def test_impossible_protocols_are_refused(root):
     with pytest.raises(ValueError, match="protocol: expected one of seen, unseen, got 'some'"):
-        SignatureDataModule(root, "some")  # type: ignore[arg-type]
+        SignatureDataModule(root, "some")
     with pytest.raises(ValueError, match="n_test: expected None with protocol 'seen'"):
         SignatureDataModule(root, "seen", n_test=2)
 
 
-def test_meshes_are_read_as_asked(root: Path, tmp_path: Path) -> None:
+def test_meshes_are_read_as_asked(root, tmp_path):
     """A mesh with a hole stops training, unless holes are allowed."""
     mesh = trimesh.load(root / "class1" / "2.off", process=False)
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
@@ -159,18 +155,18 @@ def test_meshes_are_read_as_asked(root: Path, tmp_path: Path) -> None:
     module(reading=LoadOptions("never", allow_open=True)).prepare_data()
 
 
-def test_nothing_to_validate_on_is_no_loader(root: Path, tmp_path: Path) -> None:
+def test_nothing_to_validate_on_is_no_loader(root, tmp_path):
     module = SignatureDataModule(
         root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1
     )
     assert module.val_dataloader() == []
 
 
-def test_without_a_configuration_a_checkpoint_keeps_nothing_of_the_data(root: Path) -> None:
+def test_without_a_configuration_a_checkpoint_keeps_nothing_of_the_data(root):
     """Paths and configurations could be read only by running code."""
     assert SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG).hparams == {}
 
 
-def test_a_validation_part_without_pairs_is_refused_where_it_is_given(root: Path) -> None:
+def test_a_validation_part_without_pairs_is_refused_where_it_is_given(root):
     with pytest.raises(ValueError, match="n_validation: expected at least 2 bodies of a class"):
         SignatureDataModule(root, n_train=3, n_validation=1, config=CONFIG)

@@ -48,7 +48,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     names: list[str] = []
     compute = pipeline_module.compute_signature
 
-    def counting(mesh, config):  # type: ignore[no-untyped-def]
+    def counting(mesh, config):
         names.append(mesh.name)
         return compute(mesh, config)
 
@@ -56,7 +56,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def test_items_are_labelled_and_named(dataset: SignatureDataset) -> None:
+def test_items_are_labelled_and_named(dataset):
     item = dataset[2]
     assert isinstance(item, LabelledSignature)
     assert (item.id, item.label, item.signature.name) == ("egg/1.off", 1, "egg/1.off")
@@ -65,7 +65,7 @@ def test_items_are_labelled_and_named(dataset: SignatureDataset) -> None:
     assert item.signature.config == CONFIG
 
 
-def test_functions_of_position_become_attributes(root: Path, tmp_path: Path) -> None:
+def test_functions_of_position_become_attributes(root, tmp_path):
     dataset = SignatureDataset(
         root, CONFIG, tmp_path / "cache", attributes={"height": lambda points: points[:, 2]}
     )
@@ -83,15 +83,15 @@ def test_functions_of_position_become_attributes(root: Path, tmp_path: Path) -> 
         broken[0]
 
 
-def test_the_name_of_an_attribute_is_no_source(root: Path, tmp_path: Path) -> None:
+def test_the_name_of_an_attribute_is_no_source(root, tmp_path):
     with pytest.raises(
         ValueError,
         match=r"attributes: expected functions or sources by names other than .*, got h='depth'",
     ):
-        SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"h": "depth"})  # type: ignore[dict-item]
+        SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"h": "depth"})
 
 
-def test_an_attribute_does_not_stand_in_for_one_of_the_library(root: Path, tmp_path: Path) -> None:
+def test_an_attribute_does_not_stand_in_for_one_of_the_library(root, tmp_path):
     with pytest.raises(
         ValueError,
         match=r"names other than .*depth.*, got depth=.*of the library are set by SignatureConfig",
@@ -101,7 +101,7 @@ def test_an_attribute_does_not_stand_in_for_one_of_the_library(root: Path, tmp_p
         )
 
 
-def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) -> None:
+def test_computed_once_then_read(dataset, counted):
     first = dataset[0].signature
     second = dataset[0].signature
     assert len(counted) == 1
@@ -123,15 +123,13 @@ def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) 
         {"least_vertices": 200},
     ],
 )
-def test_key_covers_every_parameter(
-    root: Path, tmp_path: Path, counted: list[str], change: dict[str, object]
-) -> None:
+def test_key_covers_every_parameter(root, tmp_path, counted, change):
     SignatureDataset(root, CONFIG, tmp_path / "cache")[0]
-    SignatureDataset(root, replace(CONFIG, **change), tmp_path / "cache")[0]  # type: ignore[arg-type]
+    SignatureDataset(root, replace(CONFIG, **change), tmp_path / "cache")[0]
     assert len(counted) == 2
 
 
-def test_parametrisation_above_is_complete() -> None:
+def test_parametrisation_above_is_complete():
     changed = {
         "n_eigenpairs",
         "resolution",
@@ -150,17 +148,13 @@ def test_parametrisation_above_is_complete() -> None:
 @pytest.mark.parametrize(
     "option", [{"mend": "always"}, {"component": "largest"}, {"allow_open": True}]
 )
-def test_key_covers_how_the_file_is_read(
-    root: Path, tmp_path: Path, counted: list[str], option: dict[str, object]
-) -> None:
+def test_key_covers_how_the_file_is_read(root, tmp_path, counted, option):
     SignatureDataset(root, CONFIG, tmp_path / "cache")[0]
-    SignatureDataset(root, CONFIG, tmp_path / "cache", reading=LoadOptions(**option))[0]  # type: ignore[arg-type]
+    SignatureDataset(root, CONFIG, tmp_path / "cache", reading=LoadOptions(**option))[0]
     assert len(counted) == 2
 
 
-def test_key_covers_content_and_version_but_not_the_path(
-    root: Path, tmp_path: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_key_covers_content_and_version_but_not_the_path(root, tmp_path, counted, monkeypatch):
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     dataset[0]
     (root / "ball" / "1.off").rename(root / "egg" / "9.off")
@@ -176,9 +170,7 @@ def test_key_covers_content_and_version_but_not_the_path(
 
 
 @pytest.mark.parametrize("cache", ["file", "file/cache"])
-def test_a_cache_that_cannot_be_made_is_no_fault_of_the_bodies(
-    root: Path, tmp_path: Path, cache: str
-) -> None:
+def test_a_cache_that_cannot_be_made_is_no_fault_of_the_bodies(root, tmp_path, cache):
     (tmp_path / "file").touch()
     with pytest.raises(
         MachineError,
@@ -187,9 +179,7 @@ def test_a_cache_that_cannot_be_made_is_no_fault_of_the_bodies(
         SignatureDataset(root, CONFIG, tmp_path / cache).precompute(n_workers=1)
 
 
-def test_truncated_file_is_reported_and_computed_again(
-    dataset: SignatureDataset, counted: list[str], caplog: pytest.LogCaptureFixture, tmp_path: Path
-) -> None:
+def test_truncated_file_is_reported_and_computed_again(dataset, counted, caplog, tmp_path):
     before = dataset[0].signature
     (file,) = (tmp_path / "cache").rglob("*.safetensors")
     file.write_bytes(file.read_bytes()[:100])
@@ -201,9 +191,7 @@ def test_truncated_file_is_reported_and_computed_again(
 
 
 @pytest.mark.parametrize("how", ["processes", "inline", "threads"])
-def test_precompute_fills_the_cache_and_lists_bad_meshes(
-    root: Path, tmp_path: Path, how: str
-) -> None:
+def test_precompute_fills_the_cache_and_lists_bad_meshes(root, tmp_path, how):
     (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     if how == "threads":
@@ -220,7 +208,7 @@ def test_precompute_fills_the_cache_and_lists_bad_meshes(
     assert usable.labels.tolist() == [0, 0, 1, 1]
 
 
-def test_precompute_resumes(dataset: SignatureDataset, counted: list[str]) -> None:
+def test_precompute_resumes(dataset, counted):
     dataset[1]
     assert dataset.precompute(n_workers=1, progress=False) == []
     assert len(counted) == 4
@@ -228,14 +216,14 @@ def test_precompute_resumes(dataset: SignatureDataset, counted: list[str]) -> No
     assert len(counted) == 4
 
 
-def test_strict_stops_at_a_bad_mesh(root: Path, tmp_path: Path) -> None:
+def test_strict_stops_at_a_bad_mesh(root, tmp_path):
     (root / "egg" / "bad.off").write_text("nothing")
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     with pytest.raises(MeshError, match=r"bad\.off"):
         dataset.precompute(n_workers=1, strict=True, progress=False)
 
 
-def test_a_missing_file_is_a_failure_like_any_other(root: Path, tmp_path: Path) -> None:
+def test_a_missing_file_is_a_failure_like_any_other(root, tmp_path):
     dataset = SignatureDataset(
         [root / "ball" / "1.off", root / "gone.off"], CONFIG, tmp_path / "cache"
     )
@@ -245,7 +233,7 @@ def test_a_missing_file_is_a_failure_like_any_other(root: Path, tmp_path: Path) 
         dataset[1]
 
 
-def test_two_processes_on_one_cache(root: Path, tmp_path: Path) -> None:
+def test_two_processes_on_one_cache(root, tmp_path):
     datasets = [SignatureDataset(root, CONFIG, tmp_path / "cache") for _ in range(2)]
     with ThreadPoolExecutor(2) as pool:
         results = list(pool.map(lambda d: d.precompute(n_workers=2, progress=False), datasets))
@@ -255,7 +243,7 @@ def test_two_processes_on_one_cache(root: Path, tmp_path: Path) -> None:
     assert all(isinstance(datasets[0][i], LabelledSignature) for i in range(4))
 
 
-def test_works_in_a_data_loader(dataset: SignatureDataset) -> None:
+def test_works_in_a_data_loader(dataset):
     batches = list(DataLoader(dataset, batch_size=3, collate_fn=collate))
     assert [batch.ids for batch in batches] == [
         ("ball/1.off", "ball/2.off", "egg/1.off"),
@@ -267,7 +255,7 @@ def test_works_in_a_data_loader(dataset: SignatureDataset) -> None:
         assert torch.equal(batch.labels, direct.labels)
 
 
-def test_batch_has_the_meshes_on_demand(dataset: SignatureDataset) -> None:
+def test_batch_has_the_meshes_on_demand(dataset):
     assert dataset.batch([3, 1]).meshes is None
     batch = dataset.batch([3, 1], meshes=True)
     assert isinstance(batch, SignatureBatch)
@@ -284,7 +272,7 @@ class Named(SignatureDataset):
     motto = "mine"
 
 
-def test_parts_of_a_subclass_are_of_it_and_keep_what_it_has(root: Path, tmp_path: Path) -> None:
+def test_parts_of_a_subclass_are_of_it_and_keep_what_it_has(root, tmp_path):
     dataset = Named(root, CONFIG, tmp_path / "cache")
     dataset.motto = "changed"
     failure = Failure("ball/1.off", root / "ball" / "1.off", "bad")
@@ -311,15 +299,13 @@ def test_parts_of_a_subclass_are_of_it_and_keep_what_it_has(root: Path, tmp_path
         ([], []),
     ],
 )
-def test_some_items_are_a_dataset(
-    dataset: SignatureDataset, index: slice | list[int], chosen: list[int]
-) -> None:
+def test_some_items_are_a_dataset(dataset, index, chosen):
     part = dataset[index]
     assert part.bodies.names == tuple(dataset.bodies.names[i] for i in chosen)
     assert part.labels.tolist() == dataset.labels[chosen].tolist()
 
 
-def test_an_item_is_asked_for_by_number_or_name(dataset: SignatureDataset) -> None:
+def test_an_item_is_asked_for_by_number_or_name(dataset):
     assert [dataset[i].id for i in (-1, np.int64(2), "ball/2.off")] == [
         "egg/2.off",
         "egg/1.off",
@@ -327,7 +313,7 @@ def test_an_item_is_asked_for_by_number_or_name(dataset: SignatureDataset) -> No
     ]
     assert [item.id for item in dataset] == list(dataset.bodies.names)
     for number in (torch.tensor(2), np.array(2)):
-        assert dataset[number].id == "egg/1.off"  # type: ignore[call-overload]
+        assert dataset[number].id == "egg/1.off"
     with pytest.raises(IndexError):
         dataset[4]
     with pytest.raises(IndexError, match="mask: expected 4 entries, got an array of shape"):
@@ -336,7 +322,7 @@ def test_an_item_is_asked_for_by_number_or_name(dataset: SignatureDataset) -> No
         dataset["cat"]
 
 
-def test_the_descriptor_says_what_signatures_it_is_for(root: Path, tmp_path: Path) -> None:
+def test_the_descriptor_says_what_signatures_it_is_for(root, tmp_path):
     """Itself, or what it requires, as its requirements applied by hand."""
     rich = igps.descriptor("rich")
     expected = rich.requirements.apply_to(SignatureConfig()).resolved()
@@ -352,12 +338,10 @@ def test_the_descriptor_says_what_signatures_it_is_for(root: Path, tmp_path: Pat
     with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs"):
         SignatureDataset(root, small, descriptor=rich)
     with pytest.raises(TypeError, match=r"got its name. Give igps.descriptor\('rich'\)"):
-        SignatureDataset(root, descriptor="rich")  # type: ignore[arg-type]
+        SignatureDataset(root, descriptor="rich")
 
 
-def test_after_precompute_the_meshes_are_not_needed(
-    dataset: SignatureDataset, root: Path, counted: list[str]
-) -> None:
+def test_after_precompute_the_meshes_are_not_needed(dataset, root, counted):
     before = [dataset[i].signature for i in range(4)]
     assert dataset.precompute(n_workers=1, progress=False) == []
     keys = dataset.cached_keys()
@@ -375,18 +359,14 @@ def test_after_precompute_the_meshes_are_not_needed(
         dataset.mesh(0)
 
 
-def test_after_precompute_a_lost_signature_is_computed_again(
-    dataset: SignatureDataset, counted: list[str], tmp_path: Path
-) -> None:
+def test_after_precompute_a_lost_signature_is_computed_again(dataset, counted, tmp_path):
     dataset.precompute(n_workers=1, progress=False)
     shutil.rmtree(tmp_path / "cache")
     assert dataset[1].id == "ball/2.off"
     assert len(counted) == 5
 
 
-def test_in_memory_nothing_is_read_any_more(
-    dataset: SignatureDataset, root: Path, tmp_path: Path
-) -> None:
+def test_in_memory_nothing_is_read_any_more(dataset, root, tmp_path):
     before = collate([dataset[i] for i in range(4)])
     kept = dataset.to_memory()
     shutil.rmtree(root)
@@ -398,13 +378,11 @@ def test_in_memory_nothing_is_read_any_more(
     assert kept.precompute() == []
 
 
-def test_sizes_are_those_of_the_interior_samples(dataset: SignatureDataset) -> None:
+def test_sizes_are_those_of_the_interior_samples(dataset):
     assert dataset.sizes.tolist() == [len(item.signature.interior) for item in dataset]
 
 
-def test_a_transform_is_applied_at_each_reading_and_not_kept(
-    dataset: SignatureDataset, counted: list[str]
-) -> None:
+def test_a_transform_is_applied_at_each_reading_and_not_kept(dataset, counted):
     plain = dataset[0].signature
     changed = SignatureDataset(
         dataset.bodies,
@@ -423,9 +401,7 @@ def test_a_transform_is_applied_at_each_reading_and_not_kept(
     assert len(changed.subset([0])[0].signature.interior) == 5
 
 
-def test_a_pre_transform_is_kept_under_a_key_of_its_own(
-    dataset: SignatureDataset, counted: list[str], root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pre_transform_is_kept_under_a_key_of_its_own(dataset, counted, root, monkeypatch):
     dataset.precompute(n_workers=1, progress=False)
     counted.clear()
     applied: list[str] = []
@@ -460,7 +436,7 @@ def test_a_pre_transform_is_kept_under_a_key_of_its_own(
         (lambda signature: signature, "expected an object with a cache_tag"),
     ):
         with pytest.raises(ValueError, match=f"pre_transform: {message}"):
-            SignatureDataset(root, CONFIG, dataset.pipeline.cache_dir, pre_transform=wrong)  # type: ignore[arg-type]
+            SignatureDataset(root, CONFIG, dataset.pipeline.cache_dir, pre_transform=wrong)
 
 
 class Image:
@@ -481,8 +457,8 @@ class Image:
 
 
 def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(
-    dataset: SignatureDataset, counted: list[str], root: Path, tmp_path: Path
-) -> None:
+    dataset, counted, root, tmp_path
+):
     dataset.precompute(n_workers=1, progress=False)
     counted.clear()
     image = Image(2.0)
@@ -518,9 +494,7 @@ def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(
     )
 
 
-def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(
-    tmp_path: Path,
-) -> None:
+def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(tmp_path):
     for name in ("a", "b"):
         write_body(tmp_path / f"{name}.off", 1.1, 1.3)
     files = [tmp_path / "a.off", tmp_path / "b.off"]
@@ -538,9 +512,7 @@ def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(
         np.testing.assert_array_equal(one.interior.points, found[0].interior.points)
 
 
-def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(
-    root: Path, tmp_path: Path
-) -> None:
+def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root, tmp_path):
     def changed(slope: float) -> SignatureDataset:
         return SignatureDataset(
             root,
@@ -566,9 +538,7 @@ def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(
 
 
 @pytest.mark.parametrize(("start", "how"), [("fork", "cache"), ("fork", "file"), ("spawn", "file")])
-def test_workers_give_what_this_process_gives(
-    dataset: SignatureDataset, root: Path, tmp_path: Path, how: str, start: str
-) -> None:
+def test_workers_give_what_this_process_gives(dataset, root, tmp_path, how, start):
     dataset.precompute(n_workers=1, progress=False)
     expected = dataset.batch(range(4))
     if how == "file":
@@ -590,7 +560,7 @@ def test_workers_give_what_this_process_gives(
         assert torch.equal(found.labels, expected.labels)
 
 
-def test_slow_meshes_are_listed(dataset: SignatureDataset, tmp_path: Path) -> None:
+def test_slow_meshes_are_listed(dataset, tmp_path):
     (failure,) = dataset.subset([2]).precompute(
         n_workers=1, progress=False, limits=Limits(seconds=1e-6)
     )
@@ -599,7 +569,7 @@ def test_slow_meshes_are_listed(dataset: SignatureDataset, tmp_path: Path) -> No
     assert not list((tmp_path / "cache").rglob("*.safetensors"))
 
 
-def test_a_failure_names_its_file_once(dataset: SignatureDataset) -> None:
+def test_a_failure_names_its_file_once(dataset):
     path = dataset.bodies.paths[2]
     expected = Failure("egg/1.off", path, f"{path}: bad")
     assert (
@@ -609,9 +579,7 @@ def test_a_failure_names_its_file_once(dataset: SignatureDataset) -> None:
     )
 
 
-def test_a_dataset_has_the_names_of_torchvision_and_tells_in_a_line_what_it_is(
-    tmp_path: Path,
-) -> None:
+def test_a_dataset_has_the_names_of_torchvision_and_tells_in_a_line_what_it_is(tmp_path):
     for name in ("balls/1.off", "balls/2.off", "rods/1.off"):
         write_body(tmp_path / name, 1.0, 2.0)
     dataset = SignatureDataset(tmp_path, SignatureConfig(n_eigenpairs=9))
@@ -620,9 +588,7 @@ def test_a_dataset_has_the_names_of_torchvision_and_tells_in_a_line_what_it_is(
     assert repr(dataset) == "SignatureDataset(3 bodies, 2 classes: balls, rods; 9 eigenpairs)"
 
 
-def test_a_disk_that_is_full_costs_only_the_cache(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_disk_that_is_full_costs_only_the_cache(tmp_path, monkeypatch, caplog):
     write_body(tmp_path / "1.off", 1.0, 2.0)
     config = SignatureConfig(n_eigenpairs=9, resolution=8, min_samples=0, n_surface_samples=20)
     dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import nibabel
@@ -27,7 +26,7 @@ def two_balls_and_a_speck() -> np.ndarray:
     return labels
 
 
-def test_they_have_the_signatures_of_their_files(tmp_path: Path) -> None:
+def test_they_have_the_signatures_of_their_files(tmp_path):
     image = nibabel.Nifti1Image(two_balls_and_a_speck(), AFFINE)
     nibabel.save(image, tmp_path / "a.nii")
     BALL.export(tmp_path / "b.stl")
@@ -57,7 +56,7 @@ def test_they_have_the_signatures_of_their_files(tmp_path: Path) -> None:
         in_memory.mesh(2)
 
 
-def test_arrays_have_their_spacing_and_are_cached_by_what_they_hold(tmp_path: Path) -> None:
+def test_arrays_have_their_spacing_and_are_cached_by_what_they_hold(tmp_path):
     labels = two_balls_and_a_speck()
     volumes = []
     for spacing in ((1, 1, 2), (1, 1, 1)):  # under one name
@@ -70,14 +69,14 @@ def test_arrays_have_their_spacing_and_are_cached_by_what_they_hold(tmp_path: Pa
     assert volumes == pytest.approx([2 * (labels == 2).sum(), (labels == 2).sum()], rel=1e-3)
 
 
-def test_each_has_a_label() -> None:
+def test_each_has_a_label():
     with pytest.raises(ValueError, match=r"labels: expected one for each of 1 bodies, got 2"):
         SignatureDataset({"a": BALL}, CONFIG, labels=["x", "y"])
     with pytest.raises(ValueError, match=r"bodies: expected at least one"):
         SignatureDataset({}, CONFIG)
 
 
-def test_an_executor_gets_them_too(tmp_path: Path) -> None:
+def test_an_executor_gets_them_too(tmp_path):
     dataset = SignatureDataset({"a": BALL, "b": BALL.copy().apply_scale(2)}, CONFIG, tmp_path)
     with ThreadPoolExecutor(2) as executor:
         assert dataset.precompute(executor, progress=False) == []

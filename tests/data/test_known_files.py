@@ -49,9 +49,7 @@ def make_old(path: Path) -> None:
     os.utime(path, (LONG_AGO, LONG_AGO))
 
 
-def test_files_that_did_not_change_are_not_read_again(
-    dataset: SignatureDataset, read: list[str]
-) -> None:
+def test_files_that_did_not_change_are_not_read_again(dataset, read):
     dataset.precompute(n_workers=1, progress=False)
     assert set(read) == {"0.off", "1.off", "2.off"}
     read.clear()
@@ -61,9 +59,7 @@ def test_files_that_did_not_change_are_not_read_again(
     assert dataset.all_notes() == [dataset.notes(i) for i in range(3)]
 
 
-def test_a_changed_file_is_read_again(
-    dataset: SignatureDataset, read: list[str], tmp_path: Path
-) -> None:
+def test_a_changed_file_is_read_again(dataset, read, tmp_path):
     """Even to another of the same size, with the old time given back to it."""
     dataset.precompute(n_workers=1, progress=False)
     first, second = (tmp_path / "meshes" / f"{i}.off" for i in range(2))
@@ -78,9 +74,7 @@ def test_a_changed_file_is_read_again(
     )
 
 
-def test_a_file_that_changed_a_moment_ago_is_not_remembered(
-    dataset: SignatureDataset, read: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_changed_a_moment_ago_is_not_remembered(dataset, read, monkeypatch):
     monkeypatch.setattr("igps.data.known_files.MIN_AGE", 1000 * 10**9)
     dataset.precompute(n_workers=1, progress=False)
     read.clear()
@@ -89,9 +83,7 @@ def test_a_file_that_changed_a_moment_ago_is_not_remembered(
 
 
 @pytest.mark.parametrize("left", [None, 100])
-def test_a_lost_signature_is_computed_again(
-    dataset: SignatureDataset, tmp_path: Path, left: int | None
-) -> None:
+def test_a_lost_signature_is_computed_again(dataset, tmp_path, left):
     dataset.precompute(n_workers=1, progress=False)
     before = {path: path.read_bytes() for path in (tmp_path / "cache").rglob("*.safetensors")}
     path = sorted(before)[0]
@@ -102,7 +94,7 @@ def test_a_lost_signature_is_computed_again(
     } == before
 
 
-def test_other_parameters_are_other_files(dataset: SignatureDataset, tmp_path: Path) -> None:
+def test_other_parameters_are_other_files(dataset, tmp_path):
     dataset.precompute(n_workers=1, progress=False)
     other = SignatureDataset(
         tmp_path / "meshes", SignatureConfig(n_eigenpairs=21, resolution=10), tmp_path / "cache"
@@ -112,13 +104,7 @@ def test_other_parameters_are_other_files(dataset: SignatureDataset, tmp_path: P
 
 
 @pytest.mark.parametrize("fault", ["garbage", "another table", "a folder"])
-def test_without_the_memory_all_goes_on(
-    dataset: SignatureDataset,
-    tmp_path: Path,
-    read: list[str],
-    caplog: pytest.LogCaptureFixture,
-    fault: str,
-) -> None:
+def test_without_the_memory_all_goes_on(dataset, tmp_path, read, caplog, fault):
     dataset.precompute(n_workers=1, progress=False)
     memory = tmp_path / "cache" / "known_files.sqlite"
     memory.unlink()

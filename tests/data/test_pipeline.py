@@ -49,9 +49,7 @@ def is_cached(pipeline: SignaturePipeline, body: BodyRef) -> bool:
         return False
 
 
-def test_a_signature_is_computed_once_and_is_that_of_the_mesh(
-    pipeline: SignaturePipeline, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_signature_is_computed_once_and_is_that_of_the_mesh(pipeline, path, monkeypatch):
     assert not is_cached(pipeline, BodyRef(path))
     first = pipeline.signature(BodyRef(path))
     assert is_cached(pipeline, BodyRef(path))
@@ -66,14 +64,14 @@ def test_a_signature_is_computed_once_and_is_that_of_the_mesh(
         np.testing.assert_array_equal(one.eigenvalues, expected.eigenvalues)
 
 
-def test_fill_caches_and_returns_only_what_serves(pipeline: SignaturePipeline, path: Path) -> None:
+def test_fill_caches_and_returns_only_what_serves(pipeline, path):
     filled = pipeline.fill([BodyRef(path)])
     assert len(pickle.dumps(filled)) < 1000
     assert is_cached(pipeline, BodyRef(path))
     assert [found(pipeline, BodyRef(path))] == filled == pipeline.fill([BodyRef(path)])
 
 
-def test_a_worker_gets_a_small_copy(pipeline: SignaturePipeline, path: Path) -> None:
+def test_a_worker_gets_a_small_copy(pipeline, path):
     sent = pickle.dumps(pipeline)
     assert len(sent) < 2000
     assert pickle.loads(sent) == pipeline
@@ -81,8 +79,8 @@ def test_a_worker_gets_a_small_copy(pipeline: SignaturePipeline, path: Path) -> 
 
 
 def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
-    pipeline: SignaturePipeline, path: Path, tmp_path: Path
-) -> None:
+    pipeline, path, tmp_path
+):
     copy = tmp_path / "copy.off"
     renamed = tmp_path / "egg.obj"
     other = tmp_path / "other.off"
@@ -108,9 +106,7 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
     assert len(set(keys)) == len(keys)
 
 
-def test_the_key_tells_pdb_from_pqr_also_when_compressed(
-    pipeline: SignaturePipeline, tmp_path: Path
-) -> None:
+def test_the_key_tells_pdb_from_pqr_also_when_compressed(pipeline, tmp_path):
     """A PDB line without an element is valid PQR, with its occupancy as charge and its B-factor as radius."""
     line = b"ATOM      1  CA  ALA A   1      11.104   6.134  -6.504  1.00  4.00\n"
     names = [f"a.{kind}{packed}" for kind in ("pqr", "pdb", "PQR") for packed in (".gz", "")]
@@ -123,9 +119,7 @@ def test_the_key_tells_pdb_from_pqr_also_when_compressed(
     assert len(set(keys)) == 4
 
 
-def test_keys_are_those_of_the_caches_that_exist(
-    pipeline: SignaturePipeline, tmp_path: Path
-) -> None:
+def test_keys_are_those_of_the_caches_that_exist(pipeline, tmp_path):
     """Frozen: another key leaves all caches useless. It changes with the three versions alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
     assert (SignatureConfig.ALGORITHM_VERSION, MENDING_VERSION, MEASURES_VERSION) == (5, 10, 3)
@@ -134,9 +128,7 @@ def test_keys_are_those_of_the_caches_that_exist(
 
 
 @pytest.mark.parametrize("name", ["igps.data.keys.MENDING_VERSION", "ALGORITHM_VERSION"])
-def test_another_version_makes_other_keys(
-    pipeline: SignaturePipeline, path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_another_version_makes_other_keys(pipeline, path, monkeypatch, name):
     pipeline.fill([BodyRef(path)])
     before = pipeline.key(BodyRef(path))
     if name == "ALGORITHM_VERSION":
@@ -151,9 +143,7 @@ def test_another_version_makes_other_keys(
     assert is_cached(pipeline, BodyRef(path))
 
 
-def test_a_body_that_cannot_be_used_is_not_read_again_until_it_changes(
-    pipeline: SignaturePipeline, tmp_path: Path
-) -> None:
+def test_a_body_that_cannot_be_used_is_not_read_again_until_it_changes(pipeline, tmp_path):
     path = tmp_path / "thin.off"
     copy = tmp_path / "copy.off"
     path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
@@ -187,9 +177,7 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("subdivisions", [2, 3])
-def test_fewer_eigenpairs_are_the_beginning_of_the_default_number(
-    tmp_path: Path, computed: list[int], subdivisions: int
-) -> None:
+def test_fewer_eigenpairs_are_the_beginning_of_the_default_number(tmp_path, computed, subdivisions):
     """Of 642 vertices, and of 162, which are too few for the default number: both are subdivided alike.
 
     A body without symmetry: in one that has some, rounding decides which of like points comes first.
@@ -223,9 +211,7 @@ def test_fewer_eigenpairs_are_the_beginning_of_the_default_number(
     assert computed == [250, 64, 250]
 
 
-def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(
-    pipeline: SignaturePipeline, path: Path, computed: list[int]
-) -> None:
+def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(pipeline, path, computed):
     """The file has 162 vertices: enough for 64 eigenpairs, and subdivided for 250."""
     replace(pipeline, config=USUAL).signature(BodyRef(path))
     replace(pipeline, config=NEEDED).signature(BodyRef(path))
@@ -236,9 +222,7 @@ def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(
     assert computed == [250, 64, 20, 64]
 
 
-def test_a_damaged_longer_signature_is_passed_over(
-    path: Path, tmp_path: Path, computed: list[int]
-) -> None:
+def test_a_damaged_longer_signature_is_passed_over(path, tmp_path, computed):
     pipeline = SignaturePipeline(USUAL, LoadOptions(), tmp_path / "cache")
     pipeline.signature(BodyRef(path))
     (file,) = (tmp_path / "cache").rglob("*.safetensors")
@@ -251,7 +235,7 @@ def test_a_damaged_longer_signature_is_passed_over(
         assert computed == [250, 64]
 
 
-def test_a_missing_file_is_named(pipeline: SignaturePipeline, tmp_path: Path) -> None:
+def test_a_missing_file_is_named(pipeline, tmp_path):
     gone = BodyRef(tmp_path / "gone.off")
     assert not is_cached(pipeline, gone)
     for function in (pipeline.key, pipeline.signature, pipeline.mesh):

@@ -17,7 +17,7 @@ from igps.nn.embedding import SpectralEmbedding
 from igps.signature.signature import SignatureConfig
 
 
-def test_together_is_what_both_need() -> None:
+def test_together_is_what_both_need():
     one = Requirements(5, ("depth", "surface_direction"))
     other = Requirements(9, ("electrostatic_potential", "depth"), mesh=True)
     assert one | other == Requirements(
@@ -26,7 +26,7 @@ def test_together_is_what_both_need() -> None:
     assert one | Requirements() == Requirements() | one == one
 
 
-def test_completed_configuration_satisfies_what_is_needed() -> None:
+def test_completed_configuration_satisfies_what_is_needed():
     requirements = Requirements(30, ("surface_direction", "depth"))
     config = SignatureConfig(n_eigenpairs=40, attributes=("depth",), resolution=17)
     with pytest.raises(ValueError, match="surface_direction"):
@@ -53,14 +53,12 @@ def test_completed_configuration_satisfies_what_is_needed() -> None:
         ),
     ],
 )
-def test_a_configuration_that_lacks_something_is_refused(
-    config: SignatureConfig, message: str
-) -> None:
+def test_a_configuration_that_lacks_something_is_refused(config, message):
     with pytest.raises(ValueError, match=message):
         Requirements(12, ("depth",)).check_config(config)
 
 
-def test_a_batch_that_lacks_something_is_refused() -> None:
+def test_a_batch_that_lacks_something_is_refused():
     """The second shape has seven eigenpairs; what is padded is none."""
     batch = two_bodies()
     Requirements(7, ("depth", "surface_direction")).check(batch)
@@ -81,7 +79,7 @@ def test_a_batch_that_lacks_something_is_refused() -> None:
     Requirements().check(batch_of(torch.rand(1, 5, 3)))
 
 
-def test_needs_of_an_embedding_are_its_eigenpairs() -> None:
+def test_needs_of_an_embedding_are_its_eigenpairs():
     assert embedding_requirements(SpectralEmbedding(n_eigenpairs=6)) == Requirements(6)
     assert embedding_requirements(SpectralEmbedding()) == Requirements(whole_spectrum=True)
     assert embedding_requirements(nn.Identity()) == Requirements(whole_spectrum=True)
@@ -100,9 +98,7 @@ def test_needs_of_an_embedding_are_its_eigenpairs() -> None:
         (Requirements(300, whole_spectrum=True), 300),
     ],
 )
-def test_as_many_eigenpairs_as_needed_where_no_number_is_given(
-    needs: Requirements, n_eigenpairs: int
-) -> None:
+def test_as_many_eigenpairs_as_needed_where_no_number_is_given(needs, n_eigenpairs):
     """64 or more, on which the order of the samples depends; a mesh has room for 250 in any case."""
     completed = needs.apply_to(SignatureConfig(resolution=17))
     assert (completed.n_eigenpairs, completed.resolution) == (n_eigenpairs, 17)
@@ -119,7 +115,7 @@ def test_as_many_eigenpairs_as_needed_where_no_number_is_given(
     assert needs.apply_to(SignatureConfig(least_vertices=2000)).n_vertices_read == 2000
 
 
-def test_what_a_descriptor_does_not_say_is_all() -> None:
+def test_what_a_descriptor_does_not_say_is_all():
     class Own(BodyDescriptor):
         def describe_body(self, body: Body) -> NDArray[np.float32]:
             return body.eigenvalues.astype(np.float32)
@@ -127,7 +123,7 @@ def test_what_a_descriptor_does_not_say_is_all() -> None:
     assert Own().requirements.apply_to(SignatureConfig()).n_eigenpairs == 250
 
 
-def test_no_descriptor_needs_more_eigenpairs_than_are_computed_by_default() -> None:
+def test_no_descriptor_needs_more_eigenpairs_than_are_computed_by_default():
     for name in NAMES:
         needs = descriptor(name).requirements
         n_eigenpairs = needs.apply_to(SignatureConfig()).n_eigenpairs

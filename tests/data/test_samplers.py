@@ -9,7 +9,7 @@ SIZES = torch.randint(1000, 4000, (403,), generator=torch.Generator().manual_see
 
 
 @pytest.mark.parametrize("drop_last", [False, True])
-def test_every_shape_comes_once_in_batches_of_the_size_asked(drop_last: bool) -> None:
+def test_every_shape_comes_once_in_batches_of_the_size_asked(drop_last):
     sampler = BucketBatchSampler(
         SIZES, 8, drop_last=drop_last, generator=torch.Generator().manual_seed(0)
     )
@@ -29,14 +29,14 @@ def padding(batches: list[list[int]]) -> float:
     )
 
 
-def test_padding_is_a_small_part_of_that_of_random_batches() -> None:
+def test_padding_is_a_small_part_of_that_of_random_batches():
     sampler = BucketBatchSampler(SIZES.tolist(), 8, generator=torch.Generator().manual_seed(0))
     random = torch.randperm(403, generator=torch.Generator().manual_seed(0)).split(8)
     assert padding([one.tolist() for one in random]) > 0.3
     assert padding(list(sampler)) < 0.1
 
 
-def test_epochs_differ_and_seeds_say_all() -> None:
+def test_epochs_differ_and_seeds_say_all():
     def epochs(seed: int) -> list[list[list[int]]]:
         sampler = BucketBatchSampler(SIZES, 8, generator=torch.Generator().manual_seed(seed))
         return [list(sampler), list(sampler)]
@@ -49,5 +49,5 @@ def test_epochs_differ_and_seeds_say_all() -> None:
         BucketBatchSampler(SIZES, 0)
 
 
-def test_no_shapes_make_no_batch() -> None:
+def test_no_shapes_make_no_batch():
     assert list(BucketBatchSampler([], 8)) == []

@@ -16,7 +16,7 @@ def touch(root: Path, *names: str) -> None:
         (root / name).write_text("")
 
 
-def test_folder_per_class(tmp_path: Path) -> None:
+def test_folder_per_class(tmp_path):
     touch(
         tmp_path,
         "cat/2.off",
@@ -33,7 +33,7 @@ def test_folder_per_class(tmp_path: Path) -> None:
     assert files.paths[2] == tmp_path / "dog" / "deep" / "3.ply"
 
 
-def test_labels_file_decides_what_belongs(tmp_path: Path) -> None:
+def test_labels_file_decides_what_belongs(tmp_path):
     touch(tmp_path, "1.off", "2.off", "3.off")
     (tmp_path / "labels.csv").write_text("label,file\r\ncat,2.off\r\ndog,1.off\r\n")
     files = find_bodies(tmp_path)
@@ -41,7 +41,7 @@ def test_labels_file_decides_what_belongs(tmp_path: Path) -> None:
     assert files.labels == ("cat", "dog")
 
 
-def test_meshes_alone_have_no_classes(tmp_path: Path) -> None:
+def test_meshes_alone_have_no_classes(tmp_path):
     touch(tmp_path, "b.obj", "a.STL", "notes.json")
     files = find_bodies(tmp_path)
     assert files.names == ("a.STL", "b.obj")
@@ -69,7 +69,7 @@ def test_meshes_alone_have_no_classes(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bad_labels_file(tmp_path: Path, text: str, message: str) -> None:
+def test_bad_labels_file(tmp_path, text, message):
     (tmp_path / "labels.csv").write_text(text, encoding="latin-1")
     with pytest.raises(ValueError, match=rf"labels\.csv: .*{message}"):
         find_bodies(tmp_path)
@@ -77,7 +77,7 @@ def test_bad_labels_file(tmp_path: Path, text: str, message: str) -> None:
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_tables_as_spreadsheets_save_them(tmp_path: Path, encoding: str, separator: str) -> None:
+def test_tables_as_spreadsheets_save_them(tmp_path, encoding, separator):
     touch(tmp_path, "1.off", "2.off")
     rows = [("File", "Label", "Alter"), ("1.off", "Wölfe", "3"), ("2.off", "cat", "4")]
     text = "".join(separator.join(row) + "\r\n" for row in rows)
@@ -87,7 +87,7 @@ def test_tables_as_spreadsheets_save_them(tmp_path: Path, encoding: str, separat
     assert found.columns == {"Alter": ("3", "4")}
 
 
-def test_blanks_around_the_words_of_a_table_make_no_other_class(tmp_path: Path) -> None:
+def test_blanks_around_the_words_of_a_table_make_no_other_class(tmp_path):
     touch(tmp_path, "1.off", "2.off")
     (tmp_path / "labels.csv").write_text("file, label, age\n1.off, cat, 3\n2.off ,cat \n")
     found = find_bodies(tmp_path)
@@ -96,7 +96,7 @@ def test_blanks_around_the_words_of_a_table_make_no_other_class(tmp_path: Path) 
     assert found.columns == {"age": ("3", None)}
 
 
-def test_a_part_is_told_from_a_folder_with_its_mark(tmp_path: Path) -> None:
+def test_a_part_is_told_from_a_folder_with_its_mark(tmp_path):
     touch(tmp_path, "case #1/a.obj", "case #1/b#2.obj")
     folder = tmp_path / "case #1"
     assert file_and_part(folder / "a.obj#liver") == (folder / "a.obj", "liver")
@@ -109,9 +109,7 @@ def test_a_part_is_told_from_a_folder_with_its_mark(tmp_path: Path) -> None:
     )  # no name of a file is as long
 
 
-def test_what_is_left_out_of_a_folder_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_is_left_out_of_a_folder_is_told(tmp_path, monkeypatch, caplog):
     touch(tmp_path, "cat/1.off", "dog/2.off", "alone.off")
     # As of a file that was not fetched
     (tmp_path / "cat" / "lost.off").symlink_to(tmp_path / "not there.off")
@@ -137,7 +135,7 @@ def test_what_is_left_out_of_a_folder_is_told(
     assert len(caplog.records) == 3
 
 
-def test_names_that_are_no_words_are_refused(tmp_path: Path) -> None:
+def test_names_that_are_no_words_are_refused(tmp_path):
     name = Path(os.fsdecode(os.fsencode(tmp_path) + b"/m\xfcll"))
     touch(name, "1.off")
     with pytest.raises(ValueError, match=r"m\\xfcll': expected a name in UTF-8"):
@@ -148,16 +146,16 @@ def test_names_that_are_no_words_are_refused(tmp_path: Path) -> None:
         bodies_of_files([name / "1.off"])
 
 
-def test_labels_may_be_an_array_and_are_of_files_alone(tmp_path: Path) -> None:
+def test_labels_may_be_an_array_and_are_of_files_alone(tmp_path):
     touch(tmp_path, "cat/1.off", "dog/2.off")
     paths = [tmp_path / "cat" / "1.off", tmp_path / "dog" / "2.off"]
-    assert bodies_of(paths, np.array(["x", "y"])).labels == ("x", "y")  # type: ignore[arg-type]
+    assert bodies_of(paths, np.array(["x", "y"])).labels == ("x", "y")
     for given in (tmp_path, find_bodies(tmp_path)):
         with pytest.raises(ValueError, match="labels: expected None with a folder or bodies"):
             bodies_of(given, ["x", "y"])
 
 
-def test_nothing_there(tmp_path: Path) -> None:
+def test_nothing_there(tmp_path):
     with pytest.raises(FileNotFoundError, match="no body found"):
         find_bodies(tmp_path)
     with pytest.raises(FileNotFoundError, match="no such folder"):
@@ -168,7 +166,7 @@ def test_nothing_there(tmp_path: Path) -> None:
         bodies_of(tmp_path / "nowhere")
 
 
-def test_given_files_need_one_label_each() -> None:
+def test_given_files_need_one_label_each():
     assert bodies_of_files(["b.off", "a.off"], ["x", "y"]).labels == ("x", "y")
     with pytest.raises(ValueError, match="labels: expected one for each of 2"):
         bodies_of_files(["b.off", "a.off"], ["x"])

@@ -19,7 +19,7 @@ def disjoint(split: Split) -> bool:
     return sum(map(len, parts)) == len(set.union(*parts))
 
 
-def test_seen_split_takes_the_same_number_of_every_class() -> None:
+def test_seen_split_takes_the_same_number_of_every_class():
     split = split_seen(LABELS, 4, n_validation=1, seed=3)
     assert disjoint(split)
     assert classes(split.train) == sorted([*range(8)] * 3)
@@ -27,7 +27,7 @@ def test_seen_split_takes_the_same_number_of_every_class() -> None:
     assert classes(split.test) == sorted([*range(8)] * 2)
 
 
-def test_unseen_split_shares_no_class() -> None:
+def test_unseen_split_shares_no_class():
     split = split_unseen(LABELS, 5, n_validation=2, seed=3)
     assert disjoint(split)
     parts = [set(classes(part)) for part in (split.train, split.validation, split.test)]
@@ -36,12 +36,12 @@ def test_unseen_split_shares_no_class() -> None:
     assert len(split.train) == 3 * 6
 
 
-def test_a_whole_number_may_be_a_float() -> None:
+def test_a_whole_number_may_be_a_float():
     labels = torch.arange(3).repeat_interleave(4)
     assert split_seen(labels, 3.0, n_validation=1.0) == split_seen(labels, 3, n_validation=1)
 
 
-def test_shares_leave_two_of_each_class_to_validate_and_to_test() -> None:
+def test_shares_leave_two_of_each_class_to_validate_and_to_test():
     labels = torch.arange(3).repeat_interleave(torch.tensor([5, 8, 20]))
     split = split_seen(labels, 0.75, n_validation=0.25)
     counts = [
@@ -55,18 +55,18 @@ def test_shares_leave_two_of_each_class_to_validate_and_to_test() -> None:
     ] == [1, 1]
 
 
-def test_fewer_training_classes_keep_the_test_classes() -> None:
+def test_fewer_training_classes_keep_the_test_classes():
     many, few = (split_unseen(LABELS, n, n_test=2, seed=5) for n in (6, 3))
     assert many.test == few.test
     assert set(few.train) < set(many.train)
 
 
-def test_validation_is_taken_from_the_training_part_alone() -> None:
+def test_validation_is_taken_from_the_training_part_alone():
     for split in (split_seen, split_unseen):
         assert split(LABELS, 4, seed=2).test == split(LABELS, 4, n_validation=2, seed=2).test
 
 
-def test_splits_depend_on_the_seed_alone() -> None:
+def test_splits_depend_on_the_seed_alone():
     for split in (split_seen, split_unseen):
         torch.manual_seed(0)
         first = split(LABELS, 4, seed=1)
@@ -88,6 +88,6 @@ def test_splits_depend_on_the_seed_alone() -> None:
         (split_unseen, {"n_train": 3, "n_validation": 3}, "n_validation"),
     ],
 )
-def test_impossible_splits_are_refused(split, arguments: dict[str, float], message: str) -> None:  # type: ignore[no-untyped-def]
+def test_impossible_splits_are_refused(split, arguments, message):
     with pytest.raises(ValueError, match=message):
         split(LABELS, **arguments)

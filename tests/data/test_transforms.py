@@ -16,7 +16,6 @@ from igps.data.transforms import (
     FlipSigns,
     Noise,
     Scale,
-    Transform,
 )
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
@@ -59,9 +58,7 @@ def same(one: Signature, other: Signature) -> bool:
 
 
 @pytest.mark.parametrize("transform", EVERY, ids=lambda one: type(one).__name__)
-def test_a_seed_says_all_and_no_input_is_changed(
-    signature: Signature, transform: Transform
-) -> None:
+def test_a_seed_says_all_and_no_input_is_changed(signature, transform):
     before = [array.copy() for array in arrays(signature)]
     for array in arrays(signature):
         array.flags.writeable = False
@@ -78,9 +75,7 @@ def test_a_seed_says_all_and_no_input_is_changed(
 
 
 @pytest.mark.parametrize("transform", EVERY, ids=lambda one: type(one).__name__)
-def test_without_a_seed_the_global_generator_draws(
-    signature: Signature, transform: Transform
-) -> None:
+def test_without_a_seed_the_global_generator_draws(signature, transform):
     torch.manual_seed(0)
     first = transform(signature)
     second = transform(signature)
@@ -95,7 +90,7 @@ def rows(samples: Samples) -> list[tuple[float, ...]]:
     return [tuple(row) for row in np.hstack([samples.points, samples.eigenfunctions])]
 
 
-def test_fewer_samples_are_some_of_them_in_their_order(signature: Signature) -> None:
+def test_fewer_samples_are_some_of_them_in_their_order(signature):
     few = FewerSamples(n_interior=9, n_surface=10**6, seed=0)(signature)
     assert len(few.interior) == 9
     places = [rows(signature.interior).index(row) for row in rows(few.interior)]
@@ -104,7 +99,7 @@ def test_fewer_samples_are_some_of_them_in_their_order(signature: Signature) -> 
     assert rows(few.surface) == rows(signature.surface)
 
 
-def test_fewer_eigenpairs_are_some_of_them_with_their_eigenvalues(signature: Signature) -> None:
+def test_fewer_eigenpairs_are_some_of_them_with_their_eigenvalues(signature):
     few = FewerEigenpairs(n_eigenpairs=5, seed=0)(signature)
     places = [signature.eigenvalues.tolist().index(value) for value in few.eigenvalues]
     assert len(places) == 5
@@ -113,7 +108,7 @@ def test_fewer_eigenpairs_are_some_of_them_with_their_eigenvalues(signature: Sig
         np.testing.assert_array_equal(some.eigenfunctions, all_of_them.eigenfunctions[:, places])
 
 
-def test_noise_is_as_strong_as_it_says(signature: Signature) -> None:
+def test_noise_is_as_strong_as_it_says(signature):
     many = FewerSamples(seed=0)(signature)
     noisy = Noise(points=0.02, eigenfunctions=0.3, seed=0)(many)
     root = np.sqrt(signature.area)
@@ -123,7 +118,7 @@ def test_noise_is_as_strong_as_it_says(signature: Signature) -> None:
     assert same(Noise(seed=0)(many), many)
 
 
-def test_scaled_is_the_signature_of_the_scaled_body(signature: Signature) -> None:
+def test_scaled_is_the_signature_of_the_scaled_body(signature):
     """Computed from a mesh of twice the size; eigenfunctions to their signs, so that products of them are compared."""
     scaled = Scale(smallest=2.0, largest=2.0, seed=0)(signature)
     expected = of_egg(2.0)
@@ -141,9 +136,7 @@ def test_scaled_is_the_signature_of_the_scaled_body(signature: Signature) -> Non
         Scale(smallest=2.0, largest=1.0)
 
 
-def test_signs_are_flipped_for_all_samples_alike_and_change_no_distance(
-    signature: Signature,
-) -> None:
+def test_signs_are_flipped_for_all_samples_alike_and_change_no_distance(signature):
     flipped = FlipSigns(seed=1)(signature)
     inside = signature.interior.eigenfunctions
     outside = signature.surface.eigenfunctions
@@ -156,7 +149,7 @@ def test_signs_are_flipped_for_all_samples_alike_and_change_no_distance(
     )
 
 
-def test_composed_are_one_after_the_other(signature: Signature) -> None:
+def test_composed_are_one_after_the_other(signature):
     both = Compose(FewerSamples(n_interior=9, seed=0), Scale(seed=1))
     assert same(both(signature), Scale(seed=1)(FewerSamples(n_interior=9, seed=0)(signature)))
     assert both.cache_tag == f"{FewerSamples(n_interior=9, seed=0)!r}; {Scale(seed=1)!r}"

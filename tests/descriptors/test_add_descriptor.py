@@ -40,12 +40,12 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
 
 
-def test_the_example_is_short() -> None:
+def test_the_example_is_short():
     text = file_of_the_page("mine.py") + file_of_the_page("pyproject.toml")
     assert len(text.splitlines()) <= 30
 
 
-def test_an_installed_descriptor_is_known_by_its_name(installed: None, blob: igps.Mesh) -> None:
+def test_an_installed_descriptor_is_known_by_its_name(installed, blob):
     config = SignatureConfig(n_eigenpairs=5, resolution=6, min_samples=0, n_surface_samples=50)
     batch = igps.collate([igps.compute_signature(blob, config)])
     roundness = igps.descriptor("roundness")
@@ -53,14 +53,12 @@ def test_an_installed_descriptor_is_known_by_its_name(installed: None, blob: igp
     assert roundness(batch).item() == pytest.approx(blob.volume / blob.area**1.5)
 
 
-def test_a_wrong_name_lists_installed_descriptors_too(installed: None) -> None:
+def test_a_wrong_name_lists_installed_descriptors_too(installed):
     with pytest.raises(ValueError, match=r"expected one of interior, .*, roundness, or package"):
         igps.descriptor("round")
 
 
-def test_a_name_of_the_library_stays_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_name_of_the_library_stays_its_own(tmp_path, monkeypatch):
     info = tmp_path / "other-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")

@@ -31,17 +31,17 @@ def words() -> str:
     return found
 
 
-def test_every_descriptor_has_words_of_its_own() -> None:
+def test_every_descriptor_has_words_of_its_own():
     assert len({cache_tag(descriptor(name)) for name in NAMES} - {None}) == len(NAMES)
     assert words() == words()
 
 
-def test_what_is_not_the_librarys_has_none() -> None:
+def test_what_is_not_the_librarys_has_none():
     assert cache_tag(own_descriptors.Same()) is None
     assert cache_tag(EmbeddedDescriptor(own_descriptors.Same(), WhitenedHead())) is None
 
 
-def test_a_hook_is_not_the_librarys() -> None:
+def test_a_hook_is_not_the_librarys():
     """It changes descriptions, which came from the cache without it."""
     for register in (
         torch.nn.Module.register_forward_hook,
@@ -54,7 +54,7 @@ def test_a_hook_is_not_the_librarys() -> None:
         assert cache_tag(hooked) == cache_tag(descriptor("interior"))
 
 
-def test_what_it_was_made_with_changes_the_words() -> None:
+def test_what_it_was_made_with_changes_the_words():
     one, other = (
         PairHistogram([EuclideanDistance(8), Attribute(name, [0.1, 0.2])])
         for name in ("depth", "twist")
@@ -67,14 +67,14 @@ def test_what_it_was_made_with_changes_the_words() -> None:
     )
 
 
-def test_parameters_change_the_words() -> None:
+def test_parameters_change_the_words():
     changed = descriptor("interior")
     with torch.no_grad():
         next(changed.buffers()).mul_(1.5)
     assert cache_tag(changed) != cache_tag(descriptor("interior"))
 
 
-def test_the_code_changes_the_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_changes_the_words(tmp_path, monkeypatch):
     before = words()
     copied = tmp_path / "igps"
     shutil.copytree(Path(fingerprint.__file__).parents[1], copied)
@@ -88,7 +88,7 @@ def test_the_code_changes_the_words(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert words() != before
 
 
-def test_versions_change_the_words(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_versions_change_the_words(monkeypatch):
     before = words()
     fingerprint._code_tag.cache_clear()
     version = fingerprint.importlib.metadata.version

@@ -101,7 +101,7 @@ def description(name: str, kind: str) -> torch.Tensor:
         return descriptor(name)(body(kind))
 
 
-def test_descriptors_are_named_and_say_where_they_are_from() -> None:
+def test_descriptors_are_named_and_say_where_they_are_from():
     for name in NAMES:
         found = igps.descriptor(name)
         assert found.name == name
@@ -112,7 +112,7 @@ def test_descriptors_are_named_and_say_where_they_are_from() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_descriptions_are_finite_numbers_of_one_shape_and_repeat(name: str) -> None:
+def test_descriptions_are_finite_numbers_of_one_shape_and_repeat(name):
     first = description(name, "rod")
     other = description(name, "other")
     assert first.dtype == other.dtype == torch.float32
@@ -126,7 +126,7 @@ def test_descriptions_are_finite_numbers_of_one_shape_and_repeat(name: str) -> N
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_padding_changes_no_description(name: str) -> None:
+def test_padding_changes_no_description(name):
     signatures = []
     meshes = []
     for batch in (body("rod"), body("other")):
@@ -150,7 +150,7 @@ def with_individuals(name: str) -> Descriptor:
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("name", ON_TENSORS)
-def test_half_precision_describes_nearly_the_same(name: str, dtype: torch.dtype) -> None:
+def test_half_precision_describes_nearly_the_same(name, dtype):
     """Of the module, and of the samples; what is rounded to 3 or 2 digits falls into other cells now and then."""
     expected = description(name, "rod").flatten().float()
     with torch.inference_mode():
@@ -162,9 +162,7 @@ def test_half_precision_describes_nearly_the_same(name: str, dtype: torch.dtype)
 
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("name", [*NAMES, "rich+", "pretrained+"])
-def test_tensors_are_made_on_the_device_of_the_bodies(
-    name: str, compiled: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tensors_are_made_on_the_device_of_the_bodies(name, compiled, monkeypatch):
     """With the default device "meta", a tensor that is made without naming a device would have no values."""
     if not compiled:  # as on a GPU
         monkeypatch.setattr(blocks, "uses_loops", lambda _: False)
@@ -197,9 +195,7 @@ class Counting(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("name", ON_TENSORS)
-def test_a_batch_on_a_device_is_described_at_once(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_batch_on_a_device_is_described_at_once(name, monkeypatch):
     """The number of operations does not depend on the number of bodies; descriptions equal those of single bodies."""
     found = descriptor(name)
     pair = SignatureBatch.concatenate(
@@ -223,7 +219,7 @@ def test_a_batch_on_a_device_is_described_at_once(
 
 
 @pytest.mark.parametrize("name", ON_TENSORS)
-def test_any_number_of_bodies_goes_through_an_exported_program(name: str) -> None:
+def test_any_number_of_bodies_goes_through_an_exported_program(name):
     rod, other = (body(kind) for kind in ("rod", "other"))
     found = descriptor(name)
     several = SignatureBatch.concatenate([other, rod, other, body("pose")])
@@ -235,7 +231,7 @@ def test_any_number_of_bodies_goes_through_an_exported_program(name: str) -> Non
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("name", [*NAMES, "rich+", "pretrained+"])
-def test_cuda_describes_as_the_cpu_does(name: str) -> None:
+def test_cuda_describes_as_the_cpu_does(name):
     found = with_individuals(name)
     with torch.inference_mode():
         expected = torch.cat([found(body(kind)) for kind in ("rod", "other")])
@@ -253,7 +249,7 @@ def test_cuda_describes_as_the_cpu_does(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["gps", "multiscale", "rich", "rich+", "pretrained", "pretrained+"]
 )
-def test_descriptors_are_traced_whole(name: str) -> None:
+def test_descriptors_are_traced_whole(name):
     found = with_individuals(name)
     torch.compiler.reset()
     with torch.inference_mode():
@@ -263,7 +259,7 @@ def test_descriptors_are_traced_whole(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_distances_are_a_matrix_of_what_pairs_give(name: str) -> None:
+def test_distances_are_a_matrix_of_what_pairs_give(name):
     distance = descriptor(name).distances
     queries = torch.cat([description(name, kind) for kind in ("rod", "other")])
     gallery = torch.cat([description(name, kind) for kind in ("other", "pose", "rod")])
@@ -283,7 +279,7 @@ def test_distances_are_a_matrix_of_what_pairs_give(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_bent_body_is_closer_than_another(name: str) -> None:
+def test_a_bent_body_is_closer_than_another(name):
     distance = descriptor(name).distances
     bent_rod, other = (
         float(distance(description(name, "rod"), description(name, kind)))
@@ -293,7 +289,7 @@ def test_a_bent_body_is_closer_than_another(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "change"), CHANGES)
-def test_descriptions_are_invariant_as_claimed(name: str, change: str) -> None:
+def test_descriptions_are_invariant_as_claimed(name, change):
     distance = descriptor(name).distances
     changed = float(distance(description(name, "rod"), description(name, change)))
     other = float(distance(description(name, "rod"), description(name, "other")))
@@ -311,7 +307,7 @@ def test_descriptions_are_invariant_as_claimed(name: str, change: str) -> None:
 @pytest.mark.parametrize(
     "name", [name for name in NAMES if "pose" not in descriptor(name).invariant_to]
 )
-def test_descriptors_not_claimed_pose_invariant_change_with_pose(name: str) -> None:
+def test_descriptors_not_claimed_pose_invariant_change_with_pose(name):
     distance = descriptor(name).distances
     changed = float(distance(description(name, "rod"), description(name, "pose")))
     scaled = float(distance(description(name, "rod"), description(name, "scale")))
@@ -320,7 +316,7 @@ def test_descriptors_not_claimed_pose_invariant_change_with_pose(name: str) -> N
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_batch_without_what_is_needed_is_refused(name: str) -> None:
+def test_a_batch_without_what_is_needed_is_refused(name):
     found = descriptor(name)
     whole = body("rod")
     (one,) = whole.bodies()

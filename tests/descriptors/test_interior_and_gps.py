@@ -24,7 +24,7 @@ def signature(blob: Mesh) -> Signature:
 
 
 @pytest.mark.parametrize("samples", ["interior", "surface"])
-def test_histograms_are_those_of_the_layout(signature: Signature, samples: str) -> None:
+def test_histograms_are_those_of_the_layout(signature, samples):
     """4 classes of [0, 1.5], and 64 bins of [0, 4] with a linear kernel, of φ/√λ at the samples of that name."""
     found = {"interior": interior, "surface": gps}[samples](N_EIGENPAIRS)
     expected = paper_histogram(
@@ -35,7 +35,7 @@ def test_histograms_are_those_of_the_layout(signature: Signature, samples: str) 
     assert (expected > 0).any(axis=1).sum() >= 3, "several classes are seen"
 
 
-def test_the_paper_takes_250_eigenpairs(signature: Signature) -> None:
+def test_the_paper_takes_250_eigenpairs(signature):
     for name in ("interior", "gps"):
         found = igps.descriptor(name)
         assert found.requirements.n_eigenpairs == 250

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -25,7 +24,7 @@ def ellipsoid(*semi_axes: float, unit: str | None = None) -> Mesh:
     return Mesh(SPHERE.vertices * semi_axes, SPHERE.faces, unit=unit)
 
 
-def test_signatures_of_files_hold_the_numbers_of_their_meshes(tmp_path: Path) -> None:
+def test_signatures_of_files_hold_the_numbers_of_their_meshes(tmp_path):
     for height in (1, 2):
         tall = trimesh.Trimesh(SPHERE.vertices * [1, 1, height], SPHERE.faces)
         tall.export(tmp_path / f"{height}.off")
@@ -38,7 +37,7 @@ def test_signatures_of_files_hold_the_numbers_of_their_meshes(tmp_path: Path) ->
     assert len(described[1].signature.eigenvalues) == 0
 
 
-def test_scaled_bodies_differ_by_their_size_alone() -> None:
+def test_scaled_bodies_differ_by_their_size_alone():
     bodies = [
         ellipsoid(1, 2, 3),
         ellipsoid(2, 4, 6),
@@ -61,19 +60,19 @@ def test_scaled_bodies_differ_by_their_size_alone() -> None:
     torch.testing.assert_close(logarithms[3], logarithms[0], atol=1e-3, rtol=0)
 
 
-def test_a_scaled_signature_has_the_numbers_of_the_scaled_body() -> None:
+def test_a_scaled_signature_has_the_numbers_of_the_scaled_body():
     scaled = Scale(smallest=2, largest=2, seed=0)(compute_signature(ellipsoid(1, 2, 3), CONFIG))
     expected = compute_signature(ellipsoid(2, 4, 6), CONFIG)
     assert dict(scaled.measures) == pytest.approx(dict(expected.measures))
 
 
-def test_bodies_without_numbers_are_refused() -> None:
+def test_bodies_without_numbers_are_refused():
     bare = replace(compute_signature(ellipsoid(1, 2, 3), CONFIG), measures={})
     with pytest.raises(ValueError, match=r"^measures: expected bodies with plain numbers"):
         igps.descriptor("measures")(collate([bare]))
 
 
-def test_columns_are_scaled_by_the_first_collection_and_by_no_other() -> None:
+def test_columns_are_scaled_by_the_first_collection_and_by_no_other():
     bodies = [ellipsoid(1, 2, height) for height in (1, 2, 4)]
     numbers = [compute_signature(body, CONFIG).measures for body in bodies]
     found = Measures()

@@ -73,11 +73,11 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return f"{package}.shapes"
 
 
-def test_names_are_the_fourteen() -> None:
+def test_names_are_the_fourteen():
     assert NAMES == FOURTEEN
 
 
-def test_a_wrong_name_lists_all() -> None:
+def test_a_wrong_name_lists_all():
     names = ", ".join((*FOURTEEN, "composition", "fold", "molecular"))
     with pytest.raises(
         ValueError, match=f"^descriptor: expected one of {names}, or .*, got 'best'"
@@ -85,12 +85,12 @@ def test_a_wrong_name_lists_all() -> None:
         igps.descriptor("best")
 
 
-def test_an_object_is_itself() -> None:
+def test_an_object_is_itself():
     mine = D2(n_bins=3)
     assert igps.descriptor(mine) is mine
 
 
-def test_own_class_function_and_object_by_import_path(own: str, blob: igps.Mesh) -> None:
+def test_own_class_function_and_object_by_import_path(own, blob):
     config = SignatureConfig(n_eigenpairs=5, resolution=6, min_samples=0, n_surface_samples=50)
     batch = igps.collate([igps.compute_signature(blob, config)])
     made = {name: igps.descriptor(f"{own}:{name}") for name in ("Roundness", "coarse", "ready")}
@@ -114,12 +114,12 @@ def test_own_class_function_and_object_by_import_path(own: str, blob: igps.Mesh)
         ("OWN:nothing", "nothing to be or to make an igps.Descriptor, got NoneType"),
     ],
 )
-def test_what_is_no_descriptor_is_refused(own: str, path: str, message: str) -> None:
+def test_what_is_no_descriptor_is_refused(own, path, message):
     with pytest.raises(ValueError, match=message):
         igps.descriptor(path.replace("OWN", own))
 
 
-def test_what_a_descriptor_needs_is_added_or_asked_for() -> None:
+def test_what_a_descriptor_needs_is_added_or_asked_for():
     config = SignatureConfig(n_eigenpairs=50, attributes=("electrostatic_potential",))
     assert igps.descriptor("rich").requirements.apply_to(config) == replace(
         config, attributes=("electrostatic_potential", "depth", "surface_direction")
@@ -142,7 +142,7 @@ def test_what_a_descriptor_needs_is_added_or_asked_for() -> None:
             needs.apply_to(SignatureConfig(n_eigenpairs=least - 1))
 
 
-def test_needs_together_are_the_most_of_each() -> None:
+def test_needs_together_are_the_most_of_each():
     one = Requirements(n_eigenpairs=5, attributes=("depth",))
     other = Requirements(n_eigenpairs=3, attributes=("surface_direction", "depth"), mesh=True)
     assert one | other == Requirements(5, ("depth", "surface_direction"), mesh=True)

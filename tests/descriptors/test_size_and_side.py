@@ -75,9 +75,7 @@ def from_body(name: str, signatures: dict[str, Signature]) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("name", ["interior", "pretrained"])
-def test_distances_with_size_are_those_of_the_formula(
-    name: str, signatures: dict[str, Signature]
-) -> None:
+def test_distances_with_size_are_those_of_the_formula(name, signatures):
     plain = from_body(name, signatures)
     sized = from_body(f"{name}+size", signatures)
     for other in ("body", "centimetres", "mirrored"):
@@ -88,9 +86,7 @@ def test_distances_with_size_are_those_of_the_formula(
     assert sized["larger"] == pytest.approx(expected, rel=1e-3)
 
 
-def test_vectors_count_a_small_difference_in_size_as_distances_do(
-    signatures: dict[str, Signature],
-) -> None:
+def test_vectors_count_a_small_difference_in_size_as_distances_do(signatures):
     descriptor = igps.descriptor("interior", size="keep")
     body = descriptor(collate([signatures["body"]]))
     other = body.clone()
@@ -101,7 +97,7 @@ def test_vectors_count_a_small_difference_in_size_as_distances_do(
     )
 
 
-def test_short_vectors_keep_the_numbers_of_size_and_side(signatures: dict[str, Signature]) -> None:
+def test_short_vectors_keep_the_numbers_of_size_and_side(signatures):
     descriptor = igps.descriptor("pretrained+side+size")
     vectors = descriptor(collate(list(signatures.values())))
     short = descriptor.shorten(vectors)
@@ -112,9 +108,7 @@ def test_short_vectors_keep_the_numbers_of_size_and_side(signatures: dict[str, S
 
 
 @pytest.mark.parametrize("name", ["interior", "rich"])
-def test_a_mirror_image_is_the_body_unless_it_is_distinct(
-    name: str, signatures: dict[str, Signature]
-) -> None:
+def test_a_mirror_image_is_the_body_unless_it_is_distinct(name, signatures):
     same = from_body(name, signatures)
     distinct = from_body(f"{name}+side", signatures)
     assert same["mirrored"] < 0.1 * SCALES[name]
@@ -122,9 +116,7 @@ def test_a_mirror_image_is_the_body_unless_it_is_distinct(
     assert distinct["larger"] < 0.2 * distinct["mirrored"]  # to sampling noise the body itself
 
 
-def test_twists_of_a_mirror_image_have_the_other_sign_and_a_symmetric_body_has_none(
-    signatures: dict[str, Signature],
-) -> None:
+def test_twists_of_a_mirror_image_have_the_other_sign_and_a_symmetric_body_has_none(signatures):
     descriptor = igps.descriptor("interior", mirror="distinct")
     odd = {name: descriptor(collate([one]))[0, -18:] for name, one in signatures.items()}
     assert float((odd["body"] + odd["mirrored"]).norm()) < 0.15 * float(odd["body"].norm())
@@ -132,7 +124,7 @@ def test_twists_of_a_mirror_image_have_the_other_sign_and_a_symmetric_body_has_n
 
 
 @pytest.mark.parametrize("seed", [3, 5])
-def test_a_body_that_is_turned_is_far_nearer_than_its_mirror_image(seed: int) -> None:
+def test_a_body_that_is_turned_is_far_nearer_than_its_mirror_image(seed):
     """Of a ball with a dozen smooth bumps and dents, whose sides differ little."""
     random = np.random.default_rng(seed)
     ball = SURFACE.vertices
@@ -165,9 +157,7 @@ def bent(mirrored: bool = False, turn: np.ndarray | None = None) -> Mesh:
     return Mesh(points if turn is None else points @ turn.T * 3 + 5, SURFACE.faces)
 
 
-def test_signed_volumes_turn_their_signs_with_a_mirror_image_and_are_blind_to_motion_scale_and_padding() -> (
-    None
-):
+def test_signed_volumes_turn_their_signs_with_a_mirror_image_and_are_blind_to_motion_scale_and_padding():
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     turn *= np.linalg.det(turn)
     made = [
@@ -183,7 +173,7 @@ def test_signed_volumes_turn_their_signs_with_a_mirror_image_and_are_blind_to_mo
     assert float(found[3].norm()) < 0.1 * float(found[0].norm())
 
 
-def test_a_signed_volume_is_that_of_its_three_vectors() -> None:
+def test_a_signed_volume_is_that_of_its_three_vectors():
     """Of the interior and of the surface by distance, and of the surface by heat: written down for one body."""
     signature = compute_signature(bent(), CONFIG)
     inside, outside = (
@@ -207,7 +197,7 @@ def test_a_signed_volume_is_that_of_its_three_vectors() -> None:
     assert float(signed_volumes(collate([signature]))[0, 0]) == pytest.approx(expected, rel=1e-3)
 
 
-def test_names_carry_the_choice() -> None:
+def test_names_carry_the_choice():
     assert igps.descriptor("rich", size="keep", mirror="distinct").name == "rich+side+size"
     assert igps.descriptor("rich+size", mirror="distinct").name == "rich+side+size"
     assert igps.descriptor("rich", size="auto", units=["mm", "Å"]).name == "rich+size"
@@ -218,17 +208,17 @@ def test_names_carry_the_choice() -> None:
     assert len(tags - {None}) == 3
 
 
-def test_what_cannot_be_weighed_is_refused() -> None:
+def test_what_cannot_be_weighed_is_refused():
     with pytest.raises(
         ValueError, match=r"size: expected .* or \"auto\" with the units of the bodies"
     ):
         igps.descriptor("gps", size="auto")
     with pytest.raises(ValueError, match="mirror: expected one of same, distinct, got 'different'"):
-        igps.descriptor("gps", mirror="different")  # type: ignore[arg-type]
+        igps.descriptor("gps", mirror="different")
     with pytest.raises(ValueError, match="size: expected one of auto, keep, ignore, got True"):
-        igps.descriptor("gps", size=True)  # type: ignore[arg-type]
+        igps.descriptor("gps", size=True)
     with pytest.raises(ValueError, match="size: expected one of auto, keep, ignore, got 'kept'"):
-        keeps_size("kept", ["mm"])  # type: ignore[arg-type]
+        keeps_size("kept", ["mm"])
     with pytest.raises(
         ValueError, match=r"expected \+NAME or \+NAME=WEIGHT .*got 'gps\+colour=red'"
     ):
@@ -266,7 +256,7 @@ def test_what_cannot_be_weighed_is_refused() -> None:
         ("ignore", ["mm", "mm"], False, ""),
     ],
 )
-def test_size_is_kept_where_there_are_units(size, units, expected: bool, told: str) -> None:  # type: ignore[no-untyped-def]
+def test_size_is_kept_where_there_are_units(size, units, expected, told):
     kept, sentence = keeps_size(size, units)
     assert kept is expected
     assert sentence.startswith(told)
@@ -288,9 +278,7 @@ def write_3mf(path: Path, radius: float, unit: str, body: trimesh.Trimesh | Mesh
         )
 
 
-def test_balls_of_one_size_find_each_other_in_whatever_unit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path, capsys):
     root = tmp_path / "balls"
     for name, radius, unit in (
         ("1/a", 1, "inch"),
@@ -339,9 +327,7 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(
     assert "no unit" not in capsys.readouterr().out
 
 
-def test_copies_of_another_size_are_no_duplicates_where_size_counts(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_copies_of_another_size_are_no_duplicates_where_size_counts(tmp_path, capsys):
     for name, factor, unit in (
         ("a", 1, "inch"),
         ("b", 25.4, "millimeter"),
@@ -361,7 +347,7 @@ def test_copies_of_another_size_are_no_duplicates_where_size_counts(
     assert "size is ignored: 1 of 4 bodies have no unit of length" in capsys.readouterr().out
 
 
-def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_path: Path) -> None:
+def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_path):
     shapes = igps.ArticulatedShapes(n_classes=2, n_per_class=4, n_vertices=600)
     shapes.write(tmp_path / "shapes")
     dataset = igps.SignatureDataset(
@@ -395,12 +381,8 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
     ],
 )
 def test_a_name_that_contradicts_an_option_is_refused_before_anything_is_computed(
-    command: str,
-    name: str,
-    options: dict[str, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    command, name, options, tmp_path, monkeypatch
+):
     write_3mf(tmp_path / "balls" / "1" / "a.3mf", 1, "inch")
     igps.descriptor("d2+size").save(tmp_path / "kept.safetensors", {})
     monkeypatch.chdir(tmp_path)
@@ -417,7 +399,7 @@ def test_a_name_that_contradicts_an_option_is_refused_before_anything_is_compute
         run(**options)
 
 
-def test_a_descriptor_is_compared_with_itself_that_keeps_size(tmp_path: Path) -> None:
+def test_a_descriptor_is_compared_with_itself_that_keeps_size(tmp_path):
     for name, radius in (("1/a", 1), ("1/b", 1.1), ("2/c", 3), ("2/d", 3.3)):
         write_3mf(tmp_path / "balls" / f"{name}.3mf", radius, "inch")
     rows = compare(
@@ -432,9 +414,7 @@ def test_a_descriptor_is_compared_with_itself_that_keeps_size(tmp_path: Path) ->
         compare(tmp_path / "nowhere", ["shape_dna", "shape_dna+size"], size="keep")
 
 
-def test_coordinates_keep_size_beside_those_of_the_descriptor(
-    signatures: dict[str, Signature],
-) -> None:
+def test_coordinates_keep_size_beside_those_of_the_descriptor(signatures):
     sized = igps.descriptor("interior+size")
     descriptions = sized(collate([signatures["body"], signatures["larger"]]))
     rows = sized.coordinates(descriptions)

@@ -75,9 +75,9 @@ def bodies(tmp_path: Path) -> SignatureDataset:
     [(INTERIOR, lambda: igps.descriptor("interior")), (PRETRAINED, pretrained_parts)],
 )
 def test_a_descriptor_of_the_library_written_down_gives_the_same_numbers(
-    bodies: SignatureDataset, tmp_path: Path, text: str, named: object
-) -> None:
-    # type: ignore[operator]
+    bodies, tmp_path, text, named
+):
+
     own = igps.descriptor(write(tmp_path, text))
     theirs = named().eval()
     found = describe(bodies, own)
@@ -121,9 +121,7 @@ def test_a_descriptor_of_the_library_written_down_gives_the_same_numbers(
         ("parts: [", "while parsing"),
     ],
 )
-def test_what_is_no_descriptor_is_told_with_what_there_is(
-    tmp_path: Path, text: str, sentence: str
-) -> None:
+def test_what_is_no_descriptor_is_told_with_what_there_is(tmp_path, text, sentence):
     with pytest.raises(ValueError, match=rf"mine\.yaml: expected a descriptor \(.*{sentence}.*"):
         igps.descriptor(str(write(tmp_path, text)))
     assert not Path("hacked").exists()
@@ -131,9 +129,7 @@ def test_what_is_no_descriptor_is_told_with_what_there_is(
         igps.descriptor("none.yaml")
 
 
-def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(
-    tmp_path: Path,
-) -> None:
+def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tmp_path):
     for i in range(2):
         trimesh.creation.icosphere(subdivisions=2, radius=1 + i).export(tmp_path / f"{i}.off")
     text = "parts: [{eigenpairs: 20, axes: [height: {quantiles: 4, soft: true}, interior_distance: {n_bins: 8}]}]"
@@ -182,9 +178,7 @@ def texture(kind: str, generator: np.random.Generator, points: np.ndarray) -> np
     return 2 * np.exp(-np.square(points).sum(axis=1) / 0.3) - 0.5
 
 
-def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(
-    tmp_path: Path,
-) -> None:
+def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp_path):
     nibabel = pytest.importorskip("nibabel")
     generator = np.random.default_rng(0)
     affine = np.diag([0.1, 0.1, 0.1, 1.0])
@@ -222,9 +216,7 @@ def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(
     assert found["interior"] < 0.6
 
 
-def test_an_attribute_adds_its_histograms_with_its_weight(
-    bodies: SignatureDataset, tmp_path: Path
-) -> None:
+def test_an_attribute_adds_its_histograms_with_its_weight(bodies, tmp_path):
     files = [tmp_path / f"{i}.off" for i in range(3)]
     heights = {"height": lambda points: points[:, 2]}
     whole = igps.descriptor("pretrained+height=0.5")

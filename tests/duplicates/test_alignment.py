@@ -64,7 +64,7 @@ def moved(samples: SurfaceSamples, seed: int, mirror: bool, scale: float) -> Sur
 @pytest.mark.parametrize(
     ("seed", "mirror", "scale"), [(1, False, 1.0), (2, True, 7.0), (3, True, 0.05)]
 )
-def test_a_motion_a_mirror_and_a_scale_leave_nothing(seed: int, mirror: bool, scale: float) -> None:
+def test_a_motion_a_mirror_and_a_scale_leave_nothing(seed, mirror, scale):
     """Of a body without any symmetry: two ellipsoids beside each other."""
     one = ellipsoid((1.0, 0.6, 0.4))
     other = ellipsoid((0.5, 0.3, 0.7), 500, seed=4)
@@ -77,14 +77,14 @@ def test_a_motion_a_mirror_and_a_scale_leave_nothing(seed: int, mirror: bool, sc
     assert surface_distance(body, again) < 1e-5
 
 
-def test_other_samples_of_one_surface_are_nearer_than_the_gaps_between_them() -> None:
+def test_other_samples_of_one_surface_are_nearer_than_the_gaps_between_them():
     one = ellipsoid((1.0, 0.6, 0.4), seed=1)
     other = ellipsoid((1.0, 0.6, 0.4), seed=2)
     assert surface_distance(one, other) < 0.1 * one.gap
 
 
 @pytest.mark.parametrize("amplitude", [0.05, 0.1])
-def test_a_ball_and_a_bumpy_one_are_as_far_apart_as_the_bumps_are_high(amplitude: float) -> None:
+def test_a_ball_and_a_bumpy_one_are_as_far_apart_as_the_bumps_are_high(amplitude):
     """P₄ is orthogonal to all that a shift or a scale does to a ball, so that its mean square, 1/9, stays."""
     expected = amplitude / 3 / np.sqrt(4 * np.pi)
     assert surface_distance(bumpy(0.0), bumpy(amplitude, seed=5)) == pytest.approx(
@@ -92,7 +92,7 @@ def test_a_ball_and_a_bumpy_one_are_as_far_apart_as_the_bumps_are_high(amplitude
     )
 
 
-def test_a_rotated_body_with_equal_principal_axes_is_aligned() -> None:
+def test_a_rotated_body_with_equal_principal_axes_is_aligned():
     """All principal moments are equal, so that the principal axes do not determine the rotation."""
     body = bumpy(0.15)
     again = moved(body, 7, mirror=True, scale=2.0)
@@ -111,7 +111,7 @@ def rough(amplitude: float, n: int, seed: int) -> tuple[Array, Array]:
     return points, smooth / steepness
 
 
-def test_fine_relief_cancels_but_another_shape_does_not() -> None:
+def test_fine_relief_cancels_but_another_shape_does_not():
     """Ripples within a patch of ten samples average out; their root mean square is amplitude/√2."""
     amplitude, area = 0.01, 6.1
     plain, ruffled = (
@@ -133,7 +133,7 @@ def triangles(
     return np.asarray(ball.vertices * axes), np.asarray(ball.faces)
 
 
-def test_the_surface_itself_tells_more_than_samples() -> None:
+def test_the_surface_itself_tells_more_than_samples():
     """Few samples of a curved surface leave their tangent planes; the surface leaves what its triangles do."""
     axes = (1.0, 0.6, 0.4)
     vertices, faces = triangles(axes, 5)
@@ -142,7 +142,7 @@ def test_the_surface_itself_tells_more_than_samples() -> None:
     assert surface_distance(*with_surface) < 0.05 * surface_distance(*few)
 
 
-def test_nearest_points_of_a_surface() -> None:
+def test_nearest_points_of_a_surface():
     """Against trimesh's loop over all triangles, and above the middle of each face, where its normal stands."""
     vertices, faces = triangles((1.0, 0.6, 0.4), 2)
     surface = TriangleSurface(vertices, faces)
@@ -158,7 +158,7 @@ def test_nearest_points_of_a_surface() -> None:
     np.testing.assert_allclose(normals, body.face_normals, atol=1e-9)
 
 
-def test_in_place_nothing_is_moved() -> None:
+def test_in_place_nothing_is_moved():
     """A ball and itself moved by h along a line: h/√3, the root mean square of h·cos θ; laid onto itself, nothing."""
     vertices, faces = triangles((1.0, 1.0, 1.0), 5)
     step = np.array([0.0, 0.0, 0.02])
@@ -172,7 +172,7 @@ def test_in_place_nothing_is_moved() -> None:
     assert surface_distance(ball, beside) < 1e-4
 
 
-def test_distances_beyond_an_edge_are_those_to_the_edge() -> None:
+def test_distances_beyond_an_edge_are_those_to_the_edge():
     """Closed form: 0.05 from points to the nearest edge of a box; the planes of its sides are nearer."""
     box = trimesh.creation.box((1.0, 1.0, 0.1))
     x = np.linspace(-0.4, 0.4, 30)
@@ -204,7 +204,7 @@ def wheel(thinned: float, seed: int) -> SurfaceSamples:
     return SurfaceSamples.of(points[kept], normals[kept], 4.0)
 
 
-def test_misleading_principal_axes_do_not_decide_the_alignment() -> None:
+def test_misleading_principal_axes_do_not_decide_the_alignment():
     """The principal axes lead to a local minimum, in which the high bump lies on a low one."""
     one = wheel(0.0, 1)
     other = wheel(2 * np.pi / 5, 2)
@@ -213,7 +213,7 @@ def test_misleading_principal_axes_do_not_decide_the_alignment() -> None:
     assert surface_distance(one, other) < 0.05 * one.gap
 
 
-def test_thin_sheets_of_other_widths_are_told_apart() -> None:
+def test_thin_sheets_of_other_widths_are_told_apart():
     """The planes of both sheets nearly coincide, so that only distances beside the smaller sheet separate them."""
 
     def sheet(length: float, width: float) -> SurfaceSamples:
@@ -231,14 +231,14 @@ def test_thin_sheets_of_other_widths_are_told_apart() -> None:
     assert 0.0006 < surface_distance(sheet(2.0, 1.0), sheet(3.0, 1.0)) < 0.009
 
 
-def test_the_search_ends_where_it_is_enough() -> None:
+def test_the_search_ends_where_it_is_enough():
     one = ellipsoid((1.0, 0.6, 0.4))
     other = ellipsoid((1.0, 0.5, 0.4), seed=2)
     best = surface_distance(one, other)
     assert best <= surface_distance(one, other, stop_at=2 * best) <= 2 * best
 
 
-def test_what_is_hopeless_stays_beyond_that() -> None:
+def test_what_is_hopeless_stays_beyond_that():
     one = ellipsoid((1.0, 0.6, 0.4))
     other = ellipsoid((1.0, 0.3, 0.3), seed=2)
     far = surface_distance(one, other)
@@ -246,14 +246,14 @@ def test_what_is_hopeless_stays_beyond_that() -> None:
     assert surface_distance(one, other, hopeless=4 * far) == far
 
 
-def test_samples_that_do_not_fit_are_refused() -> None:
+def test_samples_that_do_not_fit_are_refused():
     with pytest.raises(
         ValueError, match=r"points, normals: expected both \(P, 3\) .* got \(5, 3\) and \(4, 3\)"
     ):
         SurfaceSamples.of(np.zeros((5, 3)), np.zeros((4, 3)), 1.0)
 
 
-def test_what_is_farther_than_asked_for_is_told_to_be() -> None:
+def test_what_is_farther_than_asked_for_is_told_to_be():
     one = bumpy(0.0)
     other = bumpy(0.1, seed=5)
     far = surface_distance(one, other)
@@ -289,14 +289,14 @@ def sampled(body: trimesh.Trimesh) -> SurfaceSamples:
     [{"step": 0.45}, {"boss": 0.45}, {"hole": 4.2}],
     ids=["a higher step", "a boss moved", "a wider hole"],
 )
-def test_a_changed_part_is_told_from_another_level_of_detail(change: dict[str, float]) -> None:
+def test_a_changed_part_is_told_from_another_level_of_detail(change):
     """One percent of the length, in a few places. Fewer segments lie as far apart, but on round places alone."""
     assert changed_share(part(), part(**change), 5e-4) > 0.015
     for n_segments in (8, 16):
         assert changed_share(part(), part(sections=n_segments), 5e-4) < 0.005
 
 
-def test_only_a_reflection_lays_a_chiral_part_onto_its_mirror_image() -> None:
+def test_only_a_reflection_lays_a_chiral_part_onto_its_mirror_image():
     one = part()
     assert one.surface is not None
     surface = one.surface()

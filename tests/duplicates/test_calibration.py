@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,24 +42,20 @@ def calibration(drawn: dict[str, np.ndarray]) -> Calibration:
 
 
 @pytest.mark.parametrize("distance", [0.3, 1.0, 3.0, 9.0])
-def test_the_share_that_is_closer_is_the_one_that_is_counted(
-    calibration: Calibration, drawn: dict[str, np.ndarray], distance: float
-) -> None:
+def test_the_share_that_is_closer_is_the_one_that_is_counted(calibration, drawn, distance):
     for kind, values in drawn.items():
         assert calibration.share_closer(kind, distance) == pytest.approx(
             (values < distance).mean(), abs=0.02
         )
 
 
-def test_shares_at_the_ends(calibration: Calibration) -> None:
+def test_shares_at_the_ends(calibration):
     for kind in KINDS:
         assert calibration.share_closer(kind, 0.0) == 0.0
         assert calibration.share_closer(kind, 1e9) == 1.0
 
 
-def test_the_words_say_what_is_counted(
-    calibration: Calibration, drawn: dict[str, np.ndarray]
-) -> None:
+def test_the_words_say_what_is_counted(calibration, drawn):
     distance = float(np.quantile(drawn["poses"], 0.6))
     parts = calibration.words(distance).split(", ")
     assert [part.split(" of ", 1)[1] for part in parts] == [
@@ -77,16 +72,14 @@ def test_the_words_say_what_is_counted(
     assert "closer than all pairs of different classes" in calibration.words(0.0)
 
 
-def test_a_share_is_never_rounded_up(calibration: Calibration) -> None:
+def test_a_share_is_never_rounded_up(calibration):
     """What 99.96 % are farther than is not all."""
     ends = replace(calibration, distances={kind: list(np.array(LEVELS) + 0.0) for kind in KINDS})
     assert "closer than 99.9 % of poses of one body" in ends.words(0.0004)
     assert "closer than 98 % of poses of one body" in ends.words(0.011)
 
 
-def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(
-    calibration: Calibration,
-) -> None:
+def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(calibration):
     calibration.check("same", Same(), CONFIG)
     with pytest.raises(
         ValueError, match="descriptor: expected same, whose distances are calibrated, got interior"
@@ -104,20 +97,18 @@ def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(
     ("coarseness", "limit"),
     [(0.0, 0.00006), (0.001, 0.006), (0.02, 0.12), (1.0, 0.5), (np.inf, 0.5)],
 )
-def test_what_is_coarse_may_be_farther_apart(
-    calibration: Calibration, coarseness: float, limit: float
-) -> None:
+def test_what_is_coarse_may_be_farther_apart(calibration, coarseness, limit):
     """Six times the coarseness, of which there is a least, and never more than any copies are."""
     assert calibration.limit(coarseness) == pytest.approx(limit)
 
 
-def test_what_is_saved_is_loaded(calibration: Calibration, tmp_path: Path) -> None:
+def test_what_is_saved_is_loaded(calibration, tmp_path):
     calibration.save(tmp_path / "c.json")
     assert Calibration.load(tmp_path / "c.json") == calibration
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", json.dumps({"descriptor": "pretrained"})])
-def test_what_is_no_calibration_is_refused(text: str, tmp_path: Path) -> None:
+def test_what_is_no_calibration_is_refused(text, tmp_path):
     (tmp_path / "c.json").write_text(text)
     with pytest.raises(
         ValueError, match=r"c\.json: expected a calibration as `Calibration\.save` writes it"
@@ -125,7 +116,7 @@ def test_what_is_no_calibration_is_refused(text: str, tmp_path: Path) -> None:
         Calibration.load(tmp_path / "c.json")
 
 
-def test_the_shipped_one_is_of_the_shipped_descriptor() -> None:
+def test_the_shipped_one_is_of_the_shipped_descriptor():
     found = Calibration.load()
     module = descriptor("pretrained")
     found.check("pretrained", module, module.requirements.apply_to(SignatureConfig()))

@@ -103,9 +103,7 @@ def grouped(groups: tuple[tuple[str, ...], ...]) -> set[frozenset[str]]:
     return set(map(frozenset, groups))
 
 
-def test_copies_are_grouped_and_neither_poses_nor_siblings(
-    dataset: SignatureDataset, root: Path
-) -> None:
+def test_copies_are_grouped_and_neither_poses_nor_siblings(dataset, root):
     found = duplicates(dataset, n_workers=1)
     assert grouped(found.groups) == SAME
     assert found.n_files == 7
@@ -120,7 +118,7 @@ def test_copies_are_grouped_and_neither_poses_nor_siblings(
     assert set(grades.values()) == {"same at another level of detail"}
 
 
-def test_pairs_are_graded(tmp_path: Path) -> None:
+def test_pairs_are_graded(tmp_path):
     """A file beside its copy, the mesh turned and scaled, its vertices in another order, or fewer, and a sibling."""
     body = bar(4)
     order = np.random.default_rng(0).permutation(len(body.vertices))
@@ -146,9 +144,7 @@ def test_pairs_are_graded(tmp_path: Path) -> None:
     assert 0.001 < found[3][1] < 0.005
 
 
-def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_crop(
-    tmp_path: Path,
-) -> None:
+def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_crop(tmp_path):
     """On another grid they are other bodies, as near as a fraction of a voxel, and never those of another label."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
 
@@ -195,7 +191,7 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
     }
 
 
-def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> None:
+def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path):
     """One half moves on by a hundredth: as far as coarse copies are apart, and much farther than fine ones.
 
     A coarse copy would be near to both, and join them.
@@ -221,7 +217,7 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> No
     assert apart.limit < apart.surfaces < Calibration.load().same.distance
 
 
-def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path: Path) -> None:
+def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path):
     """It is near enough to both, as coarse as it is, and belongs to the nearer one."""
     fine = bar(5)
     longer = fine.copy()
@@ -242,7 +238,7 @@ def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path: Path) -> None:
     assert list(found.pairs) == [("one.off", "coarse.off")]
 
 
-def test_each_file_of_a_group_has_one_finer_file_beside_it() -> None:
+def test_each_file_of_a_group_has_one_finer_file_beside_it():
     """Worked by hand: a file joins the nearest finer leader, else the nearest finer file; no pair joins two groups."""
     apart = {(0, 1): 0.1, (1, 2): 0.05, (0, 4): 0.2, (3, 4): 0.1, (1, 4): 0.01, (2, 3): 0.3}
 
@@ -262,7 +258,7 @@ def test_each_file_of_a_group_has_one_finer_file_beside_it() -> None:
     assert found == {(0, 1): 0.1, (1, 2): 0.05, (3, 4): 0.1}
 
 
-def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None:
+def test_handles_tell_bodies_apart_however_near_they_are(tmp_path):
     """But not where mending may have made them, or closed them."""
     ring = trimesh.creation.torus(1.0, 0.3, 40, 20)
     cut = ring.submesh(
@@ -289,7 +285,7 @@ def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None
     }
 
 
-def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
+def test_washers_with_other_holes_are_no_copies(tmp_path):
     """Washers of 128 vertices with holes 0.5 and 1 % larger: coarseness must not excuse displaced vertices."""
     for name, hole in (("one", 0.5), ("half", 0.5025), ("whole", 0.505)):
         trimesh.creation.annulus(hole, 1.0, 0.3, sections=32).export(tmp_path / f"{name}.off")
@@ -304,7 +300,7 @@ def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
     assert not found.mirrored  # a washer is its own mirror image
 
 
-def test_a_mirror_image_is_called_so(tmp_path: Path) -> None:
+def test_a_mirror_image_is_called_so(tmp_path):
     """A bracket of three boxes in a spiral, its copy, and its mirror image."""
     boxes = [trimesh.creation.box(bounds=b) for b in BRACKET]
     bracket = trimesh.boolean.union(boxes, engine="manifold")
@@ -322,9 +318,7 @@ def test_a_mirror_image_is_called_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("numbered", ["alike", "otherwise"])
-def test_a_small_hole_that_is_a_little_larger_is_another_surface(
-    tmp_path: Path, numbered: str
-) -> None:
+def test_a_small_hole_that_is_a_little_larger_is_another_surface(tmp_path, numbered):
     """The hole is larger by 0.5 %; the largest distance is the difference of the radii over √area."""
     one, larger = (
         trimesh.creation.annulus(hole, 1.0, 0.3, sections=64) for hole in (0.05, 0.05025)
@@ -341,7 +335,7 @@ def test_a_small_hole_that_is_a_little_larger_is_another_surface(
     assert apart == pytest.approx(0.00025 / one.area**0.5, rel=0.05)
 
 
-def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path: Path) -> None:
+def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path):
     """The middle of its neighbours lies off a vertex by the square of their distance: a quarter with edges of half."""
     for subdivisions in (3, 4, 5):
         ball(subdivisions).export(tmp_path / f"{subdivisions}.off")
@@ -351,7 +345,7 @@ def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path: Pat
     assert 3 < middle / fine < 5.3
 
 
-def test_poses_are_grouped_by_the_descriptor_alone(dataset: SignatureDataset) -> None:
+def test_poses_are_grouped_by_the_descriptor_alone(dataset):
     """A descriptor that sees no difference takes all for poses of one body; their surfaces still tell."""
     shipped = Calibration.load()
     calibration = replace(
@@ -364,8 +358,8 @@ def test_poses_are_grouped_by_the_descriptor_alone(dataset: SignatureDataset) ->
 
 
 def test_a_gallery_gives_the_same_groups_and_tells_of_files_that_are_gone(
-    dataset: SignatureDataset, root: Path, cache: Path, tmp_path: Path
-) -> None:
+    dataset, root, cache, tmp_path
+):
     pytest.importorskip("lancedb")
     moved = tmp_path / "moved"
     shutil.copytree(root, moved)
@@ -386,7 +380,7 @@ def test_a_gallery_gives_the_same_groups_and_tells_of_files_that_are_gone(
     )
 
 
-def test_a_distance_and_what_it_means(dataset: SignatureDataset) -> None:
+def test_a_distance_and_what_it_means(dataset):
     number = {name: i for i, name in enumerate(dataset.bodies.names)}
 
     def between(one: str, other: str) -> tuple[float, bool]:
@@ -406,13 +400,7 @@ def test_a_distance_and_what_it_means(dataset: SignatureDataset) -> None:
         body_distance(dataset)
 
 
-def test_the_commands(
-    root: Path,
-    cache: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_commands(root, cache, tmp_path, monkeypatch, capsys):
     options = ["--cache_dir", cache, "--n_workers", 1]
     run(monkeypatch, "duplicates", root, "--out", tmp_path / "out" / "groups.csv", *options)
     lines = capsys.readouterr().out.splitlines()
@@ -423,7 +411,7 @@ def test_the_commands(
     assert rows[5] == f"2,lump.stl,{root / 'lump.stl'}"
 
 
-def test_the_page_runs(tmp_path: Path) -> None:
+def test_the_page_runs(tmp_path):
     """Its Python prints the group of the copy; its commands exist."""
     page = (PROJECT / "docs" / "how-to" / "duplicates.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
@@ -444,13 +432,7 @@ def test_the_page_runs(tmp_path: Path) -> None:
         assert name in {command.split()[0] for command in COMMANDS}
 
 
-def test_what_is_wrong_is_one_sentence(
-    root: Path,
-    cache: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_is_wrong_is_one_sentence(root, cache, tmp_path, monkeypatch, capsys):
     options = ["--cache_dir", cache, "--n_workers", 1]
     pytest.importorskip("lancedb")
     dataset = SignatureDataset([root / "bar.off", root / "lump.off"], None, cache)
@@ -460,7 +442,7 @@ def test_what_is_wrong_is_one_sentence(
     assert "build it with --size ignore" in words
 
 
-def test_other_lengths_are_no_candidates(tmp_path: Path) -> None:
+def test_other_lengths_are_no_candidates(tmp_path):
     """Ellipsoids of which one axis is longer by a quarter are no copies; of a copy the triangles alone are others."""
     for name, subdivisions, stretch in (("ball", 3, 1.0), ("copy", 4, 1.0), ("longer", 4, 1.25)):
         body = trimesh.creation.icosphere(subdivisions=subdivisions)

@@ -36,7 +36,7 @@ def lump(
     return body
 
 
-def test_moments_of_a_box_are_its_closed_forms() -> None:
+def test_moments_of_a_box_are_its_closed_forms():
     sides = np.array([1.0, 2.0, 3.0])
     area = 22.0
     body = trimesh.creation.box(sides)
@@ -50,7 +50,7 @@ def test_moments_of_a_box_are_its_closed_forms() -> None:
     np.testing.assert_allclose(of(body)[0], [*expected, 0.0], rtol=1e-9, atol=1e-5)
 
 
-def test_moments_of_a_tetrahedron_are_those_of_its_points() -> None:
+def test_moments_of_a_tetrahedron_are_those_of_its_points():
     """By a product of Gauss's rules on the cube that is folded into it, exact up to the ninth degree."""
     corners = np.array([[0.0, 0, 0], [2, 0.1, 0], [0.3, 1, 0], [0.2, 0.1, 0.7]])
     body = trimesh.Trimesh(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -71,7 +71,7 @@ def test_moments_of_a_tetrahedron_are_those_of_its_points() -> None:
     )
 
 
-def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing() -> None:
+def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing():
     body = lump((1.0, 0.7, 0.4), 0.1)
     turn = -Rotation.random(random_state=1).as_matrix()
     again = trimesh.Trimesh(
@@ -84,9 +84,7 @@ def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing() -> None:
 @pytest.mark.parametrize(
     "stretch", [(1.0, 1.0, 1.0), (1.0, 1.0, 0.4), (3.0, 0.5, 0.5), (3.0, 0.8, 0.5)]
 )
-def test_the_lower_bound_does_not_exceed_the_displacement(
-    stretch: tuple[float, float, float], bumps: float
-) -> None:
+def test_the_lower_bound_does_not_exceed_the_displacement(stretch, bumps):
     """Normal displacements by polynomials, scaled to a known root mean square; bodies with and without symmetry."""
     body = lump(stretch, bumps)
     normals = np.asarray(body.vertex_normals)
@@ -105,7 +103,7 @@ def test_the_lower_bound_does_not_exceed_the_displacement(
     assert max(told) > 0.6
 
 
-def test_the_lower_bound_is_tight_for_displacements_along_gradients() -> None:
+def test_the_lower_bound_is_tight_for_displacements_along_gradients():
     """Gradients of scale-invariant combinations of moments, by finite differences at each vertex."""
     body = lump((0.7, 0.5, 1.5), 0.05)
     # One end is thick, so that the middle moves
@@ -136,12 +134,12 @@ def test_the_lower_bound_is_tight_for_displacements_along_gradients() -> None:
         assert float(found) == pytest.approx(far, rel=0.04), which
 
 
-def test_a_scale_by_a_tenth_counts_as_much_as_the_most() -> None:
+def test_a_scale_by_a_tenth_counts_as_much_as_the_most():
     body = lump((1.0, 0.7, 0.4), 0.1)
     assert apart(body, body, 1.1) == pytest.approx(MOST, rel=0.01)
 
 
-def test_a_hole_is_closed_by_a_cone_whatever_the_triangles() -> None:
+def test_a_hole_is_closed_by_a_cone_whatever_the_triangles():
     """Three sides of a box are a corner; with its cones it is half of the box, and no other corner's."""
     corner = trimesh.creation.box((1.0, 0.8, 0.6)).subdivide()
     corner.update_faces((corner.face_normals > 0.5).any(axis=1))

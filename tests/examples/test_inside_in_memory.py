@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,9 +52,7 @@ def in_nibabel(values: np.ndarray, affine: np.ndarray = AFFINE) -> Any:
     return pytest.importorskip("nibabel").Nifti1Image(values, affine)
 
 
-def test_images_of_nibabel_and_simpleitk_give_the_numbers_of_arrays(
-    expected: dict[str, Any],
-) -> None:
+def test_images_of_nibabel_and_simpleitk_give_the_numbers_of_arrays(expected):
     check(igps.inside(in_nibabel(IMAGE), in_nibabel(LABELS)), expected)
     simpleitk = pytest.importorskip("SimpleITK")
     converted = []
@@ -70,7 +67,7 @@ def test_images_of_nibabel_and_simpleitk_give_the_numbers_of_arrays(
     check(igps.inside(in_nibabel(IMAGE), converted[1]), expected)
 
 
-def test_an_image_on_another_grid_is_read_by_its_place() -> None:
+def test_an_image_on_another_grid_is_read_by_its_place():
     affine = np.diag([0.9, 1.1, 1.3, 1.0])
     affine[:3, 3] = CENTRE - np.array([13.5, 16.5, 19.5])
     slope = np.array([0.7, -1.3, 2.1])
@@ -81,7 +78,7 @@ def test_an_image_on_another_grid_is_read_by_its_place() -> None:
     assert row["image_and_same.correlation"] == pytest.approx(1, abs=1e-6)
 
 
-def test_each_label_has_a_row_and_one_that_is_too_small_a_sentence() -> None:
+def test_each_label_has_a_row_and_one_that_is_too_small_a_sentence():
     labels = LABELS.copy()
     labels[LABELS > 0] = 1 + (world() @ np.array([0, 0, 1]) > CENTRE[2])[LABELS > 0]
     labels[0, 0, :3] = 7
@@ -92,7 +89,7 @@ def test_each_label_has_a_row_and_one_that_is_too_small_a_sentence() -> None:
     assert np.isnan(rows["7"]["image.mean"])
 
 
-def test_what_cannot_be_compared_is_refused_with_a_sentence() -> None:
+def test_what_cannot_be_compared_is_refused_with_a_sentence():
     three = np.zeros(SHAPE, np.uint8)
     three[5, 5, 3:6] = 1
     with pytest.raises(MeshError, match="expected at least 8 voxels, got 3"):
@@ -120,7 +117,7 @@ def test_what_cannot_be_compared_is_refused_with_a_sentence() -> None:
     assert np.isnan(row["image.moran"])
 
 
-def test_rows_are_a_table_of_pandas(expected: dict[str, Any]) -> None:
+def test_rows_are_a_table_of_pandas(expected):
     pandas = pytest.importorskip("pandas")
     table = pandas.DataFrame(igps.inside({"ct": IMAGE, "pet": IMAGE**2}, LABELS, SPACING))
     assert table["ct.rim.mean"][0] == pytest.approx(expected["image.rim.mean"])
@@ -130,7 +127,7 @@ def test_rows_are_a_table_of_pandas(expected: dict[str, Any]) -> None:
     ]
 
 
-def test_a_subject_of_torchio_brings_its_metadata(expected: dict[str, Any]) -> None:
+def test_a_subject_of_torchio_brings_its_metadata(expected):
     torchio = pytest.importorskip("torchio", reason="torchio is not installed")
     subject = torchio.Subject(
         image=torchio.ScalarImage(tensor=IMAGE[None], affine=AFFINE),
@@ -143,9 +140,7 @@ def test_a_subject_of_torchio_brings_its_metadata(expected: dict[str, Any]) -> N
     assert (rows[0]["age"], rows[0]["centre"], rows[0]["label"]) == (63, "A", "1")
 
 
-def test_a_transform_of_monai_is_pickled_and_kept_by_its_caching_dataset(
-    expected: dict[str, Any],
-) -> None:
+def test_a_transform_of_monai_is_pickled_and_kept_by_its_caching_dataset(expected):
     data = pytest.importorskip("monai.data", reason="monai is not installed")
     from monai.transforms import Compose, EnsureChannelFirstd, ToTensord
 
@@ -169,15 +164,13 @@ def test_a_transform_of_monai_is_pickled_and_kept_by_its_caching_dataset(
     np.testing.assert_array_equal(cached[0]["label_inside"], first)
 
 
-def test_without_monai_the_transform_tells_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_monai_the_transform_tells_how_to_get_it(monkeypatch):
     monkeypatch.setattr("igps.monai._MISSING", ImportError("no module"))
     with pytest.raises(ImportError, match=r"interior-gps\[monai\]"):
         InteriorFeaturesd(keys="label", image_key="image")
 
 
-def test_features_of_scikit_learn_hold_the_numbers(
-    expected: dict[str, Any], tmp_path: Path
-) -> None:
+def test_features_of_scikit_learn_hold_the_numbers(expected, tmp_path):
     nibabel = pytest.importorskip("nibabel")
     straight = np.diag([*SPACING, 1.0])  # the grid of samples is along the axes of the world
     nibabel.save(in_nibabel(LABELS, straight), tmp_path / "a.nii.gz")

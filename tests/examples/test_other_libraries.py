@@ -39,9 +39,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> igps.SignatureDataset:
     return found.to_memory()
 
 
-def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(
-    dataset: igps.SignatureDataset,
-) -> None:
+def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(dataset):
     from torch_geometric.loader import DataLoader as GeometricLoader
     from torch_geometric.nn import global_add_pool
 
@@ -96,7 +94,7 @@ class DiffusionBlock(nn.Module):
         )
 
 
-def test_a_diffusion_net_reads_the_spectrum_of_a_surface() -> None:
+def test_a_diffusion_net_reads_the_spectrum_of_a_surface():
     """Against implicit Euler steps of the heat equation, and it trains."""
     import scipy.sparse.linalg
     import trimesh
@@ -139,7 +137,7 @@ def test_a_diffusion_net_reads_the_spectrum_of_a_surface() -> None:
     assert losses[-1] < losses[0] / 3
 
 
-class AsTheirs(distances.BaseDistance):  # type: ignore[misc]
+class AsTheirs(distances.BaseDistance):
     """A head's or a descriptor's distance for pytorch-metric-learning; its own are passed on by `compute_mat`."""
 
     def __init__(self, distances: Any) -> None:
@@ -155,9 +153,7 @@ class AsTheirs(distances.BaseDistance):  # type: ignore[misc]
         )
 
 
-def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back(
-    dataset: igps.SignatureDataset,
-) -> None:
+def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back(dataset):
     from pytorch_metric_learning.distances import LpDistance
     from pytorch_metric_learning.losses import TripletMarginLoss
     from pytorch_metric_learning.miners import BatchHardMiner
@@ -230,7 +226,7 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     assert scores == igps.retrieval_scores(torch.cdist(cells, cells), dataset.labels).mean()
 
 
-def test_retrieval_scores_accumulate_step_by_step(dataset: igps.SignatureDataset) -> None:
+def test_retrieval_scores_accumulate_step_by_step(dataset):
     descriptor = small_interior()
     metric = RetrievalScoresMetric(descriptor.distances)
     for batch in DataLoader(dataset, batch_size=3, collate_fn=igps.collate):
@@ -244,9 +240,7 @@ def test_retrieval_scores_accumulate_step_by_step(dataset: igps.SignatureDataset
     )
 
 
-def test_missing_extras_are_named(
-    monkeypatch: pytest.MonkeyPatch, dataset: igps.SignatureDataset
-) -> None:
+def test_missing_extras_are_named(monkeypatch, dataset):
     monkeypatch.setitem(__import__("sys").modules, "torch_geometric.data", None)
     with pytest.raises(ImportError, match=r"interior-gps\[geometric\]"):
         to_pyg(dataset[0].signature)

@@ -68,7 +68,7 @@ def space(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return found
 
 
-def test_there_are_twenty_things_that_work_and_reasons_for_the_rest() -> None:
+def test_there_are_twenty_things_that_work_and_reasons_for_the_rest():
     assert len(ROWS) >= 20
     numbers = [int(n) for n in re.findall(r"^\| (\d+) \|", PAGE, re.MULTILINE)]
     assert numbers == list(range(1, 28))
@@ -77,9 +77,7 @@ def test_there_are_twenty_things_that_work_and_reasons_for_the_rest() -> None:
 
 
 @pytest.mark.parametrize("number", [number for number in ROWS if number != 4])
-def test_a_line_of_the_table_works(
-    space: dict[str, Any], number: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_line_of_the_table_works(space, number, monkeypatch):
     monkeypatch.chdir(space["folder"])
     monkeypatch.setattr("igps.data.dataset.default_cache_dir", lambda: space["folder"] / "cache")
     torch.compiler.reset()
@@ -91,9 +89,7 @@ def test_a_line_of_the_table_works(
         assert CHECKS[number](found, space), ROWS[number][0]
 
 
-def test_a_transform_is_set_and_taken_away(
-    space: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_transform_is_set_and_taken_away(space, monkeypatch):
     monkeypatch.chdir(space["folder"])
     dataset: igps.SignatureDataset = space["dataset"]
     whole = len(dataset[0].signature.interior)

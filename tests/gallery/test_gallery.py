@@ -54,9 +54,7 @@ def dataset(root: Path, tmp_path: Path) -> SignatureDataset:
     return SignatureDataset(root, CONFIG, tmp_path / "cache")
 
 
-def test_it_ranks_as_the_descriptor_does(
-    dataset: SignatureDataset, root: Path, tmp_path: Path
-) -> None:
+def test_it_ranks_as_the_descriptor_does(dataset, root, tmp_path):
     gallery, failures = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert failures == []
     histograms = describe(dataset, small_interior())
@@ -71,7 +69,7 @@ def test_it_ranks_as_the_descriptor_does(
     )
 
 
-def test_adding_is_building(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:
+def test_adding_is_building(dataset, root, tmp_path):
     whole, _ = Gallery.build(tmp_path / "whole.igps", dataset, INTERIOR, n_workers=1)
     added, _ = Gallery.build(tmp_path / "a.igps", dataset.subset([0, 1, 2]), INTERIOR, n_workers=1)
     added.add(dataset.subset([2, 3, 4]), n_workers=1)
@@ -88,9 +86,7 @@ def test_adding_is_building(dataset: SignatureDataset, root: Path, tmp_path: Pat
     assert first.distance < 1e-6
 
 
-def test_a_gallery_is_merged_into_another_by_its_rows(
-    dataset: SignatureDataset, tmp_path: Path
-) -> None:
+def test_a_gallery_is_merged_into_another_by_its_rows(dataset, tmp_path):
     """As the page about galleries shows."""
     whole, _ = Gallery.build(tmp_path / "whole.igps", dataset, INTERIOR, n_workers=1)
     one, _ = Gallery.build(tmp_path / "a.igps", dataset.subset([0, 1, 2]), INTERIOR, n_workers=1)
@@ -103,7 +99,7 @@ def test_a_gallery_is_merged_into_another_by_its_rows(
     assert one.nearest(described) == whole.nearest(described)
 
 
-def test_bodies_of_one_file_are_entries_of_their_own(tmp_path: Path) -> None:
+def test_bodies_of_one_file_are_entries_of_their_own(tmp_path):
     boxes = [trimesh.creation.box(extents=(1, 1, length)) for length in (1.0, 2.0, 4.0)]
     for i, one in enumerate(boxes):
         one.apply_translation((3 * i, 0, 0))
@@ -122,7 +118,7 @@ def test_bodies_of_one_file_are_entries_of_their_own(tmp_path: Path) -> None:
     assert {one.path for (one,) in found} == {(tmp_path / "plate.glb").resolve()}
 
 
-def test_what_cannot_be_described_is_told(root: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_described_is_told(root, tmp_path):
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     gallery, failures = Gallery.build(
         tmp_path / "g.igps", dataset, "own_descriptors:picky", n_workers=1
@@ -140,7 +136,7 @@ def test_what_cannot_be_described_is_told(root: Path, tmp_path: Path) -> None:
         Gallery.build(tmp_path / "none.igps", alone, "own_descriptors:picky", n_workers=1)
 
 
-def test_a_checksum_tells_descriptors_apart() -> None:
+def test_a_checksum_tells_descriptors_apart():
     assert fingerprint(small_interior()) == fingerprint(small_interior())
     torch.manual_seed(0)
     other = small_interior()
@@ -156,9 +152,7 @@ def test_a_checksum_tells_descriptors_apart() -> None:
     assert len({fingerprint(one) for one in several}) == 5
 
 
-def test_a_query_of_a_gallery_is_that_of_its_folder(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_query_of_a_gallery_is_that_of_its_folder(root, tmp_path, monkeypatch, capsys):
     index = tmp_path / "gallery.igps"
     cache = ["--cache_dir", tmp_path / "cache"]
     by_name = ["--descriptor", INTERIOR, *cache, *SMALL]
@@ -182,13 +176,7 @@ def test_a_query_of_a_gallery_is_that_of_its_folder(
     assert warning == "1 of these 4 files were moved or deleted since they were described."
 
 
-def test_what_does_not_fit_is_refused_in_a_sentence(
-    dataset: SignatureDataset,
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_does_not_fit_is_refused_in_a_sentence(dataset, root, tmp_path, monkeypatch, capsys):
     index = tmp_path / "g.igps"
     mesh = root / "egg" / "1.off"
     Gallery.build(index, dataset, INTERIOR, n_workers=1)
@@ -229,7 +217,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
     assert len(Gallery(index)) == 6
 
 
-def test_rows_tell_size_class_and_what_labels_tell(root: Path, tmp_path: Path) -> None:
+def test_rows_tell_size_class_and_what_labels_tell(root, tmp_path):
     """Volumes and areas are those of the meshes, and a condition keeps what NumPy keeps."""
     labelled = [
         (f"{one}/{i}.off", f"{one}s", 10 * i, "A" if i else "")
@@ -268,9 +256,7 @@ def test_rows_tell_size_class_and_what_labels_tell(root: Path, tmp_path: Path) -
     assert gallery.nearest(description, where="age > 99") == [[]]
 
 
-def test_sync_finds_what_is_new_changed_and_gone(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sync_finds_what_is_new_changed_and_gone(root, tmp_path, monkeypatch):
     """Afterwards it is what building makes; what has not changed is neither described nor written."""
     cache = tmp_path / "cache"
     monkeypatch.setattr(rows, "MIN_AGE", 10**18)  # however busy the machine, no file is old
@@ -313,9 +299,7 @@ def test_sync_finds_what_is_new_changed_and_gone(
     assert {one.label for one in built.nearest(described)[0]} == {"round"}
 
 
-def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(root, tmp_path, monkeypatch):
     cache = tmp_path / "cache"
     dataset = SignatureDataset(root, CONFIG, cache)
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
@@ -343,7 +327,7 @@ def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(
     assert {row["name"] for row in gallery.rows("name")} == {*dataset.bodies.names} - {"ball/0.off"}
 
 
-def test_it_opens_where_it_was_moved_to(dataset: SignatureDataset, tmp_path: Path) -> None:
+def test_it_opens_where_it_was_moved_to(dataset, tmp_path):
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     described = describe(dataset, small_interior())
     expected = gallery.nearest(described)
@@ -354,9 +338,7 @@ def test_it_opens_where_it_was_moved_to(dataset: SignatureDataset, tmp_path: Pat
     assert moved.remove("class = 'egg'") == 3
 
 
-def test_commands_that_change_a_gallery(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_that_change_a_gallery(root, tmp_path, monkeypatch, capsys):
     gallery = tmp_path / "gallery.igps"
     cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
 
@@ -377,9 +359,7 @@ def test_commands_that_change_a_gallery(
     assert len(lines(*query, "--exact", *cache)) == 1 + 3
 
 
-def test_sync_notices_a_table_of_names_that_was_edited(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, monkeypatch):
     """With its two names swapped the rows have the same names, and the bodies of each other."""
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
@@ -404,9 +384,7 @@ def test_sync_notices_a_table_of_names_that_was_edited(
     assert after == {"block": before["bar"], "bar": before["block"]}
 
 
-def test_a_column_with_a_dot_is_told_before_anything_is_described(
-    root: Path, tmp_path: Path
-) -> None:
+def test_a_column_with_a_dot_is_told_before_anything_is_described(root, tmp_path):
     (root / "labels.csv").write_text("file,label,scan.age\nball/0.off,ball,3\n")
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     with pytest.raises(
@@ -417,8 +395,8 @@ def test_a_column_with_a_dot_is_told_before_anything_is_described(
 
 
 def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gallery(
-    root: Path, dataset: SignatureDataset, tmp_path: Path
-) -> None:
+    root, dataset, tmp_path
+):
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     (root / "labels.csv").write_text("file,label,_rowid\nball/0.off,ball,3\n")
     for change in (Gallery.add, lambda one, other, **_: sync(one, other, root)):
@@ -441,9 +419,7 @@ def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gall
         " -- note\n junk",
     ],
 )
-def test_a_condition_is_read_to_its_end(
-    dataset: SignatureDataset, tmp_path: Path, rest: str
-) -> None:
+def test_a_condition_is_read_to_its_end(dataset, tmp_path, rest):
     """Any text after a valid condition is an error, since it may have been meant to restrict the condition."""
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     where = "name = 'ball/0.off'"
@@ -461,7 +437,7 @@ def test_a_condition_is_read_to_its_end(
     assert gallery.remove(f"({where}) -- a note") == 1
 
 
-def test_a_folder_linked_twice_gives_each_body_once(root: Path, tmp_path: Path) -> None:
+def test_a_folder_linked_twice_gives_each_body_once(root, tmp_path):
     """By the first of its names, whether it is built, added or synced."""
     (root / "zoo").symlink_to(root / "egg", target_is_directory=True)
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
@@ -477,7 +453,7 @@ def test_a_folder_linked_twice_gives_each_body_once(root: Path, tmp_path: Path) 
     assert sorted(row["name"] for row in gallery.rows("name")) == names
 
 
-def test_a_gallery_is_no_file(dataset: SignatureDataset, tmp_path: Path) -> None:
+def test_a_gallery_is_no_file(dataset, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(
         ValueError, match=r"notes.txt: expected a gallery or a new folder, got a file"
@@ -486,7 +462,7 @@ def test_a_gallery_is_no_file(dataset: SignatureDataset, tmp_path: Path) -> None
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
     """When the file can be read again, bodies that it no longer holds are removed, and the others described again."""
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
@@ -513,7 +489,7 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path: Path) -> 
     assert sorted(row["part"] for row in gallery.rows("part")) == ["1", "1", "2", "2", "3"]
 
 
-def test_numbers_stay_as_they_are_written_in_a_column_of_text(root: Path, tmp_path: Path) -> None:
+def test_numbers_stay_as_they_are_written_in_a_column_of_text(root, tmp_path):
     for label, ages in (("ball", ("old", "young", "")), ("egg", ("03", "4", ""))):
         lines = [f"{i}.off,{label},{age}" for i, age in enumerate(ages)]
         (root / label / "labels.csv").write_text("\n".join(["file,label,age", *lines]))
@@ -528,7 +504,7 @@ def test_numbers_stay_as_they_are_written_in_a_column_of_text(root: Path, tmp_pa
     assert gallery.table.table.version == version
 
 
-def test_what_labels_tell_no_more_sync_empties(root: Path, tmp_path: Path) -> None:
+def test_what_labels_tell_no_more_sync_empties(root, tmp_path):
     table = root / "labels.csv"
     cache = tmp_path / "cache"
     table.write_text("file,label,age,scanner\nball/0.off,ball,41,A\negg/0.off,egg,3,B\n")
@@ -547,8 +523,8 @@ def test_what_labels_tell_no_more_sync_empties(root: Path, tmp_path: Path) -> No
 
 
 def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    root, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(
         SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
     )
@@ -560,9 +536,7 @@ def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
     assert "ct: expected centres, got 8 quantiles that are not fitted" in told
 
 
-def test_a_gallery_remembers_the_table_of_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_gallery_remembers_the_table_of_names(tmp_path, monkeypatch, capsys):
     """As how files are read; another one may be given, as where it was moved to."""
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)

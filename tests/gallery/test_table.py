@@ -87,7 +87,7 @@ def recall(
 
 
 @pytest.mark.parametrize("searched_by", ["chi_square", None])
-def test_few_are_compared_one_by_one(tmp_path: Path, searched_by: str | None) -> None:
+def test_few_are_compared_one_by_one(tmp_path, searched_by):
     rows = histograms(90, 12).reshape(90, 3, 4)
     table = written(tmp_path / "g.igps", rows, searched_by)
     expected = search(rows[:5], rows, top=7)
@@ -100,7 +100,7 @@ def test_few_are_compared_one_by_one(tmp_path: Path, searched_by: str | None) ->
     assert len(table) == 90
 
 
-def test_the_nearest_of_many_are_those_of_all(tmp_path: Path) -> None:
+def test_the_nearest_of_many_are_those_of_all(tmp_path):
     rows = histograms(4500)
     asked = rows[::150]
     table = written(tmp_path / "g.igps", rows, "chi_square")
@@ -113,7 +113,7 @@ def test_the_nearest_of_many_are_those_of_all(tmp_path: Path) -> None:
     )
 
 
-def test_a_condition_keeps_what_numpy_keeps(tmp_path: Path) -> None:
+def test_a_condition_keeps_what_numpy_keeps(tmp_path):
     """The nearest among those that satisfy it, where it keeps many, one in a hundred, few and none."""
     rows = units(4500)
     every = np.arange(4500)
@@ -149,7 +149,7 @@ def test_a_condition_keeps_what_numpy_keeps(tmp_path: Path) -> None:
                 table.nearest(rows[:1], cosine, top=1, where=wrong, exact=exact)
 
 
-def test_vectors_of_any_length_are_searched(tmp_path: Path) -> None:
+def test_vectors_of_any_length_are_searched(tmp_path):
     """More may be wanted than are near."""
     rows = units(4500, width=21)
     table = written(tmp_path / "g.igps", rows, "cosine")
@@ -158,7 +158,7 @@ def test_vectors_of_any_length_are_searched(tmp_path: Path) -> None:
     assert numbers(table.nearest(rows[:1], cosine, top=1500)) == expected
 
 
-def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
+def test_long_descriptions_are_kept_in_half_precision(tmp_path):
     """Each number to 0.05 %, however small all of them are."""
     rows = histograms(60, 1500)
     rows[7] *= 1e-9
@@ -173,7 +173,7 @@ def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
     )
 
 
-def test_rows_are_added_replaced_and_removed(tmp_path: Path) -> None:
+def test_rows_are_added_replaced_and_removed(tmp_path):
     """However the rows came, the answers are those of all rows at once; a new column is empty before."""
     rows = units(5000)
     table = written(tmp_path / "g.igps", rows[:2400], "cosine")
@@ -198,7 +198,7 @@ def test_rows_are_added_replaced_and_removed(tmp_path: Path) -> None:
         table.add(rows[:1], [{**told(0), "age": "old"}], {"age": str})
 
 
-def test_weighted_numbers_decide_which_rows_are_candidates(tmp_path: Path) -> None:
+def test_weighted_numbers_decide_which_rows_are_candidates(tmp_path):
     """By a distance of the last two numbers alone, the nearest rows are not those by the cosine of all."""
     rows = units(4500, 40)
 
@@ -217,7 +217,7 @@ def test_weighted_numbers_decide_which_rows_are_candidates(tmp_path: Path) -> No
     assert plain < 0.5 < 0.98 <= weighted
 
 
-def test_versions_are_those_of_the_engine(tmp_path: Path) -> None:
+def test_versions_are_those_of_the_engine(tmp_path):
     """An earlier version, also one with another map to short vectors, is restored and searched."""
     rows = units(4500)
     table = written(tmp_path / "g.igps", rows, "cosine")
@@ -230,7 +230,7 @@ def test_versions_are_those_of_the_engine(tmp_path: Path) -> None:
     assert numbers(restored.nearest(rows[29:30], cosine, top=1)) == [29]
 
 
-def test_a_gallery_lies_in_an_object_store(tmp_path: Path) -> None:
+def test_a_gallery_lies_in_an_object_store(tmp_path):
     """By the protocol that object stores share; here the store is a folder."""
     place = f"file-object-store://{tmp_path}/store/g.igps"
     assert not is_gallery(place)
@@ -243,13 +243,13 @@ def test_a_gallery_lies_in_an_object_store(tmp_path: Path) -> None:
     assert numbers(BodyTable(place).nearest(rows[7:8], cosine, top=1)) == [7]
 
 
-def test_a_path_keeps_the_place_in_a_bucket() -> None:
+def test_a_path_keeps_the_place_in_a_bucket():
     assert address(Path("s3://bucket/all/g.igps")) == "s3://bucket/all/g.igps"
     assert address("gs://bucket/g.igps") == "gs://bucket/g.igps"
     assert address(Path("C:/meshes/g.igps")) == "C:/meshes/g.igps"
 
 
-def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path):
     table = written(tmp_path / "g.igps", units(10), "cosine")
     other = {"descriptor": "test", "signature": {"resolution": 20}}
     with pytest.raises(
@@ -275,7 +275,7 @@ def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
     assert len(BodyTable(tmp_path / "g.igps")) == 10
 
 
-def test_a_strangers_gallery_runs_nothing(tmp_path: Path) -> None:
+def test_a_strangers_gallery_runs_nothing(tmp_path):
     """LanceDB would load the model that a table names; a head that does not fit is told in a sentence."""
     for i, (name, value) in enumerate(
         (("embedding_functions", b"[]"), ("gallery", b"{"), ("gallery", b"[1]"))
@@ -297,7 +297,7 @@ def test_a_strangers_gallery_runs_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["truncated", "gone", "empty"])
-def test_no_damaged_file_gives_a_wrong_answer(tmp_path: Path, how: str) -> None:
+def test_no_damaged_file_gives_a_wrong_answer(tmp_path, how):
     """The damage is an error in a sentence, or the answer is right without the file."""
     rows = units(4500)
     path = tmp_path / "g.igps"
@@ -331,7 +331,7 @@ def _answers(path: Path) -> list[list[int]]:
     ]
 
 
-def test_several_processes_read_while_one_adds(tmp_path: Path) -> None:
+def test_several_processes_read_while_one_adds(tmp_path):
     rows = units(1500)
     table = written(tmp_path / "g.igps", rows[:1300], "cosine")
     opened = BodyTable(table.path)
@@ -349,7 +349,7 @@ def test_several_processes_read_while_one_adds(tmp_path: Path) -> None:
     )
 
 
-def test_an_index_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+def test_an_index_of_an_earlier_version_is_refused(tmp_path):
     """Its signatures are of version 4: with these nothing is compared."""
     (tmp_path / "manifest.json").write_text('{"format": "igps-index-1"}')
     assert is_gallery(tmp_path)
@@ -434,7 +434,7 @@ def is_whole(table: BodyTable) -> bool:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGKILL")
-def test_kills_of_two_writers_leave_whole_changes(tmp_path: Path) -> None:
+def test_kills_of_two_writers_leave_whole_changes(tmp_path):
     assert killed_writers(tmp_path / "g.igps", 1, longest=0.8) == 0
     assert (
         len(
@@ -448,7 +448,7 @@ def test_kills_of_two_writers_leave_whole_changes(tmp_path: Path) -> None:
     )
 
 
-def test_is_whole_detects_a_change_stored_in_part(tmp_path: Path) -> None:
+def test_is_whole_detects_a_change_stored_in_part(tmp_path):
     """The check of the test above can fail."""
     table = written(tmp_path / "g.igps", units(50, seed=1), "cosine", mark="still")
     table.add(units(40, seed=3), [told(1000 + i, "1-3") for i in range(40)], {})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 import igps
-from igps.learning.fitting import HeadName, classification_scores, classify
+from igps.learning.fitting import classification_scores, classify
 from igps.learning.shortcuts import shortcuts
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, KernelHead, WhitenedHead
@@ -43,15 +42,13 @@ def histograms(dataset: igps.SignatureDataset) -> Tensor:
     return igps.describe(dataset, small_interior()).flatten(1)
 
 
-def test_a_classifier_is_fitted_saved_and_asked(
-    dataset: igps.SignatureDataset, tmp_path: Path
-) -> None:
+def test_a_classifier_is_fitted_saved_and_asked(dataset, tmp_path):
     train = dataset.subset([i for i in range(16) if i % 4])
     test = dataset.subset(range(0, 16, 4))
     model = igps.fit(train, small_interior(), head="classifier")
     model.save(tmp_path / "mine.safetensors")
     for one in (model, tmp_path / "mine.safetensors"):
-        found = classify(test, one)  # type: ignore[arg-type]
+        found = classify(test, one)
         assert found.classes == tuple(sorted(HEIGHTS))
         assert found.names == test.bodies.names
         expected = KernelHead().fit(histograms(train), train.labels).predict(histograms(test))
@@ -63,17 +60,17 @@ def test_a_classifier_is_fitted_saved_and_asked(
     assert (card["head"], card["goal"], card["prior"]) == ("classifier", "known", False)
 
 
-def test_a_classifier_without_names_tells_numbers(dataset: igps.SignatureDataset) -> None:
+def test_a_classifier_without_names_tells_numbers(dataset):
     for names, told in (((), ("0", "1", "2", "3")), (("a", "b", "c", "d"), ("a", "b", "c", "d"))):
         head = ClassifierHead(names=names).fit(histograms(dataset), dataset.labels)
-        model = EmbeddedDescriptor(small_interior(), head)  # type: ignore[arg-type]
+        model = EmbeddedDescriptor(small_interior(), head)
         assert classify(dataset, model).classes == told
     head.names = ("a",)
     with pytest.raises(ValueError, match="expected names of 4 classes, got 1"):
         classify(dataset, model)
 
 
-def test_held_out_scores_are_of_what_was_held_out(dataset: igps.SignatureDataset) -> None:
+def test_held_out_scores_are_of_what_was_held_out(dataset):
     """Accuracy by hand, of a kernel head that is fitted without each fold in turn."""
     model = igps.fit(dataset, small_interior(), head="classifier")
     cells = histograms(dataset)
@@ -99,7 +96,7 @@ def test_held_out_scores_are_of_what_was_held_out(dataset: igps.SignatureDataset
     assert scores["unknown_auc"] == pytest.approx(np.mean(areas))
 
 
-def test_the_prior_stands_beside_the_new_head_or_not(dataset: igps.SignatureDataset) -> None:
+def test_the_prior_stands_beside_the_new_head_or_not(dataset):
     base = small_interior()
     assert isinstance(base, HistogramDescriptor)
     prior = WhitenedHead().fit(histograms(dataset), dataset.labels)
@@ -111,9 +108,7 @@ def test_the_prior_stands_beside_the_new_head_or_not(dataset: igps.SignatureData
         assert (model.head.prior is prior) == wanted == model.card["prior"]
 
 
-def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(
-    dataset: igps.SignatureDataset,
-) -> None:
+def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(dataset):
     model = igps.fit(dataset, small_interior(), goal="new")
     assert set(model.card["held_out_scores"]) == {"nn", "ft", "dcg"}
     assert model.card["head"] in ("whitened", "as_is")
@@ -129,16 +124,14 @@ def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(
 
 
 @pytest.mark.parametrize("head", ["as_is", "whitened"])
-def test_the_descriptor_that_is_given_stays_as_it_was(
-    dataset: igps.SignatureDataset, head: HeadName
-) -> None:
+def test_the_descriptor_that_is_given_stays_as_it_was(dataset, head):
     given = small_interior()
     model = igps.fit(dataset, given, goal="new", head=head)
     assert (model.scale, model.card["head"]) == (model.card["scale"], head)
     assert (given.scale, dict(given.card)) == (None, {})
 
 
-def test_too_little_to_fit_to_is_said(dataset: igps.SignatureDataset) -> None:
+def test_too_little_to_fit_to_is_said(dataset):
     with pytest.raises(
         ValueError, match=r"classes: expected at least 2, .* of two bodies, got \{'flat': 4\}"
     ):
@@ -146,33 +139,31 @@ def test_too_little_to_fit_to_is_said(dataset: igps.SignatureDataset) -> None:
     with pytest.raises(ValueError, match="classes: expected at least 4"):
         igps.fit(dataset.subset(range(8)), small_interior(), goal="new")
     with pytest.raises(ValueError, match="goal: expected one of known, new, got 'both'"):
-        igps.fit(dataset, small_interior(), goal="both")  # type: ignore[arg-type]
+        igps.fit(dataset, small_interior(), goal="both")
     with pytest.raises(
         ValueError,
         match="head: expected one of auto, classifier, linear, whitened, as_is, got 'best'",
     ):
-        igps.fit(dataset, small_interior(), head="best")  # type: ignore[arg-type]
+        igps.fit(dataset, small_interior(), head="best")
     with pytest.raises(ValueError, match="descriptions: expected histograms"):
         igps.fit(dataset, Below(), head="whitened")
 
 
 @pytest.mark.parametrize("sizes", [(5, 5, 5), (5, 5, 5, 1), (5, 1, 1), (3, 1), (2, 2)])
-def test_no_sizes_of_classes_are_too_uneven(
-    dataset: igps.SignatureDataset, sizes: tuple[int, ...]
-) -> None:
+def test_no_sizes_of_classes_are_too_uneven(dataset, sizes):
     """Folds may lack two training bodies of any class, or hold out no class that the classifier knows."""
     labels = [name for name, n in zip(HEIGHTS, sizes, strict=False) for _ in range(n)]
     bodies = replace(dataset.bodies.subset(range(len(labels))), labels=tuple(labels))
     again = igps.SignatureDataset(bodies, dataset.config, dataset.pipeline.cache_dir)
     for head in ("auto", "classifier", "whitened"):
-        model = igps.fit(again, small_interior(), head=head)  # type: ignore[arg-type]
+        model = igps.fit(again, small_interior(), head=head)
         assert sorted(model.card["classes"].values()) == sorted(sizes)
         # With a class held out, two classes of at least two bodies must remain
         detects_unknown = head != "whitened" and sum(n > 1 for n in sizes) >= 3
         assert ("unknown_auc" in model.card["held_out_scores"]) == detects_unknown
 
 
-def test_fit_takes_size_where_only_size_tells_the_classes_and_says_so(tmp_path: Path) -> None:
+def test_fit_takes_size_where_only_size_tells_the_classes_and_says_so(tmp_path):
     for i in range(16):
         egg = trimesh.creation.icosphere(subdivisions=2)
         egg.vertices *= [1, 1, 1 + 0.03 * (i // 2)]
@@ -193,11 +184,11 @@ def test_fit_takes_size_where_only_size_tells_the_classes_and_says_so(tmp_path: 
     assert by_parts["linear of form, without prior"]["auc"] < 0.9
     assert model.card["shortcuts"] == []
     model.save(tmp_path / "mine.safetensors")
-    found = classify(dataset, tmp_path / "mine.safetensors")  # type: ignore[arg-type]
+    found = classify(dataset, tmp_path / "mine.safetensors")
     assert found.probabilities.argmax(dim=1).tolist() == dataset.labels.tolist()
 
 
-def test_balanced_accuracy_and_area_count_small_classes_as_much_as_large_ones() -> None:
+def test_balanced_accuracy_and_area_count_small_classes_as_much_as_large_ones():
     probabilities = torch.tensor([[0.9, 0.1], [0.8, 0.2], [0.6, 0.4], [0.7, 0.3]])
     labels = torch.tensor([3, 3, 3, 8])
     scores = classification_scores(probabilities, labels, torch.tensor([3, 8]))
@@ -207,7 +198,7 @@ def test_balanced_accuracy_and_area_count_small_classes_as_much_as_large_ones() 
     assert scores["auc"] == pytest.approx(2 / 3)
 
 
-def test_what_tells_the_classes_without_form_is_said(dataset: igps.SignatureDataset) -> None:
+def test_what_tells_the_classes_without_form_is_said(dataset):
     assert shortcuts(dataset) == []
     scanners = tuple(
         "A" if label in ("flat", "round") else label for label in dataset.bodies.labels or ()

@@ -46,7 +46,7 @@ def parts(path: Path, options: LoadOptions) -> list[str | None]:
     return [body.part for body in list_bodies(path, options)]
 
 
-def test_six_copies_on_a_plate_are_six_bodies_in_its_unit(tmp_path: Path) -> None:
+def test_six_copies_on_a_plate_are_six_bodies_in_its_unit(tmp_path):
     items = "".join(
         f'<item objectid="1" transform="1 0 0 0 1 0 0 0 1 {3 * i} 0 0"/>' for i in range(6)
     )
@@ -65,9 +65,7 @@ def test_six_copies_on_a_plate_are_six_bodies_in_its_unit(tmp_path: Path) -> Non
     assert len(read_surface(path).faces) == 24
 
 
-def test_an_object_of_objects_is_one_body_turned_and_mirrored_as_the_plan_says(
-    tmp_path: Path,
-) -> None:
+def test_an_object_of_objects_is_one_body_turned_and_mirrored_as_the_plan_says(tmp_path):
     """The second component lies in another member; mirrored, its faces still look outward."""
     mirrored = (
         '<component objectid="7" p:path="/3D/more.model" transform="-2 0 0 0 1 0 0 0 1 0 0 0"/>'
@@ -86,7 +84,7 @@ def test_an_object_of_objects_is_one_body_turned_and_mirrored_as_the_plan_says(
     np.testing.assert_allclose([corners[4:, :, 1].min(), corners[4:, :, 1].max()], [18, 20])
 
 
-def test_objects_that_are_made_of_themselves_or_of_thousands_are_refused(tmp_path: Path) -> None:
+def test_objects_that_are_made_of_themselves_or_of_thousands_are_refused(tmp_path):
     circle = '<object id="1"><components><component objectid="1"/></components></object>'
     with pytest.raises(MeshError, match="made of themselves"):
         load_mesh(plate(tmp_path / "circle.3mf", circle, '<item objectid="1"/>'))
@@ -99,7 +97,7 @@ def test_objects_that_are_made_of_themselves_or_of_thousands_are_refused(tmp_pat
         load_mesh(path, LoadOptions(max_unpacked=10**6))
 
 
-def test_places_in_a_scene_are_bodies(tmp_path: Path) -> None:
+def test_places_in_a_scene_are_bodies(tmp_path):
     scene = trimesh.Scene()
     box = trimesh.creation.box((1, 2, 3))
     for i, name in enumerate(("left", "right")):
@@ -113,7 +111,7 @@ def test_places_in_a_scene_are_bodies(tmp_path: Path) -> None:
     assert right.unit == "m"
 
 
-def test_objects_of_an_obj_file_are_bodies_and_without_them_its_groups(tmp_path: Path) -> None:
+def test_objects_of_an_obj_file_are_bodies_and_without_them_its_groups(tmp_path):
     first = trimesh.creation.box((1, 1, 1))
     second = trimesh.creation.box((1, 1, 2))
     text = ""
@@ -131,7 +129,7 @@ def test_objects_of_an_obj_file_are_bodies_and_without_them_its_groups(tmp_path:
     assert parts(path, OBJECTS) == [None]
 
 
-def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path: Path) -> None:
+def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path):
     """Also in a file of loose triangles; a crumb is no piece, and points are one body."""
     sizes = [1.0, 3.0, 2.0, 0.01]
     boxes = [
@@ -156,9 +154,7 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path: Pat
     assert parts(tmp_path / "cloud.xyz", PIECES) == [None]
 
 
-def test_one_bad_body_does_not_cost_the_others(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_one_bad_body_does_not_cost_the_others(tmp_path, caplog):
     flat = '<triangles><triangle v1="0" v2="0" v3="0"/></triangles>'
     flat = f'<mesh><vertices><vertex x="0" y="0" z="0"/></vertices>{flat}</mesh>'
     objects = f'<object id="1" name="good">{MESH}</object><object id="2" name="bad">{flat}</object>'
@@ -172,7 +168,7 @@ def test_one_bad_body_does_not_cost_the_others(
         load_bodies(plate(tmp_path / "two.3mf", objects, '<item objectid="2"/>'), OBJECTS)
 
 
-def test_several_bodies_and_unknown_parts_are_told_with_the_names_there_are(tmp_path: Path) -> None:
+def test_several_bodies_and_unknown_parts_are_told_with_the_names_there_are(tmp_path):
     items = '<item objectid="1"/><item objectid="1"/>'
     path = plate(tmp_path / "two.3mf", f'<object id="1" name="part">{MESH}</object>', items)
     with pytest.raises(
@@ -187,19 +183,17 @@ def test_several_bodies_and_unknown_parts_are_told_with_the_names_there_are(tmp_
     ):
         load_mesh(tmp_path / "box.off", part="lid")
     with pytest.raises(ValueError, match="bodies: expected one of whole, labels"):
-        LoadOptions(bodies="organs")  # type: ignore[arg-type]
+        LoadOptions(bodies="organs")
 
 
-def test_what_a_format_does_not_have_is_its_usual_way(tmp_path: Path) -> None:
+def test_what_a_format_does_not_have_is_its_usual_way(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.stl")
     for bodies in ("labels", "chains", "objects"):
         assert parts(tmp_path / "box.stl", LoadOptions(bodies=bodies)) == [None]
 
 
 @pytest.mark.parametrize(("unit", "scale"), [(".MILLI.", 1.0), ("$", 1000.0)])
-def test_solids_of_a_step_file_are_bodies_in_millimetres(
-    unit: str, scale: float, tmp_path: Path
-) -> None:
+def test_solids_of_a_step_file_are_bodies_in_millimetres(unit, scale, tmp_path):
     """A part of one solid, and one of two; the file is in millimetres or in metres."""
     path = tmp_path / "parts.step"
     pair = [((5, 0, 0), (6, 1, 1)), ((10, 0, 0), (12, 2, 2))]
@@ -214,7 +208,7 @@ def test_solids_of_a_step_file_are_bodies_in_millimetres(
         load_mesh(path)
 
 
-def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path: Path) -> None:
+def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path):
     """Two boxes of voxels that touch, beside a label of seven voxels; the whole is both boxes."""
     labels = np.zeros((20, 20, 12), dtype=np.uint8)
     labels[2:8, 2:14, 2:10] = 1
@@ -234,13 +228,13 @@ def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path
         body = load_mesh(path, options, part=name)
         assert body.volume == pytest.approx(6 * 12 * 16, rel=1e-6)
         assert body.unit == "mm"
-        np.testing.assert_array_equal(body.vertices, outcomes[name].vertices)  # type: ignore[union-attr]
+        np.testing.assert_array_equal(body.vertices, outcomes[name].vertices)
     assert load_mesh(path, LoadOptions(bodies="whole")).volume == pytest.approx(
         2 * 6 * 12 * 16, rel=0.02
     )
 
 
-def test_chains_of_a_structure_are_bodies_in_angstrom(tmp_path: Path) -> None:
+def test_chains_of_a_structure_are_bodies_in_angstrom(tmp_path):
     """Two zinc ions far from each other, balls of 1.39 Å."""
     line = "HETATM    {0} ZN    ZN {1}   1      {2:6.3f}   6.134  -6.504  1.00 20.00          ZN\n"
     path = tmp_path / "zinc.pdb"

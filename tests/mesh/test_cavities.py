@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -42,7 +40,7 @@ def ball(radius: float, at: float = 0.0, *, inwards: bool = False) -> Surface:
     return BALL.vertices * radius + [at, 0, 0], faces[:, ::-1] if inwards else faces
 
 
-def test_a_cavity_that_is_turned_inwards_is_part_of_the_body_as_it_is() -> None:
+def test_a_cavity_that_is_turned_inwards_is_part_of_the_body_as_it_is():
     hollow = mend(*joined(ball(1), ball(0.5, inwards=True)), cavities="keep")
     assert hollow.notes == ()
     assert hollow.volume == pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-12)
@@ -51,13 +49,13 @@ def test_a_cavity_that_is_turned_inwards_is_part_of_the_body_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("inwards", [False, True])
-def test_filled_it_is_the_ball(inwards: bool) -> None:
+def test_filled_it_is_the_ball(inwards):
     full = mend(*joined(ball(1), ball(0.5, inwards=inwards)))
     np.testing.assert_array_equal(full.vertices, BALL.vertices)
     np.testing.assert_array_equal(full.faces, BALL.faces)
 
 
-def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_once() -> None:
+def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_once():
     surface = joined(ball(1), ball(0.5), ball(0.2), ball(0.1, 0.75))
     hollow = mend(*surface, cavities="keep")
     assert hollow.volume == pytest.approx((1 - 0.5**3 - 0.1**3) * BALL.volume, rel=1e-12)
@@ -70,12 +68,12 @@ def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_o
 
 
 @pytest.mark.parametrize("inwards", [False, True])
-def test_a_cavity_is_one_though_the_outer_surface_is_inside_out(inwards: bool) -> None:
+def test_a_cavity_is_one_though_the_outer_surface_is_inside_out(inwards):
     hollow = mend(*joined(ball(1, inwards=True), ball(0.5, inwards=inwards)), cavities="keep")
     assert hollow.volume == pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-12)
 
 
-def test_loose_triangles_are_welded_before() -> None:
+def test_loose_triangles_are_welded_before():
     vertices, faces = joined(ball(1), ball(0.5))
     hollow = mend(
         vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), cavities="keep"
@@ -93,7 +91,7 @@ def test_loose_triangles_are_welded_before() -> None:
     ],
     ids=["turned outwards", "outside", "across", "in another"],
 )
-def test_what_is_no_cavity_is_refused(other: Surface) -> None:
+def test_what_is_no_cavity_is_refused(other):
     with pytest.raises(
         MeshError, match=r"closed surfaces bounds no cavity: .*--mend auto, or without cavities"
     ):
@@ -102,7 +100,7 @@ def test_what_is_no_cavity_is_refused(other: Surface) -> None:
         Mesh(*joined(ball(1), other))
 
 
-def test_samples_lie_in_the_wall_and_on_all_surfaces() -> None:
+def test_samples_lie_in_the_wall_and_on_all_surfaces():
     hollow = Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True)
     radii = np.linalg.norm(interior_samples(hollow, 32, 1000), axis=1)
     assert radii.min() > 0.69
@@ -122,7 +120,7 @@ def test_samples_lie_in_the_wall_and_on_all_surfaces() -> None:
     )
 
 
-def test_eigenfunctions_of_the_outside_go_on_through_the_wall() -> None:
+def test_eigenfunctions_of_the_outside_go_on_through_the_wall():
     """The first three of a ball extend to linear functions in the wall: the sum of squares is 3 |x|² / 4π."""
     config = SignatureConfig(n_eigenpairs=30, accuracy=None)
     hollow = compute_signature(
@@ -135,7 +133,7 @@ def test_eigenfunctions_of_the_outside_go_on_through_the_wall() -> None:
         np.testing.assert_allclose(squares, np.square(samples.points).sum(axis=1), rtol=0.03)
 
 
-def test_the_outer_surface_has_vertices_enough_whatever_the_cavity_has() -> None:
+def test_the_outer_surface_has_vertices_enough_whatever_the_cavity_has():
     box = trimesh.creation.box((4, 4, 4))
     surface = joined((np.asarray(box.vertices), np.asarray(box.faces)), ball(1, inwards=True))
     hollow = mend(*surface, least_vertices=100, cavities="keep")
@@ -144,7 +142,7 @@ def test_the_outer_surface_has_vertices_enough_whatever_the_cavity_has() -> None
     assert simplify(hollow, 700).cavities
 
 
-def test_a_file_is_read_with_its_cavities_where_they_are_kept(tmp_path: Path) -> None:
+def test_a_file_is_read_with_its_cavities_where_they_are_kept(tmp_path):
     vertices, faces = joined(ball(1), ball(0.5, inwards=True))
     trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "hollow.off")
     kept = load_mesh(tmp_path / "hollow.off", LoadOptions(cavities="keep"))
@@ -152,10 +150,10 @@ def test_a_file_is_read_with_its_cavities_where_they_are_kept(tmp_path: Path) ->
     assert load_mesh(tmp_path / "hollow.off").volume == pytest.approx(BALL.volume, rel=1e-6)
     assert LoadOptions(cavities="keep").as_dict() == {**LoadOptions().as_dict(), "cavities": "keep"}
     with pytest.raises(ValueError, match="cavities: expected one of fill, keep, got 'leave'"):
-        LoadOptions(cavities="leave")  # type: ignore[arg-type]
+        LoadOptions(cavities="leave")
 
 
-def test_a_label_keeps_its_cavities() -> None:
+def test_a_label_keeps_its_cavities():
     radius = np.linalg.norm(np.indices((40, 40, 40)) - 19.5, axis=0)
     mask = (radius < 16) & (radius > 7)
     mask[19, 19, 4] = False  # a voxel of noise is no cavity
@@ -168,7 +166,7 @@ def test_a_label_keeps_its_cavities() -> None:
     assert notes != full[2]
 
 
-def test_a_cavity_behind_a_wall_with_gaps_is_noted() -> None:
+def test_a_cavity_behind_a_wall_with_gaps_is_noted():
     """As of a wall thinner than a voxel. A closed wall, and a cup, get no note."""
     offset = np.indices((40, 40, 40)) - 19.7
     radius = np.linalg.norm(offset, axis=0)
@@ -182,7 +180,7 @@ def test_a_cavity_behind_a_wall_with_gaps_is_noted() -> None:
         assert voxel_surface(mask, cavities=True)[2] == ()
 
 
-def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path: Path) -> None:
+def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path):
     """A ball with a core that is another label, as a kidney with a cyst, and a ring around both."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     x, y, z = np.meshgrid(
@@ -223,7 +221,7 @@ def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path: Path) -> None:
     assert signature.volume == pytest.approx(wall.volume)
 
 
-def test_a_piece_of_a_label_in_its_cavity_is_told() -> None:
+def test_a_piece_of_a_label_in_its_cavity_is_told():
     """A seed in its shell was left out without a word."""
     radius = np.linalg.norm(np.indices((41, 41, 41)) - 20.0, axis=0)
     shell = (radius > 14) & (radius < 18)
@@ -236,7 +234,7 @@ def test_a_piece_of_a_label_in_its_cavity_is_told() -> None:
     assert notes == (f"in a cavity: filled holes: {n:,} voxels, {n:,}",)
 
 
-def test_the_larger_the_cavity_the_farther_from_the_ball() -> None:
+def test_the_larger_the_cavity_the_farther_from_the_ball():
     bodies = [Mesh(*ball(1))]
     bodies += [
         Mesh(*joined(ball(1), ball(radius, inwards=True)), cavities=True)
@@ -251,7 +249,7 @@ def test_the_larger_the_cavity_the_farther_from_the_ball() -> None:
         assert bool((distances.diff() > 0).all()), (module.name, distances)
 
 
-def test_of_two_cavities_that_meet_at_a_vertex_both_are_turned_inwards() -> None:
+def test_of_two_cavities_that_meet_at_a_vertex_both_are_turned_inwards():
     tip = int(np.argmax(BALL.vertices[:, 0]))
     one = (BALL.vertices - BALL.vertices[tip]) * 0.25  # reaches from the left to the origin
     other = one * [-0.8, 0.8, 0.8]  # its mirror image, smaller

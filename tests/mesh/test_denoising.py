@@ -24,13 +24,13 @@ def bumpy() -> Mesh:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_noise_is_found_and_shape_is_not(sphere: Mesh, seed: int) -> None:
+def test_noise_is_found_and_shape_is_not(sphere, seed):
     assert is_noisy(noise(sphere, 0.004, seed).vertices, sphere.faces)
     assert not is_noisy(sphere.vertices, sphere.faces)
     assert not is_noisy(bumpy().vertices, bumpy().faces)
 
 
-def test_rounding_creases_and_odd_triangles_are_no_noise() -> None:
+def test_rounding_creases_and_odd_triangles_are_no_noise():
     box = trimesh.creation.box((1, 2, 3)).subdivide_to_size(0.1)
     generator = np.random.default_rng(0)
     flat = np.asarray(box.vertices) + generator.normal(0, 1e-7, box.vertices.shape)
@@ -41,13 +41,13 @@ def test_rounding_creases_and_odd_triangles_are_no_noise() -> None:
     assert not is_noisy(shifted, np.asarray(surface.faces))
 
 
-def test_the_rough_half_of_a_body_stays(sphere: Mesh) -> None:
+def test_the_rough_half_of_a_body_stays(sphere):
     rough = noise(sphere, 0.004, 0).vertices
     upper = sphere.vertices[:, 2:] > 0.2
     assert not is_noisy(np.where(upper, rough, sphere.vertices), sphere.faces)
 
 
-def test_area_and_volume_come_back(sphere: Mesh) -> None:
+def test_area_and_volume_come_back(sphere):
     noisy = noise(sphere, 0.004, 1)
     assert noisy.area > 1.05 * sphere.area
     smooth = Mesh(remove_noise(noisy.vertices, noisy.faces), noisy.faces)
@@ -61,7 +61,7 @@ def test_area_and_volume_come_back(sphere: Mesh) -> None:
 
 @pytest.mark.parametrize("ratio", [0.1, 0.2, 0.3])
 @pytest.mark.parametrize("subdivisions", [4, 5])
-def test_passes_follow_the_noise(ratio: float, subdivisions: int) -> None:
+def test_passes_follow_the_noise(ratio, subdivisions):
     """The area, volume and normals of the clean ball come back from noise of several strengths."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices = np.asarray(ball.vertices)
@@ -85,7 +85,7 @@ def test_passes_follow_the_noise(ratio: float, subdivisions: int) -> None:
 
 @pytest.mark.parametrize("sections", [200, 256])
 @pytest.mark.parametrize("steps", [3, 5])
-def test_turned_parts_of_thin_triangles_come_back(steps: int, sections: int) -> None:
+def test_turned_parts_of_thin_triangles_come_back(steps, sections):
     """Rims of many corners, far apart: noise as wide as a triangle crumples them. The clean part is the oracle."""
     random = np.random.default_rng(steps)
     ends = np.cumsum(random.uniform(0.2, 1, steps))
@@ -108,7 +108,7 @@ def test_turned_parts_of_thin_triangles_come_back(steps: int, sections: int) -> 
 
 
 @pytest.mark.parametrize("amplitude", [0.002, 0.003])
-def test_edges_of_a_box_stay_sharp(amplitude: float) -> None:
+def test_edges_of_a_box_stay_sharp(amplitude):
     """The normals of its sides are the oracle, also of the triangles along its edges; smoothing alone rounds those."""
     box = trimesh.creation.box((1, 2, 3)).subdivide_to_size(0.1)
     part = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
@@ -142,7 +142,7 @@ def plate_with_holes(seed: int, longest_edge: float | None = None) -> Mesh:
 
 @pytest.mark.parametrize("longest_edge", [None, 0.06])
 @pytest.mark.parametrize("seed", range(3))
-def test_plates_with_holes_keep_their_volume(seed: int, longest_edge: float | None) -> None:
+def test_plates_with_holes_keep_their_volume(seed, longest_edge):
     """Against the clean plate. Neighbours on a rim lie on one side of a vertex; noise may exceed slivers."""
     part = plate_with_holes(seed, longest_edge)
     rough = noise(part, 0.002, seed)
@@ -152,7 +152,7 @@ def test_plates_with_holes_keep_their_volume(seed: int, longest_edge: float | No
     assert abs(smooth.area - part.area) < 0.5 * (rough.area - part.area)
 
 
-def test_a_fan_of_thousands_of_slivers_does_not_fold_up() -> None:
+def test_a_fan_of_thousands_of_slivers_does_not_fold_up():
     """Noise is wider than they are, and all meet in one vertex."""
     import manifold3d
 
@@ -174,7 +174,7 @@ def test_a_fan_of_thousands_of_slivers_does_not_fold_up() -> None:
     assert smooth.volume == pytest.approx(part.volume, rel=0.005)
 
 
-def test_many_faces_are_filtered_as_few_are(sphere: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_faces_are_filtered_as_few_are(sphere, monkeypatch):
     rough = noise(sphere, 0.004, 2).vertices
     expected = remove_noise(rough, sphere.faces)
     monkeypatch.setattr(denoising, "_FACES_AT_ONCE", 100)
@@ -182,7 +182,7 @@ def test_many_faces_are_filtered_as_few_are(sphere: Mesh, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])
-def test_the_unit_of_length_does_not_matter(scale: float) -> None:
+def test_the_unit_of_length_does_not_matter(scale):
     ring = trimesh.creation.annulus(0.2, 0.5, 1, sections=512)
     part = Mesh(np.asarray(ring.vertices), np.asarray(ring.faces))
     rough = noise(part, 0.002, seed=1)
@@ -193,7 +193,7 @@ def test_the_unit_of_length_does_not_matter(scale: float) -> None:
     )
 
 
-def test_a_knurled_knob_is_no_noise() -> None:
+def test_a_knurled_knob_is_no_noise():
     """Teeth go up and down from vertex to vertex as noise does, but their flanks are planes."""
     knob = trimesh.creation.revolve(np.array([(0, 0), (1, 0), (1, 1), (0, 1)]), sections=600)
     vertices = np.array(knob.vertices)
@@ -202,7 +202,7 @@ def test_a_knurled_knob_is_no_noise() -> None:
     assert not is_noisy(vertices, np.asarray(knob.faces))
 
 
-def test_noise_of_a_smooth_shape_is_next_to_none(sphere: Mesh) -> None:
+def test_noise_of_a_smooth_shape_is_next_to_none(sphere):
     assert _noise_over_edge(sphere.vertices, sphere.faces) < 0.01
     assert _noise_over_edge(3 * sphere.vertices, sphere.faces) == pytest.approx(
         _noise_over_edge(sphere.vertices, sphere.faces)
@@ -219,7 +219,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("index", [0, 3, 7, 9, 11])
-def test_coarse_bodies_are_told_apart_from_noisy_ones(index: int) -> None:
+def test_coarse_bodies_are_told_apart_from_noisy_ones(index):
     """Of about 1,500 vertices, where an edge is long and the surface bends within it."""
     body = ArticulatedShapes(index + 1, 1, seed=2, n_vertices=1500)[index]
     mesh = Mesh(body.vertices, body.faces)
@@ -229,15 +229,13 @@ def test_coarse_bodies_are_told_apart_from_noisy_ones(index: int) -> None:
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.005, True), (0.05, False)])
-def test_what_is_full_of_holes_is_no_surface_to_look_over(
-    sphere: Mesh, share: float, expected: bool
-) -> None:
+def test_what_is_full_of_holes_is_no_surface_to_look_over(sphere, share, expected):
     rough = noise(sphere, 0.004, 0)
     faces = rough.faces[np.random.default_rng(0).random(len(rough.faces)) >= share]
     assert is_noisy(rough.vertices, faces) is expected
 
 
-def test_boundaries_stay(sphere: Mesh) -> None:
+def test_boundaries_stay(sphere):
     faces = sphere.faces[sphere.vertices[sphere.faces].mean(axis=1)[:, 2] < 0.5]
     noisy = noise(sphere, 0.004, 1).vertices
     smooth = remove_noise(noisy, faces)
@@ -248,7 +246,7 @@ def test_boundaries_stay(sphere: Mesh) -> None:
     assert not np.array_equal(smooth, noisy)
 
 
-def test_mending_smooths_noise_only(sphere: Mesh) -> None:
+def test_mending_smooths_noise_only(sphere):
     noisy = noise(sphere, 0.004, 1)
     mesh = mend(noisy.vertices, noisy.faces)
     assert repair_steps(mesh.notes) == ("smoothed",)

@@ -17,21 +17,21 @@ from igps.signature.voxels import interior_samples
 
 
 @pytest.mark.parametrize("kind", ["off", "ply", "stl"])
-def test_announced_numbers(tmp_path: Path, kind: str) -> None:
+def test_announced_numbers(tmp_path, kind):
     surface = trimesh.creation.icosphere(subdivisions=4)
     surface.export(tmp_path / f"ball.{kind}")
     assert expected_faces(tmp_path / f"ball.{kind}") == len(surface.faces)
 
 
 @pytest.mark.parametrize("name", ["ball.obj", "ball_ascii.stl"])
-def test_numbers_from_the_size(tmp_path: Path, name: str) -> None:
+def test_numbers_from_the_size(tmp_path, name):
     surface = trimesh.creation.icosphere(subdivisions=5)
     kind = "stl_ascii" if "ascii" in name else None
     surface.export(tmp_path / name, file_type=kind)
     assert 0.5 < expected_faces(tmp_path / name) / len(surface.faces) < 3
 
 
-def test_headers_with_comments_and_lies(tmp_path: Path) -> None:
+def test_headers_with_comments_and_lies(tmp_path):
     file = tmp_path / "a.off"
     file.write_text("OFF\n# made by hand\n8 12 0\n" + "0 0 0\n" * 8)
     assert expected_faces(file) == 12
@@ -60,7 +60,7 @@ def under_limits(program: str, most: int, *words: str) -> list[str]:
     ).stdout.splitlines()
 
 
-def test_ten_million_triangles_in_two_gibibytes(tmp_path: Path) -> None:
+def test_ten_million_triangles_in_two_gibibytes(tmp_path):
     file = tmp_path / "huge.stl"
     with file.open("wb") as stream:  # a sparse file: only its head is on the disk
         stream.write(bytes(80) + (10_000_000).to_bytes(4, "little"))
@@ -75,7 +75,7 @@ def test_ten_million_triangles_in_two_gibibytes(tmp_path: Path) -> None:
         assert "Simplify" in message
 
 
-def test_what_fits_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_fits_passes(tmp_path, monkeypatch):
     file = tmp_path / "ball.off"
     trimesh.creation.icosphere(subdivisions=6).export(file)
     check_memory(file)
@@ -87,7 +87,7 @@ def test_what_fits_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="the system does not tell")
-def test_some_memory_is_available() -> None:
+def test_some_memory_is_available():
     free = available_memory()
     assert free is not None
     assert 0 < free < 1 << 50
@@ -107,7 +107,7 @@ def group(folder: Path, version: int, most: object, used: int, cached: int) -> N
     (folder / "memory.stat").write_text(f"active_file 7\nsome_{cache} 3\n{cache} {cached}\n")
 
 
-def test_the_groups_around_a_process_bound_its_memory(tmp_path: Path) -> None:
+def test_the_groups_around_a_process_bound_its_memory(tmp_path):
     own = tmp_path / "own"
     root = tmp_path / "groups"
     own.write_text("0::/job/step\n")
@@ -120,7 +120,7 @@ def test_the_groups_around_a_process_bound_its_memory(tmp_path: Path) -> None:
     assert limits._memory_in_groups(root, own) == 200
 
 
-def test_a_container_has_its_group_as_the_root(tmp_path: Path) -> None:
+def test_a_container_has_its_group_as_the_root(tmp_path):
     own = tmp_path / "own"
     root = tmp_path / "groups"
     own.write_text("9:name=systemd:/\n4:cpu,memory:/docker/0815\n")
@@ -131,7 +131,7 @@ def test_a_container_has_its_group_as_the_root(tmp_path: Path) -> None:
     assert limits._memory_in_groups(tmp_path / "nowhere", tmp_path / "nothing") is None
 
 
-def test_the_limits_of_the_process_bound_its_memory() -> None:
+def test_the_limits_of_the_process_bound_its_memory():
     program = (
         "assert before is None or 0 < available_memory() <= min(before, 1 << 33) + (1 << 26)\n"
         "block = bytearray(1 << 29)\n"
@@ -141,7 +141,7 @@ def test_the_limits_of_the_process_bound_its_memory() -> None:
     assert under_limits(program, 1 << 33) == ["bounded", "bounded"]
 
 
-def test_a_grid_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_grid_that_does_not_fit_is_refused(monkeypatch):
     ball = trimesh.creation.icosphere(subdivisions=2)
     mesh = Mesh(ball.vertices, ball.faces, name="ball")
     free = 100 * 2**20

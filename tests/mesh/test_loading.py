@@ -22,7 +22,7 @@ def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
     return path
 
 
-def test_missing_and_unreadable_files(tmp_path: Path) -> None:
+def test_missing_and_unreadable_files(tmp_path):
     with pytest.raises(MeshError, match=r"nowhere\.off: no such file"):
         load_mesh(tmp_path / "nowhere.off")
     with pytest.raises(MeshError, match="expected a file, got a folder"):
@@ -38,7 +38,7 @@ def test_missing_and_unreadable_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "xyz", "3mf"])
-def test_an_empty_file_is_called_empty(tmp_path: Path, suffix: str) -> None:
+def test_an_empty_file_is_called_empty(tmp_path, suffix):
     (tmp_path / f"none.{suffix}").write_bytes(b"")
     with pytest.raises(
         MeshError, match=rf"none\.{suffix}: the file is empty \(0 bytes\)\. Export it again"
@@ -47,7 +47,7 @@ def test_an_empty_file_is_called_empty(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "glb"])
-def test_formats_keep_vertices_in_order(tmp_path: Path, suffix: str) -> None:
+def test_formats_keep_vertices_in_order(tmp_path, suffix):
     surface = trimesh.creation.icosphere(subdivisions=1)
     surface.export(tmp_path / f"mesh.{suffix}")
     mesh = load_mesh(tmp_path / f"mesh.{suffix}")
@@ -59,9 +59,7 @@ def test_formats_keep_vertices_in_order(tmp_path: Path, suffix: str) -> None:
     ("suffix", "comment"), [("off", "# {}"), ("obj", "# {}"), ("ply", "comment {}")]
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "shift_jis"])
-def test_comments_may_be_in_any_encoding(
-    tmp_path: Path, suffix: str, comment: str, encoding: str
-) -> None:
+def test_comments_may_be_in_any_encoding(tmp_path, suffix, comment, encoding):
     surface = trimesh.creation.icosphere(subdivisions=1)
     options = {"encoding": "ascii"} if suffix == "ply" else {}
     text = surface.export(file_type=suffix, **options)
@@ -81,7 +79,7 @@ def test_comments_may_be_in_any_encoding(
     )
 
 
-def test_a_byte_order_mark_costs_no_vertex(tmp_path: Path) -> None:
+def test_a_byte_order_mark_costs_no_vertex(tmp_path):
     """Editors on Windows put it first, before the first vertex where no comment stands above."""
     surface = trimesh.creation.icosphere(subdivisions=1)
     text = "\n".join(
@@ -94,7 +92,7 @@ def test_a_byte_order_mark_costs_no_vertex(tmp_path: Path) -> None:
     )
 
 
-def test_quads_become_triangles(tmp_path: Path) -> None:
+def test_quads_become_triangles(tmp_path):
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
     quads = np.array(
         [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]]
@@ -106,7 +104,7 @@ def test_quads_become_triangles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("start", range(4))
-def test_polygons_with_corners_turned_inwards_do_not_fold(start: int, tmp_path: Path) -> None:
+def test_polygons_with_corners_turned_inwards_do_not_fold(start, tmp_path):
     """Prisms over stars, whose area and volume are those of the polygon (Gauss's formula)."""
     random = np.random.default_rng(start)
     angle = (
@@ -132,7 +130,7 @@ def test_polygons_with_corners_turned_inwards_do_not_fold(start: int, tmp_path: 
     assert mesh.area == pytest.approx(2 * area + 2 * around)
 
 
-def test_a_polygon_around_a_hole_does_not_fold(tmp_path: Path) -> None:
+def test_a_polygon_around_a_hole_does_not_fold(tmp_path):
     """A square with a square hole, reached by an edge that is run through twice, as CAD programs write it."""
     square = [(0, 0), (3, 0), (3, 3), (0, 3), (1, 1), (1, 2), (2, 2), (2, 1)]
     (tmp_path / "ring.obj").write_text(
@@ -145,9 +143,7 @@ def test_a_polygon_around_a_hole_does_not_fold(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("n_corners", [60, 5000])
-def test_a_polygon_that_crosses_itself_or_has_many_corners_is_cut_all_the_same(
-    n_corners: int, tmp_path: Path
-) -> None:
+def test_a_polygon_that_crosses_itself_or_has_many_corners_is_cut_all_the_same(n_corners, tmp_path):
     """Into triangles that use every corner, each side of the polygon once."""
     places = np.random.default_rng(0).normal(size=(n_corners, 2)).tolist()
     face = " ".join(str(i + 1) for i in range(n_corners))
@@ -176,7 +172,7 @@ def by_trimesh(text: str, path: Path) -> trimesh.Trimesh:
     return trimesh.load(path, process=False, force="scene").to_mesh()
 
 
-def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:
+def test_off_files_are_read_as_trimesh_reads_them(tmp_path):
     """These are plain, or have faults and liberties of all kinds."""
     ball = trimesh.creation.icosphere(subdivisions=0)
     plain = ball.export(file_type="off")
@@ -243,7 +239,7 @@ def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:
     assert 150 < sum(outcomes) < len(texts) - 150
 
 
-def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:
+def test_texture_seams_do_not_split_vertices(tmp_path):
     lines = [f"v {x} {y} {z}" for x, y, z in TETRAHEDRON] + ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
     lines += [f"f {a + 1}/{i % 4 + 1} {b + 1}/2 {c + 1}/3" for i, (a, b, c) in enumerate(FACES)]
     (tmp_path / "seams.obj").write_text("\n".join(lines) + "\n")
@@ -263,7 +259,7 @@ def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("away", [0.0, 1e-9])
-def test_loose_triangles_need_and_get_welding(tmp_path: Path, away: float) -> None:
+def test_loose_triangles_need_and_get_welding(tmp_path, away):
     """Corners that are in one place, or nearly so; of an STL file the former are one vertex already."""
     surface = trimesh.creation.icosphere(subdivisions=2)
     loose = np.asarray(surface.vertices)[surface.faces].reshape(-1, 3)
@@ -278,7 +274,7 @@ def test_loose_triangles_need_and_get_welding(tmp_path: Path, away: float) -> No
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_each_fault_is_mended_at_any_scale(tmp_path: Path, scale: float) -> None:
+def test_each_fault_is_mended_at_any_scale(tmp_path, scale):
     surface = trimesh.creation.icosphere(subdivisions=2)
     vertices = np.asarray(surface.vertices)
     faces = np.asarray(surface.faces)
@@ -298,7 +294,7 @@ def test_each_fault_is_mended_at_any_scale(tmp_path: Path, scale: float) -> None
     )
 
 
-def test_largest_component_is_that_of_the_largest_area(tmp_path: Path) -> None:
+def test_largest_component_is_that_of_the_largest_area(tmp_path):
     fine = trimesh.creation.icosphere(subdivisions=3)
     large = trimesh.creation.box((5, 5, 5))
     vertices = np.vstack([fine.vertices + 20, large.vertices])
@@ -311,7 +307,7 @@ def test_largest_component_is_that_of_the_largest_area(tmp_path: Path) -> None:
     assert any("largest of 2 components" in note for note in mesh.notes)
 
 
-def test_open_files_are_read_when_allowed(tmp_path: Path) -> None:
+def test_open_files_are_read_when_allowed(tmp_path):
     path = write_off(tmp_path / "open.off", TETRAHEDRON, FACES[:3])
     with pytest.raises(MeshError, match="3 boundary edges"):
         load_mesh(path, LoadOptions("never"))
@@ -320,9 +316,7 @@ def test_open_files_are_read_when_allowed(tmp_path: Path) -> None:
     assert len(mesh.faces) == 3
 
 
-def test_the_largest_component_of_loose_triangles_is_what_they_make_together(
-    tmp_path: Path,
-) -> None:
+def test_the_largest_component_of_loose_triangles_is_what_they_make_together(tmp_path):
     small = trimesh.creation.box((1, 1, 1))
     large = trimesh.creation.box((1, 2, 3))
     # It touches the large one
@@ -335,23 +329,21 @@ def test_the_largest_component_of_loose_triangles_is_what_they_make_together(
     assert load_mesh(path, LoadOptions(component="largest")).volume == pytest.approx(6)
 
 
-def test_unknown_component_is_refused() -> None:
+def test_unknown_component_is_refused():
     with pytest.raises(
         ValueError, match="component: expected one of largest, None, got 'smallest'"
     ):
-        LoadOptions(component="smallest")  # type: ignore[arg-type]
+        LoadOptions(component="smallest")
 
 
-def test_unknown_way_to_mend_is_refused() -> None:
+def test_unknown_way_to_mend_is_refused():
     with pytest.raises(ValueError, match="mend: expected one of auto, never, always, got 'please'"):
-        LoadOptions(mend="please")  # type: ignore[arg-type]
+        LoadOptions(mend="please")
 
 
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("suffix", ["xyz", "ply"])
-def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(
-    tmp_path: Path, suffix: str, normals: bool
-) -> None:
+def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path, suffix, normals):
     surface = trimesh.creation.icosphere(subdivisions=4)
     rows = np.asarray(surface.vertices) * [1, 0.8, 1.3]
     names = ["x", "y", "z"]
@@ -376,7 +368,7 @@ def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(
         load_mesh(path, LoadOptions("never"))
 
 
-def test_a_body_is_left_as_it_is_bit_for_bit(tmp_path: Path) -> None:
+def test_a_body_is_left_as_it_is_bit_for_bit(tmp_path):
     surface = trimesh.creation.icosphere(subdivisions=3)
     path = write_off(tmp_path / "body.off", surface.vertices, surface.faces)
     mended = load_mesh(path)
@@ -386,7 +378,7 @@ def test_a_body_is_left_as_it_is_bit_for_bit(tmp_path: Path) -> None:
     assert mended.notes == ()
 
 
-def test_too_few_vertices_for_the_eigenpairs_are_made_more(tmp_path: Path) -> None:
+def test_too_few_vertices_for_the_eigenpairs_are_made_more(tmp_path):
     box = trimesh.creation.box()
     path = write_off(tmp_path / "box.off", box.vertices, box.faces)
     mesh = load_mesh(path, least_vertices=100)
@@ -395,9 +387,7 @@ def test_too_few_vertices_for_the_eigenpairs_are_made_more(tmp_path: Path) -> No
     assert mesh.area == pytest.approx(6)
 
 
-def test_a_format_without_its_module_says_which_extra_has_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_format_without_its_module_says_which_extra_has_it(tmp_path, monkeypatch):
     (tmp_path / "part.dae").write_bytes(b"<COLLADA/>")
 
     def missing(*_: object, **__: object) -> None:
@@ -409,7 +399,7 @@ def test_a_format_without_its_module_says_which_extra_has_it(
 
 
 @pytest.mark.parametrize("where", ["far", "far in double precision", "at the origin"])
-def test_places_that_single_precision_rounds_off_are_told(where: str, tmp_path: Path) -> None:
+def test_places_that_single_precision_rounds_off_are_told(where, tmp_path):
     """In coordinates of maps an object of some metres has steps of half a metre, which bend its surface."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
     vertices = ball.vertices + (0.0 if where == "at the origin" else np.array([5e5, 5.4e6, 0.0]))

@@ -46,7 +46,7 @@ def same_surface(a: Mesh, b: Mesh) -> bool:
     return len(a.faces) == len(b.faces) and bool(np.allclose(canonical(a), canonical(b), atol=2e-5))
 
 
-def test_a_body_is_left_as_it_is(blob: Mesh) -> None:
+def test_a_body_is_left_as_it_is(blob):
     mesh = mend(blob.vertices, blob.faces)
     np.testing.assert_array_equal(mesh.vertices, blob.vertices)
     np.testing.assert_array_equal(mesh.faces, blob.faces)
@@ -55,13 +55,13 @@ def test_a_body_is_left_as_it_is(blob: Mesh) -> None:
 
 
 @pytest.mark.parametrize("name", ["soup", "turned", "fins", "parts"])
-def test_welding_and_dropping_gives_the_very_surface(blob: Mesh, name: str) -> None:
+def test_welding_and_dropping_gives_the_very_surface(blob, name):
     mesh = mend(*DAMAGES[name].apply(blob, 3))
     assert repair_steps(mesh.notes) == ("welded",)
     assert same_surface(mesh, blob)
 
 
-def test_holes_are_filled_where_the_surface_was(sphere: Mesh) -> None:
+def test_holes_are_filled_where_the_surface_was(sphere):
     mesh = mend(*holes(sphere, seed=1))
     assert repair_steps(mesh.notes) == ("filled",)
     assert mesh.notes == ("filled 3 small holes",)
@@ -74,7 +74,7 @@ def test_holes_are_filled_where_the_surface_was(sphere: Mesh) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_holes_that_touch_are_filled_one_by_one(sphere: Mesh, seed: int) -> None:
+def test_holes_that_touch_are_filled_one_by_one(sphere, seed):
     """Rims that meet in a vertex are taken apart: after it, each edge has two faces again."""
     kept = np.ones(len(sphere.faces), dtype=bool)
     kept[np.random.default_rng(seed).choice(len(kept), len(kept) // 20, replace=False)] = False
@@ -85,12 +85,12 @@ def test_holes_that_touch_are_filled_one_by_one(sphere: Mesh, seed: int) -> None
     assert (counts == 2).all()
 
 
-def test_no_faces_have_no_holes() -> None:
+def test_no_faces_have_no_holes():
     none = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     assert fill_small_holes(*none, [])[1] is none[1]
 
 
-def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere: Mesh) -> None:
+def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere):
     """Those of a disc of radius r = n / 2π steps that are one step apart: about π r² = n² / 4π."""
     away = np.linalg.norm(sphere.vertices - sphere.vertices[0], axis=1)
     kept = sphere.faces[(away[sphere.faces] > 0.11 * np.ptp(sphere.vertices)).all(axis=1)]
@@ -105,27 +105,27 @@ def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere: Mesh) -> None:
     assert len(vertices) - len(used) == pytest.approx(n**2 / (4 * np.pi), rel=0.35)
 
 
-def test_halves_that_overlap_are_the_body_again(blob: Mesh) -> None:
+def test_halves_that_overlap_are_the_body_again(blob):
     mesh = mend(*halves(blob))
     assert repair_steps(mesh.notes) == ("united",)
     assert mesh.volume == pytest.approx(blob.volume, rel=1e-9)
     assert mesh.area == pytest.approx(blob.area, rel=1e-9)
 
 
-def test_halves_that_overlap_and_are_always_made_watertight_come_near_it(blob: Mesh) -> None:
+def test_halves_that_overlap_and_are_always_made_watertight_come_near_it(blob):
     mesh = mend(*halves(blob), how="always")
     assert repair_steps(mesh.notes) == ("watertight",)
     assert mesh.volume == pytest.approx(blob.volume, rel=0.01)
     assert mesh.area == pytest.approx(blob.area, rel=0.01)
 
 
-def test_all_at_once(blob: Mesh) -> None:
+def test_all_at_once(blob):
     mesh = mend(*DAMAGES["everything"].apply(blob, 0))
     assert repair_steps(mesh.notes)[-1] == "watertight"
     assert mesh.volume == pytest.approx(blob.volume, rel=0.03)
 
 
-def test_a_cup_is_not_filled() -> None:
+def test_a_cup_is_not_filled():
     surface = trimesh.creation.icosphere(subdivisions=3)
     open_faces = np.asarray(surface.faces)[surface.triangles_center[:, 2] < 0.2]
     mesh = mend(np.asarray(surface.vertices), open_faces)
@@ -136,7 +136,7 @@ def test_a_cup_is_not_filled() -> None:
     assert mesh.volume < 0.1 * surface.volume
 
 
-def test_a_part_that_sticks_out_is_not_hidden() -> None:
+def test_a_part_that_sticks_out_is_not_hidden():
     surface = trimesh.creation.icosphere(subdivisions=3)
     knob = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
     knob.apply_translation([1, 0, 0])
@@ -146,7 +146,7 @@ def test_a_part_that_sticks_out_is_not_hidden() -> None:
     assert mesh.vertices[:, 0].max() == pytest.approx(1.3, abs=1e-9)
 
 
-def test_too_few_vertices_are_more_on_the_same_surface() -> None:
+def test_too_few_vertices_are_more_on_the_same_surface():
     mesh = mend(box().vertices, box().faces, least_vertices=52)
     assert repair_steps(mesh.notes) == ("subdivided",)
     assert len(mesh.vertices) >= 52
@@ -158,7 +158,7 @@ def test_too_few_vertices_are_more_on_the_same_surface() -> None:
 
 
 @pytest.mark.parametrize("n_vertices", [9, 100, 333])
-def test_longest_edges_are_cut_first(n_vertices: int) -> None:
+def test_longest_edges_are_cut_first(n_vertices):
     mesh = subdivide(box(), n_vertices)
     assert len(mesh.vertices) == n_vertices
     sides = mesh.vertices[mesh.faces]
@@ -168,7 +168,7 @@ def test_longest_edges_are_cut_first(n_vertices: int) -> None:
     assert (np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1) > 1e-6).all()
 
 
-def test_never_refuses_and_always_makes_watertight(blob: Mesh) -> None:
+def test_never_refuses_and_always_makes_watertight(blob):
     vertices, faces = holes(blob)
     with pytest.raises(MeshError, match="open surface"):
         mend(vertices, faces, how="never")
@@ -176,17 +176,17 @@ def test_never_refuses_and_always_makes_watertight(blob: Mesh) -> None:
     assert repair_steps(mesh.notes) == ("watertight",)
     assert mesh.volume == pytest.approx(blob.volume, rel=0.01)
     with pytest.raises(ValueError, match="how"):
-        mend(vertices, faces, how="sometimes")  # type: ignore[arg-type]
+        mend(vertices, faces, how="sometimes")
 
 
-def test_always_leaves_the_boundary_of_one_body_as_it_is(blob: Mesh) -> None:
+def test_always_leaves_the_boundary_of_one_body_as_it_is(blob):
     mesh = mend(blob.vertices, blob.faces, how="always")
     assert mesh.notes == ()
     np.testing.assert_array_equal(mesh.vertices, blob.vertices)
     np.testing.assert_array_equal(mesh.faces, blob.faces)
 
 
-def test_close_turns_of_a_coil_stay_apart() -> None:
+def test_close_turns_of_a_coil_stay_apart():
     """Two turns of a coil, half a cell from each other: a grid joins them."""
     near = coil(turns=2.2, pitch=0.41)
     assert watertight(near.vertices, near.faces).area < 0.97 * near.area
@@ -196,7 +196,7 @@ def test_close_turns_of_a_coil_stay_apart() -> None:
         assert mesh.area == pytest.approx(near.area, rel=1e-6)
 
 
-def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertight() -> None:
+def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertight():
     """A coil with less room than it is thick; the union of its balls is the oracle for the volume."""
     crossing = coil(turns=2.2, pitch=0.3)
     assert mend(crossing.vertices, crossing.faces).notes == ()
@@ -249,13 +249,13 @@ def coil(turns: float, pitch: float, radius: float = 0.2) -> Mesh:
     return Mesh(vertices, np.vstack([walls, start, end]))
 
 
-def test_a_cloud_is_a_surface(sphere: Mesh) -> None:
+def test_a_cloud_is_a_surface(sphere):
     mesh = mend(sphere.vertices, None)
     assert mesh.volume == pytest.approx(sphere.volume, rel=0.03)
     assert repair_steps(mesh.notes) == ("watertight",)
 
 
-def test_neighbours_are_turned_alike_in_every_part(blob: Mesh) -> None:
+def test_neighbours_are_turned_alike_in_every_part(blob):
     n = len(blob.vertices)
     vertices = np.vstack([blob.vertices, blob.vertices + 10])
     faces = np.vstack([blob.faces, blob.faces + n])
@@ -270,7 +270,7 @@ def test_neighbours_are_turned_alike_in_every_part(blob: Mesh) -> None:
     assert notes == [f"turned {counted(int(chosen.sum()), 'face')} to orient the surface"]
 
 
-def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob: Mesh) -> None:
+def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob):
     mesh = mend(
         np.vstack([blob.vertices[:9], [[1e9, 0, 0]], blob.vertices[9:]]),
         blob.faces + (blob.faces >= 9),
@@ -280,9 +280,7 @@ def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob: Mesh) -> None
 
 
 @pytest.mark.parametrize("share", [0.02, 0.5])
-def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(
-    blob: Mesh, share: float
-) -> None:
+def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(blob, share):
     generator = np.random.default_rng(0)
     corners = blob.vertices[blob.faces].reshape(-1, 3).astype(np.float32)
     moved = np.nextafter(corners, generator.choice(np.float32([-9, 9]), corners.shape))
@@ -293,7 +291,7 @@ def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(
     assert mesh.area == pytest.approx(blob.area, rel=1e-5)
 
 
-def test_welding_agrees_with_trimesh(blob: Mesh) -> None:
+def test_welding_agrees_with_trimesh(blob):
     vertices, faces = DAMAGES["soup"].apply(blob, 0)
     by_trimesh = trimesh.Trimesh(vertices, faces, process=True)
     again, _ = weld(vertices, faces, [])
@@ -340,9 +338,9 @@ UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], st
 
 @pytest.mark.parametrize("case", sorted(UNUSABLE))
 @pytest.mark.parametrize("how", ["auto", "always"])
-def test_what_cannot_be_mended_is_named(case: str, how: str) -> None:
+def test_what_cannot_be_mended_is_named(case, how):
     make, words = UNUSABLE[case]
     vertices, faces = make()
     with pytest.raises(MeshError, match=words) as error:
-        mend(vertices, faces, how=how, name="some/file.obj")  # type: ignore[arg-type]
+        mend(vertices, faces, how=how, name="some/file.obj")
     assert str(error.value).startswith("some/file.obj: ")

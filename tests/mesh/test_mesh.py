@@ -1,8 +1,5 @@
 """A mesh is checked when made, and what is wrong is named with its remedy."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from types import SimpleNamespace
 
 import nibabel
@@ -17,13 +14,13 @@ from igps.mesh.mesh import Mesh
 from igps.mesh.objects import as_mesh
 
 
-def test_closed_forms_of_area_and_volume() -> None:
+def test_closed_forms_of_area_and_volume():
     mesh = Mesh(TETRAHEDRON, FACES)
     assert mesh.volume == pytest.approx(1 / 6)
     assert mesh.area == pytest.approx(1.5 + np.sqrt(3) / 2)
 
 
-def test_mesh_copies_and_freezes_its_arrays() -> None:
+def test_mesh_copies_and_freezes_its_arrays():
     vertices = TETRAHEDRON.copy()
     mesh = Mesh(vertices, FACES)
     vertices[0] = 9
@@ -32,7 +29,7 @@ def test_mesh_copies_and_freezes_its_arrays() -> None:
         mesh.vertices[0] = 1
 
 
-def test_inside_out_mesh_is_turned_and_says_so() -> None:
+def test_inside_out_mesh_is_turned_and_says_so():
     mesh = Mesh(TETRAHEDRON, FACES[:, ::-1])
     assert mesh.volume == pytest.approx(1 / 6)
     assert any("inside out" in note for note in mesh.notes)
@@ -68,14 +65,12 @@ def test_inside_out_mesh_is_turned_and_says_so() -> None:
         (TETRAHEDRON * [1, 1, 0], FACES, "encloses no volume"),
     ],
 )
-def test_bad_mesh_is_named_and_explained(
-    vertices: np.ndarray, faces: np.ndarray, message: str
-) -> None:
+def test_bad_mesh_is_named_and_explained(vertices, faces, message):
     with pytest.raises(MeshError, match=rf"(?s)bad\.off: .*{message}"):
         Mesh(vertices, faces, name="bad.off")
 
 
-def test_every_message_of_a_repairable_fault_names_the_remedy() -> None:
+def test_every_message_of_a_repairable_fault_names_the_remedy():
     for faces in (
         FACES[:3],
         np.vstack([FACES, [[0, 0, 1]]]),
@@ -85,12 +80,12 @@ def test_every_message_of_a_repairable_fault_names_the_remedy() -> None:
             Mesh(TETRAHEDRON, faces)
 
 
-def test_open_mesh_passes_when_allowed() -> None:
+def test_open_mesh_passes_when_allowed():
     mesh = Mesh(TETRAHEDRON, FACES[:3], allow_open=True)
     assert len(mesh.faces) == 3
 
 
-def test_genus_and_diagonal() -> None:
+def test_genus_and_diagonal():
     ring = as_mesh(trimesh.creation.torus(1, 0.1, major_sections=64, minor_sections=16))
     for mesh, expected in (
         (Mesh(TETRAHEDRON, FACES), 0),
@@ -104,7 +99,7 @@ def test_genus_and_diagonal() -> None:
         _ = Mesh(TETRAHEDRON, FACES[:3], allow_open=True).genus
 
 
-def test_numbered_by_faces_is_the_same_surface_whatever_the_numbers(blob: Mesh) -> None:
+def test_numbered_by_faces_is_the_same_surface_whatever_the_numbers(blob):
     order = np.random.default_rng(0).permutation(len(blob.vertices))
     rank = np.argsort(order)
     found = blob.numbered_by_faces()
@@ -115,7 +110,7 @@ def test_numbered_by_faces_is_the_same_surface_whatever_the_numbers(blob: Mesh) 
     assert found.numbered_by_faces().faces.tolist() == found.faces.tolist()
 
 
-def test_more_notes_and_a_unit_leave_the_surface_as_it_is(blob: Mesh) -> None:
+def test_more_notes_and_a_unit_leave_the_surface_as_it_is(blob):
     told = blob.annotated(notes=("first",), unit="mm")
     assert told.notes == ("first", *blob.notes)
     assert (told.unit, told.annotated().unit, blob.unit) == ("mm", "mm", None)
@@ -123,12 +118,12 @@ def test_more_notes_and_a_unit_leave_the_surface_as_it_is(blob: Mesh) -> None:
     assert told.area == blob.area
 
 
-def test_a_trimesh_that_was_read_is_called_by_its_file(tmp_path: Path) -> None:
+def test_a_trimesh_that_was_read_is_called_by_its_file(tmp_path):
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.off")
     assert as_mesh(trimesh.load(tmp_path / "box.off")).name == "box.off"
 
 
-def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself() -> None:
+def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself():
     box = trimesh.creation.box((1, 2, 3))
     mesh = as_mesh(box)
     np.testing.assert_array_equal(mesh.vertices, box.vertices)
@@ -143,7 +138,7 @@ def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself() -> None:
 
 
 @pytest.mark.parametrize("body", [None, "box.ply", np.zeros((3, 3)), trimesh.Scene()])
-def test_what_is_no_mesh_is_named(body: object) -> None:
+def test_what_is_no_mesh_is_named(body):
     with pytest.raises(
         TypeError,
         match=rf"mesh: expected a Mesh, a trimesh.Trimesh, .* got .*{type(body).__name__}\. Read",
@@ -151,7 +146,7 @@ def test_what_is_no_mesh_is_named(body: object) -> None:
         as_mesh(body)
 
 
-def test_meshes_of_other_libraries(blob: Mesh) -> None:
+def test_meshes_of_other_libraries(blob):
     """PyVista's polygons stand in one row, each behind its number of corners; only what it is asked for is needed."""
     of_trimesh = trimesh.Trimesh(blob.vertices, blob.faces, process=False)
     of_trimesh.units = "inch"
@@ -179,7 +174,7 @@ def test_meshes_of_other_libraries(blob: Mesh) -> None:
     )
 
 
-def test_voxels_of_one_label_are_a_mesh() -> None:
+def test_voxels_of_one_label_are_a_mesh():
     ball = ((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0) < 8**2
     image = nibabel.Nifti1Image(5 * ball.astype(np.uint8), np.diag([-1, 1, 2, 1]))
     for thing, spacing, unit in ((image, None, "mm"), (ball, (1, 1, 2), "mm"), (ball, None, None)):
@@ -195,6 +190,6 @@ def test_voxels_of_one_label_are_a_mesh() -> None:
         as_mesh(ball, (1, 2))
 
 
-def test_an_image_without_a_surface_is_none() -> None:
+def test_an_image_without_a_surface_is_none():
     with pytest.raises(TypeError, match="expected a GIFTI image of a surface"):
         as_mesh(nibabel.gifti.GiftiImage())

@@ -1,7 +1,5 @@
 """Simplified meshes keep their shape, their topology and the promised size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -12,7 +10,7 @@ from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
 
 
-def test_simplify_keeps_the_shape_and_the_promise(sphere: Mesh) -> None:
+def test_simplify_keeps_the_shape_and_the_promise(sphere):
     small = simplify(sphere, 500)
     assert len(small.vertices) <= 500
     assert small.volume == pytest.approx(sphere.volume, rel=0.02)
@@ -21,12 +19,12 @@ def test_simplify_keeps_the_shape_and_the_promise(sphere: Mesh) -> None:
 
 
 @pytest.mark.parametrize("scale", [2.0**-20, 2.0**20])
-def test_simplify_does_not_depend_on_scale(blob: Mesh, scale: float) -> None:
+def test_simplify_does_not_depend_on_scale(blob, scale):
     scaled = simplify(Mesh(blob.vertices * scale, blob.faces), 200)
     np.testing.assert_allclose(scaled.vertices / scale, simplify(blob, 200).vertices, atol=1e-9)
 
 
-def test_simplify_keeps_the_topology() -> None:
+def test_simplify_keeps_the_topology():
     ring = trimesh.creation.torus(1, 0.1, major_sections=64, minor_sections=16)
     small = simplify(as_mesh(ring), 60)
     n_vertices = len(small.vertices)

@@ -16,7 +16,7 @@ def sphere(n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("with_normals", [True, False])
-def test_each_point_has_a_hexagon_across_the_surface(with_normals: bool) -> None:
+def test_each_point_has_a_hexagon_across_the_surface(with_normals):
     """Centred on it, in the plane of its normal, which on a sphere is the radius."""
     points = sphere(2000)
     vertices, faces, _ = splats(points, points if with_normals else None, 32, "cloud")
@@ -31,7 +31,7 @@ def test_each_point_has_a_hexagon_across_the_surface(with_normals: bool) -> None
     assert hexagons == pytest.approx(1.5 * 3**0.5 * size**2)
 
 
-def test_only_large_clouds_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_large_clouds_are_thinned(monkeypatch):
     """Two scans of one surface in one file: all of it counts, until there are too many points."""
     points = np.concatenate([sphere(500), sphere(500) + 1e-4])
     assert len(splats(points, points, 32, "cloud")[0]) == 6 * 1000

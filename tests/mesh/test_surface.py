@@ -1,17 +1,14 @@
 """Areas, normals, edges and components against trimesh and loops."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
 
 from conftest import as_mesh, as_trimesh
 from igps.mesh import surface
-from igps.mesh.mesh import Mesh
 
 
-def test_areas_and_normals(blob: Mesh) -> None:
+def test_areas_and_normals(blob):
     oracle = as_trimesh(blob)
     np.testing.assert_allclose(
         surface.face_areas(blob.vertices, blob.faces), oracle.area_faces, rtol=1e-12
@@ -30,7 +27,7 @@ def test_areas_and_normals(blob: Mesh) -> None:
     )
 
 
-def test_the_mean_of_neighbours_is_that_of_a_loop(blob: Mesh) -> None:
+def test_the_mean_of_neighbours_is_that_of_a_loop(blob):
     expected = np.empty_like(blob.vertices)
     for i, neighbours in enumerate(as_trimesh(blob).vertex_neighbors):
         beside = blob.vertices[neighbours]
@@ -41,7 +38,7 @@ def test_the_mean_of_neighbours_is_that_of_a_loop(blob: Mesh) -> None:
     )
 
 
-def test_a_neighbour_in_the_same_place_is_the_mean(blob: Mesh) -> None:
+def test_a_neighbour_in_the_same_place_is_the_mean(blob):
     vertices = blob.vertices.copy()
     a, b, _ = blob.faces[0]
     vertices[a] = vertices[b]
@@ -49,14 +46,14 @@ def test_a_neighbour_in_the_same_place_is_the_mean(blob: Mesh) -> None:
     np.testing.assert_allclose(found[[a, b]], vertices[[b, b]], atol=1e-6)
 
 
-def test_unit_vectors() -> None:
+def test_unit_vectors():
     np.testing.assert_allclose(
         surface.unit(np.array([[3.0, 0, 4], [0, 0, 0], [0, -1e-100, 0]])),
         [[0.6, 0, 0.8], [0, 0, 0], [0, -1, 0]],
     )
 
 
-def test_edges(blob: Mesh) -> None:
+def test_edges(blob):
     n_vertices = len(blob.vertices)
     edges, edge_of = surface.undirected_edges(blob.faces, n_vertices)
     sides = [(int(face[i]), int(face[(i + 1) % 3])) for face in blob.faces for i in range(3)]
@@ -71,7 +68,7 @@ def test_edges(blob: Mesh) -> None:
 
 
 @pytest.mark.parametrize("n_pieces", [1, 3])
-def test_components(n_pieces: int) -> None:
+def test_components(n_pieces):
     piece = trimesh.creation.icosphere(subdivisions=1)
     pieces = trimesh.util.concatenate(
         [piece.copy().apply_translation([3 * i, 0, 0]) for i in range(n_pieces)]
@@ -82,7 +79,7 @@ def test_components(n_pieces: int) -> None:
 
 
 @pytest.mark.parametrize("n_handles", [0, 1, 2, 3])
-def test_genus_counts_handles(n_handles: int) -> None:
+def test_genus_counts_handles(n_handles):
     """A slab of cubes with holes through it; the surface of voxels that share faces alone is a manifold."""
     cells = np.ones((2 * n_handles + 1, 3, 1), dtype=bool)
     cells[1::2, 1] = False
@@ -91,7 +88,7 @@ def test_genus_counts_handles(n_handles: int) -> None:
     assert mesh.genus == n_handles
 
 
-def test_parts_of_faces_and_their_areas() -> None:
+def test_parts_of_faces_and_their_areas():
     pieces = [
         trimesh.creation.icosphere(subdivisions=k, radius=radius)
         for k, radius in ((2, 1.0), (1, 3.0), (0, 2.0))
@@ -108,14 +105,14 @@ def test_parts_of_faces_and_their_areas() -> None:
     np.testing.assert_allclose(areas, [piece.area for piece in pieces], rtol=1e-12)
 
 
-def test_compact_keeps_the_triangles_and_the_order(blob: Mesh) -> None:
+def test_compact_keeps_the_triangles_and_the_order(blob):
     some = blob.faces[100:140]
     vertices, faces = surface.compact(blob.vertices, some)
     np.testing.assert_array_equal(vertices[faces], blob.vertices[some])
     np.testing.assert_array_equal(vertices, blob.vertices[sorted({int(i) for i in some.ravel()})])
 
 
-def test_signed_volume(blob: Mesh) -> None:
+def test_signed_volume(blob):
     expected = as_trimesh(blob).volume
     far = blob.vertices + np.array([100.0, -50, 20])
     assert surface.signed_volume(far, blob.faces) == pytest.approx(expected, rel=1e-10)

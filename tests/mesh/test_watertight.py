@@ -63,7 +63,7 @@ def assert_closed(mesh: Mesh) -> None:
     assert all((b, a) in seen for a, b in seen)
 
 
-def test_ball_of_loose_turned_triangles() -> None:
+def test_ball_of_loose_turned_triangles():
     vertices, faces = arrays(ball(subdivisions=4))
     generator = np.random.default_rng(0)
     soup = vertices[generator.permutation(faces)].reshape(-1, 3)
@@ -90,7 +90,7 @@ def test_ball_of_loose_turned_triangles() -> None:
     ],
     ids=["block", "plate", "thin plate", "rod"],
 )
-def test_the_volume_is_kept_by_the_grid_and_by_the_simplification(solid: trimesh.Trimesh) -> None:
+def test_the_volume_is_kept_by_the_grid_and_by_the_simplification(solid):
     body = watertight(*arrays(solid))
     assert len(body.vertices) <= 5000
     assert body.volume == pytest.approx(solid.volume, rel=3.5e-3)
@@ -99,7 +99,7 @@ def test_the_volume_is_kept_by_the_grid_and_by_the_simplification(solid: trimesh
     assert np.abs(np.ptp(body.vertices, axis=0) - solid.extents).max() < solid.extents.max() / 96
 
 
-def test_a_hole_is_closed_and_a_cup_stays_open() -> None:
+def test_a_hole_is_closed_and_a_cup_stays_open():
     holed = watertight(*cut_ball(0.9), resolution=64)
     assert holed.volume == pytest.approx(BALL, rel=0.02)
     assert any("opening" in note for note in holed.notes)
@@ -111,7 +111,7 @@ def test_a_hole_is_closed_and_a_cup_stays_open() -> None:
     assert 0.7 * cell < cup.volume / (2 * np.pi * 1.3) < 1.5 * cell
 
 
-def test_a_missing_base_is_no_leak_beyond_the_bounding_box() -> None:
+def test_a_missing_base_is_no_leak_beyond_the_bounding_box():
     surface = trimesh.creation.box((1, 1, 4)).subdivide_to_size(0.2)
     faces = np.asarray(surface.faces)[surface.triangles_center[:, 2] > -1.99]
     body = watertight(np.asarray(surface.vertices), faces, resolution=64)
@@ -120,7 +120,7 @@ def test_a_missing_base_is_no_leak_beyond_the_bounding_box() -> None:
     assert np.ptp(body.vertices[:, 2]) == pytest.approx(4, abs=0.05)
 
 
-def test_the_neck_of_a_bottle_is_closed_unless_its_wall_has_two_sides() -> None:
+def test_the_neck_of_a_bottle_is_closed_unless_its_wall_has_two_sides():
     outer = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.5), (0.2, 1.8), (0.2, 2.2)]
     assert is_inside(watertight(*turned_profile(outer), resolution=48), (0, 0, 0.8)) == [True]
     inner = [(0.14, 2.2), (0.14, 1.75), (0.94, 1.45), (0.94, 0.06), (0.0, 0.06)]
@@ -133,7 +133,7 @@ def test_the_neck_of_a_bottle_is_closed_unless_its_wall_has_two_sides() -> None:
     ]
 
 
-def test_what_is_hidden_is_filled() -> None:
+def test_what_is_hidden_is_filled():
     body = watertight(
         *arrays(ball(), ball(0.3, (0.2, 0, 0)), trimesh.creation.box((0.5, 0.4, 0.3))),
         resolution=64,
@@ -143,7 +143,7 @@ def test_what_is_hidden_is_filled() -> None:
     assert np.linalg.norm(body.vertices, axis=1).min() > 0.98
 
 
-def test_overlapping_parts_are_one() -> None:
+def test_overlapping_parts_are_one():
     first = trimesh.creation.box((1, 1, 1))
     second = trimesh.creation.box((1, 1, 1))
     second.apply_translation([0.6, 0.3, 0.2])
@@ -153,7 +153,7 @@ def test_overlapping_parts_are_one() -> None:
 
 
 @pytest.mark.parametrize("turned", [(False, True), (True, False), (True, True)])
-def test_parts_are_turned_outward_by_their_winding_numbers(turned: tuple[bool, bool]) -> None:
+def test_parts_are_turned_outward_by_their_winding_numbers(turned):
     # Two rings: the far sides of each face its middle, so that no simple rule tells their outside.
     rings = [
         trimesh.creation.torus(10.0, 1.0, major_sections=48, minor_sections=16) for _ in range(2)
@@ -173,7 +173,7 @@ def test_parts_are_turned_outward_by_their_winding_numbers(turned: tuple[bool, b
     np.testing.assert_allclose(surface.winding(places), [2, 1, 1, 0, 0], atol=0.05)
 
 
-def test_faces_between_solids_are_left_out_of_the_winding_numbers() -> None:
+def test_faces_between_solids_are_left_out_of_the_winding_numbers():
     outer = ball(subdivisions=4)
     core = ball(0.3)
     wall = trimesh.creation.box((1.2, 1.2, 0.02))
@@ -194,7 +194,7 @@ def test_faces_between_solids_are_left_out_of_the_winding_numbers() -> None:
 
 
 @pytest.mark.parametrize("number", [6, 11])
-def test_a_thin_body_of_overlapping_halves_with_holes_is_solid(number: int) -> None:
+def test_a_thin_body_of_overlapping_halves_with_holes_is_solid(number):
     shape = ArticulatedShapes(number + 1, 1, seed=11, n_vertices=3500)[number]
     body = Mesh(shape.vertices, shape.faces)
     mended = mend(*DAMAGES["everything"].apply(body, 0))
@@ -203,7 +203,7 @@ def test_a_thin_body_of_overlapping_halves_with_holes_is_solid(number: int) -> N
     assert mended.area == pytest.approx(body.area, rel=0.03)
 
 
-def test_parts_that_share_an_edge_are_one() -> None:
+def test_parts_that_share_an_edge_are_one():
     vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
     faces = np.asarray(trimesh.Trimesh(vertices).convex_hull.faces)
     hull = np.asarray(trimesh.Trimesh(vertices).convex_hull.vertices)
@@ -213,7 +213,7 @@ def test_parts_that_share_an_edge_are_one() -> None:
     assert body.volume == pytest.approx(2, rel=0.02)
 
 
-def test_a_wall_inside_that_lies_on_points_of_the_grid_is_filled() -> None:
+def test_a_wall_inside_that_lies_on_points_of_the_grid_is_filled():
     left = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
     # Whose squares in the wall are cut along the other diagonal
     right = left.copy().apply_translation([1, 0, 0])
@@ -223,7 +223,7 @@ def test_a_wall_inside_that_lies_on_points_of_the_grid_is_filled() -> None:
     assert mesh.volume == pytest.approx(2, rel=0.01)
 
 
-def test_a_sheet_gets_about_a_cell() -> None:
+def test_a_sheet_gets_about_a_cell():
     x, y = (values.ravel() for values in np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5)))
     vertices = np.stack([x, y, np.zeros_like(x)], axis=1)
     start = np.array([5 * i + j for i in range(4) for j in range(4)])
@@ -236,7 +236,7 @@ def test_a_sheet_gets_about_a_cell() -> None:
     assert 0.9 / (2 * 48) < thickness < 1.5 / (0.8 * 48)
 
 
-def test_pieces_are_joined_and_specks_dropped() -> None:
+def test_pieces_are_joined_and_specks_dropped():
     apart = watertight(*arrays(ball(), ball(0.7, (2.5, 0, 0))), resolution=64)
     assert_closed(apart)
     assert apart.volume == pytest.approx(BALL * (1 + 0.7**3), rel=0.03)
@@ -246,7 +246,7 @@ def test_pieces_are_joined_and_specks_dropped() -> None:
     np.testing.assert_array_equal(speck.vertices, alone.vertices)
 
 
-def test_wires_stay_in_one_piece() -> None:
+def test_wires_stay_in_one_piece():
     t = np.linspace(0, 4 * np.pi, 200)
     path = np.stack([np.cos(t), np.sin(t), t / 6], axis=1)
     strip = np.vstack([path, path + np.array([0, 0, 1e-3])])
@@ -258,7 +258,7 @@ def test_wires_stay_in_one_piece() -> None:
 
 
 @pytest.mark.parametrize("with_normals", [True, False])
-def test_point_clouds(with_normals: bool) -> None:
+def test_point_clouds(with_normals):
     points = np.random.default_rng(0).standard_normal((6000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     body = watertight(points, normals=points if with_normals else None, resolution=64)
@@ -266,7 +266,7 @@ def test_point_clouds(with_normals: bool) -> None:
     assert body.volume == pytest.approx(BALL, rel=0.03)
 
 
-def test_flat_places_have_a_delaunay_triangulation() -> None:
+def test_flat_places_have_a_delaunay_triangulation():
     body = watertight(*arrays(trimesh.creation.box((1, 1, 0.6))), resolution=48, max_vertices=500)
     assert_closed(body)
     opposite = {}
@@ -282,7 +282,7 @@ def test_flat_places_have_a_delaunay_triangulation() -> None:
     assert sums.max() < 2 * np.pi - 1e-3
 
 
-def test_follows_the_surface_when_it_is_moved_and_scaled() -> None:
+def test_follows_the_surface_when_it_is_moved_and_scaled():
     vertices, faces = arrays(trimesh.creation.torus(1.0, 0.3))
     body = watertight(vertices, faces, resolution=64)
     moved = watertight(vertices * 8 + [16, -32, 64], faces, resolution=64)
@@ -292,14 +292,14 @@ def test_follows_the_surface_when_it_is_moved_and_scaled() -> None:
     assert euler == 0
 
 
-def test_many_triangles_are_rounded_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_triangles_are_rounded_first(monkeypatch):
     monkeypatch.setattr(module, "_MAX_FACES", 1000)
     body = watertight(*arrays(ball(subdivisions=5)), resolution=64)
     assert np.abs(np.linalg.norm(body.vertices, axis=1) - 1).max() < 0.5 * 2 / 64
     assert body.volume == pytest.approx(BALL, rel=0.01)
 
 
-def test_inputs_stay_as_they_are() -> None:
+def test_inputs_stay_as_they_are():
     vertices, faces = arrays(ball())
     before = vertices.copy(), faces.copy()
     watertight(vertices, faces, resolution=24)
@@ -307,7 +307,7 @@ def test_inputs_stay_as_they_are() -> None:
     np.testing.assert_array_equal(faces, before[1])
 
 
-def test_what_is_no_surface_is_refused() -> None:
+def test_what_is_no_surface_is_refused():
     with pytest.raises(
         MeshError, match=r"line\.obj: expected a surface, but no triangle has an area"
     ):
@@ -324,18 +324,18 @@ def test_what_is_no_surface_is_refused() -> None:
         watertight(*arrays(ball()), resolution=2)
 
 
-def test_a_body_between_the_points_of_the_grid_is_refused_by_name() -> None:
+def test_a_body_between_the_points_of_the_grid_is_refused_by_name():
     with pytest.raises(MeshError, match=r"wire\.off: no grid point lies inside the body"):
         level_surface(np.ones((4, 4, 4), dtype=np.float32), "wire.off")
 
 
-def test_no_point_of_the_field_is_nearly_on_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_point_of_the_field_is_nearly_on_the_surface(monkeypatch):
     """Marching cubes would make slivers there: whatever lies nearer is moved to a fiftieth of a cell, on its side."""
     fields: list[NDArray[np.float32]] = []
     level_set = module.level_set
 
     def kept(*arguments: object) -> NDArray[np.float32]:
-        fields.append(level_set(*arguments))  # type: ignore[arg-type]
+        fields.append(level_set(*arguments))
         return fields[-1]
 
     monkeypatch.setattr(module, "level_set", kept)
@@ -353,7 +353,7 @@ def chain(n: int, gap: float) -> Surface:
 
 
 @pytest.mark.parametrize("gap", [1.9, 2.1])
-def test_a_chain_of_beads_gets_a_grid_as_fine_as_its_beads_ask_for(gap: float) -> None:
+def test_a_chain_of_beads_gets_a_grid_as_fine_as_its_beads_ask_for(gap):
     """Beads that overlap, and beads that do not touch and are joined."""
     body = watertight(*chain(60, gap))
     hidden = max(1 - gap / 2, 0)  # of the area, by the caps inside of other beads
@@ -367,14 +367,14 @@ def test_a_chain_of_beads_gets_a_grid_as_fine_as_its_beads_ask_for(gap: float) -
     assert not any("coarse" in note for note in body.notes)
 
 
-def test_a_long_rod_is_as_thick_as_it_was() -> None:
+def test_a_long_rod_is_as_thick_as_it_was():
     rod = trimesh.creation.cylinder(0.005, 1, sections=32)
     body = watertight(*arrays(rod))
     assert body.volume == pytest.approx(rod.volume, rel=0.03)
     assert body.area == pytest.approx(rod.area, rel=0.03)
 
 
-def test_a_note_tells_that_the_grid_is_too_coarse() -> None:
+def test_a_note_tells_that_the_grid_is_too_coarse():
     """Thin rods in all directions, for which the grid cannot be refined enough."""
     rods = [trimesh.creation.cylinder(0.004, 1, sections=12) for _ in range(12)]
     generator = np.random.default_rng(0)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodies import Mesh, bumpy_sphere, cube, exterior_points, interior_points, torus
+from bodies import bumpy_sphere, cube, exterior_points, interior_points, torus
 from igps.mesh.winding import winding_number
 
 
 @pytest.mark.parametrize(
     "mesh", [bumpy_sphere(3), cube(), torus(20, 12)], ids=["bumpy", "cube", "torus"]
 )
-def test_winding_number_is_one_inside_and_zero_outside(mesh: Mesh) -> None:
+def test_winding_number_is_one_inside_and_zero_outside(mesh):
     np.testing.assert_allclose(winding_number(*mesh, interior_points(mesh, 100)), 1, atol=1e-12)
     np.testing.assert_allclose(winding_number(*mesh, exterior_points(mesh, 100)), 0, atol=1e-12)
     np.testing.assert_allclose(
@@ -42,7 +42,7 @@ def winding_by_loops(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
 
 
 @pytest.mark.parametrize("kind", ["opened", "soup"])
-def test_winding_number_is_the_sum_of_solid_angles(kind: str) -> None:
+def test_winding_number_is_the_sum_of_solid_angles(kind):
     generator = np.random.default_rng(1)
     vertices, faces = bumpy_sphere(2)
     if kind == "opened":
@@ -62,11 +62,11 @@ def test_winding_number_is_the_sum_of_solid_angles(kind: str) -> None:
     )
 
 
-def test_winding_number_of_flat_faces_alone_is_refused() -> None:
+def test_winding_number_of_flat_faces_alone_is_refused():
     flat = np.array([[0, 1, 1], [2, 2, 2]])
     with pytest.raises(ValueError, match="expected at least one face with an area"):
         winding_number(cube()[0], flat, np.zeros((1, 3)))
 
 
-def test_no_points_have_no_winding_numbers() -> None:
+def test_no_points_have_no_winding_numbers():
     assert winding_number(*cube(), np.zeros((0, 3))).shape == (0,)

@@ -28,7 +28,7 @@ class Counting(nn.Module):
         return eigenfunctions
 
 
-def test_nearest_directions_are_those_of_a_loop() -> None:
+def test_nearest_directions_are_those_of_a_loop():
     generator = torch.Generator().manual_seed(1)
     points = torch.randn(9, 3, generator=generator, dtype=torch.float64)
     targets = torch.randn(20, 3, generator=generator, dtype=torch.float64)
@@ -50,7 +50,7 @@ def test_nearest_directions_are_those_of_a_loop() -> None:
     torch.testing.assert_close(few, normalize(targets[:5].mean(dim=0) - points, dim=1))
 
 
-def test_an_embedding_is_computed_once() -> None:
+def test_an_embedding_is_computed_once():
     batch = two_bodies()
     features = BatchFeatures(batch, training=False)
     embedding = Counting()
@@ -66,7 +66,7 @@ def test_an_embedding_is_computed_once() -> None:
     assert embedding.calls == 3
 
 
-def test_positions_do_not_change_with_scale() -> None:
+def test_positions_do_not_change_with_scale():
     batch = two_bodies()
     large = scaled(two_bodies(), 8.0)
     expected = SampleFeatures(batch, "interior", batch.interior).positions()
@@ -78,10 +78,10 @@ def test_positions_do_not_change_with_scale() -> None:
 
 
 @pytest.mark.parametrize("kind", ["interior", "surface"])
-def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind: str) -> None:
+def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind):
     batch = two_bodies()
     embedding = SpectralEmbedding(n_eigenpairs=4)
-    directions = SampleFeatures(batch, kind, getattr(batch, kind)).embedded_directions(embedding)  # type: ignore[arg-type]
+    directions = SampleFeatures(batch, kind, getattr(batch, kind)).embedded_directions(embedding)
     for i, n in enumerate(N_POINTS):
         inside, surface = (embedded(batch, i, where, 4) for where in ("interior", "surface"))
         own, other, sign = (inside, surface, 1) if kind == "interior" else (surface, inside, -1)
@@ -96,7 +96,7 @@ def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind: st
         torch.testing.assert_close(unpadded[0], directions[i, :n])
 
 
-def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding() -> None:
+def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding():
     batch = two_bodies()
     embedding = SpectralEmbedding(n_eigenpairs=4)
     samples = SampleFeatures(batch, "surface", batch.surface)
@@ -108,7 +108,7 @@ def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding() -> No
         assert torch.equal(found[i, :n], apart.argsort(dim=1)[:, :16])
 
 
-def test_subsets() -> None:
+def test_subsets():
     batch = two_bodies()
     assert BatchFeatures(batch, training=False).of("interior", None, 5).samples is batch.interior
     fixed, again, drawn, other = (
@@ -124,7 +124,7 @@ def test_subsets() -> None:
     assert features.of("interior", 5, None) is not features.of("interior", 5, 5)
 
 
-def test_nearest_points_are_those_of_a_loop() -> None:
+def test_nearest_points_are_those_of_a_loop():
     points = torch.randn(30, 4, generator=torch.Generator().manual_seed(3))
     for i, found in enumerate(nearest_neighbours(points, 5).tolist()):
         # Type: ignore[misc]

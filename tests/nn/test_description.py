@@ -70,9 +70,7 @@ class Area(BodyDescriptor):
 
 
 @pytest.mark.parametrize(("batch_size", "n_workers"), [(1, 1), (3, 1), (1, 3)])
-def test_describe_is_the_descriptor_of_each_batch(
-    dataset: SignatureDataset, batch_size: int, n_workers: int
-) -> None:
+def test_describe_is_the_descriptor_of_each_batch(dataset, batch_size, n_workers):
     descriptor = histogram()
     expected = torch.cat([descriptor(dataset.batch([i])) for i in range(4)])
     threads = torch.get_num_threads()
@@ -84,19 +82,17 @@ def test_describe_is_the_descriptor_of_each_batch(
     assert failures == []
 
 
-def test_a_name_in_place_of_a_descriptor_is_told(dataset: SignatureDataset) -> None:
+def test_a_name_in_place_of_a_descriptor_is_told(dataset):
     with pytest.raises(TypeError, match=r"got 'rich'. Give igps.descriptor\('rich'\)"):
-        describe(dataset, "rich")  # type: ignore[arg-type]
+        describe(dataset, "rich")
 
 
-def test_meshes_come_to_descriptors_that_need_them(dataset: SignatureDataset) -> None:
+def test_meshes_come_to_descriptors_that_need_them(dataset):
     expected = [[dataset.mesh(i).area, dataset[i].signature.area] for i in range(4)]
     np.testing.assert_allclose(describe(dataset, Area(), n_workers=1), expected, rtol=1e-6)
 
 
-def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(
-    dataset: SignatureDataset,
-) -> None:
+def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(dataset):
     modes: list[bool] = []
 
     class Looking(torch.nn.Module):
@@ -116,7 +112,7 @@ def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(
     assert (module.training, module.frozen.training, module.trained.training) == (True, False, True)
 
 
-def test_modes_are_put_back_after_an_error() -> None:
+def test_modes_are_put_back_after_an_error():
     module = torch.nn.Sequential(torch.nn.Dropout(), torch.nn.Dropout().eval())
 
     def fail() -> None:
@@ -129,7 +125,7 @@ def test_modes_are_put_back_after_an_error() -> None:
     assert [one.training for one in module.modules()] == [True, True, False]
 
 
-def test_training_subsets_are_for_training_alone(dataset: SignatureDataset) -> None:
+def test_training_subsets_are_for_training_alone(dataset):
     drawn = HistogramDescriptor(PairHistogram(["interior_distance"], n_training_samples=5)).train()
     torch.testing.assert_close(
         describe(dataset, drawn),
@@ -138,7 +134,7 @@ def test_training_subsets_are_for_training_alone(dataset: SignatureDataset) -> N
 
 
 @pytest.mark.parametrize("function", [describe, describe_usable])
-def test_a_descriptor_that_needs_more_refuses(dataset: SignatureDataset, function) -> None:  # type: ignore[no-untyped-def]
+def test_a_descriptor_that_needs_more_refuses(dataset, function):
     """Before anything is computed, and names what is missing."""
     with pytest.raises(
         ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 13, got 12"
@@ -152,7 +148,7 @@ def test_a_descriptor_that_needs_more_refuses(dataset: SignatureDataset, functio
         function(dataset, cosines)
 
 
-def test_what_cannot_be_described_is_listed(dataset: SignatureDataset) -> None:
+def test_what_cannot_be_described_is_listed(dataset):
     area = Area(refused="2.off")
     values, failures = describe_usable(dataset, area, n_workers=1)
     np.testing.assert_allclose(
@@ -167,7 +163,7 @@ def test_what_cannot_be_described_is_listed(dataset: SignatureDataset) -> None:
         describe_usable(dataset, Area(refused=".off"), n_workers=1)
 
 
-def test_a_mesh_that_cannot_be_read_is_listed(dataset: SignatureDataset, tmp_path: Path) -> None:
+def test_a_mesh_that_cannot_be_read_is_listed(dataset, tmp_path):
     (tmp_path / "bad.off").write_text("nothing")
     paths = [dataset.bodies.paths[0], tmp_path / "bad.off"]
     both = SignatureDataset(paths, CONFIG, tmp_path / "cache")
@@ -179,9 +175,7 @@ def test_a_mesh_that_cannot_be_read_is_listed(dataset: SignatureDataset, tmp_pat
         describe(both, histogram(), n_workers=1)
 
 
-def test_a_body_that_kills_its_process_costs_no_other_its_description(
-    dataset: SignatureDataset,
-) -> None:
+def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset):
     values, failures = describe_usable(dataset, Area(refused="1.off", dies=True), n_workers=2)
     np.testing.assert_allclose(
         values[:, 1], [dataset[i].signature.area for i in (0, 2, 3)], rtol=1e-6
@@ -190,7 +184,7 @@ def test_a_body_that_kills_its_process_costs_no_other_its_description(
     assert "was killed twice" in failures[0].error
 
 
-def test_descriptions_that_are_not_finite_are_failures(dataset: SignatureDataset) -> None:
+def test_descriptions_that_are_not_finite_are_failures(dataset):
     class Broken(Area):
         def describe_body(self, body: Body) -> NDArray[np.float32]:
             return np.array([np.nan if body.id.endswith("0.off") else 1.0], dtype=np.float32)
@@ -200,7 +194,7 @@ def test_descriptions_that_are_not_finite_are_failures(dataset: SignatureDataset
     assert "0.off: the description has entries that are not finite" in failures[0].error
 
 
-def test_an_empty_dataset_is_refused(dataset: SignatureDataset) -> None:
+def test_an_empty_dataset_is_refused(dataset):
     with pytest.raises(
         ValueError, match="dataset: expected at least one mesh to describe, got none"
     ):
@@ -240,7 +234,7 @@ def fresh(tmp_path: Path) -> SignatureDataset:
     return SignatureDataset(paths, CONFIG, tmp_path / "cache")  # which looks at the files again
 
 
-def test_what_has_been_described_is_not_described_again(fresh: SignatureDataset) -> None:
+def test_what_has_been_described_is_not_described_again(fresh):
     names, values = asked(fresh)
     assert names == ["0", "1", "2"]
     again, same = asked(fresh)
@@ -251,7 +245,7 @@ def test_what_has_been_described_is_not_described_again(fresh: SignatureDataset)
     assert torch.equal(asked(fresh.subset([2, 0]))[1], values[[2, 0]])
 
 
-def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDataset) -> None:
+def test_descriptions_are_kept_by_all_that_they_depend_on(fresh):
     paths = fresh.bodies.paths
     _, values = asked(fresh)
     assert asked(fresh, cache_tag="other words")[0] == ["0", "1", "2"]
@@ -272,9 +266,7 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
     assert not torch.equal(other[1], values[1])
 
 
-def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(
-    fresh: SignatureDataset,
-) -> None:
+def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(fresh):
     """Two files change places while they are described: neither description is kept as that of the other."""
     first, second = fresh.bodies.paths[:2]
     _, values = asked(fresh, cache_tag=None)
@@ -292,9 +284,7 @@ def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(
     assert torch.equal(asked(fresh)[1], values[[1, 0, 2]])
 
 
-def test_damaged_descriptions_are_made_again(
-    fresh: SignatureDataset, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damaged_descriptions_are_made_again(fresh, caplog):
     _, values = asked(fresh)
     first, second, _ = sorted((fresh.pipeline.cache_dir / "descriptions").rglob("*.safetensors"))
     content = bytearray(first.read_bytes())
@@ -308,16 +298,14 @@ def test_damaged_descriptions_are_made_again(
     assert asked(fresh)[0] == []
 
 
-def test_where_descriptions_cannot_be_kept_they_are_made(
-    fresh: SignatureDataset, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_where_descriptions_cannot_be_kept_they_are_made(fresh, caplog):
     (fresh.pipeline.cache_dir / "descriptions").write_text("in the way")
     for _ in range(2):
         assert asked(fresh)[0] == ["0", "1", "2"]
     assert caplog.text.count("descriptions are not cached") == 2
 
 
-def test_failures_are_not_kept(fresh: SignatureDataset) -> None:
+def test_failures_are_not_kept(fresh):
     for refused in ("1.off", "2.off"):
         values, failures = describe_usable(
             fresh, Area(refused=refused), cache_tag="area", n_workers=1

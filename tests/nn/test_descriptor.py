@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,7 @@ from igps.nn.axes import (
     PairCosines,
     Potential,
 )
-from igps.nn.descriptor import BodyDescriptor, Descriptor, EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.descriptor import BodyDescriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.heads.closed_form import WhitenedHead
 from igps.nn.histograms.pairs import PairHistogram
@@ -65,7 +64,7 @@ def combined() -> HistogramDescriptor:
             *oriented().histograms,
             *oriented(in_embedding=True).histograms,
             surface,
-        ]  # type: ignore[list-item]
+        ]
     )
 
 
@@ -73,7 +72,7 @@ MAKERS = [paper, learned, oriented, lambda: oriented(in_embedding=True), combine
 
 
 @pytest.mark.parametrize("make", MAKERS)
-def test_padding_never_shows(batch: SignatureBatch, make: Callable[[], Descriptor]) -> None:
+def test_padding_never_shows(batch, make):
     descriptor = make()
     with torch.no_grad():
         together = descriptor(batch)
@@ -84,7 +83,7 @@ def test_padding_never_shows(batch: SignatureBatch, make: Callable[[], Descripto
 
 
 @pytest.mark.parametrize("make", MAKERS)
-def test_does_not_change_with_scale(batch: SignatureBatch, make: Callable[[], Descriptor]) -> None:
+def test_does_not_change_with_scale(batch, make):
     descriptor = make()
     with torch.no_grad():
         torch.testing.assert_close(
@@ -92,7 +91,7 @@ def test_does_not_change_with_scale(batch: SignatureBatch, make: Callable[[], De
         )
 
 
-def test_everything_learns(batch: SignatureBatch) -> None:
+def test_everything_learns(batch):
     descriptor = learned()
     result = descriptor(batch)
     assert result.shape == (2, 45, 8, 4)
@@ -107,7 +106,7 @@ def test_everything_learns(batch: SignatureBatch) -> None:
 
 
 @pytest.mark.parametrize("in_embedding", [False, True])
-def test_cosines_and_their_filter_learn(batch: SignatureBatch, in_embedding: bool) -> None:
+def test_cosines_and_their_filter_learn(batch, in_embedding):
     descriptor = oriented(in_embedding=in_embedding, learnable=True)
     result = descriptor(batch)
     (result[0] - result[1]).square().sum().backward()
@@ -130,7 +129,7 @@ def gradients(
     return result.detach(), *torch.autograd.grad(result.square().sum(), parameters)
 
 
-def test_compiled_equals_eager(batch: SignatureBatch) -> None:
+def test_compiled_equals_eager(batch):
     descriptor = learned()
     parameters = list(descriptor.parameters())
     torch.compiler.reset()
@@ -144,7 +143,7 @@ def test_compiled_equals_eager(batch: SignatureBatch) -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda_equals_cpu(batch: SignatureBatch) -> None:
+def test_cuda_equals_cpu(batch):
     descriptor = learned()
     expected = gradients(descriptor, batch, list(descriptor.parameters()))
     descriptor.cuda()
@@ -154,7 +153,7 @@ def test_cuda_equals_cpu(batch: SignatureBatch) -> None:
     )
 
 
-def test_cells_are_counted_by_part(batch: SignatureBatch) -> None:
+def test_cells_are_counted_by_part(batch):
     descriptor = combined()
     assert descriptor(batch).shape == (2, sum(descriptor.part_cells))
     assert descriptor.part_cells == (45 * 8 * 4 + 10 * 64, 3 * 6 * 4, 4 * 27, 4 * 27, 6 * 125)
@@ -162,9 +161,7 @@ def test_cells_are_counted_by_part(batch: SignatureBatch) -> None:
     assert paper().part_cells == (640,)
 
 
-def test_a_single_histogram_keeps_its_shape_and_a_list_of_one_is_flat(
-    batch: SignatureBatch,
-) -> None:
+def test_a_single_histogram_keeps_its_shape_and_a_list_of_one_is_flat(batch):
     histogram = PairHistogram()
     single = HistogramDescriptor(histogram)(batch)
     listed = HistogramDescriptor([histogram])(batch)
@@ -174,10 +171,10 @@ def test_a_single_histogram_keeps_its_shape_and_a_list_of_one_is_flat(
 
 def small(n_eigenpairs: int, n_classes: int, **options: int) -> PairHistogram:
     axes = [Potential(n_classes), InteriorDistance(16)]
-    return PairHistogram(axes, SpectralEmbedding(n_eigenpairs=n_eigenpairs), **options)  # type: ignore[arg-type]
+    return PairHistogram(axes, SpectralEmbedding(n_eigenpairs=n_eigenpairs), **options)
 
 
-def test_parts_have_equal_shares_and_so_have_their_histograms(batch: SignatureBatch) -> None:
+def test_parts_have_equal_shares_and_so_have_their_histograms(batch):
     first, second, third = histograms = [small(3, 2), small(5, 3), small(4, 1)]
     result = HistogramDescriptor([[first, second], third])(batch)
     expected = [
@@ -188,7 +185,7 @@ def test_parts_have_equal_shares_and_so_have_their_histograms(batch: SignatureBa
     torch.testing.assert_close(result.sum(dim=1), torch.ones(2))
 
 
-def test_chi_square_of_parts_is_the_mean(batch: SignatureBatch) -> None:
+def test_chi_square_of_parts_is_the_mean(batch):
     parts = [small(3, 2), small(5, 3)]
     descriptor = HistogramDescriptor(parts)
     combined = descriptor(batch)
@@ -209,7 +206,7 @@ class Counting(SpectralEmbedding):
         return super().forward(*arguments)
 
 
-def test_what_histograms_share_is_computed_once(batch: SignatureBatch) -> None:
+def test_what_histograms_share_is_computed_once(batch):
     embedding = Counting(n_eigenpairs=5)
     other = Counting(n_eigenpairs=5)
     first = PairHistogram([Potential(2), InteriorDistance(8)], embedding)
@@ -223,7 +220,7 @@ def test_what_histograms_share_is_computed_once(batch: SignatureBatch) -> None:
     assert (embedding.calls, other.calls) == (4, 2)
 
 
-def test_sharing_changes_no_number(batch: SignatureBatch) -> None:
+def test_sharing_changes_no_number(batch):
     shared = SpectralEmbedding(n_eigenpairs=5)
     made = [
         HistogramDescriptor(
@@ -236,7 +233,7 @@ def test_sharing_changes_no_number(batch: SignatureBatch) -> None:
     assert torch.equal(made[0](batch), made[1](batch))
 
 
-def test_subset_of_samples_is_the_same_in_any_batch(batch: SignatureBatch) -> None:
+def test_subset_of_samples_is_the_same_in_any_batch(batch):
     descriptor = HistogramDescriptor(small(5, 2, n_samples=5))
     together = descriptor(batch)
     for i in range(2):
@@ -244,7 +241,7 @@ def test_subset_of_samples_is_the_same_in_any_batch(batch: SignatureBatch) -> No
     assert not torch.allclose(together, HistogramDescriptor(small(5, 2))(batch))
 
 
-def test_training_draws_another_subset_each_time(batch: SignatureBatch) -> None:
+def test_training_draws_another_subset_each_time(batch):
     descriptor = HistogramDescriptor([small(5, 2, n_training_samples=5), small(5, 1)])
     torch.manual_seed(0)
     one = descriptor(batch)
@@ -258,7 +255,7 @@ def test_training_draws_another_subset_each_time(batch: SignatureBatch) -> None:
     )
 
 
-def test_histograms_that_draw_alike_draw_the_same_subset(batch: SignatureBatch) -> None:
+def test_histograms_that_draw_alike_draw_the_same_subset(batch):
     twice = HistogramDescriptor(
         [small(5, 2, n_training_samples=5), small(5, 2, n_training_samples=5)]
     )
@@ -266,8 +263,8 @@ def test_histograms_that_draw_alike_draw_the_same_subset(batch: SignatureBatch) 
     assert torch.equal(first, second)
 
 
-def test_needs_are_those_of_all_histograms(batch: SignatureBatch) -> None:
-    descriptor = HistogramDescriptor([[small(5, 2), oriented().histograms[0]], small(9, 1)])  # type: ignore[list-item]
+def test_needs_are_those_of_all_histograms(batch):
+    descriptor = HistogramDescriptor([[small(5, 2), oriented().histograms[0]], small(9, 1)])
     # The embedding of the oriented one takes all that there are.
     assert descriptor.requirements == Requirements(9, ("surface_direction",), whole_spectrum=True)
     with pytest.raises(
@@ -287,7 +284,7 @@ def test_needs_are_those_of_all_histograms(batch: SignatureBatch) -> None:
 
 
 @pytest.mark.parametrize("histograms", [[], [[]], [PairHistogram(), []]])
-def test_no_histogram_is_refused(histograms: list) -> None:
+def test_no_histogram_is_refused(histograms):
     with pytest.raises(
         ValueError, match="histograms: expected at least one in each part, got none"
     ):
@@ -307,11 +304,11 @@ class Extent(BodyDescriptor):
         return np.array([len(points), functions.shape[1], np.abs(points).max(), body.area])
 
 
-def test_a_descriptor_of_bodies_sees_each_without_padding(batch: SignatureBatch) -> None:
+def test_a_descriptor_of_bodies_sees_each_without_padding(batch):
     descriptor = Extent()
     with pytest.raises(ValueError, match="meshes: this descriptor needs the surfaces too"):
         descriptor(batch)
-    described = descriptor(replace(batch, meshes=(object(), object())))  # type: ignore[arg-type]
+    described = descriptor(replace(batch, meshes=(object(), object())))
     assert described.dtype == torch.float32
     largest = [float(batch.interior.points[i].abs().max()) for i in range(2)]
     expected = torch.tensor([[40, 12, largest[0], 2], [25, 7, largest[1], 3]])
@@ -319,14 +316,12 @@ def test_a_descriptor_of_bodies_sees_each_without_padding(batch: SignatureBatch)
 
 
 @pytest.mark.parametrize("make", [*MAKERS, Extent])
-def test_a_batch_without_shapes_is_refused(
-    batch: SignatureBatch, make: Callable[[], Descriptor]
-) -> None:
+def test_a_batch_without_shapes_is_refused(batch, make):
     with pytest.raises(ValueError, match="batch: expected at least one shape, got none"):
         make()(batch[batch.labels == 7])
 
 
-def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch: SignatureBatch) -> None:
+def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch):
     below = HistogramDescriptor(
         [small(5, 2), small(3, 1)], name="two", invariant_to=("motion", "scale")
     )
@@ -354,7 +349,7 @@ def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch: SignatureBat
     )
 
 
-def test_coordinates_of_histograms_are_their_roots(batch: SignatureBatch) -> None:
+def test_coordinates_of_histograms_are_their_roots(batch):
     """As Hellinger's distance takes them; those of others are the descriptions."""
     histograms = paper()(batch)
     torch.testing.assert_close(paper().coordinates(histograms).square(), histograms.flatten(1))
@@ -363,14 +358,14 @@ def test_coordinates_of_histograms_are_their_roots(batch: SignatureBatch) -> Non
 
 
 @pytest.mark.parametrize("given", ["body.off", torch.zeros(3), two_bodies()[0]])
-def test_what_is_no_batch_is_refused_with_the_remedy(given: object) -> None:
+def test_what_is_no_batch_is_refused_with_the_remedy(given):
     with pytest.raises(TypeError, match=r"batch: expected a SignatureBatch, got .*igps.collate"):
         HistogramDescriptor(PairHistogram())(given)
 
 
-def test_a_parameter_that_is_not_finite_is_blamed_and_not_the_samples() -> None:
+def test_a_parameter_that_is_not_finite_is_blamed_and_not_the_samples():
     descriptor = HistogramDescriptor(PairHistogram(embedding=SpectralEmbedding(n_knots=3)))
     with torch.no_grad():
-        descriptor.histograms[0].embedding.log_gain[1] = torch.nan  # type: ignore[union-attr, index]
+        descriptor.histograms[0].embedding.log_gain[1] = torch.nan
     with pytest.raises(ValueError, match=r"histograms.0.embedding.log_gain: expected a finite par"):
         descriptor(two_bodies())

@@ -36,7 +36,7 @@ def embed(
 
 
 def learned(kind: str, time: float | None) -> SpectralEmbedding:
-    module = SpectralEmbedding(kind, time=time, n_knots=9)  # type: ignore[arg-type]
+    module = SpectralEmbedding(kind, time=time, n_knots=9)
     assert module.log_gain is not None
     with torch.no_grad():
         module.log_gain.copy_(torch.randn(9, generator=torch.Generator().manual_seed(1)))
@@ -51,30 +51,26 @@ def learned(kind: str, time: float | None) -> SpectralEmbedding:
         ("biharmonic", None, lambda value: 1 / (value * math.sqrt(AREA))),
     ],
 )
-def test_weights_are_the_definition(
-    spectrum: tuple[Tensor, Tensor], kind: str, time: float | None, weight
-) -> None:
+def test_weights_are_the_definition(spectrum, kind, time, weight):
     functions, values = spectrum
     expected = functions.numpy() * [weight(float(value)) for value in values]
     np.testing.assert_allclose(embed(kind, time, functions, values), expected, rtol=1e-12)
-    module = SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
+    module = SpectralEmbedding(kind, time=time)
     np.testing.assert_allclose(
         module(functions, values, torch.tensor(AREA, dtype=torch.float64)), expected, rtol=1e-12
     )
 
 
-def test_default_is_the_commute_time(spectrum: tuple[Tensor, Tensor]) -> None:
+def test_default_is_the_commute_time(spectrum):
     area = torch.tensor(AREA)
     assert torch.equal(SpectralEmbedding()(*spectrum, area), commute_time_embedding(*spectrum))
 
 
 @pytest.mark.parametrize(("kind", "time"), KINDS)
 @pytest.mark.parametrize("is_learned", [False, True])
-def test_does_not_change_with_scale(
-    spectrum: tuple[Tensor, Tensor], kind: str, time: float, is_learned: bool
-) -> None:
+def test_does_not_change_with_scale(spectrum, kind, time, is_learned):
     functions, values = spectrum
-    module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
+    module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)
     scale = 7.0
     scaled = module(
         functions / scale, values / scale**2, torch.tensor(AREA * scale**2, dtype=torch.float64)
@@ -85,11 +81,9 @@ def test_does_not_change_with_scale(
 
 @pytest.mark.parametrize(("kind", "time"), KINDS)
 @pytest.mark.parametrize("is_learned", [False, True])
-def test_padding_has_no_weight(
-    spectrum: tuple[Tensor, Tensor], kind: str, time: float, is_learned: bool
-) -> None:
+def test_padding_has_no_weight(spectrum, kind, time, is_learned):
     functions, values = spectrum
-    module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
+    module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)
     padded_values = torch.full((2, 12), math.inf, dtype=torch.float64)
     padded_values[0] = values
     padded_values[1, :5] = values[:5]
@@ -107,7 +101,7 @@ def test_padding_has_no_weight(
         assert (module.log_gain.grad != 0).any()
 
 
-def test_keeps_the_first_eigenpairs(spectrum: tuple[Tensor, Tensor]) -> None:
+def test_keeps_the_first_eigenpairs(spectrum):
     functions, values = spectrum
     area = torch.tensor(AREA)
     for module in (SpectralEmbedding(n_eigenpairs=4), SpectralEmbedding(n_eigenpairs=4, n_knots=3)):
@@ -121,16 +115,14 @@ def test_keeps_the_first_eigenpairs(spectrum: tuple[Tensor, Tensor]) -> None:
 
 
 @pytest.mark.parametrize(("kind", "time"), KINDS)
-def test_learned_filter_starts_at_its_kind(
-    spectrum: tuple[Tensor, Tensor], kind: str, time: float | None
-) -> None:
+def test_learned_filter_starts_at_its_kind(spectrum, kind, time):
     area = torch.tensor(AREA)
-    start = SpectralEmbedding(kind, time=time, n_knots=16)  # type: ignore[arg-type]
-    plain = SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
+    start = SpectralEmbedding(kind, time=time, n_knots=16)
+    plain = SpectralEmbedding(kind, time=time)
     assert torch.equal(start(*spectrum, area), plain(*spectrum, area))
 
 
-def test_learned_filter_interpolates_its_knots_in_log() -> None:
+def test_learned_filter_interpolates_its_knots_in_log():
     module = learned("commute_time", None)
     assert module.log_gain is not None
     gain = module.log_gain.detach().double().numpy()
@@ -143,7 +135,7 @@ def test_learned_filter_interpolates_its_knots_in_log() -> None:
     assert (weights >= 0).all()
 
 
-def test_gradient_of_the_filter(spectrum: tuple[Tensor, Tensor]) -> None:
+def test_gradient_of_the_filter(spectrum):
     functions, values = spectrum
     module = SpectralEmbedding(n_knots=6).double()
     gain = torch.randn(
@@ -158,7 +150,7 @@ def test_gradient_of_the_filter(spectrum: tuple[Tensor, Tensor]) -> None:
     assert torch.autograd.gradcheck(embedding, (gain,))
 
 
-def test_learned_filter_survives_its_state(spectrum: tuple[Tensor, Tensor]) -> None:
+def test_learned_filter_survives_its_state(spectrum):
     module = learned("biharmonic", None)
     fresh = SpectralEmbedding("biharmonic", n_knots=9)
     fresh.load_state_dict(module.state_dict())
@@ -167,7 +159,7 @@ def test_learned_filter_survives_its_state(spectrum: tuple[Tensor, Tensor]) -> N
     assert not torch.equal(fresh(*spectrum, area), SpectralEmbedding("biharmonic")(*spectrum, area))
 
 
-def test_result_has_single_precision_at_least(spectrum: tuple[Tensor, Tensor]) -> None:
+def test_result_has_single_precision_at_least(spectrum):
     functions, values = spectrum
     for dtype in (torch.float32, torch.bfloat16):
         result = embed("diffusion", 0.01, functions.to(dtype), values)
@@ -187,9 +179,9 @@ def test_result_has_single_precision_at_least(spectrum: tuple[Tensor, Tensor]) -
         ("commute_time", {"n_eigenpairs": 0}, "n_eigenpairs"),
     ],
 )
-def test_bad_filter_is_refused(kind: str, options: dict[str, float], message: str) -> None:
+def test_bad_filter_is_refused(kind, options, message):
     with pytest.raises(ValueError, match=message):
-        SpectralEmbedding(kind, **options)  # type: ignore[arg-type]
+        SpectralEmbedding(kind, **options)
     if set(options) <= {"time"}:
         with pytest.raises(ValueError, match=message):
-            spectral_weights(torch.ones(3), torch.ones(()), kind, **options)  # type: ignore[arg-type]
+            spectral_weights(torch.ones(3), torch.ones(()), kind, **options)

@@ -37,7 +37,7 @@ def trained(model: nn.Module) -> float:
     return losses[-1] / losses[0]
 
 
-def test_a_sequence_with_a_linear_layer_trains() -> None:
+def test_a_sequence_with_a_linear_layer_trains():
     descriptor = learnable()
     model = nn.Sequential(descriptor, nn.Flatten(), nn.Linear(descriptor.n_features, 2))
     assert descriptor.n_features == 6 * 7
@@ -49,7 +49,7 @@ def test_a_sequence_with_a_linear_layer_trains() -> None:
     )
 
 
-def test_one_call_builds_a_classifier() -> None:
+def test_one_call_builds_a_classifier():
     torch.manual_seed(0)
     model = Classifier(learnable(), 2)
     assert trained(model) < 0.2
@@ -58,7 +58,7 @@ def test_one_call_builds_a_classifier() -> None:
         Classifier(learnable(), 1)
 
 
-def test_a_classifier_is_as_precise_as_its_layers() -> None:
+def test_a_classifier_is_as_precise_as_its_layers():
     model = Classifier(learnable(), 2).eval()
     batch = two_bodies()
     expected = model(batch).double()
@@ -67,6 +67,6 @@ def test_a_classifier_is_as_precise_as_its_layers() -> None:
     torch.testing.assert_close(double, expected, rtol=0, atol=1e-4)
 
 
-def test_a_fixed_descriptor_leaves_only_the_layer_to_train() -> None:
+def test_a_fixed_descriptor_leaves_only_the_layer_to_train():
     model = Classifier(igps.descriptor("interior"), 5)
     assert [tuple(one.shape) for one in model.parameters()] == [(5, 640), (5,)]

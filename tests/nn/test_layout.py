@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 
@@ -31,7 +29,7 @@ def batch() -> SignatureBatch:
 
 
 @pytest.mark.parametrize("name", HISTOGRAMS)
-def test_a_learned_layout_starts_as_the_fixed_one(name: str, batch: SignatureBatch) -> None:
+def test_a_learned_layout_starts_as_the_fixed_one(name, batch):
     fixed = igps.descriptor(name)
     learned = igps.descriptor(fixed, learnable=True)
     found = learned(batch)  # with gradients, as in training
@@ -47,7 +45,7 @@ def test_a_learned_layout_starts_as_the_fixed_one(name: str, batch: SignatureBat
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_only_what_is_named_is_learned(part: str) -> None:
+def test_only_what_is_named_is_learned(part):
     learned = igps.descriptor("interior", learnable=[part])
     [(name, parameter)] = learned.named_parameters()
     assert (
@@ -61,21 +59,21 @@ def test_only_what_is_named_is_learned(part: str) -> None:
     assert len(parameter) == {"classes": 4, "bins": 64, "filter": 12}[part]
 
 
-def test_a_learned_layout_is_saved(tmp_path: Path) -> None:
+def test_a_learned_layout_is_saved(tmp_path):
     learned = igps.descriptor("interior", learnable=True, n_training_samples=20)
     with torch.no_grad():
         for parameter in learned.parameters():
             parameter.add_(0.3)
     learned.save(tmp_path / "mine.safetensors")
     loaded = igps.load(tmp_path / "mine.safetensors")
-    assert loaded.histograms[0].n_training_samples == 20  # type: ignore[union-attr]
+    assert loaded.histograms[0].n_training_samples == 20
     batch = two_bodies()
     learned.requirements = loaded.requirements = type(loaded.requirements)()
     assert torch.equal(loaded(batch), learned(batch))
     assert not torch.equal(loaded(batch), igps.descriptor("interior").describe(batch))
 
 
-def test_names_of_axes_and_what_was_fitted_are_kept() -> None:
+def test_names_of_axes_and_what_was_fitted_are_kept():
     axis = Attribute("depth", quantiles=3)
     axis.fit(torch.tensor([0.1, 0.2, 0.6, 0.9]))
     own = igps.HistogramDescriptor(
@@ -89,7 +87,7 @@ def test_names_of_axes_and_what_was_fitted_are_kept() -> None:
     assert len(list(learned.parameters())) == 6
 
 
-def test_an_embedding_that_is_shared_stays_shared() -> None:
+def test_an_embedding_that_is_shared_stays_shared():
     embedding = igps.SpectralEmbedding(n_eigenpairs=5)
     axes = [Potential(2), InteriorDistance(4)]
     own = igps.HistogramDescriptor([PairHistogram(axes, embedding), PairHistogram(axes, embedding)])
@@ -97,7 +95,7 @@ def test_an_embedding_that_is_shared_stays_shared() -> None:
     assert first.embedding is second.embedding is not embedding
 
 
-def test_what_has_no_layout_says_so() -> None:
+def test_what_has_no_layout_says_so():
     with pytest.raises(ValueError, match=r"learnable: expected a descriptor whose .* got 'd2'"):
         igps.descriptor("d2", learnable=True)
     with pytest.raises(ValueError, match="learnable: expected one of bins, classes, filter, got"):

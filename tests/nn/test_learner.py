@@ -64,7 +64,7 @@ def items(shapes: Path) -> list[LabelledSignature]:
 
 def loader(items: list[LabelledSignature]) -> DataLoader[LabelledSignature]:
     """Of no datamodule."""
-    return DataLoader(items, batch_size=6, collate_fn=collate)  # type: ignore[arg-type]
+    return DataLoader(items, batch_size=6, collate_fn=collate)
 
 
 def bins() -> HistogramDescriptor:
@@ -73,7 +73,7 @@ def bins() -> HistogramDescriptor:
 
 
 def two_parts() -> HistogramDescriptor:
-    return HistogramDescriptor([bins().histograms[0], PairHistogram([InteriorDistance(9)])])  # type: ignore[list-item]
+    return HistogramDescriptor([bins().histograms[0], PairHistogram([InteriorDistance(9)])])
 
 
 def learner(head: torch.nn.Module | None = None) -> RetrievalLearner:
@@ -104,9 +104,7 @@ def trainer(epochs: int, root: Path) -> Trainer:
     )
 
 
-def test_training_moves_bins_filter_and_head_and_is_reproducible(
-    shapes: Path, tmp_path: Path
-) -> None:
+def test_training_moves_bins_filter_and_head_and_is_reproducible(shapes, tmp_path):
     states = []
     for _ in range(2):
         model = learner()
@@ -130,7 +128,7 @@ def test_training_moves_bins_filter_and_head_and_is_reproducible(
     assert not any(name.startswith("scores") for name in states[0])
 
 
-def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes, tmp_path):
     module = data(shapes)
     model = learner()
     run = trainer(1, tmp_path)
@@ -152,7 +150,7 @@ def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes: Path, tmp_path: Pat
         assert state[f"distance.{name}"] != 1
 
 
-def test_the_loss_uses_what_the_miner_chose(shapes: Path, tmp_path: Path) -> None:
+def test_the_loss_uses_what_the_miner_chose(shapes, tmp_path):
     seen = []
 
     class First(torch.nn.Module):
@@ -170,7 +168,7 @@ def test_the_loss_uses_what_the_miner_chose(shapes: Path, tmp_path: Path) -> Non
     class Loss(TripletMarginLoss):
         def forward(
             self, embeddings: torch.Tensor, labels: torch.Tensor, chosen: tuple
-        ) -> torch.Tensor:  # type: ignore[override]
+        ) -> torch.Tensor:
             seen.append([len(indices) for indices in chosen])
             return super().forward(embeddings, labels, chosen)
 
@@ -182,9 +180,7 @@ def test_the_loss_uses_what_the_miner_chose(shapes: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("validated", [True, False])
-def test_a_head_in_closed_form_follows_the_bins(
-    shapes: Path, tmp_path: Path, validated: bool
-) -> None:
+def test_a_head_in_closed_form_follows_the_bins(shapes, tmp_path, validated):
     seed_everything(3, verbose=False)
     model = RetrievalLearner(two_parts(), BlendedDistance(WhitenedHead(4), share=1.0))
     module = data(shapes)
@@ -203,9 +199,7 @@ def test_a_head_in_closed_form_follows_the_bins(
 
 
 @pytest.mark.parametrize("make", [ProjectionHead, WhitenedHead, KernelHead])
-def test_any_loader_of_labelled_batches_trains(
-    items: list[LabelledSignature], tmp_path: Path, make: type[torch.nn.Module]
-) -> None:
+def test_any_loader_of_labelled_batches_trains(items, tmp_path, make):
     """Without a datamodule and without validation data, and the default checkpoint of an epoch holds a fitted head."""
     model = learner(make())
     before = state_of(model.descriptor)
@@ -253,9 +247,7 @@ def test_any_loader_of_labelled_batches_trains(
 
 
 @pytest.mark.parametrize("make", [ProjectionHead, WhitenedHead])
-def test_saving_a_checkpoint_changes_nothing(
-    items: list[LabelledSignature], tmp_path: Path, make: type[torch.nn.Module]
-) -> None:
+def test_saving_a_checkpoint_changes_nothing(items, tmp_path, make):
     model = learner(make())
     run = trainer(1, tmp_path)
     seen: list[bool] = []
@@ -265,7 +257,7 @@ def test_saving_a_checkpoint_changes_nothing(
 
         def on_train_batch_end(
             self, trainer: Trainer, module: RetrievalLearner, *_: object
-        ) -> None:  # type: ignore[override]
+        ) -> None:
             before = state_of(module)
             modes = [one.training for one in module.modules()]
             generator = torch.get_rng_state()
@@ -276,7 +268,7 @@ def test_saving_a_checkpoint_changes_nothing(
             assert torch.equal(torch.get_rng_state(), generator)
             seen.append(module.training)
 
-    run.callbacks.append(Save())  # type: ignore[attr-defined]
+    run.callbacks.append(Save())
     run.fit(model, loader(items))
     assert seen == [True]
     before = state_of(model)
@@ -284,9 +276,7 @@ def test_saving_a_checkpoint_changes_nothing(
     assert_same(state_of(model), before)
 
 
-def test_the_mode_of_each_module_outlives_a_fit(
-    items: list[LabelledSignature], tmp_path: Path
-) -> None:
+def test_the_mode_of_each_module_outlives_a_fit(items, tmp_path):
     """A module that the caller froze in evaluation mode stays there, whenever the head is fitted."""
     modes: list[list[bool]] = []
     frozen = learner()
@@ -295,29 +285,27 @@ def test_the_mode_of_each_module_outlives_a_fit(
     class Look(Callback):
         def on_train_batch_start(
             self, trainer: Trainer, module: RetrievalLearner, *_: object
-        ) -> None:  # type: ignore[override]
+        ) -> None:
             modes.append([module.training, module.descriptor.training, module.distance.training])
 
     run = trainer(2, tmp_path)
-    run.callbacks.append(Look())  # type: ignore[attr-defined]
+    run.callbacks.append(Look())
     run.fit(frozen, loader(items))
     assert modes == [[True, False, True]] * 2
 
 
 @pytest.mark.parametrize("precision", ["64-true", "bf16-true", "16-true"])
 def test_a_precision_that_would_write_into_batches_is_refused_with_the_remedy(
-    items: list[LabelledSignature], tmp_path: Path, precision: str
-) -> None:
-    run = Trainer(precision=precision, accelerator="cpu", logger=False, default_root_dir=tmp_path)  # type: ignore[arg-type]
+    items, tmp_path, precision
+):
+    run = Trainer(precision=precision, accelerator="cpu", logger=False, default_root_dir=tmp_path)
     with pytest.raises(
         ValueError, match=f"precision: expected one of .*bf16-mixed, got {precision}"
     ):
         run.fit(learner(), loader(items))
 
 
-def test_a_checkpoint_that_names_a_foreign_class_is_refused(
-    items: list[LabelledSignature], tmp_path: Path
-) -> None:
+def test_a_checkpoint_that_names_a_foreign_class_is_refused(items, tmp_path):
     model = learner()
     run = trainer(1, tmp_path)
     run.fit(model, loader(items))
@@ -356,20 +344,20 @@ def test_a_checkpoint_that_names_a_foreign_class_is_refused(
         )
 
 
-def test_a_lazy_head_has_its_size_before_the_optimiser_is_made() -> None:
+def test_a_lazy_head_has_its_size_before_the_optimiser_is_made():
     model = RetrievalLearner(two_parts(), BlendedDistance(ProjectionHead(width=4)))
     assert not any(isinstance(one, torch.nn.UninitializedParameter) for one in model.parameters())
     assert model.distance.head.layers[1].in_features == 3 * 16 + 9
     assert model.distance.head.training
 
 
-def test_size_beside_histograms_is_refused() -> None:
+def test_size_beside_histograms_is_refused():
     with pytest.raises(ValueError, match=r"molecular.*size.*without_size"):
         RetrievalLearner(molecular(), BlendedDistance(WhitenedHead()))
     RetrievalLearner(molecular().without_size(), BlendedDistance(WhitenedHead()))
 
 
-def test_any_module_describes(items: list[LabelledSignature], tmp_path: Path) -> None:
+def test_any_module_describes(items, tmp_path):
     class Plain(torch.nn.Module):
         """Cells that are learned, whatever the shape."""
 
@@ -389,9 +377,7 @@ def test_any_module_describes(items: list[LabelledSignature], tmp_path: Path) ->
     assert (model.descriptor.cells != 0).any()
 
 
-def test_bodies_of_unknown_classes_are_refused(
-    items: list[LabelledSignature], tmp_path: Path
-) -> None:
+def test_bodies_of_unknown_classes_are_refused(items, tmp_path):
     """As −1 all would be of one class, and every score the best."""
     unknown = [replace(item, label=-1) for item in items]
     with pytest.raises(ValueError, match="labels: expected the class of each body, got −1"):
@@ -400,14 +386,12 @@ def test_bodies_of_unknown_classes_are_refused(
         trainer(1, tmp_path).test(learner(), loader(unknown), verbose=False)
 
 
-def test_several_training_loaders_are_refused(
-    items: list[LabelledSignature], tmp_path: Path
-) -> None:
+def test_several_training_loaders_are_refused(items, tmp_path):
     with pytest.raises(ValueError, match="train_dataloaders: expected one DataLoader, got list"):
         trainer(1, tmp_path).fit(learner(), [loader(items), loader(items)])
 
 
-def test_without_head_the_test_scores_are_the_plain_ones(shapes: Path, tmp_path: Path) -> None:
+def test_without_head_the_test_scores_are_the_plain_ones(shapes, tmp_path):
     module = data(shapes)
     module.prepare_data()
     model = RetrievalLearner(HistogramDescriptor(PairHistogram()), BlendedDistance())
@@ -422,7 +406,7 @@ def test_without_head_the_test_scores_are_the_plain_ones(shapes: Path, tmp_path:
         trainer(1, tmp_path).fit(model, module)
 
 
-def test_a_repeated_shape_counts_once(shapes: Path, tmp_path: Path) -> None:
+def test_a_repeated_shape_counts_once(shapes, tmp_path):
     """As a distributed sampler repeats some to give every process the same number."""
     module = data(shapes)
     model = RetrievalLearner(bins(), BlendedDistance(), loss=torch.nn.Identity())
@@ -433,8 +417,8 @@ def test_a_repeated_shape_counts_once(shapes: Path, tmp_path: Path) -> None:
 
 
 def test_the_configuration_trains_and_its_checkpoint_loads_without_running_code(
-    shapes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    shapes, tmp_path, monkeypatch
+):
     layout = tmp_path / "small.yaml"
     layout.write_text("parts:\n  - axes: [potential, interior_distance]\n    eigenpairs: 20\n")
     values = {

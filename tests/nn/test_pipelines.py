@@ -66,7 +66,7 @@ def gradients(module: nn.Module, batch: SignatureBatch) -> list[Tensor]:
     return list(torch.autograd.grad(loss, list(module.parameters()))) if loss.requires_grad else []
 
 
-def test_the_whole_graph_is_traced(module: DescriptionPart) -> None:
+def test_the_whole_graph_is_traced(module):
     batch = two_bodies()
     torch.compiler.reset()
     traced = torch.compile(module, backend="aot_eager", fullgraph=True)
@@ -75,9 +75,7 @@ def test_the_whole_graph_is_traced(module: DescriptionPart) -> None:
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-7)
 
 
-def test_what_is_compiled_does_not_grow_with_the_samples(
-    module: DescriptionPart, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_compiled_does_not_grow_with_the_samples(module, monkeypatch):
     """Thousands of samples are counted in many blocks: unrolled they would take minutes to compile."""
     monkeypatch.setattr(count_by_torch, "_BLOCK", 1)
     batch = two_bodies()
@@ -99,7 +97,7 @@ def test_what_is_compiled_does_not_grow_with_the_samples(
 
 
 @pytest.mark.parametrize("name", ["hard", "learned", "in space"])
-def test_a_compiled_program_serves_any_number_of_bodies(name: str) -> None:
+def test_a_compiled_program_serves_any_number_of_bodies(name):
     """With fullgraph=True PyTorch compiles eight times and then raises."""
     descriptor = HistogramDescriptor(MODULES[name]()).eval()
     batch = two_bodies()
@@ -118,7 +116,7 @@ def test_a_compiled_program_serves_any_number_of_bodies(name: str) -> None:
     assert len(programs) == 2  # the second time with any number
 
 
-def test_a_description_of_a_padded_batch_is_exported() -> None:
+def test_a_description_of_a_padded_batch_is_exported():
     descriptor = HistogramDescriptor([make() for make in MODULES.values()]).eval()
     batch = two_bodies()
     other = replace(
@@ -133,9 +131,7 @@ def test_a_description_of_a_padded_batch_is_exported() -> None:
             torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 
 
-def test_an_exported_program_takes_any_number_of_bodies_and_samples(
-    module: DescriptionPart,
-) -> None:
+def test_an_exported_program_takes_any_number_of_bodies_and_samples(module):
     descriptor = HistogramDescriptor(module).eval()
     batch = two_bodies()
     fewer = {
@@ -152,7 +148,7 @@ def test_an_exported_program_takes_any_number_of_bodies_and_samples(
             torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 
 
-def test_double_precision_stays_double(module: DescriptionPart) -> None:
+def test_double_precision_stays_double(module):
     single = module(two_bodies()).detach()
     result = module.double()(two_bodies().to(torch.float64))
     assert result.dtype == torch.float64
@@ -162,7 +158,7 @@ def test_double_precision_stays_double(module: DescriptionPart) -> None:
     )
 
 
-def test_transforms_of_functions_follow_a_histogram(module: DescriptionPart) -> None:
+def test_transforms_of_functions_follow_a_histogram(module):
     """`torch.func.grad` gives what a backward pass gives, and `jvp` what it says of a direction."""
     batch = two_bodies().to(torch.float64)
     module = module.double().eval()
@@ -187,9 +183,7 @@ def test_transforms_of_functions_follow_a_histogram(module: DescriptionPart) -> 
         )
 
 
-def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(
-    module: DescriptionPart,
-) -> None:
+def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(module):
     """Finite differences at the largest entry; the gradient at padding is 0, also at its infinite eigenvalues."""
     batch = two_bodies().to(torch.float64)
     module = module.double()
@@ -239,7 +233,7 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
     assert compared > 0
 
 
-def test_padding_leaves_second_derivatives_as_they_are(module: DescriptionPart) -> None:
+def test_padding_leaves_second_derivatives_as_they_are(module):
     """Of a body whose samples and eigenvalues are padded, and of the same body alone."""
     if any(isinstance(one, EmbeddedPairCosines) for one in module.modules()):
         pytest.skip(
@@ -270,7 +264,7 @@ def test_padding_leaves_second_derivatives_as_they_are(module: DescriptionPart) 
             torch.testing.assert_close(padded, plain, rtol=1e-9, atol=1e-12)
 
 
-def test_a_state_is_read_back_to_the_last_key(module: DescriptionPart) -> None:
+def test_a_state_is_read_back_to_the_last_key(module):
     state = {
         name: value + 0.1 if "log" in name else value for name, value in module.state_dict().items()
     }
@@ -279,7 +273,7 @@ def test_a_state_is_read_back_to_the_last_key(module: DescriptionPart) -> None:
         module.load_state_dict({**state, "axes.9.start": torch.zeros(1)}, strict=True)
 
 
-def test_functions_stand_beside_the_modules() -> None:
+def test_functions_stand_beside_the_modules():
     """The mathematics of a module from its parts: the paper's histogram of a body."""
     batch = two_bodies()
     real = batch.interior.mask[1]

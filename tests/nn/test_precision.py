@@ -21,7 +21,7 @@ def by_backend(name: str, precision: str) -> Callable[[], None]:
         owner = getattr(backend, "matmul", None) if name else backend
         if not hasattr(owner, "fp32_precision"):
             pytest.skip("this PyTorch has no precision for each backend")
-        owner.fp32_precision = precision  # type: ignore[union-attr]
+        owner.fp32_precision = precision
 
     return change
 
@@ -94,7 +94,7 @@ def kernels() -> list[Tensor]:
     ]
 
 
-def test_no_bin_changes(setting: Callable[[], None]) -> None:
+def test_no_bin_changes(setting):
     expected = kernels()
     setting()
     before = state()
@@ -103,7 +103,7 @@ def test_no_bin_changes(setting: Callable[[], None]) -> None:
     assert state() == before
 
 
-def test_threads_share_the_settings(setting: Callable[[], None]) -> None:
+def test_threads_share_the_settings(setting):
     """A thread that leaves early must not change the precision of the others; the last one restores the settings."""
     expected = kernels()
     setting()
@@ -115,7 +115,7 @@ def test_threads_share_the_settings(setting: Callable[[], None]) -> None:
     assert state() == before
 
 
-def test_an_error_inside_restores_the_settings(setting: Callable[[], None]) -> None:
+def test_an_error_inside_restores_the_settings(setting):
     setting()
     before = state()
 
@@ -129,7 +129,7 @@ def test_an_error_inside_restores_the_settings(setting: Callable[[], None]) -> N
     assert state() == before
 
 
-def test_plain_settings_are_left_alone() -> None:
+def test_plain_settings_are_left_alone():
     before = state()
     with full_precision(), full_precision():
         assert state() == before

@@ -35,9 +35,7 @@ def learnable() -> HistogramDescriptor:
     return HistogramDescriptor([one, PairHistogram(["interior_distance"], embedding)], name="mine")
 
 
-def test_a_folder_to_share_has_the_model_and_its_card(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_to_share_has_the_model_and_its_card(tmp_path, monkeypatch):
     """By the names that hubs of models expect; a folder that is called as a descriptor of the library hides none."""
     descriptor = learnable()
     batch = two_bodies()
@@ -66,9 +64,7 @@ def test_a_folder_to_share_has_the_model_and_its_card(
         igps.load("empty")
 
 
-def test_the_umask_says_who_may_read_a_model_and_the_system_why_none_is_written(
-    tmp_path: Path,
-) -> None:
+def test_the_umask_says_who_may_read_a_model_and_the_system_why_none_is_written(tmp_path):
     before = os.umask(0o027)
     try:
         igps.descriptor("interior").save(tmp_path / "mine.safetensors")
@@ -82,7 +78,7 @@ def test_the_umask_says_who_may_read_a_model_and_the_system_why_none_is_written(
 
 
 @pytest.mark.parametrize("name", [*NAMES, "fold", "molecular"])
-def test_every_descriptor_of_the_library_comes_back(name: str, tmp_path: Path) -> None:
+def test_every_descriptor_of_the_library_comes_back(name, tmp_path):
     descriptor = igps.descriptor(name)
     descriptor.save(tmp_path / "mine.safetensors")
     found = igps.load(tmp_path / "mine.safetensors")
@@ -95,7 +91,7 @@ def test_every_descriptor_of_the_library_comes_back(name: str, tmp_path: Path) -
     assert fingerprint(found) == fingerprint(descriptor)
 
 
-def test_trained_parameters_and_what_is_shared_come_back(tmp_path: Path) -> None:
+def test_trained_parameters_and_what_is_shared_come_back(tmp_path):
     descriptor = learnable()
     batch = two_bodies()
     with torch.no_grad():
@@ -113,7 +109,7 @@ def test_trained_parameters_and_what_is_shared_come_back(tmp_path: Path) -> None
     assert igps.load(tmp_path / "again.safetensors").card == found.card
 
 
-def test_a_fitted_head_comes_back_with_its_sizes(tmp_path: Path) -> None:
+def test_a_fitted_head_comes_back_with_its_sizes(tmp_path):
     histograms = torch.rand(6, 4, generator=torch.Generator().manual_seed(1))
     histograms /= histograms.sum(dim=1, keepdim=True)
     head = WhitenedHead(2).fit(histograms, torch.tensor([0, 0, 1, 1, 2, 2]), (1, 3))
@@ -125,23 +121,23 @@ def test_a_fitted_head_comes_back_with_its_sizes(tmp_path: Path) -> None:
     assert found.n_features == 4
 
 
-def test_a_model_saved_twice_is_the_same_file(tmp_path: Path) -> None:
+def test_a_model_saved_twice_is_the_same_file(tmp_path):
     for i in range(8):
         learnable().save(tmp_path / f"{i}.safetensors", {"author": "me"})
     assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
 
 
-def test_what_was_changed_since_it_was_made_is_not_saved_as_it_was(tmp_path: Path) -> None:
+def test_what_was_changed_since_it_was_made_is_not_saved_as_it_was(tmp_path):
     """It came back as another descriptor, under another name, or not at all."""
 
     def named(one: HistogramDescriptor) -> None:
         one.name = "other"
 
     def fewer(one: HistogramDescriptor) -> None:
-        one.histograms[0].n_samples = 30  # type: ignore[assignment]
+        one.histograms[0].n_samples = 30
 
     def replaced(one: HistogramDescriptor) -> None:
-        one.histograms[1].axes[0] = EuclideanDistance(64)  # type: ignore[index, operator]
+        one.histograms[1].axes[0] = EuclideanDistance(64)
 
     for change, said in (
         (named, "name"),
@@ -155,7 +151,7 @@ def test_what_was_changed_since_it_was_made_is_not_saved_as_it_was(tmp_path: Pat
         assert not (tmp_path / "mine.safetensors").exists()
 
 
-def test_what_is_of_others_is_not_saved(tmp_path: Path) -> None:
+def test_what_is_of_others_is_not_saved(tmp_path):
     with pytest.raises(
         ValueError, match=r"made of modules of igps and numbers, got own_descriptors\.Height"
     ):
@@ -202,7 +198,7 @@ HOSTILE: dict[str, Callable[[], object]] = {
 
 
 @pytest.mark.parametrize("what", HOSTILE)
-def test_a_hostile_file_is_refused_in_a_sentence(what: str, tmp_path: Path) -> None:
+def test_a_hostile_file_is_refused_in_a_sentence(what, tmp_path):
     path = tmp_path / "mine.safetensors"
     learnable().save(path)
     words = {
@@ -220,9 +216,7 @@ def test_a_hostile_file_is_refused_in_a_sentence(what: str, tmp_path: Path) -> N
     ("parameter", "shape"),
     [("temperature", (2,)), ("members", (2,)), ("coefficients", (3, 7)), ("whitened.mean", (3,))],
 )
-def test_a_head_whose_sizes_do_not_fit_is_refused(
-    parameter: str, shape: tuple[int, ...], tmp_path: Path
-) -> None:
+def test_a_head_whose_sizes_do_not_fit_is_refused(parameter, shape, tmp_path):
     """Else it shows when all bodies are described, and not which file is at fault."""
     path = tmp_path / "mine.safetensors"
     histograms = torch.rand(6, 4, generator=torch.Generator().manual_seed(1))
@@ -248,7 +242,7 @@ def test_a_head_whose_sizes_do_not_fit_is_refused(
         igps.load(path)
 
 
-def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_such_file_is_refused(tmp_path):
     path = tmp_path / "mine.safetensors"
     learnable().save(path)
     content = path.read_bytes()
@@ -280,7 +274,7 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
         igps.descriptor(tmp_path / "gone.safetensors")
 
 
-def test_a_name_that_no_file_may_have_is_not_saved(tmp_path: Path) -> None:
+def test_a_name_that_no_file_may_have_is_not_saved(tmp_path):
     spaced = HistogramDescriptor(PairHistogram(["interior_distance"]), name="two words")
     with pytest.raises(ValueError, match="name: expected letters, digits and _, got 'two words'"):
         spaced.save(tmp_path / "mine.safetensors")
@@ -288,7 +282,7 @@ def test_a_name_that_no_file_may_have_is_not_saved(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("card", ["5", "null", "[1]", '"scale"', "[" * 9000 + "]" * 9000])
-def test_a_card_that_is_no_table_is_refused(card: str, tmp_path: Path) -> None:
+def test_a_card_that_is_no_table_is_refused(card, tmp_path):
     path = tmp_path / "mine.safetensors"
     learnable().save(path, {"scale": "1:100"})
     assert igps.load(path).scale is None  # a word of one's own, and no distance
@@ -302,13 +296,13 @@ def test_a_card_that_is_no_table_is_refused(card: str, tmp_path: Path) -> None:
         igps.load(path)
 
 
-def test_numbers_of_a_description_are_known() -> None:
+def test_numbers_of_a_description_are_known():
     batch = two_bodies()
     assert learnable().n_features == learnable()(batch).shape[1]
     assert igps.descriptor("interior").n_features == 640
     pretrained = igps.descriptor("pretrained")
     assert isinstance(pretrained, EmbeddedDescriptor)
     assert pretrained.n_features == 1068
-    assert pretrained.descriptor.n_features == sum(pretrained.descriptor.part_cells)  # type: ignore[operator]
+    assert pretrained.descriptor.n_features == sum(pretrained.descriptor.part_cells)
     assert own_descriptors.Same().n_features == 1
     assert igps.descriptor("d2").n_features == 64

@@ -46,14 +46,7 @@ def histograms(n: int, cells: tuple[int, ...], *, seed: int, filled: float = 0.6
 @pytest.mark.parametrize(
     ("n_queries", "n_gallery", "cells"), [(7, 5, (3, 8)), (1, 90, (10, 64)), (3, 2, (9000,))]
 )
-def test_agrees_with_another_library(
-    distance: Distance,
-    dtype: torch.dtype,
-    tolerance: float,
-    n_queries: int,
-    n_gallery: int,
-    cells: tuple[int, ...],
-) -> None:
+def test_agrees_with_another_library(distance, dtype, tolerance, n_queries, n_gallery, cells):
     queries = histograms(n_queries, cells, seed=1)
     gallery = histograms(n_gallery, cells, seed=2)
     expected = ORACLES[distance](queries.flatten(1).numpy(), gallery.flatten(1).numpy())
@@ -65,7 +58,7 @@ def test_agrees_with_another_library(
 
 @pytest.mark.usefixtures("either_device")
 @pytest.mark.parametrize("distance", ALL)
-def test_a_set_with_itself_has_a_zero_diagonal_and_is_symmetric(distance: Distance) -> None:
+def test_a_set_with_itself_has_a_zero_diagonal_and_is_symmetric(distance):
     shapes = histograms(60, (10, 64), seed=3).float()
     distances = distance(shapes, shapes.clone())
     assert torch.equal(distances.diagonal(), torch.zeros(60))
@@ -77,16 +70,14 @@ def test_a_set_with_itself_has_a_zero_diagonal_and_is_symmetric(distance: Distan
 @pytest.mark.parametrize(
     ("distance", "farthest"), [(chi_square, 1.0), (euclidean, 2**0.5), (cosine, 1)]
 )
-def test_histograms_without_a_common_cell_are_at_the_largest_distance(
-    distance: Distance, farthest: float
-) -> None:
+def test_histograms_without_a_common_cell_are_at_the_largest_distance(distance, farthest):
     corners = torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(
         distance(corners, corners), farthest * (1 - corners), rtol=0, atol=1e-15
     )
 
 
-def test_near_vectors_keep_their_cosine_distance() -> None:
+def test_near_vectors_keep_their_cosine_distance():
     angle = 1e-3
     a = torch.tensor([[1.0, 0.0]])
     b = torch.tensor([[np.cos(angle), np.sin(angle)]], dtype=torch.float32)
@@ -96,7 +87,7 @@ def test_near_vectors_keep_their_cosine_distance() -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
-def test_cosine_ignores_length_even_at_the_ends_of_the_dtype(scale: float) -> None:
+def test_cosine_ignores_length_even_at_the_ends_of_the_dtype(scale):
     a = torch.tensor([[1.0, 1.0]])
     b = torch.tensor([[1.0, 0.0]])
     assert cosine(scale * a, scale * b).item() == pytest.approx(1 - 0.5**0.5, rel=1e-6)
@@ -104,9 +95,7 @@ def test_cosine_ignores_length_even_at_the_ends_of_the_dtype(scale: float) -> No
 
 @pytest.mark.parametrize("distance", ALL)
 @pytest.mark.parametrize(("n_queries", "n_gallery"), [(70, 9), (9, 70), (1, 1)])
-def test_threads_change_no_bit(
-    distance: Distance, n_queries: int, n_gallery: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_threads_change_no_bit(distance, n_queries, n_gallery, monkeypatch):
     monkeypatch.setattr(threads, "n_cores", lambda: 8)
     monkeypatch.setattr(distances, "_TRIPLES_PER_THREAD", 0)
     queries = histograms(n_queries, (40,), seed=21)
@@ -122,13 +111,13 @@ def test_threads_change_no_bit(
 
 
 @pytest.mark.usefixtures("either_device")
-def test_chi_square_of_tiny_entries_does_not_underflow() -> None:
+def test_chi_square_of_tiny_entries_does_not_underflow():
     assert chi_square(torch.tensor([[1e-30]]), torch.tensor([[0.0]])).item() == pytest.approx(
         5e-31, rel=1e-6, abs=0
     )
 
 
-def test_half_precision_is_computed_in_float32() -> None:
+def test_half_precision_is_computed_in_float32():
     queries = histograms(4, (5, 8), seed=4).half()
     for distance in ALL:
         torch.testing.assert_close(
@@ -137,7 +126,7 @@ def test_half_precision_is_computed_in_float32() -> None:
 
 
 @pytest.mark.usefixtures("either_device")
-def test_cells_that_are_multiplied_in_both_weigh_so_much_in_chi_square() -> None:
+def test_cells_that_are_multiplied_in_both_weigh_so_much_in_chi_square():
     queries = histograms(4, (3, 8), seed=5)
     gallery = histograms(6, (3, 8), seed=6)
     for shape in [(3, 8), (3, 1), (8,), ()]:
@@ -158,7 +147,7 @@ def test_cells_that_are_multiplied_in_both_weigh_so_much_in_chi_square() -> None
 
 
 @pytest.mark.parametrize("distance", ALL)
-def test_gradients_agree_with_finite_differences(distance: Distance) -> None:
+def test_gradients_agree_with_finite_differences(distance):
     queries = histograms(3, (2, 5), seed=8, filled=2)
     gallery = histograms(4, (2, 5), seed=9, filled=2)
     queries = (10 * queries + 0.1).requires_grad_()
@@ -167,7 +156,7 @@ def test_gradients_agree_with_finite_differences(distance: Distance) -> None:
 
 
 @pytest.mark.parametrize("distance", ALL)
-def test_gradients_of_one_side_are_those_of_both(distance: Distance) -> None:
+def test_gradients_of_one_side_are_those_of_both(distance):
     both = [
         histograms(3, (4,), seed=23, filled=2).requires_grad_(),
         histograms(2, (4,), seed=24, filled=2),
@@ -182,9 +171,7 @@ def test_gradients_of_one_side_are_those_of_both(distance: Distance) -> None:
 
 @pytest.mark.parametrize("distance", ALL)
 @pytest.mark.parametrize("side", [0, 1])
-def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(
-    distance: Distance, side: int
-) -> None:
+def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(distance, side):
     both = [histograms(3, (40,), seed=25), histograms(2, (40,), seed=26)]
     both[1][1] = both[0][2]  # at distance zero
     along = histograms(len(both[side]), (40,), seed=29, filled=2)
@@ -210,9 +197,7 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(
 
 
 @pytest.mark.parametrize("distance", ALL)
-def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_differences(
-    distance: Distance,
-) -> None:
+def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_differences(distance):
     queries = histograms(3, (20,), seed=31, filled=2)
     gallery = histograms(4, (20,), seed=32, filled=2)
     along = histograms(3, (20,), seed=33, filled=2)
@@ -222,7 +207,7 @@ def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_diffe
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula() -> None:
+def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula():
     queries = histograms(40, (9000,), seed=10, filled=2)
     gallery = histograms(30, (9000,), seed=11, filled=2)
     upstream = torch.rand(40, 30, generator=torch.Generator().manual_seed(13), dtype=torch.float64)
@@ -237,7 +222,7 @@ def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_form
         torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-12)
 
 
-def test_chi_square_has_second_derivatives_and_none_at_empty_cells() -> None:
+def test_chi_square_has_second_derivatives_and_none_at_empty_cells():
     queries = histograms(3, (6,), seed=27, filled=2)
     gallery = histograms(4, (6,), seed=28, filled=2)
     leaves = [one.requires_grad_() for one in (queries, gallery)]
@@ -250,7 +235,7 @@ def test_chi_square_has_second_derivatives_and_none_at_empty_cells() -> None:
 
 
 @pytest.mark.parametrize("distance", ALL)
-def test_gradients_are_finite_at_empty_cells_and_at_distance_zero(distance: Distance) -> None:
+def test_gradients_are_finite_at_empty_cells_and_at_distance_zero(distance):
     shapes = histograms(6, (3, 8), seed=16, filled=0.3).requires_grad_()
     empty = (shapes.detach() == 0).all(0)
     assert empty.any()  # a cell that is empty in every shape
@@ -260,7 +245,7 @@ def test_gradients_are_finite_at_empty_cells_and_at_distance_zero(distance: Dist
     assert torch.equal(shapes.grad[:, empty], torch.zeros(6, int(empty.sum()), dtype=torch.float64))
 
 
-def test_chi_square_never_holds_all_triples_of_query_gallery_and_cell() -> None:
+def test_chi_square_never_holds_all_triples_of_query_gallery_and_cell():
     class LargestBlock(TorchDispatchMode):
         n_bytes = 0
 
@@ -281,12 +266,12 @@ def test_chi_square_never_holds_all_triples_of_query_gallery_and_cell() -> None:
 
 @pytest.mark.usefixtures("either_device")
 @pytest.mark.parametrize("distance", ALL)
-def test_an_empty_set_of_queries_gives_an_empty_matrix(distance: Distance) -> None:
+def test_an_empty_set_of_queries_gives_an_empty_matrix(distance):
     assert distance(torch.empty(0, 4), torch.ones(3, 4)).shape == (0, 3)
 
 
 @pytest.mark.parametrize("distance", ALL)
-def test_inputs_are_left_as_they_were(distance: Distance) -> None:
+def test_inputs_are_left_as_they_were(distance):
     queries = histograms(5, (6,), seed=19)
     gallery = histograms(4, (6,), seed=20)
     before = queries.clone(), gallery.clone()
@@ -320,19 +305,17 @@ def test_inputs_are_left_as_they_were(distance: Distance) -> None:
         ),
     ],
 )
-def test_wrong_descriptors_are_refused(
-    distance: Distance, queries: Tensor, gallery: Tensor, message: str
-) -> None:
+def test_wrong_descriptors_are_refused(distance, queries, gallery, message):
     with pytest.raises(ValueError, match=message):
         distance(queries, gallery)
 
 
-def test_chi_square_refuses_negative_entries() -> None:
+def test_chi_square_refuses_negative_entries():
     with pytest.raises(ValueError, match="gallery: expected entries ≥ 0"):
         chi_square(torch.ones(2, 3), torch.tensor([[0.5, -0.1, 0.6]]))
 
 
-def test_cosine_refuses_a_descriptor_without_direction() -> None:
+def test_cosine_refuses_a_descriptor_without_direction():
     with pytest.raises(
         ValueError, match="queries: expected descriptors of non-zero length, 1 of 2"
     ):

@@ -1,7 +1,5 @@
 """Ranking and search on hand-worked distances."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -9,17 +7,17 @@ import torch
 from igps.retrieval import chi_square, cosine, euclidean, rank, search
 
 
-def test_rank_orders_by_distance_and_ties_by_index() -> None:
+def test_rank_orders_by_distance_and_ties_by_index():
     distances = torch.tensor([[3.0, 1.0, 2.0, 1.0], [0.0, 0.0, float("inf"), 0.0]])
     assert rank(distances).tolist() == [[1, 3, 2, 0], [0, 1, 3, 2]]
 
 
-def test_many_ties_keep_the_order_of_the_gallery() -> None:
+def test_many_ties_keep_the_order_of_the_gallery():
     distances = torch.arange(1000).remainder(2).float()[None]
     assert rank(distances)[0].tolist() == [*range(0, 1000, 2), *range(1, 1000, 2)]
 
 
-def test_search_returns_the_closest_with_their_distances() -> None:
+def test_search_returns_the_closest_with_their_distances():
     gallery = torch.tensor([[10.0], [4.0], [7.0], [1.0]])
     result = search(torch.tensor([[5.0], [11.0]]), gallery, top=3, distance=euclidean)
     assert result.indices.tolist() == [
@@ -29,7 +27,7 @@ def test_search_returns_the_closest_with_their_distances() -> None:
     assert result.distances.tolist() == [[1.0, 2.0, 4.0], [1.0, 4.0, 7.0]]
 
 
-def test_search_finds_each_shape_first_in_its_own_gallery_by_chi_square() -> None:
+def test_search_finds_each_shape_first_in_its_own_gallery_by_chi_square():
     shapes = torch.rand(12, 3, 4, generator=torch.Generator().manual_seed(0))
     result = search(shapes, shapes, top=12)
     assert result.indices[:, 0].tolist() == list(range(12))
@@ -37,7 +35,7 @@ def test_search_finds_each_shape_first_in_its_own_gallery_by_chi_square() -> Non
     assert torch.equal(result.distances, chi_square(shapes, shapes).sort(1).values)
 
 
-def test_search_uses_the_distance_it_is_given() -> None:
+def test_search_uses_the_distance_it_is_given():
     gallery = torch.tensor([[100.0, 0.0], [1.0, 1.0]])
     query = torch.tensor([[1.0, 0.0]])
     assert search(query, gallery, top=1, distance=cosine).indices.item() == 0
@@ -45,7 +43,7 @@ def test_search_uses_the_distance_it_is_given() -> None:
 
 
 @pytest.mark.parametrize("top", [0, 4, -1])
-def test_search_refuses_more_than_the_gallery_holds(top: int) -> None:
+def test_search_refuses_more_than_the_gallery_holds(top):
     with pytest.raises(
         ValueError, match=f"top: expected 1 to 3, the size of the gallery, got {top}"
     ):
@@ -67,6 +65,6 @@ def test_search_refuses_more_than_the_gallery_holds(top: int) -> None:
         (torch.tensor([[0.5, -0.9]]), "smaller is closer.*-0.9.*similarities"),
     ],
 )
-def test_rank_refuses_what_is_no_distance(distances: torch.Tensor, message: str) -> None:
+def test_rank_refuses_what_is_no_distance(distances, message):
     with pytest.raises(ValueError, match=message):
         rank(distances)

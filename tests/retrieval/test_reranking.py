@@ -63,14 +63,14 @@ def points() -> Tensor:
 @pytest.mark.parametrize(
     ("k", "n_expanded", "share"), [(6, 3, 0.3), (9, 1, 0.0), (4, 6, 1.0), (12, 4, 0.5)]
 )
-def test_sets_and_sums_of_the_paper(k: int, n_expanded: int, share: float, points: Tensor) -> None:
+def test_sets_and_sums_of_the_paper(k, n_expanded, share, points):
     distances = euclidean(points, points)
     expected = torch.tensor(by_hand(distances.tolist(), k, n_expanded, share), dtype=torch.float64)
     found = rerank(distances, k, n_expanded, share, keep_nearest=False)
     torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
 
 
-def test_a_shape_is_its_own_nearest_among_equals(points: Tensor) -> None:
+def test_a_shape_is_its_own_nearest_among_equals(points):
     """Three copies of each of four, and one of the others; the nearest of a copy is itself, then the next copies."""
     repeated = torch.cat([points[:8], points[:4], points[:4]])
     distances = euclidean(repeated, repeated)
@@ -83,7 +83,7 @@ def test_a_shape_is_its_own_nearest_among_equals(points: Tensor) -> None:
 
 @pytest.mark.parametrize("n_copies", [0, 8])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_nearest_stays_the_nearest(n_copies: int, dtype: torch.dtype) -> None:
+def test_the_nearest_stays_the_nearest(n_copies, dtype):
     generator = torch.Generator().manual_seed(3)
     points = torch.randn(60, 4, generator=generator, dtype=torch.float64)
     points = torch.cat([points, *[points[:n_copies]] * 2])
@@ -105,7 +105,7 @@ def test_the_nearest_stays_the_nearest(n_copies: int, dtype: torch.dtype) -> Non
         assert found[nearest].max() < found[rest].min()
 
 
-def test_the_order_of_shapes_does_not_matter(points: Tensor) -> None:
+def test_the_order_of_shapes_does_not_matter(points):
     order = torch.randperm(30, generator=torch.Generator().manual_seed(1))
     found = rerank(euclidean(points, points))
     torch.testing.assert_close(
@@ -115,7 +115,7 @@ def test_the_order_of_shapes_does_not_matter(points: Tensor) -> None:
     torch.testing.assert_close(rerank(3 * euclidean(points, points)), found)
 
 
-def test_classes_that_scatter_are_found_better() -> None:
+def test_classes_that_scatter_are_found_better():
     """Twelve of twenty points each, so far apart that a third of the first tier is of another class."""
     generator = torch.Generator().manual_seed(0)
     centres = torch.randn(12, 1, 20, generator=generator)
@@ -128,7 +128,7 @@ def test_classes_that_scatter_are_found_better() -> None:
     assert after > before + 0.1
 
 
-def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points: Tensor) -> None:
+def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points):
     queries = points[:3]
     gallery = points[3:]
     whole = search(queries, gallery, top=len(gallery), distance=euclidean)
@@ -142,7 +142,7 @@ def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points: Ten
         )
 
 
-def test_a_query_is_put_in_order_by_its_nearest_alone() -> None:
+def test_a_query_is_put_in_order_by_its_nearest_alone():
     """Of 240 points the nearest 100 tell as much as all do; the nearest 20 can only change places."""
     generator = torch.Generator().manual_seed(1)
     labels = torch.arange(12).repeat_interleave(20)
@@ -162,7 +162,7 @@ def test_a_query_is_put_in_order_by_its_nearest_alone() -> None:
     assert abs(precision[2] - precision[3]) < 0.05
 
 
-def test_few_shapes_and_equal_ones() -> None:
+def test_few_shapes_and_equal_ones():
     assert rerank(torch.zeros(1, 1)).tolist() == [[0.0]]
     twins = torch.tensor([[0.0, 0, 1], [0, 0, 1], [1, 1, 0]])
     found = rerank(twins)
@@ -182,6 +182,6 @@ def test_few_shapes_and_equal_ones() -> None:
         (torch.zeros(2, 2), {"share": 1.5}, "share: expected 0 to 1, got 1.5"),
     ],
 )
-def test_what_it_refuses(distances: Tensor, numbers: dict[str, float], message: str) -> None:
+def test_what_it_refuses(distances, numbers, message):
     with pytest.raises(ValueError, match=message):
-        rerank(distances, **numbers)  # type: ignore[arg-type]
+        rerank(distances, **numbers)

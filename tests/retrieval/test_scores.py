@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,7 +79,7 @@ def line_distances(order: list[int], n: int) -> Tensor:
     return distances
 
 
-def test_hand_worked_leave_one_out_ranking() -> None:
+def test_hand_worked_leave_one_out_ranking():
     # Query 0 of class a = {0, 1, 2, 3} among six others ranks: 1 (hit), 4, 2 (hit), 5, 6, 3 (hit), so R = 3.
     labels = ["a", "a", "a", "a", "b", "b", "b"]
     scores = retrieval_scores(line_distances([1, 4, 2, 5, 6, 3], 7), labels)
@@ -98,7 +97,7 @@ def test_hand_worked_leave_one_out_ranking() -> None:
         assert getattr(scores, name)[0].item() == pytest.approx(value, abs=1e-12), name
 
 
-def test_distances_may_be_an_array_as_a_file_gives_them() -> None:
+def test_distances_may_be_an_array_as_a_file_gives_them():
     labels = ["a", "a", "a", "a", "b", "b", "b"]
     distances = line_distances([1, 4, 2, 5, 6, 3], 7)
     assert (
@@ -111,7 +110,7 @@ def test_distances_may_be_an_array_as_a_file_gives_them() -> None:
     assert torch.equal(*curves)
 
 
-def test_another_default_device_changes_no_score() -> None:
+def test_another_default_device_changes_no_score():
     labels = ["a", "a", "a", "a", "b", "b", "b"]
     distances = line_distances([1, 4, 2, 5, 6, 3], 7)
     expected = retrieval_scores(distances, labels)
@@ -123,7 +122,7 @@ def test_another_default_device_changes_no_score() -> None:
         assert torch.equal(precision_recall_curve(distances, labels).precision, curve.precision)
 
 
-def test_hand_worked_separate_gallery() -> None:
+def test_hand_worked_separate_gallery():
     # One query of class 1 against 0, 1, 1, 0, 1 ranked as 0 (miss), 2 (hit), 1 (hit), 3, 4 (hit).
     distances = torch.tensor([[0.1, 0.3, 0.2, 0.4, 0.5]])
     scores = retrieval_scores(distances, [1], [0, 1, 1, 0, 1])
@@ -144,7 +143,7 @@ def test_hand_worked_separate_gallery() -> None:
 
 @pytest.mark.parametrize("ties", [False, True])
 @pytest.mark.parametrize(("n", "n_classes"), [(12, 3), (45, 4), (90, 2)])
-def test_agrees_with_loops_over_ranks(n: int, n_classes: int, ties: bool) -> None:
+def test_agrees_with_loops_over_ranks(n, n_classes, ties):
     distances, labels = random_case(n=n, n_classes=n_classes, seed=n, ties=ties)
     scores = retrieval_scores(distances, labels)
     assert scores.n_queries == n
@@ -158,7 +157,7 @@ def test_agrees_with_loops_over_ranks(n: int, n_classes: int, ties: bool) -> Non
             )
 
 
-def test_mean_average_precision_is_that_of_scikit_learn() -> None:
+def test_mean_average_precision_is_that_of_scikit_learn():
     distances, labels = random_case(n=40, n_classes=4, seed=1)
     expected = []
     for query in range(40):
@@ -170,7 +169,7 @@ def test_mean_average_precision_is_that_of_scikit_learn() -> None:
     )
 
 
-def test_perfect_retrieval_scores_one_and_the_worst_misses_all_tiers() -> None:
+def test_perfect_retrieval_scores_one_and_the_worst_misses_all_tiers():
     labels = torch.arange(200).remainder(5)  # 40 a class: R = 39
     same = (labels[:, None] == labels).double()
     perfect = retrieval_scores(1 - same, labels).mean()
@@ -183,14 +182,14 @@ def test_perfect_retrieval_scores_one_and_the_worst_misses_all_tiers() -> None:
     )  # only the query itself is found
 
 
-def test_the_query_is_removed_by_its_index_whatever_its_distance() -> None:
+def test_the_query_is_removed_by_its_index_whatever_its_distance():
     distances, labels = random_case(n=20, n_classes=3, seed=2)
     expected = retrieval_scores(distances, labels).mean()
     for own in (0.0, 0.5, math.inf):
         assert retrieval_scores(distances.fill_diagonal_(own), labels).mean() == expected
 
 
-def test_ties_break_by_index() -> None:
+def test_ties_break_by_index():
     labels = [0, 1, 0, 1]
     # Every query ranks the others 0, 1, 2, 3 without itself
     scores = retrieval_scores(torch.zeros(4, 4), labels)
@@ -198,7 +197,7 @@ def test_ties_break_by_index() -> None:
     assert scores.map.tolist() == pytest.approx([1 / 2, 1 / 3, 1.0, 1 / 2])
 
 
-def test_leave_one_out_is_a_separate_gallery_without_the_query() -> None:
+def test_leave_one_out_is_a_separate_gallery_without_the_query():
     distances, labels = random_case(n=15, n_classes=3, seed=3)
     together = retrieval_scores(distances, labels)
     for query in range(15):
@@ -211,7 +210,7 @@ def test_leave_one_out_is_a_separate_gallery_without_the_query() -> None:
         )
 
 
-def test_the_order_of_the_gallery_does_not_matter_without_ties() -> None:
+def test_the_order_of_the_gallery_does_not_matter_without_ties():
     distances, labels = random_case(n=30, n_classes=3, seed=4)
     order = torch.randperm(30, generator=torch.Generator().manual_seed(5))
     expected = retrieval_scores(distances, labels).mean()
@@ -220,13 +219,13 @@ def test_the_order_of_the_gallery_does_not_matter_without_ties() -> None:
     )
 
 
-def test_only_the_order_of_distances_matters() -> None:
+def test_only_the_order_of_distances_matters():
     distances, labels = random_case(n=30, n_classes=3, seed=6)
     expected = retrieval_scores(distances, labels).mean()
     assert retrieval_scores(distances.square() * 7, labels).mean() == expected
 
 
-def test_strings_integers_and_tensors_label_alike() -> None:
+def test_strings_integers_and_tensors_label_alike():
     distances, labels = random_case(n=20, n_classes=3, seed=7)
     words = [["ant", "bear", "cup"][label] for label in labels]
     expected = retrieval_scores(distances, labels).mean()
@@ -235,7 +234,7 @@ def test_strings_integers_and_tensors_label_alike() -> None:
     assert retrieval_scores(distances, labels.numpy()).mean() == expected
 
 
-def test_a_query_alone_in_its_class_is_left_out_and_counted() -> None:
+def test_a_query_alone_in_its_class_is_left_out_and_counted():
     distances, _ = random_case(n=7, n_classes=1, seed=8)
     labels = ["a", "a", "lonely", "b", "b", "b", "single"]
     scores = retrieval_scores(distances, labels)
@@ -249,7 +248,7 @@ def test_a_query_alone_in_its_class_is_left_out_and_counted() -> None:
     assert scores.mean() == pytest.approx(expected)
 
 
-def test_per_class_means_are_those_of_the_members() -> None:
+def test_per_class_means_are_those_of_the_members():
     distances, _ = random_case(n=6, n_classes=1, seed=9)
     labels = ["b", "a", "b", "a", "lonely", "a"]
     scores = retrieval_scores(distances, labels)
@@ -303,14 +302,12 @@ def test_per_class_means_are_those_of_the_members() -> None:
         (torch.ones(1, 0), [1], [], "nothing to score"),
     ],
 )
-def test_what_cannot_be_scored_is_refused(
-    score: Any, distances: Tensor, query_labels: Any, gallery_labels: Any, message: str
-) -> None:
+def test_what_cannot_be_scored_is_refused(score, distances, query_labels, gallery_labels, message):
     with pytest.raises(ValueError, match=message):
         score(distances, query_labels, gallery_labels)
 
 
-def test_hand_worked_precision_recall_curve() -> None:
+def test_hand_worked_precision_recall_curve():
     # Hits at ranks 1, 3, 4, 6: precisions 1, 2/3, 3/4, 4/6 at recalls 1/4 … 1, the 2/3 lifted to the 3/4 behind it.
     distances = torch.arange(6.0)[None]
     curve = precision_recall_curve(distances, ["a"], list("abaaba"))
@@ -319,7 +316,7 @@ def test_hand_worked_precision_recall_curve() -> None:
     assert curve.n_queries == 1
 
 
-def test_precision_recall_curve_agrees_with_loops() -> None:
+def test_precision_recall_curve_agrees_with_loops():
     distances, labels = random_case(n=41, n_classes=2, seed=10)
     labels = torch.cat([labels[:-1], torch.tensor([9])])  # the last query has no relevant entry
     curve = precision_recall_curve(distances, labels)
@@ -341,7 +338,7 @@ def test_precision_recall_curve_agrees_with_loops() -> None:
     assert curve.n_queries == 40
 
 
-def test_a_recall_level_that_is_a_number_of_hits_is_not_rounded_up() -> None:
+def test_a_recall_level_that_is_a_number_of_hits_is_not_rounded_up():
     # 55 of 100 hits lead, then a miss: the precision at a recall of 0.55 is 1, above it 100/101.
     labels = [1] * 55 + [0] + [1] * 45
     assert 11 / 20 * 100 > 55  # in binary
@@ -350,7 +347,7 @@ def test_a_recall_level_that_is_a_number_of_hits_is_not_rounded_up() -> None:
 
 
 @pytest.mark.parametrize("distance", [chi_square, euclidean])
-def test_metric_over_batches_is_the_function_over_all(distance: Any) -> None:
+def test_metric_over_batches_is_the_function_over_all(distance):
     generator = torch.Generator().manual_seed(11)
     descriptors = torch.rand(30, 2, 8, generator=generator)
     labels = torch.randint(3, (30,), generator=generator)
@@ -368,7 +365,7 @@ def test_metric_over_batches_is_the_function_over_all(distance: Any) -> None:
     )  # no batch keeps its graph alive
 
 
-def test_metric_starts_afresh_after_reset() -> None:
+def test_metric_starts_afresh_after_reset():
     metric = RetrievalScoresMetric(euclidean)
     metric.update(torch.tensor([[0.0], [1.0]]), torch.tensor([0, 1]))
     metric.reset()
@@ -376,7 +373,7 @@ def test_metric_starts_afresh_after_reset() -> None:
     assert metric.compute()["nn"].item() == 1.0
 
 
-def test_metric_compares_by_chi_square_unless_told() -> None:
+def test_metric_compares_by_chi_square_unless_told():
     shapes = torch.tensor([[0.4, 0.0], [0.0, 0.0], [0.2, 0.2]])
     labels = torch.tensor([0, 0, 1])
     metric = RetrievalScoresMetric()
@@ -397,7 +394,7 @@ def test_metric_compares_by_chi_square_unless_told() -> None:
         (torch.ones(2), torch.tensor([0, 1])),
     ],
 )
-def test_metric_refuses_labels_that_are_not_aligned(descriptors: Tensor, labels: Tensor) -> None:
+def test_metric_refuses_labels_that_are_not_aligned(descriptors, labels):
     with pytest.raises(ValueError, match="labels: expected one integer for each"):
         RetrievalScoresMetric().update(descriptors, labels)
 
@@ -424,7 +421,7 @@ def seven_shapes() -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("with_ids", [True, False])
-def test_metric_counts_a_shape_once_over_processes(with_ids: bool, tmp_path: Path) -> None:
+def test_metric_counts_a_shape_once_over_processes(with_ids, tmp_path):
     torch.multiprocessing.spawn(_score_part, (str(tmp_path), with_ids), nprocs=2)
     descriptors, labels = seven_shapes()
     expected = retrieval_scores(euclidean(descriptors, descriptors), labels).mean()
@@ -439,7 +436,7 @@ def test_metric_counts_a_shape_once_over_processes(with_ids: bool, tmp_path: Pat
             assert result["nn"] > expected["nn"] + 0.1
 
 
-def test_metric_drops_repetitions_of_one_process() -> None:
+def test_metric_drops_repetitions_of_one_process():
     descriptors, labels = seven_shapes()
     once = RetrievalScoresMetric(euclidean)
     twice = RetrievalScoresMetric(euclidean)
@@ -453,7 +450,7 @@ def test_metric_drops_repetitions_of_one_process() -> None:
     assert twice.compute() == once.compute()
 
 
-def test_metric_refuses_names_that_are_not_aligned() -> None:
+def test_metric_refuses_names_that_are_not_aligned():
     metric = RetrievalScoresMetric()
     with pytest.raises(ValueError, match="ids: expected one name for each of 2"):
         metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from scipy.spatial.distance import cdist
 from scipy.stats import spearmanr
 from sklearn.decomposition import PCA
@@ -21,7 +20,7 @@ def histograms(n: int, n_cells: int) -> np.ndarray:
     return (found / found.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
-def test_features_order_as_chi_square_does() -> None:
+def test_features_order_as_chi_square_does():
     """By a fifth to a third less, the more the closer, and in nearly the same order."""
     rows = histograms(120, 500)
     vectors = VectorMap.fit(rows, "chi_square")(rows)
@@ -37,7 +36,7 @@ def test_features_order_as_chi_square_does() -> None:
     assert spearmanr(found, expected[apart])[0] > 0.995
 
 
-def test_rows_are_taken_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_are_taken_some_at_a_time(monkeypatch):
     monkeypatch.setattr(module, "_BLOCK_ROWS", 8)
     rows = histograms(30, 40)
     features = AdditiveChi2Sampler(sample_steps=2).fit_transform(rows)
@@ -46,7 +45,7 @@ def test_rows_are_taken_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_short_unit_vectors_stay_as_they_are() -> None:
+def test_short_unit_vectors_stay_as_they_are():
     rows = histograms(30, 40)
     kept = VectorMap.fit(rows, "cosine")
     assert kept.components is None

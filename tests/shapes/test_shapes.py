@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,14 +33,14 @@ def directed_edges(faces: NDArray[np.int64]) -> list[tuple[int, int]]:
     return [(int(f[i]), int(f[(i + 1) % 3])) for f in faces for i in range(3)]
 
 
-def test_each_directed_edge_occurs_once_with_its_opposite(all_shapes: list[GeneratedShape]) -> None:
+def test_each_directed_edge_occurs_once_with_its_opposite(all_shapes):
     for shape in all_shapes:
         count = Counter(directed_edges(shape.faces))
         assert set(count.values()) == {1}, shape.name
         assert all((b, a) in count for a, b in count), shape.name
 
 
-def test_the_faces_at_each_vertex_form_one_fan(all_shapes: list[GeneratedShape]) -> None:
+def test_the_faces_at_each_vertex_form_one_fan(all_shapes):
     for shape in all_shapes:
         after: list[dict[int, int]] = [{} for _ in shape.vertices]
         for a, b, c in shape.faces.tolist():
@@ -54,7 +53,7 @@ def test_the_faces_at_each_vertex_form_one_fan(all_shapes: list[GeneratedShape])
             assert len(around) == len(fan) >= 3, shape.name
 
 
-def test_one_component_of_the_recorded_genus(all_shapes: list[GeneratedShape]) -> None:
+def test_one_component_of_the_recorded_genus(all_shapes):
     for shape in all_shapes:
         edges = directed_edges(shape.faces)
         parent = list(range(len(shape.vertices)))
@@ -72,7 +71,7 @@ def test_one_component_of_the_recorded_genus(all_shapes: list[GeneratedShape]) -
         )
 
 
-def test_genus_of_known_objects() -> None:
+def test_genus_of_known_objects():
     shapes = ArticulatedShapes(n_classes=10, n_per_class=1)
     genus = {
         name: shapes[i].genus
@@ -82,12 +81,12 @@ def test_genus_of_known_objects() -> None:
     assert genus == {"biped": 0, "mug": 1, "glasses": 2}
 
 
-def test_volume_is_positive(all_shapes: list[GeneratedShape]) -> None:
+def test_volume_is_positive(all_shapes):
     for shape in all_shapes:
         assert trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume > 0.05, shape.name
 
 
-def test_arrays_and_triangles_are_sane(all_shapes: list[GeneratedShape]) -> None:
+def test_arrays_and_triangles_are_sane(all_shapes):
     for shape in all_shapes:
         assert shape.vertices.dtype == np.float64
         assert shape.faces.dtype == np.int64
@@ -98,7 +97,7 @@ def test_arrays_and_triangles_are_sane(all_shapes: list[GeneratedShape]) -> None
         assert np.degrees(np.percentile(angles, 1)) > 20.0, shape.name
 
 
-def test_same_seed_same_arrays_other_seed_others(default_shapes: list[GeneratedShape]) -> None:
+def test_same_seed_same_arrays_other_seed_others(default_shapes):
     for i in (0, 4, 23):
         again = ArticulatedShapes(n_per_class=3)[i]
         np.testing.assert_array_equal(again.vertices, default_shapes[i].vertices)
@@ -109,7 +108,7 @@ def test_same_seed_same_arrays_other_seed_others(default_shapes: list[GeneratedS
     )
 
 
-def test_a_shape_does_not_depend_on_the_others(all_shapes: list[GeneratedShape]) -> None:
+def test_a_shape_does_not_depend_on_the_others(all_shapes):
     """Neither on those made before nor on how many there are: class 10 of 11 or 12, shape 0 of 1 or 4."""
     alone = ArticulatedShapes(n_classes=11, n_per_class=4, seed=3)[10 * 4]
     among = all_shapes[24 + 2]
@@ -118,7 +117,7 @@ def test_a_shape_does_not_depend_on_the_others(all_shapes: list[GeneratedShape])
     np.testing.assert_array_equal(alone.faces, among.faces)
 
 
-def test_shapes_of_a_class_differ(default_shapes: list[GeneratedShape]) -> None:
+def test_shapes_of_a_class_differ(default_shapes):
     """In more than the rigid motion: their areas and volumes differ too."""
     for start in range(0, 24, 3):
         meshes = [
@@ -129,7 +128,7 @@ def test_shapes_of_a_class_differ(default_shapes: list[GeneratedShape]) -> None:
         assert np.ptp(compactness) > 1e-3 * np.mean(compactness), default_shapes[start].name
 
 
-def test_resolution_follows_n_vertices() -> None:
+def test_resolution_follows_n_vertices():
     for n_vertices in (1200, 6000):
         for i in (0, 7):
             shape = ArticulatedShapes(n_per_class=1, n_vertices=n_vertices)[i]
@@ -144,7 +143,7 @@ def distance_histogram(shape: GeneratedShape) -> NDArray[np.float64]:
     return np.histogram(distances, 32, (0.0, 1.6))[0] / distances.size
 
 
-def test_shapes_of_a_class_are_closer_than_others(default_shapes: list[GeneratedShape]) -> None:
+def test_shapes_of_a_class_are_closer_than_others(default_shapes):
     histograms = np.array([distance_histogram(shape) for shape in default_shapes])
     apart = np.abs(histograms[:, None] - histograms[None]).sum(axis=2)
     labels = np.array([shape.label for shape in default_shapes])
@@ -153,7 +152,7 @@ def test_shapes_of_a_class_are_closer_than_others(default_shapes: list[Generated
     assert within < 0.6 * apart[~same].mean()
 
 
-def test_names_and_labels() -> None:
+def test_names_and_labels():
     shapes = ArticulatedShapes(n_per_class=2)
     assert shapes.class_names == DEFAULTS
     assert len(shapes) == len(shapes.labels) == len(shapes.names) == 16
@@ -165,7 +164,7 @@ def test_names_and_labels() -> None:
 
 
 @pytest.mark.parametrize("index", [16, -17])
-def test_no_such_shape(index: int) -> None:
+def test_no_such_shape(index):
     with pytest.raises(IndexError, match=str(index)):
         ArticulatedShapes(n_per_class=2)[index]
 
@@ -174,12 +173,12 @@ def test_no_such_shape(index: int) -> None:
     "arguments",
     [{"n_classes": 0}, {"n_classes": 13}, {"n_per_class": 0}, {"seed": -1}, {"n_vertices": 10}],
 )
-def test_arguments_out_of_range_are_named(arguments: dict[str, int]) -> None:
+def test_arguments_out_of_range_are_named(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         ArticulatedShapes(**arguments)
 
 
-def test_write_gives_the_same_meshes_and_resumes(tmp_path: Path) -> None:
+def test_write_gives_the_same_meshes_and_resumes(tmp_path):
     shapes = ArticulatedShapes(n_classes=2, n_per_class=2, n_vertices=1500)
     shapes.write(tmp_path)
     files = sorted(tmp_path.rglob("*.off"))
@@ -210,7 +209,7 @@ def test_write_gives_the_same_meshes_and_resumes(tmp_path: Path) -> None:
     ]
 
 
-def test_write_refuses_a_folder_of_other_shapes(tmp_path: Path) -> None:
+def test_write_refuses_a_folder_of_other_shapes(tmp_path):
     ArticulatedShapes(n_classes=1, n_per_class=1, n_vertices=1000).write(tmp_path)
     with pytest.raises(ValueError, match="root="):
         ArticulatedShapes(n_classes=1, n_per_class=1, n_vertices=1000, seed=1).write(tmp_path)
@@ -256,13 +255,13 @@ def swept(solid: Solid) -> NDArray[np.float64]:
         Ring(0.4, 0.1, 0.3),
     ],
 )
-def test_distance_to_swept_solids(solid: Solid) -> None:
+def test_distance_to_swept_solids(solid):
     outside = swept(solid) > 0.0
     np.testing.assert_allclose(solid.distance(*POINTS.T)[outside], swept(solid)[outside], atol=1e-3)
 
 
 @pytest.mark.parametrize("solid", [Box((1.0, 0.6, 1.6), 0.1), Prism(4, 0.9, 0.5, 0.05)])
-def test_flat_solids_have_their_volume(solid: Solid) -> None:
+def test_flat_solids_have_their_volume(solid):
     """Of a box and of a square prism, by counting points; the rounding takes off little."""
     points = np.random.default_rng(1).uniform(-1.0, 1.0, (400_000, 3))
     volume = 8.0 * np.mean(solid.distance(*points.T) < 0.0)

@@ -29,20 +29,18 @@ def points() -> np.ndarray:
     return np.random.default_rng(0).uniform(-0.45, 0.45, (40, 3)) * [1, 2, 3]
 
 
-def test_depth_in_a_box_is_to_the_nearest_wall(box: Mesh, points: np.ndarray) -> None:
+def test_depth_in_a_box_is_to_the_nearest_wall(box, points):
     expected = (np.array([0.5, 1.0, 1.5]) - np.abs(points)).min(axis=1) / np.sqrt(22)
     np.testing.assert_allclose(depth(box, points), expected, atol=1e-12)
 
 
-def test_direction_in_a_box_is_the_normal_of_the_nearest_wall(
-    box: Mesh, points: np.ndarray
-) -> None:
+def test_direction_in_a_box_is_the_normal_of_the_nearest_wall(box, points):
     gap = np.array([0.5, 1.0, 1.5]) - np.abs(points)
     expected = np.sign(points) * (gap == gap.min(axis=1, keepdims=True))
     np.testing.assert_allclose(surface_direction(box, points), expected, atol=1e-12)
 
 
-def test_direction_on_the_surface_is_the_outward_normal(sphere: Mesh) -> None:
+def test_direction_on_the_surface_is_the_outward_normal(sphere):
     faces = np.arange(0, len(sphere.faces), 7)
     centres = sphere.vertices[sphere.faces[faces]].mean(axis=1)
     normals = surface_attributes(sphere, faces, ("depth", "surface_direction"))
@@ -52,7 +50,7 @@ def test_direction_on_the_surface_is_the_outward_normal(sphere: Mesh) -> None:
     assert surface_attributes(sphere, faces, ("depth",)) == {}
 
 
-def test_potential_in_a_charged_ball_is_constant(sphere: Mesh) -> None:
+def test_potential_in_a_charged_ball_is_constant(sphere):
     points = np.random.default_rng(1).normal(size=(30, 3))
     points *= np.linspace(0, 0.9, 30)[:, None] / np.linalg.norm(points, axis=1)[:, None]
     np.testing.assert_allclose(
@@ -60,7 +58,7 @@ def test_potential_in_a_charged_ball_is_constant(sphere: Mesh) -> None:
     )
 
 
-def test_potential_in_a_box_is_the_surface_integral(box: Mesh) -> None:
+def test_potential_in_a_box_is_the_surface_integral(box):
     point = np.array([0.1, -0.3, 0.6])
     size = np.array([1.0, 2.0, 3.0])
     total = 0.0
@@ -84,13 +82,13 @@ def test_potential_in_a_box_is_the_surface_integral(box: Mesh) -> None:
     )
 
 
-def test_potential_stays_finite_on_a_vertex(sphere: Mesh) -> None:
+def test_potential_stays_finite_on_a_vertex(sphere):
     value = electrostatic_potential(sphere, sphere.vertices[:1])
     np.testing.assert_allclose(value, np.sqrt(4 * np.pi), rtol=2e-3)
 
 
 @pytest.mark.parametrize("n_subdivisions", [0, 1, 2])
-def test_potential_does_not_depend_on_the_triangles(n_subdivisions: int) -> None:
+def test_potential_does_not_depend_on_the_triangles(n_subdivisions):
     """The centre of a thin cylinder, whose vertices are all at its ends."""
     cylinder = trimesh.creation.cylinder(0.2, 4, sections=300)
     for _ in range(n_subdivisions):
@@ -103,7 +101,7 @@ def test_potential_does_not_depend_on_the_triangles(n_subdivisions: int) -> None
     assert value == pytest.approx(3.34, abs=0.01)
 
 
-def test_attributes_do_not_change_with_scale_or_place(box: Mesh, points: np.ndarray) -> None:
+def test_attributes_do_not_change_with_scale_or_place(box, points):
     names = ("depth", "electrostatic_potential", "surface_direction")
     moved = Mesh(box.vertices * 7 + [100.0, 0, 5], box.faces)
     here, there = (
@@ -116,8 +114,8 @@ def test_attributes_do_not_change_with_scale_or_place(box: Mesh, points: np.ndar
 
 
 @pytest.mark.parametrize("names", [("height",), ("depth", "depth")])
-def test_unknown_or_repeated_names_are_refused(names: tuple[str, ...]) -> None:
+def test_unknown_or_repeated_names_are_refused(names):
     with pytest.raises(
         ValueError, match="attributes: expected distinct names among depth, electrostatic_potential"
     ):
-        SignatureConfig(attributes=names)  # type: ignore[arg-type]
+        SignatureConfig(attributes=names)

@@ -38,7 +38,7 @@ def commute_time_embedding(name: str) -> tuple[Mesh, np.ndarray]:
 
 @pytest.mark.parametrize("accuracy", [7e-3, 1e-3, 1e-4])
 @pytest.mark.parametrize("name", ["bumpy", "torus", "slivers"])
-def test_approximation_keeps_its_accuracy_and_spends_it(name: str, accuracy: float) -> None:
+def test_approximation_keeps_its_accuracy_and_spends_it(name, accuracy):
     mesh, embedding = commute_time_embedding(name)
     points = interior_points(mesh, 250)
     for functions in (embedding, smooth_functions(mesh[0])):
@@ -49,7 +49,7 @@ def test_approximation_keeps_its_accuracy_and_spends_it(name: str, accuracy: flo
         assert accuracy / 20 < np.quantile(error, 0.99) < accuracy
 
 
-def test_approximation_tends_to_the_exact_result() -> None:
+def test_approximation_tends_to_the_exact_result():
     mesh = bumpy_sphere(4)
     points = interior_points(mesh, 60)
     functions = smooth_functions(mesh[0])
@@ -72,8 +72,8 @@ def all_weights(surface: HatSurface, x: np.ndarray, ratio: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("bend", "factor"), [(0.0, 1 / 8), (1.0, 1 / 4)])
 def test_far_rule_error_falls_with_the_third_power_in_a_flat_hat_and_the_second_in_a_bent_one(
-    bend: float, factor: float
-) -> None:
+    bend, factor
+):
     """One hat, seen from ever farther away."""
     ring = np.array(
         [[1.0, 0, 0.2], [0.2, 1.1, 0], [-0.9, 0.4, 0.3], [-0.5, -0.8, -0.1], [0.6, -0.9, 0.1]]
@@ -100,7 +100,7 @@ def small_clusters(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small_clusters")
-def test_surface_points_are_interpolated_also_where_most_of_the_surface_is_far() -> None:
+def test_surface_points_are_interpolated_also_where_most_of_the_surface_is_far():
     vertices, faces = bumpy_sphere(4)
     functions = smooth_functions(vertices)
     rng = np.random.default_rng(5)
@@ -114,7 +114,7 @@ def test_surface_points_are_interpolated_also_where_most_of_the_surface_is_far()
 
 @pytest.mark.usefixtures("small_clusters")
 @pytest.mark.parametrize("accuracy", [7e-3, 1e-3])
-def test_small_clusters_keep_the_accuracy(accuracy: float) -> None:
+def test_small_clusters_keep_the_accuracy(accuracy):
     mesh = torus(80, 30)
     points = interior_points(mesh, 250)
     functions = smooth_functions(mesh[0])
@@ -124,7 +124,7 @@ def test_small_clusters_keep_the_accuracy(accuracy: float) -> None:
     assert np.quantile(np.abs(near - exact) / exact, 0.99) < accuracy
 
 
-def test_clusters_turn_with_the_mesh() -> None:
+def test_clusters_turn_with_the_mesh():
     vertices, faces = bumpy_sphere(4)
     # No mirror symmetry, no ties
     vertices = vertices + 1e-3 * np.random.default_rng(0).normal(size=vertices.shape)
@@ -141,7 +141,7 @@ def test_clusters_turn_with_the_mesh() -> None:
     assert np.abs(still - exact).max() > 1e-5
 
 
-def test_approximation_reproduces_positions() -> None:
+def test_approximation_reproduces_positions():
     mesh = torus(240, 80)
     points = interior_points(mesh, 300)
     for accuracy in (1e-2, 1e-3, 1e-4):
@@ -150,7 +150,7 @@ def test_approximation_reproduces_positions() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 8])
-def test_spatial_order_cuts_a_grid_into_cubes(size: int) -> None:
+def test_spatial_order_cuts_a_grid_into_cubes(size):
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), -1).reshape(-1, 3)
     points = np.random.default_rng(0).permutation(grid)
     order = spatial_order(points, size)
@@ -160,7 +160,7 @@ def test_spatial_order_cuts_a_grid_into_cubes(size: int) -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 7, 8, 9, 83, 512])
-def test_spatial_order_is_one_for_any_number(n: int) -> None:
+def test_spatial_order_is_one_for_any_number(n):
     points = np.random.default_rng(n).normal(size=(n, 3))
     order = spatial_order(points, 8)
     np.testing.assert_array_equal(np.sort(order), np.arange(n))
@@ -174,7 +174,7 @@ def scaled_surface(mesh: Mesh) -> tuple[HatSurface, np.ndarray]:
 
 
 @pytest.mark.parametrize("ratio", [1.1, 2.0, 1e9])
-def test_a_box_sees_each_hat_once_and_none_that_is_near_in_a_cluster(ratio: float) -> None:
+def test_a_box_sees_each_hat_once_and_none_that_is_near_in_a_cluster(ratio):
     surface, vertices = scaled_surface(torus(160, 60))
     n_hats = len(vertices)
     tree = HatClusters.from_hats(surface.hats, vertices)
@@ -200,7 +200,7 @@ def test_a_box_sees_each_hat_once_and_none_that_is_near_in_a_cluster(ratio: floa
     assert (n_clusters > 0) == (ratio < 1e9)
 
 
-def test_near_pairs_equal_all_distances_and_have_no_series() -> None:
+def test_near_pairs_equal_all_distances_and_have_no_series():
     surface, vertices = scaled_surface(bumpy_sphere(3))
     x = np.ascontiguousarray(interior_points(bumpy_sphere(3), 50).T) / 2
     for chosen in (np.arange(642), np.arange(17, 600, 3)):
@@ -218,7 +218,7 @@ def test_near_pairs_equal_all_distances_and_have_no_series() -> None:
         assert (apart <= of_hat[:, 3:4]).all()
 
 
-def test_clusters_of_point_elements_leave_an_error_of_third_order() -> None:
+def test_clusters_of_point_elements_leave_an_error_of_third_order():
     """Hats that are two surface elements n dS each, the kernel of which is n·r/|r|⁴."""
     rng = np.random.default_rng(0)
     centres, offsets, one, two = rng.normal(size=(4, 50, 3))
@@ -257,7 +257,7 @@ def test_clusters_of_point_elements_leave_an_error_of_third_order() -> None:
     assert errors[2] / errors[1] == pytest.approx(1 / 8, rel=0.1)
 
 
-def test_cluster_error_falls_with_the_third_power() -> None:
+def test_cluster_error_falls_with_the_third_power():
     """All clusters of one level together, seen from ever farther away, against the closed form of all faces."""
     surface, vertices = scaled_surface(bumpy_sphere(3))
     functions = smooth_functions(vertices)
@@ -277,9 +277,7 @@ def test_cluster_error_falls_with_the_third_power() -> None:
         assert after < before / 6.5
 
 
-def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(monkeypatch, caplog):
     """Error constants that are too small stand for such a mesh; the sampled error must trigger a second evaluation."""
     mesh = bumpy_sphere(5)
     points = interior_points(mesh, 250)
@@ -303,9 +301,7 @@ def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(
     assert "evaluated again" in caplog.text
 
 
-def test_where_no_approximation_serves_the_closed_form_does(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_where_no_approximation_serves_the_closed_form_does(monkeypatch):
     mesh = bumpy_sphere(5)
     points = interior_points(mesh, 60)
     functions = smooth_functions(mesh[0])
@@ -321,7 +317,7 @@ def test_where_no_approximation_serves_the_closed_form_does(
     assert settings
 
 
-def test_the_sampled_error_is_that_of_the_distances() -> None:
+def test_the_sampled_error_is_that_of_the_distances():
     mesh = bumpy_sphere(4)
     points = interior_points(mesh, 100)
     functions = smooth_functions(mesh[0])

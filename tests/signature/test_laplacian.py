@@ -14,22 +14,22 @@ from igps.signature.laplacian import laplacian
 
 @pytest.mark.parametrize("backend", ["cotangent", "robust"])
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_rows_sum_to_zero_and_mass_to_area(blob: Mesh, backend: str, scale: float) -> None:
+def test_rows_sum_to_zero_and_mass_to_area(blob, backend, scale):
     mesh = Mesh(blob.vertices * scale, blob.faces)
-    stiffness, mass = laplacian(mesh, backend)  # type: ignore[arg-type]
+    stiffness, mass = laplacian(mesh, backend)
     assert abs(stiffness.sum(axis=1)).max() < 1e-10
     assert mass.sum() == pytest.approx(mesh.area, rel=1e-9)
     assert mass.min() > 0
     assert abs(stiffness - stiffness.T).max() < 1e-12
 
 
-def test_stiffness_is_positive_semidefinite_with_constants_as_kernel(blob: Mesh) -> None:
+def test_stiffness_is_positive_semidefinite_with_constants_as_kernel(blob):
     values = np.linalg.eigvalsh(laplacian(blob)[0].toarray())
     assert abs(values[0]) < 1e-12
     assert values[1] > 1e-3
 
 
-def test_stiffness_equals_lapy_and_libigl(blob: Mesh) -> None:
+def test_stiffness_equals_lapy_and_libigl(blob):
     stiffness, _ = laplacian(blob)
     lapy = Solver(TriaMesh(np.array(blob.vertices), np.array(blob.faces))).stiffness
     assert abs(stiffness - lapy).max() < 1e-5  # LaPy assembles in single precision in places
@@ -37,14 +37,14 @@ def test_stiffness_equals_lapy_and_libigl(blob: Mesh) -> None:
     assert abs(stiffness - libigl).max() < 1e-12
 
 
-def test_mixed_voronoi_mass_equals_libigl(blob: Mesh) -> None:
+def test_mixed_voronoi_mass_equals_libigl(blob):
     libigl = igl.massmatrix(
         np.array(blob.vertices), np.array(blob.faces), igl.MASSMATRIX_TYPE_VORONOI
     )
     np.testing.assert_allclose(laplacian(blob)[1], libigl.diagonal(), rtol=1e-10)
 
 
-def test_robust_backend_equals_its_library(blob: Mesh) -> None:
+def test_robust_backend_equals_its_library(blob):
     stiffness, mass = laplacian(blob, "robust")
     expected, expected_mass = robust_laplacian.mesh_laplacian(
         np.array(blob.vertices), np.array(blob.faces)
@@ -53,7 +53,7 @@ def test_robust_backend_equals_its_library(blob: Mesh) -> None:
     np.testing.assert_allclose(mass, expected_mass.diagonal(), rtol=1e-4)
 
 
-def test_obtuse_triangle_shares_by_hand() -> None:
+def test_obtuse_triangle_shares_by_hand():
     # A tetrahedron with obtuse faces; each face's shares are worked out from its angles.
     vertices = np.array([[0, 0, 0], [2, 0, 0], [3, 1, 0], [1.7, 0.4, 0.6]], dtype=float)
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -80,7 +80,7 @@ def _angle(corners: np.ndarray, i: int) -> float:
     return float(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
 
 
-def test_zero_area_faces_stay_finite_and_tie_their_corners_together() -> None:
+def test_zero_area_faces_stay_finite_and_tie_their_corners_together():
     # A vertex of an edge is moved onto its neighbour: two faces collapse, and both corners become one point.
     surface = trimesh.creation.icosphere(subdivisions=2)
     vertices = np.array(surface.vertices)
@@ -95,6 +95,6 @@ def test_zero_area_faces_stay_finite_and_tie_their_corners_together() -> None:
     assert stiffness[a, b] < -100  # a stiff spring: equal values at both ends
 
 
-def test_unknown_backend_is_refused() -> None:
+def test_unknown_backend_is_refused():
     with pytest.raises(ValueError, match="backend"):
-        laplacian(as_mesh(trimesh.creation.box()), "magic")  # type: ignore[arg-type]
+        laplacian(as_mesh(trimesh.creation.box()), "magic")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from bodies import (
-    Mesh,
     bumpy_sphere,
     cube,
     exterior_points,
@@ -72,9 +70,7 @@ def published_loop(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) -
     "mesh", [bumpy_sphere(2), cube(), torus(14, 9)], ids=["bumpy", "cube", "torus"]
 )
 @pytest.mark.parametrize("sample", [interior_points, exterior_points])
-def test_weights_sum_to_one_and_reproduce_linear_functions(
-    mesh: Mesh, sample: Callable[..., np.ndarray]
-) -> None:
+def test_weights_sum_to_one_and_reproduce_linear_functions(mesh, sample):
     points = sample(mesh, 60)
     weights = mean_value_coordinates(*mesh, points)
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-12)
@@ -82,19 +78,19 @@ def test_weights_sum_to_one_and_reproduce_linear_functions(
 
 
 @pytest.mark.parametrize("mesh", [bumpy_sphere(1), cube()], ids=["bumpy", "cube"])
-def test_weights_equal_the_published_loop(mesh: Mesh) -> None:
+def test_weights_equal_the_published_loop(mesh):
     points = np.concatenate([interior_points(mesh, 15), exterior_points(mesh, 15)])
     expected = np.stack([published_loop(*mesh, point) for point in points])
     np.testing.assert_allclose(mean_value_coordinates(*mesh, points), expected, atol=1e-9)
 
 
-def test_centre_of_a_regular_solid_weighs_all_vertices_alike() -> None:
+def test_centre_of_a_regular_solid_weighs_all_vertices_alike():
     icosahedron = trimesh.creation.icosahedron()
     weights = mean_value_coordinates(icosahedron.vertices, icosahedron.faces, np.zeros((1, 3)))
     np.testing.assert_allclose(weights, 1 / 12, atol=1e-14)
 
 
-def test_surface_points_are_interpolated_in_their_triangle() -> None:
+def test_surface_points_are_interpolated_in_their_triangle():
     vertices, faces = bumpy_sphere(2)
     rng = np.random.default_rng(3)
     chosen = rng.integers(len(faces), size=30)
@@ -109,7 +105,7 @@ def test_surface_points_are_interpolated_in_their_triangle() -> None:
 
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-5, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12, 1e-15])
-def test_weights_are_continuous_towards_faces_edges_and_vertices(distance: float) -> None:
+def test_weights_are_continuous_towards_faces_edges_and_vertices(distance):
     vertices, faces = bumpy_sphere(2)
     functions = smooth_functions(vertices)
     rng = np.random.default_rng(4)
@@ -130,7 +126,7 @@ def test_weights_are_continuous_towards_faces_edges_and_vertices(distance: float
 
 @pytest.mark.parametrize("offset", [0.0, 1e-11, 1e-8])
 @pytest.mark.parametrize("subdivisions", [0, 2])
-def test_points_in_the_planes_of_faces_are_exact(subdivisions: int, offset: float) -> None:
+def test_points_in_the_planes_of_faces_are_exact(subdivisions, offset):
     """A turned cube: what should be zero is rounding instead, and most faces are far."""
     box = trimesh.creation.box(extents=(2, 2, 2))
     for _ in range(subdivisions):
@@ -149,7 +145,7 @@ def test_points_in_the_planes_of_faces_are_exact(subdivisions: int, offset: floa
 
 
 @pytest.mark.parametrize("accuracy", [None, 1e-2])
-def test_similarities_do_not_change_the_result(accuracy: float | None) -> None:
+def test_similarities_do_not_change_the_result(accuracy):
     vertices, faces = bumpy_sphere(3)
     points = interior_points((vertices, faces), 40)
     functions = smooth_functions(vertices)
@@ -161,7 +157,7 @@ def test_similarities_do_not_change_the_result(accuracy: float | None) -> None:
         np.testing.assert_allclose(result, expected, atol=tolerance)
 
 
-def test_orientation_and_order_do_not_matter() -> None:
+def test_orientation_and_order_do_not_matter():
     vertices, faces = bumpy_sphere(2)
     points = interior_points((vertices, faces), 30)
     expected = mean_value_coordinates(vertices, faces, points)
@@ -176,7 +172,7 @@ def test_orientation_and_order_do_not_matter() -> None:
 
 
 @pytest.mark.parametrize("accuracy", [None, 7e-3])
-def test_flat_faces_and_loose_vertices_contribute_nothing(accuracy: float | None) -> None:
+def test_flat_faces_and_loose_vertices_contribute_nothing(accuracy):
     vertices, faces = bumpy_sphere(3)
     points = interior_points((vertices, faces), 30)
     functions = smooth_functions(vertices)
@@ -190,9 +186,7 @@ def test_flat_faces_and_loose_vertices_contribute_nothing(accuracy: float | None
 
 
 @pytest.mark.parametrize(("accuracy", "tolerance"), [(None, 1e-12), (7e-3, 1e-11)])
-def test_pieces_do_not_change_the_result(
-    accuracy: float | None, tolerance: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pieces_do_not_change_the_result(accuracy, tolerance, monkeypatch):
     vertices, faces = bumpy_sphere(3)
     points = np.concatenate([interior_points((vertices, faces), 43), vertices[:3]])
     functions = smooth_functions(vertices)
@@ -207,7 +201,7 @@ def test_pieces_do_not_change_the_result(
     )
 
 
-def test_weights_stay_within_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_stay_within_their_memory(monkeypatch):
     mesh = bumpy_sphere(2)
     monkeypatch.setattr(coordinates, "_BLOCK_BYTES", 7 * 8 * len(mesh[0]))
     sizes = []
@@ -224,7 +218,7 @@ def test_weights_stay_within_their_memory(monkeypatch: pytest.MonkeyPatch) -> No
     assert sizes == [(162, 7)] * 5 + [(162, 5)]
 
 
-def test_angles_over_lengths_are_those_of_numpy() -> None:
+def test_angles_over_lengths_are_those_of_numpy():
     """All around, at every length; where both vanish the angle is a right one."""
     generator = np.random.default_rng(2)
     angle = np.concatenate(
@@ -243,7 +237,7 @@ def test_angles_over_lengths_are_those_of_numpy() -> None:
 
 
 @pytest.mark.parametrize(("accuracy", "tolerance"), [(None, 1e-5), (1e-2, 1e-5)])
-def test_single_precision_agrees_with_double(accuracy: float | None, tolerance: float) -> None:
+def test_single_precision_agrees_with_double(accuracy, tolerance):
     mesh = bumpy_sphere(4)
     points = interior_points(mesh, 80)
     functions = smooth_functions(mesh[0])
@@ -258,23 +252,21 @@ def test_single_precision_agrees_with_double(accuracy: float | None, tolerance: 
 @pytest.mark.parametrize(
     ("accuracy", "dtype"), [(1e-3, np.float32), (1e-5, np.float64), (None, np.float64)]
 )
-def test_the_cheapest_precision_that_keeps_the_accuracy_is_taken(
-    accuracy: float | None, dtype: type
-) -> None:
+def test_the_cheapest_precision_that_keeps_the_accuracy_is_taken(accuracy, dtype):
     mesh = bumpy_sphere(3)
     arguments = *mesh, smooth_functions(mesh[0]), interior_points(mesh, 30)
     chosen, given = (extend(*arguments, accuracy=accuracy, dtype=d) for d in (None, dtype))
     assert np.array_equal(chosen, given)
 
 
-def test_no_points_give_no_rows() -> None:
+def test_no_points_give_no_rows():
     mesh = cube()
     none = np.zeros((0, 3))
     assert mean_value_coordinates(*mesh, none).shape == (0, 8)
     assert extend(*mesh, np.ones((8, 3)), none, accuracy=1e-3).shape == (0, 3)
 
 
-def test_read_only_and_single_precision_input_is_accepted_and_kept() -> None:
+def test_read_only_and_single_precision_input_is_accepted_and_kept():
     vertices, faces = cube()
     points = np.array([[0.1, 0.2, 0.3]])
     functions = np.ones((8, 2), np.float32)
@@ -314,7 +306,7 @@ def test_read_only_and_single_precision_input_is_accepted_and_kept() -> None:
         ({"dtype": np.float16}, "dtype: expected"),
     ],
 )
-def test_invalid_arguments_are_named(change: dict[str, object], message: str) -> None:
+def test_invalid_arguments_are_named(change, message):
     vertices, faces = cube()
     arguments = {
         "vertices": vertices,
@@ -327,7 +319,7 @@ def test_invalid_arguments_are_named(change: dict[str, object], message: str) ->
 
 
 @pytest.mark.parametrize("accuracy", [None, 1e-3])
-def test_functions_are_divided_on_the_way(accuracy: float | None) -> None:
+def test_functions_are_divided_on_the_way(accuracy):
     mesh = bumpy_sphere(3)
     generator = np.random.default_rng(5)
     functions = generator.standard_normal((len(mesh[0]), 4))
@@ -337,20 +329,20 @@ def test_functions_are_divided_on_the_way(accuracy: float | None) -> None:
     assert np.array_equal(result, extend(*mesh, functions / divisors, points, accuracy=accuracy))
 
 
-def test_finite_functions_may_sum_to_infinity() -> None:
+def test_finite_functions_may_sum_to_infinity():
     vertices, faces = cube()
     huge = np.full((8, 2), 3e38, dtype=np.float32)
     assert extend(vertices, faces, huge, np.zeros((1, 3))) == pytest.approx(3e38, rel=1e-6)
 
 
-def test_weights_without_a_sum_raise() -> None:
+def test_weights_without_a_sum_raise():
     """A point in the plane of a single triangle sees nothing of it."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     with pytest.raises(ValueError, match="points: expected mean value weights with a non-zero sum"):
         extend(vertices, np.array([[0, 1, 2]]), np.ones((3, 1)), np.array([[2.0, 2, 0]]))
 
 
-def test_coarse_meshes_are_evaluated_more_accurately(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_coarse_meshes_are_evaluated_more_accurately(monkeypatch):
     mesh = bumpy_sphere(3)
     points = interior_points(mesh, 100)
     functions = smooth_functions(mesh[0])

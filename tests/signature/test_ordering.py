@@ -45,7 +45,7 @@ def spectrum_of(n_points: int) -> tuple[np.ndarray, np.ndarray]:
     return generator.normal(size=(n_points, 30)), np.sort(generator.uniform(5, 300, 30))
 
 
-def test_places_go_with_the_points_and_leave_signs_and_bases_alone() -> None:
+def test_places_go_with_the_points_and_leave_signs_and_bases_alone():
     functions, eigenvalues = spectrum_of(500)
     eigenvalues[7:10] = eigenvalues[7]  # a multiplet, of which any basis may come
     expected = ordering_keys(functions, eigenvalues, 1.0)
@@ -66,7 +66,7 @@ def test_places_go_with_the_points_and_leave_signs_and_bases_alone() -> None:
     )
 
 
-def test_points_of_one_potential_have_different_places() -> None:
+def test_points_of_one_potential_have_different_places():
     """Mirror images in a symmetric body get distinct keys, which do not depend on their order."""
     functions, eigenvalues = spectrum_of(300)
     mirror = np.where(np.arange(30) % 3 == 0, -1.0, 1.0)
@@ -77,7 +77,7 @@ def test_points_of_one_potential_have_different_places() -> None:
     np.testing.assert_allclose(np.sort(exchanged), np.sort(found), rtol=1e-9)
 
 
-def test_spacings_and_area_shares_by_hand() -> None:
+def test_spacings_and_area_shares_by_hand():
     line = np.zeros((9, 3))
     line[:, 0] = np.arange(9)
     expected = np.abs(line[:, 0] - line[:, :1]).mean(axis=1)  # all are nearest
@@ -89,7 +89,7 @@ def test_spacings_and_area_shares_by_hand() -> None:
     )
 
 
-def test_systematic_samples_follow_the_sizes() -> None:
+def test_systematic_samples_follow_the_sizes():
     sizes = np.random.default_rng(0).random(50) ** 3
     sizes[[0, 20, 49]] = 0
     ends = np.cumsum(sizes)
@@ -144,7 +144,7 @@ def histograms() -> list[PairHistogram]:
 
 
 @pytest.mark.parametrize("move", MOVES)
-def test_histograms_of_subsets_do_not_move(move: str, histograms: list[PairHistogram]) -> None:
+def test_histograms_of_subsets_do_not_move(move, histograms):
     still = {name: collate([compute_signature(mesh, CONFIG)]) for name, mesh in bodies().items()}
     for histogram in histograms:
         assert all(
@@ -157,7 +157,7 @@ def test_histograms_of_subsets_do_not_move(move: str, histograms: list[PairHisto
             assert chi_square(one[None], moved) < 1e-4 * between, name
 
 
-def test_numbering_leaves_the_surface_samples_in_place(blob: Mesh) -> None:
+def test_numbering_leaves_the_surface_samples_in_place(blob):
     points, others = (
         compute_signature(mesh, CONFIG).surface.points for mesh in (blob, renumbered(blob))
     )
@@ -169,7 +169,7 @@ def test_numbering_leaves_the_surface_samples_in_place(blob: Mesh) -> None:
     assert np.quantile(cKDTree(other_seed).query(points)[0], 0.5) > 1e-3
 
 
-def test_subsets_take_equal_steps() -> None:
+def test_subsets_take_equal_steps():
     lengths = (10, 7, 3)
     mask = torch.arange(10) < torch.tensor(lengths)[:, None]
     places = torch.arange(10.0).expand(3, -1)
@@ -196,7 +196,7 @@ def test_subsets_take_equal_steps() -> None:
     assert set().union(*starts) == set(range(10))  # none is left out by every start
 
 
-def test_the_order_of_form_takes_out_every_numbering(blob: Mesh) -> None:
+def test_the_order_of_form_takes_out_every_numbering(blob):
     expected = in_canonical_order(blob)
     for seed in range(3):
         found = in_canonical_order(renumbered(blob, seed))
@@ -204,7 +204,7 @@ def test_the_order_of_form_takes_out_every_numbering(blob: Mesh) -> None:
         np.testing.assert_array_equal(found.faces, expected.faces)
 
 
-def test_the_order_of_form_keeps_the_surface(blob: Mesh) -> None:
+def test_the_order_of_form_keeps_the_surface(blob):
     found = in_canonical_order(blob)
 
     def corners(mesh: Mesh) -> set[bytes]:
@@ -216,7 +216,7 @@ def test_the_order_of_form_keeps_the_surface(blob: Mesh) -> None:
     assert len(found.faces) == len(blob.faces)
 
 
-def test_the_order_of_form_does_not_depend_on_place_and_scale(blob: Mesh) -> None:
+def test_the_order_of_form_does_not_depend_on_place_and_scale(blob):
     turn = Rotation.from_rotvec([0.3, 1.1, -0.7]).as_matrix()
     moved = replace(blob, vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2])
     expected = in_canonical_order(blob)

@@ -119,7 +119,7 @@ CLOSED_FORMS = {
 
 
 @pytest.mark.parametrize("name", CLOSED_FORMS)
-def test_measures_are_those_of_closed_forms_in_any_position(name: str) -> None:
+def test_measures_are_those_of_closed_forms_in_any_position(name):
     mesh, expected = CLOSED_FORMS[name]
     moved = Mesh(mesh.vertices @ ROTATION.T + [5, -3, 2], mesh.faces)
     found = measures(moved)

@@ -1,7 +1,5 @@
 """Random points of a surface: evenly distributed, reproducible, and interpolated linearly."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import chisquare, kstest
 
@@ -11,7 +9,7 @@ from igps.mesh.surface import face_areas
 from igps.signature.sampling import surface_points
 
 
-def test_faces_are_drawn_by_their_area() -> None:
+def test_faces_are_drawn_by_their_area():
     mesh = Mesh(TETRAHEDRON * [1, 2, 5], FACES)
     counts = np.bincount(surface_points(mesh, 20_000, seed=0).face, minlength=4)
     area = face_areas(mesh.vertices, mesh.faces)
@@ -19,7 +17,7 @@ def test_faces_are_drawn_by_their_area() -> None:
     assert chisquare(counts, np.full(4, 5000)).pvalue < 1e-9
 
 
-def test_points_are_even_within_a_face() -> None:
+def test_points_are_even_within_a_face():
     """Each barycentric coordinate w of an even distribution has P(w < x) = 1 − (1 − x)²."""
     weights = surface_points(Mesh(TETRAHEDRON, FACES), 20_000, seed=1).weights
     assert weights.min() >= 0
@@ -28,7 +26,7 @@ def test_points_are_even_within_a_face() -> None:
         assert kstest(coordinate, lambda x: 1 - (1 - x) ** 2).pvalue > 0.01
 
 
-def test_linear_functions_are_interpolated_exactly(blob: Mesh) -> None:
+def test_linear_functions_are_interpolated_exactly(blob):
     points = surface_points(blob, 500, seed=2)
     slopes = np.random.default_rng(0).normal(size=(3, 4))
     np.testing.assert_allclose(
@@ -41,7 +39,7 @@ def test_linear_functions_are_interpolated_exactly(blob: Mesh) -> None:
     )
 
 
-def test_the_seed_alone_decides(blob: Mesh) -> None:
+def test_the_seed_alone_decides(blob):
     one, same, other = (surface_points(blob, 50, seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.positions, same.positions)
     assert np.abs(one.positions - other.positions).max() > 0.1

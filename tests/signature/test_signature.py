@@ -36,7 +36,7 @@ def signature(blob: Mesh) -> Signature:
     return compute_signature(blob, CONFIG)
 
 
-def test_another_default_device_changes_nothing(signature: Signature) -> None:
+def test_another_default_device_changes_nothing(signature):
     # Eigenpairs by the solver for large meshes
     mesh = as_mesh(trimesh.creation.icosphere(subdivisions=4))
     expected = compute_signature(mesh, CONFIG)
@@ -47,7 +47,7 @@ def test_another_default_device_changes_nothing(signature: Signature) -> None:
     assert torch.equal(batch.eigenvalues, collate([expected]).eigenvalues)
 
 
-def test_shapes_types_and_measures(blob: Mesh, signature: Signature) -> None:
+def test_shapes_types_and_measures(blob, signature):
     n_samples = len(signature.interior)
     assert signature.eigenvalues.shape == (40,)
     assert signature.interior.points.shape == (n_samples, 3)
@@ -58,9 +58,7 @@ def test_shapes_types_and_measures(blob: Mesh, signature: Signature) -> None:
     assert signature.volume == pytest.approx(trimesh.Trimesh(blob.vertices, blob.faces).volume)
 
 
-def test_distance_and_potential_equal_the_papers_gram_form(
-    blob: Mesh, signature: Signature
-) -> None:
+def test_distance_and_potential_equal_the_papers_gram_form(blob, signature):
     # Rustamov 2010: d²(p,q) = (w(p) − w(q))ᵀ A (w(p) − w(q)) and U²(p) = w(p)ᵀ A w(p), A the Gram matrix of the GPS.
     spectrum = eigenpairs(*laplacian(blob), 40, positions=blob.vertices)
     gps = spectrum.eigenfunctions / np.sqrt(spectrum.eigenvalues)
@@ -79,14 +77,12 @@ def test_distance_and_potential_equal_the_papers_gram_form(
     np.testing.assert_allclose(barycentroid_potential(embedding), potential, rtol=1e-5)
 
 
-def test_distance_to_itself_is_zero(signature: Signature) -> None:
+def test_distance_to_itself_is_zero(signature):
     embedding = torch.from_numpy(signature.interior.eigenfunctions)
     assert interior_distance(embedding, embedding).diagonal().abs().max() == 0
 
 
-def test_barycentroid_of_a_ball_is_its_centre_and_of_a_body_its_least_potential(
-    sphere: Mesh, signature: Signature
-) -> None:
+def test_barycentroid_of_a_ball_is_its_centre_and_of_a_body_its_least_potential(sphere, signature):
     ball = compute_signature(sphere, replace(CONFIG, resolution=11))
     np.testing.assert_allclose(ball.barycentroid, 0, atol=1e-9)
     embedding = spectral_embedding(
@@ -99,7 +95,7 @@ def test_barycentroid_of_a_ball_is_its_centre_and_of_a_body_its_least_potential(
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_scale_does_not_matter(blob: Mesh, signature: Signature, scale: float) -> None:
+def test_scale_does_not_matter(blob, signature, scale):
     scaled = compute_signature(Mesh(blob.vertices * scale, blob.faces), CONFIG)
     np.testing.assert_allclose(scaled.eigenvalues * scale**2, signature.eigenvalues, rtol=1e-7)
     for samples in ("interior", "surface"):
@@ -108,7 +104,7 @@ def test_scale_does_not_matter(blob: Mesh, signature: Signature, scale: float) -
         )
 
 
-def test_grid_symmetries_and_shifts_do_not_matter(blob: Mesh, signature: Signature) -> None:
+def test_grid_symmetries_and_shifts_do_not_matter(blob, signature):
     turn = np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], dtype=float)
     moved = compute_signature(Mesh(blob.vertices @ turn.T + [10, -200, 3], blob.faces), CONFIG)
     for samples in ("interior", "surface"):
@@ -117,7 +113,7 @@ def test_grid_symmetries_and_shifts_do_not_matter(blob: Mesh, signature: Signatu
         )
 
 
-def test_numbering_of_vertices_and_faces_does_not_matter(blob: Mesh, signature: Signature) -> None:
+def test_numbering_of_vertices_and_faces_does_not_matter(blob, signature):
     generator = np.random.default_rng(5)
     order = generator.permutation(len(blob.vertices))
     faces = np.argsort(order)[blob.faces][generator.permutation(len(blob.faces))]
@@ -127,7 +123,7 @@ def test_numbering_of_vertices_and_faces_does_not_matter(blob: Mesh, signature: 
     np.testing.assert_allclose(histogram(renumbered), histogram(signature), atol=1e-5)
 
 
-def test_signs_of_eigenfunctions_do_not_matter(signature: Signature) -> None:
+def test_signs_of_eigenfunctions_do_not_matter(signature):
     signs = np.where(np.arange(40) % 3 == 0, -1, 1).astype(np.float32)
     flipped = replace(
         signature,
@@ -140,7 +136,7 @@ def test_signs_of_eigenfunctions_do_not_matter(signature: Signature) -> None:
         )
 
 
-def test_surface_samples_lie_on_the_surface_and_follow_its_area() -> None:
+def test_surface_samples_lie_on_the_surface_and_follow_its_area():
     box = trimesh.creation.box((1, 2, 3))
     for _ in range(3):
         box = box.subdivide()
@@ -152,7 +148,7 @@ def test_surface_samples_lie_on_the_surface_and_follow_its_area() -> None:
     np.testing.assert_allclose(share, np.array([6, 3, 2]) / 11, atol=0.012)
 
 
-def test_surface_values_are_interpolated_linearly(blob: Mesh, signature: Signature) -> None:
+def test_surface_values_are_interpolated_linearly(blob, signature):
     blob = blob.numbered_by_faces()  # on which the signs of eigenfunctions depend
     spectrum = eigenpairs(*laplacian(blob), 40, positions=blob.vertices)
     surface = trimesh.Trimesh(blob.vertices, blob.faces, process=False)
@@ -162,7 +158,7 @@ def test_surface_values_are_interpolated_linearly(blob: Mesh, signature: Signatu
     np.testing.assert_allclose(signature.surface.eigenfunctions[:20], expected, atol=1e-4)
 
 
-def test_simplified_mesh_gives_a_near_descriptor(sphere: Mesh) -> None:
+def test_simplified_mesh_gives_a_near_descriptor(sphere):
     config = replace(CONFIG, max_vertices=700)
     small = compute_signature(sphere, config)
     full = compute_signature(sphere, CONFIG)
@@ -170,7 +166,7 @@ def test_simplified_mesh_gives_a_near_descriptor(sphere: Mesh) -> None:
     assert small.eigenvalues[0] == pytest.approx(full.eigenvalues[0], rel=0.02)
 
 
-def test_robust_backend_and_seed_are_honoured(blob: Mesh, signature: Signature) -> None:
+def test_robust_backend_and_seed_are_honoured(blob, signature):
     robust = compute_signature(blob, replace(CONFIG, backend="robust"))
     assert not np.array_equal(robust.eigenvalues, signature.eigenvalues)
     np.testing.assert_allclose(robust.eigenvalues, signature.eigenvalues, rtol=0.05)
@@ -190,9 +186,7 @@ def needles(blob: Mesh) -> Mesh:
     return Mesh(vertices, blob.faces, name="needles")
 
 
-def test_other_matrices_serve_where_the_cotangent_ones_fail(
-    needles: Mesh, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_matrices_serve_where_the_cotangent_ones_fail(needles, monkeypatch):
     plain = compute_signature(needles, CONFIG)
     assert 1e-12 < plain.residual < 1e-6
     assert plain.notes == ()
@@ -210,9 +204,7 @@ def test_other_matrices_serve_where_the_cotangent_ones_fail(
     np.testing.assert_array_equal(signature.interior.eigenfunctions, robust.interior.eigenfunctions)
 
 
-def test_a_mesh_that_no_matrices_serve_is_refused(
-    needles: Mesh, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mesh_that_no_matrices_serve_is_refused(needles, monkeypatch):
     monkeypatch.setattr("igps.signature.signature._MAX_RESIDUAL", 1e-18)
     monkeypatch.setattr("igps.spectra.eigensolver.RESIDUAL_LIMIT", 1e-18)
     with pytest.raises(
@@ -222,17 +214,17 @@ def test_a_mesh_that_no_matrices_serve_is_refused(
         compute_signature(needles, CONFIG)
 
 
-def test_a_trimesh_has_the_signature_of_its_mesh(blob: Mesh, signature: Signature) -> None:
+def test_a_trimesh_has_the_signature_of_its_mesh(blob, signature):
     surface = trimesh.Trimesh(blob.vertices, blob.faces, process=False)
     found = compute_signature(surface, CONFIG)
     np.testing.assert_array_equal(found.interior.eigenfunctions, signature.interior.eigenfunctions)
     with pytest.raises(
         TypeError, match=r"expected a Mesh, a trimesh\.Trimesh, .* got builtins\.str"
     ):
-        compute_signature("blob.off", CONFIG)  # type: ignore[arg-type]
+        compute_signature("blob.off", CONFIG)
 
 
-def test_attributes_are_added_to_samples_and_nothing_else_changes(signature: Signature) -> None:
+def test_attributes_are_added_to_samples_and_nothing_else_changes(signature):
     samples = signature.interior
     height = samples.points[:, 2]
     away = samples.points - samples.points.mean(axis=0)
@@ -257,7 +249,7 @@ def test_attributes_are_added_to_samples_and_nothing_else_changes(signature: Sig
             samples.with_attributes({"height": values})
 
 
-def test_too_few_vertices_say_so(blob: Mesh) -> None:
+def test_too_few_vertices_say_so(blob):
     with pytest.raises(
         MeshError,
         match=r"blob: expected at least 643 vertices for 641 eigenpairs, got 642.*lower n_eigenpairs",
@@ -280,13 +272,13 @@ def test_too_few_vertices_say_so(blob: Mesh) -> None:
         {"seed": -1},
     ],
 )
-def test_bad_configuration_is_named(field: dict[str, object]) -> None:
+def test_bad_configuration_is_named(field):
     with pytest.raises(ValueError, match=next(iter(field))):
-        SignatureConfig(**field)  # type: ignore[arg-type]
+        SignatureConfig(**field)
 
 
 @pytest.mark.parametrize("n_eigenpairs", [64, 100])
-def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs: int) -> None:
+def test_a_signature_is_the_beginning_of_one_with_more(blob, n_eigenpairs):
     """Samples, their order and the eigenvalues; the eigenfunctions but for the sign, which a single one has free."""
     exact = replace(CONFIG, n_eigenpairs=n_eigenpairs)
     more = replace(exact, n_eigenpairs=250)
@@ -304,7 +296,7 @@ def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs:
         np.testing.assert_allclose(one.eigenfunctions * signs, other.eigenfunctions, atol=1e-4)
 
 
-def test_no_number_of_eigenpairs_is_the_usual_one(blob: Mesh) -> None:
+def test_no_number_of_eigenpairs_is_the_usual_one(blob):
     config = SignatureConfig(resolution=6, min_samples=0, n_surface_samples=20)
     assert (
         config.as_dict()
@@ -322,7 +314,7 @@ def test_no_number_of_eigenpairs_is_the_usual_one(blob: Mesh) -> None:
     assert len(signature.eigenvalues) == signature.config.n_eigenpairs == 250
 
 
-def test_the_longer_configuration_of_one_with_fewer_eigenpairs() -> None:
+def test_the_longer_configuration_of_one_with_fewer_eigenpairs():
     """It reads the same mesh, and has eigenpairs enough for the same order of the samples."""
     small = SignatureConfig(resolution=17, attributes=("depth",)).with_eigenpairs(64)
     longer = small.longer()
@@ -334,7 +326,7 @@ def test_the_longer_configuration_of_one_with_fewer_eigenpairs() -> None:
     assert SignatureConfig(n_eigenpairs=64, max_vertices=120).longer() is None  # another mesh
 
 
-def test_paper_is_the_paper() -> None:
+def test_paper_is_the_paper():
     paper = SignatureConfig.paper()
     assert (paper.n_eigenpairs, paper.resolution, paper.min_samples, paper.backend) == (
         250,
@@ -345,7 +337,7 @@ def test_paper_is_the_paper() -> None:
     assert paper.max_vertices is None
 
 
-def test_real_model(homer: Mesh) -> None:
+def test_real_model(homer):
     signature = compute_signature(homer, SignatureConfig.paper())
     assert histogram(signature).sum() == pytest.approx(1)
     exact = compute_signature(homer, replace(SignatureConfig.paper(), accuracy=None))

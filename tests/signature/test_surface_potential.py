@@ -49,7 +49,7 @@ def triangle_of(kind: str) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["any", "obtuse", "needle"])
 @pytest.mark.parametrize("height", [0.0, 1e-9, 1e-3, -0.3, 5.0, -40.0])
-def test_triangle_equals_quadrature(kind: str, height: float) -> None:
+def test_triangle_equals_quadrature(kind, height):
     triangle = triangle_of(kind)
     normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
     normal /= np.linalg.norm(normal)
@@ -64,7 +64,7 @@ def test_triangle_equals_quadrature(kind: str, height: float) -> None:
     np.testing.assert_allclose(exact, expected, rtol=1e-7)
 
 
-def test_quadrature_itself_is_that_of_a_double_integral() -> None:
+def test_quadrature_itself_is_that_of_a_double_integral():
     triangle = triangle_of("any")
     point = np.array([0.3, -0.2, 2.0])
     a, b, c = triangle
@@ -79,7 +79,7 @@ def test_quadrature_itself_is_that_of_a_double_integral() -> None:
     assert by_quadrature(triangle, point) == pytest.approx(value, rel=1e-8)
 
 
-def test_square_from_its_centre_side_and_corner() -> None:
+def test_square_from_its_centre_side_and_corner():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     # On the diagonal, and at its ends or not
@@ -93,7 +93,7 @@ def test_square_from_its_centre_side_and_corner() -> None:
     )
 
 
-def test_disc_on_its_axis() -> None:
+def test_disc_on_its_axis():
     n = 4000
     angles = np.linspace(0, 2 * np.pi, n, endpoint=False)
     rim = 3 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(n)])
@@ -106,7 +106,7 @@ def test_disc_on_its_axis() -> None:
 
 
 @pytest.mark.parametrize("n_subdivisions", [0, 1, 2])
-def test_centre_of_a_cylinder_of_needles(n_subdivisions: int) -> None:
+def test_centre_of_a_cylinder_of_needles(n_subdivisions):
     cylinder = trimesh.creation.cylinder(0.2, 4, sections=300)
     for _ in range(n_subdivisions):
         cylinder = cylinder.subdivide()
@@ -146,7 +146,7 @@ def samples(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     )
 
 
-def test_every_value_has_the_accuracy() -> None:
+def test_every_value_has_the_accuracy():
     vertices, faces = body()
     points = samples(vertices, faces)
     exact = surface_potential(vertices, faces, points, accuracy=1e-13)
@@ -162,7 +162,7 @@ def test_every_value_has_the_accuracy() -> None:
     assert errors[1e-6] < 1e-9
 
 
-def test_exact_values_are_the_sum_over_the_triangles() -> None:
+def test_exact_values_are_the_sum_over_the_triangles():
     vertices, faces = body()
     points = samples(vertices, faces)[::40]
     exact = surface_potential(vertices, faces, points, accuracy=1e-13)
@@ -175,7 +175,7 @@ def test_exact_values_are_the_sum_over_the_triangles() -> None:
     assert (exact > expected).all()
 
 
-def test_motion_scale_numbering_and_company_do_not_matter() -> None:
+def test_motion_scale_numbering_and_company_do_not_matter():
     vertices, faces = body()
     points = samples(vertices, faces)
     expected = surface_potential(vertices, faces, points)
@@ -194,7 +194,7 @@ def test_motion_scale_numbering_and_company_do_not_matter() -> None:
     np.testing.assert_allclose(alone, expected[::25], rtol=1e-5)
 
 
-def test_faces_without_area_add_nothing_and_no_points_give_none() -> None:
+def test_faces_without_area_add_nothing_and_no_points_give_none():
     vertices, faces = body()
     points = samples(vertices, faces)
     flat = np.vstack([faces, [[0, 0, 5], [7, 8, 8]]])

@@ -18,19 +18,19 @@ def grid_points(axes: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def test_box_is_filled_exactly() -> None:
+def test_box_is_filled_exactly():
     points = interior_samples(as_mesh(trimesh.creation.box((1, 2, 4))), resolution=32)
     assert len(points) == 8 * 16 * 32
     np.testing.assert_allclose(np.sort(np.unique(points[:, 0].round(9))), (np.arange(8) - 3.5) / 8)
 
 
-def test_volume_of_samples_tends_to_volume(blob: Mesh) -> None:
+def test_volume_of_samples_tends_to_volume(blob):
     resolution = 64
     cell = np.ptp(blob.vertices, axis=0).max() / resolution
     assert len(interior_samples(blob, resolution)) * cell**3 == pytest.approx(blob.volume, rel=0.01)
 
 
-def test_radial_law_of_a_ball(sphere: Mesh) -> None:
+def test_radial_law_of_a_ball(sphere):
     radius = np.linalg.norm(interior_samples(sphere, 32), axis=1)
     assert kstest(radius, lambda r: np.clip(r, 0, 1) ** 3).statistic < 0.02
 
@@ -38,14 +38,14 @@ def test_radial_law_of_a_ball(sphere: Mesh) -> None:
 @pytest.mark.parametrize(
     "make", [lambda: trimesh.creation.torus(1, 0.3), lambda: trimesh.creation.capsule(2, 0.5)]
 )
-def test_inside_equals_libigl_winding_number(make) -> None:  # type: ignore[no-untyped-def]
+def test_inside_equals_libigl_winding_number(make):
     mesh = as_mesh(make())
     axes = grid_axes(mesh, 19)
     winding = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces), grid_points(axes))
     np.testing.assert_array_equal(inside_grid(mesh, axes).ravel(), winding > 0.5)
 
 
-def test_grid_lines_through_vertices_and_edges() -> None:
+def test_grid_lines_through_vertices_and_edges():
     # A grid whose lines run through every vertex and along every edge of an octahedron, and through none when shifted.
     mesh = as_mesh(trimesh.Trimesh(*_octahedron(), process=False))
     exact = tuple(np.arange(-2, 3) / 2.0 for _ in range(3))
@@ -64,7 +64,7 @@ def _octahedron() -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
-def test_overlapping_parts_count_as_inside_once_or_twice() -> None:
+def test_overlapping_parts_count_as_inside_once_or_twice():
     # Two boxes that overlap, bridged to one component by sharing no vertex is not allowed: use a self-crossing tube.
     surface = trimesh.creation.torus(1, 0.6, major_sections=48, minor_sections=24)
     surface.vertices[:, 0] *= 0.5  # the tube now crosses itself near the axis
@@ -74,7 +74,7 @@ def test_overlapping_parts_count_as_inside_once_or_twice() -> None:
     np.testing.assert_array_equal(inside_grid(mesh, axes).ravel(), winding > 0.5)
 
 
-def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(sphere: Mesh) -> None:
+def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(sphere):
     axes = grid_axes(sphere, 24)
     whole = inside_grid(sphere, axes)
     few = np.delete(sphere.faces, [3, 700, 2222], axis=0)
@@ -89,9 +89,7 @@ def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(spher
     np.testing.assert_array_equal(inside_grid(bowl, axes).ravel()[clear], (winding > 0.5)[clear])
 
 
-def test_solid_angles_are_needed_near_a_hole_only(
-    sphere: Mesh, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_solid_angles_are_needed_near_a_hole_only(sphere, monkeypatch):
     asked: list[np.ndarray] = []
 
     def recording(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -106,7 +104,7 @@ def test_solid_angles_are_needed_near_a_hole_only(
     assert all(np.linalg.norm(points - hole, axis=1).max() < 0.2 for points in asked)
 
 
-def test_grid_moves_and_turns_with_the_mesh(blob: Mesh) -> None:
+def test_grid_moves_and_turns_with_the_mesh(blob):
     turn = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=float)
     shift = np.array([3.0, -40.0, 0.7])
     moved = interior_samples(Mesh(blob.vertices @ turn.T + shift, blob.faces), 20)
@@ -115,14 +113,14 @@ def test_grid_moves_and_turns_with_the_mesh(blob: Mesh) -> None:
     np.testing.assert_allclose(key(moved), key(expected), atol=1e-9)
 
 
-def test_min_samples_refines_the_grid(blob: Mesh) -> None:
+def test_min_samples_refines_the_grid(blob):
     coarse = interior_samples(blob, 8)
     refined = interior_samples(blob, 8, min_samples=1000)
     assert len(coarse) < 1000 <= len(refined) < 2500
     np.testing.assert_array_equal(interior_samples(blob, 8, min_samples=len(coarse)), coarse)
 
 
-def test_body_too_thin_for_the_grid() -> None:
+def test_body_too_thin_for_the_grid():
     sheet = trimesh.creation.box((1, 1, 1e-3))
     sheet.vertices = (
         sheet.vertices @ trimesh.transformations.rotation_matrix(0.4, [1, 2, 0])[:3, :3].T
@@ -131,7 +129,7 @@ def test_body_too_thin_for_the_grid() -> None:
         interior_samples(as_mesh(sheet, "sheet"), resolution=2)
 
 
-def test_limits_of_the_grid_are_named(blob: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_of_the_grid_are_named(blob, monkeypatch):
     monkeypatch.setattr(voxels, "_MAX_RESOLUTION", 8)
     with pytest.raises(
         MeshError, match=r"at least 1000 cells inside, got \d+ in a grid of 8 .*lower min_samples"
@@ -145,9 +143,7 @@ def test_limits_of_the_grid_are_named(blob: Mesh, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("depth", "n_inside"), [(5e-6, 16 * 16), (5e-7, 0)])
-def test_surface_is_as_thick_where_the_grid_has_one_layer(
-    axis: int, depth: float, n_inside: int
-) -> None:
+def test_surface_is_as_thick_where_the_grid_has_one_layer(axis, depth, n_inside):
     # The cell centres of a plate lie so many cells below its two faces; closer than 1e-6 cells is on the surface.
     extents = np.roll([2 * depth / 16, 1.0, 1.0], axis)
     axes = grid_axes(plate := as_mesh(trimesh.creation.box(extents)), 16)
@@ -158,6 +154,6 @@ def test_surface_is_as_thick_where_the_grid_has_one_layer(
 @pytest.mark.parametrize(
     ("resolution", "min_samples", "name"), [(0, 0, "resolution"), (4, -1, "min_samples")]
 )
-def test_bad_arguments(blob: Mesh, resolution: int, min_samples: int, name: str) -> None:
+def test_bad_arguments(blob, resolution, min_samples, name):
     with pytest.raises(ValueError, match=name):
         interior_samples(blob, resolution, min_samples)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable
-from typing import Any
 
 import igl
 import lapy
@@ -56,9 +55,7 @@ def assert_pairs(spectrum: Spectrum, problem: Problem, tolerance: float = 1e-7) 
 
 @pytest.mark.usefixtures("either_processor")
 @pytest.mark.parametrize("n_eigenpairs", [1, 7, 100, 280])
-def test_agrees_with_a_dense_solver(
-    n_eigenpairs: int, torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_agrees_with_a_dense_solver(n_eigenpairs, torus_problem, torus_oracle):
     stiffness, mass, positions = torus_problem
     spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions)
     np.testing.assert_allclose(
@@ -67,9 +64,7 @@ def test_agrees_with_a_dense_solver(
     assert_pairs(spectrum, torus_problem)
 
 
-def test_spans_the_space_of_the_dense_solver(
-    torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_spans_the_space_of_the_dense_solver(torus_problem, torus_oracle):
     stiffness, mass, positions = torus_problem
     values, functions = torus_oracle
     cut = 60 + int(np.argmax(np.diff(values[60:90])))
@@ -78,7 +73,7 @@ def test_spans_the_space_of_the_dense_solver(
     np.testing.assert_allclose(np.linalg.svd(overlap, compute_uv=False), 1, atol=1e-9)
 
 
-def test_sphere_has_multiplets_of_odd_size() -> None:
+def test_sphere_has_multiplets_of_odd_size():
     """l(l + 1) with multiplicity 2l + 1 on the unit sphere; the last multiplet is cut."""
     mesh = trimesh.creation.icosphere(subdivisions=4)
     problem = cotangent_problem(mesh)
@@ -105,7 +100,7 @@ def copies_of_a_patch(n_copies: int, side: int) -> Problem:
     return stiffness, np.linspace(1, 1, n_vertices), np.zeros((n_vertices, 3))
 
 
-def test_multiplets_larger_than_the_block() -> None:
+def test_multiplets_larger_than_the_block():
     problem = copies_of_a_patch(n_copies=40, side=5)
     values = np.linalg.eigvalsh(problem[0].toarray())
     assert np.ptp(values[1:40]) < 1e-12 < 1e-3 < values[40] - values[39]
@@ -115,7 +110,7 @@ def test_multiplets_larger_than_the_block() -> None:
         assert_pairs(spectrum, problem)
 
 
-def test_more_copies_than_distinct_eigenvalues() -> None:
+def test_more_copies_than_distinct_eigenvalues():
     """Four distinct eigenvalues fill most of the space: the Krylov space of the start block is soon exhausted."""
     problem = copies_of_a_patch(n_copies=300, side=2)
     values = np.linalg.eigvalsh(problem[0].toarray())
@@ -125,7 +120,7 @@ def test_more_copies_than_distinct_eigenvalues() -> None:
 
 
 @pytest.mark.usefixtures("either_processor")
-def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_change_no_bit(monkeypatch):
     """10,242 vertices: two pieces of the basis, two subtrees; and a team, though the result is small."""
     sphere = trimesh.creation.icosphere(subdivisions=5)
     sphere.vertices *= 1, 0.8, 0.6
@@ -160,9 +155,7 @@ def filled(vectors: np.ndarray, steps: list[Callable[[], None]]) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("either_processor")
-def test_krylov_basis_projection_and_residuals(
-    torus_problem: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_krylov_basis_projection_and_residuals(torus_problem, monkeypatch):
     """Orthonormal rows, the projection of the operator, and residuals recomputed by NumPy; also after widening."""
     monkeypatch.setattr(krylov, "PIECE_COLUMNS", 100)  # the eigenvectors take many steps
     stiffness, mass, positions = torus_problem
@@ -196,9 +189,7 @@ def test_krylov_basis_projection_and_residuals(
 
 @pytest.mark.usefixtures("either_processor")
 @pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-9])
-def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
-    distance: float, torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(distance, torus_problem, torus_oracle):
     """Near an eigenvalue the operator magnifies rounding errors from block to block; dense solver as oracle."""
     stiffness, mass, positions = torus_problem
     area = mass.sum()
@@ -221,7 +212,7 @@ def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
     np.testing.assert_allclose(quotients, exact, rtol=1e-10)
 
 
-def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem: Problem) -> None:
+def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem):
     stiffness, mass, positions = torus_problem
     spectrum = eigenpairs(stiffness, mass, 100, positions=positions, tolerance=1e-3)
     functions = spectrum.eigenfunctions
@@ -231,10 +222,8 @@ def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem: Problem) 
 
 @pytest.mark.usefixtures("either_processor")
 def test_a_large_basis_gives_its_place_to_the_eigenvectors(
-    torus_problem: Problem,
-    torus_oracle: tuple[np.ndarray, np.ndarray],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    torus_problem, torus_oracle, monkeypatch
+):
     stiffness, mass, positions = torus_problem
     monkeypatch.setattr(basis, "MAX_SINGLE_ENTRIES", 1000)
     monkeypatch.setattr(krylov, "PIECE_COLUMNS", 100)
@@ -245,7 +234,7 @@ def test_a_large_basis_gives_its_place_to_the_eigenvectors(
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_scale_of_the_coordinates(scale: float, torus_problem: Problem) -> None:
+def test_scale_of_the_coordinates(scale, torus_problem):
     stiffness, mass, positions = torus_problem
     one = eigenpairs(stiffness, mass, 50, positions=positions)
     other = eigenpairs(stiffness, mass * scale**2, 50, positions=positions * scale)
@@ -253,7 +242,7 @@ def test_scale_of_the_coordinates(scale: float, torus_problem: Problem) -> None:
     assert_pairs(other, (stiffness, mass * scale**2, positions))
 
 
-def test_same_seed_same_bits_other_seed_same_space(torus_problem: Problem) -> None:
+def test_same_seed_same_bits_other_seed_same_space(torus_problem):
     stiffness, mass, positions = torus_problem
     one, again, other = (
         eigenpairs(stiffness, mass, 40, positions=positions, seed=seed) for seed in (0, 0, 1)
@@ -263,7 +252,7 @@ def test_same_seed_same_bits_other_seed_same_space(torus_problem: Problem) -> No
     np.testing.assert_allclose(one.eigenvalues, other.eigenvalues, rtol=1e-10)
 
 
-def test_positions_change_only_the_work(torus_problem: Problem) -> None:
+def test_positions_change_only_the_work(torus_problem):
     stiffness, mass, positions = torus_problem
     with_positions = eigenpairs(stiffness, mass, 60, positions=positions)
     np.testing.assert_allclose(
@@ -272,7 +261,7 @@ def test_positions_change_only_the_work(torus_problem: Problem) -> None:
 
 
 @pytest.mark.parametrize("n_vertices", [4, 12])
-def test_tiny_meshes(n_vertices: int) -> None:
+def test_tiny_meshes(n_vertices):
     tetrahedron = trimesh.Trimesh(np.eye(4)[:, :3], [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
     problem = cotangent_problem(tetrahedron if n_vertices == 4 else trimesh.creation.icosahedron())
     spectrum = eigenpairs(*problem[:2], n_vertices - 2)
@@ -281,7 +270,7 @@ def test_tiny_meshes(n_vertices: int) -> None:
     assert_pairs(spectrum, problem)
 
 
-def test_flat_triangles_with_huge_cotangents() -> None:
+def test_flat_triangles_with_huge_cotangents():
     mesh = torus(jitter=0.0)
     squashed = np.random.default_rng(3).choice(len(mesh.faces), 40, replace=False)
     for a, b, c in mesh.faces[squashed]:
@@ -295,7 +284,7 @@ def test_flat_triangles_with_huge_cotangents() -> None:
     np.testing.assert_allclose(spectrum.eigenvalues, values[1:81], rtol=1e-7)
 
 
-def test_arpack_agrees(torus_problem: Problem) -> None:
+def test_arpack_agrees(torus_problem):
     stiffness, mass, positions = torus_problem
     one = eigenpairs(stiffness, mass, 80, positions=positions)
     arpack = Spectrum(
@@ -305,12 +294,7 @@ def test_arpack_agrees(torus_problem: Problem) -> None:
     assert_pairs(arpack, torus_problem)
 
 
-def test_a_missed_pair_is_noticed_by_inertia(
-    torus_problem: Problem,
-    torus_oracle: tuple[np.ndarray, np.ndarray],
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_missed_pair_is_noticed_by_inertia(torus_problem, torus_oracle, monkeypatch, caplog):
     """Hide the tenth pair twice: the solver must not return before it is back."""
     leading = krylov.RitzPairs.leading
     calls = []
@@ -333,9 +317,7 @@ def fail(*arguments: object) -> None:
     raise ConvergenceError("on purpose")
 
 
-def test_falls_back_to_arpack_with_a_warning(
-    torus_problem: Problem, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_falls_back_to_arpack_with_a_warning(torus_problem, monkeypatch, caplog):
     stiffness, mass, positions = torus_problem
     expected = eigenpairs(stiffness, mass, 30, positions=positions)
     monkeypatch.setattr(eigensolver, "lanczos", fail)
@@ -345,12 +327,7 @@ def test_falls_back_to_arpack_with_a_warning(
     assert "falling back to ARPACK: on purpose" in caplog.text
 
 
-def test_a_shift_below_the_spectrum_takes_over(
-    torus_problem: Problem,
-    torus_oracle: tuple[np.ndarray, np.ndarray],
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_shift_below_the_spectrum_takes_over(torus_problem, torus_oracle, monkeypatch, caplog):
     stiffness, mass, positions = torus_problem
     monkeypatch.setattr(lanczos, "_factorize_inside", fail)
     with caplog.at_level(logging.INFO):
@@ -361,13 +338,11 @@ def test_a_shift_below_the_spectrum_takes_over(
     assert "ARPACK" not in caplog.text
 
 
-def test_the_fallback_too_is_proved_complete(
-    torus_problem: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_fallback_too_is_proved_complete(torus_problem, monkeypatch):
     arpack = eigensolver._arpack
 
     def lossy(*arguments: object) -> tuple[np.ndarray, np.ndarray]:
-        values, functions = arpack(*arguments)  # type: ignore[arg-type]
+        values, functions = arpack(*arguments)
         return np.delete(values, 4), np.delete(functions, 4, axis=1)
 
     monkeypatch.setattr(eigensolver, "lanczos", fail)
@@ -376,9 +351,7 @@ def test_the_fallback_too_is_proved_complete(
         eigenpairs(*torus_problem[:2], 30)
 
 
-def test_wrong_pairs_are_not_returned(
-    torus_problem: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_pairs_are_not_returned(torus_problem, monkeypatch):
     stiffness, mass, _ = torus_problem
     values = np.arange(1.0, 11)
     vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(len(mass), 10)))[0]
@@ -392,7 +365,7 @@ def test_wrong_pairs_are_not_returned(
 
 
 @pytest.mark.parametrize("n_eigenpairs", [60, 300])  # Lanczos, and the dense solver
-def test_the_residual_is_that_of_the_worst_pair(n_eigenpairs: int, torus_problem: Problem) -> None:
+def test_the_residual_is_that_of_the_worst_pair(n_eigenpairs, torus_problem):
     stiffness, mass, positions = torus_problem
     spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions, tolerance=1e-4)
     values = spectrum.eigenvalues
@@ -406,9 +379,7 @@ def test_the_residual_is_that_of_the_worst_pair(n_eigenpairs: int, torus_problem
 @pytest.mark.parametrize(
     "pack", [sparse.diags_array, sparse.diags, lambda mass: sparse.csc_matrix(np.diag(mass))]
 )
-def test_mass_may_be_a_diagonal_matrix(
-    pack: Callable[[np.ndarray], Any], torus_problem: Problem
-) -> None:
+def test_mass_may_be_a_diagonal_matrix(pack, torus_problem):
     stiffness, mass, positions = torus_problem
     of_vector = eigenpairs(stiffness, mass, 20, positions=positions)
     of_matrix = eigenpairs(stiffness, pack(mass), 20, positions=positions)
@@ -416,7 +387,7 @@ def test_mass_may_be_a_diagonal_matrix(
     np.testing.assert_array_equal(of_matrix.mass, mass)
 
 
-def test_takes_the_matrices_of_other_libraries() -> None:
+def test_takes_the_matrices_of_other_libraries():
     """LaPy's and libigl's, as they give them; LaPy solves with them as the oracle."""
     mesh = torus(32, 16)
     vertices = np.array(mesh.vertices)
@@ -431,7 +402,7 @@ def test_takes_the_matrices_of_other_libraries() -> None:
 
 
 @pytest.mark.parametrize(("length", "usable"), [(400, True), (8000, False)])
-def test_rounding_excuses_only_a_small_residual(length: float, usable: bool) -> None:
+def test_rounding_excuses_only_a_small_residual(length, usable):
     """A needle's cotangents: what rounding allows grows with the square of its length, what is accepted does not."""
     needle = trimesh.creation.cylinder(0.2, length, sections=300)
     stiffness, mass = laplacian(Mesh(needle.vertices, needle.faces))
@@ -442,7 +413,7 @@ def test_rounding_excuses_only_a_small_residual(length: float, usable: bool) -> 
             eigenpairs(stiffness, mass, 50, tolerance=1e-6)
 
 
-def test_arguments_are_left_alone(torus_problem: Problem) -> None:
+def test_arguments_are_left_alone(torus_problem):
     stiffness, mass, positions = (array.copy() for array in torus_problem)
     spectrum = eigenpairs(stiffness, mass, 20, positions=positions)
     assert (stiffness != torus_problem[0]).nnz == 0
@@ -451,7 +422,7 @@ def test_arguments_are_left_alone(torus_problem: Problem) -> None:
     assert not np.shares_memory(spectrum.mass, mass)
 
 
-def test_two_components_are_counted_at_any_scale() -> None:
+def test_two_components_are_counted_at_any_scale():
     one = trimesh.creation.icosphere(subdivisions=2)
     two = trimesh.util.concatenate([one, one.copy().apply_translation([3, 0, 0])])
     for scale in (1e-6, 1, 1e6):
@@ -460,7 +431,7 @@ def test_two_components_are_counted_at_any_scale() -> None:
             eigenpairs(stiffness, mass * scale**2, 10)
 
 
-def test_components_tied_by_rounding_alone_are_counted() -> None:
+def test_components_tied_by_rounding_alone_are_counted():
     stiffness, mass, _ = cotangent_problem(trimesh.creation.icosphere(subdivisions=1))
     both = sparse.lil_array(sparse.block_diag([stiffness, stiffness]))
     both[0, len(mass)] = both[len(mass), 0] = -1e-17
@@ -468,7 +439,7 @@ def test_components_tied_by_rounding_alone_are_counted() -> None:
         eigenpairs(sparse.csr_array(both), np.r_[mass, mass], 10)
 
 
-def test_what_is_refused(torus_problem: Problem) -> None:
+def test_what_is_refused(torus_problem):
     stiffness, mass, positions = torus_problem
     n_vertices = len(mass)
 
@@ -482,7 +453,7 @@ def test_what_is_refused(torus_problem: Problem) -> None:
     with pytest.raises(ValueError, match="n_eigenpairs: expected at least 1, got 0"):
         eigenpairs(stiffness, mass, 0)
     with pytest.raises(ValueError, match=r"n_eigenpairs: expected a whole number, got 2\.5\."):
-        eigenpairs(stiffness, mass, 2.5)  # type: ignore[arg-type]
+        eigenpairs(stiffness, mass, 2.5)
     with pytest.raises(ValueError, match="Compute fewer eigenpairs"):
         eigenpairs(stiffness, mass, n_vertices - 1)
     with pytest.raises(ValueError, match="stiffness: expected finite entries"):
@@ -495,7 +466,7 @@ def test_what_is_refused(torus_problem: Problem) -> None:
     with pytest.raises(ValueError, match="sum to zero"):
         eigenpairs(stiffness + sparse.diags_array(mass), mass, 5)
     with pytest.raises(ValueError, match="scipy sparse"):
-        eigenpairs(stiffness.toarray(), mass, 5)  # type: ignore[arg-type]
+        eigenpairs(stiffness.toarray(), mass, 5)
     with pytest.raises(ValueError, match=r"expected \(V, V\) and \(V,\), got"):
         eigenpairs(stiffness, mass[1:], 5)
     with pytest.raises(ValueError, match="positions"):

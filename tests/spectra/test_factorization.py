@@ -91,7 +91,7 @@ def elimination_growth(factors: Factors) -> float:
 
 @pytest.mark.parametrize("shift", [-20.0, 0.37, 3.0])
 @pytest.mark.parametrize(("leaf_size", "with_places"), SPLITS)
-def test_solve_and_inertia_on_a_grid(shift: float, leaf_size: int, with_places: bool) -> None:
+def test_solve_and_inertia_on_a_grid(shift, leaf_size, with_places):
     matrix, places = grid_matrix(23)
     dense = matrix.toarray() - shift * np.eye(matrix.shape[0])
     right = np.random.default_rng(1).normal(size=(len(dense), 5))
@@ -109,9 +109,7 @@ def test_solve_and_inertia_on_a_grid(shift: float, leaf_size: int, with_places: 
 
 @pytest.mark.parametrize("shift", [-1.0, 300.0, 700.0, 1e4])
 @pytest.mark.parametrize(("leaf_size", "with_places"), SPLITS)
-def test_slivers_and_shifts_among_the_eigenvalues_cost_no_digits(
-    shift: float, leaf_size: int, with_places: bool
-) -> None:
+def test_slivers_and_shifts_among_the_eigenvalues_cost_no_digits(shift, leaf_size, with_places):
     """As the eigensolver uses it: eigenvalues from 0 to 10⁷, of which the shift has none to some hundred below it.
 
     One shift in about a hundred lies so close to an eigenvalue of a leading block that it does cost digits.
@@ -133,7 +131,7 @@ def test_slivers_and_shifts_among_the_eigenvalues_cost_no_digits(
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 60, 400])
-def test_solve_and_inertia_on_random_graphs(n: int) -> None:
+def test_solve_and_inertia_on_random_graphs(n):
     matrix = random_graph_matrix(n, seed=n)
     dense = matrix.toarray()
     factors = analyse(matrix, leaf_size=8).factorize(matrix)
@@ -144,7 +142,7 @@ def test_solve_and_inertia_on_random_graphs(n: int) -> None:
     assert factors.n_negative == (np.linalg.eigvalsh(dense) < 0).sum()
 
 
-def test_subtrees_solved_side_by_side() -> None:
+def test_subtrees_solved_side_by_side():
     """20,449 unknowns, four subtrees: the residual is as of one, and a team changes no bit."""
     matrix, places = grid_matrix(143)
     factors = analyse(matrix, places).factorize(matrix, -20.0)
@@ -158,7 +156,7 @@ def test_subtrees_solved_side_by_side() -> None:
 
 
 @pytest.mark.parametrize("at_once", [50, 256])
-def test_subtrees_eliminated_side_by_side(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_subtrees_eliminated_side_by_side(at_once, monkeypatch):
     """The five-point Laplacian of as large a grid, its inertia from its eigenvalues: a team changes no bit."""
     monkeypatch.setattr(multifrontal, "PIECE_SIZE", at_once)
     line = sparse.diags_array([[-1.0] * 142, [2.0] * 143, [-1.0] * 142], offsets=[-1, 0, 1])
@@ -183,7 +181,7 @@ def test_subtrees_eliminated_side_by_side(at_once: int, monkeypatch: pytest.Monk
             assert again.n_negative == structure.inertia(matrix, shift, team) == behind + 1
 
 
-def test_coinciding_places_are_allowed() -> None:
+def test_coinciding_places_are_allowed():
     matrix, _ = grid_matrix(12)
     factors = analyse(matrix, np.zeros((144, 3)), leaf_size=8).factorize(matrix, -20.0)
     right = np.random.default_rng(0).normal(size=(144, 1))
@@ -193,13 +191,13 @@ def test_coinciding_places_are_allowed() -> None:
     )
 
 
-def test_a_separator_keeps_blocks_small() -> None:
+def test_a_separator_keeps_blocks_small():
     """On an n × n grid the root needs about n unknowns; a cut through the wrong place would need many more."""
     matrix, places = grid_matrix(40)
     assert np.diff(analyse(matrix, places).structure.own_start)[-1] <= 1.5 * 40
 
 
-def test_one_dissection_serves_other_values() -> None:
+def test_one_dissection_serves_other_values():
     matrix, places = grid_matrix(15)
     structure = analyse(matrix, places)
     other = matrix.copy()
@@ -213,7 +211,7 @@ def test_one_dissection_serves_other_values() -> None:
         structure.factorize(grid_matrix(16)[0])
 
 
-def test_arguments_are_left_alone() -> None:
+def test_arguments_are_left_alone():
     matrix, places = grid_matrix(10)
     unsorted = sparse.csr_array(
         (matrix.data.copy(), matrix.indices.copy(), matrix.indptr.copy()), shape=matrix.shape
@@ -234,7 +232,7 @@ def test_arguments_are_left_alone() -> None:
     )
 
 
-def test_what_is_refused() -> None:
+def test_what_is_refused():
     matrix, places = grid_matrix(6)
     with pytest.raises(ValueError, match="got an asymmetric pattern"):
         analyse(sparse.csr_array(sparse.triu(matrix)), places)

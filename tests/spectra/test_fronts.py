@@ -22,7 +22,7 @@ def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:
 
 @pytest.mark.parametrize("n", [1, 2, 7, 8, 9, 26, 63, 120])
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_a_block_is_inverted_and_its_negative_eigenvalues_counted(n: int, share: float) -> None:
+def test_a_block_is_inverted_and_its_negative_eigenvalues_counted(n, share):
     rng = np.random.default_rng(n)
     vectors = np.linalg.qr(rng.normal(size=(n, n)))[0]
     eigenvalues = rng.uniform(1, 3, n) * np.where(np.arange(n) < share * n, -1, 1)
@@ -35,7 +35,7 @@ def test_a_block_is_inverted_and_its_negative_eigenvalues_counted(n: int, share:
         np.testing.assert_allclose(inverse, vectors / eigenvalues @ vectors.T, rtol=0, atol=1e-12)
 
 
-def test_most_indefinite_blocks_are_inverted() -> None:
+def test_most_indefinite_blocks_are_inverted():
     """Shifted Laplacians on a line against NumPy: at most 3 of 56 blocks are refused, and no result is wrong."""
     refused = 0
     for n in range(5, 61):
@@ -51,7 +51,7 @@ def test_most_indefinite_blocks_are_inverted() -> None:
 
 @pytest.mark.parametrize("n", [2, 3, 10, 19])
 @pytest.mark.parametrize("tiny", [0.0, 1e-9])
-def test_pivots_that_are_too_small_are_taken_last(n: int, tiny: float) -> None:
+def test_pivots_that_are_too_small_are_taken_last(n, tiny):
     """An arrow's: its tip, nearly 0, is the first of the pivots; backwards, it is the last."""
     matrix = np.diag(np.arange(1.0, n + 1))
     matrix[0, 1:] = matrix[1:, 0] = 1.0
@@ -62,7 +62,7 @@ def test_pivots_that_are_too_small_are_taken_last(n: int, tiny: float) -> None:
 
 
 @pytest.mark.parametrize("tiny", [0.0, 1e-9, np.nan])
-def test_a_block_with_small_pivots_at_both_ends_is_refused(tiny: float) -> None:
+def test_a_block_with_small_pivots_at_both_ends_is_refused(tiny):
     matrix = np.eye(6)
     matrix[:2, :2] = matrix[4:, 4:] = [[tiny, 1], [1, tiny]]
     assert invert(matrix)[0] == -1

@@ -38,7 +38,7 @@ def smallest_cut(graph: np.ndarray, places: np.ndarray, part: np.ndarray) -> int
 
 @pytest.mark.parametrize("leaf_size", [1, 5, 32, 5000])
 @pytest.mark.parametrize("n", [1, 2, 17, 300, 0])
-def test_every_separator_is_the_smallest_and_separates(n: int, leaf_size: int) -> None:
+def test_every_separator_is_the_smallest_and_separates(n, leaf_size):
     if n:
         graph = random_graph(n, seed=n)
         places = np.random.default_rng(n).integers(0, 9, (n, 2)).astype(float)

@@ -29,7 +29,7 @@ N_COLUMNS = 5003
 @pytest.mark.parametrize("keep", [True, False])
 @pytest.mark.parametrize("transposed", [True, False])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_product_in_tiles(shape: tuple[int, int, int], transposed: bool, keep: bool) -> None:
+def test_a_product_in_tiles(shape, transposed, keep):
     """Between other numbers, which stay as they are."""
     m, n, k = shape
     rng = np.random.default_rng(0)
@@ -54,7 +54,7 @@ def test_a_product_in_tiles(shape: tuple[int, int, int], transposed: bool, keep:
     np.testing.assert_allclose(out, expected, rtol=0, atol=1e-13)
 
 
-def test_a_product_of_whole_tiles_may_be_added_in_place() -> None:
+def test_a_product_of_whole_tiles_may_be_added_in_place():
     rng = np.random.default_rng(0)
     a = rng.normal(size=(5, 9))
     x = rng.normal(size=(5, 24))
@@ -72,9 +72,7 @@ def rows(n: int, seed: int) -> np.ndarray:
 @pytest.mark.usefixtures("either_processor")
 @pytest.mark.parametrize("piece", PIECES)
 @pytest.mark.parametrize("n_rows", N_ROWS)
-def test_overlaps_are_the_products_of_the_rows(
-    n_rows: tuple[int, int], piece: tuple[int, int]
-) -> None:
+def test_overlaps_are_the_products_of_the_rows(n_rows, piece):
     a = rows(n_rows[0], seed=0)
     b = rows(n_rows[1], seed=1)
     columns = slice(*piece)
@@ -85,9 +83,7 @@ def test_overlaps_are_the_products_of_the_rows(
 @pytest.mark.parametrize(("precision", "error"), [(np.float64, 1e-13), (np.float32, 1e-5)])
 @pytest.mark.parametrize("piece", PIECES)
 @pytest.mark.parametrize("n_rows", N_ROWS)
-def test_subtract_takes_the_product_from_a_piece(
-    n_rows: tuple[int, int], piece: tuple[int, int], precision: type, error: float
-) -> None:
+def test_subtract_takes_the_product_from_a_piece(n_rows, piece, precision, error):
     before = rows(n_rows[0], seed=0)
     others = rows(n_rows[1], seed=1).astype(precision)
     factors = np.random.default_rng(2).standard_normal(n_rows).astype(precision)
@@ -103,7 +99,7 @@ def test_subtract_takes_the_product_from_a_piece(
 
 
 @pytest.mark.usefixtures("either_processor")
-def test_subtraction_by_single_precision_factors_keeps_double_rows() -> None:
+def test_subtraction_by_single_precision_factors_keeps_double_rows():
     """A component of 1e-9 is removed from unit rows down to 1e-15, although the factors are rounded to single."""
     basis = np.linalg.qr(rows(20, seed=3).T)[0].T.copy()
     old = basis[:16]
@@ -128,8 +124,8 @@ def test_subtraction_by_single_precision_factors_keeps_double_rows() -> None:
     ],
 )
 def test_mkl_is_preferred_only_on_intel_processors_with_avx_512(
-    processor: str, has_avx512: bool, has_mkl: bool, expected: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    processor, has_avx512, has_mkl, expected, monkeypatch
+):
     monkeypatch.setattr(binding, "get_host_cpu_name", lambda: processor)
     monkeypatch.setattr(binding, "get_host_cpu_features", lambda: {"avx512f": has_avx512})
     monkeypatch.setattr(torch.backends.mkl, "is_available", lambda: has_mkl)

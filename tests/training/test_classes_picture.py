@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -13,9 +11,7 @@ from matplotlib.image import imread
 from training.shapes import GradedShapes
 
 
-def test_every_class_is_drawn_right_side_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_class_is_drawn_right_side_out(tmp_path, monkeypatch):
     shapes = GradedShapes(n_classes=5, n_bodies=1, n_poses=1, seed=1, n_vertices=(1500, 1500))
     made = list(shapes)
     is_mirrored = {bool(np.linalg.det(shape.motion) < 0) for shape in made}

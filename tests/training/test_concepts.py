@@ -83,9 +83,7 @@ def histogram(dataset: SignatureDataset, name: str) -> NDArray[np.float64]:
     return counts[:64] / len(distances)
 
 
-def test_pose_draws_the_histogram_of_every_mesh(
-    root: Path, tmp_path: Path, drawn: list[Figure], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pose_draws_the_histogram_of_every_mesh(root, tmp_path, drawn, capsys):
     out = tmp_path / "new" / "pose.png"
     cache = tmp_path / "cache"
     concepts.pose(root, ["egg", "ball"], out, CONFIG, cache)
@@ -115,9 +113,7 @@ def test_pose_draws_the_histogram_of_every_mesh(
     assert others > 3 * within
 
 
-def test_pose_draws_all_classes_by_default_and_refuses_unknown_ones(
-    root: Path, tmp_path: Path, drawn: list[Figure], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pose_draws_all_classes_by_default_and_refuses_unknown_ones(root, tmp_path, drawn, capsys):
     out = tmp_path / "pose.png"
     concepts.pose(root, None, out, CONFIG, tmp_path / "cache")
     # There is no distance within a class of one body.
@@ -127,9 +123,7 @@ def test_pose_draws_all_classes_by_default_and_refuses_unknown_ones(
         concepts.pose(root, ["egg", "hat"], out, CONFIG, tmp_path / "cache")
 
 
-def test_topology_measures_the_change_of_the_same_pairs(
-    open_ring: Path, tmp_path: Path, drawn: list[Figure], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_topology_measures_the_change_of_the_same_pairs(open_ring, tmp_path, drawn, capsys):
     out = tmp_path / "topology.png"
     concepts.topology(open_ring, None, out, n_eigenpairs=30, resolution=16)
     printed = capsys.readouterr().out
@@ -169,16 +163,14 @@ def test_topology_measures_the_change_of_the_same_pairs(
     assert imread(out).std() > 0.05
 
 
-def test_topology_welds_where_it_is_told(
-    open_ring: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_topology_welds_where_it_is_told(open_ring, tmp_path, capsys):
     concepts.topology(open_ring, (3, 357), tmp_path / "t.png", n_eigenpairs=10)
     assert "welded at vertices 3 and 357" in capsys.readouterr().out
     with pytest.raises(ValueError, match="b: expected a vertex index from 0 to 361"):
         concepts.topology(open_ring, (3, 400), tmp_path / "t.png", n_eigenpairs=10)
 
 
-def test_potential_is_least_in_the_middle(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_potential_is_least_in_the_middle(tmp_path, drawn):
     body = trimesh.creation.icosphere(subdivisions=3)
     body.vertices = body.vertices * [0.7, 2, 1] + [5, 6, 7]
     path = tmp_path / "egg.off"
@@ -213,7 +205,7 @@ def test_potential_is_least_in_the_middle(tmp_path: Path, drawn: list[Figure]) -
     assert imread(tmp_path / "potential.png").std() > 0.05
 
 
-def test_upright_turns_without_mirroring() -> None:
+def test_upright_turns_without_mirroring():
     points = np.random.default_rng(0).normal(size=(200, 3)) * [1, 4, 2]
     turned = concepts.upright(points)
     frame = np.linalg.lstsq(points, turned, rcond=None)[0]

@@ -34,7 +34,7 @@ def tried_one_by_one(vertices: np.ndarray, faces: np.ndarray) -> set[tuple[int, 
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_all_crossings_are_found(seed: int) -> None:
+def test_all_crossings_are_found(seed):
     g = np.random.default_rng(seed)
     vertices = g.normal(size=(90, 3))
     # Long and short triangles, some with common vertices.
@@ -45,7 +45,7 @@ def test_all_crossings_are_found(seed: int) -> None:
     assert found
 
 
-def test_two_balls() -> None:
+def test_two_balls():
     ball = trimesh.creation.icosphere(2)
     for gap, crossed in ((2.1, False), (1.5, True)):
         both = trimesh.util.concatenate([ball, ball.copy().apply_translation([gap, 0.013, 0.007])])

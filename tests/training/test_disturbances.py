@@ -1,7 +1,5 @@
 """Each disturbance does what it says, and leaves a checked body."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -13,7 +11,7 @@ from conftest import as_trimesh, horseshoe, surface_genus
 from igps.mesh.mesh import Mesh
 
 
-def test_noise_moves_along_the_normals(sphere: Mesh) -> None:
+def test_noise_moves_along_the_normals(sphere):
     noisy = noise(sphere, 0.01, seed=3)
     radius = np.linalg.norm(noisy.vertices, axis=1)
     np.testing.assert_allclose(noisy.vertices / radius[:, None], sphere.vertices, atol=1e-3)
@@ -25,13 +23,13 @@ def test_noise_moves_along_the_normals(sphere: Mesh) -> None:
         noise(sphere, 0)
 
 
-def test_simplified_keeps_the_share(sphere: Mesh) -> None:
+def test_simplified_keeps_the_share(sphere):
     assert len(simplified(sphere, 0.1).vertices) == 256
     with pytest.raises(ValueError, match="share"):
         simplified(sphere, 1.0)
 
 
-def test_remesh_gives_other_triangles_on_the_same_surface(sphere: Mesh) -> None:
+def test_remesh_gives_other_triangles_on_the_same_surface(sphere):
     other = remesh(sphere)
     assert surface_genus(other) == 0
     assert 0.98 * len(sphere.faces) <= len(other.faces) <= len(sphere.faces)
@@ -46,7 +44,7 @@ def test_remesh_gives_other_triangles_on_the_same_surface(sphere: Mesh) -> None:
     assert surface_genus(remesh(weld_gap(horseshoe()))) == 1
 
 
-def test_hole_is_one_patch_of_the_wanted_area(sphere: Mesh) -> None:
+def test_hole_is_one_patch_of_the_wanted_area(sphere):
     holed = hole(sphere, 0.05, seed=2)
     assert holed.allow_open
     assert 1 - holed.area / sphere.area == pytest.approx(0.05, abs=1 / len(sphere.faces))
@@ -63,7 +61,7 @@ def test_hole_is_one_patch_of_the_wanted_area(sphere: Mesh) -> None:
         hole(sphere, 0)
 
 
-def test_hole_does_not_cut_the_body_in_two() -> None:
+def test_hole_does_not_cut_the_body_in_two():
     mesh = horseshoe()
     # A Mesh of two pieces would have been refused
     whole = [hole(mesh, 0.3, seed=seed) for seed in range(8)]
@@ -73,7 +71,7 @@ def test_hole_does_not_cut_the_body_in_two() -> None:
     assert (lost < 0.2).any()
 
 
-def test_clip_takes_a_cap_off_a_ball(sphere: Mesh) -> None:
+def test_clip_takes_a_cap_off_a_ball(sphere):
     turned = move(sphere)
     cut = clip(turned, 0.1)
     assert surface_genus(cut) == 0
@@ -90,7 +88,7 @@ def test_clip_takes_a_cap_off_a_ball(sphere: Mesh) -> None:
     )
 
 
-def test_clip_keeps_the_largest_piece() -> None:
+def test_clip_keeps_the_largest_piece():
     ring = horseshoe(0.4)
     x, y, _ = ring.vertices.T
     # Its bend far away from its ends, of which one is thicker.
@@ -106,7 +104,7 @@ def test_clip_keeps_the_largest_piece() -> None:
         clip(mesh, 0)
 
 
-def test_scale_and_motion_keep_the_form(blob: Mesh) -> None:
+def test_scale_and_motion_keep_the_form(blob):
     larger = scale(blob, 7)
     moved = move(blob, seed=1)
     np.testing.assert_allclose(larger.vertices, 7 * blob.vertices)
@@ -124,7 +122,7 @@ def test_scale_and_motion_keep_the_form(blob: Mesh) -> None:
 
 
 @pytest.mark.parametrize("name", DISTURBANCES)
-def test_every_disturbance_says_what_it_did(name: str) -> None:
+def test_every_disturbance_says_what_it_did(name):
     mesh = horseshoe()
     before = mesh.vertices.copy(), mesh.faces.copy()
     disturbed = DISTURBANCES[name].apply(mesh)

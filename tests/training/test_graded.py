@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
@@ -62,7 +61,7 @@ def made(shapes: GradedShapes) -> list[GradedShape]:
     return list(shapes)
 
 
-def test_every_family_gives_bodies_and_poses(poses: dict[str, Pose]) -> None:
+def test_every_family_gives_bodies_and_poses(poses):
     assert set(poses) == set(TEMPLATES) | set(KINDS)
     for kind, pose in poses.items():
         surface = trimesh.Trimesh(pose.bent, pose.faces, process=False)
@@ -72,7 +71,7 @@ def test_every_family_gives_bodies_and_poses(poses: dict[str, Pose]) -> None:
         assert surface.body_count == 1, kind
 
 
-def test_a_pose_is_nearly_isometric_to_the_surface_at_rest(poses: dict[str, Pose]) -> None:
+def test_a_pose_is_nearly_isometric_to_the_surface_at_rest(poses):
     area = []
     volume = []
     for pose in poses.values():
@@ -85,7 +84,7 @@ def test_a_pose_is_nearly_isometric_to_the_surface_at_rest(poses: dict[str, Pose
     assert max(volume) < 0.06
 
 
-def test_animals_bend_and_things_do_not(poses: dict[str, Pose]) -> None:
+def test_animals_bend_and_things_do_not(poses):
     """The greatest change of a distance between two vertices, over the body's extent."""
 
     def change(pose: Pose) -> float:
@@ -101,7 +100,7 @@ def test_animals_bend_and_things_do_not(poses: dict[str, Pose]) -> None:
     assert np.median([change(poses[kind]) for kind in BENDING]) > 0.15
 
 
-def test_every_sheet_has_the_holes_that_its_name_tells() -> None:
+def test_every_sheet_has_the_holes_that_its_name_tells():
     """Of every outline, also of those whose middle is a disc; each hole is a handle."""
     for outline in SHEETS:
         without, *others = (sheet(np.random.default_rng(3), outline, n).genus for n in (0, 1, 2, 4))
@@ -116,7 +115,7 @@ def test_every_sheet_has_the_holes_that_its_name_tells() -> None:
         draw_body(CLASSES[i], [0, i], [1, i])  # its surface has that genus, or there is none
 
 
-def test_a_body_that_cannot_be_made_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_body_that_cannot_be_made_is_tried_once(monkeypatch):
     tried = []
 
     def impossible(*arguments: object) -> NoReturn:
@@ -134,7 +133,7 @@ def test_a_body_that_cannot_be_made_is_tried_once(monkeypatch: pytest.MonkeyPatc
     assert len(tried) == 2
 
 
-def test_shapes_are_read_without_mending(made: list[GradedShape], tmp_path: Path) -> None:
+def test_shapes_are_read_without_mending(made, tmp_path):
     for shape in made:
         path = tmp_path / "shape.off"
         path.write_text(off_text(shape.vertices, shape.faces))
@@ -144,7 +143,7 @@ def test_shapes_are_read_without_mending(made: list[GradedShape], tmp_path: Path
         assert 0.66 * N_VERTICES[0] <= len(shape.vertices) <= 1.34 * N_VERTICES[1]
 
 
-def test_poses_differ_in_triangles_and_bodies_in_compactness(made: list[GradedShape]) -> None:
+def test_poses_differ_in_triangles_and_bodies_in_compactness(made):
     """Area^1.5 over volume does not change with motion, scale or bending, and does with the body."""
     assert len({len(shape.vertices) for shape in made}) > 12
     compactness: dict[str, list[float]] = {}
@@ -163,7 +162,7 @@ def test_poses_differ_in_triangles_and_bodies_in_compactness(made: list[GradedSh
     assert max(between) > 0.1
 
 
-def test_same_seed_same_arrays_other_seed_others(made: list[GradedShape]) -> None:
+def test_same_seed_same_arrays_other_seed_others(made):
     """A shape depends neither on those made before nor on how many classes, bodies and poses there are."""
     for index, shape in ((17, made[17]), (4, made[4])):
         body_class, rest = divmod(index, 6)
@@ -179,7 +178,7 @@ def test_same_seed_same_arrays_other_seed_others(made: list[GradedShape]) -> Non
     )
 
 
-def test_both_levels_are_labels(shapes: GradedShapes, made: list[GradedShape]) -> None:
+def test_both_levels_are_labels(shapes, made):
     assert len(shapes) == len(made) == 18
     assert shapes.names[:4] == ["biped/00/00", "biped/00/01", "biped/00/02", "biped/01/00"]
     assert (
@@ -193,7 +192,7 @@ def test_both_levels_are_labels(shapes: GradedShapes, made: list[GradedShape]) -
         shapes[18]
 
 
-def test_the_look_alikes_can_be_left_out() -> None:
+def test_the_look_alikes_can_be_left_out():
     assert set(LOOK_ALIKE_TEMPLATES) == set(TEMPLATES)
     assert set(LOOK_ALIKE_FAMILIES) < set(KINDS)
     with_them = GradedShapes(200)
@@ -207,7 +206,7 @@ def test_the_look_alikes_can_be_left_out() -> None:
     assert GradedShapes(30).class_names == with_them.class_names[:30]
 
 
-def test_the_other_generator_is_as_it_was() -> None:
+def test_the_other_generator_is_as_it_was():
     """Tests and figures rest on its shapes: sums of coordinates as they were at first."""
     shapes = ArticulatedShapes(n_classes=12, n_per_class=2)
     found = [(len(shapes[i].vertices), len(shapes[i].faces)) for i in (0, 13)]
@@ -215,7 +214,7 @@ def test_the_other_generator_is_as_it_was() -> None:
     assert np.abs(shapes[0].vertices).sum() == pytest.approx(SUM, rel=1e-9)
 
 
-def test_write_makes_folders_of_classes_and_bodies(tmp_path: Path) -> None:
+def test_write_makes_folders_of_classes_and_bodies(tmp_path):
     shapes = GradedShapes(1, 2, 2, seed=4, n_vertices=(1600, 2000))
     shapes.write(tmp_path, n_workers=2)
     files = find_bodies(tmp_path)
@@ -244,7 +243,7 @@ def test_write_makes_folders_of_classes_and_bodies(tmp_path: Path) -> None:
         GradedShapes(1, 2, 2, seed=5, n_vertices=(1600, 2000)).write(tmp_path)
 
 
-def test_it_travels_to_other_processes(shapes: GradedShapes, made: list[GradedShape]) -> None:
+def test_it_travels_to_other_processes(shapes, made):
     again = pickle.loads(pickle.dumps(shapes))
     assert repr(again) == repr(shapes)
     np.testing.assert_array_equal(again[7].vertices, made[7].vertices)
@@ -262,9 +261,9 @@ def test_it_travels_to_other_processes(shapes: GradedShapes, made: list[GradedSh
         {"n_classes": 100_000},
     ],
 )
-def test_arguments_out_of_range_are_named(arguments: dict[str, int]) -> None:
+def test_arguments_out_of_range_are_named(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
-        GradedShapes(**arguments)  # type: ignore[arg-type]
+        GradedShapes(**arguments)
 
 
 def counted_volume(solid: Plate | Helix) -> float:
@@ -279,7 +278,7 @@ def counted_volume(solid: Plate | Helix) -> float:
     return float(np.prod(high - low) * inside.mean())
 
 
-def test_a_plate_has_its_volume() -> None:
+def test_a_plate_has_its_volume():
     """A stadium with a round hole; the rounded rim takes off little."""
     plate = Plate(((-0.5, 0.0, 0.5, 0.0, 0.4, 0.4),), ((0.2, 0.0, 0.2),), 0.2)
     area = 0.8 + np.pi * 0.4**2 - np.pi * 0.2**2
@@ -287,7 +286,7 @@ def test_a_plate_has_its_volume() -> None:
     assert 0.94 * area * 0.2 < counted_volume(plate) < area * 0.2
 
 
-def test_a_helix_has_its_volume() -> None:
+def test_a_helix_has_its_volume():
     """By Pappus: the cross-section times the length of the wire, and half a ball at either end."""
     helix = Helix(0.5, 0.4, 2.5, 0.12)
     length = 2.5 * np.hypot(2 * np.pi * 0.5, 0.4)
@@ -296,7 +295,7 @@ def test_a_helix_has_its_volume() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_genus_of_outlines_and_machine_parts_is_at_least_that_of_their_holes(seed: int) -> None:
+def test_genus_of_outlines_and_machine_parts_is_at_least_that_of_their_holes(seed):
     for position, outline in enumerate(SHEETS):
         skeleton = sheet(np.random.default_rng([seed, position]), outline, position % 3)
         assert skeleton.genus >= position % 3

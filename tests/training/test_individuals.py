@@ -16,9 +16,7 @@ def shapes() -> GradedShapes:
     return GradedShapes(2, 1, 2, seed=3, n_vertices=(1500, 1800), n_individuals=N_INDIVIDUALS)
 
 
-def test_individuals_are_changed_by_a_hundredth_to_a_twentieth_of_the_root_of_the_area(
-    shapes: GradedShapes,
-) -> None:
+def test_individuals_are_changed_by_a_hundredth_to_a_twentieth_of_the_root_of_the_area(shapes):
     """On a grid of their own; and no motion and scale, found by trimesh, takes the change back."""
     for number in range(2):
         body = shapes._body(number, 0)
@@ -42,7 +40,7 @@ def test_individuals_are_changed_by_a_hundredth_to_a_twentieth_of_the_root_of_th
         assert max(between) < 2.1 * SHARES[1]
 
 
-def test_poses_of_individuals_are_bodies_that_names_tell_apart(shapes: GradedShapes) -> None:
+def test_poses_of_individuals_are_bodies_that_names_tell_apart(shapes):
     assert len(shapes) == 2 * N_INDIVIDUALS * 2 == len(set(shapes.names)) == len(shapes.labels)
     for index in (0, 3, 11):
         made = shapes[index]
@@ -62,7 +60,7 @@ def test_poses_of_individuals_are_bodies_that_names_tell_apart(shapes: GradedSha
     assert np.array_equal(shapes[5].vertices, more.vertices)
 
 
-def test_without_individuals_names_are_class_body_and_pose() -> None:
+def test_without_individuals_names_are_class_body_and_pose():
     plain = GradedShapes(1, 1, 1, seed=3, n_vertices=(1500, 1800))
     assert plain.names == [f"{plain.class_names[0]}/00/00"]
     assert individual_of(plain.names[0]) == body_of(plain.names[0]) == f"{plain.class_names[0]}/00"

@@ -1,7 +1,5 @@
 """The study of where a signal lies: what is known of its bodies and values."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -12,7 +10,7 @@ from training.shapes.bodies import Pose
 from igps.analysis.inside import column_names
 
 
-def test_points_of_a_moved_body_are_moved_back() -> None:
+def test_points_of_a_moved_body_are_moved_back():
     ball = trimesh.creation.icosphere(subdivisions=2)
     turn = Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix()
     bent = ball.vertices @ turn.T + [1.0, 2.0, 3.0]
@@ -22,7 +20,7 @@ def test_points_of_a_moved_body_are_moved_back() -> None:
     np.testing.assert_allclose(found, points, atol=1e-9)
 
 
-def test_values_of_all_bodies_have_the_same_histogram() -> None:
+def test_values_of_all_bodies_have_the_same_histogram():
     random = np.random.default_rng(0)
     first = random.normal(size=300)
     second = random.gamma(1.0, size=300) * 1000
@@ -31,14 +29,14 @@ def test_values_of_all_bodies_have_the_same_histogram() -> None:
     np.testing.assert_array_equal(values.argsort(), first.argsort())
 
 
-def test_the_share_of_neighbours_is_counted_among_other_rows() -> None:
+def test_the_share_of_neighbours_is_counted_among_other_rows():
     rows = np.array([[0.0, 5], [0.1, 5], [1.0, 5], [1.1, 5]])
     assert nearest_share(rows, ["a", "a", "b", "b"]) == 1
     assert nearest_share(rows, ["a", "b", "b", "b"]) == 0.5
 
 
 @pytest.mark.parametrize("shift", [0.0, 3.0])
-def test_groups_are_told_apart_only_if_they_differ(shift: float) -> None:
+def test_groups_are_told_apart_only_if_they_differ(shift):
     rows = np.random.default_rng(1).normal(size=(24, len(column_names(["x"]))))
     rows[12:] += shift
     assert rejections(rows, 12, 0, has_numbers=True) == [bool(shift)] * 4

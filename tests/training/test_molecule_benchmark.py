@@ -32,7 +32,7 @@ def chain(seed: int, n: int = 70) -> Molecule:
 CHAINS = [chain(seed) for seed in range(6)]
 
 
-def test_families_share_folds_and_compositions_cross_them() -> None:
+def test_families_share_folds_and_compositions_cross_them():
     made, folds = program.families(CHAINS, 0)
     assert folds == [fold for fold in range(6) for _ in program.CHANGES]
     by_fold = retrieval_scores(program.fold_distances(made), folds).mean()
@@ -41,14 +41,14 @@ def test_families_share_folds_and_compositions_cross_them() -> None:
     assert by_composition["ft"] < 0.2
 
 
-def test_threading_changes_the_residues_and_not_the_fold() -> None:
+def test_threading_changes_the_residues_and_not_the_fold():
     generator = np.random.default_rng(0)
     made = program.threaded(CHAINS[0], np.full(20, 0.05), generator)
     assert len(set(made.residue_names)) > 10
     assert float(program.fold_distances([CHAINS[0], made])[0, 1]) == 0
 
 
-def test_a_bent_chain_keeps_the_distances_within_its_halves() -> None:
+def test_a_bent_chain_keeps_the_distances_within_its_halves():
     generator = np.random.default_rng(0)
     bent = program.bent_chain(CHAINS[1], 40, generator)
     before = torch.cdist(*[torch.tensor(CHAINS[1].residue_positions)] * 2)
@@ -59,7 +59,7 @@ def test_a_bent_chain_keeps_the_distances_within_its_halves() -> None:
     assert float((after - before).abs().max()) > 1
 
 
-def test_an_elastic_network_resists_all_but_rigid_motions() -> None:
+def test_an_elastic_network_resists_all_but_rigid_motions():
     positions = CHAINS[2].residue_positions
     stiffness = program.elastic_network(positions).toarray()
     turning = np.cross([0.3, -0.2, 0.5], positions).ravel()
@@ -70,7 +70,7 @@ def test_an_elastic_network_resists_all_but_rigid_motions() -> None:
     assert values[6] > 1e-4
 
 
-def test_deformed_and_permuted_chains_move_as_far_as_told() -> None:
+def test_deformed_and_permuted_chains_move_as_far_as_told():
     generator = np.random.default_rng(0)
     moved = program.deformed(CHAINS[3], generator).residue_positions
     shift = np.sqrt(((moved - CHAINS[3].residue_positions) ** 2).sum(axis=1).mean())

@@ -1,9 +1,5 @@
 """Movements of descriptions, against distances worked out by hand."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -27,9 +23,7 @@ from own_descriptors import Root, root_area, write_egg
 ROOT = "own_descriptors:Root"
 
 
-def test_the_table_holds_mean_movements_over_the_distance_between_classes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_table_holds_mean_movements_over_the_distance_between_classes(tmp_path, capsys):
     meshes = [write_egg(tmp_path / f"{height}.off", height) for height in (1.0, 1.5, 3.0)]
     low = [root_area(write_egg(tmp_path / f"gallery/low/{x}.off", x, 2)) for x in (1.0, 1.3)]
     high = [root_area(write_egg(tmp_path / f"gallery/high/{x}.off", x, 2)) for x in (2.0, 2.4)]
@@ -59,7 +53,7 @@ def test_the_table_holds_mean_movements_over_the_distance_between_classes(
         assert f"  {column}: {disturbance.description}" in rest
 
 
-def test_real_descriptors_on_a_body_with_a_gap(tmp_path: Path) -> None:
+def test_real_descriptors_on_a_body_with_a_gap(tmp_path):
     ring = horseshoe(0.06)
     path = tmp_path / "ring.off"
     trimesh.Trimesh(ring.vertices, ring.faces, process=False).export(path)
@@ -91,7 +85,7 @@ def test_real_descriptors_on_a_body_with_a_gap(tmp_path: Path) -> None:
             assert found[descriptor.name][column] == pytest.approx([expected], rel=0.02)
 
 
-def test_a_gallery_of_one_class_is_refused(tmp_path: Path) -> None:
+def test_a_gallery_of_one_class_is_refused(tmp_path):
     for height in (1.0, 2.0):
         write_egg(tmp_path / f"gallery/one/{height}.off", height, 2)
     with pytest.raises(ValueError, match=r"gallery: expected two classes in .*, got one"):

@@ -75,8 +75,8 @@ def checkpoint(out: Path, name: str = "last") -> dict[str, Any]:
 
 
 def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    root, tmp_path, monkeypatch
+):
     run(settings(root, tmp_path / "whole"))
     step = RetrievalLearner.training_step
 
@@ -116,7 +116,7 @@ def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(
     assert (tmp_path / "whole" / "config.yaml").is_file()
 
 
-def test_training_stops_when_validation_no_longer_improves(root: Path, tmp_path: Path) -> None:
+def test_training_stops_when_validation_no_longer_improves(root, tmp_path):
     values = settings(root, tmp_path / "still", epochs=30)
     # Nothing is learned at a rate of 0, so that no validation is better than the first.
     values["model"] |= {"learning_rate": 0.0, "bin_rate": 0.0}
@@ -127,12 +127,12 @@ def test_training_stops_when_validation_no_longer_improves(root: Path, tmp_path:
     assert checkpoint(tmp_path / "still", "best")["epoch"] == 0
 
 
-def test_a_missing_checkpoint_to_resume_is_named(root: Path, tmp_path: Path) -> None:
+def test_a_missing_checkpoint_to_resume_is_named(root, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"resume: .*last\.ckpt"):
         run(settings(root, tmp_path / "none"), "--resume", "true")
 
 
-def test_a_checkpoint_is_scored_as_by_the_librarys_parts(root: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_is_scored_as_by_the_librarys_parts(root, tmp_path):
     """From a folder to a checkpoint to its scores, in processes of their own."""
     out = tmp_path / "out"
     file = tmp_path / "values.yaml"
@@ -187,12 +187,8 @@ def run_apart(module: str, *arguments: object) -> str:
     ],
 )
 def test_a_file_that_is_no_checkpoint_is_named_in_one_sentence(
-    name: str,
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    name, message, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.ckpt").write_text("words")
     monkeypatch.setattr(sys, "argv", ["evaluate", name])

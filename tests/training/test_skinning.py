@@ -33,7 +33,7 @@ def scalar_first(rotation: Rotation) -> Array:
     return rotation.as_quat()[..., [3, 0, 1, 2]]
 
 
-def test_products_are_those_of_rotations() -> None:
+def test_products_are_those_of_rotations():
     a = Rotation.random(20, rng=1)
     b = Rotation.random(20, rng=2)
     found = product(scalar_first(a), scalar_first(b))
@@ -42,14 +42,14 @@ def test_products_are_those_of_rotations() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-14)
 
 
-def test_a_motion_turns_and_then_moves() -> None:
+def test_a_motion_turns_and_then_moves():
     turns = Rotation.random(50, rng=3)
     steps = g.normal(size=(50, 3))
     found = transform(motion(scalar_first(turns), steps), POINTS)
     np.testing.assert_allclose(found, turns.apply(POINTS) + steps, atol=1e-13)
 
 
-def test_a_turn_about_a_point_leaves_it_where_it_is() -> None:
+def test_a_turn_about_a_point_leaves_it_where_it_is():
     vectors = g.normal(size=(50, 3))
     centres = g.normal(size=(50, 3))
     turns = rotations_about(centres, vectors)
@@ -60,7 +60,7 @@ def test_a_turn_about_a_point_leaves_it_where_it_is() -> None:
     np.testing.assert_allclose(transform(still, POINTS), POINTS, atol=1e-15)
 
 
-def test_one_motion_after_another() -> None:
+def test_one_motion_after_another():
     first, second = (
         rotations_about(g.normal(size=(50, 3)), g.normal(size=(50, 3))) for _ in range(2)
     )
@@ -71,7 +71,7 @@ def test_one_motion_after_another() -> None:
     )
 
 
-def test_a_blend_is_rigid_and_half_way_between() -> None:
+def test_a_blend_is_rigid_and_half_way_between():
     """Of a rotation and no motion about the same point: half the angle."""
     axis = np.array([0.0, 0.0, 1.0])
     centre = np.array([1.0, 2.0, 3.0])
@@ -118,7 +118,7 @@ def bent_bar(turns: Array) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
     return bar, trimesh.Trimesh(vertices, bar.faces, process=False)
 
 
-def test_one_element_that_turns_carries_everything_rigidly() -> None:
+def test_one_element_that_turns_carries_everything_rigidly():
     turns = np.zeros((61, 3))
     turns[0] = (0.3, -1.1, 0.4)
     bar, moved_bar = bent_bar(turns)
@@ -128,7 +128,7 @@ def test_one_element_that_turns_carries_everything_rigidly() -> None:
 
 
 @pytest.mark.parametrize("degrees", [60.0, 130.0])
-def test_a_bent_bar_is_a_piece_of_a_torus(degrees: float) -> None:
+def test_a_bent_bar_is_a_piece_of_a_torus(degrees):
     """Bent evenly by an angle: area and volume stay (Pappus), and the far end is turned by that angle."""
     turns = np.zeros((61, 3))
     turns[1:60, 0] = np.radians(degrees) / 59
@@ -142,7 +142,7 @@ def test_a_bent_bar_is_a_piece_of_a_torus(degrees: float) -> None:
     np.testing.assert_allclose(end, turned.apply(flat), atol=1e-9)
 
 
-def test_a_hinge_keeps_lengths_near_both_bones() -> None:
+def test_a_hinge_keeps_lengths_near_both_bones():
     """Two bones and weights that go over between them: away from the joint every edge keeps its length."""
     bar = cylinder(3.0, 0.2)
     z = bar.vertices[:, 2]
@@ -169,7 +169,7 @@ def test_a_hinge_keeps_lengths_near_both_bones() -> None:
     np.testing.assert_allclose(bent[top], expected, atol=1e-12)
 
 
-def test_weights_are_shares_and_follow_the_nearest_rod() -> None:
+def test_weights_are_shares_and_follow_the_nearest_rod():
     arm = limb("arm", [0.6, 0.6], [0.15, 0.13, 0.12], [(20, 10), (25, 0)])
     hub: Solid = Blob((0.4, 0.4, 0.4))
     skeleton = Skeleton(
@@ -202,7 +202,7 @@ def test_weights_are_shares_and_follow_the_nearest_rod() -> None:
     assert np.abs(np.diff(mean)).max() < 0.15
 
 
-def test_trunks_bend_and_frames_do_not() -> None:
+def test_trunks_bend_and_frames_do_not():
     """A wheel without limbs has no joint at all; the trunk of a four-legged animal is a rod, its legs too."""
     wheel = KINDS["wheel"].build(np.random.default_rng(0), 4, 3, "none", "plain")
     assert all(len(rod.arc_lengths) == 1 for rod in limb_rig(bones_at_rest(wheel, {})).rods)

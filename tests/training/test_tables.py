@@ -1,9 +1,6 @@
 """The tables of the pages are those of the files of results, and these are of today's signatures."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pytest
 from docs.benchmarks import tables
@@ -15,24 +12,24 @@ SHOWN = [(page, name) for page, text in sorted(PAGES.items()) for name in tables
 
 
 @pytest.mark.parametrize(("page", "name"), SHOWN)
-def test_a_table_is_of_the_signatures_of_today(page: str, name: str) -> None:
+def test_a_table_is_of_the_signatures_of_today(page, name):
     assert tables.load_results(name)["signatures"] == SignatureConfig.ALGORITHM_VERSION, (
         f"{page}: measure {name} again"
     )
 
 
 @pytest.mark.parametrize("page", sorted({page for page, _ in SHOWN}))
-def test_a_page_shows_what_was_measured(page: str) -> None:
+def test_a_page_shows_what_was_measured(page):
     assert tables.with_tables(PAGES[page]) == PAGES[page], (
         "write it by python -m docs.benchmarks.tables"
     )
 
 
-def test_every_result_is_shown() -> None:
+def test_every_result_is_shown():
     assert {path.stem for path in tables.RESULTS.glob("*.json")} == {name for _, name in SHOWN}
 
 
-def test_results_become_a_table_of_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_become_a_table_of_a_page(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "PAGES", tmp_path)
     monkeypatch.setattr(tables, "RESULTS", tmp_path / "results")
     page = tmp_path / "page.md"

@@ -20,7 +20,7 @@ from training.shapes.benchmark import GradedShape, body_of
 from training.train import CONFIG
 
 import igps
-from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
+from igps.data.splits import Split, split_seen, split_unseen
 from igps.descriptors.pretrained.descriptor import pretrained
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
@@ -70,9 +70,7 @@ def expected_scores(
 
 
 @pytest.mark.parametrize(("name", "protocol"), [("interior", "unseen"), ("rich", "seen")])
-def test_splits_are_scored_as_by_the_librarys_parts(
-    root: Path, name: str, protocol: SplitProtocol, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_splits_are_scored_as_by_the_librarys_parts(root, name, protocol, capsys):
     n_train = 3 if protocol == "seen" else 2
     seeds = (100, 101)
     learning.splits(root / "meshes", name, protocol, n_train, seeds, root / "cache")
@@ -102,7 +100,7 @@ def test_splits_are_scored_as_by_the_librarys_parts(
     assert any(of_split["none"] != of_split["whitened"] for of_split in expected)
 
 
-def test_a_metric_is_the_prior_of_the_heads(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_metric_is_the_prior_of_the_heads(root, capsys):
     learning.splits(root / "meshes", "pretrained", "unseen", 2, [100], root / "cache")
     printed = scores_by_row(capsys.readouterr().out)
     assert list(printed) == ["none", "prior", "whitened", "kernel"]
@@ -143,12 +141,7 @@ class QuickShapes(GradedShapes):
         return GradedShape(vertices, shape.faces, label, body_of(name), name, 0, np.eye(3), ())
 
 
-def test_pretraining_saves_a_metric_and_measures_it(
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_pretraining_saves_a_metric_and_measures_it(root, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pretrain, "GradedShapes", QuickShapes)
     out = tmp_path / "metric.safetensors"
     shipped = yaml.safe_load((CONFIG.parent / "pretrain.yaml").read_text())

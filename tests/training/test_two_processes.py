@@ -63,7 +63,7 @@ def trainer(n_processes: int, root: Path) -> Trainer:
     )
 
 
-def in_two_processes(work):  # type: ignore[no-untyped-def]
+def in_two_processes(work):
     """The result of what starts two processes; the test is skipped where no process can be started."""
     try:
         return work()
@@ -71,9 +71,7 @@ def in_two_processes(work):  # type: ignore[no-untyped-def]
         pytest.skip(f"no two processes here: {error}")
 
 
-def test_scores_on_two_processes_are_those_on_one(
-    module: SignatureDataModule, tmp_path: Path
-) -> None:
+def test_scores_on_two_processes_are_those_on_one(module, tmp_path):
     seed_everything(3, verbose=False)
     bins = PairHistogram(
         [Potential(2, learnable=True), InteriorDistance(16, learnable=True)], SpectralEmbedding()

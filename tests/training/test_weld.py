@@ -40,7 +40,7 @@ def paths(mesh: Mesh) -> NDArray[np.float64]:
     return shortest_path(graph.tocsr(), directed=False)
 
 
-def test_weld_adds_a_handle_and_nothing_else() -> None:
+def test_weld_adds_a_handle_and_nothing_else():
     mesh = horseshoe()
     # the middles of the two ends
     a = len(mesh.vertices) - 2
@@ -66,7 +66,7 @@ def test_weld_adds_a_handle_and_nothing_else() -> None:
     assert paths(welded)[a, b] < 5 * np.linalg.norm(mesh.vertices[a] - mesh.vertices[b])
 
 
-def test_weld_takes_the_shortest_tube() -> None:
+def test_weld_takes_the_shortest_tube():
     mesh = horseshoe(0.15)
     a = 3
     b = len(mesh.vertices) - 10
@@ -84,7 +84,7 @@ def test_weld_takes_the_shortest_tube() -> None:
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum() == pytest.approx(min(lengths))
 
 
-def test_weld_refuses_what_cannot_be_welded(sphere: Mesh) -> None:
+def test_weld_refuses_what_cannot_be_welded(sphere):
     for pair in ((0, len(sphere.vertices)), (-1, 5)):
         with pytest.raises(ValueError, match="expected a vertex index from 0 to 2561"):
             weld(sphere, *pair)
@@ -103,9 +103,7 @@ def test_weld_refuses_what_cannot_be_welded(sphere: Mesh) -> None:
     ],
     ids=["narrow", "wide", "crease"],
 )
-def test_facing_vertices_are_the_best_of_all_pairs(
-    mesh: Mesh, largest_gap: float, least_path: float | None
-) -> None:
+def test_facing_vertices_are_the_best_of_all_pairs(mesh, largest_gap, least_path):
     a, b = facing_vertices(mesh)
     normals = as_trimesh(mesh)
     areas = normals.face_normals * normals.area_faces[:, None]
@@ -130,7 +128,7 @@ def test_facing_vertices_are_the_best_of_all_pairs(
     assert value[a, b] == pytest.approx(value[allowed].max())
 
 
-def test_search_lists_every_facing_pair_once_and_best_first() -> None:
+def test_search_lists_every_facing_pair_once_and_best_first():
     mesh = horseshoe(0.2, n_sections=30, n_around=8)
     largest_gap = 0.3 * mesh.diagonal
     unit = vertex_normals(mesh.vertices, mesh.faces)
@@ -152,7 +150,7 @@ def test_search_lists_every_facing_pair_once_and_best_first() -> None:
         assert (np.diff(values) <= 1e-12).all()
 
 
-def test_narrow_gaps_come_before_wide_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_narrow_gaps_come_before_wide_ones(monkeypatch):
     mesh = horseshoe()
     asked = []
 
@@ -168,7 +166,7 @@ def test_narrow_gaps_come_before_wide_ones(monkeypatch: pytest.MonkeyPatch) -> N
     assert asked == [(1 / 64, 1 / 4), (1 / 32, 1 / 4), (1 / 16, 1 / 4), (1 / 16, None)]
 
 
-def test_gap_must_be_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gap_must_be_outside(monkeypatch):
     mesh = horseshoe()
     search = weld_module._GapSearch(mesh)
     ends = len(mesh.vertices) - 2, len(mesh.vertices) - 1
@@ -180,12 +178,12 @@ def test_gap_must_be_outside(monkeypatch: pytest.MonkeyPatch) -> None:
         facing_vertices(mesh)
 
 
-def test_convex_body_has_no_gap(sphere: Mesh) -> None:
+def test_convex_body_has_no_gap(sphere):
     with pytest.raises(MeshError, match="no two places face each other"):
         weld_gap(sphere)
 
 
-def test_homer_is_welded_at_the_feet(homer: Mesh) -> None:
+def test_homer_is_welded_at_the_feet(homer):
     pair = homer.vertices[list(facing_vertices(homer))]
     height = (pair[:, 1] - homer.vertices[:, 1].min()) / np.ptp(homer.vertices[:, 1])
     assert (height < 0.1).all()

@@ -60,7 +60,7 @@ def sheet(curvature: float) -> Mesh:
     return Mesh(vertices, np.concatenate([top, top[:, ::-1] + n, sides]), "sheet")
 
 
-def test_a_rolled_up_sheet_has_the_form_of_the_flat_one() -> None:
+def test_a_rolled_up_sheet_has_the_form_of_the_flat_one():
     descriptor = CanonicalForm(max_vertices=1200)
     flat, rolled = (descriptor.describe_body(of_mesh(sheet(curvature))) for curvature in (0.0, 2.0))
     other = descriptor.describe_body(of_mesh(as_mesh(trimesh.creation.icosphere(subdivisions=3))))
@@ -75,7 +75,7 @@ def test_a_rolled_up_sheet_has_the_form_of_the_flat_one() -> None:
     assert distance(*rigid, descriptor) > 10 * distance(flat, rolled, descriptor)
 
 
-def test_the_geodesics_of_the_rolled_up_sheet_are_straight_when_flat() -> None:
+def test_the_geodesics_of_the_rolled_up_sheet_are_straight_when_flat():
     # The sheet is developable: the oracle of its canonical form is the flat rectangle itself.
     source = 5 * 17 + 3
     distances = geodesic_distances(sheet(2.0), [source])[0][: 33 * 17]
@@ -86,7 +86,7 @@ def test_the_geodesics_of_the_rolled_up_sheet_are_straight_when_flat() -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_points_of_space_come_back(dimension: int) -> None:
+def test_points_of_space_come_back(dimension):
     points = np.random.default_rng(0).normal(size=(40, dimension)) * [3, 2, 1][:dimension]
     distances = cdist(points, points)
     form = classical_scaling(distances)
@@ -97,7 +97,7 @@ def test_points_of_space_come_back(dimension: int) -> None:
     np.testing.assert_allclose(cdist(refined, refined), distances, atol=1e-6)
 
 
-def test_least_squares_equals_scikit_learn(sphere: Mesh) -> None:
+def test_least_squares_equals_scikit_learn(sphere):
     sources = np.arange(0, 2562, 40)
     distances = np.arccos(np.clip(sphere.vertices[sources] @ sphere.vertices[sources].T, -1, 1))
     start = classical_scaling(distances)
@@ -118,7 +118,7 @@ def test_least_squares_equals_scikit_learn(sphere: Mesh) -> None:
     np.testing.assert_allclose(cdist(form, form), cdist(reference, reference), atol=0.02)
 
 
-def test_no_step_raises_the_stress() -> None:
+def test_no_step_raises_the_stress():
     generator = np.random.default_rng(1)
     distances = cdist(*[generator.normal(size=(25, 6))] * 2)
     start = generator.normal(size=(25, 3))
@@ -131,7 +131,7 @@ def test_no_step_raises_the_stress() -> None:
     )
 
 
-def test_moments_of_a_box_by_closed_form() -> None:
+def test_moments_of_a_box_by_closed_form():
     # Midpoints of a fine grid on [−3, 3] × [−2, 2] × [−1, 1]: E x² = a²/3, E x⁴ = a⁴/5, odd moments zero.
     axes = [(np.arange(40) + 0.5) / 20 - 1] * 3
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * [3, 2, 1]
@@ -144,7 +144,7 @@ def test_moments_of_a_box_by_closed_form() -> None:
         assert value == pytest.approx(expected, rel=3e-3, abs=1e-9)
 
 
-def test_exponents_are_complete() -> None:
+def test_exponents_are_complete():
     every = {e for e in product(range(5), repeat=3) if 2 <= sum(e) <= 4} - {
         (1, 1, 0),
         (1, 0, 1),
@@ -154,7 +154,7 @@ def test_exponents_are_complete() -> None:
     assert len(exponents(4)) == len(every)
 
 
-def test_distances_ignore_reflections_but_not_their_mixture() -> None:
+def test_distances_ignore_reflections_but_not_their_mixture():
     descriptor = CanonicalForm()
     powers = exponents(4)
     form = np.random.default_rng(0).gamma(2.0, size=(60, 3)) * [3, 2, 1]
@@ -176,7 +176,7 @@ def test_distances_ignore_reflections_but_not_their_mixture() -> None:
     assert distance(other, described, descriptor) == pytest.approx(loop, rel=1e-6)
 
 
-def test_motion_reflection_and_scale(blob: Mesh) -> None:
+def test_motion_reflection_and_scale(blob):
     descriptor = CanonicalForm()
     turn = special_ortho_group.rvs(3, random_state=1) * 2.5
     moved = Mesh(blob.vertices @ turn + 3, blob.faces)
@@ -188,7 +188,7 @@ def test_motion_reflection_and_scale(blob: Mesh) -> None:
         ) < 1e-5 * np.linalg.norm(described)
 
 
-def test_the_form_is_that_of_least_squares(blob: Mesh) -> None:
+def test_the_form_is_that_of_least_squares(blob):
     distances = farthest_points(blob, 200).mutual / np.sqrt(blob.area)
     classical = classical_scaling(distances)
     forms = [moments(form, 4) for form in (least_squares_scaling(distances, classical), classical)]
@@ -202,7 +202,7 @@ def test_the_form_is_that_of_least_squares(blob: Mesh) -> None:
     assert apart[1] > 1e-2
 
 
-def test_parameters_are_checked(blob: Mesh) -> None:
+def test_parameters_are_checked(blob):
     with pytest.raises(ValueError, match="max_order"):
         CanonicalForm(max_order=1)
     for n_samples in (3, 1001):
@@ -212,7 +212,7 @@ def test_parameters_are_checked(blob: Mesh) -> None:
         CanonicalForm(n_samples=700).describe_body(of_mesh(blob))
 
 
-def test_the_numbers_of_vertices_do_not_matter(blob: Mesh) -> None:
+def test_the_numbers_of_vertices_do_not_matter(blob):
     # Simplified too, which is where ties could be broken by numbers.
     descriptor = CanonicalForm(max_vertices=400)
     order = np.random.default_rng(3).permutation(len(blob.vertices))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
@@ -21,7 +19,7 @@ def round_body(sphere: Mesh) -> Body:
     return of_signature(compute_signature(sphere, config))
 
 
-def test_d2_of_a_sphere_has_the_density_of_its_chords(round_body: Body) -> None:
+def test_d2_of_a_sphere_has_the_density_of_its_chords(round_body):
     """On the unit sphere the length of a random chord has the density l/2 on [0, 2]: l²/4 is its distribution."""
     n_bins = 40
     reach = 2 / np.sqrt(4 * np.pi)
@@ -34,12 +32,12 @@ def test_d2_of_a_sphere_has_the_density_of_its_chords(round_body: Body) -> None:
     assert wide.sum() == pytest.approx(1, abs=1e-6)
 
 
-def test_d1_of_a_sphere_is_its_radius(round_body: Body) -> None:
+def test_d1_of_a_sphere_is_its_radius(round_body):
     histogram = D2(function="d1", n_bins=10, reach=1.0).describe_body(round_body)
     assert histogram[2] == pytest.approx(1)  # 1 / √(4π) = 0.282
 
 
-def test_a3_of_a_sphere_has_the_moments_of_its_angles() -> None:
+def test_a3_of_a_sphere_has_the_moments_of_its_angles():
     """Chords from a point of a sphere have cosine-weighted directions u, so that E[u·v] = E[u]² = (2/3)² and
     E[(u·v)²] = Σ E[uᵢ²]² = 1/4 + 1/16 + 1/16."""
     points = np.random.default_rng(3).standard_normal((4000, 3))
@@ -49,21 +47,21 @@ def test_a3_of_a_sphere_has_the_moments_of_its_angles() -> None:
     assert np.square(cosine).mean() == pytest.approx(3 / 8, abs=0.01)
 
 
-def test_a3_takes_distinct_samples_and_its_range_is_half_a_turn() -> None:
+def test_a3_takes_distinct_samples_and_its_range_is_half_a_turn():
     """Of three points in a line the angle is 0 at either end and π in the middle."""
     points = np.array([[0.0, 0, 0], [1, 1, 1], [3, 3, 3]])
     histogram = D2(function="a3", n_bins=5, n_triples=30_000).describe_body(of_points(points))
     np.testing.assert_allclose(histogram, [2 / 3, 0, 0, 0, 1 / 3], atol=0.02)
 
 
-def test_d2_counts_each_pair_once_and_what_lies_beyond_in_the_last_bin() -> None:
+def test_d2_counts_each_pair_once_and_what_lies_beyond_in_the_last_bin():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0], [50, 0, 0]])
     histogram = D2(n_bins=4, reach=2.0).describe_body(of_points(points, area=4.0))
     # Lengths over √4: 0.5, 2.5, 25, 2, 24.5, 22.5.
     np.testing.assert_allclose(histogram, [0, 1 / 6, 0, 5 / 6], atol=1e-6)
 
 
-def test_d2_distance_is_half_the_l1_norm() -> None:
+def test_d2_distance_is_half_the_l1_norm():
     one = torch.tensor([[0.5, 0.5, 0.0]])
     two = torch.tensor([[0.0, 0.25, 0.75], [0.5, 0.5, 0.0]])
     torch.testing.assert_close(D2().distances(one, two), torch.tensor([[0.75, 0.0]]))
@@ -72,7 +70,7 @@ def test_d2_distance_is_half_the_l1_norm() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: D2(function="d3"), "function.*'d3'"),  # type: ignore[arg-type]
+        (lambda: D2(function="d3"), "function.*'d3'"),
         (lambda: D2(n_bins=0), "n_bins"),
         (lambda: D2(n_triples=0), "n_triples"),
         (lambda: D2(reach=0.0), "reach"),
@@ -84,8 +82,6 @@ def test_d2_distance_is_half_the_l1_norm() -> None:
         ),
     ],
 )
-def test_parameters_and_signatures_out_of_range_are_named(
-    make: Callable[[], object], message: str
-) -> None:
+def test_parameters_and_signatures_out_of_range_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -26,7 +26,7 @@ def sphere_eigenvalues(count: int) -> np.ndarray:
     return np.sort(np.concatenate(values))[::-1][:count]
 
 
-def test_eigenvalues_of_great_circles(sphere: Mesh) -> None:
+def test_eigenvalues_of_great_circles(sphere):
     # Vertices of an icosphere are nearly uniform, so that the matrix is a quadrature of the integral operator.
     points = sphere.vertices[:642]  # the vertices of the next coarser icosphere
     distances = np.arccos(np.clip(points @ points.T, -1, 1))
@@ -36,7 +36,7 @@ def test_eigenvalues_of_great_circles(sphere: Mesh) -> None:
     np.testing.assert_allclose(affinity_eigenvalues(distances, 16), expected, atol=1e-3)
 
 
-def test_description_of_the_sphere(sphere: Mesh) -> None:
+def test_description_of_the_sphere(sphere):
     descriptor = GeodesicSpectral(n_eigenvalues=9, n_samples=300, max_vertices=2562)
     described = descriptor.describe_body(of_mesh(sphere))
     assert described.shape == (9,)
@@ -44,14 +44,14 @@ def test_description_of_the_sphere(sphere: Mesh) -> None:
     np.testing.assert_allclose(described, np.sqrt(np.abs(sphere_eigenvalues(9))), atol=0.02)
 
 
-def test_eigenvalues_of_two_and_of_equidistant_points() -> None:
+def test_eigenvalues_of_two_and_of_equidistant_points():
     # exp(−½) everywhere but on the diagonal: (1 + (n − 1) e^−½) / n once, (1 − e^−½) / n otherwise.
     distances = 3.0 * (1 - np.eye(5))
     expected = np.array([1 + 4 * np.exp(-0.5)] + [1 - np.exp(-0.5)] * 4) / 5
     np.testing.assert_allclose(affinity_eigenvalues(distances, 5), expected)
 
 
-def test_trace_is_one(blob: Mesh) -> None:
+def test_trace_is_one(blob):
     descriptor = GeodesicSpectral(n_eigenvalues=60, n_samples=60)
     described = descriptor.describe_body(of_mesh(blob)).astype(float)
     distances = geodesic_distances(blob, np.arange(60))[:, :60]
@@ -61,12 +61,12 @@ def test_trace_is_one(blob: Mesh) -> None:
     assert (np.diff(described[:10]) <= 0).all()
 
 
-def test_number_of_samples_matters_little(blob: Mesh) -> None:
+def test_number_of_samples_matters_little(blob):
     few, many = (GeodesicSpectral(n_samples=n).describe_body(of_mesh(blob)) for n in (100, 400))
     np.testing.assert_allclose(few[:4], many[:4], rtol=0.1)
 
 
-def test_motion_scale_and_bending(blob: Mesh) -> None:
+def test_motion_scale_and_bending(blob):
     descriptor = GeodesicSpectral()
     described = descriptor.describe_body(of_mesh(blob))
     turn = special_ortho_group.rvs(3, random_state=1) * 2.5
@@ -109,7 +109,7 @@ def _tube(angle: float) -> Mesh:
     )
 
 
-def test_distances_are_chi_square() -> None:
+def test_distances_are_chi_square():
     a = np.array([[0.9, 0.3]], dtype=np.float32)
     b = np.array([[0.5, 0.1]], dtype=np.float32)
     expected = (0.4**2 / 1.4 + 0.2**2 / 0.4) / 2
@@ -119,7 +119,7 @@ def test_distances_are_chi_square() -> None:
     assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_parameters_are_checked(blob: Mesh) -> None:
+def test_parameters_are_checked(blob):
     with pytest.raises(ValueError, match="n_eigenvalues"):
         GeodesicSpectral(n_eigenvalues=0)
     for n_samples in (19, 1001):
@@ -129,7 +129,7 @@ def test_parameters_are_checked(blob: Mesh) -> None:
         GeodesicSpectral(n_samples=700).describe_body(of_mesh(blob))
 
 
-def test_the_numbers_of_vertices_do_not_matter(blob: Mesh) -> None:
+def test_the_numbers_of_vertices_do_not_matter(blob):
     descriptor = GeodesicSpectral(max_vertices=400)
     order = np.random.default_rng(3).permutation(len(blob.vertices))
     renumbered = Mesh(blob.vertices[order], np.argsort(order)[blob.faces][::-1])

@@ -42,7 +42,7 @@ def exact(mesh: Mesh, source: int) -> np.ndarray:
     )
 
 
-def test_great_circles_of_the_sphere(sphere: Mesh) -> None:
+def test_great_circles_of_the_sphere(sphere):
     sources = np.array([0, 100, 2000])
     distances = geodesic_distances(sphere, sources)
     arcs = np.arccos(np.clip(sphere.vertices[sources] @ sphere.vertices.T, -1, 1))
@@ -57,7 +57,7 @@ def test_great_circles_of_the_sphere(sphere: Mesh) -> None:
 
 
 @pytest.mark.parametrize(("points_per_edge", "error"), [(0, 0.7), (2, 0.09), (5, 0.025)])
-def test_unfolded_paths_of_the_cube(points_per_edge: int, error: float) -> None:
+def test_unfolded_paths_of_the_cube(points_per_edge, error):
     cube = unit_cube(3)
     corner = int(np.argmin(cube.vertices.sum(axis=1)))
     distances = geodesic_distances(cube, [corner], points_per_edge)[0]
@@ -69,7 +69,7 @@ def test_unfolded_paths_of_the_cube(points_per_edge: int, error: float) -> None:
     assert error / 2 < excess.max() < error
 
 
-def test_never_shorter_than_the_exact_polyhedral_distance(blob: Mesh) -> None:
+def test_never_shorter_than_the_exact_polyhedral_distance(blob):
     for source in (3, 400):
         reference = exact(blob, source)
         distances = geodesic_distances(blob, [source])[0]
@@ -77,7 +77,7 @@ def test_never_shorter_than_the_exact_polyhedral_distance(blob: Mesh) -> None:
         np.testing.assert_allclose(distances, reference, rtol=0.05)
 
 
-def test_thin_triangles_do_no_harm() -> None:
+def test_thin_triangles_do_no_harm():
     cube = unit_cube(3)
     needles = Mesh(cube.vertices * [1, 1, 40], cube.faces)
     distances = geodesic_distances(needles, [0])[0]
@@ -85,7 +85,7 @@ def test_thin_triangles_do_no_harm() -> None:
     np.testing.assert_allclose(distances, reference, atol=0.03 * reference.max())
 
 
-def test_a_metric(blob: Mesh) -> None:
+def test_a_metric(blob):
     distances = geodesic_distances(blob, np.arange(len(blob.vertices)))
     np.testing.assert_allclose(distances, distances.T, rtol=1e-12)
     assert (distances + np.diag(np.full(len(distances), np.inf)) > 0).all()
@@ -95,13 +95,13 @@ def test_a_metric(blob: Mesh) -> None:
         assert (distances <= distances[:, [through]] + distances[[through]] + 1e-12).all()
 
 
-def test_more_points_on_the_edges_shorten_nested_paths(blob: Mesh) -> None:
+def test_more_points_on_the_edges_shorten_nested_paths(blob):
     coarse, fine = (geodesic_distances(blob, [5], n)[0] for n in (1, 3))
     assert (fine <= coarse + 1e-12).all()
     assert fine.sum() < 0.995 * coarse.sum()
 
 
-def test_equivariance(blob: Mesh) -> None:
+def test_equivariance(blob):
     order = np.random.default_rng(0).permutation(len(blob.vertices))
     new = np.argsort(order)
     moved = Mesh(3 * blob.vertices[order][:, [1, 2, 0]] + 5, new[blob.faces])
@@ -112,7 +112,7 @@ def test_equivariance(blob: Mesh) -> None:
     )
 
 
-def test_farthest_points_are_greedy(blob: Mesh) -> None:
+def test_farthest_points_are_greedy(blob):
     samples = farthest_points(blob, 30)
     np.testing.assert_allclose(
         samples.distances, geodesic_distances(blob, samples.vertices), rtol=1e-12
@@ -140,14 +140,14 @@ def renumbered(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:
     return Mesh(mesh.vertices[order], faces, mesh.name), new
 
 
-def test_farthest_points_do_not_depend_on_numbers(blob: Mesh) -> None:
+def test_farthest_points_do_not_depend_on_numbers(blob):
     samples = farthest_points(blob, 60)
     for seed in range(3):
         mesh, new = renumbered(blob, seed)
         np.testing.assert_array_equal(farthest_points(mesh, 60).vertices, new[samples.vertices])
 
 
-def test_rounding_does_not_decide_between_equally_far_points() -> None:
+def test_rounding_does_not_decide_between_equally_far_points():
     # A body with three planes of symmetry, whose triangles have them too: most points have equals.
     octahedron = trimesh.creation.icosphere(subdivisions=2)
     mesh = as_mesh(octahedron.apply_scale([3.0, 2.0, 1.0]))
@@ -159,13 +159,13 @@ def test_rounding_does_not_decide_between_equally_far_points() -> None:
         )
 
 
-def test_all_vertices_can_be_sampled() -> None:
+def test_all_vertices_can_be_sampled():
     cube = unit_cube(1)
     n_vertices = len(cube.vertices)
     assert sorted(farthest_points(cube, n_vertices).vertices) == list(range(n_vertices))
 
 
-def test_counts_are_checked(blob: Mesh) -> None:
+def test_counts_are_checked(blob):
     with pytest.raises(ValueError, match="points_per_edge"):
         geodesic_distances(blob, [0], -1)
     for n_samples in (0, 643):

@@ -51,7 +51,7 @@ def links_by_looking(points: np.ndarray) -> np.ndarray:
     return links
 
 
-def test_bound_is_that_of_the_98_directions() -> None:
+def test_bound_is_that_of_the_98_directions():
     steps = np.array([s for s in product(range(-2, 3), repeat=3) if gcd(*s) == 1], dtype=float)
     assert len(steps) == 98
     # A path made of the steps is longest for its span where the hull of the unit steps is nearest to the origin.
@@ -61,7 +61,7 @@ def test_bound_is_that_of_the_98_directions() -> None:
     assert 1 / inradius <= METRICATION < 1 / inradius + 1e-3
 
 
-def test_box_has_euclidean_distances_within_the_bound() -> None:
+def test_box_has_euclidean_distances_within_the_bound():
     points = block(9, 7, 12) * 0.3 + [1.0, -2.0, 5.0]
     inner = every(points)
     straight = cdist(points, points)
@@ -70,7 +70,7 @@ def test_box_has_euclidean_distances_within_the_bound() -> None:
     np.testing.assert_allclose(inner, inner.T, atol=1e-12)
 
 
-def test_random_cells_equal_floyd_and_warshall() -> None:
+def test_random_cells_equal_floyd_and_warshall():
     generator = np.random.default_rng(3)
     points = block(6, 5, 5)[generator.random(150) < 0.45]
     expected = floyd_warshall(links_by_looking(points))
@@ -78,7 +78,7 @@ def test_random_cells_equal_floyd_and_warshall() -> None:
     np.testing.assert_allclose(every(points), expected, rtol=1e-12)
 
 
-def test_path_goes_round_the_corner_of_an_l() -> None:
+def test_path_goes_round_the_corner_of_an_l():
     whole = block(21, 21, 3)
     points = whole[(whole[:, 0] <= 2) | (whole[:, 1] <= 2)]
     a = index_of(points, (20, 2, 1))
@@ -89,7 +89,7 @@ def test_path_goes_round_the_corner_of_an_l() -> None:
     assert length > 1.3 * np.hypot(18, 18)
 
 
-def test_path_goes_round_both_corners_of_a_u() -> None:
+def test_path_goes_round_both_corners_of_a_u():
     whole = block(13, 21, 3)
     points = whole[(whole[:, 0] <= 2) | (whole[:, 0] >= 10) | (whole[:, 1] <= 2)]
     a = index_of(points, (2, 20, 1))
@@ -98,7 +98,7 @@ def test_path_goes_round_both_corners_of_a_u() -> None:
     assert exact <= inner_distances(points, np.array([a]))[0, b] <= METRICATION * exact
 
 
-def test_pieces_are_joined_at_their_closest_samples() -> None:
+def test_pieces_are_joined_at_their_closest_samples():
     points = np.concatenate([block(3, 3, 3), block(3, 3, 3) + np.array([7, 0, 0])])
     length = inner_distances(points, np.array([index_of(points, (0, 1, 1))]))[
         0, index_of(points, (9, 1, 1))
@@ -108,12 +108,12 @@ def test_pieces_are_joined_at_their_closest_samples() -> None:
     )  # one link of 5 cells, at any of the equally close pairs
 
 
-def test_chain_of_single_cells_is_walked_along() -> None:
+def test_chain_of_single_cells_is_walked_along():
     points = np.array([[0, 0, 0], [3, 0, 0], [7, 0, 0], [7, 5, 0], [7, 5, 1]], dtype=float)
     np.testing.assert_allclose(inner_distances(points, np.array([0]))[0], [0, 3, 7, 12, 13])
 
 
-def test_cell_is_found_where_no_two_samples_are_neighbours() -> None:
+def test_cell_is_found_where_no_two_samples_are_neighbours():
     points = np.array([[0, 0, 0], [2, 0, 0], [5, 0, 0]]) * 0.1 + 0.7
     np.testing.assert_allclose(inner_distances(points, np.array([0]))[0], [0, 0.2, 0.5])
 
@@ -122,12 +122,12 @@ def test_cell_is_found_where_no_two_samples_are_neighbours() -> None:
     ("points", "message"),
     [(np.zeros((1, 3)), "at least two"), (np.random.default_rng(0).random((30, 3)), "cubic grid")],
 )
-def test_samples_off_a_grid_are_refused(points: np.ndarray, message: str) -> None:
+def test_samples_off_a_grid_are_refused(points, message):
     with pytest.raises(ValueError, match=message):
         inner_distances(points, np.array([0]))
 
 
-def test_histogram_equals_a_loop_over_all_pairs() -> None:
+def test_histogram_equals_a_loop_over_all_pairs():
     points = block(4, 3, 5) * 0.5
     area = 9.0
     descriptor = InnerDistance(n_bins=8, max_distance=0.8, n_sources=1000)
@@ -148,7 +148,7 @@ def test_histogram_equals_a_loop_over_all_pairs() -> None:
     np.testing.assert_allclose(histogram, expected / expected.sum(), atol=1e-6)
 
 
-def test_scale_motion_and_symmetry_do_not_matter() -> None:
+def test_scale_motion_and_symmetry_do_not_matter():
     points = block(10, 4, 5)[np.random.default_rng(1).random(200) < 0.7]
     descriptor = InnerDistance(n_sources=1000)
     moved = points[::-1][:, [2, 0, 1]] * [1, -1, 1] * 7.0 + [100, 20, -3]
@@ -158,7 +158,7 @@ def test_scale_motion_and_symmetry_do_not_matter() -> None:
     np.testing.assert_allclose(there, here, atol=1e-6)
 
 
-def test_few_sources_estimate_the_whole() -> None:
+def test_few_sources_estimate_the_whole():
     points = block(12, 8, 8) / 8
     whole = InnerDistance(n_bins=16, n_sources=1000).describe_body(body_of(points))
     few = InnerDistance(n_bins=16, n_sources=150).describe_body(body_of(points))
@@ -169,6 +169,6 @@ def test_few_sources_estimate_the_whole() -> None:
 @pytest.mark.parametrize(
     ("name", "value"), [("n_bins", 1), ("n_sources", 0), ("max_distance", 0.0)]
 )
-def test_bad_parameters_are_refused(name: str, value: float) -> None:
+def test_bad_parameters_are_refused(name, value):
     with pytest.raises(ValueError, match=name):
-        InnerDistance(**{name: value})  # type: ignore[arg-type]
+        InnerDistance(**{name: value})

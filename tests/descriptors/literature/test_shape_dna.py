@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
@@ -22,7 +20,7 @@ def round_body(sphere: Mesh) -> Body:
     return of_signature(compute_signature(sphere, config))
 
 
-def test_shape_dna_of_a_sphere_is_known(round_body: Body) -> None:
+def test_shape_dna_of_a_sphere_is_known(round_body):
     """l(l+1) with multiplicity 2l+1, and the area 4π."""
     expected = 4 * np.pi * np.repeat([2, 6, 12], [3, 5, 7])
     np.testing.assert_allclose(
@@ -31,14 +29,14 @@ def test_shape_dna_of_a_sphere_is_known(round_body: Body) -> None:
 
 
 @pytest.mark.parametrize("area", [0.3, 12.0])
-def test_slope_makes_weyl_spectra_alike(area: float) -> None:
+def test_slope_makes_weyl_spectra_alike(area):
     """λₖ = 4πk / area: divided by the slope, the number k remains, whatever the area says."""
     k = np.arange(1, 41)
     spectrum = of_points(np.zeros((1, 3)), area=1.0, eigenvalues=4 * np.pi * k / area)
     np.testing.assert_allclose(ShapeDNA(30, "slope").describe_body(spectrum), k[:30], rtol=1e-6)
 
 
-def test_slope_is_that_of_least_squares() -> None:
+def test_slope_is_that_of_least_squares():
     k = np.arange(1, 21)
     values = np.sort(3 * k + np.random.default_rng(0).random(20))
     slope = np.linalg.lstsq(k[:, None], values, rcond=None)[0][0]
@@ -46,7 +44,7 @@ def test_slope_is_that_of_least_squares() -> None:
     np.testing.assert_allclose(result, values / slope, rtol=1e-6)
 
 
-def test_shape_dna_distance_is_euclidean() -> None:
+def test_shape_dna_distance_is_euclidean():
     one = torch.tensor([[1.0, 2.0]])
     two = torch.tensor([[4.0, 6.0], [1.0, 2.0]])
     torch.testing.assert_close(ShapeDNA(2).distances(one, two), torch.tensor([[5.0, 0.0]]))
@@ -56,17 +54,15 @@ def test_shape_dna_distance_is_euclidean() -> None:
     ("make", "message"),
     [
         (lambda: ShapeDNA(0), "n_eigenvalues"),
-        (lambda: ShapeDNA(normalisation="volume"), "normalisation"),  # type: ignore[arg-type]
+        (lambda: ShapeDNA(normalisation="volume"), "normalisation"),
     ],
 )
-def test_parameters_and_signatures_out_of_range_are_named(
-    make: Callable[[], object], message: str
-) -> None:
+def test_parameters_and_signatures_out_of_range_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
-def test_fewer_eigenvalues_than_asked_for_are_refused(sphere: Mesh) -> None:
+def test_fewer_eigenvalues_than_asked_for_are_refused(sphere):
     config = SignatureConfig(n_eigenpairs=12, resolution=6, min_samples=0, n_surface_samples=20)
     batch = igps.collate([compute_signature(sphere, config)])
     assert ShapeDNA(12)(batch).shape == (1, 12)

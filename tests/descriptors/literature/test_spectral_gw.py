@@ -55,7 +55,7 @@ def sphere_kernel(cosine: np.ndarray, time: float) -> np.ndarray:
     )
 
 
-def test_heat_kernel_of_the_sphere(round_signature: Signature) -> None:
+def test_heat_kernel_of_the_sphere(round_signature):
     times = (0.25, 1.0, 4.0)
     kernels = heat_kernels(round_signature, "surface", times, n_samples=400)
     points = round_signature.surface.points
@@ -68,9 +68,7 @@ def test_heat_kernel_of_the_sphere(round_signature: Signature) -> None:
         )
 
 
-def test_signature_bound_on_the_sphere_is_the_heat_kernel_signature(
-    round_signature: Signature,
-) -> None:
+def test_signature_bound_on_the_sphere_is_the_heat_kernel_signature(round_signature):
     # Every point of the sphere has the same signature √(4π k_2t(x, x)).
     for bound in ("trace", "signature"):
         described = SpectralGromovWasserstein(
@@ -81,7 +79,7 @@ def test_signature_bound_on_the_sphere_is_the_heat_kernel_signature(
         np.testing.assert_allclose(described, np.full(described.shape, expected), rtol=0.06)
 
 
-def test_interior_kernel_of_the_ball(round_signature: Signature) -> None:
+def test_interior_kernel_of_the_ball(round_signature):
     # Mean value interpolation keeps constants, and at the centre of a ball all but these vanish.
     kernel = heat_kernels(round_signature, "interior", (1.0,), n_samples=10**6)[0]
     points = round_signature.interior.points
@@ -93,13 +91,13 @@ def test_interior_kernel_of_the_ball(round_signature: Signature) -> None:
     assert 1.5 < kernel[outermost, outermost] < sphere_kernel(np.ones(1), 1.0)[0]
 
 
-def test_quantile_means_by_hand() -> None:
+def test_quantile_means_by_hand():
     np.testing.assert_allclose(quantiles([3.0, 1.0], 4), [1, 1, 3, 3])
     np.testing.assert_allclose(quantiles([4.0, 1.0, 1.0], 2), [1, 3])  # 1 on [½, ⅔], 4 on [⅔, 1]
     np.testing.assert_allclose(quantiles([[5.0, 2.0]], 1), [3.5])
 
 
-def test_quantiles_give_the_wasserstein_distance() -> None:
+def test_quantiles_give_the_wasserstein_distance():
     generator = np.random.default_rng(0)
     first = generator.gamma(2.0, size=300)
     second = generator.normal(size=120)
@@ -110,9 +108,7 @@ def test_quantiles_give_the_wasserstein_distance() -> None:
         assert estimate == pytest.approx(exact, rel=0.05 if n_quantiles == 10 else 1e-9)
 
 
-def test_distances_are_wasserstein_distances_of_exponent_two(
-    round_signature: Signature, blob_signature: Signature
-) -> None:
+def test_distances_are_wasserstein_distances_of_exponent_two(round_signature, blob_signature):
     # The linear programme of optimal transport, over all couplings of few points.
     times = (0.5, 2.0)
     descriptor = SpectralGromovWasserstein(
@@ -137,7 +133,7 @@ def test_distances_are_wasserstein_distances_of_exponent_two(
     assert max(expected) > 1.5 * min(expected)
 
 
-def test_time_weight_peaks_at_one() -> None:
+def test_time_weight_peaks_at_one():
     times = np.geomspace(0.1, 10, 101)
     weights = [time_weight(time) for time in times]
     assert times[int(np.argmax(weights))] == pytest.approx(1)
@@ -146,14 +142,12 @@ def test_time_weight_peaks_at_one() -> None:
 
 
 @pytest.mark.parametrize("where", ["surface", "interior"])
-def test_lower_bounds_and_their_order(
-    where: str, round_signature: Signature, blob_signature: Signature
-) -> None:
+def test_lower_bounds_and_their_order(where, round_signature, blob_signature):
     pytest.importorskip("ot", reason="Gromov-Wasserstein needs POT")
-    above = gromov_wasserstein(round_signature, blob_signature, samples=where, n_samples=30)  # type: ignore[arg-type]
+    above = gromov_wasserstein(round_signature, blob_signature, samples=where, n_samples=30)
     below = {}
     for bound in BOUNDS:
-        descriptor = SpectralGromovWasserstein(samples=where, bound=bound, n_samples=30)  # type: ignore[arg-type]
+        descriptor = SpectralGromovWasserstein(samples=where, bound=bound, n_samples=30)
         described = [
             torch.from_numpy(descriptor.describe_body(of_signature(s)))[None]
             for s in (round_signature, blob_signature)
@@ -165,7 +159,7 @@ def test_lower_bounds_and_their_order(
     assert above < 10 * max(below.values())
 
 
-def test_gromov_wasserstein_by_brute_force() -> None:
+def test_gromov_wasserstein_by_brute_force():
     # Three points against three: the best of the six permutations bounds the best coupling from above.
     pytest.importorskip("ot", reason="Gromov-Wasserstein needs POT")
     generator = np.random.default_rng(3)
@@ -193,17 +187,15 @@ def test_gromov_wasserstein_by_brute_force() -> None:
     assert gromov_wasserstein(shapes[0], relabelled, n_samples=3) < 1e-6
 
 
-def test_gromov_wasserstein_names_the_extra(
-    blob_signature: Signature, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gromov_wasserstein_names_the_extra(blob_signature, monkeypatch):
     monkeypatch.setitem(sys.modules, "ot", None)
     with pytest.raises(ImportError, match=r"interior-gps\[transport\]"):
         gromov_wasserstein(blob_signature, blob_signature)
 
 
 @pytest.mark.parametrize("bound", BOUNDS)
-def test_signs_multiplets_and_scale(bound: str, blob_signature: Signature) -> None:
-    descriptor = SpectralGromovWasserstein(bound=bound)  # type: ignore[arg-type]
+def test_signs_multiplets_and_scale(bound, blob_signature):
+    descriptor = SpectralGromovWasserstein(bound=bound)
     described = descriptor.describe_body(of_signature(blob_signature))
     assert described.dtype == np.float32
     assert np.isfinite(described).all()
@@ -227,7 +219,7 @@ def test_signs_multiplets_and_scale(bound: str, blob_signature: Signature) -> No
     )
 
 
-def test_few_samples_and_the_draw(blob_signature: Signature) -> None:
+def test_few_samples_and_the_draw(blob_signature):
     few = SpectralGromovWasserstein(samples="interior", n_samples=3)
     assert few.describe_body(of_signature(blob_signature)).shape == (5, 200)
     a, b, c = (
@@ -240,8 +232,8 @@ def test_few_samples_and_the_draw(blob_signature: Signature) -> None:
     assert (a != c).any()
 
 
-def test_parameters_are_checked(blob_signature: Signature) -> None:
-    wrong: list[dict] = [  # type: ignore[type-arg]
+def test_parameters_are_checked(blob_signature):
+    wrong: list[dict] = [
         {"samples": "edges"},
         {"bound": "upper"},
         {"times": ()},
@@ -257,7 +249,7 @@ def test_parameters_are_checked(blob_signature: Signature) -> None:
         heat_kernels(blob_signature, "surface", (-1.0,), 10)
 
 
-def test_some_samples_stand_for_all(blob_signature: Signature) -> None:
+def test_some_samples_stand_for_all(blob_signature):
     # Steps along the order of form: whatever the first one, no part of the body is left out or taken twice.
     few = [SpectralGromovWasserstein(n_samples=100, n_quantiles=20, seed=seed) for seed in range(4)]
     of_all = SpectralGromovWasserstein(n_samples=400, n_quantiles=20).describe_body(

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import product
 
 import numpy as np
@@ -61,7 +60,7 @@ def ball_eigenvalues(boundary: Boundary, n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_cube_has_the_spectrum_of_its_grid_with_all_multiplets(boundary: Boundary) -> None:
+def test_cube_has_the_spectrum_of_its_grid_with_all_multiplets(boundary):
     n = 12
     angles = np.pi * np.array(cube_frequencies(boundary, 200)) / (2 * n)
     expected = np.sort(4 * n**2 * np.square(np.sin(angles)).sum(axis=1))[:60]
@@ -70,7 +69,7 @@ def test_cube_has_the_spectrum_of_its_grid_with_all_multiplets(boundary: Boundar
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_cube_converges_with_order_two(boundary: Boundary) -> None:
+def test_cube_converges_with_order_two(boundary):
     exact = np.pi**2 * np.square(cube_frequencies(boundary, 20)).sum(axis=1)
     cube = as_mesh(trimesh.creation.box((1, 1, 1)))
     coarse, fine = (
@@ -83,9 +82,7 @@ def test_cube_converges_with_order_two(boundary: Boundary) -> None:
 @pytest.mark.parametrize(
     ("boundary", "largest", "order"), [("dirichlet", 0.04, 1.8), ("neumann", 0.05, 1.25)]
 )
-def test_ball_tends_to_zeros_of_bessel_functions(
-    boundary: Boundary, largest: float, order: float
-) -> None:
+def test_ball_tends_to_zeros_of_bessel_functions(boundary, largest, order):
     exact = ball_eigenvalues(boundary, 30)
     ball = as_mesh(trimesh.creation.icosphere(subdivisions=4))
     coarse, fine = (np.abs(volume_spectrum(ball, 30, boundary, n) / exact - 1) for n in (500, 8000))
@@ -95,7 +92,7 @@ def test_ball_tends_to_zeros_of_bessel_functions(
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_turned_cube_is_still_a_cube(boundary: Boundary) -> None:
+def test_turned_cube_is_still_a_cube(boundary):
     exact = np.pi**2 * np.square(cube_frequencies(boundary, 20)).sum(axis=1)
     surface = trimesh.creation.box((1, 1, 1))
     surface.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
@@ -104,7 +101,7 @@ def test_turned_cube_is_still_a_cube(boundary: Boundary) -> None:
     )
 
 
-def test_walls_lie_between_the_cells_where_the_surface_is() -> None:
+def test_walls_lie_between_the_cells_where_the_surface_is():
     # Walls half a cell beyond the last centre inside, as in a body of whole voxels, would be wrong by more than 1 %.
     cube = trimesh.creation.box((1, 1, 1))
     generator = np.random.default_rng(0)
@@ -117,7 +114,7 @@ def test_walls_lie_between_the_cells_where_the_surface_is() -> None:
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_scale_and_place_do_not_matter(blob: Mesh, boundary: Boundary) -> None:
+def test_scale_and_place_do_not_matter(blob, boundary):
     descriptor = VolumeShapeDNA(boundary, n_eigenvalues=20, n_voxels=500)
     moved = Mesh(blob.vertices * 1000 + [3e4, 2e3, -1e4], blob.faces)
     np.testing.assert_allclose(
@@ -125,40 +122,40 @@ def test_scale_and_place_do_not_matter(blob: Mesh, boundary: Boundary) -> None:
     )
 
 
-def test_description_is_the_spectrum(blob: Mesh) -> None:
+def test_description_is_the_spectrum(blob):
     description = VolumeShapeDNA(n_eigenvalues=10, n_voxels=500).describe_body(of_mesh(blob))
     assert description.dtype == np.float32
     assert description.shape == (10,)
     np.testing.assert_allclose(description, volume_spectrum(blob, 10, "dirichlet", 500), rtol=1e-6)
 
 
-def test_rod_thinner_than_a_cell_vibrates_along_its_length() -> None:
+def test_rod_thinner_than_a_cell_vibrates_along_its_length():
     # 20 cells of side 2 along a rod of 1 × 1 × 40.
     spectrum = volume_spectrum(as_mesh(trimesh.creation.box((1, 1, 40))), 4, "neumann", 5)
     chain = 4 / 2**2 * np.sin(np.pi * np.arange(1, 5) / (2 * 20)) ** 2
     np.testing.assert_allclose(spectrum, chain * 40 ** (2 / 3), rtol=1e-5)
 
 
-def test_piece_behind_an_invisible_neck_adds_its_zero() -> None:
+def test_piece_behind_an_invisible_neck_adds_its_zero():
     single = ball_eigenvalues("neumann", 3) * 2 ** (2 / 3)  # in units of the two balls' volume
     spectrum = volume_spectrum(two_balls(1.0, 1e-3), 7, "neumann", 4000)
     assert spectrum[0] == pytest.approx(0, abs=1e-6)
     np.testing.assert_allclose(spectrum[1:], np.repeat(single, 2), rtol=0.05)
 
 
-def test_crumb_is_left_out() -> None:
+def test_crumb_is_left_out():
     spectrum = volume_spectrum(two_balls(0.15, 1e-3), 3, "neumann", 4000)
     np.testing.assert_allclose(spectrum, ball_eigenvalues("neumann", 3), rtol=0.05)
 
 
-def test_distances_are_euclidean() -> None:
+def test_distances_are_euclidean():
     rows = torch.tensor([[0.0, 0.0], [3.0, 4.0]])
     torch.testing.assert_close(
         VolumeShapeDNA().distances(rows, rows), torch.tensor([[0.0, 5.0], [5.0, 0.0]])
     )
 
 
-def test_too_few_cells_are_refused(blob: Mesh) -> None:
+def test_too_few_cells_are_refused(blob):
     with pytest.raises(MeshError, match="too few for 40 eigenvalues"):
         VolumeShapeDNA(n_eigenvalues=40, n_voxels=20).describe_body(of_mesh(blob))
 
@@ -166,11 +163,11 @@ def test_too_few_cells_are_refused(blob: Mesh) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: VolumeShapeDNA(boundary="robin"), "boundary: expected"),  # type: ignore[arg-type]
+        (lambda: VolumeShapeDNA(boundary="robin"), "boundary: expected"),
         (lambda: VolumeShapeDNA(n_eigenvalues=0), "n_eigenvalues: expected"),
         (lambda: VolumeShapeDNA(n_voxels=0), "n_voxels: expected"),
     ],
 )
-def test_bad_parameters_are_refused(make: Callable[[], VolumeShapeDNA], message: str) -> None:
+def test_bad_parameters_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

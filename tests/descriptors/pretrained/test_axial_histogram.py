@@ -33,7 +33,7 @@ def moved(batch: SignatureBatch, motion: Tensor, shift: Tensor) -> SignatureBatc
     )
 
 
-def test_it_is_the_share_of_samples_in_each_cell() -> None:
+def test_it_is_the_share_of_samples_in_each_cell():
     """One sample, axis and cell at a time; the axes by NumPy's weighted covariance."""
     batch = two_bodies()
     n_bins = (5, 4, 3, 2)
@@ -72,7 +72,7 @@ def test_it_is_the_share_of_samples_in_each_cell() -> None:
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored: bool) -> None:
+def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored):
     batch = two_bodies()
     histogram = AxialHistogram(EMBEDDING)
     motion = torch.from_numpy(Rotation.random(random_state=0).as_matrix()).float() * (
@@ -83,7 +83,7 @@ def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored: bool) -> No
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
 
 
-def test_padding_changes_nothing() -> None:
+def test_padding_changes_nothing():
     batch = two_bodies()
     histogram = AxialHistogram(EMBEDDING)
     found = histogram(batch)
@@ -92,7 +92,7 @@ def test_padding_changes_nothing() -> None:
         torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
 
 
-def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end() -> None:
+def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end():
     generator = torch.Generator().manual_seed(0)
     brick = (torch.rand(20000, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor(
         [1.0, 3.0, 2.0]
@@ -108,7 +108,7 @@ def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end(
     assert float((turn.T @ axes)[1, 0]) < -0.99
 
 
-def test_a_limb_that_moves_hardly_turns_the_axes() -> None:
+def test_a_limb_that_moves_hardly_turns_the_axes():
     """A trunk of low potential, and a heavy limb of high potential that sweeps a right angle."""
     generator = torch.Generator().manual_seed(1)
     trunk = (torch.rand(600, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor(
@@ -130,7 +130,7 @@ def test_a_limb_that_moves_hardly_turns_the_axes() -> None:
     assert turned[0] < 10 < 30 < turned[1]
 
 
-def test_it_has_gradients_of_places_and_directions() -> None:
+def test_it_has_gradients_of_places_and_directions():
     batch = two_bodies()
     points = batch.surface.points.clone().requires_grad_()
     histogram = AxialHistogram(EMBEDDING)(
@@ -142,7 +142,7 @@ def test_it_has_gradients_of_places_and_directions() -> None:
     assert float(points.grad.abs().max()) > 0
 
 
-def test_needs_and_errors() -> None:
+def test_needs_and_errors():
     assert AxialHistogram(EMBEDDING).requirements == Requirements(
         n_eigenpairs=6, attributes=("surface_direction",)
     )

@@ -53,7 +53,7 @@ def pieces_of(kept: set[int], graph: list[set[int]]) -> list[set[int]]:
     return found
 
 
-def test_branches_are_as_long_as_pieces_stay_apart() -> None:
+def test_branches_are_as_long_as_pieces_stay_apart():
     """By brute force: components of every superlevel set; when components merge, that of the highest peak survives."""
     batch = two_bodies()
     found = BranchHistogram(EMBEDDING, n_branches=4)(batch)
@@ -79,7 +79,7 @@ def test_branches_are_as_long_as_pieces_stay_apart() -> None:
         np.testing.assert_allclose(found[i], expected / expected.sum(), atol=1e-5)
 
 
-def test_pieces_count_by_their_sizes_and_lengths() -> None:
+def test_pieces_count_by_their_sizes_and_lengths():
     """One level, piece and cell at a time."""
     batch = two_bodies()
     found = PieceHistogram(LEVELS, EMBEDDING, n_bins=(4, 3))(batch)
@@ -127,13 +127,13 @@ def star(n_arms: int, length: float, seed: int) -> SignatureBatch:
 
 
 @pytest.mark.parametrize("n_arms", [3, 5])
-def test_as_many_shares_are_large_as_there_are_arms(n_arms: int) -> None:
+def test_as_many_shares_are_large_as_there_are_arms(n_arms):
     found = BranchHistogram(SpectralEmbedding())(star(n_arms, 1.0, seed=n_arms))[0]
     assert (found[:n_arms] > 0.8 / n_arms).all()
     assert float(found[n_arms:].sum()) < 0.1
 
 
-def test_pieces_of_a_star_are_its_arms() -> None:
+def test_pieces_of_a_star_are_its_arms():
     """Each of three arms has 60 of 380 points: the binary log is −2.66, between the last two centres."""
     found = PieceHistogram((180 / 380,), SpectralEmbedding(), n_bins=(6, 5))(star(3, 1.0, seed=3))[
         0, 0
@@ -144,7 +144,7 @@ def test_pieces_of_a_star_are_its_arms() -> None:
 
 
 @BOTH
-def test_padding_and_scale_change_nothing(make: Maker) -> None:
+def test_padding_and_scale_change_nothing(make):
     batch = two_bodies()
     histogram = make(embedding=EMBEDDING)
     found = histogram(batch)
@@ -156,7 +156,7 @@ def test_padding_and_scale_change_nothing(make: Maker) -> None:
 
 
 @BOTH
-def test_the_order_of_samples_changes_nothing(make: Maker) -> None:
+def test_the_order_of_samples_changes_nothing(make):
     batch = alone(two_bodies(), 0)
     histogram = make(embedding=EMBEDDING)
     order = torch.randperm(40, generator=torch.Generator().manual_seed(5))
@@ -168,7 +168,7 @@ def test_the_order_of_samples_changes_nothing(make: Maker) -> None:
 
 
 @BOTH
-def test_a_subset_of_the_samples_is_told(make: Maker) -> None:
+def test_a_subset_of_the_samples_is_told(make):
     batch = two_bodies()
     expected = make(embedding=EMBEDDING)(replace(batch, surface=batch.surface.subset(20, seed=0)))
     torch.testing.assert_close(make(embedding=EMBEDDING, n_samples=20)(batch), expected)
@@ -179,7 +179,7 @@ def test_a_subset_of_the_samples_is_told(make: Maker) -> None:
 
 
 @BOTH
-def test_a_body_that_is_the_same_everywhere_is_one_piece(make: Maker) -> None:
+def test_a_body_that_is_the_same_everywhere_is_one_piece(make):
     same = batch_of(torch.ones(1, 10, 3), points=torch.ones(1, 10, 3))
     found = make()(same)
     torch.testing.assert_close(found.sum(), torch.tensor(1.0))
@@ -189,7 +189,7 @@ def test_a_body_that_is_the_same_everywhere_is_one_piece(make: Maker) -> None:
 
 
 @BOTH
-def test_needs_and_what_is_refused(make: Maker) -> None:
+def test_needs_and_what_is_refused(make):
     assert make(embedding=EMBEDDING).requirements == Requirements(n_eigenpairs=5)
     with pytest.raises(ValueError, match="n_samples: expected at least 2, got 1"):
         make(n_samples=1)
@@ -204,7 +204,7 @@ def test_needs_and_what_is_refused(make: Maker) -> None:
         make(embedding=EMBEDDING)(replace(batch, surface=broken))
 
 
-def test_layouts_that_are_none_are_named() -> None:
+def test_layouts_that_are_none_are_named():
     with pytest.raises(ValueError, match="n_branches: expected at least 2, got 1"):
         BranchHistogram(n_branches=1)
     for levels in ((), (0.5, 0.2), (0.0, 0.5), (0.5, 1.5)):
@@ -220,7 +220,7 @@ def test_layouts_that_are_none_are_named() -> None:
         PieceHistogram(embedding=EMBEDDING)(replace(batch, surface=broken))
 
 
-def test_gradients_are_those_of_differences() -> None:
+def test_gradients_are_those_of_differences():
     generator = torch.Generator().manual_seed(7)
     embedding = torch.randn(1, 12, 3, generator=generator, dtype=torch.float64)
     points = torch.rand(1, 12, 3, generator=generator, dtype=torch.float64)
@@ -239,7 +239,7 @@ def test_gradients_are_those_of_differences() -> None:
 
 
 @BOTH
-def test_a_program_is_compiled_around_them(make: Maker) -> None:
+def test_a_program_is_compiled_around_them(make):
     batch = two_bodies()
     module = make(embedding=EMBEDDING)
     torch.compiler.reset()
@@ -249,7 +249,7 @@ def test_a_program_is_compiled_around_them(make: Maker) -> None:
 
 
 @BOTH
-def test_another_default_device_changes_nothing_of_weighted_samples(make: Maker) -> None:
+def test_another_default_device_changes_nothing_of_weighted_samples(make):
     batch = two_bodies()
     histogram = make(embedding=EMBEDDING)
     weights = torch.rand(batch.surface.mask.shape, generator=torch.Generator().manual_seed(3))

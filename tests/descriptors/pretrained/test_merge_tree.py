@@ -32,7 +32,7 @@ def random_graph(seed: int, n: int = 80, k: int = 3) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_as_many_branches_live_at_each_level_as_there_are_components(seed: int) -> None:
+def test_as_many_branches_live_at_each_level_as_there_are_components(seed):
     values, neighbours = random_graph(seed)
     tree = merge_tree(values, neighbours)
     peaks = values[tree.peaks]
@@ -46,7 +46,7 @@ def test_as_many_branches_live_at_each_level_as_there_are_components(seed: int) 
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_pieces_are_components_named_by_their_peaks(seed: int) -> None:
+def test_pieces_are_components_named_by_their_peaks(seed):
     values, neighbours = random_graph(seed)
     counts = [1, 8, 8, 30, 80]
     tree = merge_tree(values, neighbours, counts)
@@ -68,7 +68,7 @@ def on_a_path(values: Sequence[float]) -> tuple[Tensor, Tensor]:
     )
 
 
-def test_the_lower_of_two_peaks_ends_where_they_meet() -> None:
+def test_the_lower_of_two_peaks_ends_where_they_meet():
     """Heights 5, 3 and 4, passes 1 and 2 between them, and 0 at the lower end."""
     values, neighbours = on_a_path([0.0, 5.0, 1.0, 3.0, 2.0, 4.0])
     tree = merge_tree(values, neighbours)
@@ -76,7 +76,7 @@ def test_the_lower_of_two_peaks_ends_where_they_meet() -> None:
     assert found == {5.0: 0.0, 4.0: 1.0, 3.0: 2.0}
 
 
-def test_of_equal_peaks_the_first_lives_on() -> None:
+def test_of_equal_peaks_the_first_lives_on():
     tree = merge_tree(*on_a_path([2.0, 1.0, 2.0, 0.0]))
     assert sorted(zip(tree.peaks.tolist(), tree.saddles.tolist(), strict=True)) == [(0, 3), (2, 1)]
     many = merge_tree(*on_a_path([2.0, 1.0] * 200 + [0.0]))
@@ -84,13 +84,13 @@ def test_of_equal_peaks_the_first_lives_on() -> None:
     assert (0, 400) in zip(many.peaks.tolist(), many.saddles.tolist(), strict=True)
 
 
-def test_what_is_apart_ends_at_the_bottom() -> None:
+def test_what_is_apart_ends_at_the_bottom():
     values = torch.tensor([3.0, 1.0, 2.0, 0.5])
     tree = merge_tree(values, torch.tensor([[1], [0], [3], [2]]))
     assert sorted(zip(tree.peaks.tolist(), tree.saddles.tolist(), strict=True)) == [(0, 3), (2, 3)]
 
 
-def test_points_outside_the_mask_are_not_there() -> None:
+def test_points_outside_the_mask_are_not_there():
     values, neighbours = random_graph(7)
     mask = torch.arange(80) % 3 != 1
     numbers = mask.nonzero()[:, 0]
@@ -107,11 +107,11 @@ def test_points_outside_the_mask_are_not_there() -> None:
     assert (tree.pieces >= 0).sum(dim=1).tolist() == [5, 20]
 
 
-def test_a_single_point_is_one_branch_of_no_length() -> None:
+def test_a_single_point_is_one_branch_of_no_length():
     tree = merge_tree(torch.tensor([1.0]), nearest_neighbours(torch.zeros(1, 3), 4), [1])
     assert [one.tolist() for one in tree] == [[0], [0], [[0]]]
 
 
-def test_what_cannot_be_ordered_is_refused() -> None:
+def test_what_cannot_be_ordered_is_refused():
     with pytest.raises(ValueError, match="values: expected finite numbers, got NaN or infinity"):
         merge_tree(torch.tensor([1.0, torch.nan]), torch.tensor([[1], [0]]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -54,9 +53,7 @@ def histograms(dataset: SignatureDataset) -> torch.Tensor:
     return describe(dataset, igps.descriptor("rich"))
 
 
-def test_rich_is_its_histograms_side_by_side_with_equal_shares(
-    dataset: SignatureDataset, histograms: torch.Tensor
-) -> None:
+def test_rich_is_its_histograms_side_by_side_with_equal_shares(dataset, histograms):
     """Each computed alone, without what they share."""
     found = igps.descriptor("rich")
     assert isinstance(found, HistogramDescriptor)
@@ -77,7 +74,7 @@ def test_rich_is_its_histograms_side_by_side_with_equal_shares(
     torch.testing.assert_close(whole, torch.stack(of_parts).mean(dim=0), rtol=1e-4, atol=1e-6)
 
 
-def test_a_class_is_closer_to_itself(dataset: SignatureDataset, histograms: torch.Tensor) -> None:
+def test_a_class_is_closer_to_itself(dataset, histograms):
     """NN and FT of `rich`; as a control, FT of shuffled labels, where 2 of 35 other shapes (6 %) match."""
     scores = retrieval_scores(
         igps.descriptor("rich").distances(histograms, histograms), dataset.labels
@@ -91,7 +88,7 @@ def test_a_class_is_closer_to_itself(dataset: SignatureDataset, histograms: torc
     assert by_chance["ft"] < 0.3
 
 
-def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> None:
+def test_pretrained_is_what_its_parameters_say(dataset):
     """Written down from the stored numbers: roots, directions and lengths part by part."""
     part = dataset.subset(range(4))
     module = pretrained()
@@ -145,7 +142,7 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
     )
 
 
-def test_pretrained_gives_unit_vectors_and_short_ones(dataset: SignatureDataset) -> None:
+def test_pretrained_gives_unit_vectors_and_short_ones(dataset):
     """By cosines, short vectors lose less than 0.02 of FT."""
     module = pretrained()
     found = describe(dataset, module)
@@ -160,7 +157,7 @@ def test_pretrained_gives_unit_vectors_and_short_ones(dataset: SignatureDataset)
     assert of_short > whole - 0.02
 
 
-def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
+def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path):
     """Over the plain distance of `rich`, and over that of its own histograms: on classes that are hard to tell apart.
 
     Of another seed than those that it was fitted to, and without the twelve templates, which all descriptors tell.
@@ -183,7 +180,7 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
     assert learned > first_tier(chi_square(own, own)) + 0.1
 
 
-def test_a_head_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_path: Path) -> None:
+def test_a_head_of_ones_own_is_stored_and_loaded(dataset, tmp_path):
     dataset = dataset.subset(range(20))
     descriptor = pretrained_parts().eval()
     described = describe(dataset, descriptor)
@@ -198,9 +195,7 @@ def test_a_head_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_
     )
 
 
-def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_numbers(
-    dataset: SignatureDataset,
-) -> None:
+def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_numbers(dataset):
     """By the places of samples; `torch.cdist` has none of them, and pieces of one sample have no spread."""
     batch = dataset.batch([0]).to(torch.float64)
     pretrained = igps.descriptor("pretrained").double()
@@ -225,11 +220,11 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_nu
     assert torch.isfinite(torch.func.jvp(torch.func.grad(loss), (places,), (along,))[1]).all()
 
 
-def test_shipped_file_is_small() -> None:
+def test_shipped_file_is_small():
     assert PRETRAINED.stat().st_size < 5e6
 
 
-def test_a_file_of_another_head_is_named(tmp_path: Path) -> None:
+def test_a_file_of_another_head_is_named(tmp_path):
     path = tmp_path / "other.safetensors"
     save_file({"head.mean": torch.zeros(3)}, path)
     with pytest.raises(
@@ -240,7 +235,7 @@ def test_a_file_of_another_head_is_named(tmp_path: Path) -> None:
         pretrained(tmp_path / "missing.safetensors")
 
 
-def test_coordinates_within_a_class_separate_a_small_difference_from_sampling() -> None:
+def test_coordinates_within_a_class_separate_a_small_difference_from_sampling():
     """A width that differs by 3 % changes them more than other samples do; for whole vectors it does not."""
     descriptor = igps.descriptor("pretrained")
     config = descriptor.requirements.apply_to(SignatureConfig())

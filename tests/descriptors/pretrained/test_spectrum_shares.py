@@ -1,7 +1,5 @@
 """Shares of eigenvalues against a loop, on scaled and padded bodies, and where Weyl's law knows them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -14,7 +12,7 @@ from igps.descriptors.pretrained.spectrum_shares import SpectrumShares
 from igps.nn.descriptor import HistogramDescriptor
 
 
-def test_shares_are_those_of_a_loop() -> None:
+def test_shares_are_those_of_a_loop():
     batch = two_bodies()
     found = SpectrumShares(6)(batch)
     assert found.shape == (2, 7)
@@ -26,7 +24,7 @@ def test_shares_are_those_of_a_loop() -> None:
         torch.testing.assert_close(found[i], torch.tensor([*shares, 1 - sum(shares)]))
 
 
-def test_a_spectrum_that_follows_weyl_has_equal_shares() -> None:
+def test_a_spectrum_that_follows_weyl_has_equal_shares():
     """Half of the bound, times the area of the ball of equal volume over the body's own area."""
     batch = two_bodies()
     line = 4 * torch.pi * torch.arange(1, 13, dtype=torch.float64) / batch.area[:, None]
@@ -37,7 +35,7 @@ def test_a_spectrum_that_follows_weyl_has_equal_shares() -> None:
     )
 
 
-def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off() -> None:
+def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off():
     batch = two_bodies()
     part = SpectrumShares(min(N_EIGENPAIRS))
     found = part(replace(batch, eigenvalues=1e3 * batch.eigenvalues))
@@ -46,7 +44,7 @@ def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off() -> None:
     torch.testing.assert_close(found[:, -1], torch.zeros(2), atol=1e-6, rtol=0)
 
 
-def test_padding_and_scale_change_nothing() -> None:
+def test_padding_and_scale_change_nothing():
     batch = two_bodies()
     histogram = SpectrumShares(min(N_EIGENPAIRS))
     found = histogram(batch)
@@ -56,7 +54,7 @@ def test_padding_and_scale_change_nothing() -> None:
     torch.testing.assert_close(histogram(scaled(batch, 3.0)), found)
 
 
-def test_needs_and_what_is_refused() -> None:
+def test_needs_and_what_is_refused():
     assert SpectrumShares(20).requirements == Requirements(n_eigenpairs=20)
     with pytest.raises(ValueError, match="n_eigenpairs: expected at least 2, got 1"):
         SpectrumShares(1)

@@ -17,7 +17,6 @@ from igps.nn.axes import (
     PairAxis,
     PairCosines,
     PairTwist,
-    PointAxis,
     Potential,
     axis_of,
 )
@@ -29,10 +28,10 @@ from loops import hat, soft_classes
 
 def view(kind: str = "interior") -> SampleFeatures:
     batch = two_bodies()
-    return SampleFeatures(batch, kind, getattr(batch, kind))  # type: ignore[arg-type]
+    return SampleFeatures(batch, kind, getattr(batch, kind))
 
 
-def test_hats_are_the_linear_kernel() -> None:
+def test_hats_are_the_linear_kernel():
     values = torch.tensor([0.0, 0.1, 0.3, 0.35, 0.5, 0.9, 1.0, 5.0], dtype=torch.float64)
     centres = [0.1, 0.35, 0.4, 0.95]
     expected = [hat(float(value), centres) for value in values]
@@ -45,7 +44,7 @@ def test_hats_are_the_linear_kernel() -> None:
     np.testing.assert_allclose(in_rows.flatten(0, 1), expected, atol=1e-14)
 
 
-def test_hats_are_differentiable_in_both_arguments() -> None:
+def test_hats_are_differentiable_in_both_arguments():
     values = torch.tensor([0.0, 0.2, 0.37, 0.5, 2.0], dtype=torch.float64, requires_grad=True)
     centres = torch.tensor([0.1, 0.35, 0.9], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(soft_memberships, (values, centres))
@@ -54,7 +53,7 @@ def test_hats_are_differentiable_in_both_arguments() -> None:
 @pytest.mark.parametrize(
     "axis", [Potential(4, 1.5), Attribute("depth", [0.1875, 0.5625, 0.9375, 1.3125])]
 )
-def test_hard_classes_are_those_of_the_nearest_centre(axis: PointAxis) -> None:
+def test_hard_classes_are_those_of_the_nearest_centre(axis):
     values = torch.tensor([0.0, 0.3749, 0.375, 0.7, 0.75, 1.125, 1.5, 9.0])
     expected = [0, 0, 1, 1, 2, 3, 3, 3]
     assert axis.memberships(values).tolist() == np.eye(4)[expected].tolist()
@@ -65,10 +64,8 @@ def test_hard_classes_are_those_of_the_nearest_centre(axis: PointAxis) -> None:
     "options", [{}, {"soft": True}, {"learnable": True}, {"soft": True, "learnable": True}]
 )
 @pytest.mark.parametrize("depths", [[0.1, 0.35, 0.4, 0.95], [0.2, 0.3], [0.4]])
-def test_members_are_memberships_without_their_zeros(
-    options: dict[str, bool], depths: list[float]
-) -> None:
-    axis = Attribute("depth", depths, **options)  # type: ignore[arg-type]
+def test_members_are_memberships_without_their_zeros(options, depths):
+    axis = Attribute("depth", depths, **options)
     values = torch.tensor([[0.0, 0.1, 0.3, 0.35], [0.5, 0.9, 1.0, torch.nan]])
     mask = values.isfinite()
     classes, weights = axis.members(values, mask)
@@ -79,7 +76,7 @@ def test_members_are_memberships_without_their_zeros(
 
 
 @pytest.mark.parametrize("learnable", [False, True])
-def test_soft_classes_are_hats(learnable: bool) -> None:
+def test_soft_classes_are_hats(learnable):
     axis = Potential(3, 0.9, soft=True, learnable=learnable)
     values = torch.linspace(0, 1.2, 30)
     np.testing.assert_allclose(
@@ -88,7 +85,7 @@ def test_soft_classes_are_hats(learnable: bool) -> None:
     assert len(list(axis.parameters())) == learnable
 
 
-def test_learned_hard_classes_are_hard_and_have_the_derivative_of_soft_ones() -> None:
+def test_learned_hard_classes_are_hard_and_have_the_derivative_of_soft_ones():
     axes = {soft: Potential(3, 0.9, soft=soft, learnable=True) for soft in (False, True)}
     values = torch.linspace(0, 1.2, 30, requires_grad=True)
     upstream = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
@@ -103,7 +100,7 @@ def test_learned_hard_classes_are_hard_and_have_the_derivative_of_soft_ones() ->
     assert all(bool(gradient.any()) for gradient in found)
 
 
-def test_values_of_points() -> None:
+def test_values_of_points():
     seen = view()
     potential = Potential().values(seen, SpectralEmbedding(n_eigenpairs=4))
     for i, n in enumerate((40, 25)):
@@ -115,7 +112,7 @@ def test_values_of_points() -> None:
     )
 
 
-def test_values_that_are_not_finite_are_refused() -> None:
+def test_values_that_are_not_finite_are_refused():
     for soft in (False, True):
         with pytest.raises(
             ValueError, match="Attribute: expected finite values, got NaN or infinity"
@@ -123,7 +120,7 @@ def test_values_that_are_not_finite_are_refused() -> None:
             Attribute("depth", [0.1, 0.2], soft=soft).memberships(torch.tensor([0.1, torch.nan]))
 
 
-def test_a_missing_attribute_lists_what_there_is() -> None:
+def test_a_missing_attribute_lists_what_there_is():
     with pytest.raises(
         ValueError,
         match=r"attributes: expected the surface samples to have 'charge', got \['depth', 'surface_direction'\]",
@@ -136,14 +133,14 @@ def test_a_missing_attribute_lists_what_there_is() -> None:
         PairCosines().pairs(SampleFeatures(bare, "interior", bare.interior), SpectralEmbedding())
 
 
-def test_directions_are_no_classes() -> None:
+def test_directions_are_no_classes():
     with pytest.raises(
         ValueError, match="expected a scalar, got 'surface_direction', which is a direction"
     ):
         Attribute("surface_direction", [0.0, 1.0]).values(view(), nn.Identity())
 
 
-def test_needs() -> None:
+def test_needs():
     fine = SpectralEmbedding(n_eigenpairs=9)
     coarse = SpectralEmbedding(n_eigenpairs=2)
     assert Potential().requirements(fine) == Requirements(n_eigenpairs=9)
@@ -162,13 +159,13 @@ def test_needs() -> None:
     assert Attribute("one of my own", [0.1]).requirements(fine) == Requirements()
 
 
-def test_shapes() -> None:
+def test_shapes():
     assert InteriorDistance(7).shape == (7,)
     assert EuclideanDistance(3).shape == PairTwist(3).shape == (3,)
     assert PairCosines(4).shape == EmbeddedPairCosines(4).shape == (4, 4, 4)
 
 
-def test_named_axes_are_made_as_they_are_by_default() -> None:
+def test_named_axes_are_made_as_they_are_by_default():
     assert {name: type(axis_of(name)) for name in AXES} == dict(AXES)
     assert isinstance(axis_of("interior_distance"), PairAxis)
     np.testing.assert_allclose(
@@ -176,7 +173,7 @@ def test_named_axes_are_made_as_they_are_by_default() -> None:
     )
 
 
-def test_a_wrong_name_lists_the_axes() -> None:
+def test_a_wrong_name_lists_the_axes():
     with pytest.raises(
         ValueError, match=r"axes: expected one of potential, interior_distance, .*, got 'geodesic'"
     ):
@@ -193,13 +190,13 @@ def test_a_wrong_name_lists_the_axes() -> None:
         (lambda: EmbeddedPairCosines(-3), "n_bins: expected at least 2, got -3"),
         (lambda: InteriorDistance(reach=0.0), "reach: expected a positive number, got 0"),
         (lambda: Potential(0), "n_classes: expected at least 1, got 0"),
-        (lambda: Potential(2.5), "n_classes: expected a whole number, got 2.5"),  # type: ignore[arg-type]
+        (lambda: Potential(2.5), "n_classes: expected a whole number, got 2.5"),
         (
             lambda: Attribute("depth", [0.2, 0.1]),
             "start: expected finite values in ascending order",
         ),
     ],
 )
-def test_impossible_axes_are_refused(make, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_impossible_axes_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

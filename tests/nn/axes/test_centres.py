@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -7,7 +5,7 @@ import torch
 from igps.nn.axes.centres import OrderedCentres, interval_centres
 
 
-def test_interval_centres_lie_in_the_middle_of_equal_intervals() -> None:
+def test_interval_centres_lie_in_the_middle_of_equal_intervals():
     edges = np.linspace(0, 1.5, 5)
     np.testing.assert_allclose(
         interval_centres(4, 1.5, "n_classes"), (edges[1:] + edges[:-1]) / 2, rtol=1e-6
@@ -17,7 +15,7 @@ def test_interval_centres_lie_in_the_middle_of_equal_intervals() -> None:
 @pytest.mark.parametrize(
     ("n", "largest"), [(0, 1.0), (3, 0.0), (3, float("inf")), (3, float("nan"))]
 )
-def test_impossible_intervals_are_refused(n: int, largest: float) -> None:
+def test_impossible_intervals_are_refused(n, largest):
     expected = (
         "n_bins: expected at least 1, got 0"
         if n == 0
@@ -28,7 +26,7 @@ def test_impossible_intervals_are_refused(n: int, largest: float) -> None:
 
 
 @pytest.mark.parametrize("start", [[0.1, 0.2, 0.5, 0.6], [-3.0, -1.0, 0.0, 7.0], [0.4]])
-def test_learned_centres_stay_in_order(start: list[float]) -> None:
+def test_learned_centres_stay_in_order(start):
     centres = OrderedCentres(start, learnable=True)
     assert centres.log_gap is not None
     np.testing.assert_allclose(centres().detach(), start, atol=1e-6)
@@ -41,7 +39,7 @@ def test_learned_centres_stay_in_order(start: list[float]) -> None:
         assert start[0] < 0 or values[0] > 0
 
 
-def test_fixed_centres_are_a_copy_and_no_parameters() -> None:
+def test_fixed_centres_are_a_copy_and_no_parameters():
     start = torch.tensor([0.1, 0.4])
     centres = OrderedCentres(start)
     start += 1
@@ -50,6 +48,6 @@ def test_fixed_centres_are_a_copy_and_no_parameters() -> None:
 
 
 @pytest.mark.parametrize("start", [[0.2, 0.1], [0.1, 0.1], [], [0.1, float("nan")], [[0.1, 0.2]]])
-def test_centres_that_do_not_ascend_are_refused(start: list[float]) -> None:
+def test_centres_that_do_not_ascend_are_refused(start):
     with pytest.raises(ValueError, match="start: expected finite values in ascending order"):
         OrderedCentres(start)

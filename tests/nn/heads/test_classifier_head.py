@@ -26,7 +26,7 @@ def drawn(
     return cells / cells.sum(dim=1, keepdim=True), labels + 10
 
 
-def test_folds_hold_out_each_shape_once_and_leave_every_class() -> None:
+def test_folds_hold_out_each_shape_once_and_leave_every_class():
     labels = torch.tensor([4] * 7 + [2] * 3 + [9])
     masks = list(folds(labels))
     assert torch.stack(masks).sum(dim=0).tolist() == [1] * 10 + [0]
@@ -34,7 +34,7 @@ def test_folds_hold_out_each_shape_once_and_leave_every_class() -> None:
     assert list(folds(torch.arange(5))) == []
 
 
-def test_scores_are_those_of_the_kernel_head_and_probabilities_their_softmax() -> None:
+def test_scores_are_those_of_the_kernel_head_and_probabilities_their_softmax():
     histograms, labels = drawn(4, 8)
     head = ClassifierHead().fit(histograms, labels, PARTS)
     kernel = KernelHead().fit(histograms, labels, PARTS)
@@ -48,7 +48,7 @@ def test_scores_are_those_of_the_kernel_head_and_probabilities_their_softmax() -
     )
 
 
-def test_the_temperature_is_the_likeliest_on_what_is_held_out() -> None:
+def test_the_temperature_is_the_likeliest_on_what_is_held_out():
     histograms, labels = drawn(4, 8, noise=1.5)
     head = ClassifierHead().fit(histograms, labels, PARTS)
     scores = []
@@ -67,7 +67,7 @@ def test_the_temperature_is_the_likeliest_on_what_is_held_out() -> None:
     assert loss(found) <= min(loss(found * factor) for factor in (0.5, 0.9, 1.1, 2.0))
 
 
-def test_strangeness_is_what_its_formula_says() -> None:
+def test_strangeness_is_what_its_formula_says():
     """By loops: the mean of two distances in the class that a shape is taken for, minus its score."""
     prior = WhitenedHead(2).fit(*drawn(3, 5, seed=3), PARTS)
     histograms, labels = drawn(3, 6)
@@ -93,7 +93,7 @@ def test_strangeness_is_what_its_formula_says() -> None:
         assert found == pytest.approx(sum(nearest) / 2 - float(score), abs=1e-4)
 
 
-def test_a_class_that_was_left_out_is_unknown_and_others_are_not() -> None:
+def test_a_class_that_was_left_out_is_unknown_and_others_are_not():
     histograms, labels = drawn(6, 12, noise=0.3)
     known = labels < 15
     head = ClassifierHead(names=list("abcde")).fit(histograms[known], labels[known], PARTS)
@@ -104,7 +104,7 @@ def test_a_class_that_was_left_out_is_unknown_and_others_are_not() -> None:
     assert head.names == tuple("abcde")
 
 
-def test_one_shape_of_each_class_is_enough_and_calls_nothing_unknown() -> None:
+def test_one_shape_of_each_class_is_enough_and_calls_nothing_unknown():
     histograms, labels = drawn(3, 1)
     head = ClassifierHead(WhitenedHead()).fit(histograms, labels)
     assert head.predict(histograms).tolist() == labels.tolist()

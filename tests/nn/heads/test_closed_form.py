@@ -41,7 +41,7 @@ def ft(embedding: Tensor, labels: Tensor) -> float:
     return retrieval_scores(cosine(embedding, embedding), labels).mean()["ft"]
 
 
-def test_whitening_is_the_inverse_root_of_the_covariance(collection: tuple[Tensor, Tensor]) -> None:
+def test_whitening_is_the_inverse_root_of_the_covariance(collection):
     histograms, labels = collection
     roots = histograms.double().sqrt().numpy()
     residuals = np.concatenate(
@@ -56,7 +56,7 @@ def test_whitening_is_the_inverse_root_of_the_covariance(collection: tuple[Tenso
     np.testing.assert_allclose(head(histograms), normalize(torch.from_numpy(expected)), atol=2e-5)
 
 
-def test_few_directions_are_the_largest(collection: tuple[Tensor, Tensor]) -> None:
+def test_few_directions_are_the_largest(collection):
     histograms, labels = collection
     few = WhitenedHead(n_directions=3).fit(histograms, labels)
     many = WhitenedHead(n_directions=40).fit(histograms, labels)
@@ -66,7 +66,7 @@ def test_few_directions_are_the_largest(collection: tuple[Tensor, Tensor]) -> No
     )
 
 
-def test_parts_are_whitened_one_by_one(collection: tuple[Tensor, Tensor]) -> None:
+def test_parts_are_whitened_one_by_one(collection):
     histograms, labels = collection
     parts = histograms.split([20, 40], dim=1)
     together = WhitenedHead().fit(histograms, labels, (20, 40))(histograms)
@@ -75,7 +75,7 @@ def test_parts_are_whitened_one_by_one(collection: tuple[Tensor, Tensor]) -> Non
     torch.testing.assert_close(cosine(together, together), expected, atol=1e-5, rtol=0)
 
 
-def test_kernels_of_parts_are_averaged(collection: tuple[Tensor, Tensor]) -> None:
+def test_kernels_of_parts_are_averaged(collection):
     histograms, labels = collection
     kernels = []
     for part in histograms.split([20, 40], dim=1):
@@ -97,7 +97,7 @@ def test_kernels_of_parts_are_averaged(collection: tuple[Tensor, Tensor]) -> Non
     torch.testing.assert_close(copy(histograms), head(histograms))
 
 
-def test_an_unfitted_head_gives_normalised_square_roots(collection: tuple[Tensor, Tensor]) -> None:
+def test_an_unfitted_head_gives_normalised_square_roots(collection):
     """Whatever the number of cells."""
     torch.testing.assert_close(WhitenedHead()(collection[0]), collection[0].sqrt())
     few = collection[0][:, :7]
@@ -106,7 +106,7 @@ def test_an_unfitted_head_gives_normalised_square_roots(collection: tuple[Tensor
     torch.testing.assert_close(WhitenedHead()(stacked), collection[0].sqrt())
 
 
-def test_centred_head_damps_nothing(collection: tuple[Tensor, Tensor]) -> None:
+def test_centred_head_damps_nothing(collection):
     histograms, _ = collection
     roots = histograms.sqrt() - histograms.sqrt().mean(dim=0)
     torch.testing.assert_close(WhitenedHead().centre(histograms)(histograms), normalize(roots))
@@ -115,14 +115,14 @@ def test_centred_head_damps_nothing(collection: tuple[Tensor, Tensor]) -> None:
     torch.testing.assert_close(in_parts, torch.cat(parts, dim=1))
 
 
-def test_heads_are_heads_and_unit_vectors(collection: tuple[Tensor, Tensor]) -> None:
+def test_heads_are_heads_and_unit_vectors(collection):
     for head in (WhitenedHead(), KernelHead()):
         assert isinstance(head, Head)
         assert head.fit(*collection) is head
         torch.testing.assert_close(head(collection[0]).norm(dim=1), torch.ones(48))
 
 
-def test_whitening_serves_classes_it_was_not_fitted_to(collection: tuple[Tensor, Tensor]) -> None:
+def test_whitening_serves_classes_it_was_not_fitted_to(collection):
     histograms, labels = collection
     trained = labels < 4
     head = WhitenedHead(shrinkage=0.1).fit(histograms[trained], labels[trained])
@@ -130,7 +130,7 @@ def test_whitening_serves_classes_it_was_not_fitted_to(collection: tuple[Tensor,
     assert ft(head(unseen), labels[~trained]) > ft(unseen.sqrt(), labels[~trained]) + 0.2
 
 
-def test_order_of_the_training_shapes_does_not_matter(collection: tuple[Tensor, Tensor]) -> None:
+def test_order_of_the_training_shapes_does_not_matter(collection):
     histograms, labels = collection
     order = torch.randperm(len(labels), generator=torch.Generator().manual_seed(1))
     one = KernelHead().fit(histograms, labels)
@@ -138,7 +138,7 @@ def test_order_of_the_training_shapes_does_not_matter(collection: tuple[Tensor, 
     torch.testing.assert_close(one(histograms), other(histograms), atol=1e-4, rtol=0)
 
 
-def test_kernel_head_is_kernel_ridge_regression(collection: tuple[Tensor, Tensor]) -> None:
+def test_kernel_head_is_kernel_ridge_regression(collection):
     histograms, labels = collection
     train = slice(0, 48, 2)
     test = slice(1, 48, 2)
@@ -153,7 +153,7 @@ def test_kernel_head_is_kernel_ridge_regression(collection: tuple[Tensor, Tensor
     np.testing.assert_array_equal(head.predict(histograms[test]), expected.argmax(axis=1))
 
 
-def test_identical_shapes_have_no_direction() -> None:
+def test_identical_shapes_have_no_direction():
     histograms = torch.tensor(
         [[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.0, 0.25, 0.75], [0.0, 0.25, 0.75]]
     )
@@ -162,7 +162,7 @@ def test_identical_shapes_have_no_direction() -> None:
     torch.testing.assert_close(head(histograms), normalize(centred))
 
 
-def test_classes_keep_their_names(collection: tuple[Tensor, Tensor]) -> None:
+def test_classes_keep_their_names(collection):
     histograms, labels = collection
     head = KernelHead().fit(histograms, 10 * labels + 3)
     assert (head.predict(histograms) == 10 * labels + 3).all()
@@ -170,11 +170,7 @@ def test_classes_keep_their_names(collection: tuple[Tensor, Tensor]) -> None:
 
 @pytest.mark.parametrize("kind", [WhitenedHead, KernelHead])
 @pytest.mark.parametrize("part_cells", [None, (20, 40)])
-def test_state_round_trips_into_a_head_of_other_sizes(
-    collection: tuple[Tensor, Tensor],
-    kind: type[WhitenedHead | KernelHead],
-    part_cells: tuple[int, int] | None,
-) -> None:
+def test_state_round_trips_into_a_head_of_other_sizes(collection, kind, part_cells):
     histograms, labels = collection
     head = kind().fit(histograms, labels, part_cells)
     state = {name: value.clone() for name, value in head.state_dict().items()}
@@ -186,7 +182,7 @@ def test_state_round_trips_into_a_head_of_other_sizes(
             assert torch.equal(value, state[name]), name
 
 
-def test_a_head_is_fitted_anew(collection: tuple[Tensor, Tensor]) -> None:
+def test_a_head_is_fitted_anew(collection):
     """What it was fitted to before leaves no trace."""
     histograms, labels = collection
     for kind in (WhitenedHead, KernelHead):
@@ -196,7 +192,7 @@ def test_a_head_is_fitted_anew(collection: tuple[Tensor, Tensor]) -> None:
         )
 
 
-def test_errors_name_the_argument(collection: tuple[Tensor, Tensor]) -> None:
+def test_errors_name_the_argument(collection):
     histograms, labels = collection
     fitted = WhitenedHead().fit(histograms, labels)
     with pytest.raises(ValueError, match="expected 60 cells as in training, got 59"):
@@ -255,9 +251,7 @@ def squared(prior: WhitenedHead) -> SquaredPrior:
 
 
 @pytest.mark.parametrize("kind", [WhitenedHead, KernelHead])
-def test_a_prior_stays_as_it_is(
-    collection: tuple[Tensor, Tensor], prior: WhitenedHead, kind: type[WhitenedHead | KernelHead]
-) -> None:
+def test_a_prior_stays_as_it_is(collection, prior, kind):
     histograms, labels = collection
     before = {name: value.clone() for name, value in prior.state_dict().items()}
     head = kind(prior=prior).fit(histograms[labels < 4], labels[labels < 4], (30, 30))
@@ -276,9 +270,7 @@ class SteppedPrior(WhitenedHead):
         return (euclidean(queries, gallery) > 1.1).to(queries.dtype).clamp_min(0.01)
 
 
-def test_an_indefinite_kernel_is_projected_on_its_positive_eigenvectors(
-    collection: tuple[Tensor, Tensor], prior: WhitenedHead
-) -> None:
+def test_an_indefinite_kernel_is_projected_on_its_positive_eigenvectors(collection, prior):
     """Against scikit-learn on the projected kernel. Here the ridge cancels the smallest eigenvalue."""
     histograms, labels = collection
     stepped = SteppedPrior()
@@ -298,9 +290,7 @@ def test_an_indefinite_kernel_is_projected_on_its_positive_eigenvectors(
     )
 
 
-def test_weights_and_temperature_are_loaded(
-    collection: tuple[Tensor, Tensor], prior: WhitenedHead
-) -> None:
+def test_weights_and_temperature_are_loaded(collection, prior):
     """Into heads that were made with others."""
     pairs = (
         (WhitenedHead(prior=prior, prior_share=0.2), WhitenedHead(prior=WhitenedHead())),
@@ -311,9 +301,7 @@ def test_weights_and_temperature_are_loaded(
         torch.testing.assert_close(other(collection[0]), head(collection[0]), rtol=0, atol=0)
 
 
-def test_whitened_distance_is_the_weighted_mean_with_the_priors(
-    collection: tuple[Tensor, Tensor], prior: WhitenedHead, squared: SquaredPrior
-) -> None:
+def test_whitened_distance_is_the_weighted_mean_with_the_priors(collection, prior, squared):
     """With the prior's own distance, where it has one; the cosine distance of the vectors is that with its cosines."""
     histograms, labels = collection
     own = WhitenedHead().fit(histograms, labels)(histograms)
@@ -331,9 +319,7 @@ def test_whitened_distance_is_the_weighted_mean_with_the_priors(
         WhitenedHead(prior=prior).distances(beside, beside)
 
 
-def test_parts_beside_a_prior_are_weighted_by_fishers_discriminant(
-    collection: tuple[Tensor, Tensor], squared: SquaredPrior
-) -> None:
+def test_parts_beside_a_prior_are_weighted_by_fishers_discriminant(collection, squared):
     """Means and variances over all pairs, by `statistics`; the last part separates shapes, but not classes."""
     histograms, labels = collection
     backwards = histograms.roll(1, dims=0).view(8, 6, N_CELLS).transpose(0, 1).reshape(48, N_CELLS)
@@ -382,9 +368,7 @@ class Stretched(Head):
         return self.head.distances(queries, gallery)
 
 
-def test_without_separation_all_parts_have_equal_weights(
-    collection: tuple[Tensor, Tensor], prior: WhitenedHead
-) -> None:
+def test_without_separation_all_parts_have_equal_weights(collection, prior):
     """A single class, or two classes of identical shapes."""
     histograms, _ = collection
     again = torch.cat([histograms[:6], histograms[:6]])
@@ -399,9 +383,7 @@ def test_without_separation_all_parts_have_equal_weights(
 
 
 @pytest.mark.parametrize("power", [1, 2])
-def test_the_priors_kernel_is_one_more(
-    collection: tuple[Tensor, Tensor], prior: WhitenedHead, squared: SquaredPrior, power: int
-) -> None:
+def test_the_priors_kernel_is_one_more(collection, prior, squared, power):
     """By the prior's own distance, where it has one."""
     histograms, labels = collection
     train = slice(0, 48, 2)
@@ -423,9 +405,7 @@ def test_the_priors_kernel_is_one_more(
     )
 
 
-def test_one_shape_of_each_class_leaves_the_prior_alone(
-    collection: tuple[Tensor, Tensor], prior: WhitenedHead
-) -> None:
+def test_one_shape_of_each_class_leaves_the_prior_alone(collection, prior):
     histograms, labels = collection
     vectors = prior(histograms).double().numpy()
     distances = 1 - vectors @ vectors[::6].T
@@ -438,8 +418,8 @@ def test_one_shape_of_each_class_leaves_the_prior_alone(
 
 @pytest.mark.parametrize(("n_of_each", "temperature"), [(3, 0.2), (6, 0.1), (24, 0.1)])
 def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(
-    collection: tuple[Tensor, Tensor], n_of_each: int, temperature: float
-) -> None:
+    collection, n_of_each, temperature
+):
     """Against NumPy and SciPy's softmax; with three shapes of each class the temperature is doubled."""
     histograms, labels = collection
     used = slice(None, None, 2 if n_of_each == 3 else 1)
@@ -456,7 +436,7 @@ def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(
     assert torch.isfinite(hard(histograms)).all()  # as no exponential overflows
 
 
-def test_one_shape_of_each_class_is_centred_alone(collection: tuple[Tensor, Tensor]) -> None:
+def test_one_shape_of_each_class_is_centred_alone(collection):
     histograms, labels = collection
     head = KernelHead().fit(histograms[::6], labels[::6])
     centred = WhitenedHead().centre(histograms[::6])
@@ -476,9 +456,7 @@ def fitted_heads(collection: tuple[Tensor, Tensor]) -> list[Head]:
     return [prior, *(head.fit(*collection, [20, 40]) for head in made)]
 
 
-def test_fitted_heads_are_traced_whole_and_take_half_precision(
-    collection: tuple[Tensor, Tensor],
-) -> None:
+def test_fitted_heads_are_traced_whole_and_take_half_precision(collection):
     histograms = collection[0]
     for head in fitted_heads(collection):
         expected = head(histograms)

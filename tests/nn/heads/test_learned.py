@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 
@@ -23,9 +21,7 @@ def histograms() -> torch.Tensor:
     return counts / counts.sum(dim=(1, 2), keepdim=True)
 
 
-def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(
-    histograms: torch.Tensor,
-) -> None:
+def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(histograms):
     torch.manual_seed(0)
     head = ProjectionHead(width=5, n_hidden=16)
     histograms.requires_grad_()
@@ -37,14 +33,12 @@ def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(
     assert histograms.grad.abs().max() > 0
 
 
-def test_linear_head_with_identity_weights_ranks_like_hellingers_distance(
-    histograms: torch.Tensor,
-) -> None:
+def test_linear_head_with_identity_weights_ranks_like_hellingers_distance(histograms):
     head = ProjectionHead(width=24, n_hidden=0).eval()
     head(histograms)  # which tells its size
     with torch.no_grad():
-        head.layers[1].weight.copy_(torch.eye(24))  # type: ignore[union-attr]
-        head.layers[1].bias.zero_()  # type: ignore[union-attr]
+        head.layers[1].weight.copy_(torch.eye(24))
+        head.layers[1].bias.zero_()
     embedding = head(histograms)
     # Of histograms that sum to 1 the square roots are unit vectors; Hellinger's distance is theirs over √2.
     roots = histograms.detach().flatten(1).sqrt()
@@ -52,7 +46,7 @@ def test_linear_head_with_identity_weights_ranks_like_hellingers_distance(
     torch.testing.assert_close(squared, torch.cdist(roots, roots).square(), atol=1e-6, rtol=1e-5)
 
 
-def test_fit_centres_and_scales(histograms: torch.Tensor) -> None:
+def test_fit_centres_and_scales(histograms):
     head = ProjectionHead(width=3, n_hidden=0).eval()
     assert head.fit(histograms, torch.zeros(12), part_cells=(4, 20)) is head
     inputs = (histograms.flatten(1).sqrt() - head.mean) / head.scale
@@ -63,21 +57,21 @@ def test_fit_centres_and_scales(histograms: torch.Tensor) -> None:
     torch.testing.assert_close(embedding, torch.nn.functional.normalize(linear(inputs), dim=1))
 
 
-def test_sizes_come_from_the_data(histograms: torch.Tensor) -> None:
+def test_sizes_come_from_the_data(histograms):
     head = ProjectionHead(width=5, n_hidden=7)
     assert isinstance(head, Head)
-    assert isinstance(head.layers[1].weight, torch.nn.UninitializedParameter)  # type: ignore[union-attr]
+    assert isinstance(head.layers[1].weight, torch.nn.UninitializedParameter)
     assert head(histograms).shape == (12, 5)
-    assert head.layers[1].weight.shape == (7, 24)  # type: ignore[union-attr]
+    assert head.layers[1].weight.shape == (7, 24)
 
 
-def test_wrong_number_of_cells_is_named(histograms: torch.Tensor) -> None:
+def test_wrong_number_of_cells_is_named(histograms):
     head = ProjectionHead().fit(histograms, torch.zeros(12))
     with pytest.raises(ValueError, match="descriptions: expected 24 cells as in training, got 16"):
         head(histograms[:, :2])
 
 
-def test_impossible_inputs_are_refused(histograms: torch.Tensor) -> None:
+def test_impossible_inputs_are_refused(histograms):
     with pytest.raises(ValueError, match="width: expected at least 1, got 0"):
         ProjectionHead(width=0)
     with pytest.raises(ValueError, match="at least two training shapes, got 1"):
@@ -88,7 +82,7 @@ def test_impossible_inputs_are_refused(histograms: torch.Tensor) -> None:
         ProjectionHead()(histograms - 0.5)
 
 
-def test_share_goes_from_plain_to_learned(histograms: torch.Tensor) -> None:
+def test_share_goes_from_plain_to_learned(histograms):
     torch.manual_seed(1)
     head = ProjectionHead(width=4).eval()
     embedding = head(histograms)
@@ -115,9 +109,7 @@ def test_share_goes_from_plain_to_learned(histograms: torch.Tensor) -> None:
         lambda: KernelHead(TwoLevelHead()),
     ],
 )
-def test_the_head_alone_is_what_a_descriptor_under_it_deploys(
-    histograms: torch.Tensor, make: Callable[[], Head]
-) -> None:
+def test_the_head_alone_is_what_a_descriptor_under_it_deploys(histograms, make):
     """Its distance and no other, but for the unit that calibration gives it."""
     torch.manual_seed(1)
     labels = torch.arange(4).repeat_interleave(3)
@@ -139,7 +131,7 @@ def test_the_head_alone_is_what_a_descriptor_under_it_deploys(
     )
 
 
-def test_without_head_it_is_the_paper(histograms: torch.Tensor) -> None:
+def test_without_head_it_is_the_paper(histograms):
     distance = BlendedDistance()
     distance.calibrate(histograms)
     torch.testing.assert_close(
@@ -147,7 +139,7 @@ def test_without_head_it_is_the_paper(histograms: torch.Tensor) -> None:
     )
 
 
-def test_plain_distance_may_be_another(histograms: torch.Tensor) -> None:
+def test_plain_distance_may_be_another(histograms):
     flat = histograms.flatten(1)
     torch.testing.assert_close(
         BlendedDistance(plain=euclidean)(flat, flat), euclidean(flat, flat), atol=0, rtol=0
@@ -163,10 +155,10 @@ def test_plain_distance_may_be_another(histograms: torch.Tensor) -> None:
     torch.testing.assert_close(distance(flat, flat), expected)
 
 
-def test_state_round_trips_into_one_without_sizes(histograms: torch.Tensor) -> None:
+def test_state_round_trips_into_one_without_sizes(histograms):
     torch.manual_seed(2)
     one = BlendedDistance(ProjectionHead().eval())
-    one.head.fit(histograms, torch.zeros(12))  # type: ignore[union-attr, operator]
+    one.head.fit(histograms, torch.zeros(12))
     one.calibrate(histograms)
     state = {name: value.clone() for name, value in one.state_dict().items()}
     other_size = BlendedDistance(ProjectionHead().fit(histograms[:, :1], torch.zeros(12)).eval())
@@ -180,6 +172,6 @@ def test_state_round_trips_into_one_without_sizes(histograms: torch.Tensor) -> N
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1])
-def test_share_out_of_range_is_refused(share: float) -> None:
+def test_share_out_of_range_is_refused(share):
     with pytest.raises(ValueError, match="share"):
         BlendedDistance(share=share)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,6 @@ from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
 from igps.nn.heads import LinearHead
-from igps.nn.heads.linear import LinearPart
 
 
 def rows(n_classes: int) -> tuple[Tensor, Tensor]:
@@ -25,7 +22,7 @@ def rows(n_classes: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("n_classes", [2, 3])
-def test_probabilities_are_those_of_logistic_regression(n_classes: int) -> None:
+def test_probabilities_are_those_of_logistic_regression(n_classes):
     x, y = rows(n_classes)
     head = LinearHead(parts=("numbers", "size"), n_numbers=3).fit(x, y, calibrate=False)
     columns = x[:, 20:].double().numpy()
@@ -38,9 +35,7 @@ def test_probabilities_are_those_of_logistic_regression(n_classes: int) -> None:
 
 
 @pytest.mark.parametrize("parts", [("form",), ("numbers",), ("form", "numbers", "size")])
-def test_only_named_parts_are_used_and_the_state_is_kept(
-    parts: tuple[LinearPart, ...], tmp_path: Path
-) -> None:
+def test_only_named_parts_are_used_and_the_state_is_kept(parts, tmp_path):
     x, y = rows(3)
     head = LinearHead(parts=parts, n_numbers=3).fit(x, y)
     changed = x.clone()
@@ -61,9 +56,9 @@ def test_only_named_parts_are_used_and_the_state_is_kept(
         assert bool((head.strangeness(far) > head.strange_from).all())
 
 
-def test_what_is_no_part_or_not_fitted_says_so() -> None:
+def test_what_is_no_part_or_not_fitted_says_so():
     with pytest.raises(ValueError, match="parts: expected one of form, numbers, size, got 'shape'"):
-        LinearHead(parts=("shape",))  # type: ignore[arg-type]
+        LinearHead(parts=("shape",))
     with pytest.raises(ValueError, match="parts: expected at least one"):
         LinearHead(parts=())
     with pytest.raises(RuntimeError, match="expected to be fitted first"):

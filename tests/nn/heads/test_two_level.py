@@ -57,9 +57,7 @@ def projected(histograms: Tensor, bodies: Tensor, shrinkage: float) -> np.ndarra
     return centred @ whitening @ axes[:10].T
 
 
-def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
-    collection: tuple[Tensor, Tensor, Tensor],
-) -> None:
+def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(collection):
     """Against SciPy's `sqrtm` and NumPy's SVD; cosines are compared, since vectors are unique only up to a rotation."""
     histograms, _, bodies = collection
     expected = projected(histograms, bodies, 0.2)
@@ -69,9 +67,7 @@ def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-6)
 
 
-def test_parts_have_equal_shares_and_others_do_not_count(
-    collection: tuple[Tensor, Tensor, Tensor],
-) -> None:
+def test_parts_have_equal_shares_and_others_do_not_count(collection):
     histograms, classes, _ = collection
     cells = (12, 18, 10)
     alone = [WCCNHead().fit(part, classes)(part) for part in histograms.split(cells, dim=1)]
@@ -88,9 +84,7 @@ def test_parts_have_equal_shares_and_others_do_not_count(
     torch.testing.assert_close(head(changed), found, atol=1e-6, rtol=0)
 
 
-def test_with_lengths_distances_are_those_of_mahalanobis(
-    collection: tuple[Tensor, Tensor, Tensor],
-) -> None:
+def test_with_lengths_distances_are_those_of_mahalanobis(collection):
     """Against SciPy's `sqrtm`, up to one common factor; the last number makes the length of the vector 1."""
     histograms, _, bodies = collection
     expected = torch.from_numpy(projected(histograms, bodies, 0.2))
@@ -104,9 +98,7 @@ def test_with_lengths_distances_are_those_of_mahalanobis(
     assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
 
 
-def test_shapes_far_from_the_training_shapes_have_unit_vectors(
-    collection: tuple[Tensor, Tensor, Tensor],
-) -> None:
+def test_shapes_far_from_the_training_shapes_have_unit_vectors(collection):
     histograms, _, bodies = collection
     head = WCCNHead(n_directions=10, lengths=True).fit(histograms, bodies)
     # One cell each; training shapes fill all 40 cells
@@ -115,9 +107,7 @@ def test_shapes_far_from_the_training_shapes_have_unit_vectors(
 
 
 @pytest.mark.parametrize("same_class", [0.55, 0.1])
-def test_the_distance_is_what_the_formula_says(
-    same_class: float, collection: tuple[Tensor, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_distance_is_what_the_formula_says(same_class, collection, monkeypatch):
     """Against the formula in float64; the last number of a vector with `lengths` does not enter its distance."""
     monkeypatch.setattr(two_level, "_SAME_CLASS", same_class)
     histograms, classes, bodies = collection
@@ -166,7 +156,7 @@ def test_the_distance_is_what_the_formula_says(
     assert ((shorter < 0.95) | (shorter > 1.05)).double().mean() > 0.5
 
 
-def test_body_heads_can_have_shapes_of_their_own(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_body_heads_can_have_shapes_of_their_own(collection):
     histograms, classes, bodies = collection
     head = TwoLevelHead().fit(
         histograms[:200], classes[:200], bodies=bodies[200:], body_descriptions=histograms[200:]
@@ -186,9 +176,7 @@ def test_body_heads_can_have_shapes_of_their_own(collection: tuple[Tensor, Tenso
     )
 
 
-def test_distances_of_equal_vectors_have_a_gradient(
-    collection: tuple[Tensor, Tensor, Tensor],
-) -> None:
+def test_distances_of_equal_vectors_have_a_gradient(collection):
     histograms, classes, bodies = collection
     body_heads = [WCCNHead((part,), n_directions=6, lengths=True) for part in range(2)]
     head = TwoLevelHead(body_heads=body_heads, scales=(0.1, 0.1), exponents=(0.2, 0.8))
@@ -206,7 +194,7 @@ def test_distances_of_equal_vectors_have_a_gradient(
     assert torch.isfinite(slope).all()
 
 
-def test_small_scales_do_not_overflow(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_small_scales_do_not_overflow(collection):
     histograms, classes, bodies = collection
     head = TwoLevelHead(scales=(1e-3,)).fit(histograms, classes, bodies=bodies)
     vectors = head(histograms).requires_grad_()
@@ -217,7 +205,7 @@ def test_small_scales_do_not_overflow(collection: tuple[Tensor, Tensor, Tensor])
     assert torch.isfinite(vectors.grad).all()
 
 
-def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to_bodies() -> None:
+def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to_bodies():
     """On other classes. Poses change the first cells, individuals the last ones, by less than bodies differ."""
     generator = torch.Generator().manual_seed(1)
     shape = (12, 2, 3, 4)  # classes, bodies, individuals, poses
@@ -254,9 +242,7 @@ def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to
     assert found[1][2] > found[0][2] - 0.02
 
 
-def test_short_vectors_span_the_leading_singular_directions(
-    collection: tuple[Tensor, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_short_vectors_span_the_leading_singular_directions(collection, monkeypatch):
     """Against NumPy's SVD for 7 numbers; if all numbers fit, the cosines do not change."""
     histograms, classes, bodies = collection
     head = TwoLevelHead().fit(histograms, classes, bodies=bodies)
@@ -273,9 +259,7 @@ def test_short_vectors_span_the_leading_singular_directions(
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-4)
 
 
-def test_both_levels_score_better_than_with_the_other_head_alone(
-    collection: tuple[Tensor, Tensor, Tensor],
-) -> None:
+def test_both_levels_score_better_than_with_the_other_head_alone(collection):
     """FT on held-out classes, by bodies and by classes, exceeds that of the other level's head by 0.05."""
     histograms, classes, bodies = collection
     seen = classes < N_CLASSES // 2
@@ -294,7 +278,7 @@ def test_both_levels_score_better_than_with_the_other_head_alone(
     assert found["c"] > ft(head.body_heads[0](rest), of_class) + 0.05
 
 
-def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_it_is_stored_and_loaded(collection):
     histograms, classes, bodies = collection
     fitted = TwoLevelHead(
         WCCNHead((0,), 5), [WCCNHead((1,), 6, lengths=True)], scales=[0.3], share=0.3
@@ -322,14 +306,12 @@ def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> N
         ({"shrinkage": 0.0}, "shrinkage: expected a positive number"),
     ],
 )
-def test_wrong_arguments_of_a_level_are_named(
-    arguments: dict[str, object], message: str, collection: tuple[Tensor, Tensor, Tensor]
-) -> None:
+def test_wrong_arguments_of_a_level_are_named(arguments, message, collection):
     with pytest.raises(ValueError, match=message):
-        WCCNHead(**arguments).fit(collection[0], collection[1], (20, 20))  # type: ignore[arg-type]
+        WCCNHead(**arguments).fit(collection[0], collection[1], (20, 20))
 
 
-def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+def test_what_cannot_be_fitted_is_named(collection):
     histograms, classes, _ = collection
     with pytest.raises(ValueError, match="part_cells: expected cells that add up to 40"):
         WCCNHead().fit(histograms, classes, (3, 4))

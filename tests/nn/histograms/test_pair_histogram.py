@@ -228,11 +228,9 @@ CASES: dict[str, Case] = {
 
 @pytest.mark.parametrize("kind", ["interior", "surface"])
 @pytest.mark.parametrize("name", CASES)
-def test_product_of_axes_equals_brute_force_loop(
-    batch: SignatureBatch, name: str, kind: str
-) -> None:
+def test_product_of_axes_equals_brute_force_loop(batch, name, kind):
     make, classes, pairs = CASES[name]
-    histogram = PairHistogram(make(), FINE, kind)  # type: ignore[arg-type]
+    histogram = PairHistogram(make(), FINE, kind)
     result = histogram(batch)
     assert result.shape == (2, *histogram.shape)
     assert result[0].numel() == histogram.n_cells
@@ -254,7 +252,7 @@ def learn(*modules: nn.Module) -> None:
 
 
 @pytest.mark.parametrize("with_cosines", [False, True])
-def test_learned_axes_equal_brute_force_loop(batch: SignatureBatch, with_cosines: bool) -> None:
+def test_learned_axes_equal_brute_force_loop(batch, with_cosines):
     """The centres are wherever the parameters take them."""
     potential = Potential(2, soft=True, learnable=True)
     depth = Attribute("depth", DEPTH, soft=True, learnable=True)
@@ -304,7 +302,7 @@ class DepthDifference(PairAxis):
         return PairValues((features.attribute("depth"),), (torch.tensor([0.0, 0.1, 0.5]),), between)
 
 
-def test_an_axis_of_ones_own_counts_values_of_its_own(batch: SignatureBatch) -> None:
+def test_an_axis_of_ones_own_counts_values_of_its_own(batch):
     histogram = PairHistogram([Potential(2), DepthDifference(), InteriorDistance(4)], FINE)
     assert histogram.shape == (3, 4, 3)
     assert histogram.requirements == Requirements(6, ("depth",))
@@ -318,7 +316,7 @@ def test_an_axis_of_ones_own_counts_values_of_its_own(batch: SignatureBatch) -> 
         )
 
 
-def test_defaults_are_the_papers_histogram(batch: SignatureBatch) -> None:
+def test_defaults_are_the_papers_histogram(batch):
     result = PairHistogram()(batch)
     assert result.shape == (2, 10, 64)
     for i in range(2):
@@ -327,7 +325,7 @@ def test_defaults_are_the_papers_histogram(batch: SignatureBatch) -> None:
         np.testing.assert_allclose(result[i], expected, atol=1e-5)
 
 
-def test_names_are_axes(batch: SignatureBatch) -> None:
+def test_names_are_axes(batch):
     named = PairHistogram(["potential", "interior_distance", "euclidean_distance"])
     made = PairHistogram([Potential(4), InteriorDistance(64), EuclideanDistance(16)])
     assert torch.equal(named(batch), made(batch))
@@ -350,9 +348,7 @@ def test_names_are_axes(batch: SignatureBatch) -> None:
         ([PairCosines(2), EmbeddedPairCosines(3)], (1, 2, 2, 2, 3, 3, 3)),
     ],
 )
-def test_order_of_the_dimensions(
-    batch: SignatureBatch, axes: list[PointAxis | PairAxis], shape: tuple
-) -> None:
+def test_order_of_the_dimensions(batch, axes, shape):
     """Pairs of classes; distances in the given order; cosines in the given order."""
     histogram = PairHistogram(axes)
     assert histogram.shape == shape
@@ -360,7 +356,7 @@ def test_order_of_the_dimensions(
     assert histogram(batch).shape == (2, *shape)
 
 
-def test_needs_are_those_of_all_axes() -> None:
+def test_needs_are_those_of_all_axes():
     far = SpectralEmbedding(n_eigenpairs=30)
     axes = [
         Attribute("depth", DEPTH),
@@ -382,7 +378,7 @@ def test_needs_are_those_of_all_axes() -> None:
     assert PairHistogram([InteriorDistance(embedding=far)], COARSE).requirements == Requirements(30)
 
 
-def test_summing_a_dimension_out_leaves_the_rest(batch: SignatureBatch) -> None:
+def test_summing_a_dimension_out_leaves_the_rest(batch):
     """Whatever the algorithm that counts it."""
     interior = InteriorDistance(32)
     euclidean = EuclideanDistance(16)
@@ -399,7 +395,7 @@ def test_summing_a_dimension_out_leaves_the_rest(batch: SignatureBatch) -> None:
         torch.testing.assert_close(oriented.sum(dim=(3, 4, 5)), expected, atol=1e-6, rtol=0)
 
 
-def test_a_trained_module_gives_the_same_without_gradient(batch: SignatureBatch) -> None:
+def test_a_trained_module_gives_the_same_without_gradient(batch):
     histogram = PairHistogram([Potential(3), InteriorDistance(8)], SpectralEmbedding(n_knots=5))
     learn(histogram.embedding)
     with_gradient = histogram(batch)
@@ -409,7 +405,7 @@ def test_a_trained_module_gives_the_same_without_gradient(batch: SignatureBatch)
     torch.testing.assert_close(with_gradient.detach(), without, atol=1e-6, rtol=0)
 
 
-def test_batch_equals_single_shapes_whatever_the_padding() -> None:
+def test_batch_equals_single_shapes_whatever_the_padding():
     generator = torch.Generator().manual_seed(3)
     embedding = torch.randn(90, 6, generator=generator, dtype=torch.float64) * 0.7
     mask = torch.zeros(2, 90, dtype=torch.bool)
@@ -458,9 +454,7 @@ def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
         (lambda: [InteriorDistance(4), EmbeddedPairCosines(3)], 9.0),
     ],
 )
-def test_padding_changes_neither_result_nor_gradient_of_the_samples(
-    make: Callable[[], list[PointAxis | PairAxis]], padding: float
-) -> None:
+def test_padding_changes_neither_result_nor_gradient_of_the_samples(make, padding):
     embedding, points, directions = some(40)
     mask = torch.zeros(2, 40, dtype=torch.bool)
     mask[0] = True
@@ -484,7 +478,7 @@ def test_padding_changes_neither_result_nor_gradient_of_the_samples(
     assert expected.abs().max() > 1e-6
 
 
-def test_gradient_through_classes_and_layout() -> None:
+def test_gradient_through_classes_and_layout():
     """By learned centres and by the embedding, whose norm is the potential; against finite differences."""
     embedding = some(9, seed=2)[0].requires_grad_()
     layer = PairHistogram(
@@ -507,7 +501,7 @@ def test_gradient_through_classes_and_layout() -> None:
     assert torch.autograd.gradcheck(histogram, leaves)
 
 
-def test_gradient_of_learned_cosines_is_that_of_finite_differences() -> None:
+def test_gradient_of_learned_cosines_is_that_of_finite_differences():
     embedding, points, directions = some(7)
     angles = PairCosines(3, learnable=True)
     layer = PairHistogram(
@@ -537,7 +531,7 @@ def test_gradient_of_learned_cosines_is_that_of_finite_differences() -> None:
         assert gradient.view(-1)[entry] == pytest.approx((moved[0] - moved[1]) / 2e-6, rel=1e-4)
 
 
-def test_soft_classes_tend_to_hard_ones() -> None:
+def test_soft_classes_tend_to_hard_ones():
     """Where every potential is at the centre of its class, the soft layout is the hard one."""
     directions = normalize(some(60)[0], dim=1)
     centres = (torch.arange(4, dtype=torch.float64) + 0.5) * 1.5 / 4
@@ -549,7 +543,7 @@ def test_soft_classes_tend_to_hard_ones() -> None:
     np.testing.assert_allclose(result, pair_histogram(embedding, potential, n_bins=16), atol=1e-8)
 
 
-def test_values_beyond_the_ranges_stay_in_the_last_cells() -> None:
+def test_values_beyond_the_ranges_stay_in_the_last_cells():
     embedding, points, _ = some(50)
     axes = [
         Potential(soft=True, learnable=True),
@@ -565,16 +559,16 @@ def test_values_beyond_the_ranges_stay_in_the_last_cells() -> None:
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
 @pytest.mark.parametrize("name", ["distance_range", "potential_range"])
-def test_a_range_that_is_no_positive_number_is_refused(name: str, value: float) -> None:
+def test_a_range_that_is_no_positive_number_is_refused(name, value):
     """An infinite range of potentials put all points into the first class."""
     embedding, _, _ = some(20)
     with pytest.raises(ValueError, match=f"{name}: expected a positive number, got {value}"):
-        pair_histogram(embedding, embedding.norm(dim=1), **{name: value})  # type: ignore[arg-type]
+        pair_histogram(embedding, embedding.norm(dim=1), **{name: value})
 
 
 def two_layouts(options: dict[str, bool], *more: Callable[..., PairAxis]) -> PairHistogram:
     learned = {"learnable": options.get("learnable", False)}
-    points = [Potential(**options), Attribute("depth", [-0.1, 0.2, 0.5], **options)]  # type: ignore[arg-type]
+    points = [Potential(**options), Attribute("depth", [-0.1, 0.2, 0.5], **options)]
     return PairHistogram(
         [*points, InteriorDistance(**learned), *(axis(**learned) for axis in more)]
     )
@@ -584,7 +578,7 @@ def two_layouts(options: dict[str, bool], *more: Callable[..., PairAxis]) -> Pai
     "more",
     [(), (EuclideanDistance,), (partial(PairCosines, 3),), (partial(EmbeddedPairCosines, 3),)],
 )
-def test_learned_layout_starts_as_the_fixed_one(more: tuple[Callable[..., PairAxis], ...]) -> None:
+def test_learned_layout_starts_as_the_fixed_one(more):
     embedding, points, directions = (value[None].float() for value in some(30))
     attributes = {"depth": points[:, :, 0], "surface_direction": directions}
     batch = batch_of(embedding, None, points, attributes)
@@ -594,7 +588,7 @@ def test_learned_layout_starts_as_the_fixed_one(more: tuple[Callable[..., PairAx
     np.testing.assert_allclose(learned.detach(), fixed, atol=1e-6)
 
 
-def test_training_moves_a_layout_and_keeps_its_order() -> None:
+def test_training_moves_a_layout_and_keeps_its_order():
     batch = batch_of(some(60)[0].float()[None])
     layer = PairHistogram(
         [Potential(soft=True, learnable=True), InteriorDistance(8, learnable=True)]
@@ -615,7 +609,7 @@ def test_training_moves_a_layout_and_keeps_its_order() -> None:
         assert (centres() - before).abs().max() > 0.01
 
 
-def test_layout_survives_its_state() -> None:
+def test_layout_survives_its_state():
     def made(reach: float) -> PairHistogram:
         depth = Attribute("depth", [0.1, 0.3], soft=True, learnable=True)
         pairs = [InteriorDistance(6, reach, learnable=True), EuclideanDistance(5, learnable=True)]
@@ -633,7 +627,7 @@ def test_layout_survives_its_state() -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("cosines", [False, True])
-def test_half_precision_and_autocast_count_in_single(device: str, cosines: bool) -> None:
+def test_half_precision_and_autocast_count_in_single(device, cosines):
     embedding = some(60)[0].to(device, torch.bfloat16)
     more = [EmbeddedPairCosines(3, learnable=True)] if cosines else []
     layer = PairHistogram(
@@ -665,7 +659,7 @@ def test_half_precision_and_autocast_count_in_single(device: str, cosines: bool)
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("name", CASES)
-def test_cuda_equals_cpu(batch: SignatureBatch, name: str) -> None:
+def test_cuda_equals_cpu(batch, name):
     histogram = PairHistogram(CASES[name][0](), SpectralEmbedding(n_eigenpairs=6))
     expected = histogram(batch)
     torch.testing.assert_close(
@@ -673,7 +667,7 @@ def test_cuda_equals_cpu(batch: SignatureBatch, name: str) -> None:
     )
 
 
-def test_impossible_histograms_are_refused() -> None:
+def test_impossible_histograms_are_refused():
     with pytest.raises(
         ValueError, match=r"axes: expected one of potential, interior_distance, .*got 'depth'"
     ):
@@ -681,7 +675,7 @@ def test_impossible_histograms_are_refused() -> None:
     with pytest.raises(
         ValueError, match="axes: expected axes of points or of pairs, got SpectralEmbedding"
     ):
-        PairHistogram([SpectralEmbedding()])  # type: ignore[list-item]
+        PairHistogram([SpectralEmbedding()])
     for axes in ([], ["potential"]):
         with pytest.raises(
             ValueError,
@@ -691,16 +685,16 @@ def test_impossible_histograms_are_refused() -> None:
     with pytest.raises(
         ValueError, match="samples: expected one of interior, surface, got 'volume'"
     ):
-        PairHistogram(samples="volume")  # type: ignore[arg-type]
+        PairHistogram(samples="volume")
 
 
 @pytest.mark.parametrize("argument", ["n_samples", "n_training_samples"])
-def test_a_single_sample_forms_no_pair(argument: str) -> None:
+def test_a_single_sample_forms_no_pair(argument):
     with pytest.raises(ValueError, match=f"{argument}: expected at least 2"):
-        PairHistogram(**{argument: 1})  # type: ignore[arg-type]
+        PairHistogram(**{argument: 1})
 
 
-def test_bad_batch_is_refused(batch: SignatureBatch) -> None:
+def test_bad_batch_is_refused(batch):
     with pytest.raises(
         ValueError,
         match=r"expected the interior samples to have 'charge', got \['depth', 'surface_direction'\]",

@@ -39,9 +39,7 @@ def cloud() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize(("n_classes", "n_bins"), [(1, 64), (4, 64), (3, 7), (8, 2)])
-def test_equals_brute_force_loop(
-    cloud: tuple[torch.Tensor, torch.Tensor], n_classes: int, n_bins: int
-) -> None:
+def test_equals_brute_force_loop(cloud, n_classes, n_bins):
     embedding, potential = cloud
     expected = by_loops(embedding.numpy(), potential.numpy(), 4.0, 1.5, n_classes, n_bins)
     result = pair_histogram(embedding, potential, n_classes=n_classes, n_bins=n_bins)
@@ -53,9 +51,7 @@ def test_equals_brute_force_loop(
     np.testing.assert_allclose(single, expected, atol=1e-6)
 
 
-def test_values_beyond_the_ranges_stay_in_the_last_cells(
-    cloud: tuple[torch.Tensor, torch.Tensor],
-) -> None:
+def test_values_beyond_the_ranges_stay_in_the_last_cells(cloud):
     embedding, potential = cloud
     far = pair_histogram(embedding * 100, potential * 100)
     assert far.sum() == pytest.approx(1)
@@ -64,7 +60,7 @@ def test_values_beyond_the_ranges_stay_in_the_last_cells(
     assert far[-1, -1] > 0.9
 
 
-def test_does_not_depend_on_order_or_on_the_basis(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_does_not_depend_on_order_or_on_the_basis(cloud):
     embedding, potential = cloud
     order = torch.randperm(len(embedding), generator=torch.Generator().manual_seed(0))
     rotation = torch.linalg.qr(
@@ -88,14 +84,12 @@ def test_does_not_depend_on_order_or_on_the_basis(cloud: tuple[torch.Tensor, tor
         (torch.zeros(5, 3), -torch.ones(5), "non-negative"),
     ],
 )
-def test_bad_input_is_refused(
-    embedding: torch.Tensor, potential: torch.Tensor, message: str
-) -> None:
+def test_bad_input_is_refused(embedding, potential, message):
     with pytest.raises(ValueError, match=message):
         pair_histogram(embedding, potential)
 
 
-def test_half_precision_is_counted_in_single(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_half_precision_is_counted_in_single(cloud):
     embedding = cloud[0].bfloat16()
     potential = cloud[0].bfloat16().float().norm(dim=1)
     with torch.autocast("cpu", torch.bfloat16):
@@ -108,15 +102,13 @@ def test_half_precision_is_counted_in_single(cloud: tuple[torch.Tensor, torch.Te
     ("name", "value"),
     [("n_bins", 1), ("n_classes", 0), ("distance_range", 0.0), ("potential_range", -1.0)],
 )
-def test_bad_layout_is_refused(
-    cloud: tuple[torch.Tensor, torch.Tensor], name: str, value: float
-) -> None:
+def test_bad_layout_is_refused(cloud, name, value):
     with pytest.raises(ValueError, match=f"{name}: expected .*, got {value}"):
         pair_histogram(*cloud, **{name: value})
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda_equals_cpu(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_cuda_equals_cpu(cloud):
     embedding, potential = (values.float() for values in cloud)
     on_device = pair_histogram(embedding.cuda(), potential.cuda()).cpu()
     np.testing.assert_allclose(on_device, pair_histogram(embedding, potential), atol=1e-6)

@@ -27,10 +27,10 @@ def layout(**options: int) -> PointHistogram:
         Potential(3, 1.5, embedding=SpectralEmbedding(n_eigenpairs=2), soft=True),
         Potential(4, 2.0, soft=True),
     ]
-    return PointHistogram(axes, SpectralEmbedding(n_eigenpairs=5), **options)  # type: ignore[arg-type]
+    return PointHistogram(axes, SpectralEmbedding(n_eigenpairs=5), **options)
 
 
-def test_it_is_the_share_of_samples_in_each_cell() -> None:
+def test_it_is_the_share_of_samples_in_each_cell():
     batch = two_bodies()
     histogram = layout()
     found = histogram(batch)
@@ -53,7 +53,7 @@ def test_it_is_the_share_of_samples_in_each_cell() -> None:
         np.testing.assert_allclose(found[i].flatten(), memberships.mean(axis=0), atol=1e-6)
 
 
-def test_padding_and_scale_change_nothing() -> None:
+def test_padding_and_scale_change_nothing():
     batch = two_bodies()
     histogram = layout()
     found = histogram(batch)
@@ -63,21 +63,21 @@ def test_padding_and_scale_change_nothing() -> None:
     torch.testing.assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
 
 
-def test_a_subset_of_the_samples_is_counted() -> None:
+def test_a_subset_of_the_samples_is_counted():
     batch = two_bodies()
     expected = layout()(replace(batch, surface=batch.surface.subset(20, seed=0)))
     torch.testing.assert_close(layout(n_samples=20)(batch), expected)
 
 
-def test_needs() -> None:
+def test_needs():
     assert layout().requirements == Requirements(n_eigenpairs=5, attributes=("surface_direction",))
 
 
-def test_what_it_cannot_count_is_named() -> None:
+def test_what_it_cannot_count_is_named():
     with pytest.raises(
         ValueError, match=r"axes: expected axes of points, got \['EuclideanDistance'\]"
     ):
-        PointHistogram([EuclideanDistance()])  # type: ignore[list-item]
+        PointHistogram([EuclideanDistance()])
     with pytest.raises(ValueError, match="axes: expected axes of points"):
         PointHistogram([])
     batch = two_bodies()
@@ -86,7 +86,7 @@ def test_what_it_cannot_count_is_named() -> None:
     ):
         BallRadius().values(SampleFeatures(batch, "interior", batch.interior), SpectralEmbedding())
     with pytest.raises(ValueError, match="side: expected one of inside, outside, got 'left'"):
-        BallRadius("left")  # type: ignore[arg-type]
+        BallRadius("left")
     with pytest.raises(ValueError, match="expected 0 < smallest < largest"):
         BallRadius("inside", 0.3, 0.2)
     none = replace(batch.surface, mask=torch.zeros_like(batch.surface.mask))
@@ -94,7 +94,7 @@ def test_what_it_cannot_count_is_named() -> None:
         layout()(replace(batch, surface=none))
 
 
-def test_the_function_counts_memberships_by_masks_and_weights() -> None:
+def test_the_function_counts_memberships_by_masks_and_weights():
     random = np.random.default_rng(0)
     one = random.random((2, 5, 3))
     other = random.random((2, 5, 2))

@@ -52,7 +52,7 @@ def ball_radii(request: pytest.FixtureRequest) -> Radii:
     return radii
 
 
-def test_radii_are_those_of_the_definition(ball_radii: Radii) -> None:
+def test_radii_are_those_of_the_definition(ball_radii):
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64)
     directions = normalize(torch.randn(60, 3, generator=generator, dtype=torch.float64), dim=1)
@@ -63,7 +63,7 @@ def test_radii_are_those_of_the_definition(ball_radii: Radii) -> None:
         )
 
 
-def test_near_points_keep_their_digits_in_single_precision(ball_radii: Radii) -> None:
+def test_near_points_keep_their_digits_in_single_precision(ball_radii):
     """Of a lens beside the origin, whose two sides are near each other."""
     generator = torch.Generator().manual_seed(0)
     axes = torch.tensor([0.3, 0.3, 0.02])
@@ -76,23 +76,21 @@ def test_near_points_keep_their_digits_in_single_precision(ball_radii: Radii) ->
         np.testing.assert_allclose(found[:, column], expected, rtol=1e-4)
 
 
-def test_a_ball_has_its_own_radius_inside_and_none_outside(ball_radii: Radii) -> None:
+def test_a_ball_has_its_own_radius_inside_and_none_outside(ball_radii):
     points = normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     radii = ball_radii(0.3 * points, points)
     torch.testing.assert_close(radii[:, 0], torch.full((500,), 0.3), rtol=1e-3, atol=0)
     assert (radii[:, 1] == 10).all()
 
 
-def test_a_rod_is_as_thick_as_it_is(ball_radii: Radii) -> None:
+def test_a_rod_is_as_thick_as_it_is(ball_radii):
     points, directions = on(trimesh.creation.cylinder(radius=0.05, height=1.0, sections=64), 2000)
     middle = (points[:, 2].abs() < 0.3) & (directions[:, 2].abs() < 0.5)
     radii = ball_radii(points, directions)[middle, 0]
     assert 0.045 < float(radii.median()) < 0.055
 
 
-def test_two_plates_have_half_their_thickness_inside_and_half_their_gap_outside(
-    ball_radii: Radii,
-) -> None:
+def test_two_plates_have_half_their_thickness_inside_and_half_their_gap_outside(ball_radii):
     plates = [trimesh.creation.box((0.6, 0.6, 0.1)) for _ in range(2)]
     plates[1].apply_translation((0, 0, 0.3))  # a gap of 0.2
     points, directions = on(trimesh.util.concatenate(plates), 4000)
@@ -105,7 +103,7 @@ def test_two_plates_have_half_their_thickness_inside_and_half_their_gap_outside(
     assert float(radii[into_the_gap, 1].median()) == pytest.approx(0.1, rel=0.1)
 
 
-def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii: Radii) -> None:
+def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii):
     """Closed form: 398 points of a unit sphere keep radius 1, although two noisy points lie at half the radius."""
     points = normalize(torch.randn(400, 3, generator=torch.Generator().manual_seed(2)), dim=1)
     directions = points.clone()
@@ -114,7 +112,7 @@ def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii: Radi
     torch.testing.assert_close(radii, torch.ones(398), rtol=1e-3, atol=0)
 
 
-def test_three_samples_are_enough_and_two_are_not(ball_radii: Radii) -> None:
+def test_three_samples_are_enough_and_two_are_not(ball_radii):
     points = torch.eye(3)
     outward = torch.tensor([0.0, 0.0, 1.0])
     assert ball_radii(points, outward.expand(3, 3)).tolist() == [[10.0, 10.0]] * 3
@@ -124,12 +122,12 @@ def test_three_samples_are_enough_and_two_are_not(ball_radii: Radii) -> None:
         ball_radii(points[:2], outward.expand(2, 3))
 
 
-def test_points_that_coincide_touch_no_ball(ball_radii: Radii) -> None:
+def test_points_that_coincide_touch_no_ball(ball_radii):
     points = torch.zeros(5, 3)
     assert (ball_radii(points, torch.tensor([0.0, 0.0, 1.0]).expand(5, 3)) == 10).all()
 
 
-def test_what_is_not_finite_is_refused(ball_radii: Radii) -> None:
+def test_what_is_not_finite_is_refused(ball_radii):
     points = torch.eye(3)
     points[1, 1] = torch.nan
     with pytest.raises(
@@ -138,7 +136,7 @@ def test_what_is_not_finite_is_refused(ball_radii: Radii) -> None:
         ball_radii(points, torch.eye(3))
 
 
-def test_padding_does_not_change_radii(ball_radii: Radii) -> None:
+def test_padding_does_not_change_radii(ball_radii):
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(2, 30, 3, generator=generator)
     directions = normalize(torch.randn(2, 30, 3, generator=generator), dim=2)

@@ -39,12 +39,7 @@ def bodies(*copies: int) -> SignatureBatch:
         ((50, 40, 45), True, [(3, 2000)]),
     ],
 )
-def test_groups_are_padded_to_their_largest_body(
-    copies: tuple[int, ...],
-    on_cpu: bool,
-    widths: list[tuple[int, int]],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_groups_are_padded_to_their_largest_body(copies, on_cpu, widths, monkeypatch):
     monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda device: on_cpu)
     batch = bodies(*copies)
     found = []
@@ -57,7 +52,7 @@ def test_groups_are_padded_to_their_largest_body(
     assert found == widths
 
 
-def test_large_bodies_are_not_copied() -> None:
+def test_large_bodies_are_not_copied():
     batch = bodies(1, 50, 2, 45)
     found = []
 
@@ -69,19 +64,19 @@ def test_large_bodies_are_not_copied() -> None:
     assert found == [batch.interior.eigenfunctions[i].data_ptr() for i in (1, 3)]
 
 
-def test_a_batch_may_have_samples_of_one_kind_only() -> None:
+def test_a_batch_may_have_samples_of_one_kind_only():
     batch = bodies(1, 50)
     batch = replace(batch, surface=batch.surface.map(lambda values: values[:, :0]))
     assert map_by_size(lambda group: group.area, batch).tolist() == batch.area.tolist()
 
 
-def test_padding_beyond_the_largest_body_is_cut() -> None:
+def test_padding_beyond_the_largest_body_is_cut():
     batch = bodies(1, 50, 2)[[0, 2]]
     assert map_by_size(lambda group: group.interior.points, batch).shape == (2, 80, 3)
 
 
 @pytest.mark.parametrize("several", [False, True])
-def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several: bool) -> None:
+def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several):
     histogram = PairHistogram(["interior_distance"], samples="interior")
     descriptor = HistogramDescriptor(
         [histogram, PairHistogram(samples="surface")] if several else histogram
@@ -105,7 +100,7 @@ def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several: bo
         assert not gradients[i, gradient.shape[1] :].any()
 
 
-def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body() -> None:
+def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body():
     descriptor = HistogramDescriptor(PairHistogram(["interior_distance"]))
     batch = bodies(1, 20, 2)
 

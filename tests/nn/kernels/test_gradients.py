@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 import igps
@@ -23,10 +22,10 @@ def learned() -> igps.HistogramDescriptor:
     return descriptor
 
 
-def test_backward_runs_on_one_thread_wherever_it_is_called() -> None:
+def test_backward_runs_on_one_thread_wherever_it_is_called():
     descriptor = learned()
     seen = []
-    descriptor.histograms[0].embedding.log_gain.register_hook(  # type: ignore[union-attr]
+    descriptor.histograms[0].embedding.log_gain.register_hook(
         lambda gradient: seen.append(torch.get_num_threads())
     )
     weights = descriptor.histograms[0].embedding.weights
@@ -36,16 +35,14 @@ def test_backward_runs_on_one_thread_wherever_it_is_called() -> None:
         found.register_hook(lambda gradient: seen.append(torch.get_num_threads()))
         return found
 
-    descriptor.histograms[0].embedding.weights = watched  # type: ignore[assignment]
+    descriptor.histograms[0].embedding.weights = watched
     with torch_threads(2):
         descriptor(two_bodies()).square().sum().backward()
         assert torch.get_num_threads() == 2
     assert 1 in seen
 
 
-def test_gradients_of_first_and_second_order_are_those_without_a_limit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_gradients_of_first_and_second_order_are_those_without_a_limit(monkeypatch):
     batch = two_bodies()
     descriptor = learned()
     points = batch.interior.points.clone().requires_grad_()
@@ -67,7 +64,7 @@ def test_gradients_of_first_and_second_order_are_those_without_a_limit(
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-7)
 
 
-def test_a_graph_that_is_retained_can_be_used_twice() -> None:
+def test_a_graph_that_is_retained_can_be_used_twice():
     descriptor = learned()
     loss = descriptor(two_bodies()).square().sum()
     first, again = (
@@ -77,7 +74,7 @@ def test_a_graph_that_is_retained_can_be_used_twice() -> None:
     torch.testing.assert_close(first, again)
 
 
-def test_bodies_drawn_to_one_number_are_counted_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_drawn_to_one_number_are_counted_together(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     mask = torch.arange(1500) < torch.tensor([[1500], [700], [90]])
     batch = batch_of(torch.randn(3, 1500, 4, generator=generator), mask)
@@ -86,7 +83,7 @@ def test_bodies_drawn_to_one_number_are_counted_together(monkeypatch: pytest.Mon
     count = PairHistogram.of_samples
 
     def watched(self: PairHistogram, features: object) -> torch.Tensor:
-        found = count(self, features)  # type: ignore[arg-type]
+        found = count(self, features)
         shapes.append(tuple(found.shape))
         return found
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -8,7 +6,7 @@ from igps.nn._kernels.nearest import smallest
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("n", [0, 1, 8, 40])
-def test_the_smallest_of_each_row_are_those_of_a_sort(n: int, dtype: torch.dtype) -> None:
+def test_the_smallest_of_each_row_are_those_of_a_sort(n, dtype):
     values = torch.rand(50, 40, generator=torch.Generator().manual_seed(n), dtype=dtype)
     values[3, 5:20] = torch.inf
     ordered = values.sort(dim=1)
@@ -19,5 +17,5 @@ def test_the_smallest_of_each_row_are_those_of_a_sort(n: int, dtype: torch.dtype
     assert torch.equal(columns[finite], ordered.indices[:, :n][finite])
 
 
-def test_of_equal_entries_the_first_are_kept() -> None:
+def test_of_equal_entries_the_first_are_kept():
     assert smallest(torch.zeros(2, 6), 3)[1].tolist() == [[0, 1, 2], [0, 1, 2]]

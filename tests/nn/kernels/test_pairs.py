@@ -149,13 +149,7 @@ def counted(layout: Sequence[str], given: dict[str, Tensor]) -> Tensor:
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=" × ".join)
 @pytest.mark.parametrize(("n_classes", "block"), [(1, None), (3, None), (3, (1, 4)), (3, (5, 6))])
-def test_histogram_is_the_sum_of_hats_over_all_pairs(
-    device: str,
-    layout: list[str],
-    n_classes: int,
-    block: tuple[int, int] | None,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_histogram_is_the_sum_of_hats_over_all_pairs(device, layout, n_classes, block, monkeypatch):
     given = some(n_classes=n_classes)
     if block is not None:
         n_rows, n_columns = block
@@ -186,7 +180,7 @@ def test_histogram_is_the_sum_of_hats_over_all_pairs(
         [0.001, 0.002],
     ],
 )
-def test_any_spacing_of_centres_is_exact(device: str, layout: list[float]) -> None:
+def test_any_spacing_of_centres_is_exact(device, layout):
     given = some(40)
     pairs = [
         euclidean_distances(
@@ -200,7 +194,7 @@ def test_any_spacing_of_centres_is_exact(device: str, layout: list[float]) -> No
     np.testing.assert_allclose(result.cpu(), expected, atol=1e-12)
 
 
-def test_distance_on_a_centre_is_exact(device: str) -> None:
+def test_distance_on_a_centre_is_exact(device):
     line = torch.arange(9, dtype=torch.float64, device=device)[:, None]
     result = joint_histogram(
         torch.ones_like(line), [euclidean_distances(line, centres([1, 3, 4, 7], line))]
@@ -211,7 +205,7 @@ def test_distance_on_a_centre_is_exact(device: str) -> None:
     np.testing.assert_allclose(result[0].cpu() * 36, expected, atol=1e-12)
 
 
-def test_narrow_ramps_tend_to_a_plain_histogram(device: str) -> None:
+def test_narrow_ramps_tend_to_a_plain_histogram(device):
     """Against NumPy's histogram: two centres next to each edge make the ramps narrow."""
     coordinates = some(60)["coordinates"].to(device)
     edges = torch.tensor([0.5, 1.0, 1.7, 2.0], dtype=torch.float64)
@@ -227,7 +221,7 @@ def test_narrow_ramps_tend_to_a_plain_histogram(device: str) -> None:
     np.testing.assert_allclose(torch.stack(merged), counts, atol=1e-12)
 
 
-def test_single_precision_is_summed_in_double(device: str) -> None:
+def test_single_precision_is_summed_in_double(device):
     """Half a million pairs whose weights are not whole: in single precision the sum would be off by some 10⁻⁴."""
     given = {name: value.to(device) for name, value in some(1000).items()}
     result = counted(["many"], {name: value.float() for name, value in given.items()})
@@ -236,7 +230,7 @@ def test_single_precision_is_summed_in_double(device: str) -> None:
 
 
 @pytest.mark.parametrize("layout", [EQUAL, MANY])
-def test_whole_pairs_of_single_precision_are_as_those_of_double(layout: list[float]) -> None:
+def test_whole_pairs_of_single_precision_are_as_those_of_double(layout):
     """Against double precision: one-hot points are counted in integers; sorted points make neighbours similar."""
     generator = torch.Generator().manual_seed(6)
     points = torch.randn(2300, 3, generator=generator).sort(dim=0).values * 0.4
@@ -252,7 +246,7 @@ def test_whole_pairs_of_single_precision_are_as_those_of_double(layout: list[flo
 
 
 @pytest.mark.parametrize(("spread", "bin_of_all"), [(0.0, 0), (1e4, 4)])
-def test_a_block_of_pairs_that_all_fall_into_one_bin(spread: float, bin_of_all: int) -> None:
+def test_a_block_of_pairs_that_all_fall_into_one_bin(spread, bin_of_all):
     """The largest number of pairs that one integer counts, with the largest share of a pair and with share 0."""
     points = torch.arange(1.0, 2401.0)[:, None] * spread
     expected = one_hot(torch.tensor([bin_of_all]), 5).float()
@@ -262,7 +256,7 @@ def test_a_block_of_pairs_that_all_fall_into_one_bin(spread: float, bin_of_all: 
     )
 
 
-def test_pairs_that_are_not_counted_take_no_products() -> None:
+def test_pairs_that_are_not_counted_take_no_products():
     """Of 1,000 points 499,500 pairs are counted, of 4 flops each in two dimensions."""
     points = torch.randn(1000, 2, generator=torch.Generator().manual_seed(3))
     with FlopCounterMode(display=False) as counter:
@@ -270,7 +264,7 @@ def test_pairs_that_are_not_counted_take_no_products() -> None:
     assert 499_500 * 4 <= counter.get_total_flops() < 1.15 * 499_500 * 4
 
 
-def test_features_are_those_of_a_loop() -> None:
+def test_features_are_those_of_a_loop():
     given = some(12)
     i, j = np.triu_indices(12, 1)
     expected = cosines(given["points"], given["directions"])
@@ -280,7 +274,7 @@ def test_features_are_those_of_a_loop() -> None:
         np.testing.assert_allclose(feature, one[i, j], atol=1e-12)
 
 
-def test_features_of_a_sphere_follow_from_the_distance() -> None:
+def test_features_of_a_sphere_follow_from_the_distance():
     """On a sphere of radius R with outward normals, n·u = −d/2R at either end and nᵢ·nⱼ = 1 − d²/2R²."""
     normals = some(30)["directions"]
     points = 2.5 * normals + torch.tensor([3.0, -1.0, 7.0])
@@ -291,7 +285,7 @@ def test_features_of_a_sphere_follow_from_the_distance() -> None:
     torch.testing.assert_close(between, 1 - distance**2 / 12.5, atol=1e-9, rtol=0)
 
 
-def test_points_that_coincide_have_no_line(device: str) -> None:
+def test_points_that_coincide_have_no_line(device):
     directions = some(2)["directions"].float().to(device)
     points = torch.rand(1, 3, device=device).expand(2, -1)
     first, second, _ = point_pair_features(points, directions)
@@ -303,7 +297,7 @@ def test_points_that_coincide_have_no_line(device: str) -> None:
     assert float(result[0, 1, 1].sum()) == pytest.approx(1)
 
 
-def test_a_reflection_turns_the_order_of_twists(device: str) -> None:
+def test_a_reflection_turns_the_order_of_twists(device):
     given = {name: values.to(device) for name, values in some().items()}
     mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64, device=device)
     mirrored = {
@@ -317,7 +311,7 @@ def test_a_reflection_turns_the_order_of_twists(device: str) -> None:
 
 
 @pytest.mark.parametrize("layout", [["cosines"], ["few", "cosines"]])
-def test_turning_moving_and_reordering_change_nothing(device: str, layout: list[str]) -> None:
+def test_turning_moving_and_reordering_change_nothing(device, layout):
     given = some(40)
     turn = torch.linalg.qr(some(3, seed=5)["points"]).Q
     order = torch.randperm(40, generator=torch.Generator().manual_seed(2))
@@ -332,7 +326,7 @@ def test_turning_moving_and_reordering_change_nothing(device: str, layout: list[
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_no_cell_is_negative(device: str, joint: bool) -> None:
+def test_no_cell_is_negative(device, joint):
     """Isolated pairs just below a centre: no other pair hides a rounding error in the cell before it."""
     generator = torch.Generator().manual_seed(0)
     layout = ((torch.arange(12) + 0.5) / 3).to(device)
@@ -354,7 +348,7 @@ def test_no_cell_is_negative(device: str, joint: bool) -> None:
     )
 
 
-def test_no_cell_of_cosines_is_negative(device: str) -> None:
+def test_no_cell_of_cosines_is_negative(device):
     """χ² refuses a histogram with a cell of −1e−18; a pair close below several centres leaves next to nothing there."""
     below = torch.logspace(-6, -3, 40)[:, None]
     angle = torch.linspace(0.1, 3.0, 20).expand(40, -1)
@@ -371,7 +365,7 @@ def test_no_cell_of_cosines_is_negative(device: str) -> None:
     assert joint_histogram(torch.ones(800, 2, 1, device=device), pairs).min() >= 0
 
 
-def test_shapes_of_any_sizes_are_counted_as_alone(device: str) -> None:
+def test_shapes_of_any_sizes_are_counted_as_alone(device):
     sizes = [5, 40, 2, 38, 12, 13, 40]
     shapes = [{name: value.to(device) for name, value in some(n, seed=n).items()} for n in sizes]
     padded = {
@@ -390,7 +384,7 @@ def test_shapes_of_any_sizes_are_counted_as_alone(device: str) -> None:
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
-def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_change_no_bit(monkeypatch):
     """700 points, several blocks for each share, and the gradient."""
     monkeypatch.setattr(threads, "n_cores", lambda: 8)
     given = {name: value.requires_grad_() for name, value in some(700).items()}
@@ -433,9 +427,7 @@ def dense(memberships: Tensor, values: Sequence[Tensor], layouts: Sequence[Tenso
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=" × ".join)
 @pytest.mark.parametrize("block", [None, (7, 11)])
-def test_gradients_equal_those_of_the_dense_definition(
-    device: str, layout: list[str], block: tuple[int, int] | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gradients_equal_those_of_the_dense_definition(device, layout, block, monkeypatch):
     """Also by memberships that are zero, whose gradient is not."""
     if block is not None:
         monkeypatch.setattr(count_by_loops, "_MAX_COLUMNS", block[1])
@@ -480,7 +472,7 @@ def test_gradients_equal_those_of_the_dense_definition(
 
 
 @pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"], ["twists"]])
-def test_gradcheck(device: str, layout: list[str]) -> None:
+def test_gradcheck(device, layout):
     given = some(7, n_classes=2, seed=1)
     names = [
         "memberships",
@@ -503,7 +495,7 @@ def test_gradcheck(device: str, layout: list[str]) -> None:
 
 
 @pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"], ["twists"]])
-def test_gradients_taken_under_autocast_keep_their_digits(layout: list[str]) -> None:
+def test_gradients_taken_under_autocast_keep_their_digits(layout):
     given = {name: value.float().requires_grad_() for name, value in some(30).items()}
     leaves = [given["coordinates" if layout == ["many"] else "points"]]
     [expected] = torch.autograd.grad(counted(layout, given).square().sum(), leaves)
@@ -512,7 +504,7 @@ def test_gradients_taken_under_autocast_keep_their_digits(layout: list[str]) -> 
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
 
 
-def test_coincident_points_have_finite_gradients(device: str) -> None:
+def test_coincident_points_have_finite_gradients(device):
     embedding = torch.zeros(6, 3, dtype=torch.float64, device=device)
     embedding[3:] = 0.5
     embedding.requires_grad_()
@@ -525,7 +517,7 @@ def test_coincident_points_have_finite_gradients(device: str) -> None:
 
 
 @pytest.mark.parametrize("layout", [["many"], ["few", "cosines"]])
-def test_half_precision_is_counted_in_single(device: str, layout: list[str]) -> None:
+def test_half_precision_is_counted_in_single(device, layout):
     halves = {name: value.bfloat16().to(device) for name, value in some(30).items()}
     single = {name: value.float() for name, value in halves.items()}
     for one in (halves, single):
@@ -571,16 +563,14 @@ def good() -> dict[str, Tensor]:
     ],
 )
 @pytest.mark.parametrize("layout", [["few", "many"], ["many", "few"]])
-def test_bad_points_are_refused(
-    good: dict[str, Tensor], change: dict[str, Tensor], message: str, layout: list[str]
-) -> None:
+def test_bad_points_are_refused(good, change, message, layout):
     counted(layout, good)
     with pytest.raises(ValueError, match=message):
         counted(layout, {**good, **change})
 
 
 @pytest.mark.parametrize("layout", [[0.5, 0.5, 1.0], [0.5, torch.inf], [torch.nan, 1.0], [1.0], []])
-def test_bad_centres_are_refused(layout: list[float]) -> None:
+def test_bad_centres_are_refused(layout):
     points = torch.rand(5, 3)
     bins = torch.tensor(layout)
     for pairs in (
@@ -593,7 +583,7 @@ def test_bad_centres_are_refused(layout: list[float]) -> None:
             joint_histogram(torch.ones(5, 1), pairs)
 
 
-def test_directions_are_of_the_shape_of_the_points() -> None:
+def test_directions_are_of_the_shape_of_the_points():
     points = torch.rand(10, 3)
     layout = torch.tensor([0.0, 1.0])
     with pytest.raises(
@@ -605,7 +595,7 @@ def test_directions_are_of_the_shape_of_the_points() -> None:
             joint_histogram(torch.ones(10, 1), [oriented_pairs(*inputs, layout, layout)])
 
 
-def test_far_points_are_counted_as_long_as_their_distances_can_be_squared() -> None:
+def test_far_points_are_counted_as_long_as_their_distances_can_be_squared():
     far = torch.tensor([[-1e18, 0.0], [1e18, 0.0]])
     result = joint_histogram(torch.ones(2, 1), [euclidean_distances(far, torch.tensor([0.5, 1.0]))])
     assert result.tolist() == [[0, 1]]
