@@ -38,6 +38,26 @@ def test_a_body_alone_in_its_class_is_told_not_to_be_judged():
     ] == ["alone"]
 
 
+def test_bodies_that_the_scan_cut_are_compared_with_their_like():
+    """Five of twelve are half as large, and far away in shape, because the image ends there; one at another side."""
+    vectors = usual()
+    vectors[:5] += 20 * np.eye(8)[0]
+    vectors[5] += 20 * np.eye(8)[1]
+    volume = 0.01 * np.random.default_rng(0).normal(size=24)
+    volume[:6] -= np.log(2)
+    sides = ["S"] * 5 + ["LI"] + [""] * 18
+    measures = {"volume": volume}
+    apart = found_of(vectors, measures=measures, cut=sides)
+    assert not any(one.is_outlier for one in apart)
+    assert {one.nearer_class for one in apart} == {None}
+    told = {one.body: one.reason for one in apart}
+    assert told[5].endswith("the only body of its class cut at LI by the border of the image")
+    assert {told[i] for i in range(5)} == {"nothing unusual"}
+    whole_is_small = np.where(np.arange(24) == 9, -np.log(2), volume)
+    first = found_of(vectors, measures={"volume": whole_is_small}, cut=sides)[0]
+    assert (first.body, first.is_outlier) == (9, True)
+
+
 def test_a_body_of_another_shape_comes_first():
     vectors = usual()
     vectors[3, 0] += 14

@@ -103,9 +103,9 @@ def test_a_wide_table_has_a_row_for_each_file(
     extract(monkeypatch, root, tmp_path / f"wide.{suffix}", "--wide")
     long = read(tmp_path / f"long.{suffix}")
     wide = read(tmp_path / f"wide.{suffix}")
-    first = ["file", "class", "age", "unit", "liver.notes", "liver.voxel_volume_mm3"]
-    assert wide.columns.tolist()[:6] == first
-    assert len(wide.columns) == 4 + 2 * (1 + len(POWERS) + 642)
+    first = ["file", "class", "age", "unit", "liver.at_border", "liver.border_sides", "liver.notes"]
+    assert wide.columns.tolist()[:7] == first
+    assert len(wide.columns) == 4 + 2 * (3 + len(POWERS) + 642)
     assert wide["class"].tolist() == ["well", "ill"]
     assert wide["age"].sum() == 40  # a number in Parquet, too
     for part in ("liver", "spleen"):
@@ -167,7 +167,8 @@ def test_masks_that_are_numbered_have_a_row_each(
         nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), folder / f"{number}.nii.gz")
     extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
-    assert wide.columns.tolist()[:5] == ["file", "class", "unit", "notes", "voxel_volume_mm3"]
+    border = ["at_border", "border_sides"]
+    assert wide.columns.tolist()[:6] == ["file", "class", "unit", *border, "notes"]
     assert wide["file"].tolist() == [f"{label}/{number}.nii.gz" for label, number in sides]
     np.testing.assert_allclose(
         wide["volume_mm3"], [49 * side for side in sides.values()], rtol=1e-3
@@ -238,8 +239,9 @@ def test_plain_numbers_alone_need_no_descriptor_and_notes_stand_in_the_row(
     monkeypatch.setattr(sys, "argv", ["igps", *words, *cache])
     main()
     table = pd.read_csv(tmp_path / "plain.csv", keep_default_na=False)
-    assert table.columns.tolist()[:6] == ["file", "part", "name", "class", "unit", "notes"]
-    assert len(table.columns) == 6 + len(POWERS)
+    own = ["file", "part", "name", "class", "unit", "at_border", "border_sides", "notes"]
+    assert table.columns.tolist()[:8] == own
+    assert len(table.columns) == 8 + len(POWERS)
     assert table["voxel_volume_mm3"].tolist() == [730]
     assert table["n_pieces"].tolist() == [2]
     assert table["euler_number"].tolist() == [2]

@@ -9,6 +9,7 @@ from functools import partial
 from statistics import NormalDist
 
 import numpy as np
+from numpy.typing import NDArray
 
 from igps._arrays import Floats, Integers
 from igps._failures import Failed
@@ -100,6 +101,7 @@ def outliers(
     measures: Mapping[str, Floats] | None = None,
     notes: Sequence[Sequence[str]] | None = None,
     subjects: Sequence[object] | None = None,
+    cut: Sequence[str] | None = None,
 ) -> list[Outlier]:
     """Rank bodies by how much they differ from their class, the most different first.
 
@@ -115,9 +117,15 @@ def outliers(
         notes: notes on the repairs of each body.
         subjects: subject of each body. All bodies of one subject may be unusual, as by a wrong unit. Used only if no
             subject has several bodies of one class.
+        cut: sides at which each body reaches the border of its image, "" if it does not. A body is compared with those
+            of its class that a scan may have cut at the same sides.
     """
-    names, codes = np.unique(np.asarray(labels), return_inverse=True)
-    own, other, nearest = _class_distances(np.asarray(distances, dtype=float), codes)
+    sides = cut or [""] * len(labels)
+    kinds = list(zip(labels, sides, strict=True))
+    known_kinds = sorted(set(kinds))
+    names = np.array([label for label, _ in known_kinds])
+    codes = np.array([known_kinds.index(kind) for kind in kinds])
+    own, other, nearest = _class_distances(np.asarray(distances, dtype=float), codes, names)
     n_per_subject = _max_bodies_of_subject(subjects or range(len(codes)), codes)
     scores = {
         "shape": np.fmax(
@@ -159,11 +167,10 @@ def outliers(
         if among is not None:
             reasons.append(f"labelled {label}, but nearer to {among}")
         if not reasons:
-            reasons = [
-                "shape not assessed: the only body of its class"
-                if np.isnan(own[i])
-                else "nothing unusual"
-            ]
+            reasons = ["nothing unusual"]
+            if np.isnan(own[i]):
+                place = f" cut at {sides[i]} by the border of the image" if sides[i] else ""
+                reasons = [f"shape not assessed: the only body of its class{place}"]
         result.append(Outlier(i, label, score, deviations, among, "; ".join(reasons)))
     return sorted(result, key=lambda outlier: -outlier.score)
 
@@ -272,8 +279,13 @@ def _measure(
     return list(values.values()), Place(key, low, mask.shape, int(mask.sum()), np.packbits(mask))
 
 
-def _class_distances(distances: Floats, codes: Integers) -> tuple[Floats, Floats, Integers]:
-    """Return the log mean distances to the nearest bodies of the own and of the nearest other class; and that class."""
+def _class_distances(
+    distances: Floats, codes: Integers, names: NDArray[np.str_]
+) -> tuple[Floats, Floats, Integers]:
+    """Return the log mean distances to the nearest bodies of the own and of the nearest other kind; and that kind.
+
+    Bodies have the kinds `codes` (N,); other kinds are those of another class, see their `names`.
+    """
     n = len(codes)
     n_classes = int(codes.max()) + 1
     own = np.full(n, np.nan)
@@ -288,7 +300,7 @@ def _class_distances(distances: Floats, codes: Integers) -> tuple[Floats, Floats
             if len(others) >= (1 if code == own_code else min(k, 2)):
                 means[code] = np.log(max(others[:k].mean(), 1e-12))
         own[i] = means[own_code]
-        means[own_code] = np.nan
+        means[names == names[own_code]] = np.nan
         if np.isfinite(means).any():
             nearest[i] = np.nanargmin(means)
             other[i] = means[nearest[i]]

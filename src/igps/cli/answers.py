@@ -219,7 +219,8 @@ def outliers(
     Each body is compared with the others of its class by its shape, volume and resolution; a mesh also by its handles,
     flat sides and repairs; a label also by detached pieces, cavities, holes, gaps, cut ends, and overlap with other
     labels. A score counts robust standard deviations; a body with a score above 3.5 is an outlier. The list also names
-    the bodies that are nearer to another class than to their own.
+    the bodies that are nearer to another class than to their own. Bodies that reach the border of their image are
+    compared with those that reach it at the same sides.
 
     Args:
         root: folder with one subfolder per class, or with files and a labels.csv (columns file,label).
@@ -231,6 +232,7 @@ def outliers(
     from igps.analysis.outliers import LIMIT, measure_bodies
     from igps.analysis.outliers import outliers as find_outliers
     from igps.cli.reading import Folder, described, print_failures
+    from igps.fields.volumes.border import border_of
     from igps.report.answers import outliers_figure, write_analysis
 
     check_at_least(0, top=top)
@@ -241,8 +243,13 @@ def outliers(
     files = dataset.bodies.paths
     # Where each file holds one mask, a folder holds the organs of one subject
     subjects = files if len(set(files)) < len(files) else [file.parent for file in files]
+    borders = [border_of(notes) for notes in dataset.all_notes()]
+    sides = [border.sides if border else "" for border in borders]
+    if any(sides):
+        n_cut = sum(map(bool, sides))
+        print(f"{n_cut} of {len(sides)} bodies reach the border of their image: compared apart")
     ranked = find_outliers(
-        distances, dataset.bodies.labels or (), measures, dataset.all_notes(), subjects
+        distances, dataset.bodies.labels or (), measures, dataset.all_notes(), subjects, sides
     )
     rows: list[dict[str, Any]] = [
         {

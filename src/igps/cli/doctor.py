@@ -57,7 +57,10 @@ def doctor(
 
 
 def _row(finding: Finding) -> dict[str, Any]:
+    from igps.fields.volumes.border import border_of
+
     voxels = finding.voxels
+    border = border_of(finding.notes)
     return {
         "name": finding.id,
         "usable": "no" if finding.error else "yes",
@@ -69,6 +72,8 @@ def _row(finding: Finding) -> dict[str, Any]:
         "voxels": voxels.n_voxels if voxels else None,
         "pieces": voxels.n_pieces if voxels else finding.n_pieces,
         "thinnest": voxels.thinnest if voxels else None,
+        "at_border": f"{border.share:.4f}" if border else None,
+        "border_sides": border.sides if border else None,
         "missing": f"{finding.missing:.4f}",
         "vertices": finding.n_vertices,
         "vertices_after": finding.n_vertices_after,

@@ -9,14 +9,15 @@ import numpy as np
 from igps.cli.reading import is_named_after_file
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import LABELS_FILE, file_name_of, is_number
+from igps.fields.volumes.border import border_of
 from igps.mesh.mesh import MILLIMETRES, millimetres
 from igps.report.tables import write_rows
 from igps.signature.measures import POWERS
 
 SUFFIXES = (".csv", ".parquet")
-_TEXT_COLUMNS = ("file", "folder", "part", "name", "class", "unit", "notes")
+_TEXT_COLUMNS = ("file", "folder", "part", "name", "class", "unit", "border_sides", "notes")
 # Columns that a wide table has for each body, whether or not the bodies of a file happen to agree
-_OF_BODIES = ("notes",)
+_OF_BODIES = ("at_border", "border_sides", "notes")
 # Units in names of columns, which statistics packages read as letters
 _WRITTEN = {"Å": "A", "µm": "um", "\u03bcm": "um"}
 Table = Mapping[str, Sequence[Any]]
@@ -34,7 +35,8 @@ def feature_table(
         columns: names of the D columns of the vectors.
 
     Returns:
-        The metadata: `file`, `part`, `name`, `class`, further columns of labels.csv, the `unit` of length and the
+        The metadata: `file`, `part`, `name`, `class`, further columns of labels.csv, the `unit` of length, the share of
+        the surface `at_border` of the image and the `border_sides` (None for bodies that are not from volumes), and the
         `notes` on how the body was read and changed. A column of labels.csv whose name is in use already, or is
         `folder`, is called `NAME of labels.csv`.
         The measured values: the plain numbers of `igps.measures`, named with their unit, such as `volume_mm3`, and the
@@ -51,6 +53,7 @@ def feature_table(
     measured |= {name: list(column) for name, column in zip(columns, vectors.T, strict=True)}
     last: dict[str, Sequence[Any]] = {
         "unit": dataset.units(),
+        **_border_columns(dataset),
         "notes": ["; ".join(notes) for notes in dataset.all_notes()],
     }
     reserved = {"folder", *own, *last, *measured}
@@ -58,6 +61,19 @@ def feature_table(
     for name, values in bodies.columns.items():
         further[f"{name} of {LABELS_FILE}" if name in reserved else name] = values
     return {**own, **further, **last}, measured
+
+
+def _border_columns(dataset: SignatureDataset) -> dict[str, Sequence[Any]]:
+    """Return which share of each surface lies at the border of the image, and at which sides."""
+    borders = [border_of(notes) for notes in dataset.all_notes()]
+    is_from_voxels = ["voxel_volume" in row for row in dataset.measures()]
+    whole = [0.0 if known else None for known in is_from_voxels]
+    shares = [
+        share if border is None else border.share
+        for border, share in zip(borders, whole, strict=True)
+    ]
+    sides = [None if border is None else border.sides for border in borders]
+    return {"at_border": shares, "border_sides": sides}
 
 
 def _plain_numbers(dataset: SignatureDataset) -> dict[str, Sequence[Any]]:

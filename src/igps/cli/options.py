@@ -84,6 +84,11 @@ _COLLECTION = (
 
 _RUNNING = (
     Option("n_workers", int, "number of worker processes; by default one for each core"),
+    Option(
+        "complete",
+        bool,
+        "leave out bodies that reach the border of their image, where the scan may have cut them",
+    ),
     Option("strict", bool, "stop at the first body that cannot be used instead of skipping it"),
     Option("time_limit", float, "seconds that one body may take; by default no limit"),
     Option(

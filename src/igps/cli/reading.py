@@ -27,6 +27,7 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.measures import Measures
 from igps.descriptors.size_and_side import SIDE, SIZE, keeps_size, scale_of
+from igps.fields.volumes.border import border_of
 from igps.mesh.formats import is_searched
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES
@@ -80,6 +81,7 @@ def signatures(
     source: Folder | Sequence[Path] | Bodies,
     descriptors: Sequence[Descriptor] = (),
     strict: bool = False,
+    complete: bool = False,
     n_workers: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
@@ -90,8 +92,8 @@ def signatures(
     Args:
         source: bodies.
         descriptors: descriptors whose requirements the signatures must meet.
-        strict, n_workers, time_limit, memory_limit, collection: options of every command that reads bodies, see
-            `igps.cli.options.GROUPS`.
+        strict, complete, n_workers, time_limit, memory_limit, collection: options of every command that reads bodies,
+            see `igps.cli.options.GROUPS`.
 
     Returns:
         The bodies whose signatures are in the cache, and the failures of the others.
@@ -115,6 +117,8 @@ def signatures(
             f"none of {counted(len(dataset), 'body')} could be used; the first: {failures[0].error}"
         )
     usable = dataset.usable(failures)
+    if complete:
+        usable = _complete(usable)
     if summary := mending_summary(usable, len(dataset)):
         print(summary)
     for line in residue_summaries(usable):
@@ -162,6 +166,19 @@ def described(
         module,
         name,
     )
+
+
+def _complete(dataset: SignatureDataset) -> SignatureDataset:
+    """Return the bodies that do not reach the border of their image, and print how many do."""
+    kept = [i for i, notes in enumerate(dataset.all_notes()) if border_of(notes) is None]
+    n_cut = len(dataset) - len(kept)
+    if not kept:
+        raise ValueError(
+            f"complete: all of {counted(n_cut, 'body')} reach the border of their image. "
+            "Leave it out if the images were cropped to the bodies."
+        )
+    print(f"{n_cut} of {counted(len(dataset), 'body')} at the border of the image, left out")
+    return dataset.subset(kept)
 
 
 def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:

@@ -89,9 +89,10 @@ def extract(
     """Write the descriptions of meshes to a file, for use in any classifier, statistics package or vector database.
 
     A table (.csv or .parquet) has one row per body, with the columns file, part, name, class, further columns of
-    labels.csv, unit (of length), notes, plain numbers such as volume_mm3, and the description, its columns named after
-    its parts. A NumPy archive (.npz) has features (N, ...) as the descriptor returns them, names (N,), and labels (N,)
-    if the meshes come from a folder with classes.
+    labels.csv, unit (of length), at_border (share of the surface at the border of the image), border_sides, notes,
+    plain numbers such as volume_mm3, and the description, its columns named after its parts. A NumPy archive (.npz)
+    has features (N, ...) as the descriptor returns them, names (N,), and labels (N,) if the meshes come from a folder
+    with classes.
 
     Args:
         meshes: mesh files, or one folder.
@@ -255,7 +256,8 @@ def _describe_body(mesh: Path, descriptor: Descriptor, **describing: Any) -> Ten
     """Return the description (1, ...) of a file with one body, or of one FILE#PART."""
     from igps.cli.reading import described, print_unit_warning
 
-    result = described([mesh], descriptor, **{**describing, "n_workers": 1})
+    alone = {**describing, "n_workers": 1, "complete": False}
+    result = described([mesh], descriptor, **alone)
     print_unit_warning(descriptor, result.dataset)
     if len(result.dataset) > 1:
         names = ", ".join(result.dataset.bodies.names[:5])

@@ -926,7 +926,7 @@ def test_a_label_at_the_border_of_the_image_names_the_side_of_the_patient() -> N
     up = np.diag([1.0, 1.0, 2.0, 1.0])
     down = np.diag([1.0, 1.0, -2.0, 1.0])
     for affine, side in ((up, "inferior"), (down, "superior")):
-        mesh = label_surface(LabelVolume((labels,), affine), 1)
+        mesh = label_surface(LabelVolume((labels,), affine, frame="RAS"), 1)
         (note,) = [note for note in mesh.notes if "border" in note]
         assert note.startswith(f"at the border of the image ({side}): ")
         share = float(note.split(": ")[1].split("%")[0]) / 100
@@ -934,8 +934,9 @@ def test_a_label_at_the_border_of_the_image_names_the_side_of_the_patient() -> N
         assert share == pytest.approx(0.1, rel=0.15)
     labels[0, 4:14, 4:10] = 1
     labels[1:4, 4:14, 4:10] = 1
-    (note,) = [n for n in label_surface(LabelVolume((labels,), up), 1).notes if "border" in n]
-    assert "(inferior, left)" in note
+    volume = LabelVolume((labels,), up, frame="RAS")
+    (note,) = [n for n in label_surface(volume, 1).notes if "border" in n]
+    assert "(left, inferior)" in note
 
 
 def test_a_label_within_the_image_has_no_note_of_its_border() -> None:

@@ -24,6 +24,7 @@ from igps.fields.volumes._volume_files import (
     read_raw,
     suffix_of,
 )
+from igps.fields.volumes.border import border_notes
 from igps.fields.volumes.label_measures import voxel_numbers
 from igps.fields.volumes.label_names import cleaned, read_label_names, table_beside
 from igps.fields.volumes.label_surface import MIN_VOXELS, voxel_spacing, voxel_surface
@@ -41,7 +42,6 @@ _MAX_LABELS, _MAX_UNCHECKED, _MIN_EQUAL = 20_000, 50, 0.3
 _LABEL_TOLERANCE = 0.01
 # Share of its voxels' volume by which a surface may differ without a note
 _VOLUME_TOLERANCE = 0.005
-_SIDES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))  # RAS
 
 Box = tuple[slice, slice, slice]
 
@@ -212,49 +212,14 @@ def label_surface(
     notes = (*volume.notes, *notes)
     given = voxel_numbers(mask, affine)
     mesh = mesh.annotated(notes=notes, frame=volume.frame, given=given)
-    mesh = mesh.annotated(notes=_border_notes(volume, body, mesh.area))
+    at_border = border_notes(volume.voxels(part), mesh.area, volume.frame)
+    mesh = mesh.annotated(notes=at_border)
     of_voxels = given["voxel_volume"]
     surplus = mesh.volume / of_voxels - 1
     if abs(surplus) <= _VOLUME_TOLERANCE:
         return mesh
     note = f"its volume differs by {surplus:+.1%} from that of its voxels, {of_voxels:.6g}"
     return mesh.annotated(notes=(note,))
-
-
-def _border_notes(volume: LabelVolume, body: LabelBody, area: float) -> tuple[str, ...]:
-    """Return a note if a label reaches the border of the image, where a scan may have cut it: sides, and share of area.
-
-    Sides are named in the frame of the patient (RAS), by the direction in which the axis of the image leaves it.
-    """
-    mask = volume.mask(body.label)
-    axes = np.asarray(volume.affine, dtype=np.float64)[:3, :3]
-    sides = []
-    cut_area = 0.0
-    for axis in range(3):
-        others = [k for k in range(3) if k != axis]
-        face_area = np.linalg.norm(np.cross(axes[:, others[0]], axes[:, others[1]]))
-        ends = ((0, body.box[axis].start == 0, -1), (-1, _is_last(volume, body, axis), 1))
-        for index, is_at_border, direction in ends:
-            if not is_at_border:
-                continue
-            cut_area += float(np.count_nonzero(mask.take(index, axis=axis)) * face_area)
-            sides.append(_side_of(direction * axes[:, axis]))
-    if not sides:
-        return ()
-    names = ", ".join(sorted(sides))
-    share = min(cut_area / area, 1.0)
-    return (f"at the border of the image ({names}): {share:.1%} of the surface may be a cut",)
-
-
-def _is_last(volume: LabelVolume, body: LabelBody, axis: int) -> bool:
-    return body.box[axis].stop == volume.layers[body.layer].shape[axis]
-
-
-def _side_of(direction: Floats) -> str:
-    """Return the side of the patient to which a vector in RAS points, such as "left"."""
-    axis = int(np.argmax(np.abs(direction)))
-    negative, positive = _SIDES[axis]
-    return positive if direction[axis] > 0 else negative
 
 
 def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
