@@ -53,9 +53,7 @@ def test_each_side_of_an_oblique_image_is_told_with_its_share(axis, end):
     assert border.sides == FRAMELESS[letter]
 
 
-def test_no_whole_body_is_told_and_every_cut_one(
-    tmp_path, monkeypatch, capsys
-):
+def test_no_whole_body_is_told_and_every_cut_one(tmp_path, monkeypatch, capsys):
     """Whole balls one voxel from the border, and balls that a corner or a face cuts by a voxel or more."""
     inner = RADIUS + 0.5
     whole = {f"whole{i}": (inner, N - 1 - inner, 16.0 + i) for i in range(3)}
