@@ -125,3 +125,20 @@ def test_measures_are_those_of_closed_forms_in_any_position(name):
     found = measures(moved)
     for measure in expected.keys() - {"hull"}:
         assert found[measure] == pytest.approx(expected[measure], rel=0.01), measure
+
+
+def test_thickness_of_a_box_falls_towards_its_edges_as_its_closed_form() -> None:
+    sides = np.array([2, 1.2, 0.7])
+    box = trimesh.creation.box(sides)
+    found = measures(Mesh(box.vertices @ ROTATION.T, box.faces))
+    # A ball of radius r contains a point if the box of the centres of all such balls is within r of it
+    depths = np.random.default_rng(0).random((20_000, 3)) * sides / 2
+    low = np.zeros(len(depths))
+    high = np.full(len(depths), sides.min() / 2)
+    for _ in range(30):
+        r = (low + high) / 2
+        to_centres = np.linalg.norm(np.maximum(r[:, None] - depths, 0), axis=1)
+        low = np.where(to_centres <= r, r, low)
+        high = np.where(to_centres <= r, high, r)
+    assert found["mean_thickness"] == pytest.approx(2 * low.mean(), rel=0.015)
+    assert found["greatest_thickness"] == pytest.approx(0.7, rel=0.01)

@@ -12,14 +12,14 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.distance import cdist
 
-from igps._arrays import Floats
+from igps._arrays import Floats, Integers
 from igps._threads import one_thread
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, components, directed_edges, undirected_edges, unit
 from igps.signature.sampling import surface_points
 from igps.signature.voxels import interior_samples
 
-MEASURES_VERSION = 4
+MEASURES_VERSION = 5
 """Part of every cache key: raise it whenever the same mesh would give other numbers."""
 
 POWERS: Mapping[str, int] = {
@@ -55,11 +55,16 @@ POWERS: Mapping[str, int] = {
 # of these widths is within 0.4 % of the largest diameter, which the steps after them find.
 _N_DIRECTIONS = 250
 _N_DIAMETER_STEPS = 3
-# Interior points at which the thickness is measured, and steps by which balls grow: the last move a centre by less than
-# a hundredth of the radius.
+# Interior points at which the thickness is measured, and the largest number of steps by which balls grow there; most
+# need eight. A step of less than a hundredth of the radius is the last.
 _N_THICKNESS_POINTS = 400
-_N_THICKNESS_STEPS = 10
-# Samples of the surface in which nearest points are looked for, over area³/volume², and their largest number.
+_N_THICKNESS_STEPS = 16
+_LAST_STEP = 0.01
+_LEAST_GROWTH = 1e-6  # more than rounding
+# Share of the largest radius at which a ball counts as one of the largest
+_NEARLY_LARGEST = 0.995
+# Samples of the surface in which nearest points are looked for, over area³/volume², and their largest number: their
+# spacing is about a third of the thickness of a plate.
 _SAMPLES_PER_THICKNESS = 8
 _MAX_SAMPLES = 50_000
 _N_NEAREST = 4
@@ -115,7 +120,8 @@ def measures(mesh: Mesh, points: Floats | None = None) -> dict[str, float]:
     if points is None:
         points = interior_samples(mesh, min_samples=_N_THICKNESS_POINTS)
     thickness = local_thickness(mesh, points)
-    total_curvature = _total_mean_curvature(mesh)
+    edges, edge_of = undirected_edges(mesh.faces, len(mesh.vertices))
+    total_curvature = _total_mean_curvature(mesh, edge_of)
     numbers = {
         "volume": volume,
         "area": area,
@@ -132,7 +138,7 @@ def measures(mesh: Mesh, points: Floats | None = None) -> dict[str, float]:
         "extent": volume / box,
         "convexity": volume / hull.volume,
         "n_pieces": 1,
-        "euler_number": _euler_number(mesh),
+        "euler_number": _euler_number(mesh, edges, edge_of),
         "mean_curvature": total_curvature / area,
         "total_curvature": total_curvature,
         "centroid_x": centroid[0],
@@ -148,30 +154,68 @@ def local_thickness(mesh: Mesh, points: Floats) -> Floats:
     """Return the diameters (≤ P,) of the largest balls inside the mesh that contain points (P, 3) inside, length.
 
     Of many points, an even selection is taken. From each, a ball grows towards the middle of the body: its centre moves
-    away from the nearest point of the surface, by its radius at first, for as long as the ball grows and contains the
-    point. The thickness at a point is the largest diameter of all such balls that contain it.
+    away from the nearest point of the surface, for as long as the ball grows and contains the point. Where another wall
+    comes near, a centre turns and moves on between both. The thickness at a point is the largest diameter of all such
+    balls that contain it.
     """
-    # By their distance from the middle, so that a turned grid gives the same selection; rounded, so that a scaled body
-    # does, whose points are equally far from the middle but for rounding
-    distances = np.linalg.norm(points - points.mean(axis=0), axis=1)
-    order = np.argsort(np.round(distances / distances.max(), 9), kind="stable")
-    points = points[order[:: math.ceil(len(points) / _N_THICKNESS_POINTS)]]
+    points = _even_selection(points)
     surface = _NearestPoints(mesh)
     centres = points.copy()
     radii, away = surface.distances(centres)
-    share = np.ones(len(points))
+    heading = away.copy()
+    step = np.maximum(radii, radii.max() - radii)
+    moving = np.arange(len(points))
     for _ in range(_N_THICKNESS_STEPS):
-        # A centre that stays in its ball stays inside the body
-        moved = centres + (share * radii)[:, None] * away
-        new_radii, new_away = surface.distances(moved)
-        contains_point = np.linalg.norm(moved - points, axis=1) <= new_radii
-        grows = (new_radii > radii) & contains_point
-        centres[grows] = moved[grows]
-        radii[grows] = new_radii[grows]
-        away[grows] = new_away[grows]
-        share[~grows] /= 2
+        ahead = heading[moving]
+        length = step[moving]
+        moved = centres[moving] + length[:, None] * ahead
+        radius, new_away = surface.distances(moved)
+        growth = radius - radii[moving]
+        # No ball around a point outside of the body contains a point inside
+        contains_point = np.linalg.norm(moved - points[moving], axis=1) <= radius
+        is_larger = growth > _LEAST_GROWTH * radius
+        grows = is_larger & contains_point
+        # The length at which the walls behind and ahead are equally near, if both are flat
+        slope = _dots(away[moving], ahead)
+        new_slope = _dots(new_away, ahead)
+        level = (growth - length * new_slope) / np.maximum(slope - new_slope, 1e-9)
+        shorter = np.where(is_larger, length / 2, np.clip(level, 0, length / 2))
+        step[moving] = np.where(grows, radius / 2, shorter)
+        grown = moving[grows]
+        centres[grown] = moved[grows]
+        radii[grown] = radius[grows]
+        away[grown] = new_away[grows]
+        heading[grown] = unit(new_away[grows] + ahead[grows] / 2)
+        # No larger ball is to be found for a point of the largest
+        largest = _first_largest(radii)
+        in_largest = np.linalg.norm(points - centres[largest], axis=1) <= radii[largest]
+        is_done = in_largest | (radii >= _NEARLY_LARGEST * radii[largest])
+        is_done[grown] = False
+        is_done[largest] = False
+        is_done |= step < _LAST_STEP * radii
+        moving = moving[~is_done[moving]]
     contains = cdist(points, centres) <= radii * (1 + 1e-9)
     return 2 * np.where(contains, radii, 0).max(axis=1)
+
+
+def _even_selection(points: Floats) -> Floats:
+    """Return every n-th point by its distance from the middle, so that a turned grid gives the same selection."""
+    distances = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    # Rounded, so that a scaled body does, too: its points are equally far from the middle but for rounding
+    order = np.argsort(np.round(distances / distances.max(), 9), kind="stable")
+    every = math.ceil(len(points) / _N_THICKNESS_POINTS)
+    return points[order[every // 2 :: every]]
+
+
+def _dots(first: Floats, second: Floats) -> Floats:
+    """Return the products (N,) of vectors (N, 3)."""
+    return np.einsum("ni,ni->n", first, second)
+
+
+def _first_largest(values: Floats) -> Integers:
+    """Return the index along the last axis of the first of the values that are largest but for rounding."""
+    largest = values.max(axis=-1, keepdims=True)
+    return np.asarray((values >= largest - 1e-9 * np.abs(largest)).argmax(axis=-1))
 
 
 class _NearestPoints:
@@ -182,15 +226,12 @@ class _NearestPoints:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        # So many that their spacing is about a third of the thickness of a plate
         n_samples = int(_SAMPLES_PER_THICKNESS * mesh.area**3 / mesh.volume**2)
         samples = surface_points(mesh, min(n_samples, _MAX_SAMPLES), seed=0)
-        self._corners = mesh.vertices[mesh.faces]
-        centres = self._corners.mean(axis=1)
-        self._samples = np.concatenate([centres, samples.positions])
-        self._faces = np.concatenate([np.arange(len(mesh.faces)), samples.face])
+        self._samples = samples.positions
         # Many samples are equally far from the middle of a body: with large leaves, a query takes half of the time.
-        self._tree = cKDTree(self._samples, leafsize=64)
+        self._tree = cKDTree(self._samples, leafsize=32)
+        self._corners = mesh.vertices[mesh.faces[samples.face]]
         first = self._corners[:, 1] - self._corners[:, 0]
         second = self._corners[:, 2] - self._corners[:, 0]
         normal = np.cross(first, second)
@@ -202,20 +243,20 @@ class _NearestPoints:
     def distances(self, points: Floats) -> tuple[Floats, Floats]:
         """Return the distances (P,) of points (P, 3), and unit vectors (P, 3) away from the surface."""
         nearest = self._tree.query(points, _N_NEAREST)[1]
-        faces = self._faces[nearest]
-        offsets = points[:, None] - self._corners[faces, 0]
-        others = np.einsum("pkci,pki->pkc", self._weights[faces], offsets)
+        corners = self._corners[nearest]
+        offsets = points[:, None] - corners[:, :, 0]
+        others = (self._weights[nearest] @ offsets[..., None])[..., 0]
         weights = np.concatenate([1 - others.sum(axis=2, keepdims=True), others], axis=2)
         # A point of the face near the nearest, which may be outside of it
         weights = np.maximum(weights, 0)
         weights /= weights.sum(axis=2, keepdims=True)
-        in_faces = np.einsum("pkc,pkci->pki", weights, self._corners[faces])
+        in_faces = (weights[:, :, None] @ corners)[:, :, 0]
         candidates = np.concatenate([in_faces, self._samples[nearest[:, :1]]], axis=1)
         vectors = points[:, None] - candidates
-        lengths = np.linalg.norm(vectors, axis=2)
-        best = lengths.argmin(axis=1)
+        squared = np.einsum("pki,pki->pk", vectors, vectors)
+        best = _first_largest(-squared)
         rows = np.arange(len(points))
-        return lengths[rows, best], unit(vectors[rows, best])
+        return np.sqrt(squared[rows, best]), unit(vectors[rows, best])
 
 
 def _moments(mesh: Mesh) -> tuple[Floats, Floats, Floats]:
@@ -226,11 +267,12 @@ def _moments(mesh: Mesh) -> tuple[Floats, Floats, Floats]:
     """
     origin = mesh.vertices.mean(axis=0)
     corners = (mesh.vertices - origin)[mesh.faces]
-    shares = np.linalg.det(corners) / 6 / mesh.volume
+    normals = np.cross(corners[:, 1], corners[:, 2])
+    shares = _dots(corners[:, 0], normals) / 6 / mesh.volume
     sums = corners.sum(axis=1)
     mean = shares @ sums / 4
-    vectors = np.concatenate([corners, sums[:, None]], axis=1)
-    second = np.einsum("f,fki,fkj->ij", shares, vectors, vectors) / 20
+    vectors = np.concatenate([corners, sums[:, None]], axis=1).reshape(-1, 3)
+    second = (np.repeat(shares, 4) * vectors.T) @ vectors / 20
     variances, axes = np.linalg.eigh(second - np.outer(mean, mean))
     return origin + mean, np.maximum(variances, 0), axes
 
@@ -243,8 +285,8 @@ def _diameter(corners: Floats) -> float:
     directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
     diameter = 0.0
     for _ in range(_N_DIAMETER_STEPS):
-        along = corners @ directions.T
-        ends = corners[along.argmax(axis=0)] - corners[along.argmin(axis=0)]
+        along = directions @ corners.T
+        ends = corners[along.argmax(axis=1)] - corners[along.argmin(axis=1)]
         lengths = np.linalg.norm(ends, axis=1)
         diameter = max(diameter, float(lengths.max()))
         widest = np.argsort(lengths)[-10:]
@@ -252,9 +294,8 @@ def _diameter(corners: Floats) -> float:
     return diameter
 
 
-def _total_mean_curvature(mesh: Mesh) -> float:
+def _total_mean_curvature(mesh: Mesh, edge_of: Integers) -> float:
     """Return half the sum over edges of length times outer angle, which is negative at edges that go inward."""
-    edge_of = undirected_edges(mesh.faces, len(mesh.vertices))[1]
     by_edge = np.argsort(edge_of, kind="stable")
     first = np.searchsorted(edge_of[by_edge], np.flatnonzero(np.bincount(edge_of) == 2))
     left = by_edge[first] // 3
@@ -263,15 +304,14 @@ def _total_mean_curvature(mesh: Mesh) -> float:
     start, end = directed_edges(mesh.faces)
     side = by_edge[first]
     along = mesh.vertices[end[side]] - mesh.vertices[start[side]]  # as the left face goes round
-    sine = np.einsum("ei,ei->e", np.cross(normals[left], normals[right]), unit(along))
-    cosine = np.einsum("ei,ei->e", normals[left], normals[right])
+    sine = _dots(np.cross(normals[left], normals[right]), unit(along))
+    cosine = _dots(normals[left], normals[right])
     angles = np.arctan2(sine, cosine)
     return float(np.linalg.norm(along, axis=1) @ angles) / 2
 
 
-def _euler_number(mesh: Mesh) -> float:
+def _euler_number(mesh: Mesh, edges: Integers, edge_of: Integers) -> float:
     """Return the Euler number of a body, half of that of its surface; holes of an open surface count as closed."""
-    edges, edge_of = undirected_edges(mesh.faces, len(mesh.vertices))
     is_boundary = np.bincount(edge_of) == 1
     n_holes = 0
     if is_boundary.any():
