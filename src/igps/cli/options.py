@@ -44,7 +44,10 @@ _LOAD_HELP = {
         "chains where the format has them, and otherwise the whole file"
     ),
     "max_unpacked": "largest unpacked size of a file, in bytes",
-    "names": "table of label names; by default the names in or beside the volume",
+    "names": (
+        "table of label names; or freesurfer, totalsegmentator or totalsegmentator_v1, for volumes with no names in "
+        "them or beside them"
+    ),
     "threshold": "smallest probability of the voxels of a body, in volumes of probabilities",
     "cavities": "fill hollow bodies, or keep the surfaces of hollows as part of their boundary",
 }

@@ -48,13 +48,14 @@ class Content:
 
     digest: bytes
     files: tuple[FileDigest, ...] = ()  # none if the body is in memory
+    nameless: bytes | None = None  # the digest without a table of names; None if there is no table
 
     @staticmethod
-    def of_files(files: Sequence[FileDigest]) -> "Content":
-        """Return the content of a file and its companions."""
-        if len(files) == 1:
-            return Content(files[0].digest, tuple(files))
-        return Content(_hash(b"".join(file.digest for file in files)), tuple(files))
+    def of_files(files: Sequence[FileDigest], names: Sequence[Path] = ()) -> "Content":
+        """Return the content of a file and its companions, of which `names` only name the bodies."""
+        own = [file.digest for file in files if file.path not in names]
+        nameless = _joint(own) if len(own) < len(files) else None
+        return Content(_joint([file.digest for file in files]), tuple(files), nameless)
 
     @staticmethod
     def of_mesh(mesh: Mesh) -> "Content":
@@ -76,7 +77,11 @@ def signature_key(
     # The suffix selects the reader: the same lines in .pdb.gz and .pqr.gz are different molecules
     name = body.path.name.lower()
     suffix = ".pqr.gz" if name.endswith(".pqr.gz") else Path(name).suffix
-    return _hash(_parameters(suffix, body.part, reading, config) + content.digest).hex()
+    if body.number is None:
+        return _hash(_parameters(suffix, body.part, None, reading, config) + content.digest).hex()
+    # Whatever the body is called: other names of labels compute nothing anew
+    digest = content.nameless or content.digest
+    return _hash(_parameters(suffix, None, body.number, reading, config) + digest).hex()
 
 
 def derived_key(kind: str, key: str, *parameters: object) -> str:
@@ -86,18 +91,27 @@ def derived_key(kind: str, key: str, *parameters: object) -> str:
 
 @lru_cache
 def _parameters(
-    suffix: str, part: str | None, reading: LoadOptions, config: SignatureConfig
+    suffix: str,
+    part: str | None,
+    number: str | None,
+    reading: LoadOptions,
+    config: SignatureConfig,
 ) -> bytes:
     """Return the part of a key that is not the content; remembered, because thousands of files share it."""
     fields = {
         "suffix": suffix,
         "part": part,
+        "number": number,
         "reading": reading.as_dict(),
         "mending": MENDING_VERSION,
         "measures": MEASURES_VERSION,
         "config": config.as_dict(),  # with the version of the algorithm
     }
     return json.dumps(fields, sort_keys=True).encode()
+
+
+def _joint(digests: Sequence[bytes]) -> bytes:
+    return digests[0] if len(digests) == 1 else _hash(b"".join(digests))
 
 
 def _hash(content: bytes) -> bytes:

@@ -62,7 +62,7 @@ class Listing:
         """Return the bodies of a file from the cache, where they are stored if they were missing."""
         assert self.cache_dir is not None
         cache = Cache(self.cache_dir, "listing")
-        options = json.dumps(self.options.as_dict(), sort_keys=True)
+        options = json.dumps([self.options.as_dict(), self.options.names], sort_keys=True)
         key = derived_key("listing", content.digest.hex(), path.name, options, version())
         texts = cache.texts(key)
         if texts is not None:

@@ -19,7 +19,7 @@ from igps.data.cache import Cache, Kind, Record, decode, encode
 from igps.data.cache_hit import CacheHit
 from igps.data.keys import Content, FileDigest, derived_key, signature_key
 from igps.mesh.errors import MeshError
-from igps.mesh.formats import dependencies_of
+from igps.mesh.formats import dependencies_of, names_of
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
@@ -87,7 +87,8 @@ class SignaturePipeline:
         known = known or {}
         try:
             paths = dependencies_of(body.path, self.reading)
-            return Content.of_files([known.get(path) or FileDigest.of(path) for path in paths])
+            files = [known.get(path) or FileDigest.of(path) for path in paths]
+            return Content.of_files(files, names_of(body.path, self.reading))
         except OSError as error:
             cause = f"{body.path}: cannot be read ({error.strerror})"
             raise MeshError(f"{cause}. Check the path.") from error

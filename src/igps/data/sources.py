@@ -16,7 +16,7 @@ from typing import Literal, get_args
 from igps._files import delimiter_of, table_text
 from igps.data.attributes import AttributeSource, FileSource
 from igps.data.listing import Listing
-from igps.mesh.formats import is_searched, searched_suffixes
+from igps.mesh.formats import has_numbers, is_searched, searched_suffixes
 from igps.mesh.loading import BodyRef
 from igps.mesh.options import LoadOptions
 
@@ -40,14 +40,19 @@ class Bodies:
     parts: tuple[str | None, ...] = ()
     # Further columns of `labels.csv` by name, with one value for each body; None if a value is missing (empty, NA, ...)
     columns: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict, hash=False)
+    # Number of each label in its file, which names do not change; None for other bodies
+    label_numbers: tuple[str | None, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.parts:
             object.__setattr__(self, "parts", (None,) * len(self.paths))
+        if not self.label_numbers:
+            object.__setattr__(self, "label_numbers", (None,) * len(self.paths))
         fields = (
             ("names", self.names),
             ("labels", self.labels),
             ("parts", self.parts),
+            ("label_numbers", self.label_numbers),
             *self.columns.items(),
         )
         for name, values in fields:
@@ -60,10 +65,10 @@ class Bodies:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> BodyRef:
-        return BodyRef(self.paths[index], self.parts[index])
+        return BodyRef(self.paths[index], self.parts[index], self.label_numbers[index])
 
     def __iter__(self) -> Iterator[BodyRef]:
-        return map(BodyRef, self.paths, self.parts)
+        return map(BodyRef, self.paths, self.parts, self.label_numbers)
 
     def number(self, name: str) -> int:
         """Return the index of a body by its name; raise a KeyError if there is no such body."""
@@ -79,6 +84,7 @@ class Bodies:
             None if self.labels is None else tuple(self.labels[i] for i in indices),
             tuple(self.parts[i] for i in indices),
             {name: tuple(values[i] for i in indices) for name, values in self.columns.items()},
+            tuple(self.label_numbers[i] for i in indices),
         )
 
     def column(self, name: str) -> tuple[str, ...]:
@@ -352,21 +358,23 @@ def _bodies_in_files(
     columns: Mapping[str, Sequence[str | None]] | None = None,
 ) -> Bodies:
     """Return the bodies of files, given by path, name, label and part; without a part, all bodies of the file."""
-    listed = listing.of(path for path, _, _, chosen in rows if chosen is None)
+    listed = listing.of(path for path, _, _, part in rows if part is None or has_numbers(path))
     _number_lone_labels(listed)
-    entries: list[tuple[int, Path, str, str | None, str | None]] = []
-    for i, (path, name, label, chosen_part) in enumerate(rows):
-        if chosen_part is not None:
-            chosen_parts: list[str | None] = [chosen_part]
-        else:
-            chosen_parts = [ref.part for ref in listed[path]]
-        for part in chosen_parts:
-            entries.append((i, path, name if part is None else f"{name}#{part}", label, part))
-    indices, paths, names, labels, parts = zip(*entries, strict=True)
+    entries: list[tuple[int, Path, str, str | None, str | None, str | None]] = []
+    for i, (path, name, label, chosen) in enumerate(rows):
+        refs = listed.get(path, [])
+        if chosen is not None:
+            numbers = {key: ref.number for ref in refs for key in (ref.number, ref.part)}
+            refs = [BodyRef(path, chosen, numbers.get(chosen))]
+        for ref in refs:
+            full_name = name if ref.part is None else f"{name}#{ref.part}"
+            entries.append((i, path, full_name, label, ref.part, ref.number))
+    indices, paths, names, labels, parts, numbers_of = zip(*entries, strict=True)
     body_columns = {
         name: tuple(values[i] for i in indices) for name, values in (columns or {}).items()
     }
-    return Bodies(paths, names, None if None in labels else labels, parts, body_columns)
+    labels = None if None in labels else labels
+    return Bodies(paths, names, labels, parts, body_columns, numbers_of)
 
 
 def _number_lone_labels(listed: dict[Path, list[BodyRef]]) -> None:

@@ -1,7 +1,6 @@
 """How the descriptions of a gallery were made. Only descriptions that were made alike can be compared."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -24,7 +23,7 @@ def about_of(
         "model": fingerprint(descriptor_of(descriptor)),
         "signature": {**signature, "attributes": list(config.attributes)},
         "reading": reading.as_dict(),
-        "names": reading.names and os.path.abspath(reading.names),
+        "names": reading.names_anywhere,
     }
 
 

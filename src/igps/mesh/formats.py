@@ -47,6 +47,8 @@ class Format:
     recognises: Callable[[Path], bool] | None = None
     # Finds other files on which the bodies depend
     beside: Callable[[Path, LoadOptions], Sequence[Path]] | None = None
+    # Finds the table that names numbered bodies, by the file and `LoadOptions.names`
+    names: Callable[[Path, str | None], Path | None] | None = None
     # makes bodies of an object in memory, and returns None for an object that it does not know
     in_memory: Callable[[Any, str, LoadOptions], Sequence[RawBody] | None] | None = None
 
@@ -102,7 +104,21 @@ def dependencies_of(path: Path, options: LoadOptions = LoadOptions()) -> list[Pa
     if kind is None or kind.beside is None or not path.is_file():
         return [path]
     with faults(path, kind):
-        return [path, *(other for other in kind.beside(path, options) if other.is_file())]
+        others = [*kind.beside(path, options), *names_of(path, options)]
+        return [path, *(other for other in others if other.is_file())]
+
+
+def has_numbers(path: Path) -> bool:
+    """Return whether the bodies of a file have numbers, like labels, besides the names that a table gives them."""
+    kind = format_of(path)
+    return kind is not None and kind.names is not None
+
+
+def names_of(path: Path, options: LoadOptions) -> list[Path]:
+    """Return the table that names the bodies of a file; none if there is no table, or the format has no numbers."""
+    kind = format_of(path)
+    table = None if kind is None or kind.names is None else kind.names(path, options.names)
+    return [] if table is None else [table]
 
 
 def is_searched(path: str | Path) -> bool:

@@ -1,5 +1,6 @@
 """Options for reading a file as bodies."""
 
+import os
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
@@ -38,7 +39,8 @@ class LoadOptions:
             CAD file, files of an archive), "pieces" (connected components), or "chains", "models" or "assembly" (of a
             molecule). None, or a kind that the format does not have, selects labels, chains, or else the whole file.
         max_unpacked: largest unpacked size of a file, in bytes.
-        names: file with a table of label names, see `read_label_names`; None for the names in or beside the volume.
+        names: file with a table of label names, see `read_label_names`; None for the names in or beside the volume. Or
+            "freesurfer", "totalsegmentator" or "totalsegmentator_v1": the names of their labels, for other volumes.
         threshold: smallest probability of the voxels of a body, in volumes of probabilities.
         cavities: "fill" fills hollow bodies; "keep" makes the surfaces of hollows part of their boundary.
 
@@ -68,6 +70,12 @@ class LoadOptions:
             )
         if not 0 < self.threshold <= 1:
             raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
+
+    @property
+    def names_anywhere(self) -> str | None:
+        """The table of names as it is found from any folder."""
+        is_file = self.names is not None and os.path.isfile(self.names)
+        return os.path.abspath(self.names) if is_file and self.names else self.names
 
     def as_dict(self) -> dict[str, object]:
         """Return the options on which a body depends, for cache keys."""

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -113,15 +112,19 @@ def write_sources(folder: Path, dataset: SignatureDataset) -> None:
     """Write meshes.json: names, paths, parts and columns of the bodies, reading options, configuration, and cache."""
     pipeline = dataset.pipeline
     bodies = dataset.bodies
-    names = dataset.pipeline.reading.names
     summary = {
         "format": _FORMAT,
         "meshes": [
-            {"file": name, "path": str(body.path.resolve()), "part": body.part}
+            {
+                "file": name,
+                "path": str(body.path.resolve()),
+                "part": body.part,
+                "number": body.number,
+            }
             for name, body in zip(bodies.names, bodies, strict=True)
         ],
         "columns": bodies.columns,
-        "reading": {**asdict(pipeline.reading), "names": names and os.path.abspath(names)},
+        "reading": {**asdict(pipeline.reading), "names": pipeline.reading.names_anywhere},
         "signature": asdict(pipeline.config),
         "cache_dir": str(pipeline.cache_dir.resolve()),
     }
@@ -143,6 +146,7 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
             raise ValueError(f"its format is {summary['format']!r}")
         names = tuple(str(mesh["file"]) for mesh in summary["meshes"])
         parts = tuple(mesh.get("part") for mesh in summary["meshes"])
+        numbers = tuple(mesh.get("number") for mesh in summary["meshes"])
         if meshes is None:
             paths = tuple(Path(mesh["path"]) for mesh in summary["meshes"])
         else:
@@ -150,7 +154,7 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
                 meshes / file_name_of(name, part) for name, part in zip(names, parts, strict=True)
             )
         columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
-        bodies = Bodies(paths, names, None, parts, columns)
+        bodies = Bodies(paths, names, None, parts, columns, numbers)
         reading = LoadOptions(**summary["reading"])
         return SignatureDataset(
             bodies, SignatureConfig(**summary["signature"]), summary["cache_dir"], reading=reading

@@ -1,4 +1,8 @@
-"""Names of labels, from tables of ITK-SNAP, 3D Slicer, FreeSurfer, FSLeyes and nnU-Net, CSV, and NIfTI or MGH files."""
+"""Names of labels, from tables of ITK-SNAP, 3D Slicer, FreeSurfer, FSLeyes and nnU-Net, CSV, and NIfTI or MGH files.
+
+The tables in `label_tables` name the labels of FreeSurfer 7 and of FastSurfer, which has the same numbers, by
+FreeSurferColorLUT.txt, and those of TotalSegmentator, version 2 and version 1, task "total".
+"""
 
 import csv
 import html
@@ -17,6 +21,10 @@ logger = logging.getLogger(__name__)
 _SUFFIXES = (".label", ".ctbl", ".lut", ".txt", ".csv", ".tsv", ".json")  # of tables for one volume
 _FOLDER_TABLES = ("FreeSurferColorLUT.txt", "dataset.json")  # for all volumes of a folder
 _MAX_BYTES = 1 << 24
+BUILT_IN = {
+    path.stem: path for path in sorted(Path(__file__).with_name("label_tables").glob("*.csv"))
+}
+"""Tables of this package, by the names that stand for them."""
 # ITK-SNAP: index, three colours, opacity, visibility, mesh visibility, "name".
 _SNAP = re.compile(r'(\d+)(?:\s+[\d.]+){6}\s+"([^"]*)"')
 # FSLeyes: index, three colours, name to the end of the line.
@@ -53,9 +61,8 @@ def read_label_names(path: str | Path) -> dict[int, str]:
             )
         text = table_text(path)
     except OSError as error:
-        raise MeshError(
-            f"{path}: the table of names is not readable ({error}). Check the path."
-        ) from error
+        fault = f"{path}: the table of names is not readable ({error})"
+        raise MeshError(f"{fault}. Check the path, or give {', '.join(BUILT_IN)}.") from error
     names = (
         _parse_json(text)
         if path.suffix.lower() == ".json"
@@ -68,6 +75,17 @@ def read_label_names(path: str | Path) -> dict[int, str]:
         formats = f"{tables}, CSV with the columns label,name, or JSON from numbers to names"
         raise MeshError(f"{path}: names no label. Expected {formats}.")
     return names
+
+
+def names_table(path: Path | None, names: str | None) -> Path | None:
+    """Return the table that names the labels of a volume: `names`, else the table beside it, else a built-in table.
+
+    A built-in table counts for files that neither hold names nor lie beside a table.
+    """
+    if names is not None and names not in BUILT_IN:
+        return Path(names)
+    beside = None if path is None else table_beside(path)
+    return beside or BUILT_IN.get(names or "")
 
 
 def table_beside(path: Path) -> Path | None:

@@ -26,7 +26,7 @@ from igps.fields.volumes._volume_files import (
 )
 from igps.fields.volumes.border import border_notes
 from igps.fields.volumes.label_measures import voxel_numbers
-from igps.fields.volumes.label_names import cleaned, read_label_names, table_beside
+from igps.fields.volumes.label_names import BUILT_IN, cleaned, names_table, read_label_names
 from igps.fields.volumes.label_surface import MIN_VOXELS, voxel_spacing, voxel_surface
 from igps.mesh.errors import MeshError, NoBodyError
 from igps.mesh.formats import Format, faults
@@ -146,8 +146,8 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
     """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.nhdr`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`.
 
     Names of labels come from the table `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, NIfTI extensions,
-    MGH tags), else from a table beside it (see `table_beside`). Otherwise labels are named by their numbers, and the
-    only label of a mask, 1 or 255, is named after the file.
+    MGH tags), else from a table beside it (see `table_beside`). The only label of a mask, 1 or 255, is then named after
+    the file. Other labels are named by the built-in table that `options.names` tells, or else by their numbers.
 
     Raises:
         MeshError: the file is missing, cut short, too large, or holds no labels.
@@ -203,11 +203,6 @@ def label_surface(
         name=name,
         unit=volume.unit,
     )
-    if (volume.names or {}).get(body.label, body.name) != body.name:
-        notes = (
-            *notes,
-            "another label has the same name: the number was appended. Give names by a table",
-        )
     mesh = mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name)
     notes = (*volume.notes, *notes)
     given = voxel_numbers(mask, affine)
@@ -256,14 +251,9 @@ def _labelled(
         names = cleaned(
             {label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True)}
         )
-    if options.names is not None:
-        names = read_label_names(options.names)
-    elif not names and path is not None:
-        names = read_label_names(table) if (table := table_beside(path)) else {}
-        label = int(layers[0].max(initial=0))
-        is_mask = label in (1, 255) and bool(((layers[0] == 0) | (layers[0] == label)).all())
-        if not names and not raw.segments and is_mask:
-            names = {label: path.name[: -len(suffix_of(path))]}
+    is_chosen = options.names is not None and options.names not in BUILT_IN
+    if is_chosen or not names:
+        names = _names_of(layers, options.names, path, has_segments=bool(raw.segments))
     remarks = tuple(dict.fromkeys(notes))
     return LabelVolume(
         layers,
@@ -276,6 +266,20 @@ def _labelled(
         frame=raw.frame,
         unit_from=raw.unit_from,
     )
+
+
+def _names_of(
+    layers: Sequence[NDArray[Any]], given: str | None, path: Path | None, *, has_segments: bool
+) -> dict[int, str]:
+    """Return the names of labels by a table; of a mask that no table beside it names, the name of its file."""
+    table = names_table(path, given)
+    if table is not None and table not in BUILT_IN.values():
+        return read_label_names(table)
+    label = int(layers[0].max(initial=0))
+    is_mask = label in (1, 255) and bool(((layers[0] == 0) | (layers[0] == label)).all())
+    if path is not None and is_mask and not has_segments:
+        return {label: path.name[: -len(suffix_of(path))]}
+    return read_label_names(table) if table is not None else {}
 
 
 def _integer_labels(
@@ -424,9 +428,8 @@ def _in_pieces(volume: LabelVolume) -> LabelVolume:
 
 
 def _beside(path: Path, options: LoadOptions) -> list[Path]:
-    """Return the separate files of the voxels, if any, and the table of names."""
-    table = table_beside(path) if options.names is None else Path(options.names)
-    return [*detached(path), *([table] if table else [])]
+    """Return the separate files of the voxels, if any."""
+    return detached(path)
 
 
 FORMAT = Format(
@@ -436,5 +439,6 @@ FORMAT = Format(
     ("labels", "pieces"),
     extra="volumes",
     beside=_beside,
+    names=names_table,
     in_memory=in_memory,
 )
