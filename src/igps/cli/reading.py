@@ -81,10 +81,10 @@ def signatures(
     source: Folder | Sequence[Path] | Bodies,
     descriptors: Sequence[Descriptor] = (),
     strict: bool = False,
-    complete: bool = False,
     n_workers: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
+    complete: bool = False,
     **collection: Any,
 ) -> tuple[SignatureDataset, list[Failure]]:
     """Compute the signatures that are missing in the cache.
@@ -92,7 +92,7 @@ def signatures(
     Args:
         source: bodies.
         descriptors: descriptors whose requirements the signatures must meet.
-        strict, complete, n_workers, time_limit, memory_limit, collection: options of every command that reads bodies,
+        strict, n_workers, time_limit, memory_limit, complete, collection: options of every command that reads bodies,
             see `igps.cli.options.GROUPS`.
 
     Returns:
