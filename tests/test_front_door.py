@@ -47,7 +47,6 @@ NAMES = [
 # Import names whose distribution is called otherwise.
 DISTRIBUTIONS = {
     "igl": "libigl",
-    "ot": "POT",
     "umap": "umap-learn",
     "skimage": "scikit-image",
     "sklearn": "scikit-learn",

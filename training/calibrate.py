@@ -71,7 +71,6 @@ class Settings:
         n_classes, seed: arguments of `GradedShapes`, with four bodies of a class and four poses of a body.
         n_copied: bodies of each class to copy.
         rate: largest rate of false pairs among poses of bending bodies and bodies of one class.
-        pose_rate: largest rate of false pairs among bodies of one class if poses count as the same.
         model: file with the parameters of `pretrained`.
         out: file of the calibration.
         cache_dir: folder of cached signatures; by default the user's cache directory.
@@ -84,7 +83,6 @@ class Settings:
     seed: int
     n_copied: int
     rate: float
-    pose_rate: float
     model: Path = PRETRAINED
     out: Path = CALIBRATION
     cache_dir: Path | None = None
@@ -149,7 +147,6 @@ def calibrate(settings: Settings) -> None:
     others = surface_distances(between_shapes(bent_poses | other_bodies), n_workers)
     longer = surface_distances(to_their_copies(~is_copy), n_workers)
     different = np.concatenate([others, longer])
-    same_body = np.concatenate([by_kind["copies"], by_kind["poses"]])
     made_of = (
         f"{len(set(classes))} classes of GradedShapes({settings.n_classes}, seed={settings.seed}), "
         f"{len(set(bodies))} bodies, {len(shapes)} poses, {is_copy.sum()} copies, "
@@ -162,10 +159,8 @@ def calibrate(settings: Settings) -> None:
         made_of=made_of,
         distances={kind: quantiles(by_kind[kind]) for kind in KINDS},
         n_pairs={kind: len(by_kind[kind]) for kind in KINDS},
-        near=2 * float(by_kind["copies"].max()),
         same=threshold_between(same[:, 0], different[:, 0], settings.rate),
         detail=threshold_at(same[:, 1], different[:, 1], settings.rate),
-        pose=threshold_between(same_body, by_kind["bodies"], settings.pose_rate),
     )
     calibration.save(settings.out)
     print(made_of)
@@ -179,7 +174,7 @@ def calibrate(settings: Settings) -> None:
             f"{name}: {len(measured)} pairs, surfaces {smallest[0]:.4g} to {largest[0]:.4g} of √area, "
             f"{smallest[1]:.4g} to {largest[1]:.4g} times coarseness"
         )
-    for name in ("near", "same", "detail", "pose"):
+    for name in ("same", "detail"):
         print(f"{name}: {getattr(calibration, name)}")
 
 

@@ -769,10 +769,6 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         ),
         (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
         (
-            ["duplicates", "ROOT", "--poses", "--tolerance", "0.01"],
-            "tolerance: expected 0 with poses, got 0.01.",
-        ),
-        (
             ["classify", "ROOT", "--model", "plain.safetensors"],
             "model: expected a classifier, got d2.",
         ),

@@ -34,10 +34,8 @@ def calibration(drawn: dict[str, np.ndarray]) -> Calibration:
         "random numbers",
         {kind: quantiles(values) for kind, values in drawn.items()},
         dict.fromkeys(KINDS, 5000),
-        1.0,
         threshold,
         replace(threshold, distance=6.0),
-        threshold,
     )
 
 

@@ -10,7 +10,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +17,16 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from commands import error_of, run
+from commands import run
 from igps.cli.commands import COMMANDS
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
-from igps.descriptors.fingerprint import fingerprint
 from igps.duplicates._moments import distance_bounds
-from igps.duplicates.calibration import Calibration, calibration_params
-from igps.duplicates.duplicates import body_distance, duplicates, pose_duplicates
+from igps.duplicates.calibration import Calibration
+from igps.duplicates.duplicates import duplicates
 from igps.duplicates.grouping import assigned
 from igps.duplicates.surfaces import Surfaces
-from igps.gallery.gallery import Gallery
 from igps.signature.signature import SignatureConfig
-from own_descriptors import Same
 
 PROJECT = Path(__file__).parents[2]
 CONFIG = descriptor("pretrained").requirements.apply_to(SignatureConfig())
@@ -144,7 +140,9 @@ def test_pairs_are_graded(tmp_path):
     assert 0.001 < found[3][1] < 0.005
 
 
-def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_crop(tmp_path):
+def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_crop(
+    tmp_path,
+):
     """On another grid they are other bodies, as near as a fraction of a voxel, and never those of another label."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
 
@@ -203,7 +201,6 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path):
         body.export(tmp_path / f"{name}.off")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"one.off", "copy.off"})}
-    names = dataset.bodies.names
     assert duplicates(dataset, n_workers=1).nearly == {}
     near = duplicates(dataset, n_workers=1, tolerance=0.02).nearly
     assert {frozenset(pair) for pair in near} & {
@@ -213,8 +210,6 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path):
     assert all("longer.off" in pair for pair in near)
     with pytest.raises(ValueError, match=r"tolerance: expected 0 to 0\.02"):
         duplicates(dataset, n_workers=1, tolerance=0.5)
-    apart = body_distance(dataset.subset([names.index("one.off"), names.index("longer.off")]))
-    assert apart.limit < apart.surfaces < Calibration.load().same.distance
 
 
 def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path):
@@ -279,7 +274,6 @@ def test_handles_tell_bodies_apart_however_near_they_are(tmp_path):
     assert surfaces.limit(a_ball, a_ring, calibration) == 0
     assert surfaces.limit(a_ring, turned, calibration) > 0
     assert surfaces.limit(a_ball, a_cut, calibration) > 0
-    assert not body_distance(dataset.subset([a_ball, a_ring])).same
     assert grouped(duplicates(dataset, n_workers=1).groups) == {
         frozenset({"ring.off", "turned.off", "cut.off"})
     }
@@ -345,62 +339,13 @@ def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path):
     assert 3 < middle / fine < 5.3
 
 
-def test_poses_are_grouped_by_the_descriptor_alone(dataset):
-    """A descriptor that sees no difference takes all for poses of one body; their surfaces still tell."""
-    shipped = Calibration.load()
-    calibration = replace(
-        shipped, descriptor="same", model=fingerprint(Same()), signatures=calibration_params(CONFIG)
-    )
-    all_of_them = pose_duplicates(dataset, Same(), calibration=calibration, n_workers=1)
-    assert grouped(all_of_them.groups) == {frozenset(dataset.bodies.names)}
-    assert set(all_of_them.pairs.values()) == {0.0}
-    assert grouped(duplicates(dataset, calibration=calibration, n_workers=1).groups) == SAME
-
-
-def test_a_gallery_gives_the_same_groups_and_tells_of_files_that_are_gone(
-    dataset, root, cache, tmp_path
+def test_the_commands(
+    root,
+    cache,
+    tmp_path,
+    monkeypatch,
+    capsys,
 ):
-    pytest.importorskip("lancedb")
-    moved = tmp_path / "moved"
-    shutil.copytree(root, moved)
-    here = SignatureDataset(moved, CONFIG, cache)
-    gallery, _ = Gallery.build(tmp_path / "g.igps", here, "pretrained", n_workers=1)
-    # So few triangles as the bars have here put descriptions farther apart than meshes in use do.
-    calibration = replace(Calibration.load(), near=1.0)
-    found = duplicates(gallery, cache_dir=cache, calibration=calibration)
-    assert grouped(found.groups) == SAME
-    assert found.pairs == pytest.approx(duplicates(dataset, n_workers=1).pairs)
-    (moved / "lump.stl").unlink()
-    found = duplicates(gallery, cache_dir=cache, calibration=calibration)
-    assert grouped(found.groups) == {group for group in SAME if "bar.off" in group}
-    (failure,) = found.failures
-    assert (
-        failure.error
-        == f"{moved / 'lump.stl'}: cannot be read (No such file or directory). Check the path."
-    )
-
-
-def test_a_distance_and_what_it_means(dataset):
-    number = {name: i for i, name in enumerate(dataset.bodies.names)}
-
-    def between(one: str, other: str) -> tuple[float, bool]:
-        found = body_distance(dataset.subset([number[one], number[other]]))
-        assert found.meaning == Calibration.load().words(found.distance)
-        return found.surfaces, found.same
-
-    surfaces, same = between("bar.off", "bar.off")
-    assert surfaces < 1e-6
-    assert same
-    assert between("bar.off", "bar.ply")[1]
-    assert not between("bar.off", "bent.off")[1]
-    assert not between("bar.off", "longer.off")[1]
-    with pytest.raises(
-        ValueError, match=r"dataset: expected two meshes to compare, got 7: .* as FILE#PART"
-    ):
-        body_distance(dataset)
-
-
-def test_the_commands(root, cache, tmp_path, monkeypatch, capsys):
     options = ["--cache_dir", cache, "--n_workers", 1]
     run(monkeypatch, "duplicates", root, "--out", tmp_path / "out" / "groups.csv", *options)
     lines = capsys.readouterr().out.splitlines()
@@ -421,25 +366,14 @@ def test_the_page_runs(tmp_path):
         command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
     )
     assert done.returncode == 0, done.stderr
-    groups, meaning, surfaces = done.stdout.splitlines()
+    groups, meaning = done.stdout.splitlines()
     ((one, other),) = ast.literal_eval(groups)
     assert one.endswith("copy.stl") != other.endswith("copy.stl")
     assert "poses of one body" in meaning
-    assert surfaces.endswith("the same shape: True")
     for line in "".join(re.findall(r"```sh\n(.*?)```", page, flags=re.DOTALL)).splitlines():
         program, name, *_ = shlex.split(line)
         assert program == "igps"
         assert name in {command.split()[0] for command in COMMANDS}
-
-
-def test_what_is_wrong_is_one_sentence(root, cache, tmp_path, monkeypatch, capsys):
-    options = ["--cache_dir", cache, "--n_workers", 1]
-    pytest.importorskip("lancedb")
-    dataset = SignatureDataset([root / "bar.off", root / "lump.off"], None, cache)
-    Gallery.build(tmp_path / "g.igps", dataset, "gps", n_workers=1)
-    words = error_of(monkeypatch, capsys, "duplicates", tmp_path / "g.igps", *options)
-    assert "descriptor: expected pretrained, whose distances are calibrated, got gps" in words
-    assert "build it with --size ignore" in words
 
 
 def test_other_lengths_are_no_candidates(tmp_path):

@@ -81,44 +81,6 @@ class FewerSamples(Transform):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FewerEigenpairs(Transform):
-    """Random subset of the eigenpairs in their order. Descriptors that need more eigenpairs raise an error."""
-
-    n_eigenpairs: int = 50
-
-    def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
-        chosen = np.sort(generator.permutation(len(signature.eigenvalues))[: self.n_eigenpairs])
-        fewer = signature.map_samples(
-            lambda s: replace(s, eigenfunctions=s.eigenfunctions[:, chosen])
-        )
-        return replace(fewer, eigenvalues=signature.eigenvalues[chosen])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Noise(Transform):
-    """Gaussian noise on positions and on eigenfunctions."""
-
-    points: float = 0.0  # standard deviation of the noise, divided by √area
-    # Standard deviation times √area; the mean square of an eigenfunction is 1/area
-    eigenfunctions: float = 0.0
-
-    def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
-        length = np.sqrt(signature.area)
-
-        def noisy(samples: Samples) -> Samples:
-            points = samples.points
-            values = samples.eigenfunctions
-            if self.points:
-                points = points + self.points * length * generator.standard_normal(points.shape)
-            if self.eigenfunctions:
-                noise = generator.standard_normal(values.shape, dtype=np.float32)
-                values = values + np.float32(self.eigenfunctions / length) * noise
-            return replace(samples, points=points, eigenfunctions=values)
-
-        return signature.map_samples(noisy)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Scale(Transform):
     """Scale of the body by a random factor between `smallest` and `largest`, with a uniform logarithm."""
 
@@ -148,12 +110,3 @@ class Scale(Transform):
             },
         )
         return rescaled.map_samples(scaled)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FlipSigns(Transform):
-    """Random signs of the eigenfunctions, on which no description may depend."""
-
-    def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
-        signs = generator.choice(np.array([-1, 1], np.float32), len(signature.eigenvalues))
-        return signature.map_samples(lambda s: replace(s, eigenfunctions=s.eigenfunctions * signs))

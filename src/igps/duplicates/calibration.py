@@ -72,12 +72,8 @@ class Calibration:
     # Quantiles at `LEVELS` of the descriptor's distance, for each of `KINDS`
     distances: Mapping[str, Sequence[float]]
     n_pairs: Mapping[str, int]  # for each of `KINDS`
-    near: (
-        float  # limit of the descriptor's distance for candidates: twice the largest between copies
-    )
     same: Threshold  # limit of `surface_distance` for copies at any level of detail
     detail: Threshold  # limit, for copies, of the ratio of `surface_distance` to the larger `coarseness` of the two
-    pose: Threshold  # limit of the descriptor's distance for poses of one body
 
     def share_closer(self, kind: str, distance: float) -> float:
         """Return the share of the pairs of a kind that are closer than a distance, interpolated between quantiles."""
@@ -107,7 +103,7 @@ class Calibration:
         name = name_of(descriptor)
         if name != self.descriptor:
             expected = f"expected {self.descriptor}, whose distances are calibrated, got {name}"
-            raise ValueError(f"descriptor: {expected}. For a gallery, build it with --size ignore.")
+            raise ValueError(f"descriptor: {expected}.")
         if fingerprint(module) != self.model:
             remedy = "Make a new calibration for them"
             raise ValueError(
@@ -135,7 +131,7 @@ class Calibration:
         try:
             fields: dict[str, Any] = json.loads(Path(path).read_text())
             calibration = cls(
-                **fields | {name: Threshold(**fields[name]) for name in ("same", "detail", "pose")}
+                **fields | {name: Threshold(**fields[name]) for name in ("same", "detail")}
             )
             if any(len(calibration.distances[kind]) != len(LEVELS) for kind in KINDS):
                 raise ValueError("other quantiles")

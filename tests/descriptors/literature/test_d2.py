@@ -1,4 +1,4 @@
-"""D2, A3 and D1 where their distributions are known."""
+"""D2 where its distribution is known."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from one_body import of_points, of_signature
 
 from igps.data.batch import Body
-from igps.descriptors.literature.d2 import D2, _angles
+from igps.descriptors.literature.d2 import D2
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import SignatureConfig, compute_signature
 
@@ -32,28 +32,6 @@ def test_d2_of_a_sphere_has_the_density_of_its_chords(round_body):
     assert wide.sum() == pytest.approx(1, abs=1e-6)
 
 
-def test_d1_of_a_sphere_is_its_radius(round_body):
-    histogram = D2(function="d1", n_bins=10, reach=1.0).describe_body(round_body)
-    assert histogram[2] == pytest.approx(1)  # 1 / √(4π) = 0.282
-
-
-def test_a3_of_a_sphere_has_the_moments_of_its_angles():
-    """Chords from a point of a sphere have cosine-weighted directions u, so that E[u·v] = E[u]² = (2/3)² and
-    E[(u·v)²] = Σ E[uᵢ²]² = 1/4 + 1/16 + 1/16."""
-    points = np.random.default_rng(3).standard_normal((4000, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    cosine = np.cos(_angles(points, 200_000, np.random.default_rng(0)))
-    assert cosine.mean() == pytest.approx(4 / 9, abs=0.01)
-    assert np.square(cosine).mean() == pytest.approx(3 / 8, abs=0.01)
-
-
-def test_a3_takes_distinct_samples_and_its_range_is_half_a_turn():
-    """Of three points in a line the angle is 0 at either end and π in the middle."""
-    points = np.array([[0.0, 0, 0], [1, 1, 1], [3, 3, 3]])
-    histogram = D2(function="a3", n_bins=5, n_triples=30_000).describe_body(of_points(points))
-    np.testing.assert_allclose(histogram, [2 / 3, 0, 0, 0, 1 / 3], atol=0.02)
-
-
 def test_d2_counts_each_pair_once_and_what_lies_beyond_in_the_last_bin():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0], [50, 0, 0]])
     histogram = D2(n_bins=4, reach=2.0).describe_body(of_points(points, area=4.0))
@@ -70,16 +48,10 @@ def test_d2_distance_is_half_the_l1_norm():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: D2(function="d3"), "function.*'d3'"),
         (lambda: D2(n_bins=0), "n_bins"),
-        (lambda: D2(n_triples=0), "n_triples"),
         (lambda: D2(reach=0.0), "reach"),
         (lambda: D2(reach=float("inf")), "reach"),
         (lambda: D2().describe_body(of_points(np.zeros((1, 3)))), "surface samples.*at least 2"),
-        (
-            lambda: D2(function="a3").describe_body(of_points(np.zeros((2, 3)))),
-            "surface samples.*at least 3",
-        ),
     ],
 )
 def test_parameters_and_signatures_out_of_range_are_named(make, message):

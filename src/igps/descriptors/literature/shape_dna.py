@@ -1,30 +1,24 @@
 """Shape-DNA: the first eigenvalues of the surface (Reuter, Wolter and Peinecke 2005)."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 from torch import Tensor
 
 from igps._arrays import Singles
-from igps._parameters import check_at_least, check_one_of
+from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 
-Normalisation = Literal["area", "slope"]
-
 
 @dataclass(eq=False, repr=False)
 class ShapeDNA(BodyDescriptor):
-    """The first non-zero eigenvalues of the Laplace–Beltrami operator, normalised for scale.
+    """The first non-zero eigenvalues of the Laplace–Beltrami operator, times the area of the surface.
 
-    The normalisation "area" multiplies the eigenvalues by the area of the surface. "slope" divides them by the slope c
-    of the line λₖ = c·k that fits them best; for many eigenvalues, c tends to 4π / area (Weyl's law).
-
-    Source: Reuter, Wolter and Peinecke 2005 and 2006 (normalisations, Euclidean distance); 12 eigenvalues with the
-    normalisation by area as in Reuter's run at SHREC'11 (Lian et al. 2011).
+    Source: Reuter, Wolter and Peinecke 2005 and 2006 (Euclidean distance); 12 eigenvalues with the normalisation by
+    area as in Reuter's run at SHREC'11 (Lian et al. 2011).
     """
 
     name = "shape_dna"
@@ -32,21 +26,16 @@ class ShapeDNA(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
 
     n_eigenvalues: int = 12
-    normalisation: Normalisation = "area"
 
     def __post_init__(self) -> None:
         super().__init__()
         check_at_least(1, n_eigenvalues=self.n_eigenvalues)
-        check_one_of(get_args(Normalisation), normalisation=self.normalisation)
         self.requirements = Requirements(n_eigenpairs=self.n_eigenvalues)
 
     def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) normalised eigenvalues, ascending, without unit."""
         eigenvalues = body.eigenvalues[: self.n_eigenvalues]
-        if self.normalisation == "area":
-            return (eigenvalues * body.area).astype(np.float32)
-        k = np.arange(1, self.n_eigenvalues + 1)
-        return (eigenvalues * (k @ k) / (k @ eigenvalues)).astype(np.float32)
+        return (eigenvalues * body.area).astype(np.float32)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) Euclidean distances."""

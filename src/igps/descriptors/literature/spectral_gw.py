@@ -1,4 +1,4 @@
-"""Spectral Gromov-Wasserstein distances: shapes compared by their heat kernels (Mémoli 2009).
+"""A lower bound of the spectral Gromov-Wasserstein distance: shapes compared by their heat kernels (Mémoli 2009).
 
 Let A be the area and t a time. The kernel K_t(x, y) = A k_t(x, y) = 1 + A Σₖ exp(−λₖt) φₖ(x) φₖ(y) has mean 1 over the
 surface. The distance of two shapes, with the minimum over all couplings μ of their points, is
@@ -6,14 +6,13 @@ surface. The distance of two shapes, with the minimum over all couplings μ of t
     min_μ sup_t c²(t) (∫∫ |K_t(x, x') − K'_t(y, y')|² dμ(x, y) dμ(x', y'))^½,   c(t) = exp(−(t + 1/t)).
 
 This is the form of exponent 2. The unit of time is the slowest decay time of heat on a sphere of the same area, A/8π,
-so that the distance does not depend on scale. The lower bounds compare invariants of the single shapes. A shape is
-represented by its samples with equal weights; for the samples and the chosen times, the bounds hold exactly. The
-eigenfunctions in the interior are those of the surface, extended as in Rustamov 2010.
+so that the distance does not depend on scale. The lower bound compares the distributions of K_t(x, y) over the pairs of
+points. A shape is represented by its surface samples with equal weights; for the samples and the chosen times, the
+bound holds exactly.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -21,14 +20,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from igps._arrays import Floats, Singles
-from igps._parameters import check_at_least, check_one_of
+from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
-from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature
-
-Bound = Literal["trace", "signature", "pairs"]
+from igps.signature.signature import Signature
 
 # c² is largest at t = 1 and falls off steeply on both sides.
 TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -36,19 +33,12 @@ TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 @dataclass(eq=False, repr=False)
 class SpectralGromovWasserstein(BodyDescriptor):
-    """Lower bounds of the spectral Gromov-Wasserstein distance.
-
-    The bound "trace" compares the norms ‖K_t‖₂, whose squares are the heat traces. "signature" compares the
-    distributions of ‖K_t(x, ·)‖₂ over the points x; on the surface, this norm is the square root of the heat kernel
-    signature at 2t. "pairs" compares the distributions of K_t(x, y) over the pairs of points.
-    """
+    """The lower bound of the spectral Gromov-Wasserstein distance by pairs of points, see this module."""
 
     name = "spectral_gw"
     source = "Mémoli 2009"
     invariant_to = ("motion", "scale", "pose")
 
-    samples: SampleKind = "surface"
-    bound: Bound = "pairs"
     times: tuple[float, ...] = TIMES  # in units of A/8π
     n_samples: int = 500  # at most, at equal steps along the order of the samples
     n_quantiles: int = 200  # steps of the quantile functions
@@ -59,30 +49,17 @@ class SpectralGromovWasserstein(BodyDescriptor):
     def __post_init__(self) -> None:
         super().__init__()
         self.description_shape = (len(self.times), -1)
-        _check(self.samples, self.times, self.n_samples)
-        check_one_of(get_args(Bound), bound=self.bound)
+        _check(self.times, self.n_samples)
         check_at_least(1, n_quantiles=self.n_quantiles, n_eigenpairs=self.n_eigenpairs)
         self.requirements = Requirements(n_eigenpairs=self.n_eigenpairs)
 
     def describe_body(self, body: Body) -> Singles:
-        """(times, n_quantiles) quantile functions times c²(t); (times, 1) for the bound "trace"."""
-        kernels = heat_kernels(
-            body, self.samples, self.times, self.n_samples, self.n_eigenpairs, self.seed
-        )
+        """(times, n_quantiles) quantile functions of the kernels times c²(t)."""
+        kernels = heat_kernels(body, self.times, self.n_samples, self.n_eigenpairs, self.seed)
         rows = []
         for time, kernel in zip(self.times, kernels, strict=True):
-            values = self._invariant(kernel)
-            rows.append(time_weight(time) * values)
+            rows.append(time_weight(time) * quantiles(kernel, self.n_quantiles))
         return np.array(rows, dtype=np.float32)
-
-    def _invariant(self, kernel: Floats) -> Floats:
-        """(n_quantiles,) or (1,) what the bound compares of a kernel (P, P)."""
-        if self.bound == "pairs":
-            return quantiles(kernel, self.n_quantiles)
-        norms = _norms(kernel)
-        if self.bound == "signature":
-            return quantiles(norms, self.n_quantiles)
-        return np.sqrt(np.square(norms).mean(keepdims=True))
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) Wasserstein distances of exponent 2, the largest over the times."""
@@ -93,18 +70,17 @@ class SpectralGromovWasserstein(BodyDescriptor):
 
 def heat_kernels(
     body: Body | Signature,
-    samples: SampleKind,
     times: Sequence[float],
     n_samples: int,
     n_eigenpairs: int | None = None,
     seed: int = 0,
 ) -> list[Floats]:
-    """Heat kernels A k_t(x, y) between samples of a body: for every time a (P, P) array without unit, P ≤ `n_samples`.
+    """Heat kernels A k_t(x, y) between P ≤ `n_samples` surface samples: for every time a (P, P) array without unit.
 
     For the parameters and errors see `SpectralGromovWasserstein`; all eigenpairs are used if `n_eigenpairs` is None.
     """
-    _check(samples, times, n_samples)
-    eigenfunctions = getattr(body, samples).eigenfunctions[:, :n_eigenpairs]
+    _check(times, n_samples)
+    eigenfunctions = body.surface.eigenfunctions[:, :n_eigenpairs]
     # Samples are in a canonical order in which similar samples are neighbours, so that equal steps reach all parts.
     n_chosen = min(n_samples, len(eigenfunctions))
     step = len(eigenfunctions) / n_chosen
@@ -118,11 +94,6 @@ def heat_kernels(
         decayed = values * np.exp(-exponents * time)
         kernels.append(1 + decayed @ values.T)
     return kernels
-
-
-def _norms(kernel: Floats) -> Floats:
-    """(P,) root mean squares of the rows of a kernel."""
-    return np.sqrt(np.square(kernel).mean(axis=1))
 
 
 def time_weight(time: float) -> float:
@@ -142,48 +113,7 @@ def quantiles(values: ArrayLike, n_quantiles: int) -> Floats:
     return n_quantiles * np.diff(np.interp(ends, np.linspace(0, 1, len(integral)), integral))
 
 
-def gromov_wasserstein(
-    a: Signature,
-    b: Signature,
-    *,
-    samples: SampleKind = "surface",
-    times: Sequence[float] = TIMES,
-    n_samples: int = 50,
-    seed: int = 0,
-) -> float:
-    """Approximate the spectral Gromov-Wasserstein distance of two small sets of samples.
-
-    The couplings are optimised for each time separately, by conditional gradients from the uniform coupling and from
-    the coupling of the bound "signature". The result is the largest of these local minima over the times. No lower
-    bound of `SpectralGromovWasserstein` for the same samples and times exceeds it. For the parameters see
-    `SpectralGromovWasserstein`. An ImportError is raised if POT is not installed.
-    """
-    try:
-        import ot
-    except ImportError as error:
-        raise ImportError(
-            'gromov_wasserstein needs POT: pip install "interior-gps[transport]".'
-        ) from error
-    kernels_a = heat_kernels(a, samples, times, n_samples, seed=seed)
-    kernels_b = heat_kernels(b, samples, times, n_samples, seed=seed)
-    largest = 0.0
-    for time, first, second in zip(times, kernels_a, kernels_b, strict=True):
-        p = np.full(len(first), 1 / len(first))
-        q = np.full(len(second), 1 / len(second))
-        uniform = np.outer(p, q)
-        by_norms = ot.emd_1d(_norms(first), _norms(second), p, q)
-        squares = []
-        for start in (uniform, by_norms):
-            squares.append(
-                ot.gromov.gromov_wasserstein2(first, second, p, q, loss_fun="square_loss", G0=start)
-            )
-        distance = float(np.sqrt(max(min(squares), 0.0)))
-        largest = max(largest, time_weight(time) * distance)
-    return largest
-
-
-def _check(samples: SampleKind, times: Sequence[float], n_samples: int) -> None:
-    check_one_of(SAMPLE_KINDS, samples=samples)
+def _check(times: Sequence[float], n_samples: int) -> None:
     check_at_least(1, n_samples=n_samples)
     if not times or not all(0 < time < np.inf for time in times):
         raise ValueError(f"times: expected at least one positive number, got {tuple(times)}.")
