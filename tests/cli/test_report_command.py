@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 
 from commands import run
-from igps.analysis.explanation import explain
-from igps.data.dataset import SignatureDataset
-from igps.report.explanations import read_explanations
 from igps.report.page import render_page
 from igps.report.results import read_results
 from igps.report.surfaces import read_surfaces
 from igps.signature.signature import SignatureConfig
-from own_descriptors import SMALL, small_interior, write_egg
+from own_descriptors import SMALL, write_egg
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 INTERIOR = "own_descriptors:small_interior"
@@ -134,54 +131,6 @@ def test_sources_of_another_kind_are_refused(
         with pytest.raises(SystemExit, match="1"):
             run(monkeypatch, "report", retrieved)
         assert "meshes.json: expected the format igps-meshes-1" in capsys.readouterr().err
-
-
-def test_a_page_with_the_difference_of_each_body_from_its_nearest(
-    retrieved: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The values are those of the samples around each vertex, by a loop."""
-    out = retrieved
-    run(monkeypatch, "report", out, "--explain", "--n_workers", "1")
-    surfaces = read_surfaces(out / "surfaces.npz")
-    kept = read_explanations(out / "explanations.npz", surfaces)
-    names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(2)]
-    assert list(kept) == names
-    assert [one.other for one in kept.values()] == [names[1], names[0], names[3], names[2]]
-    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
-    found = explain(small_interior(), dataset.batch([2]), dataset.batch([3]))
-    assert kept[names[2]].summary == found.summary()
-    mesh = dataset.mesh(3)
-    signature = dataset[3].signature
-    values = []
-    for vertex in mesh.vertices:  # so few that the picture has them all
-        value = 0.0
-        for kind, shares in found.places[1].items():  # type: ignore[index]
-            if shares.any():
-                away = np.linalg.norm(getattr(signature, kind).points - vertex, axis=1)
-                value += len(shares) * np.mean([shares[i] for i in np.argsort(away)[:12]])
-        values.append(value)
-    expected = np.clip(np.array(values) / np.quantile(np.abs(values), 0.98), -1, 1)
-    painted = kept[names[2]].values[1] / 127.0 - 128 / 127
-    assert len(painted) == len(expected)
-    assert (
-        np.corrcoef(np.sort(painted), np.sort(expected))[0, 1] > 0.99
-    )  # the picture has another order
-    shapes = data_of(out / "report.html")["shapes"]
-    assert [one["explained"]["other"] for one in shapes] == [1, 0, 3, 2]
-    run(monkeypatch, "report", out, "--n_workers", "1")
-    assert data_of(out / "report.html")["shapes"] == shapes
-    fewer = {name: one for name, one in surfaces.items() if name != names[0]}
-    assert list(read_explanations(out / "explanations.npz", fewer)) == names[2:]
-
-
-def test_only_one_descriptor_is_explained(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    run(monkeypatch, "compare", root, "--descriptors", INTERIOR, "d2", *options(out))
-    with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, "report", out, "--explain", "--n_workers", "1")
-    assert "explain: expected a folder that `igps retrieve` wrote" in capsys.readouterr().err
 
 
 def test_columns_of_the_labels_reach_the_page(

@@ -36,7 +36,6 @@ from igps.analysis.clusters import clusters_of
 from igps.analysis.map import body_map
 from igps.cli import main
 from igps.mesh.mesh import Mesh
-from igps.report.explanations import SurfaceExplanation
 from igps.report.page import render_page
 from igps.report.results import Results, System, read_results
 from igps.report.surfaces import surface_of
@@ -83,19 +82,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "answers": answers_folder(root / "answers"),
     }
     for name, results in made.items():
-        page = render_page(
-            read_results(results), pictures, EXPLAINED if name == "answers" else None
-        )
+        page = render_page(read_results(results), pictures)
         (root / f"{name}.html").write_text(page, encoding="utf-8")
     return root
-
-
-# The first body has all of the difference, its nearest all of the contrary.
-EXPLAINED = {
-    NAMES[0]: SurfaceExplanation(
-        NAMES[1], "60% <i>thickness</i>", (np.full(300, 255, np.uint8), np.zeros(300, np.uint8))
-    )
-}
 
 
 class Visit:
@@ -430,26 +419,6 @@ def test_groups_and_outliers_of_the_same_folder_are_told(answers: Visit) -> None
     outliers.locator("a").click()
     answers.wait_until(lambda: answers.page.locator("dialog[open]").count() == 1)
     assert answers.name() == NAMES[5]
-
-
-def test_the_difference_from_the_nearest_is_painted(answers: Visit) -> None:
-    dialog = answers.open(0)
-    assert dialog.locator("#explained-summary").inner_text().startswith("60% <i>thickness</i>. Red")
-    assert NAMES[1] in dialog.locator("#explained-heading").inner_text()
-    assert dialog.locator("#explained-list canvas").count() == 4
-    means = answers.page.evaluate(
-        "() => [...document.querySelectorAll('#explained-list canvas')].map((c) => {"
-        "const p = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; const sum = [0, 0, 0, 0];"
-        "p.forEach((value, i) => { sum[i % 4] += value; }); return sum; })"
-    )
-    for red, _, blue, alpha in means[:2]:
-        assert red > 2 * blue
-        assert alpha > 0
-    for red, _, blue, _ in means[2:]:
-        assert blue > 2 * red
-    dialog.locator("#next").click()
-    answers.wait_until(lambda: answers.name() != NAMES[0])
-    assert dialog.locator("#explained").is_hidden()
 
 
 def test_names_run_nothing(retrieval: Visit) -> None:

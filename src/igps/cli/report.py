@@ -9,7 +9,6 @@ def report(
     results: Path,
     out: Path | None = None,
     meshes: Path | None = None,
-    explain: bool = False,
     n_workers: int | None = None,
 ) -> None:
     """Make a page of results for the browser, a single self-contained HTML file.
@@ -22,11 +21,8 @@ def report(
         results: folder that igps retrieve or igps compare wrote (--out).
         out: the page; by default report.html in the folder of results.
         meshes: folder of the meshes, if they were moved since.
-        explain: paint where each body differs from its nearest; takes seconds per body, and writes explanations.npz
         n_workers: number of processes that make the pictures; by default one for each core.
     """
-    from igps.descriptors import descriptor as descriptor_of
-    from igps.report.explanations import keep_explanations, read_explanations
     from igps.report.page import render_page
     from igps.report.results import read_results, read_sources
     from igps.report.surfaces import keep_surfaces, read_surfaces
@@ -41,22 +37,9 @@ def report(
         if dataset is None
         else keep_surfaces(stored, dataset, n_workers=n_workers)
     )
-    stored = results / "explanations.npz"
-    if not explain:
-        explanations = read_explanations(stored, surfaces)
-    elif dataset is None or len(contents.systems) != 1:
-        raise ValueError(
-            "explain: expected a folder that `igps retrieve` wrote, with its descriptor and meshes."
-        )
-    else:
-        (system,), fitted = contents.systems, results / "descriptor.safetensors"
-        module = descriptor_of(str(fitted) if fitted.is_file() else system.name)
-        explanations = keep_explanations(
-            stored, system, dataset, module, surfaces, n_workers=n_workers
-        )
     page = out or results / "report.html"
     page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text(render_page(contents, surfaces, explanations), encoding="utf-8")
+    page.write_text(render_page(contents, surfaces), encoding="utf-8")
     print(f"page of results: {page}")
 
 

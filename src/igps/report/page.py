@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
-from igps.report.explanations import SurfaceExplanation
 from igps.report.page_data import N_WORST, base64_text, data_of
 from igps.report.results import Results
 from igps.report.surfaces import PageSurface
@@ -31,12 +30,8 @@ SCORE_MEANINGS = dict(  # noqa: C408
 """Explanations of the scores by name."""
 
 
-def render_page(
-    results: Results,
-    surfaces: Mapping[str, PageSurface],
-    explanations: Mapping[str, SurfaceExplanation] | None = None,
-) -> str:
-    """Return the page of results as HTML text, with surfaces and explanations by the name of the mesh."""
+def render_page(results: Results, surfaces: Mapping[str, PageSurface]) -> str:
+    """Return the page of results as HTML text, with surfaces by the name of the mesh."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     # Autoescape, because names and notes come from files
@@ -47,7 +42,7 @@ def render_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    data = data_of(results, surfaces, explanations)
+    data = data_of(results, surfaces)
     # The content security policy allows only the page's own scripts and style, identified by their hashes
     scripts = [(_TEMPLATE / name).read_text(encoding="utf-8").strip() + "\n" for name in _SCRIPTS]
     style = (_TEMPLATE / "page.css").read_text(encoding="utf-8")

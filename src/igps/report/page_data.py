@@ -11,7 +11,6 @@ import numpy as np
 from igps._arrays import Integers
 from igps.analysis.clusters import STABLE, clusters_of
 from igps.analysis.map import body_map
-from igps.report.explanations import SurfaceExplanation
 from igps.report.results import Results, System
 from igps.report.surfaces import PageSurface
 from igps.retrieval import RetrievalScores, precision_recall_curve, retrieval_scores
@@ -30,11 +29,7 @@ _MIN_MAPPED, _MAX_MAPPED = (
 )
 
 
-def data_of(
-    results: Results,
-    surfaces: Mapping[str, PageSurface],
-    explanations: Mapping[str, SurfaceExplanation] | None = None,
-) -> dict[str, Any]:
+def data_of(results: Results, surfaces: Mapping[str, PageSurface]) -> dict[str, Any]:
     """Return the data of the page without its surfaces; for `shapes` see `_shapes`, for `systems` `_system_data`."""
     classes = sorted(set(results.labels or ()))
     index = {name: i for i, name in enumerate(results.names)}
@@ -43,7 +38,7 @@ def data_of(
     n_ranked = max(_MIN_RANKED, 2 * max(sizes.values(), default=0))
     return {
         "classes": classes,
-        "shapes": _shapes(results, surfaces, classes, explanations or {}),
+        "shapes": _shapes(results, surfaces, classes),
         "columns": {
             title: [column.get(name) for name in results.names]
             for title, column in results.columns.items()
@@ -72,15 +67,13 @@ def _shapes(
     results: Results,
     surfaces: Mapping[str, PageSurface],
     classes: Sequence[str],
-    explanations: Mapping[str, SurfaceExplanation],
 ) -> list[dict[str, Any]]:
     """Return the data of each body.
 
     Every body has its `name`, `label` (index of its class), and `notes`. A body with a surface has `surface` (index
     among the surfaces, numbers of vertices and of faces), `mesh` (measures of the original mesh), `unit`, `frame`, and
     the range of the `potential`. One of several bodies in a file has its `part` and the indices of the others,
-    `together`. An explained body has `explained`: its nearest (`other`), the largest shares as text (`summary`), and
-    the `values` of the vertices of both surfaces.
+    `together`.
     """
     result = []
     n_surfaces = 0
@@ -106,11 +99,6 @@ def _shapes(
             shape["frame"] = surface.frame
             shape["potential"] = [_significant(value) for value in surface.potential_range]
             n_surfaces += 1
-        if name in explanations:
-            painted = explanations[name]
-            values = [base64_text(array.tobytes()) for array in painted.values]
-            other = results.names.index(painted.other)
-            shape["explained"] = {"other": other, "summary": painted.summary, "values": values}
         result.append(shape)
     return result
 

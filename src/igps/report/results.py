@@ -52,7 +52,7 @@ class Unused:
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """Contents of a page, without its surfaces and explanations."""
+    """Contents of a page, without its surfaces."""
 
     command: str  # command that wrote the results
     names: tuple[str, ...]  # of all meshes that were used

@@ -15,7 +15,6 @@ from tqdm import tqdm
 from igps._arrays import Floats, Integers
 from igps._failures import Failed
 from igps._parallel import run
-from igps._threads import Job, Result
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
 from igps.mesh.errors import MeshError
@@ -34,8 +33,7 @@ _MAX_VERTICES, _MIN_VERTICES = 1200, 150  # of one surface
 # Size of all surfaces of a page, and of one vertex, which has 19 bytes as text in base 64
 _MAX_BYTES = 20e6
 _BYTES_PER_VERTEX = 19 * 4 / 3
-STEPS = 2**16 - 1
-"""Number of steps along each axis of the cube in which vertices are quantised."""
+_STEPS = 2**16 - 1  # along each axis of the cube in which vertices are quantised
 _N_NEIGHBOURS = 4  # samples whose mean is the potential of a vertex
 
 
@@ -87,26 +85,26 @@ def keep_surfaces(
     ]
     if missing:
         make = partial(_surface_of_body, dataset.pipeline, fitting_vertices(len(names)))
-        stored |= run_jobs(make, {names[i]: bodies[i] for i in missing}, "picture", n_workers)
+        stored |= _made(make, {names[i]: bodies[i] for i in missing}, n_workers)
     surfaces = {name: stored[name] for name in names if name in stored}
     if missing:
         write_surfaces(path, surfaces)
     return surfaces
 
 
-def run_jobs(
-    work: Callable[[Job], Result], jobs: Mapping[str, Job], what: str, n_workers: int | None
-) -> dict[str, Result]:
-    """Run jobs in parallel and return their results by name; a failed job is logged as "no `what`" and left out."""
-    names = list(jobs)
-    results = dict[str, Result]()
-    with contextlib.closing(run(work, list(jobs.values()), n_workers=n_workers)) as outcomes:
-        for number, outcome in tqdm(outcomes, total=len(jobs), desc=f"{what}s"):
+def _made(
+    make: Callable[[BodyRef], PageSurface], bodies: Mapping[str, BodyRef], n_workers: int | None
+) -> dict[str, PageSurface]:
+    """Return the surfaces of bodies by name, made in parallel; a body that fails is logged and left out."""
+    names = list(bodies)
+    surfaces: dict[str, PageSurface] = {}
+    with contextlib.closing(run(make, list(bodies.values()), n_workers=n_workers)) as outcomes:
+        for number, outcome in tqdm(outcomes, total=len(names), desc="pictures"):
             if isinstance(outcome, Failed):
-                logger.warning("%s: no %s: %s", names[number], what, outcome.reason)
+                logger.warning("%s: no picture: %s", names[number], outcome.reason)
             else:
-                results[names[number]] = outcome
-    return results
+                surfaces[names[number]] = outcome
+    return surfaces
 
 
 def _surface_of_body(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef) -> PageSurface:
@@ -137,7 +135,7 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
     highest = rotated.max(axis=0)
     in_cube = (rotated - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
     return PageSurface(
-        np.rint(STEPS * in_cube).astype(np.uint16),
+        np.rint(_STEPS * in_cube).astype(np.uint16),
         faces.astype(np.uint16),
         np.rint(255 * (values - low) / ((high - low) or 1)).astype(np.uint8),
         (low, high),

@@ -24,28 +24,16 @@ const colourTable = (() => {
   return table;
 })();
 
-// The 256 colours of a difference: blue for negative, grey for zero, red for positive.
-const differenceTable = (() => {
-  const [less, none, more] = ["#0059b3", "#e6e6e6", "#d64000"].map((colour) => new THREE.Color(colour));
-  const table = new Float32Array(3 * 256);
-  for (let i = 0; i < 256; i++) {
-    const share = Math.max(-1, (i - 128) / 127);
-    none.clone().lerp(share < 0 ? less : more, Math.abs(share)).toArray(table, 3 * i);
-  }
-  return table;
-})();
-
 // The geometry of a surface [index, number of vertices, number of faces], centred at the origin with a longest side of 1,
-// coloured by the potential or by other values of the vertices.
-function geometryOf([index, nVertices, nFaces], values = null) {
+// coloured by the potential.
+function geometryOf([index, nVertices, nFaces]) {
   const { buffer } = bytesOf(packedSurfaces[index]);
   const steps = new Uint16Array(buffer, 0, 3 * nVertices);
   const faces = new Uint16Array(buffer, 6 * nVertices, 3 * nFaces);
   const potential = new Uint8Array(buffer, 6 * (nVertices + nFaces), nVertices);
   const positions = Float32Array.from(steps, (step) => step / 65535 - 0.5);
   const colours = new Float32Array(3 * nVertices);
-  const table = values ? differenceTable : colourTable;
-  (values ?? potential).forEach((value, i) => colours.set(table.subarray(3 * value, 3 * value + 3), 3 * i));
+  potential.forEach((value, i) => colours.set(colourTable.subarray(3 * value, 3 * value + 3), 3 * i));
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
   geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
@@ -70,10 +58,10 @@ class Stage {
     this.scene.add(this.body);
   }
 
-  show({ surface, frame }, values = null) {
+  show({ surface, frame }) {
     this.frame = frame;
     this.body.geometry.dispose();
-    this.body.geometry = geometryOf(surface, values);
+    this.body.geometry = geometryOf(surface);
     const { center, radius } = this.body.geometry.boundingSphere;
     this.body.position.copy(center).negate();
     this.distance = radius / Math.sin((FIELD_OF_VIEW * Math.PI) / 360);
@@ -147,21 +135,6 @@ class Pictures {
     if (this.stage && this.shapes[canvas.dataset.shape].surface) {
       this.watcher.observe(canvas);
     }
-  }
-
-  // Draws a shape, coloured by values of its vertices, from the front or from behind.
-  paint(canvas, shape, values, isBehind) {
-    if (!this.stage) return;
-    this.stage.show(this.shapes[shape], values);
-    if (isBehind) {
-      this.stage.camera.position.multiply({ x: -1, y: 1, z: -1 });
-      this.stage.camera.lookAt(0, 0, 0);
-    }
-    this.stage.draw();
-    canvas.width = canvas.height = this.size;
-    canvas.getContext("2d").drawImage(this.source, 0, 0);
-    writeSides(canvas, this.stage.sides());
-    canvas.classList.add("drawn");
   }
 
   drawAll() {

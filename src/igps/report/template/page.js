@@ -274,23 +274,6 @@ function colourMap() {
   tree.colour(new Map(bodyMap.points.map(({ shape, mark }) => [shape, mark])));
 }
 
-// A shape and its nearest, painted with their differences, from the front and from behind.
-function showExplained(shape) {
-  const { other, summary, values } = shapes[shape].explained ?? {};
-  byId("explained").hidden = !summary;
-  if (!summary) return;
-  byId("explained-heading").textContent = `Where it differs from its nearest, ${shapes[other].name}`;
-  byId("explained-summary").textContent = `${summary}. Red: differs from the corresponding place of the other body; grey: does not.`;
-  const painted = [shape, other].flatMap((body, i) =>
-    ["front", "back"].map((side) => {
-      const canvas = element("canvas", { width: 1, height: 1, role: "img", "aria-label": `${shapes[body].name}, ${side}` });
-      pictures.paint(canvas, body, bytesOf(values[i]), side === "back");
-      return element("li", { class: "painted" }, canvas, element("span", { class: "about" }, `${shapes[body].name}, ${side}`));
-    }),
-  );
-  byId("explained-list").replaceChildren(...painted);
-}
-
 function showWorst() {
   if (!byId("worst")) return;
   const worst = systems[system].worst;
@@ -317,7 +300,6 @@ function openShape(shape) {
   const together = shapes[shape].together ?? [];
   byId("together").hidden = !together.length;
   byId("together-list").replaceChildren(...together.map((body) => element("li", {}, picture(body))));
-  showExplained(shape);
   if (!dialog.open) dialog.showModal();
   turntable ??= new Turntable(byId("turntable"), [...byId("turntable-sides").children]);
   turntable.show(shapes[shape]);
