@@ -3,8 +3,7 @@
     python epochs.py FOLDER-OF-MESHES
 
 Each line of standard input is a number of worker processes, followed by "memory" for signatures in memory. The script
-prints the seconds of an epoch in batches of 16 for each, without the start of the workers. The current version reads an
-exported file without meshes; version 0.2.0 reads its cache.
+prints the seconds of an epoch in batches of 16 for each, without the start of the workers.
 """
 
 from __future__ import annotations
@@ -33,10 +32,6 @@ def main() -> None:
     config = igps.SignatureConfig(n_eigenpairs=64)
     dataset: Any = igps.SignatureDataset(root, config, root.parent / f"cache-{version}")
     dataset.precompute(n_workers=1, progress=False)
-    if hasattr(dataset, "to_file"):
-        path = root.parent / f"{version}.igps"
-        dataset.to_file(path)
-        dataset = igps.SignatureDataset.from_file(path)
     indices = [i % len(dataset) for i in range(N_ITEMS)]
     collate = importlib.import_module("igps").collate
     loaders: dict[str, Any] = {}

@@ -368,38 +368,6 @@ def test_query_lists_the_nearest(
     )
 
 
-def test_what_asks_a_file_of_signatures_is_described_as_they_are(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "signatures.igps"
-    cache = ["--cache_dir", tmp_path / "cache"]
-    run(
-        monkeypatch,
-        "precompute",
-        root,
-        "--out",
-        file,
-        "--descriptors",
-        INTERIOR,
-        *cache,
-        *SMALL,
-    )
-    capsys.readouterr()
-    run(
-        monkeypatch,
-        "query",
-        root / "egg" / "1.off",
-        "--gallery",
-        file,
-        "--descriptor",
-        INTERIOR,
-        "--json",
-        *cache,
-    )
-    first = json.loads(capsys.readouterr().out)[0]
-    assert (first["name"], first["distance"]) == ("egg/1.off", 0)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -176,11 +176,6 @@ def test_further_columns_stay_with_their_bodies(root, tmp_path):
         bodies.subset([0]).numbers("scanner")
     dataset = SignatureDataset(bodies, CONFIG, tmp_path / "cache", reading=OBJECTS)
     assert dataset[["1.obj#spleen", "2.obj#spleen"]].bodies.columns["age"] == ("41.5", "30")
-    dataset[[0, 1]].to_file(tmp_path / "some.igps")
-    assert SignatureDataset.from_file(tmp_path / "some.igps").bodies.columns == {
-        "age": ("30", "41.5"),
-        "scanner": ("A", None),
-    }
 
 
 def test_a_session_is_no_number(root):

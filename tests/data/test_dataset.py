@@ -282,8 +282,6 @@ def test_parts_of_a_subclass_are_of_it_and_keep_what_it_has(root, tmp_path):
         assert part.motto == "changed"
     parts[0].motto = "another"
     assert dataset.motto == "changed"
-    dataset.to_file(tmp_path / "all.igps")
-    assert isinstance(Named.from_file(tmp_path / "all.igps"), Named)
 
 
 @pytest.mark.parametrize(
@@ -487,11 +485,6 @@ def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(
     assert counted == []
     shutil.rmtree(root)
     assert one[3].signature.interior.attributes["ct"].max() > 90
-    one.to_file(tmp_path / "all.igps")
-    travelled = SignatureDataset.from_file(tmp_path / "all.igps")
-    np.testing.assert_array_equal(
-        travelled[3].signature.surface.attributes["ct"], one[3].signature.surface.attributes["ct"]
-    )
 
 
 def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(tmp_path):
@@ -537,13 +530,12 @@ def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root, tmp_p
         )
 
 
-@pytest.mark.parametrize(("start", "how"), [("fork", "cache"), ("fork", "file"), ("spawn", "file")])
+@pytest.mark.parametrize(("start", "how"), [("fork", "cache"), ("spawn", "memory")])
 def test_workers_give_what_this_process_gives(dataset, root, tmp_path, how, start):
     dataset.precompute(n_workers=1, progress=False)
     expected = dataset.batch(range(4))
-    if how == "file":
-        dataset.to_file(tmp_path / "all.igps")
-        dataset = SignatureDataset.from_file(tmp_path / "all.igps")
+    if how == "memory":
+        dataset = dataset.to_memory()
     shutil.rmtree(root)
     loader = DataLoader(
         dataset,

@@ -236,7 +236,7 @@ def outliers(
     from igps.report.answers import outliers_figure, write_analysis
 
     check_at_least(0, top=top)
-    result = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **describing)
+    result = described(Folder(root, labelled=True), descriptor, **describing)
     dataset = result.dataset
     distances = squared_distances(result.coordinates()) ** 0.5
     measures = measure_bodies(dataset, n_workers=describing.get("n_workers"))
@@ -335,7 +335,7 @@ def explain(
     moved = None
     if isinstance(source, Folder):
         check = partial(_two_groups, group=group)
-        folder = Folder(source.root, group is None, needs_meshes=True, check=check, body=body)
+        folder = Folder(source.root, group is None, check=check, body=body)
         result = described(folder, descriptor, **describing)
         dataset = result.dataset
         module = result.descriptor

@@ -47,7 +47,6 @@ ENDINGS: Mapping[str, Sequence[str]] = {
     "extract": (".csv", ".parquet", ".npz"),
     "inside": (".csv", ".parquet"),
     "fit": (".safetensors", ""),
-    "precompute": (".igps",),
     "classify": (".csv",),
     "duplicates": (".csv",),
     "doctor": (),

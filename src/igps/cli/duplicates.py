@@ -43,9 +43,7 @@ def duplicates(
 
     if not 0 <= tolerance <= MAX_TOLERANCE:
         raise ValueError(f"tolerance: expected 0 to {MAX_TOLERANCE}, got {tolerance}.")
-    dataset, unread = signatures(
-        Folder(root, needs_meshes=True), [descriptor_of(DESCRIPTOR)], **reading
-    )
+    dataset, unread = signatures(Folder(root), [descriptor_of(DESCRIPTOR)], **reading)
     if warning := keeps_size(size, dataset.units())[1]:
         print(warning)
     n_workers = reading.get("n_workers")

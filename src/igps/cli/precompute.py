@@ -21,7 +21,6 @@ def precompute(
     cluster: str | None = None,
     shard: str | None = None,
     failures: Path | None = None,
-    out: Path | None = None,
     strict: bool = False,
     n_workers: int | None = None,
     time_limit: float | None = None,
@@ -38,12 +37,8 @@ def precompute(
             cache under the same paths as this machine.
         shard: part of the meshes for one job of a batch system, such as 3/64, the third of 64 parts.
         failures: CSV file for the meshes that cannot be used.
-        out: a file ending in .igps for all signatures, which other commands accept in place of the folder. It is
-            memory-mapped when read, and holds no code and no paths. The commands doctor, duplicates, explain and
-            outliers need the meshes themselves, and thus the folder.
     """
-    from igps._text import counted
-    from igps.cli.reading import Folder, dataset_from_options, limits_of, print_failures
+    from igps.cli.reading import Folder, dataset_from_options, limits_of
     from igps.data.requirements import Requirements
     from igps.descriptors import descriptor as descriptor_of
     from igps.report.tables import write_rows
@@ -64,12 +59,6 @@ def precompute(
             failed = dataset.precompute(executor, strict=strict, limits=limits)
     if failures is not None:
         write_rows(failures, ("name", "error"), [(failure.id, failure.error) for failure in failed])
-    if out is not None and len(failed) < len(dataset):
-        usable = dataset.usable(failed)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        usable.to_file(out)
-        print(f"{counted(len(usable), 'signature')} written to {out}")
-        print_failures(failed, len(usable))
     part = "" if shard is None else f" in shard {shard}"
     print(
         f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed"

@@ -19,7 +19,6 @@ from igps._text import counted
 from igps.cli.options import ClassRule, Mirror, Size
 from igps.data.attribute_sources import attribute_sources
 from igps.data.cache import default_cache_dir
-from igps.data.collection import is_collection
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, file_and_part, file_name_of, find_bodies
@@ -28,7 +27,6 @@ from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.measures import Measures
 from igps.descriptors.size_and_side import SIDE, SIZE, keeps_size, scale_of
 from igps.fields.volumes.border import border_of
-from igps.mesh.formats import is_searched
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES
 from igps.mesh.options import LoadOptions
@@ -42,11 +40,10 @@ _RESIDUES = re.compile(r"(\d+) (residues .*)")
 
 @dataclass(frozen=True)
 class Folder:
-    """Source of bodies: a folder, searched according to the options, or a file that `igps precompute --out` wrote."""
+    """Source of bodies: a folder, searched according to the options."""
 
     root: Path
     labelled: bool = False  # whether classes are required
-    needs_meshes: bool = False  # whether the meshes are required, besides their signatures
     # Called before any computation; raises for unsuitable bodies
     check: Callable[[Bodies], object] | None = None
     body: str | None = None  # only bodies of this name in their files, such as an organ
@@ -105,9 +102,7 @@ def signatures(
         reduce(or_, (d.requirements for d in descriptors), Requirements()) if descriptors else None
     )
     dataset = dataset_from_options(source, requirements, **collection)
-    # `from_file` has checked its attributes
-    is_file = isinstance(source, Folder) and not source.root.is_dir()
-    for descriptor in () if is_file else descriptors:
+    for descriptor in descriptors:
         check_attributes(descriptor, {*dataset.config.attributes, *dataset.pipeline.attributes})
     failures = dataset.precompute(
         n_workers=n_workers, strict=strict, limits=limits_of(time_limit, memory_limit)
@@ -182,9 +177,8 @@ def _complete(dataset: SignatureDataset) -> SignatureDataset:
 
 
 def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:
-    """Return a `Folder` if the only path is a folder or a file of signatures, otherwise the paths."""
-    is_folder = len(meshes) == 1 and (meshes[0].is_dir() or is_collection(meshes[0]))
-    return Folder(meshes[0]) if is_folder else meshes
+    """Return a `Folder` if the only path is a folder, otherwise the paths."""
+    return Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
 
 
 def check_files(paths: Sequence[Path]) -> None:
@@ -307,30 +301,6 @@ def dataset_from_options(
         )
     config = SignatureConfig.paper() if paper else signature
     reading = LoadOptions(**load)
-    if isinstance(source, Folder) and source.root.is_file() and not is_searched(source.root.name):
-        if (
-            config != SignatureConfig()
-            or reading != LoadOptions()
-            or classes is not None
-            or attribute
-        ):
-            raise ValueError(
-                f"{source.root}: expected no reading options with a file of signatures. Leave them out."
-            )
-        if source.needs_meshes:
-            raise ValueError(
-                f"{source.root}: expected meshes, got a file of signatures. Give the folder of meshes."
-            )
-        dataset = SignatureDataset.from_file(
-            source.root, descriptor=requirements, cache_dir=cache_dir
-        )
-        if source.labelled and dataset.bodies.labels is None:
-            raise ValueError(
-                f"{source.root}: expected signatures with classes. Export those of a labelled folder."
-            )
-        if source.check is not None:
-            source.check(dataset.bodies)
-        return dataset
     attributes = attribute_sources(
         attribute or (), source.root if isinstance(source, Folder) else None
     )

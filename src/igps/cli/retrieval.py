@@ -216,7 +216,7 @@ def query(
     else:
         known = described(Folder(gallery), descriptor or "pretrained", **describing)
         n_missing = 0
-        # The query is described with the options of the folder, which may be a file of signatures
+        # The query is described with the options of the folder
         options = {
             "paper": False,
             "signature": known.dataset.config,

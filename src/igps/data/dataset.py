@@ -18,7 +18,6 @@ from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.cache import default_cache_dir
 from igps.data.cache_hit import CacheHit
 from igps.data.collation import collate
-from igps.data.collection import CollectionFile, Contents, write_collection
 from igps.data.filling import Failure, fill, find_cached
 from igps.data.in_memory import bodies_in_memory
 from igps.data.indices import Indices, resolve_indices, scalar_index
@@ -117,9 +116,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         )
         self.transform = transform
         self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)  # known cache entries
-        # Signatures that are used instead of the cache, and the index of each body in them
-        self._loaded: CollectionFile | list[Signature] | None = None
-        self._loaded_indices: tuple[int, ...] = tuple(range(len(self.bodies)))
+        self._loaded: list[Signature] | None = None  # used instead of the cache
 
     @property
     def labels(self) -> Tensor:
@@ -184,7 +181,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """Return a Signature before `transform`."""
         name = self.bodies.names[i]
         if self._loaded is not None:
-            return replace(self._loaded[self._loaded_indices[i]], name=name)
+            return replace(self._loaded[i], name=name)
         cached = None if (hit := self._hits[i]) is None else self.pipeline.read(hit)
         signature = replace(cached or self.pipeline.signature(self.bodies[i]), name=name)
         for attribute, function in self._functions.items():
@@ -199,18 +196,11 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def mesh(self, index: int) -> Mesh:
         """Return a mesh, read and checked as for its Signature; raise a MeshError if it cannot be used."""
-        if isinstance(self._loaded, CollectionFile):
-            name = self.bodies.names[index]
-            file = self._loaded.path
-            raise MeshError(
-                f"{name}: {file} holds signatures and no meshes. Use a dataset of the folder of meshes."
-            )
         return self.pipeline.mesh(self.bodies[index])
 
     def key(self, index: int) -> str:
         """Return the cache key of a Signature; raise a MeshError if its file cannot be read."""
-        hit = self._hits[index] if isinstance(self._loaded, CollectionFile) else None
-        return self.pipeline.key(self.bodies[index]) if hit is None else hit.key
+        return self.pipeline.key(self.bodies[index])
 
     def cached_keys(self) -> list[str | None]:
         """Return the key of each cached Signature with its attributes; None if not cached, or changed at access."""
@@ -228,13 +218,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def units(self) -> list[str | None]:
         """Return the unit of length of each body; None if it is unknown, or there is no cached Signature."""
-        if isinstance(self._loaded, list):
+        if self._loaded is not None:
             return [signature.unit for signature in self._loaded]
         return [None if hit is None else hit.unit for hit in self._find_hits()]
 
     def measures(self) -> list[Mapping[str, float]]:
         """Return the plain numbers of each body by name, see `igps.measures`; none without a cached Signature."""
-        if isinstance(self._loaded, list):
+        if self._loaded is not None:
             return [signature.measures for signature in self._loaded]
         return [{} if hit is None else hit.measures for hit in self._find_hits()]
 
@@ -249,10 +239,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         chosen = copy.copy(self)
         chosen.bodies = self.bodies.subset(indices)
         chosen._hits = tuple(self._hits[i] for i in indices)
-        chosen._loaded_indices = tuple(self._loaded_indices[i] for i in indices)
-        if isinstance(self._loaded, list):  # copies for workers should hold no other Signatures
-            chosen._loaded = [self._loaded[i] for i in chosen._loaded_indices]
-            chosen._loaded_indices = tuple(range(len(chosen)))
+        if self._loaded is not None:  # copies for workers should hold no other Signatures
+            chosen._loaded = [self._loaded[i] for i in indices]
         return chosen
 
     def usable(self, failures: Sequence[Failure]) -> Self:
@@ -271,59 +259,6 @@ class SignatureDataset(Dataset[LabelledSignature]):
         ]
         if change is not None:  # the cache entries no longer belong to the Signatures
             dataset._hits = (None,) * len(self)
-        dataset._loaded_indices = tuple(range(len(self)))
-        return dataset
-
-    def to_file(self, path: str | Path) -> None:
-        """Write all Signatures, before `transform`, to a file that `from_file` reads without the meshes.
-
-        The file includes names, classes and parameters, but no paths. Signatures that are not cached are computed. A
-        body that cannot be used raises a MeshError, see `usable`.
-        """
-        dataset = copy.copy(self)
-        hits = [
-            hit or self.pipeline.hit(body, self.pipeline.content(body))
-            for hit, body in zip(self._hits, self.bodies, strict=True)
-        ]
-        dataset._hits = tuple(hits)
-        about = Contents(
-            self.bodies,
-            self.classes,
-            tuple(hit.whole_key for hit in hits),
-            self.reading,
-            self.config,
-        )
-        write_collection(Path(path), about, dataset._signature)
-
-    @classmethod
-    def from_file(
-        cls,
-        path: str | Path,
-        *,
-        descriptor: AnyDescriptor | None = None,
-        cache_dir: Path | None = None,
-    ) -> Self:
-        """Open a file that `to_file` wrote. It is memory-mapped, and reading it runs no code.
-
-        Args:
-            descriptor: see `SignatureDataset`.
-            cache_dir: directory for cached descriptions.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file has another format, or does not meet the requirements of the descriptor.
-        """
-        file = CollectionFile(path)
-        about = file.about
-        if descriptor is not None:
-            file.check_requirements(requirements_of(descriptor))
-        dataset = cls.__new__(cls)
-        SignatureDataset.__init__(
-            dataset, about.bodies, about.config, cache_dir, reading=about.reading
-        )
-        dataset.classes = about.classes
-        dataset._loaded = file
-        dataset._hits = file.hits()
         return dataset
 
     def precompute(
