@@ -28,7 +28,6 @@ from igps import LoadOptions, MeshError, SignatureConfig, compute_signature, loa
 from igps._failures import Failed, Limits
 from igps._parallel import run
 from igps.mesh import mending
-from igps.mesh.options import Component
 from igps.mesh.simplification import simplify
 from igps.mesh.watertight import watertight
 from igps.spectra._lanczos import ConvergenceError
@@ -110,13 +109,10 @@ def judge(broken: Broken, folder: Path, number: int) -> Verdict:
 
 def _options(number: int) -> tuple[LoadOptions, bool]:
     """Options for reading the file of a number, and whether they may change the surface."""
-    component: Component | None = "largest" if number % 7 == 1 else None
     mend = ("never", "auto", "never", "auto", "never", "auto", "never", "always")[number % 8]
     allow_open = number % 3 == 1 and mend != "always"
     # Type: ignore[arg-type]
-    return LoadOptions(
-        mend=mend, component=component, allow_open=allow_open
-    ), mend != "never" or bool(component)
+    return LoadOptions(mend=mend, allow_open=allow_open), mend != "never"
 
 
 def _grid(number: int) -> AbstractContextManager[object]:

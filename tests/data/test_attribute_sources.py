@@ -1,4 +1,4 @@
-"""What a body brings along: images, grids, values at vertices and in tetrahedra, residues; and what is refused."""
+"""What a body brings along: images, grids, values at vertices, residues; and what is refused."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from igps.data.attribute_sources import (
     fill_missing,
 )
 from igps.data.dataset import SignatureDataset
-from igps.fields.meshes.vertex_attributes import TetAttribute, VertexAttribute
+from igps.fields.meshes.vertex_attributes import VertexAttribute
 from igps.fields.molecules.residue_attributes import ResidueAttribute
 from igps.fields.volumes.image_attribute import ImageAttribute
 from igps.mesh.errors import MeshError
@@ -361,23 +361,6 @@ def test_values_at_the_vertices_of_a_cavity_count(tmp_path):
         np.testing.assert_allclose(surface.attributes["heat"], 1.0 + on_cavity, atol=1e-5)
 
 
-def test_tetrahedra_give_a_linear_function_inside_and_nothing_far_outside(body):
-    meshio = pytest.importorskip("meshio")
-    from scipy.spatial import Delaunay
-
-    points = np.random.default_rng(2).uniform(-1, 1, (300, 3))
-    points = np.concatenate([points, np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T])
-    cells = [("tetra", Delaunay(points).simplices)]
-    meshio.Mesh(points, cells, point_data={"stress": linear(points)}).write(
-        body.path.with_name("a.vtu")
-    )
-    source = attribute_source("a.vtu")
-    assert isinstance(source, TetAttribute)
-    np.testing.assert_allclose(source(body, INSIDE), linear(INSIDE), atol=1e-5)
-    with pytest.raises(MeshError, match="has no value at 200 of 200 points"):
-        source(body, INSIDE + 5)
-
-
 def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog):
     points = np.arange(40.0)[:, None] * [1, 0, 0]
     values = np.arange(40.0)
@@ -545,7 +528,7 @@ def test_words_of_the_command_line_become_sources():
         "ct": ImageAttribute("a/{stem}.nii.gz", Path("root")),
         "q": ResidueAttribute("charge"),
         "t": VertexAttribute("{file}#t", Path("root")),
-        "e": TetAttribute("a.vtu", Path("root")),
+        "e": VertexAttribute("a.vtu", Path("root")),
     }
     assert pickle.loads(pickle.dumps(found)) == found
     for wrong in ("ct", "=a.nii", "a b=c.nii", "ct="):

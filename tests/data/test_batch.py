@@ -1,17 +1,14 @@
 from __future__ import annotations
 
-import os
 from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from batches import two_bodies
-from igps.data import _shared_memory
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch
 from igps.data.collation import collate
 from igps.mesh.mesh import Mesh
@@ -281,7 +278,7 @@ class Several(Dataset[Signature]):
         return self.signatures[index]
 
 
-def test_workers_give_the_batches_of_this_process_in_one_piece_of_memory(signatures):
+def test_workers_give_the_batches_of_this_process(signatures):
     """Of like shapes, which are written as they are, and of others, which are padded in every dimension."""
     (batch,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate)
     expected = collate(signatures)
@@ -294,11 +291,6 @@ def test_workers_give_the_batches_of_this_process_in_one_piece_of_memory(signatu
     (batch,) = DataLoader(Several(alike), batch_size=2, num_workers=1, collate_fn=collate)
     assert equal(batch, collate(alike))
     assert torch.equal(batch.interior.eigenfunctions, collate(alike).interior.eigenfunctions)
-    whole = {
-        one.untyped_storage().data_ptr()
-        for one in (batch.interior.points, batch.surface.eigenfunctions)
-    }
-    assert len(whole) == 1
     batch.interior.points.zero_()  # writable, as any batch is
 
 
@@ -313,30 +305,6 @@ def test_a_batch_is_saved_and_loaded_without_trust(signatures, tmp_path):
     with torch.serialization.safe_globals([SampleBatch, SignatureBatch]):
         loaded = torch.load(tmp_path / "batch.pt", weights_only=True)
     assert equal(loaded, collate(signatures))
-
-
-def test_a_worker_takes_memory_again_only_when_its_batch_is_gone(signatures):
-    """Batches of other sizes, kept, dropped, or in part kept, hold what this process makes of the same bodies."""
-    order = [[0, 1], [2], [1, 2, 0], [0], [2, 1], [0, 0, 0]] * 6
-    expected = [collate([signatures[i] for i in some]) for some in order]
-    loader = DataLoader(
-        Several(signatures),
-        batch_sampler=order,
-        num_workers=2,
-        collate_fn=collate,
-        persistent_workers=True,
-    )
-    kept: list[tuple[SignatureBatch, SignatureBatch]] = []
-    parts: list[tuple[Tensor, Tensor]] = []
-    for epoch in range(3):
-        for i, (batch, right) in enumerate(zip(loader, expected, strict=True)):
-            assert equal(batch, right)
-            if i % 4 == epoch:
-                kept.append((batch, right))
-            if i % 5 == epoch:
-                parts.append((batch.surface.eigenfunctions[-1], right.surface.eigenfunctions[-1]))
-    assert all(equal(batch, right) for batch, right in kept)
-    assert all(torch.equal(part, right) for part, right in parts)
 
 
 def thinned(items: list[Signature]) -> SignatureBatch:
@@ -360,28 +328,6 @@ def test_a_worker_hands_over_what_its_user_makes_of_a_batch(signatures, make):
         assert batch.labels.tolist() == right.labels.tolist()
         assert batch.area.tolist() == right.area.tolist()
         assert torch.equal(batch.interior.eigenfunctions, right.interior.eigenfunctions)
-
-
-def with_blocks(items: list[Signature]) -> tuple[SignatureBatch, int]:
-    """A batch, and how many blocks its worker has; a further batch is let go in the worker."""
-    batch = collate(items)
-    collate(items)
-    return batch, len(_shared_memory._blocks)
-
-
-@pytest.mark.skipif(
-    not hasattr(os, "memfd_create"), reason="only Linux has memory that is a file without a name"
-)
-def test_a_worker_does_not_gather_memory(signatures):
-    loader = DataLoader(
-        Several(signatures * 10),
-        batch_size=2,
-        num_workers=1,
-        collate_fn=with_blocks,
-        prefetch_factor=2,
-    )
-    # Two are on their way, one is in use here, one is received, and one is let go.
-    assert max(n_blocks for _, n_blocks in loader) <= 5
 
 
 def test_numbers_of_samples_take_another_type_and_all_others_stay(signatures):

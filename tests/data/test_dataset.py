@@ -145,9 +145,7 @@ def test_parametrisation_above_is_complete():
     assert {field.name for field in fields(CONFIG)} == changed | {"least_vertices"}
 
 
-@pytest.mark.parametrize(
-    "option", [{"mend": "always"}, {"component": "largest"}, {"allow_open": True}]
-)
+@pytest.mark.parametrize("option", [{"mend": "always"}, {"allow_open": True}])
 def test_key_covers_how_the_file_is_read(root, tmp_path, counted, option):
     SignatureDataset(root, CONFIG, tmp_path / "cache")[0]
     SignatureDataset(root, CONFIG, tmp_path / "cache", reading=LoadOptions(**option))[0]

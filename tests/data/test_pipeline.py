@@ -95,7 +95,6 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
         for reading in (
             LoadOptions("never"),
             LoadOptions("always"),
-            LoadOptions(component="largest"),
             LoadOptions(allow_open=True),
         )
     ]

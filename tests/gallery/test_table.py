@@ -26,8 +26,7 @@ import pyarrow as pa
 from igps.gallery import _table
 from igps.gallery._table import BodyTable
 from igps.gallery.about import check_alike
-from igps.gallery.opening import is_gallery, open_table
-from igps.gallery.place import address
+from igps.gallery.place import address, is_gallery
 from igps.retrieval import chi_square, cosine, search
 
 ABOUT = {"descriptor": "test", "signature": {"resolution": 32}}
@@ -237,7 +236,7 @@ def test_a_gallery_lies_in_an_object_store(tmp_path):
     rows = units(4500)
     _table.write(place, ABOUT, "cosine", batches(rows), FURTHER)
     assert is_gallery(place)
-    table = open_table(place)
+    table = BodyTable(place)
     table.add(rows[:10], [told(i, "b") for i in range(10)], {})
     assert len(BodyTable(place)) == 4500
     assert numbers(BodyTable(place).nearest(rows[7:8], cosine, top=1)) == [7]
@@ -269,7 +268,7 @@ def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path):
     with pytest.raises(ValueError, match="at least one for the gallery"):
         _table.write(tmp_path / "new.igps", ABOUT, "cosine", [], {})
     with pytest.raises(FileNotFoundError, match=r"nowhere: no gallery there"):
-        open_table(tmp_path / "nowhere")
+        BodyTable(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=r"got a folder with g.igps"):
         written(tmp_path, units(10), "cosine")
     assert len(BodyTable(tmp_path / "g.igps")) == 10
@@ -347,16 +346,6 @@ def test_several_processes_read_while_one_adds(tmp_path):
         == before
         != after
     )
-
-
-def test_an_index_of_an_earlier_version_is_refused(tmp_path):
-    """Its signatures are of version 4: with these nothing is compared."""
-    (tmp_path / "manifest.json").write_text('{"format": "igps-index-1"}')
-    assert is_gallery(tmp_path)
-    with pytest.raises(
-        ValueError, match=r"an index of version 0\.2\.0, of other signatures\. Build a gallery"
-    ):
-        open_table(tmp_path)
 
 
 _WRITER = """

@@ -11,7 +11,7 @@ import trimesh
 from conftest import FACES, TETRAHEDRON
 from igps.fields.meshes import vertex_values
 from igps.mesh.errors import MeshError
-from igps.mesh.loading import load_mesh, read_surface
+from igps.mesh.loading import load_bodies, load_mesh, read_surface
 from igps.mesh.options import LoadOptions
 
 
@@ -294,7 +294,7 @@ def test_each_fault_is_mended_at_any_scale(tmp_path, scale):
     )
 
 
-def test_largest_component_is_that_of_the_largest_area(tmp_path):
+def test_pieces_that_are_no_body_together_are_bodies_each(tmp_path):
     fine = trimesh.creation.icosphere(subdivisions=3)
     large = trimesh.creation.box((5, 5, 5))
     vertices = np.vstack([fine.vertices + 20, large.vertices])
@@ -302,9 +302,8 @@ def test_largest_component_is_that_of_the_largest_area(tmp_path):
     path = write_off(tmp_path / "two.off", vertices, faces)
     with pytest.raises(MeshError, match="2 connected components"):
         load_mesh(path, LoadOptions("never"))
-    mesh = load_mesh(path, LoadOptions("never", component="largest"))
-    assert mesh.volume == pytest.approx(125)
-    assert any("largest of 2 components" in note for note in mesh.notes)
+    pieces = load_bodies(path, LoadOptions("never", bodies="pieces"))
+    assert max(piece.volume for piece in pieces) == pytest.approx(125)
 
 
 def test_open_files_are_read_when_allowed(tmp_path):
@@ -314,26 +313,6 @@ def test_open_files_are_read_when_allowed(tmp_path):
     mesh = load_mesh(path, LoadOptions(allow_open=True))
     assert mesh.allow_open
     assert len(mesh.faces) == 3
-
-
-def test_the_largest_component_of_loose_triangles_is_what_they_make_together(tmp_path):
-    small = trimesh.creation.box((1, 1, 1))
-    large = trimesh.creation.box((1, 2, 3))
-    # It touches the large one
-    beside = trimesh.creation.box((1, 1, 1)).apply_translation([0, 1.5, 0])
-    vertices = np.concatenate([small.triangles + 9, large.triangles]).reshape(-1, 3)
-    path = write_off(tmp_path / "loose.off", vertices, np.arange(len(vertices)).reshape(-1, 3))
-    assert load_mesh(path, LoadOptions(component="largest")).volume == pytest.approx(6)
-    closed = trimesh.util.concatenate([large, beside])
-    path = write_off(tmp_path / "closed.off", np.asarray(closed.vertices), np.asarray(closed.faces))
-    assert load_mesh(path, LoadOptions(component="largest")).volume == pytest.approx(6)
-
-
-def test_unknown_component_is_refused():
-    with pytest.raises(
-        ValueError, match="component: expected one of largest, None, got 'smallest'"
-    ):
-        LoadOptions(component="smallest")
 
 
 def test_unknown_way_to_mend_is_refused():

@@ -36,7 +36,6 @@ _LOAD_HELP = {
         "auto repairs a surface as little as possible; never refuses a surface that bounds no body; "
         "always makes watertight what crosses itself or does not bound a single body"
     ),
-    "component": "largest keeps only the connected piece of the largest area; by default all pieces",
     "allow_open": "accept surfaces with holes; the winding number then tells inside from outside",
     "bodies": (
         "what counts as a body: the whole file, the labels of a volume, the objects of a scene or a CAD "

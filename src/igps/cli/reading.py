@@ -266,7 +266,7 @@ def print_reading_warning(descriptor: Descriptor, dataset: SignatureDataset) -> 
     then, now = (
         {**asdict(LoadOptions()), **options} for options in (fitted, dataset.reading.as_dict())
     )
-    names = ("mend", "component", "allow_open", "cavities")
+    names = ("mend", "allow_open", "cavities")
     if changed := [
         f"--{name} {then[name]}, not {now[name]}" for name in names if then[name] != now[name]
     ]:

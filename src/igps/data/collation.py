@@ -8,7 +8,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from igps.data._shared_memory import empty_arrays
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, attribute_names
 from igps.mesh.mesh import Mesh
 from igps.signature.measures import POWERS
@@ -20,8 +19,7 @@ def collate(
 ) -> SignatureBatch:
     """Pad Signatures and collate them to a batch.
 
-    For a `DataLoader(dataset, collate_fn=collate)`. In a worker process of a DataLoader, the batch lies in shared
-    memory.
+    For a `DataLoader(dataset, collate_fn=collate)`.
 
     Example:
         >>> import trimesh
@@ -102,16 +100,11 @@ def _sample_columns(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
 
 def _padded(columns: Sequence[Sequence[Any]]) -> list[Tensor]:
     """Stack each list of N arrays to an (N, ...) tensor, padded by zeros to the largest size of each dimension."""
-    shapes = [
-        (len(arrays), *map(max, zip(*(a.shape for a in arrays), strict=True))) for arrays in columns
-    ]
-    stacks = empty_arrays(shapes, [arrays[0].dtype for arrays in columns])
-    for arrays, stack in zip(columns, stacks, strict=True):
+    stacks = []
+    for arrays in columns:
+        shape = map(max, zip(*(array.shape for array in arrays), strict=True))
+        stack = np.zeros((len(arrays), *shape), arrays[0].dtype)
         for i, array in enumerate(arrays):
-            if array.shape[1:] != stack.shape[2:]:
-                stack[i] = 0
-            place: tuple[Any, ...] = (i, *map(slice, array.shape))
-            stack[place] = array
-            if stack.ndim > 1:
-                stack[i, len(array) :] = 0
-    return [torch.from_numpy(stack) for stack in stacks]
+            stack[(i, *map(slice, array.shape))] = array
+        stacks.append(torch.from_numpy(stack))
+    return stacks

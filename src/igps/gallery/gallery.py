@@ -16,7 +16,7 @@ from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.registry import is_file
 from igps.gallery.about import about_of, check_alike
 from igps.gallery.columns import Found
-from igps.gallery.opening import open_table, tables
+from igps.gallery.place import tables
 from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
 from igps.nn.description import check_centres, describe
@@ -63,7 +63,7 @@ class Gallery:
         descriptor: str | Descriptor | None = None,
     ) -> None:
         self.path = path
-        self.table = open_table(path)
+        self.table = tables().BodyTable(path)
         about = self.about
         descriptor = about["descriptor"] if descriptor is None else descriptor
         if isinstance(descriptor, Descriptor) or not is_file(descriptor):  # a file may have moved

@@ -75,15 +75,6 @@ def places(vertices: Floats) -> Integers:
     return np.asarray(first[index.ravel()])
 
 
-def weld_boundaries(vertices: Floats, faces: Integers) -> Integers:
-    """Return the faces (F, 3) with coincident boundary vertices merged."""
-    boundary = _boundary_vertices(vertices, faces)
-    index = np.arange(len(vertices))
-    if len(boundary):
-        index[boundary] = boundary[places(vertices[boundary])]
-    return index[faces]
-
-
 def _close_cracks(vertices: Floats, faces: Integers) -> Integers:
     """Return, for each vertex (V,), the vertex into which it is merged to close cracks between boundaries."""
     boundary = _boundary_vertices(vertices, faces)

@@ -12,15 +12,14 @@ import numpy as np
 from igps._arrays import Booleans, Floats, Integers
 from igps._text import counted
 from igps._threads import one_thread
-from igps.mesh._tidying import weld_boundaries
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import Format, all_formats, faults, format_of
 from igps.mesh.limits import check_memory
 from igps.mesh.mending import mend
-from igps.mesh.mesh import Mesh, check_arrays
+from igps.mesh.mesh import Mesh
 from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.raw_body import RawBody, joined, pieces
-from igps.mesh.surface import compact, diagonal, face_areas, face_parts
+from igps.mesh.surface import compact, diagonal, face_areas
 
 logger = logging.getLogger(__name__)
 
@@ -175,14 +174,6 @@ def surface_body(
     if options.mend != "never":
         vertices, faces, dropped = _with_coordinates(vertices, faces)
         notes = (*notes, *dropped)
-    if options.component == "largest" and len(faces):
-        check_arrays(vertices, faces, name)
-        connected = faces if options.mend == "never" else weld_boundaries(vertices, faces)
-        part, areas = face_parts(vertices, connected)
-        if len(areas) > 1:
-            vertices, faces = compact(vertices, faces[part == int(np.argmax(areas))])
-            counts = f"{len(vertices)} of {len(raw.vertices)} vertices"
-            notes = (*notes, f"kept the largest of {len(areas)} components ({counts})")
     notes = (*notes, *_rounding_notes(vertices, name))
     if options.allow_open and options.mend != "always":
         try:

@@ -326,9 +326,9 @@ def _check_topology(
         (
             n_components > 1 and not cavities,
             f"{n_components} connected components; the commute time between them is "
-            "infinite. Read the file with LoadOptions(component='largest'), "
-            "on the command line --component largest, to "
-            f"keep one; with {_REPAIR} if coincident vertices are merely not welded; or join them.",
+            "infinite. Read the file with LoadOptions(bodies='pieces'), "
+            "on the command line --bodies pieces, to "
+            f"make a body of each; with {_REPAIR} if coincident vertices are merely not welded; or join them.",
         ),
     ):
         if is_wrong:

@@ -8,7 +8,6 @@ from igps._parameters import check_at_least, check_one_of
 
 Mending = Literal["auto", "never", "always"]
 Cavities = Literal["fill", "keep"]
-Component = Literal["largest"]
 BodyKind = Literal["whole", "labels", "objects", "pieces", "chains", "models", "assembly"]
 
 MAX_UNPACKED = 2**30
@@ -33,7 +32,6 @@ class LoadOptions:
         mend: "auto" makes as few repairs as possible; "never" raises an error for a surface that bounds no body;
             "always" makes every surface watertight that crosses itself or does not bound a single body, for collections
             of mixed quality.
-        component: "largest" keeps only the connected component of the largest area.
         allow_open: accept open boundaries; the winding number then tells inside from outside.
         bodies: what counts as a body: "whole" (the file), "labels" (of a volume), "objects" (of a scene, solids of a
             CAD file, files of an archive), "pieces" (connected components), or "chains", "models" or "assembly" (of a
@@ -49,7 +47,6 @@ class LoadOptions:
     """
 
     mend: Mending = "auto"
-    component: Component | None = None
     allow_open: bool = False
     bodies: BodyKind | None = None
     max_unpacked: int = MAX_UNPACKED
@@ -60,7 +57,6 @@ class LoadOptions:
     def __post_init__(self) -> None:
         check_one_of(get_args(Mending), mend=self.mend)
         check_one_of(get_args(Cavities), cavities=self.cavities)
-        check_one_of((*get_args(Component), None), component=self.component)
         check_one_of((*get_args(BodyKind), None), bodies=self.bodies)
         check_at_least(1, max_unpacked=self.max_unpacked)
         if self.allow_open and self.mend == "always":
@@ -79,15 +75,6 @@ class LoadOptions:
 
     def as_dict(self) -> dict[str, object]:
         """Return the options on which a body depends, for cache keys."""
-        # Options that were added later are left out at their defaults, which keeps older keys valid.
-        added = {"bodies": None, "threshold": 0.5, "cavities": "fill"}
-        options = {
-            name: value
-            for name, value in asdict(self).items()
-            if name not in ("max_unpacked", "names")
-        }
-        return {
-            name: value
-            for name, value in options.items()
-            if name not in added or value != added[name]
-        }
+        options = asdict(self)
+        del options["max_unpacked"], options["names"]
+        return options

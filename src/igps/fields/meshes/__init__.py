@@ -31,7 +31,4 @@ FORMATS = (
     archives.ARCHIVE,
     archives.COMPRESSED,
 )
-ATTRIBUTES = (
-    SourceKind(vertex_attributes.TetAttribute, suffixes=(".vtu",)),
-    SourceKind(vertex_attributes.VertexAttribute, suffixes=("",)),
-)
+ATTRIBUTES = (SourceKind(vertex_attributes.VertexAttribute, suffixes=("",)),)

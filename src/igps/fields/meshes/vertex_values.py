@@ -1,4 +1,4 @@
-"""Readers of values at the vertices of surfaces or of tetrahedra."""
+"""Readers of values at the vertices of surfaces."""
 
 from collections.abc import Mapping
 from io import BytesIO
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from igps._arrays import Floats, Integers
+from igps._arrays import Floats
 from igps.fields.meshes import brains, vtk
 from igps.mesh.errors import MeshError
 from igps.mesh.options import LoadOptions
@@ -22,7 +22,7 @@ def read(path: Path) -> Arrays:
     """
     name = path.name.lower()
     if name.endswith((".vtk", ".vtp", ".vtu")):
-        arrays = vtk.point_values(path, LoadOptions()).values
+        arrays = vtk.point_values(path, LoadOptions())
     elif name.endswith(".gii"):
         arrays = brains.gifti_values(path, LoadOptions())
     elif name.endswith(".ply"):
@@ -34,22 +34,6 @@ def read(path: Path) -> Arrays:
             f"{path}: expected values at vertices, got none. Export the file with values."
         )
     return {key: np.asarray(values, dtype=np.float64) for key, values in arrays.items()}
-
-
-def read_tetrahedra(path: Path) -> tuple[Floats, Integers, Arrays]:
-    """Read points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) at points by name; a ValueError without them."""
-    data = vtk.point_values(path, LoadOptions())
-    if not len(data.tetrahedra) or not data.values:
-        raise MeshError(f"{path}: expected tetrahedra with values at their points. Export both.")
-    if data.tetrahedra.min() < 0 or data.tetrahedra.max() >= len(data.vertices):
-        raise MeshError(
-            f"{path}: a tetrahedron refers to a point that is not there. Export it again."
-        )
-    return (
-        data.vertices,
-        data.tetrahedra,
-        {name: values.astype(float) for name, values in data.values.items()},
-    )
 
 
 def chosen(arrays: Arrays, name: str, path: Path) -> Floats:

@@ -6,8 +6,6 @@ header declares too large a size.
 
 import base64
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -51,15 +49,6 @@ _XML_CELLS = {
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
 # Corners laid end to end; corner counts of cells; types of cells
 Cells = tuple[Integers, Integers, Integers]
-
-
-@dataclass(frozen=True, eq=False)
-class PointValues:
-    """Points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) at the points by name."""
-
-    vertices: Floats
-    tetrahedra: Integers
-    values: Mapping[str, NDArray[np.generic]]
 
 
 class _Legacy:
@@ -191,44 +180,26 @@ def read_legacy(path: Path, options: LoadOptions, part: str | None) -> list[RawB
     return [_body(*_Legacy(path.read_bytes()).geometry()[:2])]
 
 
-def point_values(path: Path, options: LoadOptions) -> PointValues:
-    """Read the arrays at the points of a VTK file of one piece."""
+def point_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
+    """Read the arrays (V,) or (V, C) at the points of a VTK file of one piece, by name."""
     if path.suffix.lower() == ".vtk":
         legacy = _Legacy(path.read_bytes())
-        vertices, cells, heading = legacy.geometry()
-        return PointValues(vertices, _tetrahedra(cells), legacy.arrays(heading, len(vertices)))
+        vertices, _, heading = legacy.geometry()
+        return legacy.arrays(heading, len(vertices))
     file = _Xml(path, options)
     pieces = list(file.root.iter("Piece"))
     if len(pieces) != 1:
         raise ValueError(f"expected one piece, got {len(pieces)}")
-    vertices, cells = file.geometry(pieces[0])
+    vertices, _ = file.geometry(pieces[0])
     arrays: dict[str, NDArray[np.generic]] = {}
     for element in pieces[0].findall("PointData/DataArray"):
         values = file.array(element).reshape(len(vertices), -1)
         arrays[element.get("Name") or f"array {len(arrays) + 1}"] = _squeezed(values)
-    return PointValues(vertices, _tetrahedra(cells), arrays)
+    return arrays
 
 
 def _squeezed(values: NDArray[np.generic]) -> NDArray[np.generic]:
     return values[:, 0] if values.shape[1] == 1 else values
-
-
-def _tetrahedra(cells: list[Cells]) -> Integers:
-    rows = [np.zeros((0, 4), dtype=np.int64)]
-    for corners, n_corners, kinds in cells:
-        if (
-            len(kinds) == len(n_corners)
-            and (n_corners >= 0).all()
-            and n_corners.sum() == len(corners)
-        ):
-            starts = np.cumsum(n_corners) - n_corners
-            rows.append(
-                corners[
-                    starts[(kinds == _vtk_cells.TETRAHEDRON) & (n_corners == 4), None]
-                    + np.arange(4)
-                ]
-            )
-    return np.concatenate(rows)
 
 
 def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
