@@ -261,7 +261,7 @@ def test_batches_that_do_not_fit_are_not_joined(signatures):
     with pytest.raises(ValueError, match="batches: expected at least one"):
         SignatureBatch.concatenate([])
     bare = replace(signatures[0], interior=replace(signatures[0].interior, attributes={}))
-    with pytest.raises(ValueError, match="batches: all must carry the same sample attributes"):
+    with pytest.raises(ValueError, match="attributes: all bodies must carry the same"):
         SignatureBatch.concatenate([collate([bare]), without])
 
 

@@ -294,18 +294,12 @@ def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:
     return joined
 
 
-def attribute_names(samples: Sequence[Samples | SampleBatch], argument: str) -> list[str]:
-    """Return the sorted attribute names of samples; raise a ValueError that names the argument if they differ."""
-    first, *others = (sorted(sample.attributes) for sample in samples)
-    if differing := [names for names in others if names != first]:
-        raise ValueError(
-            f"{argument}: all must carry the same sample attributes, got {first} and {differing[0]}."
-        )
-    return first
-
-
 def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
-    names = attribute_names(parts, "batches")
+    names, *others = (sorted(part.attributes) for part in parts)
+    if differing := [other for other in others if other != names]:
+        raise ValueError(
+            f"attributes: all bodies must carry the same, got {names} and {differing[0]}."
+        )
     points, eigenfunctions, mask = (
         _joined([getattr(part, name) for part in parts])
         for name in ("points", "eigenfunctions", "mask")

@@ -1,14 +1,15 @@
 """Collation of Signatures to a padded batch."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, attribute_names
+from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch
 from igps.mesh.mesh import Mesh
 from igps.signature.measures import POWERS
 from igps.signature.signature import Samples, Signature
@@ -46,65 +47,41 @@ def collate(
     labelled = [
         x if isinstance(x, LabelledSignature) else LabelledSignature(x, -1, x.name) for x in items
     ]
-    signatures = [item.signature for item in labelled]
-    n_eigenpairs = max(len(s.eigenvalues) for s in signatures)
-    columns: list[list[Any]] = [
-        # Padded by infinity, so that every spectral weight of the padding is zero
-        [
-            np.pad(s.eigenvalues, (0, n_eigenpairs - len(s.eigenvalues)), constant_values=np.inf)
-            for s in signatures
-        ],
-        [np.float64(s.area) for s in signatures],
-        [np.float64(s.volume) for s in signatures],
-        [np.int64(item.label) for item in labelled],
-        [_row(s.measures) for s in signatures],
-    ]
-    samples_by_kind = [[s.interior for s in signatures], [s.surface for s in signatures]]
-    for samples in samples_by_kind:
-        columns += _sample_columns(samples)
-    eigenvalues, area, volume, labels, rows, *sample_tensors = _padded(columns)
-    data = iter(sample_tensors)
-    interior, surface = (
-        SampleBatch(
-            next(data),
-            next(data),
-            next(data),
-            {name: next(data) for name in sorted(samples[0].attributes)},
-        )
-        for samples in samples_by_kind
-    )
-    ids = tuple(item.id for item in labelled)
-    units = tuple(s.unit for s in signatures)
-    surfaces = None if meshes is None else tuple(meshes)
-    measures = rows if all(s.measures for s in signatures) else None
+    batch = SignatureBatch.concatenate([_single(item) for item in labelled])
+    return batch if meshes is None else replace(batch, meshes=tuple(meshes))
+
+
+def _single(item: LabelledSignature) -> SignatureBatch:
+    """Return a batch of one body."""
+    signature = item.signature
+    measures = None
+    if signature.measures:
+        measures = _row([signature.measures.get(name, math.nan) for name in POWERS])
     return SignatureBatch(
-        eigenvalues, interior, surface, area, volume, labels, ids, surfaces, units, measures
+        eigenvalues=_row(signature.eigenvalues),
+        interior=_samples(signature.interior),
+        surface=_samples(signature.surface),
+        area=_row(signature.area),
+        volume=_row(signature.volume),
+        labels=_row(item.label, np.int64),
+        ids=(item.id,),
+        units=(signature.unit,),
+        measures=measures,
     )
 
 
-def _row(measures: Mapping[str, float]) -> NDArray[np.float64]:
-    return np.array([measures.get(name, np.nan) for name in POWERS])
+def _samples(samples: Samples) -> SampleBatch:
+    # Centred before the conversion to single precision, where shapes far from the origin would lose digits
+    points = samples.points - samples.points.mean(axis=0)
+    attributes = {name: _row(v, np.float32) for name, v in sorted(samples.attributes.items())}
+    return SampleBatch(
+        _row(points, np.float32),
+        _row(samples.eigenfunctions, np.float32),
+        _row(np.ones(len(samples), dtype=bool), bool),
+        attributes,
+    )
 
 
-def _sample_columns(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
-    """Return lists of points, eigenfunctions, masks, and attributes in the order of their names."""
-    names = attribute_names(samples, "items")
-    return [
-        # Centred before the conversion to single precision, where shapes far from the origin would lose digits
-        [(s.points - s.points.mean(axis=0)).astype(np.float32) for s in samples],
-        [np.asarray(s.eigenfunctions, dtype=np.float32) for s in samples],
-        [np.ones(len(s), dtype=bool) for s in samples],
-        *([np.asarray(s.attributes[name], dtype=np.float32) for s in samples] for name in names),
-    ]
-
-
-def _padded(columns: Sequence[Sequence[Any]]) -> list[Tensor]:
-    """Stack each list of N arrays to an (N, ...) tensor, padded by zeros to the largest size of each dimension."""
-    stacks = []
-    for arrays in columns:
-        shape = map(max, zip(*(array.shape for array in arrays), strict=True))
-        stack = np.zeros((len(arrays), *shape), arrays[0].dtype)
-        for i, array in enumerate(arrays):
-            stack[(i, *map(slice, array.shape))] = array
-        stacks.append(torch.from_numpy(stack))
-    return stacks
+def _row(values: ArrayLike, dtype: type = np.float64) -> Tensor:
+    """Return values of one body as the only row of a tensor on the CPU."""
+    return torch.from_numpy(np.require(values, dtype, "W"))[None]
