@@ -26,7 +26,8 @@ import pyarrow as pa
 from igps.gallery import _table
 from igps.gallery._table import BodyTable
 from igps.gallery.about import check_alike
-from igps.gallery.place import address, is_gallery
+from igps.gallery.opening import is_gallery
+from igps.gallery.place import address
 from igps.retrieval import chi_square, cosine, search
 
 ABOUT = {"descriptor": "test", "signature": {"resolution": 32}}

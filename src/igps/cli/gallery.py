@@ -38,7 +38,7 @@ def build(
     from igps.cli.reading import Folder, signatures, with_side, with_size
     from igps.descriptors import descriptor as descriptor_of
     from igps.gallery.gallery import Gallery
-    from igps.gallery.place import tables
+    from igps.gallery.opening import tables
     from igps.nn.description import check_centres
 
     descriptor = with_side(descriptor, mirror, size)

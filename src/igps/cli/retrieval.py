@@ -198,7 +198,7 @@ def query(
     from igps.cli.gallery import gallery_options
     from igps.cli.reading import Folder, check_files, described
     from igps.gallery.gallery import Gallery
-    from igps.gallery.place import is_gallery
+    from igps.gallery.opening import is_gallery
     from igps.retrieval import N_RERANKED, rerank_candidates, search
 
     check_at_least(1, top=top)

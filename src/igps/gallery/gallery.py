@@ -16,7 +16,7 @@ from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.registry import is_file
 from igps.gallery.about import about_of, check_alike
 from igps.gallery.columns import Found
-from igps.gallery.place import tables
+from igps.gallery.opening import tables
 from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
 from igps.nn.description import check_centres, describe

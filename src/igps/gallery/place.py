@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 _SCHEME = re.compile(r"([a-z][a-z0-9+-]+):/+")  # two letters at least: C:/ is a drive
 
@@ -17,17 +16,3 @@ def address(path: str | Path) -> str:
     if isinstance(path, Path) and is_remote(path):
         return _SCHEME.sub(r"\1://", str(path), count=1)
     return str(path)
-
-
-def is_gallery(path: str | Path) -> bool:
-    """Return whether a place holds a gallery."""
-    if is_remote(path):
-        return bool(tables().exists(path))
-    return (Path(path) / "bodies.lance").exists()
-
-
-def tables() -> Any:
-    """Import the module that needs LanceDB."""
-    from igps.gallery import _table
-
-    return _table
