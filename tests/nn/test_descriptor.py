@@ -174,12 +174,13 @@ def small(n_eigenpairs: int, n_classes: int, **options: int) -> PairHistogram:
     return PairHistogram(axes, SpectralEmbedding(n_eigenpairs=n_eigenpairs), **options)
 
 
-def test_parts_have_equal_shares_and_so_have_their_histograms(batch):
+@pytest.mark.parametrize(("shares", "of_first"), [(None, 1 / 2), ([6, 2], 3 / 4)])
+def test_parts_have_their_shares_and_their_histograms_equal_ones(batch, shares, of_first):
     first, second, third = histograms = [small(3, 2), small(5, 3), small(4, 1)]
-    result = HistogramDescriptor([[first, second], third])(batch)
+    result = HistogramDescriptor([[first, second], third], shares=shares)(batch)
     expected = [
         share * one(batch).flatten(1)
-        for share, one in zip((1 / 4, 1 / 4, 1 / 2), histograms, strict=True)
+        for share, one in zip((of_first / 2, of_first / 2, 1 - of_first), histograms, strict=True)
     ]
     torch.testing.assert_close(result, torch.cat(expected, dim=1))
     torch.testing.assert_close(result.sum(dim=1), torch.ones(2))
@@ -289,6 +290,12 @@ def test_no_histogram_is_refused(histograms):
         ValueError, match="histograms: expected at least one in each part, got none"
     ):
         HistogramDescriptor(histograms)
+
+
+@pytest.mark.parametrize("shares", [[1.0], [1.0, 0.0], [1.0, float("nan")]])
+def test_each_part_needs_a_positive_share(shares):
+    with pytest.raises(ValueError, match="shares: expected a positive number for each of 2 parts"):
+        HistogramDescriptor([PairHistogram(), PairHistogram()], shares=shares)
 
 
 class Extent(BodyDescriptor):

@@ -235,12 +235,11 @@ def _part_shares(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
     n_cells = _n_cells(descriptor)
     sums: dict[str, float] = {}
     first = 0
-    for group in _histograms(descriptor).parts:
-        for part in group:
-            values = shares[first : first + part.n_cells]
-            first += part.n_cells
-            name = part_name(part)
-            sums[name] = sums.get(name, 0.0) + float(values.sum())
+    for _, part in _histograms(descriptor).histogram_shares:
+        values = shares[first : first + part.n_cells]
+        first += part.n_cells
+        name = part_name(part)
+        sums[name] = sums.get(name, 0.0) + float(values.sum())
     form = shares[None]
     side = size = shares.new_empty(1, 0)
     if isinstance(descriptor, SizeAndSide):
@@ -286,18 +285,16 @@ def _shares_of_body(
     features = BatchFeatures(batch, False)
     total = units.new_zeros(())
     first = 0
-    for group in histograms.parts:
-        n_histograms = len(histograms.parts) * len(group)
-        for part in group:
-            cells = part.of_features(features).flatten() / n_histograms
-            value = cells @ units[first : first + part.n_cells]
-            first += part.n_cells
-            if not value.requires_grad:
-                name = type(part).__name__
-                raise ValueError(
-                    f"descriptor: {name} does not use the weights of samples, see DescriptionPart."
-                )
-            total = total + value / part.degree
+    for share, part in histograms.histogram_shares:
+        cells = share * part.of_features(features).flatten()
+        value = cells @ units[first : first + part.n_cells]
+        first += part.n_cells
+        if not value.requires_grad:
+            name = type(part).__name__
+            raise ValueError(
+                f"descriptor: {name} does not use the weights of samples, see DescriptionPart."
+            )
+        total = total + value / part.degree
     gradients = torch.autograd.grad(total, weights, allow_unused=True, materialize_grads=True)
     shares = {}
     for kind, gradient in zip(SAMPLE_KINDS, gradients, strict=True):

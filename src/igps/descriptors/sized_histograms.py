@@ -28,7 +28,11 @@ class SizedHistograms(HistogramDescriptor):
         """Return a descriptor of the histograms alone."""
         invariant_to = (*self.invariant_to, "scale")
         return HistogramDescriptor(
-            self.parts, name=self.name, source=self.source, invariant_to=invariant_to
+            self.parts,
+            name=self.name,
+            source=self.source,
+            invariant_to=invariant_to,
+            shares=self.shares,
         )
 
     def describe(self, batch: SignatureBatch) -> Tensor:

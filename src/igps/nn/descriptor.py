@@ -1,6 +1,7 @@
 """Base classes of descriptors: description of bodies, requirements, and distances between descriptions."""
 
 import contextlib
+import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -222,9 +223,9 @@ class BodyDescriptor(Descriptor):
 class HistogramDescriptor(Descriptor):
     """One or several histograms of samples or of their pairs, compared by χ².
 
-    Several histograms are flattened and concatenated to one histogram of sum 1. All parts have equal shares, and within
-    a part all histograms; the χ² distance is the mean of the distances of the parts. Histograms that use the same
-    embedding module, or the same subset of samples, share the computation.
+    Several histograms are flattened and concatenated to one histogram of sum 1. Within a part all histograms have equal
+    shares; the χ² distance is the mean of the distances of the parts, weighted by their shares. Histograms that use the
+    same embedding module, or the same subset of samples, share the computation.
 
     Example:
         >>> from igps.nn.histograms.pairs import PairHistogram
@@ -235,9 +236,10 @@ class HistogramDescriptor(Descriptor):
     Args:
         histograms: a `DescriptionPart`, such as a `PairHistogram`; or a list of parts, each of one or several of them.
         name, source, invariant_to: see `Descriptor`.
+        shares: the share of each part, which are divided by their sum; equal shares if None.
 
     Raises:
-        ValueError: no histogram.
+        ValueError: no histogram, or not one positive share for each part.
     """
 
     search_distance: SearchDistance | None = "chi_square"
@@ -249,12 +251,18 @@ class HistogramDescriptor(Descriptor):
         name: str = "histogram",
         source: str = "",
         invariant_to: Sequence[str] = (),
+        shares: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         parts = [histograms] if isinstance(histograms, DescriptionPart) else list(histograms)
         groups = [[part] if isinstance(part, DescriptionPart) else list(part) for part in parts]
         if not groups or not all(groups):
             raise ValueError("histograms: expected at least one in each part, got none.")
+        self.shares = [1.0] * len(groups) if shares is None else list(shares)
+        if len(self.shares) != len(groups) or not all(0 < x < math.inf for x in self.shares):
+            raise ValueError(
+                f"shares: expected a positive number for each of {len(groups)} parts, got {self.shares}."
+            )
         self.histograms = nn.ModuleList(histogram for group in groups for histogram in group)
         # Histograms in each part; None for a single histogram, whose descriptions keep its shape.
         self._sizes = (
@@ -281,6 +289,16 @@ class HistogramDescriptor(Descriptor):
         )
 
     @property
+    def histogram_shares(self) -> list[tuple[float, DescriptionPart]]:
+        """Each histogram with its share of a description; the shares sum to 1."""
+        total = sum(self.shares)
+        return [
+            (share / total / len(part), histogram)
+            for share, part in zip(self.shares, self.parts, strict=True)
+            for histogram in part
+        ]
+
+    @property
     def part_cells(self) -> tuple[int, ...]:
         """The number of cells of each part."""
         return tuple(sum(histogram.n_cells for histogram in part) for part in self.parts)
@@ -301,11 +319,7 @@ class HistogramDescriptor(Descriptor):
         """Return descriptions of sum 1: of a single histogram in its shape (N, ...), of several as (N, cells)."""
         if self._sizes is None:
             return self.parts[0][0](batch)
-        shares = [
-            (1 / (len(self.parts) * len(part)), histogram)
-            for part in self.parts
-            for histogram in part
-        ]
+        shares = self.histogram_shares
 
         def concatenated(group: SignatureBatch) -> Tensor:
             features = BatchFeatures(group, self.training)
