@@ -126,10 +126,13 @@ def outliers(
     names = np.array([label for label, _ in known_kinds])
     codes = np.array([known_kinds.index(kind) for kind in kinds])
     own, other, nearest = _class_distances(np.asarray(distances, dtype=float), codes, names)
-    n_per_subject = _max_bodies_of_subject(subjects or range(len(codes)), codes)
+    n_per_subject = max_bodies_of_subject(subjects or range(len(codes)), codes)
     scores = {
         "shape": np.fmax(
-            *(_deviations(shape, codes, "shape", n_per_subject)[0] for shape in (own, own - other))
+            *(
+                deviations_of(shape, codes, "shape", n_per_subject)[0]
+                for shape in (own, own - other)
+            )
         )
     }
     values = dict(measures or {})
@@ -141,7 +144,7 @@ def outliers(
             values["repairs"][np.isfinite(values["stray"])] = 0
     usual: dict[str, Floats] = {}
     for name, measure in values.items():
-        scores[name], usual[name] = _deviations(measure, codes, name, n_per_subject)
+        scores[name], usual[name] = deviations_of(measure, codes, name, n_per_subject)
     result = []
     for i, label in enumerate(labels):
         deviations = {
@@ -307,7 +310,7 @@ def _class_distances(
     return own, other, nearest
 
 
-def _max_bodies_of_subject(subjects: Sequence[object], codes: Integers) -> int:
+def max_bodies_of_subject(subjects: Sequence[object], codes: Integers) -> int:
     """Return the largest number of bodies of a subject; 1 if subjects are few or have several bodies of a class."""
     counts = Counter(subjects)
     is_usable = (
@@ -317,7 +320,7 @@ def _max_bodies_of_subject(subjects: Sequence[object], codes: Integers) -> int:
     return max(counts.values()) if is_usable else 1
 
 
-def _deviations(
+def deviations_of(
     values: Floats, codes: Integers, name: str, n_per_subject: int
 ) -> tuple[Floats, Floats]:
     """Return how many robust standard deviations values (N,) exceed the usual value, and the usual value.

@@ -24,6 +24,7 @@ COMMANDS: Mapping[str, str] = {
     "groups": "igps.cli.answers:groups",
     "explain": "igps.cli.answers:explain",
     "outliers": "igps.cli.answers:outliers",
+    "asymmetry": "igps.cli.asymmetry:asymmetry",
     "clusters": "igps.cli.clusters:clusters",
     "map": "igps.cli.clusters:map_bodies",
     "trajectory": "igps.cli.trajectory:trajectory",
