@@ -17,7 +17,7 @@ import torch
 import trimesh
 from safetensors import safe_open
 
-from commands import run
+from commands import error_of, run
 from igps.cli.commands import COMMANDS, ENDINGS, load_command
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
@@ -112,6 +112,25 @@ def test_retrieve_prints_and_writes_what_python_computes(
         assert [row["model"] for row in ranked] == [dataset.bodies.names[j] for j in others]
         assert [row["relevant"] for row in ranked] == [str(int(i // 3 == j // 3)) for j in others]
     assert not (out / "failures.csv").exists()
+
+
+def test_some_bodies_ask_the_others(root, tmp_path, monkeypatch, capsys):
+    """The second egg and ball ask the first and the third."""
+    words = ["--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL]
+    out = tmp_path / "out"
+    run(monkeypatch, "retrieve", root, "--queries", "*/1.off", "--out", out, *words)
+    assert "2 queries, each against all that are no queries" in capsys.readouterr().out
+    rows = list(csv.DictReader((out / "ranking.csv").open(newline="")))
+    assert {row["query"] for row in rows} == {"ball/1.off", "egg/1.off"}
+    assert all(row["model"].endswith(("0.off", "2.off")) for row in rows)
+    assert len(rows) == 2 * 4
+    with np.load(out / "distances.npz") as archive:
+        distances = archive["distances"][[1, 4]][:, [0, 2, 3, 5]]
+    expected = retrieval_scores(distances, ["ball", "egg"], ["ball", "ball", "egg", "egg"]).mean()
+    scores = json.loads((out / "scores.json").read_text())
+    assert {name: scores[name] for name in expected} == pytest.approx(expected)
+    wrong = error_of(monkeypatch, capsys, "retrieve", root, "--queries", "left/*", *words)
+    assert "queries: expected a pattern that some bodies match, 0 of 6 match" in wrong
 
 
 def test_results_are_written_though_nobody_reads_what_is_printed(

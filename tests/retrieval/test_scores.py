@@ -17,6 +17,7 @@ from igps.retrieval import (
     euclidean,
     precision_recall_curve,
     retrieval_scores,
+    scores_of_queries,
 )
 from igps.retrieval.metric import RetrievalScoresMetric
 from igps.retrieval.scores import SCORE_NAMES
@@ -461,3 +462,24 @@ def test_metric_refuses_names_that_are_not_aligned():
     metric.update(torch.ones(2, 2), torch.tensor([0, 0]))
     with pytest.raises(ValueError, match="ids: expected in every update or in none"):
         metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a", "b"])
+
+
+def test_queries_with_one_answer_each_are_scored_by_its_rank():
+    """Three left bones ask three right ones: the right one is nearest, second, and third."""
+    labels = ["a", "a", "b", "b", "c", "c"]
+    is_query = [True, False] * 3
+    distances = torch.full((6, 6), 9.0)
+    distances[0, [1, 3, 5]] = torch.tensor([1.0, 2.0, 3.0])
+    distances[2, [1, 3, 5]] = torch.tensor([1.0, 2.0, 3.0])
+    distances[4, [1, 3, 5]] = torch.tensor([1.0, 2.0, 3.0])
+    distances[0, 2] = 0.0  # another query: it is not asked
+    scores = scores_of_queries(distances, labels, is_query)
+    assert scores.has_single_answers
+    assert scores.adr_self is None
+    found = scores.single_answers()
+    assert found["nn"] == pytest.approx(1 / 3)
+    assert found["map"] == pytest.approx((1 + 1 / 2 + 1 / 3) / 3)
+    assert (found["first_5"], found["median_rank"]) == (1, 2)
+    each = scores_of_queries(distances, labels)
+    assert each.n_queries == 6
+    assert not scores_of_queries(distances, ["a", "a", "a", "b", "b", "b"]).has_single_answers

@@ -1,6 +1,7 @@
 """What plain numbers find: the row that stands beside every claim about form."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,16 @@ from igps.data.attribute_sources import named_source
 from igps.data.dataset import SignatureDataset
 from igps.descriptors.measures import Measures
 from igps.mesh.formats import format_of
-from igps.retrieval import RetrievalScores, chi_square, euclidean, retrieval_scores
+from igps.retrieval import RetrievalScores, chi_square, euclidean, scores_of_queries
 from igps.signature.measures import POWERS
 
 _COMPOSITION = "composition"  # 25 shares of residues, and the logarithm of their number
 
 
-def plain_scores(dataset: SignatureDataset) -> dict[str, RetrievalScores]:
-    """Return the scores of plain numbers among labelled bodies, each against all others, by the name of the row.
+def plain_scores(
+    dataset: SignatureDataset, is_query: Sequence[bool] | None = None
+) -> dict[str, RetrievalScores]:
+    """Return the scores of plain numbers among labelled bodies by the name of the row, see `scores_of_queries`.
 
     "measures" and "measures+size" are the logarithms of `igps.measures`, each over its spread in the collection.
     Molecules also have "composition", the shares of residues by χ², and "length of chain".
@@ -30,7 +33,7 @@ def plain_scores(dataset: SignatureDataset) -> dict[str, RetrievalScores]:
     distances = _of_measures(dataset)
     if dataset.bodies.paths and all(map(_holds_chains, dataset.bodies.paths)):
         distances |= _of_residues(dataset)
-    return {name: retrieval_scores(values, labels) for name, values in distances.items()}
+    return {name: scores_of_queries(values, labels, is_query) for name, values in distances.items()}
 
 
 def plain_table(rows: dict[str, RetrievalScores], descriptor: str, own: RetrievalScores) -> str:
@@ -39,10 +42,13 @@ def plain_table(rows: dict[str, RetrievalScores], descriptor: str, own: Retrieva
         return ""
     width = max(map(len, rows))
     lines = [f"plain numbers beside {descriptor}, percent"]
-    lines.append(" " * width + "".join(f"{title:>10}" for title in ("NN", "FT", "DCG")))
+    titles = {"nn": "NN", "ft": "FT", "dcg": "DCG"}
+    if own.has_single_answers:
+        titles = {"nn": "NN", "map": "mAP"}
+    lines.append(" " * width + "".join(f"{title:>10}" for title in titles.values()))
     for name, scores in rows.items():
         means = scores.mean()
-        cells = "".join(f"{100 * means[score]:>10.1f}" for score in ("nn", "ft", "dcg"))
+        cells = "".join(f"{100 * means[score]:>10.1f}" for score in titles)
         lines.append(f"{name:<{width}}{cells}")
     ahead = [name for name, scores in rows.items() if scores.mean()["ft"] >= own.mean()["ft"]]
     if ahead:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict
+from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 def retrieve(
     root: Path,
     descriptor: str = "pretrained",
+    queries: str | None = None,
     out: Path | None = None,
     report: bool = False,
     rerank: bool = False,
@@ -34,6 +37,7 @@ def retrieve(
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
+        queries: bodies whose names match this pattern ask all others, and no other asks, such as "left/*".
         out: folder for scores.json, ranking.csv, distances.npz, meshes.json with the paths of the meshes, failures.csv
             if a mesh could not be used, and descriptor.safetensors, for queries, if the descriptor's centres were
             fitted to the collection.
@@ -48,25 +52,29 @@ def retrieve(
     from igps.cli.report import report as write_report
     from igps.report.tables import scores_table
     from igps.retrieval import rerank as reranked_distances
-    from igps.retrieval import retrieval_scores
+    from igps.retrieval import scores_of_queries
 
     check_report_folder(report, out)
-    result = described(Folder(root, labelled=True, check=_check_scored), descriptor, **describing)
+    if report and queries is not None:
+        raise ValueError("report: expected no --queries with it: on the page, each body asks.")
+    check = partial(_check_scored, queries=queries)
+    result = described(Folder(root, labelled=True, check=check), descriptor, **describing)
     labels = result.dataset.bodies.labels or ()
+    is_query = check(result.dataset.bodies)
     distances = {"distances": pair_distances(result.descriptor, result.descriptions, progress=True)}
-    scores = retrieval_scores(distances["distances"], labels)
-    plain = plain_scores(result.dataset)
+    scores = scores_of_queries(distances["distances"], labels, is_query)
+    plain = plain_scores(result.dataset, is_query)
     beside = plain_table(plain, result.descriptor.name, scores)
     summary = _summary(result, scores)
     summary["plain_numbers"] = {name: row.mean() for name, row in plain.items()}
     tables = scores_table(scores)
     if rerank:
         distances["reranked"] = reranked_distances(distances["distances"])
-        scores = retrieval_scores(distances["reranked"], labels)
-        summary["reranked"] = scores.mean()
+        scores = scores_of_queries(distances["reranked"], labels, is_query)
+        summary["reranked"] = _means(scores)
         tables += f"\n\nre-ranked by the whole collection, without labels\n{scores_table(scores)}"
     if out is not None:  # before printing, because a closed pipe, as of `head`, ends the command
-        _write_retrieval(out, result, summary, distances)
+        _write_retrieval(out, result, summary, distances, is_query)
     print(tables)
     print(beside)
     print_failures(result.failures, len(result.dataset))
@@ -267,19 +275,34 @@ def _describe_body(mesh: Path, descriptor: Descriptor, **describing: Any) -> Ten
     return result.descriptions
 
 
-def _check_scored(bodies: Bodies) -> None:
+def _check_scored(bodies: Bodies, queries: str | None) -> list[bool] | None:
+    """Return which bodies are queries, None if all are; raise a ValueError if there is nothing to score."""
+    if queries is not None:
+        is_query = [fnmatchcase(name, queries) for name in bodies.names]
+        n_queries = sum(is_query)
+        if n_queries in (0, len(bodies)):
+            raise ValueError(
+                f"queries: expected a pattern that some bodies match, {n_queries} of {len(bodies)} match "
+                f"{queries!r}. The first is called {bodies.names[0]}."
+            )
+        return is_query
     if len(set(bodies.labels or ())) == len(bodies):
         raise ValueError(
             f"root: expected a class of two bodies or more, got {len(bodies)} classes of one. Put similar bodies into "
             "one class."
         )
+    return None
+
+
+def _means(scores: RetrievalScores) -> dict[str, float]:
+    return scores.mean() | (scores.single_answers() if scores.has_single_answers else {})
 
 
 def _summary(result: Described, scores: RetrievalScores) -> dict[str, Any]:
     n_used = len(result.dataset)
     n_refused = len(result.failures)
     return {
-        **scores.mean(),
+        **_means(scores),
         "n_queries": scores.n_queries,
         "n_given": n_used + n_refused,
         "n_used": n_used,
@@ -293,9 +316,14 @@ def _summary(result: Described, scores: RetrievalScores) -> dict[str, Any]:
 
 
 def _write_retrieval(
-    out: Path, result: Described, summary: dict[str, Any], distances: dict[str, Tensor]
+    out: Path,
+    result: Described,
+    summary: dict[str, Any],
+    distances: dict[str, Tensor],
+    is_query: list[bool] | None,
 ) -> None:
     import numpy as np
+    import torch
     from tqdm import tqdm
 
     from igps.cli.reading import write_mending_notes
@@ -313,10 +341,14 @@ def _write_retrieval(
     )
 
     def ranking() -> Iterator[tuple[Any, ...]]:
+        asks = torch.tensor(is_query or [False] * len(names))
         for i, order in enumerate(tqdm(rank(distances["distances"]), desc="rankings")):
+            if is_query is not None and not is_query[i]:
+                continue
             # Much faster than access to single entries of a tensor
             row = distances["distances"][i].tolist()
-            for place, j in enumerate(order[order != i].tolist(), 1):
+            others = order[(order != i) & ~asks[order]]
+            for place, j in enumerate(others.tolist(), 1):
                 yield names[i], place, names[j], f"{row[j]:.6g}", int(labels[i] == labels[j])
 
     write_rows(out / "ranking.csv", ("query", "rank", "model", "distance", "relevant"), ranking())

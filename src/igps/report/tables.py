@@ -43,7 +43,19 @@ def write_rows(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]])
 
 
 def scores_table(scores: RetrievalScores) -> str:
-    """Return a text table of scores in percent: one line for all queries, one per class."""
+    """Return a text table of scores in percent: one line for all queries, one per class.
+
+    Where each query has one relevant body, as in classes of two, one line of the scores that suit it.
+    """
+    if scores.has_single_answers:
+        found = scores.single_answers()
+        titles = ("NN", "first 5", "first 10", "mAP", "median rank")
+        cells = [f"{100 * found[name]:.1f}" for name in ("nn", "first_5", "first_10", "map")]
+        cells.append(f"{found['median_rank']:.0f}")
+        lines = ["".join(f"{cell:>12}" for cell in row) for row in (titles, cells)]
+        of_queries = "each with one body of its class among those that it asks"
+        lines.append(f"percent, {scores.n_queries} queries, {of_queries}; mAP: mean of 1/rank")
+        return "\n".join(lines)
     columns = {name: title for name, title in TITLES.items() if name in scores.mean()}
     rows = {
         "all": scores.mean(),
@@ -55,7 +67,8 @@ def scores_table(scores: RetrievalScores) -> str:
         f"{name:<{width}}" + "".join(f"{100 * row[key]:>10.1f}" for key in columns)
         for name, row in rows.items()
     ]
-    lines.append(f"percent, {scores.n_queries} queries, each against all others")
+    others = "all others" if scores.adr_self is not None else "all that are no queries"
+    lines.append(f"percent, {scores.n_queries} queries, each against {others}")
     if scores.n_excluded:
         lines.append(
             f"not used as queries, because they are alone in their class: {scores.n_excluded}"

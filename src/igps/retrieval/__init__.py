@@ -9,6 +9,7 @@ from igps.retrieval.scores import (
     RetrievalScores,
     precision_recall_curve,
     retrieval_scores,
+    scores_of_queries,
 )
 
 __all__ = [
@@ -26,5 +27,6 @@ __all__ = [
     "rerank",
     "rerank_candidates",
     "retrieval_scores",
+    "scores_of_queries",
     "search",
 ]

@@ -45,6 +45,9 @@ class RetrievalScores:
     map: Tensor  # average precision, (1/R) Σ_k rel(k) · (hits in the first k)/k
     labels: tuple[Hashable, ...]  # of each query
     scored: Tensor  # (Q,) bool, False where the query has no relevant entry
+    has_single_answers: bool = (
+        False  # whether each scored query has one relevant entry, as in classes of two
+    )
 
     @property
     def n_queries(self) -> int:
@@ -59,6 +62,17 @@ class RetrievalScores:
     def mean(self) -> dict[str, float]:
         """Return the mean of every score over the scored queries, without `adr_self` if it is None."""
         return self._mean_over(self.scored)
+
+    def single_answers(self) -> dict[str, float]:
+        """Return what suits queries with one relevant entry, of which E-measure and DCG tell little.
+
+        `nn`, `first_5` and `first_10` are the shares of queries whose entry is nearest, among the first 5, and among
+        the first 10; `map` is the mean of 1/rank, and `median_rank` the median of the rank.
+        """
+        ranks = 1 / self.map[self.scored]
+        shares = {"nn": 1, "first_5": 5, "first_10": 10}
+        found = {name: float((ranks < n + 0.5).double().mean()) for name, n in shares.items()}
+        return {**found, "map": float((1 / ranks).mean()), "median_rank": float(ranks.median())}
 
     def per_class(self) -> dict[Hashable, dict[str, float]]:
         """Return the means over the scored queries of each class that has any, classes in order of appearance."""
@@ -157,7 +171,26 @@ def retrieval_scores(
         map=defined((relevant * hits / ranks[:-1]).sum(1) / n_relevant),
         labels=labels,
         scored=scored,
+        has_single_answers=bool((n_relevant[scored] == 1).all()),
     )
+
+
+def scores_of_queries(
+    distances: Tensor, labels: Sequence[Any], is_query: Sequence[bool] | None = None
+) -> RetrievalScores:
+    """Compute the scores of N bodies: of each against all others, or of some against those that are no queries.
+
+    Args:
+        distances: (N, N), see `retrieval_scores`.
+        labels: classes of the N bodies.
+        is_query: which bodies are queries; each against all others if None.
+    """
+    if is_query is None:
+        return retrieval_scores(distances, labels)
+    asks = torch.tensor(is_query, device=distances.device)
+    queries = [label for label, asked in zip(labels, is_query, strict=True) if asked]
+    gallery = [label for label, asked in zip(labels, is_query, strict=True) if not asked]
+    return retrieval_scores(distances[asks][:, ~asks], queries, gallery)
 
 
 def precision_recall_curve(

@@ -894,6 +894,20 @@ def test_dicom_that_is_no_segmentation_is_refused(tmp_path: Path) -> None:
         read_label_volume(path)
 
 
+def test_contours_of_radiotherapy_are_refused_with_what_converts_them(tmp_path):
+    pydicom = pytest.importorskip("pydicom", reason="the extra [volumes]")
+    dataset = pydicom.Dataset()
+    dataset.Modality = "RTSTRUCT"
+    dataset.SOPClassUID = "1.2.840.10008.5.1.4.1.1.481.3"
+    dataset.SOPInstanceUID = pydicom.uid.generate_uid()
+    dataset.file_meta = pydicom.dataset.FileMetaDataset()
+    dataset.file_meta.TransferSyntaxUID = pydicom.uid.ExplicitVRLittleEndian
+    path = tmp_path / "rs.dcm"
+    dataset.save_as(path, enforce_file_format=True)
+    with pytest.raises(MeshError, match=r"contours and no voxels.*dcmrtstruct2nii convert -r rs"):
+        read_label_volume(path)
+
+
 def test_a_table_that_names_nothing_is_refused(tmp_path: Path) -> None:
     (tmp_path / "names.txt").write_text("hello\n")
     with pytest.raises(MeshError, match="names no label"):

@@ -360,7 +360,12 @@ def _highdicom(path: Path) -> RawVolume:
     from highdicom.seg import Segmentation
 
     dataset = pydicom.dcmread(path)
-    if (modality := dataset.get("Modality", "none")) != "SEG":
+    modality = dataset.get("Modality", "none")
+    if modality == "RTSTRUCT":
+        remedy = "Convert it to masks on the grid of its image, with 3D Slicer (SlicerRT) or by"
+        convert = f"dcmrtstruct2nii convert -r {path.name} -d FOLDER_OF_THE_IMAGE -o MASKS"
+        raise MeshError(f"{path}: RTSTRUCT holds contours and no voxels. {remedy}: {convert}")
+    if modality != "SEG":
         raise MeshError(
             f"{path}: expected DICOM of modality SEG, got {modality}. Export the labels as DICOM SEG."
         )
