@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from igps.analysis.clusters import STABLE, clusters_of
-from igps.analysis.map import body_map
+from igps.analysis.map import body_map, ends_of_axis
 
 
 def blobs(n_each: int, centres: list[list[float]], scatter: float, seed: int = 0) -> np.ndarray:
@@ -166,3 +166,14 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves():
 def test_too_few_bodies_have_no_stability():
     points = np.random.default_rng(6).normal(size=(4, 2))
     assert np.isnan(clusters_of(cdist(points, points), 3).stability).all()
+
+
+def test_the_ends_of_an_axis_and_what_it_holds():
+    """Points of a cross: the longer arm has its share of the squared distances, by the variances."""
+    points = np.array([[-3.0, 0], [0, 0], [4, 0], [0, 1], [0, -1]])
+    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    variances = points.var(axis=0)
+    for axis, ends in ((1, {0, 2}), (2, {3, 4})):
+        found, share = ends_of_axis(distances, axis)
+        assert set(found) == ends
+        assert share == pytest.approx(variances[axis - 1] / variances.sum(), rel=1e-3)

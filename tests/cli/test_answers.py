@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -402,6 +403,21 @@ def test_explain_heeds_size_and_side(
     assert shares["size"] + shares["side"] == pytest.approx(found["distance"], rel=1e-3)
     if is_group:  # painted is the middle of each, although some of its numbers are negative
         assert {name[-5] for name in found["bodies"]} <= set("2345")
+
+
+def test_explain_shows_the_ends_of_an_axis_of_the_map(root, tmp_path, monkeypatch, capsys):
+    """Eggs vary in their height alone: from the ball to the longest."""
+    igps(monkeypatch, root, "explain", root, *OWN, "--axis", 1, "--out", tmp_path)
+    printed = capsys.readouterr().out
+    share = re.search(
+        r"axis 1 of the map has (\d+)% of the squared distances of 13 bodies", printed
+    )
+    assert share is not None
+    assert int(share[1]) > 80
+    assert len(list(tmp_path.glob("explain_*.ply"))) == 2
+    assert imread(tmp_path / "explain.png").std() > 0.02
+    found = {row["name"] for row in table(tmp_path / "explain_samples.csv")}
+    assert found == {"short0.off", "long3.off"}
 
 
 def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are() -> None:

@@ -81,6 +81,19 @@ def body_map(distances: Floats, layout: Layout = "mds", *, seed: int = 0) -> Bod
     return BodyMap(rotated, _stress(square, rotated))
 
 
+def ends_of_axis(distances: Floats, axis: int) -> tuple[tuple[int, int], float]:
+    """Return the two bodies at the ends of an axis of the map, and the share of the squared distances along the axis.
+
+    Args:
+        distances: (N, N) distances.
+        axis: 1 or 2, see `body_map`.
+    """
+    along = body_map(distances).points[:, axis - 1]
+    # The mean square of a distance is twice the variance
+    share = 2 * float(along.var() / np.square(checked_distances(distances)).mean())
+    return (int(along.argmin()), int(along.argmax())), share
+
+
 def _classical_mds(distances: Floats) -> Floats:
     squares = distances**2
     n = len(distances)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from igps.analysis.explanation import Explanation
     from igps.analysis.groups import GroupTest
     from igps.analysis.superposition import Movement
-    from igps.cli.reading import Described
+    from igps.cli.reading import Described, Folder
     from igps.data.dataset import SignatureDataset
     from igps.data.sources import Bodies
     from igps.report.answers import Painted
@@ -278,11 +278,27 @@ def outliers(
     return rows
 
 
+@dataclass(frozen=True, eq=False)
+class _Explained:
+    """What `igps explain` shows of two bodies."""
+
+    descriptor: str
+    dataset: SignatureDataset
+    pair: list[int]  # indices of both bodies
+    explanation: Explanation
+    painted: list[Painted]
+    legend: str  # of what is painted
+    lines: list[str]  # to print
+    moved: Movement | None = None
+    meaning: str | None = None  # of the distance, in words
+
+
 def explain(
     meshes: list[Path],
     descriptor: str = "pretrained",
     group: str | None = None,
     body: str | None = None,
+    axis: int | None = None,
     level: float = 0.05,
     out: Path | None = None,
     **describing: Any,
@@ -294,6 +310,8 @@ def explain(
         descriptor: a descriptor made of histograms, such as interior, rich or pretrained.
         group: column of labels.csv that holds the groups of a folder; the class if not given.
         body: of a folder, only the bodies of this name in their files, such as an organ.
+        axis: of a folder, the two bodies at the ends of axis 1 or 2 of its map, see igps map, between which its
+            bodies vary most; without groups.
         level: family-wise error rate, for two groups: only histogram cells and places that differ significantly count.
         out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and
             explain.svg and explain.png: two bodies painted with their shares, or the mean difference of two groups;
@@ -301,126 +319,172 @@ def explain(
             of two molecules of one sequence also explain_residues.csv, and both superposed as explain_1.cif and
             explain_2.cif with the shares of residues in percent in place of B-factors.
     """
-    import numpy as np
-
-    from igps.analysis.explanation import explain_bodies, explain_groups, without_head
-    from igps.analysis.groups import squared_distances
-    from igps.analysis.superposition import movement
-    from igps.cli.places import places_of_groups
-    from igps.cli.reading import Folder, check_files, described, files_or_folder
+    from igps.analysis.explanation import without_head
+    from igps.cli.reading import Folder, check_files, files_or_folder
     from igps.descriptors import descriptor as descriptor_of
-    from igps.descriptors.fingerprint import cache_tag
-    from igps.descriptors.size_and_side import SIZE
-    from igps.nn.description import describe
-    from igps.report.answers import (
-        painted_figure,
-        write_analysis,
-        write_movement,
-        write_painted,
-    )
+    from igps.report.answers import painted_figure, write_analysis, write_movement, write_painted
     from igps.report.drawing import file_names
 
     check_fraction(level=level)
+    if axis not in (None, 1, 2):
+        raise ValueError(f"axis: expected 1 or 2, got {axis}.")
     source = files_or_folder(meshes)
+    if axis is not None and group is not None:
+        raise ValueError("axis, group: expected one of them. Leave the other out.")
     if not isinstance(source, Folder):
         if len(source) != 2:
             raise ValueError(
                 f"meshes: expected two files, or a folder of two groups, got {len(source)} files."
             )
-        if group is not None or body is not None:
-            raise ValueError("group, body: expected a folder with them, got files. Leave them out.")
+        if (group, body, axis) != (None, None, None):
+            raise ValueError(
+                "group, body, axis: expected a folder with them, got files. Leave them out."
+            )
         check_files(source)
     # Raises for other descriptors before anything is computed
     without_head(descriptor_of(descriptor))
-    moved = None
-    if isinstance(source, Folder):
+    if not isinstance(source, Folder):
+        found = _explain_files(source, descriptor, **describing)
+    elif axis is not None:
+        found = _explain_axis(Folder(source.root, body=body), descriptor, axis, **describing)
+    else:
         check = partial(_two_groups, group=group)
         folder = Folder(source.root, group is None, check=check, body=body)
-        result = described(folder, descriptor, **describing)
-        dataset = result.dataset
-        module = result.descriptor
-        labels = check(dataset.bodies)  # without the bodies that could not be used
-        parts_found = len(set(dataset.bodies.parts))
-        if body is None and parts_found > 1:
-            print(f"{parts_found} kinds of bodies are taken together; --body NAME chooses one")
-        inner = without_head(module)
-        n_workers = describing.get("n_workers")
-        descriptions = describe(
-            dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True
-        )
-        members = [np.flatnonzero(labels == name) for name in sorted(set(labels))]
-        squares = squared_distances(inner.coordinates(descriptions).double().numpy())
-        # The medoids
-        pair = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]
-        batches = [dataset.batch([i]) for i in pair]
-        first, second = (descriptions[own] for own in members)
-        explanation, is_significant = explain_groups(module, first, second, batches, level=level)
-        n_cells = f"{int(is_significant.sum())} of {len(is_significant)}"
-        print(f"{n_cells} cells differ significantly; their samples: in the medoid of each group")
-        places = places_of_groups(
-            dataset,
-            range(len(dataset)),
-            result.coordinates(),
-            labels.tolist(),
-            keep_size=SIZE in module.name,
-            n_workers=n_workers,
-            level=level,
-        )
-    else:
-        result = described(source, descriptor, **{**describing, "strict": True})
-        pair = [0, 1]
-        dataset = result.dataset
-        module = result.descriptor
-        if len(dataset) != 2:
-            listed = ", ".join(dataset.bodies.names[:4])
-            raise ValueError(
-                f"meshes: expected two bodies, got {len(dataset)}: {listed}. Name each as FILE#PART."
-            )
-        moved = movement(*dataset.bodies)
-        explanation = explain_bodies(module, dataset, moved)
-    names = [dataset.bodies.names[i] for i in pair]
-    print(
-        f"{' and '.join(names)}: {explanation.distance:.4g} by {module.name}: {explanation.summary()}"
-    )
-    meaning = None
-    if not isinstance(source, Folder):
-        meaning = _meaning(descriptor, dataset, explanation.distance)
-        print(meaning or f"what this distance means is known for {CALIBRATED} alone")
-    if isinstance(source, Folder):
-        painted = [places.painted]
-        legend = places.legend
-        print(places.words)
-    else:
-        painted = [_painted(dataset, i, explanation, side) for side, i in enumerate(pair)]
-        legend = "share of the distance, over that of an even spread"
-        _print_extents(painted, moved)
+        found = _explain_groups(folder, descriptor, level, **describing)
+    explanation = found.explanation
+    names = [found.dataset.bodies.names[i] for i in found.pair]
+    of_names = " and ".join(names)
+    print(f"{of_names}: {explanation.distance:.4g} by {found.descriptor}: {explanation.summary()}")
+    for line in found.lines:
+        print(line)
     parts = [{"histogram": name, "share": share} for name, share in explanation.parts.items()]
     if out is not None:
-        write_analysis(out, "explain_samples", _sample_rows(dataset, pair, explanation))
-        superposed = _superposed(painted, moved)
-        write_analysis(out, "explain", parts, painted_figure(painted, legend, superposed))
-        files = [f"explain_{name}" for name in file_names([one.name for one in painted])]
-        write_painted(out, files, painted, dataset)
-        if moved is not None:
-            write_movement(out, names, moved)
+        rows = _sample_rows(found.dataset, found.pair, explanation)
+        write_analysis(out, "explain_samples", rows)
+        superposed = _superposed(found.painted, found.moved)
+        figure = painted_figure(found.painted, found.legend, superposed)
+        write_analysis(out, "explain", parts, figure)
+        files = [f"explain_{name}" for name in file_names([one.name for one in found.painted])]
+        write_painted(out, files, found.painted, found.dataset)
+        if found.moved is not None:
+            write_movement(out, names, found.moved)
         print(f"written to {out}")
     return {
         "bodies": names,
         "distance": explanation.distance,
-        "meaning": meaning,
+        "meaning": found.meaning,
         "shares": parts,
     }
 
 
-def _print_extents(painted: Sequence[Painted], movement: Movement | None) -> None:
-    """Print what is painted, and how much of each surface holds half of the paint."""
+def _explain_groups(folder: Folder, descriptor: str, level: float, **describing: Any) -> _Explained:
+    """Return the medoids of two groups, and their mean difference, painted on the body nearest to the mean."""
+    import numpy as np
+
+    from igps.analysis.explanation import explain_groups, without_head
+    from igps.analysis.groups import squared_distances
+    from igps.cli.places import places_of_groups
+    from igps.cli.reading import described
+    from igps.descriptors.fingerprint import cache_tag
+    from igps.descriptors.size_and_side import SIZE
+    from igps.nn.description import describe
+
+    result = described(folder, descriptor, **describing)
+    dataset = result.dataset
+    assert folder.check is not None
+    labels = folder.check(dataset.bodies)  # without the bodies that could not be used
+    _print_kinds(dataset, folder.body)
+    inner = without_head(result.descriptor)
+    n_workers = describing.get("n_workers")
+    descriptions = describe(
+        dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True
+    )
+    members = [np.flatnonzero(labels == name) for name in sorted(set(labels))]
+    squares = squared_distances(inner.coordinates(descriptions).double().numpy())
+    # The medoids
+    pair = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]
+    batches = [dataset.batch([i]) for i in pair]
+    first, second = (descriptions[own] for own in members)
+    explanation, is_significant = explain_groups(
+        result.descriptor, first, second, batches, level=level
+    )
+    n_cells = f"{int(is_significant.sum())} of {len(is_significant)}"
+    print(f"{n_cells} cells differ significantly; their samples: in the medoid of each group")
+    places = places_of_groups(
+        dataset,
+        range(len(dataset)),
+        result.coordinates(),
+        labels.tolist(),
+        keep_size=SIZE in result.descriptor.name,
+        n_workers=n_workers,
+        level=level,
+    )
+    name = result.descriptor.name
+    painted = [places.painted]
+    return _Explained(name, dataset, pair, explanation, painted, places.legend, [places.words])
+
+
+def _explain_axis(folder: Folder, descriptor: str, axis: int, **describing: Any) -> _Explained:
+    """Return the two bodies of a folder at the ends of an axis of its map."""
+    from igps.analysis.comparison import pair_distances
+    from igps.analysis.map import ends_of_axis
+    from igps.cli.reading import described
+
+    result = described(folder, descriptor, **describing)
+    _print_kinds(result.dataset, folder.body)
+    distances = pair_distances(result.descriptor, result.descriptions, progress=True)
+    ends, share = ends_of_axis(distances.double().numpy(), axis)
+    n = len(result.dataset)
+    print(
+        f"axis {axis} of the map has {share:.0%} of the squared distances of {n} bodies; its ends:"
+    )
+    return _explain_pair(result, list(ends), descriptor)
+
+
+def _explain_files(files: Sequence[Path], descriptor: str, **describing: Any) -> _Explained:
+    from igps.cli.reading import described
+
+    result = described(files, descriptor, **{**describing, "strict": True})
+    names = result.dataset.bodies.names
+    if len(names) != 2:
+        listed = ", ".join(names[:4])
+        raise ValueError(
+            f"meshes: expected two bodies, got {len(names)}: {listed}. Name each as FILE#PART."
+        )
+    return _explain_pair(result, [0, 1], descriptor)
+
+
+def _explain_pair(result: Described, pair: list[int], descriptor: str) -> _Explained:
+    from igps.analysis.explanation import explain_bodies
+    from igps.analysis.superposition import movement
+
+    dataset = result.dataset.subset(pair)
+    moved = movement(*dataset.bodies)
+    explanation = explain_bodies(result.descriptor, dataset, moved)
+    painted = [_painted(dataset, i, explanation, i) for i in (0, 1)]
+    legend = "share of the distance, over that of an even spread"
+    meaning = _meaning(descriptor, dataset, explanation.distance)
+    lines = [meaning or f"what this distance means is known for {CALIBRATED} alone"]
+    lines += _extents(painted, moved)
+    name = result.descriptor.name
+    return _Explained(name, dataset, [0, 1], explanation, painted, legend, lines, moved, meaning)
+
+
+def _print_kinds(dataset: SignatureDataset, body: str | None) -> None:
+    n_kinds = len(set(dataset.bodies.parts))
+    if body is None and n_kinds > 1:
+        print(f"{n_kinds} kinds of bodies are taken together; --body NAME chooses one")
+
+
+def _extents(painted: Sequence[Painted], movement: Movement | None) -> list[str]:
+    """Return in words what is painted, and how much of each surface holds half of the paint."""
     from igps.mesh.surface import vertex_areas
 
-    if movement is not None:
-        print(_moved_words(movement))
+    lines = [] if movement is None else [_moved_words(movement)]
     for one in painted:
         areas = vertex_areas(one.mesh.vertices, one.mesh.faces)
-        print(f"{one.name}: {_extent(one.values, areas)}")
+        lines.append(f"{one.name}: {_extent(one.values, areas)}")
+    return lines
 
 
 def _moved_words(movement: Movement) -> str:
