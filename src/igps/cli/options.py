@@ -147,7 +147,7 @@ computed, and `describing` also how their descriptions are compared.
 SHARED = GROUPS["describing"]
 
 COMMON = (
-    *("bodies", "mend", "names", "classes", "attribute", "cache_dir", "n_workers", "strict"),
+    *("bodies", "mend", "names", "classes", "attribute", "cache_dir", "n_workers"),
     *("size", "mirror"),
 )
 """The shared options that the help of each command shows; `igps help options` shows all."""
