@@ -41,6 +41,11 @@ def build(
     from igps.gallery.opening import tables
     from igps.nn.description import check_centres
 
+    if reading.get("complete"):
+        raise ValueError(
+            "complete: a gallery has all bodies of its folder, as igps gallery sync brings it up to date. "
+            "Leave it out, or build from a folder without the cut bodies."
+        )
     descriptor = with_side(descriptor, mirror, size)
     module = descriptor_of(descriptor)
     check_centres(module)
