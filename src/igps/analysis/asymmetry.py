@@ -56,8 +56,8 @@ def find_pairs(bodies: Bodies) -> list[Pair]:
     """Return the pairs of bodies whose names differ by a side alone, such as `kidney_left` and `kidney_right`.
 
     The side may stand in the name of a body in its file, in that of the file, or in that of a folder. What remains of
-    it names the structure, and the other parts of the path name the subject. If only one subject remains, as for
-    `left/1.ply` or `1_left.ply`, its structures are the subjects.
+    it names the structure, and the other parts of the path name the subject. If no part of a path is left, as for
+    `1_left.ply` and `2_left.ply`, the structures are the subjects.
     """
     places = [_place(name, part) for name, part in zip(bodies.names, bodies.parts, strict=True)]
     sided: dict[str, dict[tuple[str, str], int]] = {"l": {}, "r": {}}
@@ -69,12 +69,10 @@ def find_pairs(bodies: Bodies) -> list[Pair]:
     for (subject, structure), left in sided["l"].items():
         right = sided["r"].get((subject, structure))
         if right is not None:
-            pairs.append(Pair(subject, structure or "all", left, right))
+            pairs.append(Pair(subject or ".", structure or "all", left, right))
     subjects = {pair.subject for pair in pairs}
-    if len(subjects) == 1 and len(pairs) > 1 and not any(bodies.parts):
-        return [
-            Pair(pair.structure, pair.subject or "all", pair.left, pair.right) for pair in pairs
-        ]
+    if subjects == {"."} and len(pairs) > 1 and not any(bodies.parts):
+        return [Pair(pair.structure, "all", pair.left, pair.right) for pair in pairs]
     return pairs
 
 
