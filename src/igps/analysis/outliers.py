@@ -27,8 +27,9 @@ from igps.analysis.segmentation import (
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import group_by_file
 from igps.data.pipeline import SignaturePipeline
+from igps.fields.volumes.label_surface import MIN_VOXELS, TooFewVoxelsError
 from igps.mesh.errors import MeshError
-from igps.mesh.loading import BodyRef, each_surface, surface_body
+from igps.mesh.loading import BodyRef, each_raw_body, surface_body
 from igps.mesh.mesh import Mesh, millimetres
 from igps.mesh.raw_body import RawBody
 from igps.mesh.surface import area_vectors
@@ -179,7 +180,7 @@ def outliers(
 
 
 def measure_bodies(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Floats]:
-    """Measure properties of each body in which segmentations often fail; NaN where its mesh cannot be read again.
+    """Measure properties of each body in which segmentations often fail; NaN where its file cannot be read again.
 
     Args:
         dataset: N bodies.
@@ -245,9 +246,8 @@ def _measure_file(
 ) -> dict[BodyRef, tuple[list[float], Place | None]]:
     """Measure bodies of the same file, which is read once; bodies without a surface are left out."""
     result = {}
-    for body, raw in each_surface(
-        bodies[0].path, pipeline.reading, parts=[body.part for body in bodies]
-    ):
+    parts = [body.part for body in bodies]
+    for body, raw in each_raw_body(bodies[0].path, pipeline.reading, parts=parts):
         with contextlib.suppress(MeshError):
             result[body] = _measure(pipeline, body, raw)
     return result
@@ -257,20 +257,27 @@ def _measure(
     pipeline: SignaturePipeline, body: BodyRef, raw: RawBody
 ) -> tuple[list[float], Place | None]:
     """Return the measures `_MEASURED` of a body, and the place of a label."""
-    mesh = surface_body(raw, body, pipeline.reading, least_vertices=pipeline.config.n_vertices_read)
     values = dict.fromkeys(_MEASURED, np.nan)
-    length = millimetres(mesh.unit)
-    values["volume"] = np.log(mesh.volume * length**3)
     if raw.voxels is None:
+        least_vertices = pipeline.config.n_vertices_read
+        made = raw.made()
+        mesh = surface_body(made, body, pipeline.reading, least_vertices=least_vertices)
+        length = millimetres(mesh.unit)
+        values["volume"] = np.log(mesh.volume * length**3)
         values["spacing"] = np.log(mesh.area * length**2 / len(mesh.faces)) / 2
         values["handles"] = mesh.genus
         values["flat"] = flat_share(mesh)
         return list(values.values()), None
     voxels = raw.voxels()
     mask = voxels.mask
+    n_voxels = int(mask.sum())
+    if n_voxels < MIN_VOXELS:
+        raise TooFewVoxelsError(f"{body}: {n_voxels} voxels have no shape.")
     low = voxels.low
     grid = voxels.grid
     sides = np.linalg.norm(voxels.affine[:3, :3], axis=0)
+    voxel_volume = abs(np.linalg.det(voxels.affine[:3, :3]))
+    values["volume"] = np.log(n_voxels * voxel_volume)
     # Faces do not tell: the surface of a label adapts them to the shape
     values["spacing"] = np.log(sides.prod()) / 3
     values["stray"] = stray_root(mask)
@@ -279,7 +286,7 @@ def _measure(
     values["gap"] = gap_root(mask, sides)
     values["cut"] = cut_end(mask, np.stack([low == 0, low + mask.shape == grid], axis=1))
     key = body.path.parent, grid, voxels.affine.tobytes()
-    return list(values.values()), Place(key, low, mask.shape, int(mask.sum()), np.packbits(mask))
+    return list(values.values()), Place(key, low, mask.shape, n_voxels, np.packbits(mask))
 
 
 def _class_distances(

@@ -127,17 +127,27 @@ def each_surface(
     parts: Sequence[str | None] | None = None,
 ) -> Iterator[tuple[BodyRef, RawBody]]:
     """Iterate over the unchecked surfaces of the bodies of a file, or of the given parts; see `each_body`."""
+    for ref, raw in each_raw_body(path, options, parts=parts):
+        with one_thread():
+            try:
+                with faults(ref, _format(ref.path)):
+                    body = raw.made()
+            except MeshError as fault:  # the other bodies may be sound
+                body = replace(raw, fault=fault, make=None)
+        yield ref, body
+
+
+def each_raw_body(
+    path: str | Path,
+    options: LoadOptions = LoadOptions(),
+    *,
+    parts: Sequence[str | None] | None = None,
+) -> Iterator[tuple[BodyRef, RawBody]]:
+    """Iterate over the bodies of a file as they were read, slow surfaces not yet computed; see `RawBody.made`."""
     path = Path(path)
     for raw in _read(path, options, parts[0] if parts and len(parts) == 1 else None):
         if parts is None or raw.part in parts:
-            ref = BodyRef(path, raw.part)
-            with one_thread():
-                try:
-                    with faults(ref, _format(path)):
-                        body = raw.made()
-                except MeshError as fault:  # the other bodies may be sound
-                    body = replace(raw, fault=fault, make=None)
-            yield ref, body
+            yield BodyRef(path, raw.part), raw
 
 
 def read_surface(

@@ -89,7 +89,7 @@ def deferred(
             given=mesh.given,
         )
 
-    return RawBody(part=part, make=compute)
+    return RawBody(part=part, make=compute, voxels=voxels)
 
 
 def joined(bodies: Sequence[RawBody]) -> RawBody:
