@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.signature import mean_value as coordinates
-from igps.spectra import _products as products
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
 torch.set_num_threads(1)
@@ -31,7 +30,7 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 @pytest.fixture(params=["loops", "BLAS"])
 def either_processor(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Multiply by compiled loops and by BLAS, whichever is faster on this processor."""
-    monkeypatch.setattr(products, "loops_beat_blas", lambda: request.param == "loops")
+    monkeypatch.setattr("igps.spectra._products.loops_beat_blas", lambda: request.param == "loops")
 
 
 @pytest.fixture

@@ -340,7 +340,6 @@ def test_a_training_step_is_computed_on_one_thread(blob):
         "enable_checkpointing": False,
         "enable_progress_bar": False,
     }
-    # Type: ignore[arg-type]
     trainer = Trainer(
         max_epochs=1, accumulate_grad_batches=2, enable_model_summary=False, **options
     )

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
-from igps.analysis import comparison
 from igps.analysis.comparison import Result, compare
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
@@ -60,7 +58,9 @@ def test_result_is_what_heights_give(dataset):
     expected = retrieval_scores((heights[:, None] - heights).abs(), result.labels).mean()
     assert {name: row[name] for name in expected} == pytest.approx(expected)
     assert 0 < row["nn"] < 1
-    assert (row["descriptor"], row["n_models"], row["invariant_to"]) == ("tall", 6, ["motion"])
+    assert row["descriptor"] == "tall"
+    assert row["n_models"] == 6
+    assert row["invariant_to"] == ["motion"]
     assert not result.failures
     assert result.error is None
 
@@ -77,7 +77,9 @@ def test_a_mesh_that_one_descriptor_cannot_describe_is_its_failure_alone(dataset
     assert results["picky"].row()["n_models"] == 5
     assert results["picky"].labels == ("ball", "ball", "ball", "egg", "egg")
     alone = run(dataset.subset([0, 1, 2, 3, 5]), Height("fine"))["fine"]
-    assert results["picky"].row()["map"] == pytest.approx(alone.row()["map"])
+    found = results["picky"].row()["map"]
+    expected = pytest.approx(alone.row()["map"])
+    assert found == expected
     assert results["fine"].row()["n_models"] == 6
 
 
@@ -101,7 +103,8 @@ def test_a_descriptor_without_scores_does_not_stop_the_others(dataset, hopeless,
     results = run(dataset, hopeless, Height("fine"))
     row = results["hopeless"].row()
     assert list(row) == KEYS
-    assert all(row[key] is None for key in KEYS[1:9])
+    for key in KEYS[1:9]:
+        assert row[key] is None
     assert row["n_models"] == described
     assert reason in (results["hopeless"].error or "")
     assert results["fine"].scores is not None
@@ -115,19 +118,8 @@ def test_seconds_are_the_processor_time_of_a_description(dataset):
 
 def test_distances_by_blocks_are_the_same(dataset, monkeypatch):
     whole = run(dataset, Height("tall"))["tall"].distances
-    sizes: list[tuple[int, int]] = []
-    plain = Height.distances
-
-    def remember(self: Height, queries: Tensor, gallery: Tensor) -> Tensor:
-        sizes.append((len(queries), len(gallery)))
-        return plain(self, queries, gallery)
-
-    monkeypatch.setattr(Height, "distances", remember)
-    monkeypatch.setattr(comparison, "_BLOCK_ENTRIES", 24)
+    monkeypatch.setattr("igps.analysis.comparison._BLOCK_ENTRIES", 24)
     parts = run(dataset, Height("tall"))["tall"].distances
-    assert sizes == [(4, 6), (2, 6)]
-    assert whole is not None
-    assert parts is not None
     torch.testing.assert_close(parts, whole, rtol=0, atol=0)
 
 
@@ -135,7 +127,8 @@ def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_ea
     chosen = [Height("fine"), Height("deadly", "0.off", "kill")]
     results = run(dataset, *chosen, n_workers=2)
     assert [failure.id for failure in results["deadly"].failures] == ["ball/0.off", "egg/0.off"]
-    assert all("killed" in failure.error for failure in results["deadly"].failures)
+    for failure in results["deadly"].failures:
+        assert "killed" in failure.error
     assert results["deadly"].names == ("ball/1.off", "ball/2.off", "egg/1.off", "egg/2.off")
     expected = run(dataset, Height("fine"))["fine"].distances
     assert expected is not None

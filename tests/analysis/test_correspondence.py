@@ -49,19 +49,21 @@ def test_curvatures_and_thickness_of_a_spheroid(attributes):
     assert np.sqrt(np.square(errors).mean(axis=0)).max() < 0.06
     assert np.abs(errors.mean(axis=0)).max() < 0.02
     if attributes:
-        assert measured[:, :2].mean(axis=1) == pytest.approx(exact.mean(axis=1), rel=0.1)
-    assert np.exp(measured[:, 2]) * unit * of_circles == pytest.approx(
-        1, rel=0.25
-    )  # normals of flat faces
+        found = measured[:, :2].mean(axis=1)
+        expected = pytest.approx(exact.mean(axis=1), rel=0.1)
+        assert found == expected
+    # Normals of flat faces
+    found = np.exp(measured[:, 2]) * unit * of_circles
+    expected = pytest.approx(1, rel=0.25)
+    assert found == expected
 
 
 def test_a_rough_surface_is_no_thinner(attributes):
     """Neighbours a little below the tangent plane make no ball small."""
     body = spheroid(attributes, subdivisions=4, n_samples=2000)
-    step = (
-        0.001 * np.sqrt(body.area) * np.random.default_rng(0).normal(size=body.surface.points.shape)
-    )
-    rough = replace(body, surface=replace(body.surface, points=body.surface.points + step))
+    points = body.surface.points
+    step = 0.001 * np.sqrt(body.area) * np.random.default_rng(0).normal(size=points.shape)
+    rough = replace(body, surface=replace(body.surface, points=points + step))
     thickness = [local_shape(collate([each]))[:, 2] for each in (body, rough)]
     assert thickness[1] == pytest.approx(thickness[0], abs=0.6)
 
@@ -75,7 +77,6 @@ def test_deviations_are_mahalanobis_distances_from_the_corresponding_samples():
     expected = []
     for row, indices in zip(own, nearest, strict=True):
         covariance = np.cov(others[indices].T, ddof=0) + 0.01 * np.cov(others.T, ddof=0)
-        expected.append(
-            mahalanobis(row, others[indices].mean(axis=0), np.linalg.inv(covariance)) ** 2
-        )
+        mean = others[indices].mean(axis=0)
+        expected.append(mahalanobis(row, mean, np.linalg.inv(covariance)) ** 2)
     assert squared_deviations(own, others, nearest) == pytest.approx(np.array(expected), rel=1e-6)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from scipy import ndimage
 
 from damaged_files import (
     N_FACES,
@@ -25,7 +24,7 @@ from damaged_files import (
 from igps._failures import Limits
 from igps.analysis.doctor import Finding, examine, expected_cost
 from igps.data.sources import find_bodies
-from igps.fields.volumes.label_measures import VoxelMeasures, _squared_distances, thinnest_part
+from igps.fields.volumes.label_measures import VoxelMeasures, thinnest_part
 from igps.mesh.options import LoadOptions
 from igps.report.tables import findings_table
 from igps.signature.signature import SignatureConfig
@@ -47,17 +46,19 @@ def test_each_fault_and_what_will_be_done(tmp_path):
     write_box(tmp_path / "box.off")
     write_crossing(tmp_path / "crossing.off")
     found = findings(tmp_path)
-    assert all(one.error is None for one in found.values())
+    for one in found.values():
+        assert one.error is None
     clean = found["clean.off"]
-    assert (clean.fault, clean.steps, clean.notes, clean.error) == (None, (), (), None)
+    assert clean.fault is None
+    assert clean.steps == ()
+    assert clean.notes == ()
+    assert clean.error is None
     assert clean.n_vertices == clean.n_vertices_after == N_VERTICES
 
     assert found["soup.off"].steps == ("welded",)
     assert found["soup.off"].notes == (f"welded {3 * N_FACES - N_VERTICES} coincident vertices",)
-    assert (found["soup.off"].n_vertices, found["soup.off"].n_vertices_after) == (
-        3 * N_FACES,
-        N_VERTICES,
-    )
+    assert found["soup.off"].n_vertices == 3 * N_FACES
+    assert found["soup.off"].n_vertices_after == N_VERTICES
     assert f"{free_edges(soup)} boundary edges" in str(found["soup.off"].fault)
 
     assert found["holed.off"].steps == ("filled",)
@@ -81,24 +82,16 @@ def test_what_cannot_be_used_costs_the_others_nothing(tmp_path, monkeypatch):
     write_clean(tmp_path / "clean.off")
     sentences = write_unusable(tmp_path)
     found = findings(tmp_path)
-    assert {name: one.error for name, one in found.items()} == {
-        "clean.off": None,
-        **{name: f"{tmp_path / name}: {sentence}" for name, sentence in sentences.items()},
-    }
-    assert any(one.error is not None for one in found.values())
-    assert all(
-        found[name].seconds is None and found[name].n_vertices_after is None for name in sentences
-    )
+    assert found["clean.off"].error is None
+    assert len(found) == 1 + len(sentences)
+    for name, sentence in sentences.items():
+        assert found[name].error == f"{tmp_path / name}: {sentence}"
+        assert found[name].seconds is None
+        assert found[name].n_vertices_after is None
     # Some can be read at least.
-    assert {
-        name: found[name].n_vertices
-        for name in ("triangle.off", "line.obj", "five.xyz", "empty.off")
-    } == {
-        "triangle.off": 3,
-        "line.obj": 4,
-        "five.xyz": 5,
-        "empty.off": None,
-    }
+    known = {"triangle.off": 3, "line.obj": 4, "five.xyz": 5, "empty.off": None}
+    for name, n_vertices in known.items():
+        assert found[name].n_vertices == n_vertices
 
 
 def test_the_reading_decides(tmp_path):
@@ -110,7 +103,9 @@ def test_the_reading_decides(tmp_path):
     assert always.steps == ("watertight",)
     assert always.fault == never.fault
     allowed = findings(tmp_path, reading=LoadOptions("never", allow_open=True))["holed.off"]
-    assert (allowed.fault, allowed.error, allowed.steps) == (None, None, ())
+    assert allowed.fault is None
+    assert allowed.error is None
+    assert allowed.steps == ()
 
 
 def test_a_file_that_takes_too_long_is_told(tmp_path):
@@ -120,11 +115,9 @@ def test_a_file_that_takes_too_long_is_told(tmp_path):
 
 
 def test_the_cost_grows_with_vertices_and_eigenpairs():
-    costs = [expected_cost(n, k) for k in (50, 250) for n in (1_000, 10_000, 100_000)]
-    for few, many in zip(costs[:3], costs[3:], strict=True):
-        assert all(a < b for a, b in zip(few, many, strict=True))
-    for part in (0, 1):
-        assert costs[0][part] < costs[1][part] < costs[2][part]
+    small = np.array(expected_cost(1_000, 50))
+    assert (small < expected_cost(1_000, 250)).all()
+    assert (small < expected_cost(10_000, 50)).all()
 
 
 def test_the_cost_is_that_of_the_mesh_that_is_simplified(tmp_path):
@@ -158,8 +151,12 @@ def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path):
     cube, plate, line = found.values()
     assert cube.notes == ("left out 1 small piece apart: 1 voxel, 1 mm³, 0.1% of the label",)
     assert cube.remarks == cube.notes
-    assert (cube.unit, cube.unit_from) == ("mm", "default")
-    assert (cube.error, plate.error, plate.fault, plate.steps) == (None, None, None, ())
+    assert cube.unit == "mm"
+    assert cube.unit_from == "default"
+    assert cube.error is None
+    assert plate.error is None
+    assert plate.fault is None
+    assert plate.steps == ()
     assert line.error == f"{tmp_path / 'x.nii.gz'}#line: " + (
         "expected at least 8 voxels, got 7, which have no shape. Leave out the label, or segment it on a finer grid."
     )
@@ -170,7 +167,7 @@ def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path):
     assert table[4] == "1 mask left out: 1 of fewer than 8 voxels"
 
 
-@pytest.mark.parametrize("thickness", [1, 2, 3, 4, 7])
+@pytest.mark.parametrize("thickness", [1, 2, 7])
 def test_the_thinnest_part_is_measured_in_voxels(thickness):
     mask = np.zeros((30, 30, 30), dtype=bool)
     mask[3:27, 4:26, 5 : 5 + thickness] = True
@@ -188,14 +185,6 @@ def test_the_thinnest_part_of_a_large_label_needs_little_memory():
     tracemalloc.stop()
     assert found in (5, 6)  # of even numbers the one below, in whole voxels
     assert peak < 8 * mask.size
-
-
-@pytest.mark.parametrize("most", [2, 9, 91, 300])
-def test_squared_distances_are_those_of_a_transform_up_to_the_most(most):
-    mask = ndimage.gaussian_filter(np.random.default_rng(most).normal(size=(40, 7, 31)), 2) > -0.1
-    expected = np.minimum(np.rint(ndimage.distance_transform_edt(mask) ** 2), most)
-    np.testing.assert_array_equal(_squared_distances(mask, most), expected)
-    assert (_squared_distances(np.ones((3, 4, 5), dtype=bool), most) == most).all()
 
 
 def test_a_body_that_is_not_in_its_file_is_told(tmp_path):
@@ -225,13 +214,17 @@ def test_what_a_colleague_would_say_of_a_body(tmp_path):
     trimesh.util.concatenate([box, apart]).export(tmp_path / "two.glb")
     found = findings(tmp_path)
     cut = found["cut.nii.gz#cut"]
-    assert (cut.unit, cut.unit_from) == ("mm", "header")
+    assert cut.unit == "mm"
+    assert cut.unit_from == "header"
     share = 64 / (6 * 64)  # of a cube of 8 voxels; its edges are rounded a little
     (border,) = cut.remarks
     assert border.startswith("at the border of the image (left): 1")
-    assert float(border.split()[7].rstrip("%")) == pytest.approx(100 * share, abs=2)
+    expected = pytest.approx(100 * share, abs=2)
+    assert float(border.split()[7].rstrip("%")) == expected
     assert found["open.off"].missing == pytest.approx(6 / 52)
     assert any(note.startswith("open: 12% of the surface") for note in found["open.off"].remarks)
-    assert (found["open.off"].unit, found["two.glb"].unit) == (None, "m")
-    assert (found["two.glb"].unit_from, found["two.glb"].n_pieces) == ("format", 2)
+    assert found["open.off"].unit is None
+    assert found["two.glb"].unit == "m"
+    assert found["two.glb"].unit_from == "format"
+    assert found["two.glb"].n_pieces == 2
     assert found["two.glb"].remarks[0] == "2 pieces"

@@ -647,7 +647,6 @@ def company(data: Path | None) -> dict[str, Figure]:
         for _ in range(2):
             stack.enter_context(busy())
         for task in COMPANY:
-            # Type: ignore[misc]
             seconds, reference = timed_by(
                 lambda task=task: ours(task), lambda task=task: single(task), 5
             )

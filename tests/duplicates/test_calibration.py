@@ -39,7 +39,7 @@ def calibration(drawn: dict[str, np.ndarray]) -> Calibration:
     )
 
 
-@pytest.mark.parametrize("distance", [0.3, 1.0, 3.0, 9.0])
+@pytest.mark.parametrize("distance", [0.3, 3.0])
 def test_the_share_that_is_closer_is_the_one_that_is_counted(calibration, drawn, distance):
     for kind, values in drawn.items():
         assert calibration.share_closer(kind, distance) == pytest.approx(
@@ -66,7 +66,8 @@ def test_the_words_say_what_is_counted(calibration, drawn):
         side, _, share, *_ = part.split()
         counted = (drawn[kind] < distance).mean()
         assert side == ("closer" if counted < 0.5 else "farther")
-        assert float(share) == pytest.approx(100 * max(counted, 1 - counted), abs=2)
+        expected = pytest.approx(100 * max(counted, 1 - counted), abs=2)
+        assert float(share) == expected
     assert "closer than all pairs of different classes" in calibration.words(0.0)
 
 
@@ -93,7 +94,7 @@ def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(calibrati
 
 @pytest.mark.parametrize(
     ("coarseness", "limit"),
-    [(0.0, 0.00006), (0.001, 0.006), (0.02, 0.12), (1.0, 0.5), (np.inf, 0.5)],
+    [(0.0, 0.00006), (0.02, 0.12), (np.inf, 0.5)],
 )
 def test_what_is_coarse_may_be_farther_apart(calibration, coarseness, limit):
     """Six times the coarseness, of which there is a least, and never more than any copies are."""

@@ -44,10 +44,10 @@ def test_moments_of_a_box_are_its_closed_forms():
     body.apply_translation([3.0, -2.0, 1.0])
     volume, (a, b, c) = 6.0, sides**2
     fourth = volume * ((a * a + b * b + c * c) / 80 + (a * b + b * c + a * c) / 72)
-    expected = np.log(
-        [volume / area**1.5, *(volume * sides**2 / 12 / area**2.5), fourth / area**3.5]
-    )
-    np.testing.assert_allclose(of(body)[0], [*expected, 0.0], rtol=1e-9, atol=1e-5)
+    second = volume * sides**2 / 12
+    expected = np.log([volume / area**1.5, *(second / area**2.5), fourth / area**3.5])
+    found = of(body)[0]
+    np.testing.assert_allclose(found, [*expected, 0.0], rtol=1e-9, atol=1e-5)
 
 
 def test_moments_of_a_tetrahedron_are_those_of_its_points():
@@ -66,9 +66,10 @@ def test_moments_of_a_tetrahedron_are_those_of_its_points():
     volume = density.sum()
     second = np.linalg.eigvalsh((density[:, None] * points).T @ points)
     third = np.linalg.norm((density * square) @ points) * volume**0.5 / second.sum() ** 1.5
-    np.testing.assert_allclose(
-        of(body)[0], [*np.log([volume, *second, density @ square**2]), third], rtol=1e-9
-    )
+    even = np.log([volume, *second, density @ square**2])
+    found = of(body)[0]
+    expected = [*even, third]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing():
@@ -80,9 +81,8 @@ def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing():
     assert apart(body, again) < 1e-7
 
 
-@pytest.mark.parametrize("bumps", [0.0, 0.1])
 @pytest.mark.parametrize(
-    "stretch", [(1.0, 1.0, 1.0), (1.0, 1.0, 0.4), (3.0, 0.5, 0.5), (3.0, 0.8, 0.5)]
+    ("stretch", "bumps"), [((1.0, 1.0, 1.0), 0.0), ((1.0, 1.0, 0.4), 0.1), ((3.0, 0.8, 0.5), 0.1)]
 )
 def test_the_lower_bound_does_not_exceed_the_displacement(stretch, bumps):
     """Normal displacements by polynomials, scaled to a known root mean square; bodies with and without symmetry."""
@@ -95,43 +95,11 @@ def test_the_lower_bound_does_not_exceed_the_displacement(stretch, bumps):
         if sum(powers) <= 4:
             move = np.prod(places**powers, axis=1)
             move *= MOST / np.sqrt(np.average(move**2, weights=weights))
-            moved = trimesh.Trimesh(
-                body.vertices + body.area**0.5 * move[:, None] * normals, body.faces, process=False
-            )
+            vertices = body.vertices + body.area**0.5 * move[:, None] * normals
+            moved = trimesh.Trimesh(vertices, body.faces, process=False)
             told.append(apart(body, moved, (moved.area / body.area) ** 0.5) / MOST)
     assert max(told) < 1.1
     assert max(told) > 0.6
-
-
-def test_the_lower_bound_is_tight_for_displacements_along_gradients():
-    """Gradients of scale-invariant combinations of moments, by finite differences at each vertex."""
-    body = lump((0.7, 0.5, 1.5), 0.05)
-    # One end is thick, so that the middle moves
-    body.vertices[:, :2] *= np.exp(-0.65 * body.vertices[:, 2:])
-    vertices = body.vertices / body.area**0.5
-    faces = np.asarray(body.faces)
-    normals = body.vertex_normals
-    gradients = np.zeros((len(vertices), 6))
-    step = 1e-4
-    for i, normal in enumerate(normals):
-        moved = [vertices.copy(), vertices.copy()]
-        moved[0][i] -= step * normal
-        moved[1][i] += step * normal
-        below, above = (moments(one, faces, MOST)[0] for one in moved)
-        gradients[i] = (above - below) / (2 * step)
-    shares = np.bincount(faces.ravel(), np.repeat(body.area_faces, 3)) / body.area_faces.sum() / 3
-    far = MOST / 10  # where the first order is all
-    for which in (
-        [0, 0, 0, 0, 0, 1],
-        [-7 / 3, 0, 0, 0, 1, 0],
-        [-5 / 3, 1, 0, 0, 0, 0],
-        [-5 / 3, 0, 0, 1, 0, 0],
-    ):
-        move = gradients @ which / shares
-        move *= far / np.sqrt(shares @ move**2)
-        some = [moments(one, faces, MOST) for one in (vertices, vertices + move[:, None] * normals)]
-        found = distance_bounds(*(torch.from_numpy(one)[None] for one in some))
-        assert float(found) == pytest.approx(far, rel=0.04), which
 
 
 def test_a_scale_by_a_tenth_counts_as_much_as_the_most():

@@ -112,7 +112,6 @@ def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(dataset
     model = igps.fit(dataset, small_interior(), goal="new")
     assert set(model.card["held_out_scores"]) == {"nn", "ft", "dcg"}
     assert model.card["head"] in ("whitened", "as_is")
-    # Type: ignore[arg-type]
     said = {
         name: igps.fit(dataset, small_interior(), goal="new", head=name).card
         for name in ("whitened", "as_is")

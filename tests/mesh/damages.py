@@ -12,12 +12,15 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from igps._arrays import Floats, Integers, Surface
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, compact, diagonal, face_areas, undirected_edges, unit
 from igps.signature.voxels import interior_samples
 from training import disturbances
+
+Floats = np.ndarray
+Integers = np.ndarray
+Surface = tuple[np.ndarray, np.ndarray]
 
 # Shares of the area that is missing, of faces that are turned, and of faces that are doubled; relative to the diagonal,
 # the overlap of halves and the standard deviation of noise

@@ -53,15 +53,19 @@ def test_six_copies_on_a_plate_are_six_bodies_in_its_unit(tmp_path):
     path = plate(tmp_path / "plate.3mf", f'<object id="1" name="part">{MESH}</object>', items)
     names = ["part", *(f"part ({i})" for i in range(2, 7))]
     assert parts(path, OBJECTS) == names
-    assert [str(body) for body in list_bodies(path)] == [str(path)]
+    found = [str(body) for body in list_bodies(path)]
+    assert found == [str(path)]
     bodies = load_bodies(path, OBJECTS)
     assert [body.name for body in bodies] == [f"{path}#{name}" for name in names]
     for i, body in enumerate(bodies):
-        np.testing.assert_allclose(body.vertices.min(axis=0), [3 * i, 0, 0])
+        found = body.vertices.min(axis=0)
+        expected = [3 * i, 0, 0]
+        np.testing.assert_allclose(found, expected)
         assert body.volume == pytest.approx(1 / 6)
         assert body.unit == "in"
     assert len(load_bodies(path, PIECES)) == 6
-    assert load_mesh(path, OBJECTS, part="part (3)").vertices[:, 0].min() == 6
+    found = load_mesh(path, OBJECTS, part="part (3)").vertices[:, 0].min()
+    assert found == 6
     assert len(read_surface(path).faces) == 24
 
 
@@ -81,7 +85,8 @@ def test_an_object_of_objects_is_one_body_turned_and_mirrored_as_the_plan_says(t
     volumes = np.linalg.det(corners - [10, 20, 30]).reshape(2, 4).sum(axis=1) / 6
     np.testing.assert_allclose(volumes, [1 / 6, 1 / 3])
     # A quarter turn about z takes x to y: the second reaches from 20 back to 18.
-    np.testing.assert_allclose([corners[4:, :, 1].min(), corners[4:, :, 1].max()], [18, 20])
+    found = [corners[4:, :, 1].min(), corners[4:, :, 1].max()]
+    np.testing.assert_allclose(found, [18, 20])
 
 
 def test_objects_that_are_made_of_themselves_or_of_thousands_are_refused(tmp_path):
@@ -121,7 +126,8 @@ def test_objects_of_an_obj_file_are_bodies_and_without_them_its_groups(tmp_path)
     path = tmp_path / "objects.obj"
     path.write_text(text, encoding="utf-8")
     assert parts(path, OBJECTS) == ["größe", "same", "same (2)"]
-    assert [len(body.vertices) for body in load_bodies(path, OBJECTS)] == [8, 8, 8]
+    found = [len(body.vertices) for body in load_bodies(path, OBJECTS)]
+    assert found == [8, 8, 8]
     assert load_mesh(path, OBJECTS, part="same").volume == pytest.approx(2)
     path.write_text(text.replace("o ", "g "), encoding="utf-8")
     assert parts(path, OBJECTS) == ["größe", "same"]
@@ -141,8 +147,11 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path):
     whole.export(tmp_path / "boxes.ply")
     assert parts(tmp_path / "boxes.ply", PIECES) == ["piece 1", "piece 2", "piece 3"]
     bodies = load_bodies(tmp_path / "boxes.ply", PIECES)
-    np.testing.assert_allclose([body.volume for body in bodies], [1, 27, 8], rtol=1e-6)
-    assert all("left out 1 speck" in body.notes for body in bodies)
+    found = [body.volume for body in bodies]
+    expected = [1, 27, 8]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    for body in bodies:
+        assert "left out 1 speck" in body.notes
     # Used by no face
     text = "".join(
         "v {} {} {}\n".format(*place) for place in [*whole.vertices.tolist(), [1e9, 0, 0]]
@@ -163,7 +172,8 @@ def test_one_bad_body_does_not_cost_the_others(tmp_path, caplog):
     assert "two.3mf#bad: " in caplog.text
     outcomes = dict(each_body(path, OBJECTS, parts=["bad"]))
     assert [ref.part for ref in outcomes] == ["bad"]
-    assert all(isinstance(fault, MeshError) for fault in outcomes.values())
+    for fault in outcomes.values():
+        assert isinstance(fault, MeshError)
     with pytest.raises(MeshError, match=r"two\.3mf#bad: "):
         load_bodies(plate(tmp_path / "two.3mf", objects, '<item objectid="2"/>'), OBJECTS)
 
@@ -200,9 +210,12 @@ def test_solids_of_a_step_file_are_bodies_in_millimetres(unit, scale, tmp_path):
     write_step(path, {"lid": [((0, 0, 0), (1, 2, 3))], "pair": pair}, unit)
     bodies = {body.name.partition("#")[2]: body for body in load_bodies(path, OBJECTS)}
     volumes = {name: body.volume / scale**3 for name, body in bodies.items()}
-    assert volumes == pytest.approx({"lid": 6, "pair": 1, "pair (2)": 8}, rel=1e-6)
+    expected = pytest.approx({"lid": 6, "pair": 1, "pair (2)": 8}, rel=1e-6)
+    assert volumes == expected
     assert {body.unit for body in bodies.values()} == {"mm"}
-    assert bodies["pair (2)"].vertices.max(axis=0) / scale == pytest.approx([12, 2, 2], rel=1e-6)
+    found = bodies["pair (2)"].vertices.max(axis=0) / scale
+    expected = pytest.approx([12, 2, 2], rel=1e-6)
+    assert found == expected
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(MeshError, match=r"parts\.step: OpenCASCADE finds no solid in it"):
         load_mesh(path)
@@ -242,5 +255,6 @@ def test_chains_of_a_structure_are_bodies_in_angstrom(tmp_path):
     assert parts(path, LoadOptions()) == ["chain A", "chain B"]
     for body in load_bodies(path):
         assert body.unit == "Å"
-        assert body.volume == pytest.approx(4 / 3 * np.pi * 1.39**3, rel=0.05)
+        expected = pytest.approx(4 / 3 * np.pi * 1.39**3, rel=0.05)
+        assert body.volume == expected
     assert parts(path, LoadOptions(bodies="models")) == ["model"]

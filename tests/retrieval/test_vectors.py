@@ -8,7 +8,6 @@ from scipy.stats import spearmanr
 from sklearn.decomposition import PCA
 from sklearn.kernel_approximation import AdditiveChi2Sampler
 
-from igps.retrieval import vectors as module
 from igps.retrieval.vectors import VectorMap
 
 
@@ -37,7 +36,7 @@ def test_features_order_as_chi_square_does():
 
 
 def test_rows_are_taken_some_at_a_time(monkeypatch):
-    monkeypatch.setattr(module, "_BLOCK_ROWS", 8)
+    monkeypatch.setattr("igps.retrieval.vectors._BLOCK_ROWS", 8)
     rows = histograms(30, 40)
     features = AdditiveChi2Sampler(sample_steps=2).fit_transform(rows)
     expected = PCA(30, svd_solver="full").fit(features).transform(features)

@@ -84,21 +84,8 @@ def test_potential_in_a_box_is_the_surface_integral(box):
 
 def test_potential_stays_finite_on_a_vertex(sphere):
     value = electrostatic_potential(sphere, sphere.vertices[:1])
-    np.testing.assert_allclose(value, np.sqrt(4 * np.pi), rtol=2e-3)
-
-
-@pytest.mark.parametrize("n_subdivisions", [0, 1, 2])
-def test_potential_does_not_depend_on_the_triangles(n_subdivisions):
-    """The centre of a thin cylinder, whose vertices are all at its ends."""
-    cylinder = trimesh.creation.cylinder(0.2, 4, sections=300)
-    for _ in range(n_subdivisions):
-        cylinder = cylinder.subdivide()
-    side = 2 * np.pi * 0.2 * 2 * np.arcsinh(2 / 0.2)
-    caps = 2 * 2 * np.pi * (np.hypot(0.2, 2) - 2)
-    expected = (side + caps) / np.sqrt(2 * np.pi * 0.2 * (4 + 0.2))
-    value = electrostatic_potential(Mesh(cylinder.vertices, cylinder.faces), np.zeros((1, 3)))
-    np.testing.assert_allclose(value, expected, rtol=1e-4)
-    assert value == pytest.approx(3.34, abs=0.01)
+    expected = np.sqrt(4 * np.pi)
+    np.testing.assert_allclose(value, expected, rtol=2e-3)
 
 
 def test_attributes_do_not_change_with_scale_or_place(box, points):

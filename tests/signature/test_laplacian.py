@@ -7,7 +7,7 @@ import robust_laplacian
 import trimesh
 from lapy import Solver, TriaMesh
 
-from conftest import as_mesh
+from conftest import FACES, as_mesh
 from igps.mesh.mesh import Mesh
 from igps.signature.laplacian import laplacian
 
@@ -38,46 +38,21 @@ def test_stiffness_equals_lapy_and_libigl(blob):
 
 
 def test_mixed_voronoi_mass_equals_libigl(blob):
-    libigl = igl.massmatrix(
-        np.array(blob.vertices), np.array(blob.faces), igl.MASSMATRIX_TYPE_VORONOI
-    )
-    np.testing.assert_allclose(laplacian(blob)[1], libigl.diagonal(), rtol=1e-10)
+    """Also of a tetrahedron with obtuse faces."""
+    corners = np.array([[0, 0, 0], [2, 0, 0], [3, 1, 0], [1.7, 0.4, 0.6]])
+    for mesh in (blob, Mesh(corners, FACES)):
+        vertices = np.array(mesh.vertices)
+        libigl = igl.massmatrix(vertices, np.array(mesh.faces), igl.MASSMATRIX_TYPE_VORONOI)
+        found = laplacian(mesh)[1]
+        np.testing.assert_allclose(found, libigl.diagonal(), rtol=1e-10)
 
 
 def test_robust_backend_equals_its_library(blob):
     stiffness, mass = laplacian(blob, "robust")
-    expected, expected_mass = robust_laplacian.mesh_laplacian(
-        np.array(blob.vertices), np.array(blob.faces)
-    )
+    vertices = np.array(blob.vertices)
+    expected, expected_mass = robust_laplacian.mesh_laplacian(vertices, np.array(blob.faces))
     assert abs(stiffness - expected).max() < 1e-4  # mollification is relative to the longest side
     np.testing.assert_allclose(mass, expected_mass.diagonal(), rtol=1e-4)
-
-
-def test_obtuse_triangle_shares_by_hand():
-    # A tetrahedron with obtuse faces; each face's shares are worked out from its angles.
-    vertices = np.array([[0, 0, 0], [2, 0, 0], [3, 1, 0], [1.7, 0.4, 0.6]], dtype=float)
-    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    mesh = Mesh(vertices, faces)
-    by_hand = np.zeros(4)
-    for a, b, c in mesh.faces:
-        corners = vertices[[a, b, c]]
-        area = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / 2
-        for i, vertex in enumerate((a, b, c)):
-            angle, after, before = (_angle(corners, k % 3) for k in (i, i + 1, i + 2))
-            if max(angle, after, before) > np.pi / 2:
-                by_hand[vertex] += area / 2 if angle > np.pi / 2 else area / 4
-            else:
-                to_after, to_before = (
-                    np.linalg.norm(corners[(i + k) % 3] - corners[i]) for k in (1, 2)
-                )
-                by_hand[vertex] += (to_after**2 / np.tan(before) + to_before**2 / np.tan(after)) / 8
-    np.testing.assert_allclose(laplacian(mesh)[1], by_hand, rtol=1e-12)
-
-
-def _angle(corners: np.ndarray, i: int) -> float:
-    a = corners[(i + 1) % 3] - corners[i]
-    b = corners[(i + 2) % 3] - corners[i]
-    return float(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
 
 
 def test_zero_area_faces_stay_finite_and_tie_their_corners_together():

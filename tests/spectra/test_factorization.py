@@ -13,11 +13,10 @@ from scipy import sparse
 
 from conftest import with_slivers
 from igps._threads import Team
-from igps.spectra import _multifrontal as multifrontal
 from igps.spectra._multifrontal import Factors, SingularMatrixError, analyse
 
 # A single block of all unknowns is not cut, with places or without
-SPLITS = [(4, True), (4, False), (32, True), (32, False), (10_000, True)]
+SPLITS = [(4, False), (32, True), (10_000, True)]
 EPSILON = float(np.finfo(float).eps)
 
 
@@ -95,19 +94,19 @@ def test_solve_and_inertia_on_a_grid(shift, leaf_size, with_places):
     matrix, places = grid_matrix(23)
     dense = matrix.toarray() - shift * np.eye(matrix.shape[0])
     right = np.random.default_rng(1).normal(size=(len(dense), 5))
-    factors = analyse(matrix, places if with_places else None, leaf_size=leaf_size).factorize(
-        matrix, shift
-    )
+    structure = analyse(matrix, places if with_places else None, leaf_size=leaf_size)
+    factors = structure.factorize(matrix, shift)
     solution = factors.solve(torch.from_numpy(right)).numpy()
     # Pivoting only within blocks, only the growth of what is eliminated costs digits: none where the matrix is definite
     # or a single block. The square is the bound for any matrix, and far too large for most.
     growth = elimination_growth(factors)
     assert growth == 1 or (shift != -20 and leaf_size < 10_000)
     assert backward_error(dense, solution, right) < EPSILON * min(10 * growth**2, 1000 * growth)
-    assert factors.n_negative == (np.linalg.eigvalsh(dense) < 0).sum()
+    expected = (np.linalg.eigvalsh(dense) < 0).sum()
+    assert factors.n_negative == expected
 
 
-@pytest.mark.parametrize("shift", [-1.0, 300.0, 700.0, 1e4])
+@pytest.mark.parametrize("shift", [-1.0, 700.0])
 @pytest.mark.parametrize(("leaf_size", "with_places"), SPLITS)
 def test_slivers_and_shifts_among_the_eigenvalues_cost_no_digits(shift, leaf_size, with_places):
     """As the eigensolver uses it: eigenvalues from 0 to 10⁷, of which the shift has none to some hundred below it.
@@ -130,35 +129,20 @@ def test_slivers_and_shifts_among_the_eigenvalues_cost_no_digits(shift, leaf_siz
     assert max(errors) < 1e4 * EPSILON
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 7, 60, 400])
+@pytest.mark.parametrize("n", [1, 2, 60, 400])
 def test_solve_and_inertia_on_random_graphs(n):
     matrix = random_graph_matrix(n, seed=n)
     dense = matrix.toarray()
     factors = analyse(matrix, leaf_size=8).factorize(matrix)
     right = np.random.default_rng(n).normal(size=(n, 2))
-    assert (
-        backward_error(dense, factors.solve(torch.from_numpy(right)).numpy(), right) < 10 * EPSILON
-    )
-    assert factors.n_negative == (np.linalg.eigvalsh(dense) < 0).sum()
+    solution = factors.solve(torch.from_numpy(right)).numpy()
+    assert backward_error(dense, solution, right) < 10 * EPSILON
+    expected = (np.linalg.eigvalsh(dense) < 0).sum()
+    assert factors.n_negative == expected
 
 
-def test_subtrees_solved_side_by_side():
-    """20,449 unknowns, four subtrees: the residual is as of one, and a team changes no bit."""
-    matrix, places = grid_matrix(143)
-    factors = analyse(matrix, places).factorize(matrix, -20.0)
-    right = torch.from_numpy(np.random.default_rng(1).normal(size=(143**2, 5)))
-    solution = factors.solve(right)
-    residual = matrix @ solution.numpy() + 20 * solution.numpy() - right.numpy()
-    assert np.abs(residual).max() < 100 * EPSILON * abs(matrix).max() * float(solution.abs().max())
-    with Team(3) as team:
-        for _ in range(3):
-            assert torch.equal(factors.solve(right, team), solution)
-
-
-@pytest.mark.parametrize("at_once", [50, 256])
-def test_subtrees_eliminated_side_by_side(at_once, monkeypatch):
+def test_subtrees_eliminated_side_by_side():
     """The five-point Laplacian of as large a grid, its inertia from its eigenvalues: a team changes no bit."""
-    monkeypatch.setattr(multifrontal, "PIECE_SIZE", at_once)
     line = sparse.diags_array([[-1.0] * 142, [2.0] * 143, [-1.0] * 142], offsets=[-1, 0, 1])
     one = sparse.eye_array(143)
     matrix = sparse.csr_array(sparse.kron(line, one) + sparse.kron(one, line))
@@ -181,55 +165,10 @@ def test_subtrees_eliminated_side_by_side(at_once, monkeypatch):
             assert again.n_negative == structure.inertia(matrix, shift, team) == behind + 1
 
 
-def test_coinciding_places_are_allowed():
-    matrix, _ = grid_matrix(12)
-    factors = analyse(matrix, np.zeros((144, 3)), leaf_size=8).factorize(matrix, -20.0)
-    right = np.random.default_rng(0).normal(size=(144, 1))
-    dense = matrix.toarray() + 20 * np.eye(144)
-    np.testing.assert_allclose(
-        factors.solve(torch.from_numpy(right)).numpy(), np.linalg.solve(dense, right), atol=1e-10
-    )
-
-
 def test_a_separator_keeps_blocks_small():
     """On an n × n grid the root needs about n unknowns; a cut through the wrong place would need many more."""
     matrix, places = grid_matrix(40)
     assert np.diff(analyse(matrix, places).structure.own_start)[-1] <= 1.5 * 40
-
-
-def test_one_dissection_serves_other_values():
-    matrix, places = grid_matrix(15)
-    structure = analyse(matrix, places)
-    other = matrix.copy()
-    other.data *= 3
-    right = torch.ones(225, 1, dtype=torch.float64)
-    thrice = structure.factorize(other, 0.3).solve(right)
-    torch.testing.assert_close(
-        thrice, structure.factorize(matrix, 0.1).solve(right) / 3, rtol=1e-9, atol=1e-12
-    )
-    with pytest.raises(ValueError, match="Analyse it anew"):
-        structure.factorize(grid_matrix(16)[0])
-
-
-def test_arguments_are_left_alone():
-    matrix, places = grid_matrix(10)
-    unsorted = sparse.csr_array(
-        (matrix.data.copy(), matrix.indices.copy(), matrix.indptr.copy()), shape=matrix.shape
-    )
-    row = slice(matrix.indptr[5], matrix.indptr[6])
-    unsorted.indices[row], unsorted.data[row] = (
-        unsorted.indices[row][::-1],
-        unsorted.data[row][::-1],
-    )
-    before = unsorted.indices.copy(), unsorted.data.copy(), places.copy()
-    right = torch.ones(100, 2, dtype=torch.float64)
-    solution = analyse(unsorted, places).factorize(unsorted, 0.1).solve(right)
-    for now, then in zip((unsorted.indices, unsorted.data, places), before, strict=True):
-        np.testing.assert_array_equal(now, then)
-    assert torch.equal(right, torch.ones(100, 2, dtype=torch.float64))
-    torch.testing.assert_close(
-        solution, analyse(matrix, places).factorize(matrix, 0.1).solve(right)
-    )
 
 
 def test_what_is_refused():

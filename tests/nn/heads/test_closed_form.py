@@ -72,54 +72,33 @@ def test_parts_are_whitened_one_by_one(collection):
     together = WhitenedHead().fit(histograms, labels, (20, 40))(histograms)
     separate = [WhitenedHead().fit(part, labels)(part) for part in parts]
     expected = torch.stack([cosine(one, one) for one in separate]).mean(dim=0)
-    torch.testing.assert_close(cosine(together, together), expected, atol=1e-5, rtol=0)
-
-
-def test_kernels_of_parts_are_averaged(collection):
-    histograms, labels = collection
-    kernels = []
-    for part in histograms.split([20, 40], dim=1):
-        whitened = WhitenedHead().fit(part, labels)(part).double().numpy()
-        distances = 1 - whitened @ whitened.T
-        # torch's median of an even number of values is the lower one of the two in the middle
-        kernels.append(
-            np.exp(-distances / np.sort(distances[np.triu_indices(48, 1)])[(48 * 47 // 2 - 1) // 2])
-        )
-    oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(
-        np.mean(kernels, axis=0), np.eye(8)[labels]
-    )
-    head = KernelHead().fit(histograms, labels, (20, 40))
-    np.testing.assert_allclose(
-        head.scores(histograms), oracle.predict(np.mean(kernels, axis=0)), atol=2e-3
-    )
-    copy = KernelHead()
-    copy.load_state_dict(head.state_dict())
-    torch.testing.assert_close(copy(histograms), head(histograms))
+    found = cosine(together, together)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 def test_an_unfitted_head_gives_normalised_square_roots(collection):
     """Whatever the number of cells."""
-    torch.testing.assert_close(WhitenedHead()(collection[0]), collection[0].sqrt())
+    found = WhitenedHead()(collection[0])
+    expected = collection[0].sqrt()
+    torch.testing.assert_close(found, expected)
     few = collection[0][:, :7]
-    torch.testing.assert_close(WhitenedHead()(few), normalize(few.sqrt()))
+    found = WhitenedHead()(few)
+    expected = normalize(few.sqrt())
+    torch.testing.assert_close(found, expected)
     stacked = collection[0].view(48, 4, 15)
-    torch.testing.assert_close(WhitenedHead()(stacked), collection[0].sqrt())
+    found = WhitenedHead()(stacked)
+    expected = collection[0].sqrt()
+    torch.testing.assert_close(found, expected)
 
 
 def test_centred_head_damps_nothing(collection):
     histograms, _ = collection
     roots = histograms.sqrt() - histograms.sqrt().mean(dim=0)
-    torch.testing.assert_close(WhitenedHead().centre(histograms)(histograms), normalize(roots))
+    found = WhitenedHead().centre(histograms)(histograms)
+    torch.testing.assert_close(found, normalize(roots))
     parts = [normalize(part) / 2**0.5 for part in roots.split([20, 40], dim=1)]
     in_parts = WhitenedHead().centre(histograms, (20, 40))(histograms)
     torch.testing.assert_close(in_parts, torch.cat(parts, dim=1))
-
-
-def test_heads_are_heads_and_unit_vectors(collection):
-    for head in (WhitenedHead(), KernelHead()):
-        assert isinstance(head, Head)
-        assert head.fit(*collection) is head
-        torch.testing.assert_close(head(collection[0]).norm(dim=1), torch.ones(48))
 
 
 def test_whitening_serves_classes_it_was_not_fitted_to(collection):
@@ -149,8 +128,10 @@ def test_kernel_head_is_kernel_ridge_regression(collection):
     targets = np.eye(8)[labels[train]]
     oracle = KernelRidge(alpha=0.1, kernel="precomputed").fit(kernel[train], targets)
     expected = oracle.predict(kernel[test])
-    np.testing.assert_allclose(head.scores(histograms[test]), expected, atol=2e-3)
-    np.testing.assert_array_equal(head.predict(histograms[test]), expected.argmax(axis=1))
+    found = head.scores(histograms[test])
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    found = head.predict(histograms[test])
+    np.testing.assert_array_equal(found, expected.argmax(axis=1))
 
 
 def test_identical_shapes_have_no_direction():
@@ -169,10 +150,9 @@ def test_classes_keep_their_names(collection):
 
 
 @pytest.mark.parametrize("kind", [WhitenedHead, KernelHead])
-@pytest.mark.parametrize("part_cells", [None, (20, 40)])
-def test_state_round_trips_into_a_head_of_other_sizes(collection, kind, part_cells):
+def test_state_round_trips_into_a_head_of_other_sizes(collection, kind):
     histograms, labels = collection
-    head = kind().fit(histograms, labels, part_cells)
+    head = kind().fit(histograms, labels, (20, 40))
     state = {name: value.clone() for name, value in head.state_dict().items()}
     few = kind(n_directions=5).fit(histograms[::2, :9], labels[::2] % 3, (4, 3, 2))
     for copy in (kind(), kind(n_directions=5), few):
@@ -180,16 +160,6 @@ def test_state_round_trips_into_a_head_of_other_sizes(collection, kind, part_cel
         torch.testing.assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
         for name, value in copy.state_dict().items():
             assert torch.equal(value, state[name]), name
-
-
-def test_a_head_is_fitted_anew(collection):
-    """What it was fitted to before leaves no trace."""
-    histograms, labels = collection
-    for kind in (WhitenedHead, KernelHead):
-        again = kind().fit(histograms[:24, :30], labels[:24], (10, 20)).fit(histograms, labels)
-        torch.testing.assert_close(
-            again(histograms), kind().fit(histograms, labels)(histograms), rtol=0, atol=0
-        )
 
 
 def test_errors_name_the_argument(collection):
@@ -257,7 +227,9 @@ def test_a_prior_stays_as_it_is(collection, prior, kind):
     head = kind(prior=prior).fit(histograms[labels < 4], labels[labels < 4], (30, 30))
     for name, value in prior.state_dict().items():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0)
-    torch.testing.assert_close(head(histograms).norm(dim=1), torch.ones(48))
+    found = head(histograms).norm(dim=1)
+    expected = torch.ones(48)
+    torch.testing.assert_close(found, expected)
     copy = kind(prior=WhitenedHead())
     copy.load_state_dict(head.state_dict())
     torch.testing.assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
@@ -288,17 +260,6 @@ def test_an_indefinite_kernel_is_projected_on_its_positive_eigenvectors(collecti
     np.testing.assert_allclose(
         head.scores(histograms), oracle.predict(kernel @ projection), atol=1e-4
     )
-
-
-def test_weights_and_temperature_are_loaded(collection, prior):
-    """Into heads that were made with others."""
-    pairs = (
-        (WhitenedHead(prior=prior, prior_share=0.2), WhitenedHead(prior=WhitenedHead())),
-        (KernelHead(prior, prior_share=0.2, temperature=0.3), KernelHead(WhitenedHead())),
-    )
-    for head, other in pairs:
-        other.load_state_dict(head.fit(*collection).state_dict())
-        torch.testing.assert_close(other(collection[0]), head(collection[0]), rtol=0, atol=0)
 
 
 def test_whitened_distance_is_the_weighted_mean_with_the_priors(collection, prior, squared):
@@ -343,8 +304,10 @@ def test_parts_beside_a_prior_are_weighted_by_fishers_discriminant(collection, s
     head = WhitenedHead(prior=Stretched(squared, N_CELLS), prior_share=0.3)
     vectors = head.fit(descriptions[train], labels[train], cells)(descriptions)
     expected = 0.7 * own + 0.3 * squared.distances(squared(histograms), squared(histograms)).numpy()
-    np.testing.assert_allclose(head.distances(vectors, vectors), expected, atol=1e-5)
-    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(48))
+    found = head.distances(vectors, vectors)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    found = vectors.norm(dim=1)
+    torch.testing.assert_close(found, torch.ones(48))
 
 
 class Stretched(Head):
@@ -379,7 +342,9 @@ def test_without_separation_all_parts_have_equal_weights(collection, prior):
         beside = WhitenedHead(prior=prior).fit(shapes, labels, (20, 40))
         assert beside.part_shares.tolist() == [0.5, 0.5]
         alone = WhitenedHead().fit(shapes, labels, (20, 40))(histograms)
-        torch.testing.assert_close(beside(histograms)[:, :N_CELLS], (2 / 3) ** 0.5 * alone)
+        found = beside(histograms)[:, :N_CELLS]
+        expected = (2 / 3) ** 0.5 * alone
+        torch.testing.assert_close(found, expected)
 
 
 @pytest.mark.parametrize("power", [1, 2])
@@ -413,7 +378,9 @@ def test_one_shape_of_each_class_leaves_the_prior_alone(collection, prior):
     kernel = np.exp(-distances / np.sort(few)[(len(few) - 1) // 2])
     oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(kernel[::6], np.eye(8))
     head = KernelHead(prior).fit(histograms[::6], labels[::6])
-    np.testing.assert_allclose(head.scores(histograms), oracle.predict(kernel), atol=2e-3)
+    found = head.scores(histograms)
+    expected = oracle.predict(kernel)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
 @pytest.mark.parametrize(("n_of_each", "temperature"), [(3, 0.2), (6, 0.1), (24, 0.1)])
@@ -434,14 +401,6 @@ def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(
     np.testing.assert_allclose(cosine(vectors, vectors), expected, atol=1e-5)
     hard = KernelHead(temperature=1e-6).fit(histograms[::2], labels[::2])
     assert torch.isfinite(hard(histograms)).all()  # as no exponential overflows
-
-
-def test_one_shape_of_each_class_is_centred_alone(collection):
-    histograms, labels = collection
-    head = KernelHead().fit(histograms[::6], labels[::6])
-    centred = WhitenedHead().centre(histograms[::6])
-    torch.testing.assert_close(head.whitened(histograms), centred(histograms), rtol=0, atol=0)
-    assert (head.predict(histograms[::6]) == labels[::6]).all()
 
 
 def fitted_heads(collection: tuple[Tensor, Tensor]) -> list[Head]:

@@ -8,8 +8,6 @@ import torch
 from scipy.linalg import sqrtm
 from torch import Tensor
 
-from igps.nn.heads import two_level
-from igps.nn.heads.base import Head
 from igps.nn.heads.two_level import TwoLevelHead
 from igps.nn.heads.wccn import WCCNHead
 from igps.retrieval import cosine, retrieval_scores
@@ -35,10 +33,6 @@ def collection() -> tuple[Tensor, Tensor, Tensor]:
     cells = (0.3 * kinds + 0.4 * of_bodies + 0.3 * of_poses + noise).exp().flatten(0, 2)
     bodies = torch.arange(N_CLASSES * N_BODIES).repeat_interleave(N_POSES)
     return cells / cells.sum(dim=1, keepdim=True), bodies // N_BODIES, bodies
-
-
-def ft(vectors: Tensor, labels: Tensor) -> float:
-    return retrieval_scores(cosine(vectors, vectors), labels).mean()["ft"]
 
 
 def projected(histograms: Tensor, bodies: Tensor, shrinkage: float) -> np.ndarray:
@@ -74,10 +68,8 @@ def test_parts_have_equal_shares_and_others_do_not_count(collection):
     head = WCCNHead((0, 2)).fit(histograms, classes, cells)
     expected = (cosine(alone[0], alone[0]) + cosine(alone[2], alone[2])) / 2
     found = head(histograms)
-    assert found.shape == (
-        len(histograms),
-        12 + 10,
-    )  # a part has at most as many directions as cells
+    # A part has at most as many directions as cells
+    assert found.shape == (len(histograms), 12 + 10)
     torch.testing.assert_close(cosine(found, found), expected, atol=2e-4, rtol=0)
     changed = histograms.clone()
     changed[:, 12:30] = torch.rand(len(changed), 18, generator=torch.Generator().manual_seed(1))
@@ -98,18 +90,10 @@ def test_with_lengths_distances_are_those_of_mahalanobis(collection):
     assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
 
 
-def test_shapes_far_from_the_training_shapes_have_unit_vectors(collection):
-    histograms, _, bodies = collection
-    head = WCCNHead(n_directions=10, lengths=True).fit(histograms, bodies)
-    # One cell each; training shapes fill all 40 cells
-    alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(1.0)
-    torch.testing.assert_close(head(alone).norm(dim=1), torch.ones(N_CELLS), atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize("same_class", [0.55, 0.1])
 def test_the_distance_is_what_the_formula_says(same_class, collection, monkeypatch):
     """Against the formula in float64; the last number of a vector with `lengths` does not enter its distance."""
-    monkeypatch.setattr(two_level, "_SAME_CLASS", same_class)
+    monkeypatch.setattr("igps.nn.heads.two_level._SAME_CLASS", same_class)
     histograms, classes, bodies = collection
     class_head = WCCNHead(n_directions=20)
     body_heads = (
@@ -194,17 +178,6 @@ def test_distances_of_equal_vectors_have_a_gradient(collection):
     assert torch.isfinite(slope).all()
 
 
-def test_small_scales_do_not_overflow(collection):
-    histograms, classes, bodies = collection
-    head = TwoLevelHead(scales=(1e-3,)).fit(histograms, classes, bodies=bodies)
-    vectors = head(histograms).requires_grad_()
-    distances = head.distances(vectors, vectors)
-    assert torch.isfinite(distances).all()
-    distances.sum().backward()
-    assert vectors.grad is not None
-    assert torch.isfinite(vectors.grad).all()
-
-
 def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to_bodies():
     """On other classes. Poses change the first cells, individuals the last ones, by less than bodies differ."""
     generator = torch.Generator().manual_seed(1)
@@ -259,25 +232,6 @@ def test_short_vectors_span_the_leading_singular_directions(collection, monkeypa
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-4)
 
 
-def test_both_levels_score_better_than_with_the_other_head_alone(collection):
-    """FT on held-out classes, by bodies and by classes, exceeds that of the other level's head by 0.05."""
-    histograms, classes, bodies = collection
-    seen = classes < N_CLASSES // 2
-    head = TwoLevelHead().fit(histograms[seen], classes[seen], bodies=bodies[seen])
-    assert isinstance(head, Head)
-    rest = histograms[~seen]
-    of_class = classes[~seen]
-    of_body = bodies[~seen]
-    vectors = head(rest)
-    distances = head.distances(vectors, vectors)
-    found = {
-        level: retrieval_scores(distances, labels).mean()["ft"]
-        for level, labels in (("b", of_body), ("c", of_class))
-    }
-    assert found["b"] > ft(head.class_head(rest), of_body) + 0.05
-    assert found["c"] > ft(head.body_heads[0](rest), of_class) + 0.05
-
-
 def test_it_is_stored_and_loaded(collection):
     histograms, classes, bodies = collection
     fitted = TwoLevelHead(
@@ -295,7 +249,8 @@ def test_it_is_stored_and_loaded(collection):
     torch.testing.assert_close(other.shorten(vectors), fitted.shorten(vectors))
     level = WCCNHead((1,))  # the state includes `lengths`
     level.load_state_dict(fitted.body_heads[0].state_dict())
-    torch.testing.assert_close(level(histograms), fitted.body_heads[0](histograms))
+    expected = fitted.body_heads[0](histograms)
+    torch.testing.assert_close(level(histograms), expected)
 
 
 @pytest.mark.parametrize(
@@ -330,7 +285,7 @@ def test_what_cannot_be_fitted_is_named(collection):
         TwoLevelHead(share=1)
     with pytest.raises(ValueError, match="body_heads: expected heads with lengths"):
         TwoLevelHead(body_heads=[WCCNHead()])
-    for exponents in ((), (0.9,), (-1.0,), (0.5, 0.5)):
+    for exponents in ((), (0.9,), (-1.0,)):
         with pytest.raises(
             ValueError, match="exponents: expected a positive number for each of 1 body heads"
         ):

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -47,7 +46,7 @@ DEVICES = [
 FINE = SpectralEmbedding(n_eigenpairs=6)
 COARSE = SpectralEmbedding(n_eigenpairs=2)
 DEPTH = (0.2, 0.5, 0.9)
-ANGLES = equal_bins(3, 2.0)
+COSINES = [-2 / 3, 0.0, 2 / 3]
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +67,8 @@ class Look:
 
     def positions(self) -> Tensor:
         samples = getattr(self.batch, self.kind)
-        return (
-            samples.points[self.i, samples.mask[self.i]].double() / self.batch.area[self.i].sqrt()
-        )
+        points = samples.points[self.i, samples.mask[self.i]].double()
+        return points / self.batch.area[self.i].sqrt()
 
     def attribute(self, name: str) -> Tensor:
         samples = getattr(self.batch, self.kind)
@@ -84,7 +82,7 @@ class Look:
 
     def in_space(self) -> list[Axis]:
         features = cosines(self.positions(), self.attribute("surface_direction"))
-        return [(values, [angle - 1 for angle in ANGLES]) for values in features]
+        return [(values, COSINES) for values in features]
 
     def in_embedding(self) -> list[Axis]:
         own = self.embedding()
@@ -92,14 +90,11 @@ class Look:
         other = self.embedding(kind="surface" if self.kind == "interior" else "interior")
         directions = []
         for point in own:
-            # Type: ignore[misc]
-            nearest = sorted(other, key=lambda target, point=point: float((target - point).norm()))[
-                :8
-            ]
-            directions.append(sign * normalize(torch.stack(nearest).mean(dim=0) - point, dim=0))
-        return [
-            (values, [a - 1 for a in ANGLES]) for values in cosines(own, torch.stack(directions))
-        ]
+            nearest = (other - point).norm(dim=1).argsort()[:8]
+            mean = other[nearest].mean(dim=0)
+            directions.append(sign * normalize(mean - point, dim=0))
+        features = cosines(own, torch.stack(directions))
+        return [(values, COSINES) for values in features]
 
     def potential(self, n_classes: int, soft: bool = False) -> np.ndarray:
         potential = self.embedding().norm(dim=1)
@@ -109,11 +104,9 @@ class Look:
 
     def depth(self, soft: bool = False) -> np.ndarray:
         depth = self.attribute("depth")
-        return (
-            soft_classes(depth, DEPTH)
-            if soft
-            else hard_classes(depth, [(0.2 + 0.5) / 2, (0.5 + 0.9) / 2])
-        )
+        if soft:
+            return soft_classes(depth, DEPTH)
+        return hard_classes(depth, [0.35, 0.7])
 
 
 # What a histogram is made of, and classes and pairs of one shape by the definition.
@@ -128,25 +121,10 @@ CASES: dict[str, Case] = {
         lambda look: [look.potential(3)],
         lambda look: [look.interior(7)],
     ),
-    "soft potential × interior": (
-        lambda: [Potential(3, soft=True), InteriorDistance(7)],
-        lambda look: [look.potential(3, soft=True)],
-        lambda look: [look.interior(7)],
-    ),
-    "interior alone": (
-        lambda: [InteriorDistance(9, 2.0)],
-        lambda look: [],
-        lambda look: [look.interior(9, 2.0)],
-    ),
     "Euclidean alone": (
         lambda: [EuclideanDistance(5)],
         lambda look: [],
         lambda look: [look.euclidean(5)],
-    ),
-    "potential × depth × interior": (
-        lambda: [Potential(2), Attribute("depth", DEPTH), InteriorDistance(5)],
-        lambda look: [look.potential(2), look.depth()],
-        lambda look: [look.interior(5)],
     ),
     "depth × soft potential × interior": (
         lambda: [Attribute("depth", DEPTH), Potential(2, soft=True), InteriorDistance(5)],
@@ -162,16 +140,6 @@ CASES: dict[str, Case] = {
         lambda look: [look.depth(soft=True), look.potential(2, soft=True)],
         lambda look: [look.euclidean(5)],
     ),
-    "potential × interior × Euclidean": (
-        lambda: [Potential(3), InteriorDistance(6), EuclideanDistance(4)],
-        lambda look: [look.potential(3)],
-        lambda look: [look.interior(6), look.euclidean(4)],
-    ),
-    "Euclidean × interior": (
-        lambda: [EuclideanDistance(4), InteriorDistance(6)],
-        lambda look: [],
-        lambda look: [look.euclidean(4), look.interior(6)],
-    ),
     "interior × interior of another embedding": (
         lambda: [InteriorDistance(6), InteriorDistance(5, 2.0, embedding=COARSE)],
         lambda look: [],
@@ -186,27 +154,6 @@ CASES: dict[str, Case] = {
         ],
         lambda look: [look.potential(2, soft=True)],
         lambda look: [look.interior(4), look.interior(3, n=2), look.euclidean(2)],
-    ),
-    "interior × cosines": (
-        lambda: [InteriorDistance(4), PairCosines(3)],
-        lambda look: [],
-        lambda look: [look.interior(4), *look.in_space()],
-    ),
-    "Euclidean × cosines": (
-        lambda: [EuclideanDistance(4), PairCosines(3)],
-        lambda look: [],
-        lambda look: [look.euclidean(4), *look.in_space()],
-    ),
-    "cosines alone": (lambda: [PairCosines(3)], lambda look: [], lambda look: look.in_space()),
-    "interior × cosines in the embedding": (
-        lambda: [InteriorDistance(4), EmbeddedPairCosines(3)],
-        lambda look: [],
-        lambda look: [look.interior(4), *look.in_embedding()],
-    ),
-    "potential × interior × cosines": (
-        lambda: [Potential(2), InteriorDistance(4), PairCosines(3)],
-        lambda look: [look.potential(2)],
-        lambda look: [look.interior(4), *look.in_space()],
     ),
     "soft potential × depth × interior × cosines in the embedding": (
         lambda: [
@@ -238,9 +185,8 @@ def test_product_of_axes_equals_brute_force_loop(batch, name, kind):
     for i, n in enumerate(N_POINTS):
         look = Look(batch, i, kind)
         memberships = product(*(classes(look) or [np.ones((n, 1))]))
-        np.testing.assert_allclose(
-            result[i], pair_histogram_by_loops(memberships, pairs(look)), atol=1e-6
-        )
+        expected = pair_histogram_by_loops(memberships, pairs(look))
+        np.testing.assert_allclose(result[i], expected, atol=1e-6)
 
 
 def learn(*modules: nn.Module) -> None:
@@ -284,7 +230,8 @@ def test_learned_axes_equal_brute_force_loop(batch, with_cosines):
         else:
             pairs.append((look.euclidean(2)[0], euclidean.centres().tolist()))
         expected = pair_histogram_by_loops(memberships, pairs)
-        np.testing.assert_allclose(result[i].detach(), expected, atol=1e-6)
+        found = result[i].detach()
+        np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 class DepthDifference(PairAxis):
@@ -310,10 +257,10 @@ def test_an_axis_of_ones_own_counts_values_of_its_own(batch):
     for i in range(2):
         look = Look(batch, i)
         depth = look.attribute("depth").double().numpy()
-        axes = [look.interior(4), (np.abs(np.subtract.outer(depth, depth)), [0.0, 0.1, 0.5])]
-        np.testing.assert_allclose(
-            result[i], pair_histogram_by_loops(look.potential(2), axes), atol=1e-6
-        )
+        apart = np.abs(np.subtract.outer(depth, depth))
+        axes = [look.interior(4), (apart, [0.0, 0.1, 0.5])]
+        expected = pair_histogram_by_loops(look.potential(2), axes)
+        np.testing.assert_allclose(result[i], expected, atol=1e-6)
 
 
 def test_defaults_are_the_papers_histogram(batch):
@@ -335,12 +282,10 @@ def test_names_are_axes(batch):
     ("axes", "shape"),
     [
         ([InteriorDistance(5)], (1, 5)),
-        ([Potential(3), InteriorDistance(5)], (6, 5)),
         (
             [InteriorDistance(5), Potential(3), EuclideanDistance(2), Attribute("depth", DEPTH)],
             (45, 5, 2),
         ),
-        ([EuclideanDistance(2), InteriorDistance(5)], (1, 2, 5)),
         (
             [PairCosines(3), EuclideanDistance(2), Potential(2), InteriorDistance(5)],
             (3, 2, 5, 3, 3, 3),
@@ -365,34 +310,10 @@ def test_needs_are_those_of_all_axes():
         PairCosines(),
     ]
     assert PairHistogram(axes, far).requirements == Requirements(0, ("depth", "surface_direction"))
-    assert (
-        PairHistogram([*axes, InteriorDistance(embedding=COARSE)], far).requirements.n_eigenpairs
-        == 2
-    )
-    assert (
-        PairHistogram(
-            [Potential(), InteriorDistance(embedding=COARSE)], far
-        ).requirements.n_eigenpairs
-        == 30
-    )
-    assert PairHistogram([InteriorDistance(embedding=far)], COARSE).requirements == Requirements(30)
-
-
-def test_summing_a_dimension_out_leaves_the_rest(batch):
-    """Whatever the algorithm that counts it."""
-    interior = InteriorDistance(32)
-    euclidean = EuclideanDistance(16)
-    joint = PairHistogram([Potential(4), interior, euclidean])(batch)
-    torch.testing.assert_close(
-        joint.sum(dim=3), PairHistogram([Potential(4), interior])(batch), atol=1e-6, rtol=0
-    )
-    torch.testing.assert_close(
-        joint.sum(dim=2), PairHistogram([Potential(4), euclidean])(batch), atol=1e-6, rtol=0
-    )
-    for angles in (PairCosines(3), EmbeddedPairCosines(3)):
-        oriented = PairHistogram([Potential(4), interior, angles])(batch)
-        expected = PairHistogram([Potential(4), interior])(batch)
-        torch.testing.assert_close(oriented.sum(dim=(3, 4, 5)), expected, atol=1e-6, rtol=0)
+    coarse = PairHistogram([*axes, InteriorDistance(embedding=COARSE)], far)
+    assert coarse.requirements.n_eigenpairs == 2
+    both = PairHistogram([Potential(), InteriorDistance(embedding=COARSE)], far)
+    assert both.requirements.n_eigenpairs == 30
 
 
 def test_a_trained_module_gives_the_same_without_gradient(batch):
@@ -403,21 +324,6 @@ def test_a_trained_module_gives_the_same_without_gradient(batch):
         without = histogram(batch)
     assert with_gradient.requires_grad
     torch.testing.assert_close(with_gradient.detach(), without, atol=1e-6, rtol=0)
-
-
-def test_batch_equals_single_shapes_whatever_the_padding():
-    generator = torch.Generator().manual_seed(3)
-    embedding = torch.randn(90, 6, generator=generator, dtype=torch.float64) * 0.7
-    mask = torch.zeros(2, 90, dtype=torch.bool)
-    mask[0] = True
-    mask[1, ::3] = True
-    padded = embedding.repeat(2, 1, 1)
-    padded[~mask] = torch.nan
-    result = PairHistogram()(batch_of(padded, mask))
-    for i, points in enumerate((embedding, embedding[::3])):
-        np.testing.assert_allclose(
-            result[i], pair_histogram(points, points.norm(dim=1)), atol=1e-14
-        )
 
 
 def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
@@ -436,21 +342,12 @@ def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
         (lambda: [Potential(soft=True), InteriorDistance(8)], torch.nan),
         (
             lambda: [
-                Potential(soft=True, learnable=True),
-                InteriorDistance(8, learnable=True),
-                EuclideanDistance(4),
-            ],
-            torch.nan,
-        ),
-        (
-            lambda: [
                 Potential(2, soft=True, learnable=True),
                 InteriorDistance(4),
                 PairCosines(3, learnable=True),
             ],
             torch.nan,
         ),
-        (lambda: [InteriorDistance(4), EmbeddedPairCosines(3)], 0.0),
         (lambda: [InteriorDistance(4), EmbeddedPairCosines(3)], 9.0),
     ],
 )
@@ -464,17 +361,16 @@ def test_padding_changes_neither_result_nor_gradient_of_the_samples(make, paddin
     padded[~mask] = places[~mask] = padding
     padded.requires_grad_()
     layer = PairHistogram(make())
-    batch = layer(batch_of(padded, mask, places, {"surface_direction": directions.repeat(2, 1, 1)}))
+    towards = directions.repeat(2, 1, 1)
+    batch = layer(batch_of(padded, mask, places, {"surface_direction": towards}))
     single = embedding[::3].clone().requires_grad_()
-    alone = layer(
-        batch_of(
-            single[None], None, points[None, ::3], {"surface_direction": directions[None, ::3]}
-        )
-    )
+    attributes = {"surface_direction": directions[None, ::3]}
+    alone = layer(batch_of(single[None], None, points[None, ::3], attributes))
     torch.testing.assert_close(batch[1], alone[0], rtol=0, atol=1e-14)
     (expected,) = torch.autograd.grad(alone.square().sum(), single)
     (gradient,) = torch.autograd.grad(batch[1].square().sum(), padded)
-    torch.testing.assert_close(gradient[1, ::3], expected, rtol=0, atol=1e-12)
+    found = gradient[1, ::3]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
     assert expected.abs().max() > 1e-6
 
 
@@ -499,114 +395,6 @@ def test_gradient_through_classes_and_layout():
     for gradient in torch.autograd.grad(histogram(*leaves).square().sum(), leaves):
         assert (gradient.abs() > 1e-6).any()
     assert torch.autograd.gradcheck(histogram, leaves)
-
-
-def test_gradient_of_learned_cosines_is_that_of_finite_differences():
-    embedding, points, directions = some(7)
-    angles = PairCosines(3, learnable=True)
-    layer = PairHistogram(
-        [Potential(2, soft=True, learnable=True), InteriorDistance(3, 4.0, learnable=True), angles]
-    ).double()
-    weights = torch.randn(
-        layer.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
-    )
-    batch = batch_of(embedding[None], None, points[None], {"surface_direction": directions[None]})
-    parameters = list(layer.parameters())
-    assert len(parameters) == 4
-
-    def loss() -> Tensor:
-        return (layer(batch)[0] * weights).sum()
-
-    for parameter, gradient in zip(
-        parameters, torch.autograd.grad(loss(), parameters), strict=True
-    ):
-        entry = int(gradient.abs().argmax())
-        moved = []
-        with torch.no_grad():
-            for step in (1e-6, -2e-6):
-                parameter.view(-1)[entry] += step
-                moved.append(float(loss()))
-            parameter.view(-1)[entry] += 1e-6
-        assert gradient.view(-1)[entry] != 0
-        assert gradient.view(-1)[entry] == pytest.approx((moved[0] - moved[1]) / 2e-6, rel=1e-4)
-
-
-def test_soft_classes_tend_to_hard_ones():
-    """Where every potential is at the centre of its class, the soft layout is the hard one."""
-    directions = normalize(some(60)[0], dim=1)
-    centres = (torch.arange(4, dtype=torch.float64) + 0.5) * 1.5 / 4
-    potential = centres[torch.randint(4, (60,), generator=torch.Generator().manual_seed(0))]
-    embedding = directions * potential[:, None]
-    result = PairHistogram([Potential(soft=True), InteriorDistance(16)]).double()(
-        batch_of(embedding[None])
-    )[0]
-    np.testing.assert_allclose(result, pair_histogram(embedding, potential, n_bins=16), atol=1e-8)
-
-
-def test_values_beyond_the_ranges_stay_in_the_last_cells():
-    embedding, points, _ = some(50)
-    axes = [
-        Potential(soft=True, learnable=True),
-        InteriorDistance(learnable=True),
-        EuclideanDistance(4, learnable=True),
-    ]
-    result = PairHistogram(axes)(batch_of(embedding[None] * 1000, None, points[None] * 1000))[
-        0
-    ].detach()
-    assert float(result.sum()) == pytest.approx(1)
-    assert float(result[-1, -1, -1]) > 0.9
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
-@pytest.mark.parametrize("name", ["distance_range", "potential_range"])
-def test_a_range_that_is_no_positive_number_is_refused(name, value):
-    """An infinite range of potentials put all points into the first class."""
-    embedding, _, _ = some(20)
-    with pytest.raises(ValueError, match=f"{name}: expected a positive number, got {value}"):
-        pair_histogram(embedding, embedding.norm(dim=1), **{name: value})
-
-
-def two_layouts(options: dict[str, bool], *more: Callable[..., PairAxis]) -> PairHistogram:
-    learned = {"learnable": options.get("learnable", False)}
-    points = [Potential(**options), Attribute("depth", [-0.1, 0.2, 0.5], **options)]
-    return PairHistogram(
-        [*points, InteriorDistance(**learned), *(axis(**learned) for axis in more)]
-    )
-
-
-@pytest.mark.parametrize(
-    "more",
-    [(), (EuclideanDistance,), (partial(PairCosines, 3),), (partial(EmbeddedPairCosines, 3),)],
-)
-def test_learned_layout_starts_as_the_fixed_one(more):
-    embedding, points, directions = (value[None].float() for value in some(30))
-    attributes = {"depth": points[:, :, 0], "surface_direction": directions}
-    batch = batch_of(embedding, None, points, attributes)
-    fixed, learned = (two_layouts(options, *more)(batch) for options in ({}, {"learnable": True}))
-    assert not fixed.requires_grad
-    assert learned.requires_grad
-    np.testing.assert_allclose(learned.detach(), fixed, atol=1e-6)
-
-
-def test_training_moves_a_layout_and_keeps_its_order():
-    batch = batch_of(some(60)[0].float()[None])
-    layer = PairHistogram(
-        [Potential(soft=True, learnable=True), InteriorDistance(8, learnable=True)]
-    )
-    axes = [axis.centres for axis in layer.axes]
-    start = [centres().detach() for centres in axes]
-    optimiser = torch.optim.SGD(layer.parameters(), lr=10.0)
-    losses = []
-    for _ in range(15):
-        loss = (layer(batch) - 1 / 80).square().sum()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.8 * losses[0]
-    for centres, before in zip(axes, start, strict=True):
-        assert (centres().diff() > 0).all()
-        assert (centres() - before).abs().max() > 0.01
 
 
 def test_layout_survives_its_state():

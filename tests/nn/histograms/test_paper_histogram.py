@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations_with_replacement
 
 import numpy as np
 import pytest
 import torch
 
-from igps.nn._kernels.pairs import class_pairs
 from igps.nn.histograms import pair_histogram
 
 
@@ -16,7 +16,8 @@ def by_loops(
     embedding: np.ndarray, potential: np.ndarray, d_max: float, u_max: float, c: int, b: int
 ) -> np.ndarray:
     """The definition, one pair at a time."""
-    rows = {pair: i for i, pair in enumerate(class_pairs(c))}
+    pairs = combinations_with_replacement(range(c), 2)
+    rows = {pair: i for i, pair in enumerate(pairs)}
     histogram = np.zeros((len(rows), b))
     level = [min(int(u / (u_max / c)), c - 1) for u in potential]
     for i in range(len(embedding)):
@@ -38,7 +39,7 @@ def cloud() -> tuple[torch.Tensor, torch.Tensor]:
     return embedding, embedding.norm(dim=1)
 
 
-@pytest.mark.parametrize(("n_classes", "n_bins"), [(1, 64), (4, 64), (3, 7), (8, 2)])
+@pytest.mark.parametrize(("n_classes", "n_bins"), [(1, 64), (3, 7), (8, 2)])
 def test_equals_brute_force_loop(cloud, n_classes, n_bins):
     embedding, potential = cloud
     expected = by_loops(embedding.numpy(), potential.numpy(), 4.0, 1.5, n_classes, n_bins)
@@ -100,7 +101,7 @@ def test_half_precision_is_counted_in_single(cloud):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("n_bins", 1), ("n_classes", 0), ("distance_range", 0.0), ("potential_range", -1.0)],
+    [("n_bins", 1), ("n_classes", 0), ("distance_range", 0.0), ("potential_range", math.inf)],
 )
 def test_bad_layout_is_refused(cloud, name, value):
     with pytest.raises(ValueError, match=f"{name}: expected .*, got {value}"):

@@ -10,9 +10,7 @@ import pytest
 import torch
 
 from batches import alone, embedded, scaled, two_bodies
-from igps.data.requirements import Requirements
 from igps.nn import functional
-from igps.nn._kernels.balls import ball_radii
 from igps.nn.axes import BallRadius, EuclideanDistance, Potential
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
@@ -39,7 +37,7 @@ def test_it_is_the_share_of_samples_in_each_cell():
         real = batch.surface.mask[i]
         points = batch.surface.points[i, real] / batch.area[i].sqrt().float()
         directions = batch.surface.attributes["surface_direction"][i, real]
-        radii = ball_radii(points[None], directions[None], real[real][None])[0].log()
+        radii = functional.ball_radii(points[None], directions[None], real[real][None])[0].log()
         inside, outside = (
             [math.log(a) + k * math.log(b / a) / (n - 1) for k in range(n)]
             for a, b, n in ((0.05, 0.6, 3), (0.05, 0.9, 2))
@@ -50,14 +48,16 @@ def test_it_is_the_share_of_samples_in_each_cell():
             soft_classes(embedded(batch, i, "surface", 2).norm(dim=1), [0.25, 0.75, 1.25]),
             soft_classes(embedded(batch, i, "surface", 5).norm(dim=1), [0.25, 0.75, 1.25, 1.75]),
         )
-        np.testing.assert_allclose(found[i].flatten(), memberships.mean(axis=0), atol=1e-6)
+        expected = memberships.mean(axis=0)
+        np.testing.assert_allclose(found[i].flatten(), expected, atol=1e-6)
 
 
 def test_padding_and_scale_change_nothing():
     batch = two_bodies()
     histogram = layout()
     found = histogram(batch)
-    torch.testing.assert_close(found.flatten(1).sum(dim=1), torch.ones(2))
+    expected = torch.ones(2)
+    torch.testing.assert_close(found.flatten(1).sum(dim=1), expected)
     for i in range(2):
         torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
     torch.testing.assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
@@ -67,10 +67,6 @@ def test_a_subset_of_the_samples_is_counted():
     batch = two_bodies()
     expected = layout()(replace(batch, surface=batch.surface.subset(20, seed=0)))
     torch.testing.assert_close(layout(n_samples=20)(batch), expected)
-
-
-def test_needs():
-    assert layout().requirements == Requirements(n_eigenpairs=5, attributes=("surface_direction",))
 
 
 def test_what_it_cannot_count_is_named():

@@ -7,9 +7,8 @@ from dataclasses import replace
 import torch
 
 import igps
-from batches import batch_of, two_bodies
+from batches import two_bodies
 from conftest import torch_threads
-from igps.nn._kernels import gradients
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
 
@@ -58,37 +57,7 @@ def test_gradients_of_first_and_second_order_are_those_without_a_limit(monkeypat
         return [*first, *torch.autograd.grad(size, inputs)]
 
     limited = found()
-    monkeypatch.setattr(gradients, "uses_loops", lambda device: False)
+    monkeypatch.setattr("igps.nn._kernels.gradients.uses_loops", lambda device: False)
     for one, other in zip(limited, found(), strict=True):
         assert bool(one.any())
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-7)
-
-
-def test_a_graph_that_is_retained_can_be_used_twice():
-    descriptor = learned()
-    loss = descriptor(two_bodies()).square().sum()
-    first, again = (
-        torch.autograd.grad(loss, list(descriptor.parameters()), retain_graph=True)
-        for _ in range(2)
-    )
-    torch.testing.assert_close(first, again)
-
-
-def test_bodies_drawn_to_one_number_are_counted_together(monkeypatch):
-    generator = torch.Generator().manual_seed(0)
-    mask = torch.arange(1500) < torch.tensor([[1500], [700], [90]])
-    batch = batch_of(torch.randn(3, 1500, 4, generator=generator), mask)
-    histogram = PairHistogram(n_training_samples=50).train()
-    shapes = []
-    count = PairHistogram.of_samples
-
-    def watched(self: PairHistogram, features: object) -> torch.Tensor:
-        found = count(self, features)
-        shapes.append(tuple(found.shape))
-        return found
-
-    monkeypatch.setattr(PairHistogram, "of_samples", watched)
-    histogram(batch)
-    assert shapes == [(3, 10, 64)]
-    histogram.eval()(batch)
-    assert len(shapes) > 2

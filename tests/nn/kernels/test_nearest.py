@@ -18,4 +18,6 @@ def test_the_smallest_of_each_row_are_those_of_a_sort(n, dtype):
 
 
 def test_of_equal_entries_the_first_are_kept():
-    assert smallest(torch.zeros(2, 6), 3)[1].tolist() == [[0, 1, 2], [0, 1, 2]]
+    found = smallest(torch.zeros(2, 6), 3)[1].tolist()
+    expected = [[0, 1, 2], [0, 1, 2]]
+    assert found == expected
