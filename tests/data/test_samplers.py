@@ -15,18 +15,17 @@ def test_every_shape_comes_once_in_batches_of_the_size_asked(drop_last):
     )
     batches = list(sampler)
     assert len(batches) == len(sampler) == (50 if drop_last else 51)
-    assert sorted(map(len, batches))[0] == (8 if drop_last else 3)
+    found = sorted(map(len, batches))[0]
+    assert found == 8 if drop_last else 3
     drawn = [i for batch in batches for i in batch]
     assert len(set(drawn)) == len(drawn) == (400 if drop_last else 403)
 
 
 def padding(batches: list[list[int]]) -> float:
     """Padding rows of all batches, over the rows of their shapes."""
-    return (
-        sum(len(one) * int(SIZES[one].max()) for one in batches)
-        / sum(int(SIZES[one].sum()) for one in batches)
-        - 1
-    )
+    n_rows = sum(int(SIZES[one].sum()) for one in batches)
+    n_padded = sum(len(one) * int(SIZES[one].max()) for one in batches)
+    return n_padded / n_rows - 1
 
 
 def test_padding_is_a_small_part_of_that_of_random_batches():

@@ -5,9 +5,8 @@ import torch
 
 from igps.data.splits import Split, split_seen, split_unseen
 
-LABELS = torch.arange(8).repeat_interleave(6)[
-    torch.randperm(48, generator=torch.Generator().manual_seed(1))
-]
+ORDER = torch.randperm(48, generator=torch.Generator().manual_seed(1))
+LABELS = torch.arange(8).repeat_interleave(6)[ORDER]
 
 
 def classes(indices: tuple[int, ...]) -> list[int]:
@@ -38,21 +37,21 @@ def test_unseen_split_shares_no_class():
 
 def test_a_whole_number_may_be_a_float():
     labels = torch.arange(3).repeat_interleave(4)
-    assert split_seen(labels, 3.0, n_validation=1.0) == split_seen(labels, 3, n_validation=1)
+    found = split_seen(labels, 3.0, n_validation=1.0)
+    expected = split_seen(labels, 3, n_validation=1)
+    assert found == expected
 
 
 def test_shares_leave_two_of_each_class_to_validate_and_to_test():
     labels = torch.arange(3).repeat_interleave(torch.tensor([5, 8, 20]))
     split = split_seen(labels, 0.75, n_validation=0.25)
-    counts = [
-        torch.bincount(labels[list(part)]).tolist()
-        for part in (split.train, split.validation, split.test)
-    ]
-    assert counts == [[1, 4, 11], [2, 2, 4], [2, 2, 5]]
+    parts = (split.train, split.validation, split.test)
+    counts = [torch.bincount(labels[list(part)]).tolist() for part in parts]
+    expected = [[1, 4, 11], [2, 2, 4], [2, 2, 5]]
+    assert counts == expected
     of_classes = split_unseen(labels, 0.5, n_validation=0.5)
-    assert [
-        len(set(labels[list(part)].tolist())) for part in (of_classes.train, of_classes.test)
-    ] == [1, 1]
+    for part in (of_classes.train, of_classes.test):
+        assert len(labels[list(part)].unique()) == 1
 
 
 def test_fewer_training_classes_keep_the_test_classes():
@@ -63,7 +62,8 @@ def test_fewer_training_classes_keep_the_test_classes():
 
 def test_validation_is_taken_from_the_training_part_alone():
     for split in (split_seen, split_unseen):
-        assert split(LABELS, 4, seed=2).test == split(LABELS, 4, n_validation=2, seed=2).test
+        found = split(LABELS, 4, seed=2).test
+        assert found == split(LABELS, 4, n_validation=2, seed=2).test
 
 
 def test_splits_depend_on_the_seed_alone():
