@@ -38,12 +38,8 @@ def test_signatures_of_files_hold_the_numbers_of_their_meshes(tmp_path):
 
 
 def test_scaled_bodies_differ_by_their_size_alone():
-    bodies = [
-        ellipsoid(1, 2, 3),
-        ellipsoid(2, 4, 6),
-        ellipsoid(1, 1, 3),
-        ellipsoid(0.1, 0.2, 0.3, unit="cm"),
-    ]
+    bodies = [ellipsoid(1, 2, 3), ellipsoid(2, 4, 6), ellipsoid(1, 1, 3)]
+    bodies.append(ellipsoid(0.1, 0.2, 0.3, unit="cm"))
     batch = collate([compute_signature(body, CONFIG) for body in bodies])
     found = igps.descriptor("measures")
     first = found(batch)
@@ -52,11 +48,11 @@ def test_scaled_bodies_differ_by_their_size_alone():
     sized = igps.descriptor("measures", size="keep")
     assert sized.name == "measures+size"
     logarithms = sized(batch) * sized.spread
-    has_unit = torch.tensor(
-        [name not in ("extent", "convexity", "n_pieces", "euler_number") for name in sized.columns]
-    )
+    without_unit = ("extent", "convexity", "n_pieces", "euler_number")
+    has_unit = torch.tensor([name not in without_unit for name in sized.columns])
     doubled = (logarithms[1] - logarithms[0])[has_unit]
-    torch.testing.assert_close(doubled, torch.full_like(doubled, math.log(2)), atol=1e-3, rtol=0)
+    expected = torch.full_like(doubled, math.log(2))
+    torch.testing.assert_close(doubled, expected, atol=1e-3, rtol=0)
     torch.testing.assert_close(logarithms[3], logarithms[0], atol=1e-3, rtol=0)
 
 

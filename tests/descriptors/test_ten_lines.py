@@ -1,4 +1,4 @@
-"""The ten lines of the README with every named descriptor in place of the one that is printed there."""
+"""The ten lines of the README with descriptors of each kind in place of the one that is printed there."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import igps
-from igps.descriptors import NAMES
 
 README = Path(__file__).parents[2] / "README.md"
 
@@ -27,8 +26,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_ten_lines_work_with_every_descriptor(folder, name, monkeypatch, capsys):
+@pytest.mark.parametrize("name", ["interior", "pretrained", "d2", "measures"])
+def test_the_ten_lines_work_with_descriptors_of_each_kind(folder, name, monkeypatch, capsys):
     match = re.search(
         r"^```python\n(.*?)^```", README.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
     )

@@ -144,13 +144,10 @@ def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tm
     ):
         own(dataset.batch([0]))
     assert fit_centres(own, dataset)
-    values = np.concatenate(
-        [one.interior.attributes["height"][:500] for one in dataset.signatures()]
-    )
+    heights_of = [one.interior.attributes["height"][:500] for one in dataset.signatures()]
+    expected = np.quantile(np.concatenate(heights_of), [0.125, 0.375, 0.625, 0.875])
     centres = own.histograms[0].axes[0].centres()
-    np.testing.assert_allclose(
-        centres, np.quantile(values, [0.125, 0.375, 0.625, 0.875]), rtol=1e-5
-    )
+    np.testing.assert_allclose(centres, expected, rtol=1e-5)
     described = describe(dataset, own)
     assert not fit_centres(own, dataset[[0]])
     own.save(tmp_path / "kept.safetensors")
@@ -184,23 +181,20 @@ def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp
     affine = np.diag([0.1, 0.1, 0.1, 1.0])
     affine[:3, 3] = -1.5
     voxels = np.stack(np.meshgrid(*[np.arange(31)] * 3, indexing="ij"), axis=-1) * 0.1 - 1.5
+    files = []
     for kind in ("graded", "layered", "mottled", "core"):
         for i in range(4):
+            files.append(tmp_path / "root" / kind / f"{i}.off")
             body = trimesh.creation.icosphere(subdivisions=3)
             body.vertices *= np.array([1, 0.8, 1.3]) * generator.uniform(0.98, 1.02, 3)
             (tmp_path / "root" / kind).mkdir(parents=True, exist_ok=True)
-            body.export(tmp_path / "root" / kind / f"{i}.off")
+            body.export(files[-1])
             values = texture(kind, generator, voxels.reshape(-1, 3)).reshape(31, 31, 31)
             place = tmp_path / "root" / "ct" / kind / f"{i}.off.nii.gz"
             place.parent.mkdir(parents=True, exist_ok=True)
             nibabel.save(nibabel.Nifti1Image(values.astype(np.float32), affine), place)
     images = {"ct": ImageAttribute("ct/{file}.nii.gz", tmp_path / "root")}
     found = {}
-    files = [
-        tmp_path / "root" / kind / f"{i}.off"
-        for kind in ("graded", "layered", "mottled", "core")
-        for i in range(4)
-    ]
     labels = [path.parent.name for path in files]
     for name in ("interior", "interior+ct"):
         chosen = igps.descriptor(name)
@@ -209,9 +203,8 @@ def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp
         )
         fit_centres(chosen, dataset)
         described = describe(dataset, chosen)
-        found[name] = float(
-            retrieval_scores(chosen.distances(described, described), labels).mean()["nn"]
-        )
+        distances = chosen.distances(described, described)
+        found[name] = retrieval_scores(distances, labels).mean()["nn"]
     assert found["interior+ct"] >= 0.95
     assert found["interior"] < 0.6
 
@@ -228,18 +221,20 @@ def test_an_attribute_adds_its_histograms_with_its_weight(bodies, tmp_path):
     described = describe(dataset, whole)
     form = describe(dataset, descriptor("pretrained"))
     inside = describe(dataset, whole.inside)
-    np.testing.assert_allclose(inside.sum(dim=1), 1, rtol=1e-5)
+    found = inside.sum(dim=1)
+    np.testing.assert_allclose(found, 1, rtol=1e-5)
     by_bins = inside.reshape(3, 36, 32)  # pairs of eight classes
     levels = [by_bins, by_bins.reshape(3, 36, 8, 4).sum(dim=3), by_bins.sum(dim=2)]
     told = sum(chi_square(level.flatten(1), level.flatten(1)) for level in levels) / 3
     expected = descriptor("pretrained").distances(form, form) + 0.5 * 0.083 / 0.017 * told
-    np.testing.assert_allclose(whole.distances(described, described), expected, atol=1e-5)
+    found = whole.distances(described, described)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
     rows = whole.coordinates(described, within_class=True)
     kept = descriptor("pretrained").coordinates(form, within_class=True)
-    np.testing.assert_allclose(rows[:, : kept.shape[1]], kept, atol=1e-6)
-    np.testing.assert_allclose(
-        rows[:, kept.shape[1] :].square(), 0.5 * 0.083 / 0.017 * inside.flatten(1), atol=1e-5
-    )
+    found = rows[:, : kept.shape[1]]
+    np.testing.assert_allclose(found, kept, atol=1e-6)
+    squares = rows[:, kept.shape[1] :].square()
+    np.testing.assert_allclose(squares, 0.5 * 0.083 / 0.017 * inside.flatten(1), atol=1e-5)
     assert igps.descriptor("pretrained+height=0.5+size").name == "pretrained+height=0.5+size"
     with pytest.raises(ValueError, match="with: expected positive weights"):
         igps.descriptor("interior+height=0")

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from igps.descriptors.literature._geodesics import edge_graph
+from igps.descriptors.literature._geodesics import edge_graph, farthest_points
 from igps.mesh.mesh import Mesh
+
+__all__ = ["farthest_points", "geodesic_distances"]
 
 
 def geodesic_distances(

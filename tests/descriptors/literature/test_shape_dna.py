@@ -31,7 +31,9 @@ def test_shape_dna_of_a_sphere_is_known(round_body):
 def test_shape_dna_distance_is_euclidean():
     one = torch.tensor([[1.0, 2.0]])
     two = torch.tensor([[4.0, 6.0], [1.0, 2.0]])
-    torch.testing.assert_close(ShapeDNA(2).distances(one, two), torch.tensor([[5.0, 0.0]]))
+    found = ShapeDNA(2).distances(one, two)
+    expected = torch.tensor([[5.0, 0.0]])
+    torch.testing.assert_close(found, expected)
 
 
 def test_number_out_of_range_is_named():

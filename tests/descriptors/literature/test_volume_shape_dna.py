@@ -44,12 +44,6 @@ def test_cube_has_the_spectrum_of_its_grid_with_all_multiplets():
     np.testing.assert_allclose(spectrum, expected, rtol=1e-6)
 
 
-def test_cube_converges_with_order_two():
-    exact = np.pi**2 * np.square(cube_frequencies(20)).sum(axis=1)
-    cube = as_mesh(trimesh.creation.box((1, 1, 1)))
-    coarse, fine = (np.abs(volume_spectrum(cube, 20, n**3 - 1) / exact - 1).mean() for n in (8, 16))
-    assert fine < 0.02
-    assert np.log2(coarse / fine) == pytest.approx(2, abs=0.1)
 
 
 def test_ball_tends_to_zeros_of_bessel_functions():
@@ -61,11 +55,6 @@ def test_ball_tends_to_zeros_of_bessel_functions():
     assert measured > 1.8
 
 
-def test_turned_cube_is_still_a_cube():
-    exact = np.pi**2 * np.square(cube_frequencies(20)).sum(axis=1)
-    surface = trimesh.creation.box((1, 1, 1))
-    surface.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
-    np.testing.assert_allclose(volume_spectrum(as_mesh(surface), 20, 4000), exact, rtol=0.055)
 
 
 def test_walls_lie_between_the_cells_where_the_surface_is():
@@ -78,12 +67,6 @@ def test_walls_lie_between_the_cells_where_the_surface_is():
         assert first[0] == pytest.approx(3 * np.pi**2, rel=0.006)
 
 
-def test_scale_and_place_do_not_matter(blob):
-    descriptor = VolumeShapeDNA(n_eigenvalues=20, n_voxels=500)
-    moved = Mesh(blob.vertices * 1000 + [3e4, 2e3, -1e4], blob.faces)
-    np.testing.assert_allclose(
-        descriptor.describe_body(of_mesh(moved)), descriptor.describe_body(of_mesh(blob)), rtol=1e-5
-    )
 
 
 def test_description_is_the_spectrum(blob):

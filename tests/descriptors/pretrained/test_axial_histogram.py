@@ -23,14 +23,9 @@ EMBEDDING = SpectralEmbedding(n_eigenpairs=6)
 def moved(batch: SignatureBatch, motion: Tensor, shift: Tensor) -> SignatureBatch:
     surface = batch.surface
     directions = surface.attributes["surface_direction"] @ motion
-    return replace(
-        batch,
-        surface=replace(
-            surface,
-            points=surface.points @ motion + shift,
-            attributes={"surface_direction": directions},
-        ),
-    )
+    attributes = {"surface_direction": directions}
+    points = surface.points @ motion + shift
+    return replace(batch, surface=replace(surface, points=points, attributes=attributes))
 
 
 def test_it_is_the_share_of_samples_in_each_cell():
@@ -75,9 +70,9 @@ def test_it_is_the_share_of_samples_in_each_cell():
 def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored):
     batch = two_bodies()
     histogram = AxialHistogram(EMBEDDING)
-    motion = torch.from_numpy(Rotation.random(random_state=0).as_matrix()).float() * (
-        -1 if mirrored else 1
-    )
+    motion = torch.from_numpy(Rotation.random(random_state=0).as_matrix()).float()
+    if mirrored:
+        motion = -motion
     expected = histogram(batch)
     found = histogram(scaled(moved(batch, motion, torch.tensor([1.0, -2.0, 0.5])), 2.0))
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
@@ -87,33 +82,35 @@ def test_padding_changes_nothing():
     batch = two_bodies()
     histogram = AxialHistogram(EMBEDDING)
     found = histogram(batch)
-    torch.testing.assert_close(found.flatten(1).sum(dim=1), torch.ones(2))
+    expected = torch.ones(2)
+    torch.testing.assert_close(found.flatten(1).sum(dim=1), expected)
     for i in range(2):
         torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
 
 
 def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end():
     generator = torch.Generator().manual_seed(0)
-    brick = (torch.rand(20000, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor(
-        [1.0, 3.0, 2.0]
-    )
+    cube = torch.rand(20000, 3, generator=generator, dtype=torch.float64) - 0.5
+    brick = cube * torch.tensor([1.0, 3.0, 2.0])
     far = torch.tensor([[0.0, -4.0, 0.0]], dtype=torch.float64)
     turn = torch.from_numpy(Rotation.from_euler("xyz", (0.3, 0.5, -0.2)).as_matrix())
     points = torch.cat([brick, far.expand(50, 3)]) @ turn.T + 7
     weights = torch.ones(len(points), dtype=torch.float64)
     weights[len(brick) :] = 1e-9  # what is far off tells the direction, not the axes
     (centre,), (axes,) = principal_axes(points[None], weights[None])
-    np.testing.assert_allclose(centre[0], [7, 7, 7], atol=0.05)
-    np.testing.assert_allclose((turn.T @ axes).abs(), np.eye(3)[[1, 2, 0]].T, atol=0.05)
+    expected = [7, 7, 7]
+    np.testing.assert_allclose(centre[0], expected, atol=0.05)
+    found = (turn.T @ axes).abs()
+    expected = np.eye(3)[[1, 2, 0]].T
+    np.testing.assert_allclose(found, expected, atol=0.05)
     assert float((turn.T @ axes)[1, 0]) < -0.99
 
 
 def test_a_limb_that_moves_hardly_turns_the_axes():
     """A trunk of low potential, and a heavy limb of high potential that sweeps a right angle."""
     generator = torch.Generator().manual_seed(1)
-    trunk = (torch.rand(600, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor(
-        [0.6, 2.0, 0.4]
-    )
+    cube = torch.rand(600, 3, generator=generator, dtype=torch.float64) - 0.5
+    trunk = cube * torch.tensor([0.6, 2.0, 0.4])
     limb = torch.rand(400, 1, generator=generator, dtype=torch.float64) * 2
     weights = torch.cat([torch.full((600,), 0.4), torch.full((400,), 1.0)]).double() ** -4
     axes = []
@@ -121,21 +118,16 @@ def test_a_limb_that_moves_hardly_turns_the_axes():
     for direction in ([1.0, 1.0, 0.0], [1.0, -0.2, 0.0]):
         points = torch.cat([trunk, limb * torch.tensor(direction)])
         axes.append(principal_axes(points[None], weights[None])[1][0, :, 0])
-        plain.append(
-            principal_axes(points[None], torch.ones(1, 1000, dtype=torch.float64))[1][0, :, 0]
-        )
-    turned = [
-        float(torch.rad2deg(torch.arccos((one @ other).abs()))) for one, other in (axes, plain)
-    ]
-    assert turned[0] < 10 < 30 < turned[1]
+        plain.append(principal_axes(points[None], torch.ones_like(weights)[None])[1][0, :, 0])
+    turned, plainly = ((one @ other).abs().arccos().rad2deg() for one, other in (axes, plain))
+    assert turned < 10 < 30 < plainly
 
 
 def test_it_has_gradients_of_places_and_directions():
     batch = two_bodies()
     points = batch.surface.points.clone().requires_grad_()
-    histogram = AxialHistogram(EMBEDDING)(
-        replace(batch, surface=replace(batch.surface, points=points))
-    )
+    moved_batch = replace(batch, surface=replace(batch.surface, points=points))
+    histogram = AxialHistogram(EMBEDDING)(moved_batch)
     histogram.square().sum().backward()
     assert points.grad is not None
     assert torch.isfinite(points.grad).all()

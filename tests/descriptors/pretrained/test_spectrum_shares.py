@@ -21,7 +21,8 @@ def test_shares_are_those_of_a_loop():
         # Of the ball of this volume
         radius = (3 * float(batch.volume[i]) / (4 * math.pi)) ** (1 / 3)
         shares = [float(batch.eigenvalues[i, k - 1]) * radius**2 / (2 * k) / 6 for k in range(1, 7)]
-        torch.testing.assert_close(found[i], torch.tensor([*shares, 1 - sum(shares)]))
+        expected = torch.tensor([*shares, 1 - sum(shares)])
+        torch.testing.assert_close(found[i], expected)
 
 
 def test_a_spectrum_that_follows_weyl_has_equal_shares():
@@ -48,7 +49,8 @@ def test_padding_and_scale_change_nothing():
     batch = two_bodies()
     histogram = SpectrumShares(min(N_EIGENPAIRS))
     found = histogram(batch)
-    torch.testing.assert_close(found.sum(dim=1), torch.ones(2))
+    expected = torch.ones(2)
+    torch.testing.assert_close(found.sum(dim=1), expected)
     for i in range(2):
         torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
     torch.testing.assert_close(histogram(scaled(batch, 3.0)), found)
