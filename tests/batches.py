@@ -1,12 +1,9 @@
 """Batches of made-up bodies."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.functional import normalize
 
 from igps.data.batch import SampleBatch, SignatureBatch
@@ -15,7 +12,7 @@ N_POINTS = (40, 25)
 N_EIGENPAIRS = (12, 7)
 
 
-def two_bodies() -> SignatureBatch:
+def two_bodies():
     """Two shapes of different numbers of samples and eigenpairs."""
     generator = torch.Generator().manual_seed(11)
     eigenvalues = torch.rand(2, 12, generator=generator, dtype=torch.float64).cumsum(dim=1) * 10 + 5
@@ -31,7 +28,7 @@ def two_bodies() -> SignatureBatch:
     )
 
 
-def _samples(generator: torch.Generator) -> SampleBatch:
+def _samples(generator):
     longest = max(N_POINTS)
     mask = torch.arange(longest) < torch.tensor(N_POINTS)[:, None]
     functions = torch.randn(2, longest, max(N_EIGENPAIRS), generator=generator) * mask[:, :, None]
@@ -46,10 +43,10 @@ def _samples(generator: torch.Generator) -> SampleBatch:
     return SampleBatch(points, functions, mask, attributes)
 
 
-def alone(batch: SignatureBatch, i: int) -> SignatureBatch:
+def alone(batch, i):
     """One shape without its padding."""
 
-    def unpadded(samples: SampleBatch) -> SampleBatch:
+    def unpadded(samples):
         n_points = int(samples.mask[i].sum())
         n_eigenpairs = int(torch.isfinite(batch.eigenvalues[i]).sum())
         return SampleBatch(
@@ -71,10 +68,10 @@ def alone(batch: SignatureBatch, i: int) -> SignatureBatch:
     )
 
 
-def scaled(batch: SignatureBatch, scale: float) -> SignatureBatch:
+def scaled(batch, scale):
     """The same shapes, larger."""
 
-    def grown(samples: SampleBatch) -> SampleBatch:
+    def grown(samples):
         return replace(
             samples, points=samples.points * scale, eigenfunctions=samples.eigenfunctions / scale
         )
@@ -89,23 +86,16 @@ def scaled(batch: SignatureBatch, scale: float) -> SignatureBatch:
     )
 
 
-def embedded(
-    batch: SignatureBatch, i: int, kind: str = "interior", n_eigenpairs: int | None = None
-) -> Tensor:
+def embedded(batch, i, kind="interior", n_eigenpairs=None):
     """(P, K) commute time embedding of one shape's samples, φₖ/√λₖ, float64, by its definition."""
-    samples: SampleBatch = getattr(batch, kind)
+    samples = getattr(batch, kind)
     eigenvalues = batch.eigenvalues[i, torch.isfinite(batch.eigenvalues[i])][:n_eigenpairs]
     return (
         samples.eigenfunctions[i, samples.mask[i], : len(eigenvalues)].double() / eigenvalues.sqrt()
     )
 
 
-def batch_of(
-    embedding: Tensor,
-    mask: Tensor | None = None,
-    points: Tensor | None = None,
-    attributes: Mapping[str, Tensor] | None = None,
-) -> SignatureBatch:
+def batch_of(embedding, mask=None, points=None, attributes=None):
     """Shapes whose commute time embedding, (N, P, D), is the given one: their eigenvalues are 1, and their areas.
 
     All that is given is as it is, gradients and padding included; the surface samples are the interior ones.
@@ -137,19 +127,12 @@ def batch_of(
 class OfTensors(nn.Module):
     """A descriptor of the tensors of a padded batch, as a program in another language would call it."""
 
-    def __init__(self, descriptor: nn.Module, like: SignatureBatch) -> None:
+    def __init__(self, descriptor, like):
         super().__init__()
         self.descriptor = descriptor
         self.like = like
 
-    def forward(
-        self,
-        eigenvalues: Tensor,
-        area: Tensor,
-        volume: Tensor,
-        kinds: dict[str, dict[str, Tensor]],
-        measures: Tensor,
-    ) -> Tensor:
+    def forward(self, eigenvalues, area, volume, kinds, measures):
         own = ("points", "eigenfunctions", "mask")
         samples = {
             kind: SampleBatch(
@@ -169,9 +152,7 @@ class OfTensors(nn.Module):
         )
 
 
-def tensors(
-    batch: SignatureBatch,
-) -> tuple[Tensor, Tensor, Tensor, dict[str, dict[str, Tensor]], Tensor]:
+def tensors(batch):
     """What `OfTensors` takes of a batch."""
     kinds = {
         kind: {
@@ -186,7 +167,7 @@ def tensors(
     return batch.eigenvalues, batch.area, batch.volume, kinds, measures
 
 
-def exported(descriptor: nn.Module, batch: SignatureBatch) -> nn.Module:
+def exported(descriptor, batch):
     """The program of `OfTensors` that `torch.export` makes for any number of bodies and samples."""
     given = tensors(batch)
     some = {0: torch.export.Dim.AUTO}

@@ -1,7 +1,5 @@
 """Surfaces as plain arrays, points in and around them, and functions on them."""
 
-from __future__ import annotations
-
 import igl
 import numpy as np
 import trimesh
@@ -11,7 +9,7 @@ from igps.signature.mean_value import extend
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
-def bumpy_sphere(subdivisions: int, amplitude: float = 0.3) -> Mesh:
+def bumpy_sphere(subdivisions, amplitude=0.3):
     """A closed, star-shaped, asymmetric surface."""
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     x, y, z = sphere.vertices.T
@@ -21,17 +19,17 @@ def bumpy_sphere(subdivisions: int, amplitude: float = 0.3) -> Mesh:
     )
 
 
-def cube() -> Mesh:
+def cube():
     box = trimesh.creation.box(extents=(2, 2, 2))
     return np.asarray(box.vertices, np.float64), np.asarray(box.faces, np.int64)
 
 
-def torus(n_major: int, n_minor: int) -> Mesh:
+def torus(n_major, n_minor):
     shape = trimesh.creation.torus(1.0, 0.35, major_sections=n_major, minor_sections=n_minor)
     return np.asarray(shape.vertices, np.float64), np.asarray(shape.faces, np.int64)
 
 
-def interior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
+def interior_points(mesh, n, seed=0):
     vertices, faces = mesh
     low = vertices.min(0)
     high = vertices.max(0)
@@ -39,7 +37,7 @@ def interior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
     return points[igl.winding_number(vertices, faces, points) > 0.5][:n]
 
 
-def exterior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
+def exterior_points(mesh, n, seed=0):
     vertices, faces = mesh
     points = np.random.default_rng(seed).uniform(
         2 * vertices.min(0), 2 * vertices.max(0), (8 * n, 3)
@@ -47,15 +45,13 @@ def exterior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
     return points[igl.winding_number(vertices, faces, points) < 0.5][:n]
 
 
-def smooth_functions(vertices: np.ndarray) -> np.ndarray:
+def smooth_functions(vertices):
     x, y, z = vertices.T
     return np.stack(
         [np.sin(2 * x), np.cos(3 * y + x), x * y * z, np.exp(z), np.sin(5 * z) * x, x], axis=1
     )
 
 
-def mean_value_coordinates(
-    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
-) -> np.ndarray:
+def mean_value_coordinates(vertices, faces, points):
     """(P, V) at points (P, 3): what extends the vertices' own functions, each 1 at one vertex."""
     return extend(vertices, faces, np.eye(len(vertices)), points)

@@ -1,7 +1,5 @@
 """Run the command line of igps in the process of the test."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest
@@ -9,15 +7,13 @@ import pytest
 from igps.cli import main
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+def run(monkeypatch, *arguments):
     """Run `igps` with arguments."""
     monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
     main()
 
 
-def error_of(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
-) -> str:
+def error_of(monkeypatch, capsys, *arguments):
     """Return the line of the error with which `igps` ends for these arguments."""
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, *arguments)

@@ -1,11 +1,7 @@
 """Meshes and data that several tests use."""
 
-from __future__ import annotations
-
 import contextlib
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,20 +24,20 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 
 @pytest.fixture(params=["loops", "BLAS"])
-def either_processor(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def either_processor(request, monkeypatch):
     """Multiply by compiled loops and by BLAS, whichever is faster on this processor."""
     monkeypatch.setattr("igps.spectra._products.loops_beat_blas", lambda: request.param == "loops")
 
 
 @pytest.fixture
-def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], list[Figure]]:
+def figures_of(monkeypatch):
     """A function from a module to the list of figures that it makes from now on."""
 
-    def remembered(module: Any) -> list[Figure]:
+    def remembered(module):
         made = list[Figure]()
         make = module.new_figure
 
-        def remember(width: float, height: float) -> Figure:
+        def remember(width, height):
             made.append(make(width, height))
             return made[-1]
 
@@ -52,7 +48,7 @@ def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], list[Figure]]
 
 
 @contextlib.contextmanager
-def torch_threads(n_threads: int) -> Iterator[None]:
+def torch_threads(n_threads):
     """Set the number of PyTorch threads inside the context, and restore it afterwards."""
     before = torch.get_num_threads()
     torch.set_num_threads(n_threads)
@@ -62,17 +58,15 @@ def torch_threads(n_threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def as_mesh(surface: trimesh.Trimesh, name: str = "mesh") -> Mesh:
+def as_mesh(surface, name="mesh"):
     return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name=name)
 
 
-def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
+def as_trimesh(mesh):
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
-def horseshoe(
-    half_gap: float = 0.05, tube: float = 0.3, n_sections: int = 48, n_around: int = 14
-) -> Mesh:
+def horseshoe(half_gap=0.05, tube=0.3, n_sections=48, n_around=14):
     """A ring that is open by twice `half_gap` radians, with flat ends, without any symmetry."""
     jitter = np.random.default_rng(0).uniform(0.9, 1.1, (n_sections, n_around))
     u = np.linspace(half_gap, 2 * np.pi - half_gap, n_sections)[:, None]
@@ -99,9 +93,7 @@ def horseshoe(
     return Mesh(np.concatenate([ring, ends]), faces, name="horseshoe")
 
 
-def with_slivers(
-    vertices: np.ndarray, faces: np.ndarray, n_slivers: int
-) -> tuple[np.ndarray, np.ndarray]:
+def with_slivers(vertices, faces, n_slivers):
     """The same surface, with so many random faces cut in three by a vertex hardly off the middle of a side."""
     split = np.random.default_rng(3).choice(len(faces), n_slivers, replace=False)
     inside = np.einsum("i,fij->fj", [0.4995, 0.4995, 0.001], vertices[faces[split]])
@@ -113,7 +105,7 @@ def with_slivers(
     )
 
 
-def surface_genus(mesh: Mesh) -> int:
+def surface_genus(mesh):
     """Handles of a watertight mesh as trimesh counts them."""
     surface = as_trimesh(mesh)
     assert surface.is_watertight
@@ -122,7 +114,7 @@ def surface_genus(mesh: Mesh) -> int:
 
 
 @pytest.fixture
-def approximate_small_meshes() -> Iterator[None]:
+def approximate_small_meshes():
     """Else small meshes are evaluated more accurately, without clusters. It outlives a test's `monkeypatch.undo`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(coordinates, "_MIN_FINE_VERTICES", 0)
@@ -131,13 +123,13 @@ def approximate_small_meshes() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def sphere() -> Mesh:
+def sphere():
     """The unit sphere with 2,562 vertices."""
     return as_mesh(trimesh.creation.icosphere(subdivisions=4), "sphere")
 
 
 @pytest.fixture(scope="session")
-def blob() -> Mesh:
+def blob():
     """A small smooth body without symmetry, 642 vertices: its eigenvalues are well apart."""
     surface = trimesh.creation.icosphere(subdivisions=3)
     x, y, z = surface.vertices.T
@@ -147,7 +139,7 @@ def blob() -> Mesh:
 
 
 @pytest.fixture(scope="session")
-def homer() -> Mesh:
+def homer():
     path = SHARED / "data" / "homer.obj"
     if not path.is_file():
         pytest.skip(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import trimesh
 
@@ -11,7 +9,7 @@ N_VERTICES, N_FACES = 162, 320
 """Of the ball that most of the files hold."""
 
 
-def ball(width: float = 1.0, height: float = 1.0) -> trimesh.Trimesh:
+def ball(width=1.0, height=1.0):
     """A stretched ball."""
     body = trimesh.creation.icosphere(subdivisions=2)
     assert (len(body.vertices), len(body.faces)) == (N_VERTICES, N_FACES)
@@ -19,12 +17,12 @@ def ball(width: float = 1.0, height: float = 1.0) -> trimesh.Trimesh:
     return body
 
 
-def write_clean(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
+def write_clean(path, width=1.0, height=1.0):
     """A body."""
     return _written(path, ball(width, height))
 
 
-def write_soup(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
+def write_soup(path, width=1.0, height=1.0):
     """Every triangle with its own corners, as STL files have them."""
     body = ball(width, height)
     return _written(
@@ -35,7 +33,7 @@ def write_soup(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
     )
 
 
-def write_holed(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
+def write_holed(path, width=1.0, height=1.0):
     """Without a vertex and the faces around it: a hole of six edges."""
     body = ball(width, height)
     inner = next(i for i in range(N_VERTICES) if (body.faces == i).sum() == 6)
@@ -44,19 +42,19 @@ def write_holed(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
     return _written(path, body)
 
 
-def write_box(path: Path) -> Path:
+def write_box(path):
     """A body of eight vertices."""
     return _written(path, trimesh.creation.box((1, 2, 3)))
 
 
-def write_crossing(path: Path) -> Path:
+def write_crossing(path):
     """Two unit cubes of twelve triangles that go through each other by half."""
     boxes = [trimesh.creation.box(), trimesh.creation.box()]
     boxes[1].apply_translation([0.5, 0, 0])
     return _written(path, trimesh.util.concatenate(boxes))
 
 
-def write_unusable(folder: Path) -> dict[str, str]:
+def write_unusable(folder):
     """Files of which nothing can be made; what is said of each, by its name."""
     folder.mkdir(parents=True, exist_ok=True)
     texts = {
@@ -82,7 +80,7 @@ def write_unusable(folder: Path) -> dict[str, str]:
     }
 
 
-def without_collada(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def without_collada(monkeypatch) -> None:
     """What trimesh knows of COLLADA files where pycollada is not installed, wherever these tests run."""
     error = ModuleNotFoundError("No module named 'collada'")
     monkeypatch.setitem(
@@ -90,13 +88,13 @@ def without_collada(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     )
 
 
-def free_edges(path: Path) -> int:
+def free_edges(path):
     """Edges of one face only, as trimesh counts them."""
     surface = trimesh.load(path, process=False)
     return len(trimesh.grouping.group_rows(surface.edges_sorted, require_count=1))
 
 
-def _written(path: Path, surface: trimesh.Trimesh) -> Path:
+def _written(path, surface):
     path.parent.mkdir(parents=True, exist_ok=True)
     surface.export(path)
     return path

@@ -1,17 +1,14 @@
 """Jobs for other processes: functions that a worker can import."""
 
-from __future__ import annotations
-
 import errno
 import importlib
 import os
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 
-def square(x: int) -> int:
+def square(x):
     if x < 0:
         raise ValueError(f"x: expected a natural number, got {x}.")
     if x == 13:
@@ -19,19 +16,19 @@ def square(x: int) -> int:
     return x * x
 
 
-def die_at_zero(x: int) -> int:
+def die_at_zero(x):
     if x == 0:
         os.kill(os.getpid(), signal.SIGKILL)
     return x
 
 
-def interrupt(x: int) -> int:
+def interrupt(x):
     """Ctrl-C, as a worker gets it."""
     os.kill(os.getpid(), signal.SIGINT)
     return x
 
 
-def die_once(marker: Path) -> str:
+def die_once(marker):
     """Die if the file is missing, and leave it."""
     if not marker.exists():
         marker.touch()
@@ -39,16 +36,16 @@ def die_once(marker: Path) -> str:
     return marker.name
 
 
-def sleep(seconds: float) -> float:
+def sleep(seconds):
     time.sleep(seconds)
     return seconds
 
 
-def allocate(n_bytes: int) -> int:
+def allocate(n_bytes):
     return len(bytearray(n_bytes))
 
 
-def pages_cleared(n_bytes: int) -> int:
+def pages_cleared(n_bytes):
     """How many pages the system hands out for so many bytes."""
     import resource
 
@@ -57,28 +54,28 @@ def pages_cleared(n_bytes: int) -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 
-def huge_pages() -> str:
+def huge_pages():
     """When the system hands out huge pages, as Linux says it."""
     setting = Path("/sys/kernel/mm/transparent_hugepage/enabled")
     return setting.read_text() if setting.exists() else ""
 
 
-def fail_with(number: int) -> int:
+def fail_with(number):
     """Raise the system's error of a number; a MemoryError for 0."""
     if number == 0:
         raise MemoryError
     raise OSError(number, errno.errorcode[number])
 
 
-def call(job: Callable[[], object]) -> object:
+def call(job):
     return job()
 
 
-def need_library(name: str) -> None:
+def need_library(name):
     """Import what is not installed."""
     importlib.import_module(name)
 
 
-def process(_: int) -> tuple[int, str | None]:
+def process(_):
     """Which process this is, and how many threads it was told to take."""
     return os.getpid(), os.environ.get("OMP_NUM_THREADS")

@@ -1,19 +1,16 @@
 """Histograms by their definition: one pair of points, one dimension at a time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import reduce
 from itertools import combinations_with_replacement
 
 import numpy as np
-from torch import Tensor
 
 Axis = tuple[np.ndarray, Sequence[float]]
 
 
-def hat(value: float, centres: Sequence[float]) -> list[float]:
+def hat(value, centres):
     """The linear kernel of one value, one centre at a time."""
     shares = [0.0] * len(centres)
     if value <= centres[0]:
@@ -27,35 +24,35 @@ def hat(value: float, centres: Sequence[float]) -> list[float]:
     return shares
 
 
-def equal_bins(n: int, reach: float) -> list[float]:
+def equal_bins(n, reach):
     """Middles of n equal intervals of [0, reach]."""
     return [(k + 0.5) * reach / n for k in range(n)]
 
 
-def hard_classes(values: Tensor | np.ndarray, edges: Sequence[float]) -> np.ndarray:
+def hard_classes(values, edges):
     """(P, C) one-hot rows: how many of the edges between classes a value has reached."""
     return np.array(
         [np.eye(len(edges) + 1)[sum(float(value) >= edge for edge in edges)] for value in values]
     )
 
 
-def soft_classes(values: Tensor | np.ndarray, centres: Sequence[float]) -> np.ndarray:
+def soft_classes(values, centres):
     """(P, C) hats."""
     return np.array([hat(float(value), centres) for value in values])
 
 
-def product(*classes: np.ndarray) -> np.ndarray:
+def product(*classes):
     """(P, C₁·C₂…) combinations, the first changing slowest."""
     return np.array([reduce(np.kron, rows) for rows in zip(*classes, strict=True)])
 
 
-def distances(points: Tensor) -> np.ndarray:
+def distances(points):
     """(P, P)."""
     rows = points.tolist()
     return np.array([[math.dist(p, q) for q in rows] for p in rows])
 
 
-def twists(points: Tensor, directions: Tensor) -> np.ndarray:
+def twists(points, directions):
     """The signed twist of each pair of oriented points, (P, P)."""
     p = points.double().numpy()
     n = directions.double().numpy()
@@ -67,7 +64,7 @@ def twists(points: Tensor, directions: Tensor) -> np.ndarray:
     return found
 
 
-def cosines(points: Tensor, directions: Tensor) -> list[np.ndarray]:
+def cosines(points, directions):
     """The three cosines of each pair of oriented points (Wahl et al. 2003), each (P, P)."""
     p = points.double().numpy()
     n = directions.double().numpy()
@@ -81,7 +78,7 @@ def cosines(points: Tensor, directions: Tensor) -> list[np.ndarray]:
     return list(features)
 
 
-def pair_histogram_by_loops(memberships: np.ndarray | Tensor, axes: Sequence[Axis]) -> np.ndarray:
+def pair_histogram_by_loops(memberships, axes):
     """(C(C+1)/2, B, ...) of memberships (P, C) and, for each dimension, values (P, P) of the pairs and centres (B,)."""
     m = np.asarray(memberships, dtype=float)
     rows = list(combinations_with_replacement(range(m.shape[1]), 2))

@@ -1,15 +1,10 @@
 """The histogram of Rustamov 2010 by a plain count of all pairs."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
 
-def paper_histogram(
-    eigenfunctions: NDArray[np.float32], eigenvalues: NDArray[np.float64], n_eigenpairs: int = 250
-) -> NDArray[np.float64]:
+def paper_histogram(eigenfunctions, eigenvalues, n_eigenpairs=250):
     """(10, 64): 4 classes of [0, 1.5], and 64 bins of [0, 4] with a linear kernel, of φ/√λ at the samples."""
     embedding = eigenfunctions[:, :n_eigenpairs] / np.sqrt(eigenvalues[:n_eigenpairs])
     level = np.minimum((np.linalg.norm(embedding, axis=1) / 1.5 * 4).astype(int), 3)

@@ -9,7 +9,7 @@ from igps._compiled import compiled
 
 
 @compiled()
-def cumulative(values: np.ndarray) -> np.ndarray:
+def cumulative(values):
     total = 0.0
     sums = np.empty_like(values)
     for i in range(len(values)):
@@ -19,7 +19,7 @@ def cumulative(values: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def largest_sum(rows: np.ndarray) -> float:
+def largest_sum(rows):
     largest = -np.inf
     for row in rows:
         largest = max(largest, cumulative(row)[-1])

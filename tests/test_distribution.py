@@ -1,7 +1,5 @@
 """Wheel and source archive are built, hold what they must, and work where they are installed."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import subprocess
@@ -20,7 +18,7 @@ SMOKE = PROJECT / "tests" / "smoke.py"
 
 
 @pytest.fixture(scope="module")
-def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def archives(tmp_path_factory):
     """Wheel and source archive; the former made of the latter, as an installation from source would."""
     for module in ("build", "setuptools"):
         if importlib.util.find_spec(module) is None:

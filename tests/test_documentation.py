@@ -44,18 +44,18 @@ class Block:
     text: str
 
 
-def blocks(page: str) -> list[Block]:
+def blocks(page):
     found = re.findall(
         r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```', TEXT[page], flags=re.DOTALL | re.MULTILINE
     )
     return [Block(language, title or None, text) for language, title, text in found]
 
 
-def python(page: str) -> list[Block]:
+def python(page):
     return [block for block in blocks(page) if block.language == "python"]
 
 
-def run(folder: Path, *arguments: str) -> str:
+def run(folder, *arguments):
     paths = [str(PROJECT / "src"), str(folder), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *arguments]
@@ -66,7 +66,7 @@ def run(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
-def install(pyproject: str, folder: Path) -> None:
+def install(pyproject, folder):
     """Make the entry points of a package known to programs that have the folder on their path."""
     project = tomllib.loads(pyproject)["project"]
     information = folder / f"{project['name']}-{project['version']}.dist-info"
@@ -80,7 +80,7 @@ def install(pyproject: str, folder: Path) -> None:
     (information / "entry_points.txt").write_text("\n".join(lines))
 
 
-def program(page: str, folder: Path) -> tuple[str, str]:
+def program(page, folder):
     """The blocks of a page as one program, those with a title written as files; and what it has to print.
 
     Output that a page shows, in a text block after the code, must be printed next.
@@ -100,7 +100,7 @@ def program(page: str, folder: Path) -> tuple[str, str]:
     return "\n".join(code), "".join(expected)
 
 
-def first_tier(distances: np.ndarray, labels: list[str]) -> tuple[float, float]:
+def first_tier(distances, labels):
     """NN and FT by hand: of each query, is the nearest of its class, and what share of its class is among as many."""
     nearest = []
     tiers = []
@@ -112,7 +112,7 @@ def first_tier(distances: np.ndarray, labels: list[str]) -> tuple[float, float]:
     return float(np.mean(nearest)), float(np.mean(tiers))
 
 
-def histograms_by_loops(dataset: SignatureDataset) -> list[np.ndarray]:
+def histograms_by_loops(dataset):
     signatures = [dataset[i].signature for i in range(len(dataset))]
     return [
         paper_histogram(one.interior.eigenfunctions, one.eigenvalues).ravel() for one in signatures
@@ -172,7 +172,7 @@ def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path):
     assert (scores["nn"], scores["ft"]) == pytest.approx(first_tier(distances, list(labels)))
 
 
-def runs_here(page: str) -> bool:
+def runs_here(page):
     """Blocks with titles are the files of a package, which other tests install."""
     return page != "README.md" and any(block.title is None for block in python(page))
 
@@ -196,7 +196,7 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page, tmp_path):
         check(printed, tmp_path)
 
 
-def check_retrieval(printed: str, folder: Path) -> None:
+def check_retrieval(printed, folder):
     dataset = SignatureDataset(folder / "shapes", cache_dir=folder / "cache")
     cells = histograms_by_loops(dataset)
     labels = list(dataset.bodies.labels or ())
@@ -212,7 +212,7 @@ def check_retrieval(printed: str, folder: Path) -> None:
     assert ast.literal_eval(printed) == {"nn": round(100 * first), "ft": round(100 * tier)}
 
 
-def check_classification(printed: str, folder: Path) -> None:
+def check_classification(printed, folder):
     told = dict(line.split(": ", 1) for line in printed.splitlines() if ": " in line)
     paths = sorted((folder / "shapes").rglob("*.off"))
     cells = np.array(histograms_by_loops(SignatureDataset(paths, cache_dir=folder / "cache")))
@@ -239,7 +239,7 @@ def check_classification(printed: str, folder: Path) -> None:
     assert float(told["on what it was fitted to"]) == pytest.approx(expected_score)
 
 
-def check_fine_tuning(printed: str, folder: Path) -> None:
+def check_fine_tuning(printed, folder):
     scores, classified = printed.splitlines()
     assert ast.literal_eval(scores)["accuracy"] > 0.5  # by guessing: 0.25
     told = ast.literal_eval(classified.partition(": ")[2])
@@ -248,7 +248,7 @@ def check_fine_tuning(printed: str, folder: Path) -> None:
     assert (folder / "mine.safetensors").exists()
 
 
-def check_anatomy(printed: str, folder: Path) -> None:
+def check_anatomy(printed, folder):
     organs = [re.findall(r"s(\d)/\w+\.nii\.gz#(\w+)", line) for line in printed.splitlines()]
     assert len(organs) == len(list((folder / "segmentations").rglob("*.nii.gz"))) == 9
     assert all(body[0] != other[0] and body[1] == other[1] for body, other in organs)
@@ -263,7 +263,7 @@ CHECKS = {
 """What a page prints that is not printed in it: against another way to compute it, or against guessing."""
 
 
-def shell_lines(page: str) -> list[str]:
+def shell_lines(page):
     """The commands of its shell blocks, and those within sentences."""
     text = "\n".join(block.text for block in blocks(page) if block.language == "sh").replace(
         "\\\n", " "
@@ -275,14 +275,14 @@ def shell_lines(page: str) -> list[str]:
     return [line for line in words + inline if line and not line.startswith("#")]
 
 
-def known_command(words: list[str]) -> list[str]:
+def known_command(words):
     """The command of `igps` that words begin with, in one or two words."""
     name = command_of(words)
     assert name is not None, f"no command {words[:2]}"
     return name.split()
 
 
-def told(page: str) -> list[tuple[str, list[str]]]:
+def told(page):
     """What the shell is told on a page: each line, without settings for one command, and its words."""
     lines = [re.sub(r"^([A-Z_]+=\S* )+", "", line) for line in shell_lines(page)]
     return [
@@ -290,9 +290,9 @@ def told(page: str) -> list[tuple[str, list[str]]]:
     ]
 
 
-def commands_told() -> dict[str, list[tuple[str, list[str]]]]:
+def commands_told():
     """Of all pages what `igps` is told, by its command: its help takes half a second to make."""
-    found: dict[str, list[tuple[str, list[str]]]] = {}
+    found = {}
     for line, words in (one for page in TEXT for one in told(page)):
         if words[0] == "igps" and words[:2] != ["igps", "--help"]:
             with contextlib.suppress(AssertionError):  # which the page's own test tells
@@ -367,7 +367,7 @@ def test_descriptors_and_commands_are_named():
         assert f"`{name}`" in TEXT["docs/index.md"] or f"[{name}]" in "".join(TEXT.values()), name
 
 
-def anchors(text: str) -> set[str]:
+def anchors(text):
     """Ids of the headings, as GitHub and MkDocs make them of plain words."""
     headings = re.findall(
         r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), flags=re.MULTILINE
@@ -396,7 +396,7 @@ def test_links_lead_somewhere(page):
             assert anchor in anchors(path.read_text(encoding="utf-8")), f"{page}: {target}"
 
 
-def outside_code(page: str) -> list[str]:
+def outside_code(page):
     """The lines of a page that are no code."""
     return re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE).splitlines()
 
@@ -420,12 +420,12 @@ def test_tables_are_whole_and_prose_is_wrapped(page):
         place += 1
 
 
-def table_rows(page: str, heading: str) -> dict[str, dict[str, str]]:
+def table_rows(page, heading):
     """Of the first table that follows a heading, the rows by their first name in code, and their cells by column."""
     lines = outside_code(page)
     start = next(i for i in range(lines.index(heading), len(lines)) if lines[i].startswith("|"))
     columns = [cell.strip() for cell in lines[start].split("|")[1:-1]]
-    rows: dict[str, dict[str, str]] = {}
+    rows = {}
     for line in lines[start + 2 :]:
         if not line.startswith("|"):
             break

@@ -1,7 +1,5 @@
 """What `import igps` gives and costs, and that all it takes is declared."""
 
-from __future__ import annotations
-
 import ast
 import importlib.metadata
 import re
@@ -98,11 +96,11 @@ def test_lazy_names_do_load_what_they_need():
     assert done.stdout.strip() == "True"
 
 
-def imported(path: Path) -> set[str]:
+def imported(path):
     """Top-level modules that a file imports when it runs: not those for type checkers alone."""
-    found: set[str] = set()
+    found = set()
 
-    def look(node: ast.AST) -> None:
+    def look(node):
         if (
             isinstance(node, ast.If)
             and isinstance(node.test, ast.Name)
@@ -122,7 +120,7 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def normal(name: str) -> str:
+def normal(name):
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
@@ -135,7 +133,7 @@ def test_what_is_brought_along_is_required_by_what_brings_it():
         assert name in declared(importlib.metadata.requires(parent) or [])
 
 
-def declared(requirements: list[str]) -> set[str]:
+def declared(requirements):
     return {
         normal(re.split(r"[\s\[<>=!~;]", requirement, maxsplit=1)[0])
         for requirement in requirements

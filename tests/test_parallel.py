@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import errno
 import mmap
 import multiprocessing
@@ -28,14 +26,14 @@ needs_proc = pytest.mark.skipif(
 )
 
 
-def all_of(*arguments, **options) -> dict:
+def all_of(*arguments, **options):
     """Results by number; none comes twice."""
     results = list(run(*arguments, **options))
     assert len(dict(results)) == len(results)
     return dict(results)
 
 
-def ended(pid: int) -> bool:
+def ended(pid):
     """Whether a process ends within ten seconds."""
     for _ in range(100):
         if not Path(f"/proc/{pid}").exists():
@@ -56,7 +54,7 @@ OF_SQUARES = {
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> dict:
+def results(tmp_path_factory):
     """Of two workers, whose parent has other settings: squares, two that die, two that tell of themselves."""
     others = [
         partial(jobs.die_at_zero, 0),
@@ -74,7 +72,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 
 @pytest.fixture(scope="module")
-def limited() -> dict:
+def limited():
     """Of one worker with limits: two that tell of themselves, large and small, three of one size, slow and quick."""
     found = [partial(jobs.process, 0)] * 2
     found += [partial(jobs.allocate, size) for size in (1000, 2 * GIB, 2000)]

@@ -8,7 +8,7 @@ from igps._progress import Progress
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def clock(monkeypatch):
     """The time in seconds that bars see."""
     now = [0.0]
     monkeypatch.setattr("tqdm.std.time", lambda: now[0])

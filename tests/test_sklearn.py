@@ -1,8 +1,4 @@
-from __future__ import annotations
-
 from functools import cache
-from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -23,7 +19,6 @@ from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
-from igps.nn.descriptor import Descriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
 from igps.signature.signature import SignatureConfig
@@ -36,7 +31,7 @@ DISTANCES = D2(n_bins=8)
 
 
 @pytest.fixture(scope="module")
-def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def paths(tmp_path_factory):
     """Four balls and four rods."""
     root = tmp_path_factory.mktemp("shapes")
     for label, length in (("ball", 1.0), ("rod", 3.0)):
@@ -49,7 +44,7 @@ def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture
-def features(tmp_path: Path) -> VolumetricFeatures:
+def features(tmp_path):
     return VolumetricFeatures(
         interior(n_eigenpairs=20), config=CONFIG, cache_dir=tmp_path, n_workers=1
     )
@@ -195,14 +190,14 @@ class OnRows(VolumetricFeatures):
 
     def __init__(
         self,
-        descriptor: str | Descriptor = DISTANCES,
+        descriptor=DISTANCES,
         *,
-        square_root: bool = True,
-        config: SignatureConfig | None = TINY,
-        reading: LoadOptions | None = None,
-        cache_dir: str | Path | None = None,
-        n_workers: int | None = None,
-    ) -> None:
+        square_root=True,
+        config=TINY,
+        reading=None,
+        cache_dir=None,
+        n_workers=None,
+    ):
         super().__init__(
             descriptor,
             square_root=square_root,
@@ -212,25 +207,25 @@ class OnRows(VolumetricFeatures):
             n_workers=n_workers,
         )
 
-    def fit(self, X: Any, y: Any = None) -> Self:
+    def fit(self, X, y=None):
         return super().fit(meshes(X), y)
 
-    def transform(self, X: Any) -> Any:
+    def transform(self, X):
         return super().transform(meshes(X))
 
-    def __sklearn_tags__(self) -> Any:
+    def __sklearn_tags__(self):
         tags = super().__sklearn_tags__()
         tags.input_tags.two_d_array = True
         tags.input_tags.string = False
         return tags
 
 
-def meshes(rows: Any) -> list[Mesh]:
+def meshes(rows):
     return [mesh_of_row(row.tobytes()) for row in check_array(rows, dtype=np.float64)]
 
 
 @cache
-def mesh_of_row(row: bytes) -> Mesh:
+def mesh_of_row(row):
     """An ellipsoid whose half axes tell the first numbers of the row."""
     numbers = np.resize(np.frombuffer(row), 3)
     surface = trimesh.creation.icosphere(subdivisions=1)

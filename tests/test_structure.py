@@ -1,7 +1,5 @@
 """The imports run one way, without circles; and the core runs with the rooms around it taken away."""
 
-from __future__ import annotations
-
 import ast
 import shutil
 import subprocess
@@ -61,9 +59,9 @@ FILES = (
 )
 
 
-def imported_names(path: Path) -> set[str]:
+def imported_names(path):
     """Return what a file imports anywhere, also within functions, as modules or as names in them."""
-    names: set[str] = set()
+    names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
             names.add(node.module)
@@ -73,11 +71,11 @@ def imported_names(path: Path) -> set[str]:
     return names
 
 
-def imported_rooms(path: Path) -> set[str]:
+def imported_rooms(path):
     return {name.split(".")[1] for name in imported_names(path) if name.startswith("igps.")}
 
 
-def import_graph(root: Path) -> dict[str, set[str]]:
+def import_graph(root):
     """Return the modules of a package by name, and the modules that each imports."""
     files = {}
     for file in sorted(root.rglob("*.py")):
@@ -94,7 +92,7 @@ def import_graph(root: Path) -> dict[str, set[str]]:
     return graph
 
 
-def circle(root: Path) -> list[str]:
+def circle(root):
     try:
         TopologicalSorter(import_graph(root)).prepare()
     except CycleError as error:

@@ -4,9 +4,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,31 +29,31 @@ needs_affinity = pytest.mark.skipif(
 )
 
 
-def blas() -> list[int]:
+def blas():
     """Threads of NumPy's and SciPy's products."""
     found = [library for library in threadpool_info() if library["user_api"] == "blas"]
     return [library["num_threads"] for library in found]
 
 
-def in_new_thread(function: Callable[[], Any]) -> Any:
+def in_new_thread(function):
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(function).result()
 
 
-def settings() -> tuple[int, int, list[int]]:
+def settings():
     """Of this thread, of new threads, and of the process."""
     return torch.get_num_threads(), in_new_thread(torch.get_num_threads), blas()
 
 
 @pytest.fixture(autouse=True)
-def three_threads() -> Iterator[None]:
+def three_threads():
     """An unusual number, so that what restores another is seen."""
     with torch_threads(3):
         yield
 
 
 @pytest.fixture
-def many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+def many_cores(monkeypatch):
     monkeypatch.setattr(threads_module, "n_cores", lambda: 8)
 
 
@@ -120,9 +118,9 @@ def test_threads_that_overlap_leave_each_other_as_they_were():
     """Each begins within the one before and ends after it, which is where settings of the process get lost."""
     before = settings()
     entered = [threading.Event() for _ in range(4)]
-    found: list[tuple[int, int, int]] = []
+    found = []
 
-    def one(i: int) -> None:
+    def one(i):
         torch.set_num_threads(4 + i)
         outside = torch.get_num_threads()
         with one_thread():
@@ -133,7 +131,7 @@ def test_threads_that_overlap_leave_each_other_as_they_were():
             assert set(blas()) == {1}
         found.append((outside, inside, torch.get_num_threads()))
 
-    def run(i: int) -> None:
+    def run(i):
         if i:
             assert entered[i - 1].wait(60)
         one(i)
@@ -153,7 +151,7 @@ def test_the_last_context_lifts_a_limit_set_by_another_thread():
     entered = threading.Event()
     left = threading.Event()
 
-    def other() -> None:
+    def other():
         with one_thread():
             entered.set()
             assert left.wait(60)
@@ -255,7 +253,7 @@ def test_no_more_threads_than_torch_had_or_there_are_cores(monkeypatch):
 def test_jobs_on_threads_have_one_thread_each_and_start_no_more(many_cores):
     before = settings()
 
-    def job(i: int) -> tuple[int, int, int, int]:
+    def job(i):
         return i, torch.get_num_threads(), n_threads(), sum(on_threads(lambda x: x, [i, i]))
 
     assert list(on_threads(job, range(7))) == [(i, 1, 1, 2 * i) for i in range(7)]
@@ -293,10 +291,10 @@ def test_calls_on_a_body_leave_the_settings(blob):
 
 
 def test_a_body_is_computed_on_one_thread(blob, monkeypatch):
-    seen: list[tuple[int, set[int]]] = []
+    seen = []
     original = igps.signature.signature.eigenpairs
 
-    def watched(*arguments: Any, **options: Any) -> Any:
+    def watched(*arguments, **options):
         seen.append((torch.get_num_threads(), set(blas())))
         return original(*arguments, **options)
 
@@ -317,13 +315,13 @@ def test_one_thread_gives_the_numbers_of_many(blob):
 class Watched(torch.nn.Module):
     """A description with a parameter, which notes on how many threads its value and its gradient are computed."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.scale = torch.nn.Parameter(torch.ones(()))
         self.seen: list[tuple[str, int]] = []
         self.scale.register_hook(lambda _: self.seen.append(("gradient", torch.get_num_threads())))
 
-    def forward(self, batch: igps.SignatureBatch) -> torch.Tensor:
+    def forward(self, batch):
         self.seen.append(("value", torch.get_num_threads()))
         return self.scale * batch.interior.eigenfunctions.abs().mean(dim=1).softmax(dim=1)
 
@@ -352,9 +350,9 @@ def test_a_training_step_is_computed_on_one_thread(blob):
 
 def test_a_command_leaves_the_settings(monkeypatch, capsys):
     before = settings()
-    seen: list[int] = []
+    seen = []
 
-    def watched(*_: Any, **__: Any) -> Any:
+    def watched(*_, **__):
         seen.append(torch.get_num_threads())
         raise ValueError("no meshes")
 
@@ -369,9 +367,9 @@ def test_a_command_leaves_the_settings(monkeypatch, capsys):
 
 @pytest.mark.parametrize("max_threads", [1, 2, 5])
 def test_a_team_does_every_job_once_and_in_order(max_threads):
-    done: list[int] = []
+    done = []
 
-    def square(number: int) -> tuple[int, int]:
+    def square(number):
         done.append(number)
         return (
             number**2,
@@ -397,9 +395,9 @@ def test_the_calling_thread_works_in_its_team(many_cores):
 def test_a_blocked_thread_of_a_team_does_not_delay_other_callers():
     released = threading.Event()
     held = threading.Barrier(3, timeout=20)
-    ended_jobs: list[int] = []
+    ended_jobs = []
 
-    def hold(number: int) -> None:
+    def hold(number):
         held.wait()
         released.wait(10)
         ended_jobs.append(number)
@@ -419,7 +417,7 @@ def test_a_blocked_thread_of_a_team_does_not_delay_other_callers():
 def test_what_a_job_of_a_team_raises_is_raised_when_no_job_runs_any_more():
     running = threading.Semaphore(0)
 
-    def fail(number: int) -> None:
+    def fail(number):
         if number == 0:
             raise ValueError("the first")
         threading.Event().wait(0.1)
@@ -438,7 +436,7 @@ def test_what_a_job_of_a_team_raises_is_raised_when_no_job_runs_any_more():
 def test_a_team_computes_in_the_mode_of_who_asks(inference):
     together = threading.Barrier(2, timeout=20)
 
-    def add(number: int) -> bool:
+    def add(number):
         together.wait()
         sums[number] += 1
         return torch.is_inference_mode_enabled()

@@ -1,17 +1,12 @@
 """`compare`: rows, failures and distances of descriptors side by side."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 import torch
 
-from igps.analysis.comparison import Result, compare
+from igps.analysis.comparison import compare
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.descriptors.literature.d2 import D2
-from igps.nn.descriptor import Descriptor
 from igps.retrieval import retrieval_scores
 from igps.signature.signature import SignatureConfig
 from own_descriptors import Broken, Height, Slow, write_egg
@@ -22,7 +17,7 @@ CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surfac
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     """Three balls and three long eggs; the last ball is an egg by its height."""
     folder = tmp_path_factory.mktemp("collection")
     for label, heights in (("ball", (1.0, 1.1, 2.3)), ("egg", (2.2, 2.4, 2.6))):
@@ -32,13 +27,13 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def dataset(root: Path) -> SignatureDataset:
+def dataset(root):
     collection = SignatureDataset(root, CONFIG, root.parent / "cache")
     assert collection.precompute(n_workers=1, progress=False) == []
     return collection
 
 
-def run(dataset: SignatureDataset, *chosen: Descriptor, n_workers: int = 1) -> dict[str, Result]:
+def run(dataset, *chosen, n_workers=1):
     results = list(compare(dataset, chosen, n_workers=n_workers, progress=False))
     assert [result.descriptor for result in results] == list(chosen)
     return {result.descriptor.name: result for result in results}

@@ -10,22 +10,21 @@ from scipy.spatial.distance import mahalanobis
 from conftest import as_mesh
 from igps.analysis.correspondence import local_shape, squared_deviations
 from igps.data.collation import collate
-from igps.signature.attributes import AttributeName
-from igps.signature.signature import Signature, SignatureConfig, compute_signature
+from igps.signature.signature import SignatureConfig, compute_signature
 
 RADIUS, HALF_LENGTH = 1.0, 1.6
-NORMALS: dict[str, tuple[AttributeName, ...]] = {
+NORMALS = {
     "estimated normals": (),
     "given normals": ("surface_direction",),
 }
 
 
 @pytest.fixture(params=NORMALS.values(), ids=NORMALS)
-def attributes(request: pytest.FixtureRequest) -> tuple[AttributeName, ...]:
+def attributes(request):
     return request.param
 
 
-def spheroid(attributes: tuple[AttributeName, ...], subdivisions: int, n_samples: int) -> Signature:
+def spheroid(attributes, subdivisions, n_samples):
     """Return the signature of a spheroid along the z axis."""
     body = trimesh.creation.icosphere(subdivisions=subdivisions)
     body.vertices *= [RADIUS, RADIUS, HALF_LENGTH]

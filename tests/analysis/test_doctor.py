@@ -1,9 +1,6 @@
 """What `examine` says of files that were damaged by hand."""
 
-from __future__ import annotations
-
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +19,7 @@ from damaged_files import (
     write_unusable,
 )
 from igps._failures import Limits
-from igps.analysis.doctor import Finding, examine, expected_cost
+from igps.analysis.doctor import examine, expected_cost
 from igps.data.sources import find_bodies
 from igps.fields.volumes.label_measures import VoxelMeasures, thinnest_part
 from igps.mesh.options import LoadOptions
@@ -32,7 +29,7 @@ from igps.signature.signature import SignatureConfig
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 
 
-def findings(root: Path, **options) -> dict[str, Finding]:
+def findings(root, **options):
     files = find_bodies(root)
     found = examine(files, config=CONFIG, n_workers=1, progress=False, **options)
     assert tuple(finding.id for finding in found) == files.names

@@ -1,7 +1,5 @@
 """The shares of an explanation add up to the distance, and lie where the bodies differ."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -19,18 +17,17 @@ from igps.analysis.explanation import (
     unit_shares,
     without_head,
 )
-from igps.data.batch import SignatureBatch
 from igps.data.collation import collate
 from igps.descriptors import descriptor
-from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads.closed_form import WhitenedHead
 from igps.nn.histograms import PairHistogram
-from igps.signature.signature import Signature, SignatureConfig, compute_signature
+from igps.signature.signature import SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=250, resolution=12, min_samples=0, n_surface_samples=300)
 
 
-def signed(bump: float, name: str) -> Signature:
+def signed(bump, name):
     """Of an egg with a bump at its side."""
     body = trimesh.creation.icosphere(subdivisions=4)
     swell = 1 + bump * np.exp(-12 * ((body.vertices - [1, 0, 0]) ** 2).sum(axis=1))
@@ -40,16 +37,16 @@ def signed(bump: float, name: str) -> Signature:
 
 
 @pytest.fixture(scope="module")
-def signatures() -> list[Signature]:
+def signatures():
     return [signed(bump, "rich") for bump in (0.0, 1.2)]
 
 
 @pytest.fixture(scope="module")
-def batches(signatures: list[Signature]) -> list[SignatureBatch]:
+def batches(signatures):
     return [collate([one]) for one in signatures]
 
 
-def described_by(name: str) -> Descriptor:
+def described_by(name):
     if name != "whitened":
         return descriptor(name)
     histograms = HistogramDescriptor([PairHistogram(), PairHistogram(["interior_distance"])])
@@ -136,7 +133,7 @@ def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(batches):
 
 def test_shares_of_a_squared_euclidean_distance_are_products(batches):
     class Squared(HistogramDescriptor):
-        def distances(self, queries: torch.Tensor, gallery: torch.Tensor) -> torch.Tensor:
+        def distances(self, queries, gallery):
             n_cells = queries.flatten(1).shape[1]
             matrix = torch.linspace(-1, 2, 3 * n_cells, dtype=queries.dtype).view(-1, 3)
             own, other = (rows.flatten(1).sqrt() @ matrix for rows in (queries, gallery))

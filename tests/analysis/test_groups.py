@@ -1,26 +1,21 @@
 """Tests of groups hold their level, find what is there, and refuse what makes no sense."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from igps.analysis.groups import GroupTest, group_test, squared_distances, with_q_values
 
 PAIR = ["a"] * 12 + ["b"] * 12
 
 
-def quick(
-    vectors: NDArray[np.float64], groups: list[str] = PAIR, seed: int = 0, **given: object
-) -> GroupTest:
+def quick(vectors, groups=PAIR, seed=0, **given):
     options = {"n_permutations": 199, "n_bootstraps": 0, "n_repeats": 0, **given}
     return group_test(vectors, groups, seed=seed, **options)
 
 
-def whitened_kernel(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def whitened_kernel(vectors):
     """Gaussian kernel of Mahalanobis distances by the covariance of all, with a ridge.
 
     The ridge leaves as many degrees of freedom as a tenth of the bodies, or nine tenths of the numbers.

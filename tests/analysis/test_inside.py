@@ -1,7 +1,5 @@
 """Where inside a signal lies: against closed forms in a ball, and against loops over samples."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -23,19 +21,19 @@ RANDOM = np.random.default_rng(0)
 P, K = 300, 6
 
 
-def with_values(signature: Signature, **values: np.ndarray) -> Signature:
+def with_values(signature, **values):
     return replace(signature, interior=signature.interior.with_attributes(values))
 
 
 @pytest.fixture(scope="module")
-def ball() -> Signature:
+def ball():
     mesh = trimesh.creation.icosphere(subdivisions=3)
     config = inside_config(SignatureConfig(n_surface_samples=50))
     return compute_signature(Mesh(mesh.vertices, mesh.faces), config)
 
 
 @pytest.fixture(scope="module")
-def made() -> Signature:
+def made():
     """Samples that belong to no mesh, whose numbers can be counted by loops."""
     points = RANDOM.normal(size=(P, 3))
     functions = RANDOM.normal(size=(P, K)).astype(np.float32)
@@ -60,7 +58,7 @@ def test_radius_in_a_ball_has_the_means_of_its_closed_form(ball):
     radius = np.linalg.norm(ball.interior.points, axis=1)
     numbers = inside_numbers(with_values(ball, r=radius), ["r"])
 
-    def mean(low: float, high: float) -> float:
+    def mean(low, high):
         """The mean radius between two shares of the volume."""
         return 0.75 * (high ** (4 / 3) - low ** (4 / 3)) / (high - low)
 
@@ -148,7 +146,7 @@ def test_variogram_and_moran_are_counted_by_a_loop(made):
         expected = pytest.approx(half / ct.var(), rel=1e-3)
         assert numbers[f"ct.variogram.{name}"] == expected
     centred = ct - ct.mean()
-    neighbours: dict[int, list[int]] = {i: [] for i in range(P)}
+    neighbours = {i: [] for i in range(P)}
     for _, i, j in pairs[:n_near]:
         neighbours[i].append(j)
         neighbours[j].append(i)

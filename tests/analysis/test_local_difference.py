@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +7,7 @@ from igps.analysis.local_difference import local_difference, misfit, offsets
 from igps.mesh.mesh import Mesh
 
 
-def ball(radius: float, unit: str | None = None) -> Mesh:
+def ball(radius, unit=None):
     body = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     return Mesh(body.vertices + np.array([3.0, -2, 1]), body.faces, unit=unit, frame="RAS")
 

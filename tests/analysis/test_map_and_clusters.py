@@ -1,7 +1,5 @@
 """Maps keep what distances a plane can keep; clusters are those that were put in, and chance ones are told unstable."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np
@@ -12,7 +10,7 @@ from igps.analysis.clusters import STABLE, clusters_of
 from igps.analysis.map import body_map, ends_of_axis
 
 
-def blobs(n_each: int, centres: list[list[float]], scatter: float, seed: int = 0) -> np.ndarray:
+def blobs(n_each, centres, scatter, seed=0):
     random = np.random.default_rng(seed)
     return np.concatenate(
         [random.normal(centre, scatter, (n_each, len(centre))) for centre in centres]
@@ -40,7 +38,7 @@ def test_the_improved_map_has_less_stress_than_the_classical_one():
     values, axes = np.linalg.eigh(-centring @ distances**2 @ centring / 2)
     classical = axes[:, -2:] * np.sqrt(values[-2:])
 
-    def stress(plane: np.ndarray) -> float:
+    def stress(plane):
         other = cdist(plane, plane)
         other *= (distances * other).sum() / (other**2).sum()
         return float(np.sqrt(((distances - other) ** 2).sum() / (distances**2).sum()))

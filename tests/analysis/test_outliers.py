@@ -1,7 +1,5 @@
 """Outliers: what is unlike its class comes first, with the reason; what is not, does not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -15,12 +13,12 @@ from igps.data.sources import find_bodies
 LABELS = ["a"] * 12 + ["b"] * 12
 
 
-def usual(seed: int = 0) -> np.ndarray:
+def usual(seed=0):
     """Vectors of two classes."""
     return np.random.default_rng(seed).normal(size=(24, 8)) + np.repeat([0, 6], 12)[:, None]
 
 
-def found_of(vectors: np.ndarray, **given: object) -> list:
+def found_of(vectors, **given):
     return outliers(squared_distances(vectors) ** 0.5, LABELS, **given)
 
 
@@ -233,7 +231,7 @@ def test_labels_are_measured_in_their_grid(tmp_path):
     nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     x, y, z = np.indices((60, 40, 40))
 
-    def ball(at: int, radius: int = 10, height: int = 20) -> np.ndarray:
+    def ball(at, radius=10, height=20):
         return (x - at) ** 2 + (y - 20) ** 2 + (z - height) ** 2 <= radius**2
 
     island = ball(40) | ball(56, 2)

@@ -1,7 +1,5 @@
 """Masks that have a closed form: balls that are hollow, drilled, cut, or not alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,16 +8,16 @@ from igps.analysis.segmentation import cavity_root, cut_end, gap_root, hole_root
 ONES = np.ones(3)
 
 
-def offsets(half: int) -> np.ndarray:
+def offsets(half):
     """(3, X, Y, Z) from the middle of a grid."""
     return np.indices(3 * [2 * half + 1]) - half
 
 
-def ball(radius: float, half: int = 24) -> np.ndarray:
+def ball(radius, half=24):
     return (offsets(half) ** 2).sum(axis=0) <= radius**2
 
 
-def drilled(radius: float, of_hole: float, half: int = 24) -> np.ndarray:
+def drilled(radius, of_hole, half=24):
     """A ball with a tunnel along the diagonal of two axes, as no slice of the grid shows it closed."""
     x, y, z = offsets(half)
     return ball(radius, half) & ~((x - y) ** 2 / 2 + z**2 <= of_hole**2)

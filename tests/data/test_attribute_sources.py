@@ -1,13 +1,10 @@
 """What a body brings along: images, grids, values at vertices, residues; and what is refused."""
 
-from __future__ import annotations
-
 import gzip
 import logging
 import os
 import pickle
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,24 +38,24 @@ SHAPE = (22, 27, 17)
 INSIDE = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
 
 
-def linear(points: np.ndarray) -> np.ndarray:
+def linear(points):
     return points @ SLOPE + 0.4
 
 
-def image() -> np.ndarray:
+def image():
     """The linear function at the centres of all voxels."""
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
     return linear(index @ AFFINE[:3, :3].T + AFFINE[:3, 3])
 
 
-def write_nifti(path: Path, values: np.ndarray) -> None:
+def write_nifti(path, values):
     nibabel = pytest.importorskip("nibabel")
     made = nibabel.Nifti1Image(values, AFFINE)
     made.header.set_xyzt_units("mm")
     nibabel.save(made, path)
 
 
-def write_itk(path: Path, values: np.ndarray) -> None:
+def write_itk(path, values):
     itk = pytest.importorskip("SimpleITK")
     made = itk.GetImageFromArray(np.ascontiguousarray(values.T))
     to_lps = np.diag([-1.0, -1.0, 1.0])
@@ -70,7 +67,7 @@ def write_itk(path: Path, values: np.ndarray) -> None:
 
 
 @pytest.fixture
-def body(tmp_path: Path) -> BodyRef:
+def body(tmp_path):
     write_body(tmp_path / "egg.off", 1.1, 1.3)
     return BodyRef(tmp_path / "egg.off")
 
@@ -163,7 +160,7 @@ def test_a_map_that_was_cut_short_is_to_be_exported_again(body):
         attribute_source("a.mrc")(body, INSIDE)
 
 
-def write_ply(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+def write_ply(path, mesh, values):
     numbers = np.column_stack([mesh.vertices, values]).tolist()
     rows = "\n".join(" ".join(map(repr, row)) for row in numbers)
     faces = "\n".join("3 " + " ".join(map(str, face)) for face in mesh.faces)
@@ -174,13 +171,13 @@ def write_ply(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     )
 
 
-def write_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+def write_vtk(path, mesh, values):
     meshio = pytest.importorskip("meshio")
     arrays = {"height": values, "other": np.zeros((len(values), 3))}
     meshio.Mesh(mesh.vertices, [("triangle", mesh.faces)], point_data=arrays).write(path)
 
 
-def write_vtk_of_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+def write_vtk_of_vtk(path, mesh, values):
     """With the notes that VTK writes behind arrays of a field."""
     n = len(values)
     faces = len(mesh.faces)
@@ -195,7 +192,7 @@ def write_vtk_of_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> N
     path.write_text(f"{head}{cells}\nPOINT_DATA {n}\n{field}")
 
 
-def write_gifti(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+def write_gifti(path, mesh, values):
     nibabel = pytest.importorskip("nibabel")
     array = nibabel.gifti.GiftiDataArray(
         values.astype(np.float32), intent="NIFTI_INTENT_SHAPE", meta={"Name": "height"}
@@ -203,7 +200,7 @@ def write_gifti(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     nibabel.save(nibabel.gifti.GiftiImage(darrays=[array]), path)
 
 
-def write_freesurfer(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+def write_freesurfer(path, mesh, values):
     nibabel = pytest.importorskip("nibabel")
     nibabel.freesurfer.write_morph_data(str(path), values.astype(np.float32))
 
@@ -311,7 +308,7 @@ def test_values_at_the_vertices_of_a_cavity_count(tmp_path):
     hollow.export(tmp_path / "bodies" / "ball.off")
     cosines = np.linspace(-1, 1, 20001)
 
-    def in_wall(radius: float) -> float:
+    def in_wall(radius):
         across = radius**2 * cosines**2 - radius**2
         outside = 1 / (-radius * cosines + np.sqrt(across + 1))
         meets = (cosines < 0) & (across > -0.25)
@@ -421,7 +418,7 @@ def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path):
     (tmp_path / "x.nii").write_text("")
     root = tmp_path / "root"
 
-    def file(pattern: str, root: Path | None = root) -> str:
+    def file(pattern, root=root):
         found, _ = ImageAttribute(pattern, root).file(body)
         return found.relative_to(tmp_path).as_posix()
 
@@ -519,7 +516,7 @@ def test_an_image_is_added_to_a_cached_collection_and_again_when_it_changes(tmp_
         write_body(tmp_path / "bodies" / f"{name}.off", 1.1, 1.3)
         write_nifti(tmp_path / "bodies" / f"{name}.nii.gz", image())
 
-    def dataset(**options: object) -> SignatureDataset:
+    def dataset(**options):
         files = [tmp_path / "bodies" / f"{name}.off" for name in ("one", "two")]
         return SignatureDataset(files, CONFIG, tmp_path / "cache", **options)
 
@@ -631,15 +628,15 @@ def test_names_of_blocks_do_not_tell_what_a_body_is(tmp_path):
             np.testing.assert_allclose(found, charge)
 
 
-def stem_and_height(body: BodyRef, points: np.ndarray) -> np.ndarray:
+def stem_and_height(body, points):
     return len(body.path.stem) + points[:, 2]
 
 
-def times(points: np.ndarray, factor: float = 2.0) -> np.ndarray:
+def times(points, factor=2.0):
     return factor * points[:, 0]
 
 
-def with_functions(folder: Path, **functions: Callable[..., np.ndarray]) -> SignatureDataset:
+def with_functions(folder, **functions):
     return SignatureDataset(folder / "shapes", CONFIG, folder / "cache", attributes=functions)
 
 
@@ -659,13 +656,13 @@ def test_a_function_of_body_and_points_gives_an_attribute(tmp_path):
 @pytest.mark.parametrize("takes_body", [True, False])
 def test_values_of_a_function_are_cached_under_its_tag(tmp_path, takes_body):
     write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
-    calls: list[int] = []
+    calls = []
 
-    def of_points(points: np.ndarray) -> np.ndarray:
+    def of_points(points):
         calls.append(len(points))
         return points[:, 0]
 
-    def of_body(body: BodyRef, points: np.ndarray) -> np.ndarray:
+    def of_body(body, points):
         return of_points(points)
 
     function = of_body if takes_body else of_points
@@ -689,7 +686,7 @@ def test_values_of_a_function_are_cached_under_its_tag(tmp_path, takes_body):
 
 @pytest.mark.parametrize("tag", ["", 1])
 def test_a_tag_that_is_no_text_is_refused(tmp_path, tag):
-    def height(points: np.ndarray) -> np.ndarray:
+    def height(points):
         return points[:, 2]
 
     height.cache_tag = tag

@@ -1,11 +1,7 @@
 """Files that hold several bodies: found by name, computed together, and one fault costs no other body its Signature."""
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import nibabel
 import numpy as np
@@ -27,13 +23,13 @@ OBJECTS = LoadOptions(mend="never", bodies="objects")
 PARTS = {"liver": (1.0, 1.2, 1.5), "spleen": (1.0, 1.0, 2.0)}
 
 
-def egg(part: str, subject: float) -> trimesh.Trimesh:
+def egg(part, subject):
     body = trimesh.creation.icosphere(subdivisions=2)
     body.vertices *= np.array(PARTS[part]) * subject
     return body
 
 
-def write_subject(path: Path, subject: float, *broken: str) -> None:
+def write_subject(path, subject, *broken):
     """The organs of a subject as objects of one file; the broken ones are single triangles."""
     lines = []
     first = 1
@@ -49,16 +45,16 @@ def write_subject(path: Path, subject: float, *broken: str) -> None:
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     for i in (1, 2):
         write_subject(tmp_path / "subjects" / f"{i}.obj", 1.0 + 0.1 * i)
     return tmp_path / "subjects"
 
 
 @pytest.fixture
-def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def reads(monkeypatch):
     """Names of the files that are read for their bodies."""
-    names: list[str] = []
+    names = []
     for name in ("each_body", "load_mesh"):
         function = getattr(pipeline_module, name)
 
@@ -262,7 +258,7 @@ def test_what_is_read_beside_a_file_counts(tmp_path, monkeypatch):
     labels[2:8, 4:16, 4:16] = 1
     labels[10:18, 4:16, 4:16] = 2
 
-    def volumes(folder: str, names: str | None = None) -> dict[str, int]:
+    def volumes(folder, names=None):
         dataset = SignatureDataset(
             tmp_path / folder, CONFIG, tmp_path / "cache", reading=LoadOptions(names=names)
         )
@@ -329,10 +325,10 @@ def test_a_bad_body_costs_no_other_of_its_file(root, tmp_path, how):
 class Fragile(ThreadPoolExecutor):
     """Loses every job of several bodies, as a cluster does when one of them kills its worker."""
 
-    def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+    def submit(self, function, /, *arguments, **options):
         if len(arguments[0]) == 1:
             return super().submit(function, *arguments, **options)
-        lost: Future[Any] = Future()
+        lost = Future()
         lost.set_exception(RuntimeError("the worker is gone"))
         return lost
 
@@ -353,7 +349,7 @@ def test_a_name_that_is_too_long_for_a_file_costs_no_other(tmp_path):
     assert "File name too long" in failure.error
 
 
-def write_labels(path: Path, *values: int) -> None:
+def write_labels(path, *values):
     """A volume with a cube of 4³ voxels for each label."""
     path.parent.mkdir(parents=True, exist_ok=True)
     labels = np.zeros((20, 8, 8), np.uint8)
@@ -401,7 +397,7 @@ def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(tmp_path, ca
         os.utime(path, (1e9, 1e9))
     monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
 
-    def run() -> tuple[int, list[str]]:
+    def run():
         caplog.clear()
         dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
         failures = dataset.precompute(n_workers=1, progress=False)

@@ -1,10 +1,7 @@
-from __future__ import annotations
-
 import logging
 import os
 import stat
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +15,10 @@ KEY = "0123456789abcdef"
 
 
 @pytest.fixture
-def signature() -> Signature:
+def signature():
     generator = np.random.default_rng(0)
 
-    def samples(n: int) -> Samples:
+    def samples(n):
         values = generator.random((n, 3)).astype(np.float32)
         return Samples(generator.random((n, 3)), values, {"depth": values[:, 0].copy()})
 
@@ -58,23 +55,23 @@ def test_round_trip_is_exact(tmp_path, signature):
         np.testing.assert_array_equal(after.attributes["depth"], before.attributes["depth"])
 
 
-def truncate(path: Path) -> None:
+def truncate(path):
     path.write_bytes(path.read_bytes()[:-20])
 
 
-def overwrite(path: Path) -> None:
+def overwrite(path):
     path.write_bytes(b"not a tensor file at all")
 
 
-def empty(path: Path) -> None:
+def empty(path):
     path.write_bytes(b"")
 
 
-def replace_by_foreign(path: Path) -> None:
+def replace_by_foreign(path):
     save_file({"weights": np.zeros(3)}, path)
 
 
-def belongs_to_another_key(path: Path) -> None:
+def belongs_to_another_key(path):
     path.write_bytes(path.read_bytes().replace(KEY.encode(), KEY[::-1].encode()))
 
 
@@ -150,7 +147,7 @@ def test_what_a_killed_run_left_is_removed_later(tmp_path, signature):
 
 
 def test_failed_write_leaves_nothing(tmp_path, signature, monkeypatch):
-    def fail(*_: object, **__: object) -> None:
+    def fail(*_, **__):
         raise OSError("disk full")
 
     monkeypatch.setattr("igps.data.cache.os.replace", fail)
@@ -166,7 +163,7 @@ def test_default_directory_follows_the_convention(monkeypatch, tmp_path):
 
 
 def test_a_user_without_a_home_is_told_what_to_give(monkeypatch):
-    def no_home() -> None:
+    def no_home():
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)

@@ -1,17 +1,13 @@
 """A real scheduler and worker processes on this machine."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 from bodies_on_disk import write_body
@@ -33,17 +29,16 @@ CONFIG = SignatureConfig(**SMALL)
 SOURCE = str(Path(fill_elsewhere.__code__.co_filename).parents[2])
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
-        port: int = one.getsockname()[1]
-        return port
+        return one.getsockname()[1]
 
 
 class Cluster:
     """A scheduler and three workers, each a process."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.address = f"tcp://127.0.0.1:{free_port()}"
         self._folder = folder
         self._environment = {
@@ -56,11 +51,11 @@ class Cluster:
         self.scheduler = self._start("scheduler", "--host", host, "--port", port, "--no-dashboard")
         self.workers = [self.start_worker() for _ in range(3)]
 
-    def start_worker(self) -> subprocess.Popen[bytes]:
+    def start_worker(self):
         options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "300"]
         return self._start("worker", self.address, *options, "--local-directory", str(self._folder))
 
-    def _start(self, *words: str) -> subprocess.Popen[bytes]:
+    def _start(self, *words):
         command = [sys.executable, "-m", "dask", *words]
         return subprocess.Popen(
             command,
@@ -70,14 +65,14 @@ class Cluster:
             cwd=self._folder,
         )
 
-    def end(self) -> None:
+    def end(self):
         for process in [*self.workers, self.scheduler]:
             process.kill()
             process.wait()
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+def cluster(tmp_path_factory):
     one = Cluster(tmp_path_factory.mktemp("cluster"))
     try:
         with distributed.Client(one.address, timeout=300, set_as_default=False) as client:
@@ -88,13 +83,13 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     for i in range(12):
         write_body(tmp_path / "meshes" / f"{i:02}.off", 1.0 + 0.1 * i, 1.5)
     return tmp_path / "meshes"
 
 
-def stored(cache: Path) -> dict[str, bytes]:
+def stored(cache):
     return {path.name: path.read_bytes() for path in cache.rglob("*.safetensors")}
 
 
@@ -158,10 +153,8 @@ def test_shards_have_all_files_once(root, tmp_path, monkeypatch, capsys):
 class Broken(ThreadPoolExecutor):
     """What an executor does whose scheduler is lost."""
 
-    def submit(
-        self, function: Callable[..., Any], /, *arguments: Any, **options: Any
-    ) -> Future[Any]:
-        future: Future[Any] = Future()
+    def submit(self, function, /, *arguments, **options):
+        future = Future()
         future.cancel()
         future.set_running_or_notify_cancel()
         return future
@@ -170,9 +163,7 @@ class Broken(ThreadPoolExecutor):
 class Elsewhere(ThreadPoolExecutor):
     """Does nothing that is seen here."""
 
-    def submit(
-        self, function: Callable[..., Any], /, *arguments: Any, **options: Any
-    ) -> Future[Any]:
+    def submit(self, function, /, *arguments, **options):
         return super().submit(lambda bodies: [Nowhere() for _ in bodies], *arguments)
 
 

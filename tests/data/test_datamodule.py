@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +16,7 @@ CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     for label in range(3):
         for i in range(5):
             path = tmp_path / "meshes" / f"class{label}" / f"{i}.off"
@@ -84,7 +81,7 @@ def test_training_shapes_are_kept_in_memory_thinned(root, tmp_path, n_samples):
 
 
 def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(root, tmp_path):
-    def module(**options: int) -> SignatureDataModule:
+    def module(**options):
         return SignatureDataModule(
             root,
             n_train=2,
@@ -140,7 +137,7 @@ def test_meshes_are_read_as_asked(root, tmp_path):
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
     mesh.export(root / "class1" / "2.off")
 
-    def module(**options: LoadOptions) -> SignatureDataModule:
+    def module(**options):
         return SignatureDataModule(
             root,
             n_train=2,

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import logging
 import pickle
 import shutil
@@ -21,14 +19,13 @@ from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.transforms import FewerSamples, Scale
 from igps.mesh.errors import MeshError
-from igps.mesh.loading import BodyRef
-from igps.signature.signature import Signature, SignatureConfig
+from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     """Two classes of two small bodies each."""
     for label, ratio in (("ball", 1.0), ("egg", 1.7)):
         for i in (1, 2):
@@ -37,14 +34,14 @@ def root(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def dataset(root: Path, tmp_path: Path) -> SignatureDataset:
+def dataset(root, tmp_path):
     return SignatureDataset(root, CONFIG, tmp_path / "cache")
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def counted(monkeypatch):
     """Names of the meshes whose signature is computed, not read."""
-    names: list[str] = []
+    names = []
     compute = pipeline_module.compute_signature
 
     def counting(mesh, config):
@@ -375,15 +372,15 @@ def test_a_transform_is_applied_at_each_reading_and_not_kept(dataset, counted):
 class CountedScale:
     """A change of scale of one's own, which counts its bodies."""
 
-    def __init__(self, seed: int, applied: list[str]) -> None:
+    def __init__(self, seed, applied):
         self.scale = Scale(seed=seed)
         self.applied = applied
 
     @property
-    def cache_tag(self) -> str:
+    def cache_tag(self):
         return self.scale.cache_tag
 
-    def __call__(self, signature: Signature) -> Signature:
+    def __call__(self, signature):
         self.applied.append(signature.name)
         return self.scale(signature)
 
@@ -391,9 +388,9 @@ class CountedScale:
 def test_a_pre_transform_is_kept_under_a_key_of_its_own(dataset, counted, root):
     dataset.precompute(n_workers=1, progress=False)
     counted.clear()
-    applied: list[str] = []
+    applied = []
 
-    def changed(seed: int) -> SignatureDataset:
+    def changed(seed):
         own = CountedScale(seed, applied)
         return SignatureDataset(root, CONFIG, dataset.pipeline.cache_dir, pre_transform=own)
 
@@ -425,15 +422,15 @@ def test_a_pre_transform_is_kept_under_a_key_of_its_own(dataset, counted, root):
 class Image:
     """A linear function of space, as an image on a grid would be, with a checksum and a count of its readings."""
 
-    def __init__(self, slope: float, n_channels: int | None = None) -> None:
+    def __init__(self, slope, n_channels=None):
         self.slope = slope
         self.n_channels = n_channels
         self.read = 0
 
-    def cache_tag(self, body: BodyRef) -> str:
+    def cache_tag(self, body):
         return f"{body.path.parent.name} {self.slope} {self.n_channels}"
 
-    def __call__(self, body: BodyRef, points: np.ndarray) -> np.ndarray:
+    def __call__(self, body, points):
         self.read += 1
         values = self.slope * points[:, 2] + 100 * (body.path.parent.name == "egg")
         return values if self.n_channels is None else np.stack([values] * self.n_channels, axis=1)
@@ -446,7 +443,7 @@ def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(
     counted.clear()
     image = Image(2.0)
 
-    def with_image(source: Image) -> SignatureDataset:
+    def with_image(source):
         return SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"ct": source})
 
     for again in range(2):
@@ -491,7 +488,7 @@ def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(tm
 
 
 def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root, tmp_path):
-    def changed(slope: float) -> SignatureDataset:
+    def changed(slope):
         return SignatureDataset(
             root,
             CONFIG,
@@ -567,7 +564,7 @@ def test_a_disk_that_is_full_costs_only_the_cache(tmp_path, monkeypatch, caplog)
     config = SignatureConfig(n_eigenpairs=9, resolution=8, min_samples=0, n_surface_samples=20)
     dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")
 
-    def full(*arguments: object) -> None:
+    def full(*arguments):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("igps.data.cache.Cache.put", full)

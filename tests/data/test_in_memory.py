@@ -1,9 +1,6 @@
 """Bodies in memory are those of files that hold the same."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import nibabel
 import numpy as np
@@ -17,7 +14,7 @@ BALL = trimesh.creation.icosphere(subdivisions=2)
 AFFINE = np.diag([-1.0, 1, 2, 1])
 
 
-def two_balls_and_a_speck() -> np.ndarray:
+def two_balls_and_a_speck():
     index = np.indices((24, 24, 24))
     labels = np.zeros((24, 24, 24), dtype=np.uint8)
     labels[((index - 8) ** 2).sum(axis=0) < 40] = 2
@@ -33,7 +30,7 @@ def test_they_have_the_signatures_of_their_files(tmp_path):
     of_files = SignatureDataset(
         [tmp_path / "a.nii", tmp_path / "b.stl"], CONFIG, tmp_path / "files"
     )
-    given: dict[str, Any] = {
+    given = {
         "a": image,
         "b": trimesh.load(tmp_path / "b.stl"),
         "c": np.full((4, 4, 4), np.nan),

@@ -1,10 +1,7 @@
-from __future__ import annotations
-
 import logging
 import os
 import sqlite3
 import time
-from pathlib import Path
 
 import pytest
 from bodies_on_disk import write_body
@@ -18,7 +15,7 @@ LONG_AGO = time.time() - 1000
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> SignatureDataset:
+def dataset(tmp_path):
     for i in range(3):
         write_body(tmp_path / "meshes" / f"{i}.off", 1.0 + 0.1 * i, 1.5)
         make_old(tmp_path / "meshes" / f"{i}.off")
@@ -26,18 +23,18 @@ def dataset(tmp_path: Path) -> SignatureDataset:
 
 
 @pytest.fixture(autouse=True)
-def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+def patience(monkeypatch):
     """Trust recent files, too, because tests cannot set the time of the last change of a file's metadata (ctime)."""
     monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
 
 
 @pytest.fixture
-def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def read(monkeypatch):
     """Names of the mesh files that are read for their key."""
-    names: list[str] = []
+    names = []
     read_file = FileDigest.of
 
-    def reading(path: Path) -> FileDigest:
+    def reading(path):
         names.append(path.name)
         return read_file(path)
 
@@ -45,7 +42,7 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def make_old(path: Path) -> None:
+def make_old(path):
     os.utime(path, (LONG_AGO, LONG_AGO))
 
 

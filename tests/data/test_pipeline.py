@@ -1,10 +1,7 @@
-from __future__ import annotations
-
 import gzip
 import pickle
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,30 +16,29 @@ from igps.data.pipeline import SignaturePipeline
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION
-from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.signature.measures import MEASURES_VERSION
-from igps.signature.signature import Signature, SignatureConfig, compute_signature
+from igps.signature.signature import SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     write_body(tmp_path / "egg.off", 1.1, 1.5)
     return tmp_path / "egg.off"
 
 
 @pytest.fixture
-def pipeline(tmp_path: Path) -> SignaturePipeline:
+def pipeline(tmp_path):
     return SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
 
 
-def found(pipeline: SignaturePipeline, body: BodyRef) -> CacheHit | Failed | None:
+def found(pipeline, body):
     return pipeline.find(body, pipeline.content(body))
 
 
-def is_cached(pipeline: SignaturePipeline, body: BodyRef) -> bool:
+def is_cached(pipeline, body):
     try:
         return isinstance(found(pipeline, body), CacheHit)
     except MeshError:
@@ -152,11 +148,11 @@ NEEDED = USUAL.with_eigenpairs(50)
 
 
 @pytest.fixture
-def computed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def computed(monkeypatch):
     """The numbers of eigenpairs of the signatures that are computed, not read."""
-    numbers: list[int] = []
+    numbers = []
 
-    def counting(mesh: Mesh, config: SignatureConfig) -> Signature:
+    def counting(mesh, config):
         numbers.append(config.n_kept)
         return compute_signature(mesh, config)
 

@@ -1,15 +1,11 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from batches import batch_of, two_bodies
-from igps.data.batch import Body
 from igps.data.requirements import Requirements, embedding_requirements
 from igps.descriptors import NAMES, descriptor
 from igps.nn.descriptor import BodyDescriptor
@@ -116,7 +112,7 @@ def test_as_many_eigenpairs_as_needed_where_no_number_is_given(needs, n_eigenpai
 
 def test_what_a_descriptor_does_not_say_is_all():
     class Own(BodyDescriptor):
-        def describe_body(self, body: Body) -> NDArray[np.float32]:
+        def describe_body(self, body):
             return body.eigenvalues.astype(np.float32)
 
     assert Own().requirements.apply_to(SignatureConfig()).n_eigenpairs == 250

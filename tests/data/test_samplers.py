@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -21,7 +19,7 @@ def test_every_shape_comes_once_in_batches_of_the_size_asked(drop_last):
     assert len(set(drawn)) == len(drawn) == (400 if drop_last else 403)
 
 
-def padding(batches: list[list[int]]) -> float:
+def padding(batches):
     """Padding rows of all batches, over the rows of their shapes."""
     n_rows = sum(int(SIZES[one].sum()) for one in batches)
     n_padded = sum(len(one) * int(SIZES[one].max()) for one in batches)
@@ -36,7 +34,7 @@ def test_padding_is_a_small_part_of_that_of_random_batches():
 
 
 def test_epochs_differ_and_seeds_say_all():
-    def epochs(seed: int) -> list[list[list[int]]]:
+    def epochs(seed):
         sampler = BucketBatchSampler(SIZES, 8, generator=torch.Generator().manual_seed(seed))
         return [list(sampler), list(sampler)]
 

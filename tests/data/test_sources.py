@@ -1,8 +1,5 @@
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +7,7 @@ import pytest
 from igps.data.sources import bodies_of, bodies_of_files, file_and_part, find_bodies
 
 
-def touch(root: Path, *names: str) -> None:
+def touch(root, *names):
     for name in names:
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text("")
@@ -119,7 +116,7 @@ def test_what_is_left_out_of_a_folder_is_told(tmp_path, monkeypatch, caplog):
     Path(os.fsdecode(os.fsencode(tmp_path / "cat") + b"/m\xfcll.off")).write_text("")
     scan = os.scandir
 
-    def refused(path: str) -> Any:
+    def refused(path):
         if Path(path).name == "dog":
             raise PermissionError(13, "Permission denied", path)
         return scan(path)

@@ -1,19 +1,17 @@
-from __future__ import annotations
-
 import pytest
 import torch
 
-from igps.data.splits import Split, split_seen, split_unseen
+from igps.data.splits import split_seen, split_unseen
 
 ORDER = torch.randperm(48, generator=torch.Generator().manual_seed(1))
 LABELS = torch.arange(8).repeat_interleave(6)[ORDER]
 
 
-def classes(indices: tuple[int, ...]) -> list[int]:
+def classes(indices):
     return sorted(LABELS[list(indices)].tolist())
 
 
-def disjoint(split: Split) -> bool:
+def disjoint(split):
     parts = [set(part) for part in (split.train, split.validation, split.test)]
     return sum(map(len, parts)) == len(set.union(*parts))
 

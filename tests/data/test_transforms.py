@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 
@@ -10,7 +8,7 @@ import trimesh
 
 from igps.data.transforms import Compose, FewerSamples, Scale
 from igps.mesh.mesh import Mesh
-from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
+from igps.signature.signature import SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 EVERY = [
@@ -19,27 +17,27 @@ EVERY = [
 ]
 
 
-def of_egg(scale: float = 1.0) -> Signature:
+def of_egg(scale=1.0):
     body = trimesh.creation.icosphere(subdivisions=2)
     body.vertices *= np.array([1.0, 1.2, 1.7]) * scale
     return compute_signature(Mesh(body.vertices, body.faces, name="egg"), CONFIG)
 
 
 @pytest.fixture(scope="module")
-def signature() -> Signature:
+def signature():
     found = of_egg()
     depth = np.arange(len(found.interior), dtype=np.float32)
     return replace(found, interior=replace(found.interior, attributes={"depth": depth}))
 
 
-def arrays(signature: Signature) -> list[np.ndarray]:
+def arrays(signature):
     found = [signature.eigenvalues, np.array([signature.area, signature.volume])]
     for samples in (signature.interior, signature.surface):
         found += [samples.points, samples.eigenfunctions, *samples.attributes.values()]
     return found
 
 
-def same(one: Signature, other: Signature) -> bool:
+def same(one, other):
     return all(
         a.shape == b.shape and (a == b).all()
         for a, b in zip(arrays(one), arrays(other), strict=True)
@@ -76,7 +74,7 @@ def test_without_a_seed_the_global_generator_draws(signature, transform):
         _ = transform.cache_tag
 
 
-def rows(samples: Samples) -> list[tuple[float, ...]]:
+def rows(samples):
     return [tuple(row) for row in np.hstack([samples.points, samples.eigenfunctions])]
 
 

@@ -1,7 +1,5 @@
 """The example of the page *Add a descriptor*, as another package would install it."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path
@@ -14,7 +12,7 @@ from igps.signature.signature import SignatureConfig
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "add-descriptor.md"
 
 
-def file_of_the_page(name: str) -> str:
+def file_of_the_page(name):
     """The text of the block whose title is this file."""
     pattern = rf'^```\w+ title="{re.escape(name)}"\n(.*?)^```'
     match = re.search(pattern, PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
@@ -23,7 +21,7 @@ def file_of_the_page(name: str) -> str:
 
 
 @pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def installed(tmp_path, monkeypatch):
     """The package of the page, laid out on the Python path as pip would do it."""
     project = tomllib.loads(file_of_the_page("pyproject.toml"))["project"]
     (tmp_path / "mine.py").write_text(file_of_the_page("mine.py"))

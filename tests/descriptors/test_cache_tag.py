@@ -1,9 +1,6 @@
 """Under which words descriptions are kept: whatever changes them, changes the words."""
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,13 +16,13 @@ from igps.nn.histograms.pairs import PairHistogram
 
 
 @pytest.fixture(autouse=True)
-def _forgotten() -> Iterator[None]:
+def _forgotten():
     fingerprint._code_tag.cache_clear()
     yield
     fingerprint._code_tag.cache_clear()
 
 
-def words() -> str:
+def words():
     found = cache_tag(descriptor("d2"))
     assert found is not None
     return found

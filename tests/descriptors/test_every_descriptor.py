@@ -5,27 +5,24 @@ from __future__ import annotations
 import pickle
 import re
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, reduce
 from operator import or_
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from numpy.typing import NDArray
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import igps
 from batches import exported, tensors
-from igps.data.batch import Body, SignatureBatch
+from igps.data.batch import SignatureBatch
 from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.descriptors import NAMES, descriptor
 from igps.mesh.mesh import Mesh
-from igps.nn.descriptor import BodyDescriptor, Descriptor, EmbeddedDescriptor
+from igps.nn.descriptor import BodyDescriptor, EmbeddedDescriptor
 from igps.retrieval import cosine
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
@@ -34,7 +31,7 @@ ON_TENSORS = [name for name in NAMES if not isinstance(descriptor(name), BodyDes
 CHANGES = [(name, change) for name in NAMES for change in descriptor(name).invariant_to]
 
 
-def rod() -> NDArray[np.float64]:
+def rod():
     """Vertices of a rod along x, thicker at one end: the faces are those of `unit_sphere`."""
     x, y, z = unit_sphere().vertices.T
     radius = 0.25 + 0.06 * x
@@ -46,25 +43,25 @@ def rod() -> NDArray[np.float64]:
 
 
 @cache
-def unit_sphere() -> trimesh.Trimesh:
+def unit_sphere():
     return trimesh.creation.icosphere(subdivisions=4)
 
 
-def bent(vertices: NDArray[np.float64], angle: float = 1.6) -> NDArray[np.float64]:
+def bent(vertices, angle=1.6):
     """Bent around an arc that keeps the lengths along the axis."""
     x, y, z = vertices.T
     radius = 2 * 1.6 / angle
     return np.stack([(radius + y) * np.sin(x / radius), (radius + y) * np.cos(x / radius), z], 1)
 
 
-def disc(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def disc(vertices):
     return unit_sphere().vertices * [1.0, 0.8, 0.3]
 
 
 @cache
-def body(kind: str) -> SignatureBatch:
+def body(kind):
     """A rod; the same moved, scaled and bent; and another body, with all that any descriptor needs."""
-    change: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    change = {
         "rod": lambda v: v,
         "motion": lambda v: (v * [1, 1, -1]) @ ROTATION.T + [3.0, -2.0, 5.0],
         "scale": lambda v: 7.3 * v,
@@ -80,16 +77,14 @@ def body(kind: str) -> SignatureBatch:
     return collate([compute_signature(mesh, everything.apply_to(config))], [mesh])
 
 
-def signature(
-    eigenvalues: NDArray[np.float64], interior: Samples, surface: Samples, of: Body
-) -> Signature:
+def signature(eigenvalues, interior, surface, of):
     config = SignatureConfig(n_eigenpairs=len(eigenvalues))
     sizes = (of.area, of.volume)
     return Signature(eigenvalues, interior, surface, *sizes, config, of.id, measures=of.measures)
 
 
 @cache
-def description(name: str, kind: str) -> torch.Tensor:
+def description(name, kind):
     with torch.inference_mode():
         return descriptor(name)(body(kind))
 
@@ -135,7 +130,7 @@ def test_padding_changes_no_description(name):
         torch.testing.assert_close(row[None], expected, rtol=1e-4, atol=1e-5 * scale)
 
 
-def with_individuals(name: str) -> Descriptor:
+def with_individuals(name):
     """A descriptor that keeps size and side, too, where the name ends in "+"."""
     if name.endswith("+"):
         return descriptor(name.strip("+"), size="keep", mirror="distinct")
@@ -169,7 +164,7 @@ def test_tensors_are_made_on_the_device_of_the_bodies(name, compiled, monkeypatc
     assert not distances.is_meta
 
 
-def fewer_samples(batch: SignatureBatch, n: int) -> SignatureBatch:
+def fewer_samples(batch, n):
     return replace(
         batch, interior=batch.interior.subset(n, seed=0), surface=batch.surface.subset(n, seed=0)
     )
@@ -178,11 +173,11 @@ def fewer_samples(batch: SignatureBatch, n: int) -> SignatureBatch:
 class Counting(TorchDispatchMode):
     """Counts the operations that reach a device, of which each that reads a number waits for it."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.found: Counter[str] = Counter()
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         self.found[str(func)] += 1
         return func(*args, **(kwargs or {}))
 

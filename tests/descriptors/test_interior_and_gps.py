@@ -1,7 +1,5 @@
 """The paper's two histograms against a plain count of all pairs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -10,14 +8,14 @@ import igps
 from igps.descriptors.gps import gps
 from igps.descriptors.interior import interior
 from igps.mesh.mesh import Mesh
-from igps.signature.signature import Signature, SignatureConfig, compute_signature
+from igps.signature.signature import SignatureConfig, compute_signature
 from paper_histogram import paper_histogram
 
 N_EIGENPAIRS = 60
 
 
 @pytest.fixture(scope="module")
-def signature(blob: Mesh) -> Signature:
+def signature(blob):
     config = SignatureConfig(n_eigenpairs=80, resolution=24, min_samples=300, n_surface_samples=400)
     # Long, so that its ends lie far from the middle and several classes are filled.
     return compute_signature(Mesh(blob.vertices * [1, 1, 4], blob.faces), config)

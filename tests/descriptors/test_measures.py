@@ -1,7 +1,5 @@
 """Plain numbers as a descriptor, from files to distances."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -20,7 +18,7 @@ SPHERE = trimesh.creation.icosphere(subdivisions=3)
 CONFIG = SignatureConfig(n_eigenpairs=0)
 
 
-def ellipsoid(*semi_axes: float, unit: str | None = None) -> Mesh:
+def ellipsoid(*semi_axes, unit=None):
     return Mesh(SPHERE.vertices * semi_axes, SPHERE.faces, unit=unit)
 
 

@@ -1,10 +1,7 @@
 """Descriptors by name, by import path, and as objects; and what they need of signatures."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -62,7 +59,7 @@ def nothing():
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def own(tmp_path, monkeypatch):
     """A package with a module of one's own on the Python path."""
     package = f"mine_{tmp_path.name}"
     (tmp_path / package).mkdir()

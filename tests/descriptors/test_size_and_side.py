@@ -1,11 +1,7 @@
 """Size and side beside form: by hand-worked distances, scaled bodies and mirror images."""
 
-from __future__ import annotations
-
 import zipfile
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +19,6 @@ from igps.descriptors.size_and_side import SCALES, SizeAndSide, keeps_size, sign
 from igps.duplicates.duplicates import duplicates
 from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import EmbeddedDescriptor
-from igps.signature.signature import Signature
 
 CONFIG = SignatureConfig(
     n_eigenpairs=250, attributes=("depth", "electrostatic_potential", "surface_direction")
@@ -31,9 +26,7 @@ CONFIG = SignatureConfig(
 SURFACE = trimesh.creation.icosphere(subdivisions=3)
 
 
-def twisted(
-    turns: float, scale: float = 1.0, unit: str | None = None, mirrored: bool = False
-) -> Mesh:
+def twisted(turns, scale=1.0, unit=None, mirrored=False):
     """An ellipsoid whose flat side turns along its axis, which is no mirror image of itself."""
     x, y, z = (SURFACE.vertices * [1.4, 0.6, 2.2]).T
     angle = turns * z
@@ -46,7 +39,7 @@ def twisted(
 
 
 @pytest.fixture(scope="module")
-def signatures() -> dict[str, Signature]:
+def signatures():
     bodies = {
         "body": twisted(0.5, unit="mm"),
         "centimetres": twisted(0.5, 0.1, "cm"),
@@ -57,7 +50,7 @@ def signatures() -> dict[str, Signature]:
     return {name: compute_signature(body, CONFIG) for name, body in bodies.items()}
 
 
-def from_body(name: str, signatures: dict[str, Signature]) -> dict[str, float]:
+def from_body(name, signatures):
     """The distances from the first body by a descriptor."""
     descriptor = igps.descriptor(name)
     descriptions = torch.cat([descriptor(collate([one])) for one in signatures.values()])
@@ -135,7 +128,7 @@ def test_a_body_that_is_turned_is_far_nearer_than_its_mirror_image():
     assert turned < min(mirrored) / 3
 
 
-def bent(mirrored: bool = False, turn: np.ndarray | None = None) -> Mesh:
+def bent(mirrored=False, turn=None):
     """A limb that grows thicker and bends to one side, and to another at its end."""
     x, y, z = SURFACE.vertices.T
     wide = 0.45 * (1 + 0.5 * z)
@@ -247,7 +240,7 @@ def test_size_is_kept_where_there_are_units(size, units, expected, told):
     assert bool(sentence) is bool(told)
 
 
-def write_3mf(path: Path, radius: float, unit: str, body: trimesh.Trimesh | Mesh = SURFACE) -> None:
+def write_3mf(path, radius, unit, body=SURFACE):
     """A ball of a radius in a unit, or another body so many times as large."""
     points = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in body.vertices * radius)
     faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in body.faces)
@@ -271,7 +264,7 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path, capsys):
         ("2/d", 2.8, "centimeter"),
     ):
         write_3mf(root / f"{name}.3mf", radius, unit)
-    options: dict[str, Any] = {"cache_dir": tmp_path / "cache", "n_workers": 1}
+    options = {"cache_dir": tmp_path / "cache", "n_workers": 1}
     summary = retrieve(root, "shape_dna", **options)
     assert summary["config"]["descriptor"] == "shape_dna+size"
     assert summary["nn"] == 1

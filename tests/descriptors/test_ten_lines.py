@@ -1,7 +1,5 @@
 """The ten lines of the README with descriptors of each kind in place of the one that is printed there."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path
@@ -14,7 +12,7 @@ README = Path(__file__).parents[2] / "README.md"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Two classes of three small shapes, and a cache of their signatures with all that any descriptor needs."""
     root = tmp_path_factory.mktemp("ten_lines")
     igps.ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=1100).write(root / "shapes")

@@ -1,7 +1,5 @@
 """Descriptors written in YAML, and attributes that join one: the same numbers, quantiles kept, textures told."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -55,13 +53,13 @@ parts:
 """
 
 
-def write(folder: Path, text: str) -> Path:
+def write(folder, text):
     (folder / "mine.yaml").write_text(text)
     return folder / "mine.yaml"
 
 
 @pytest.fixture
-def bodies(tmp_path: Path) -> SignatureDataset:
+def bodies(tmp_path):
     for i, stretch in enumerate(((1, 1, 1.7), (1, 1.3, 2.2), (1, 1, 1))):
         ball = trimesh.creation.icosphere(subdivisions=3)
         ball.vertices *= stretch
@@ -161,7 +159,7 @@ def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tm
         fit_centres(igps.descriptor(write(tmp_path, text)), bare)
 
 
-def texture(kind: str, generator: np.random.Generator, points: np.ndarray) -> np.ndarray:
+def texture(kind, generator, points):
     """Graded, layered, mottled or with a core, in a direction and with a phase of its own."""
     direction = generator.normal(size=3)
     along = points @ (direction / np.linalg.norm(direction))

@@ -1,7 +1,5 @@
 """Surfaces laid onto each other: what a known motion leaves, and closed forms of how far apart they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +19,7 @@ from igps.duplicates._alignment import (
 Array = NDArray[np.float64]
 
 
-def even_directions(n: int, seed: int = 0) -> Array:
+def even_directions(n, seed=0):
     """(n, 3) spread evenly over the sphere by the golden angle, turned at random."""
     z = 1 - (2 * np.arange(n) + 1) / n
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
@@ -30,7 +28,7 @@ def even_directions(n: int, seed: int = 0) -> Array:
     return Rotation.random(random_state=seed).apply(directions)
 
 
-def ellipsoid(axes: tuple[float, float, float], n: int = 1500, seed: int = 0) -> SurfaceSamples:
+def ellipsoid(axes, n=1500, seed=0):
     """Samples of an ellipsoid, denser where it is pointed."""
     directions = even_directions(n, seed)
     normals = directions / axes
@@ -38,7 +36,7 @@ def ellipsoid(axes: tuple[float, float, float], n: int = 1500, seed: int = 0) ->
     return SurfaceSamples.of(directions * axes, normals, 1.0)
 
 
-def bumpy(amplitude: float, n: int = 2000, seed: int = 0) -> SurfaceSamples:
+def bumpy(amplitude, n=2000, seed=0):
     """The surface r = 1 + a·P₄(cos θ), P₄ of Legendre, with the normals of its level set."""
     directions = even_directions(n, seed)
     z = directions[:, 2]
@@ -52,7 +50,7 @@ def bumpy(amplitude: float, n: int = 2000, seed: int = 0) -> SurfaceSamples:
     return SurfaceSamples.of(radius[:, None] * directions, normals, 4 * np.pi)
 
 
-def moved(samples: SurfaceSamples, seed: int, mirror: bool, scale: float) -> SurfaceSamples:
+def moved(samples, seed, mirror, scale):
     turn = Rotation.random(random_state=seed).as_matrix() * (-1 if mirror else 1)
     shuffled = np.random.default_rng(seed).permutation(len(samples.points))
     points = (scale * samples.points @ turn.T + [3.0, -1.0, 2.0])[shuffled]
@@ -87,7 +85,7 @@ def test_a_rotated_body_with_equal_principal_axes_is_aligned():
     assert surface_distance(body, again) < 0.1 * surface_distance(body, bumpy(0.0, seed=3))
 
 
-def rough(amplitude: float, n: int, seed: int) -> tuple[Array, Array]:
+def rough(amplitude, n, seed):
     """Points and normals of an ellipsoid that is ruffled along one axis, by waves much shorter than a patch."""
     axes = np.array([1.0, 0.7, 0.45])
     wave = 0.02
@@ -114,9 +112,7 @@ def test_fine_relief_cancels_but_another_shape_does_not():
     assert surface_distance(plain, SurfaceSamples.of(turned, normals, area)) > 2 * lost
 
 
-def triangles(
-    axes: tuple[float, float, float], subdivisions: int
-) -> tuple[Array, NDArray[np.int64]]:
+def triangles(axes, subdivisions):
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     return np.asarray(ball.vertices * axes), np.asarray(ball.faces)
 
@@ -170,7 +166,7 @@ def test_distances_beyond_an_edge_are_those_to_the_edge():
 def test_thin_sheets_of_other_widths_are_told_apart():
     """The planes of both sheets nearly coincide, so that only distances beside the smaller sheet separate them."""
 
-    def sheet(length: float, width: float) -> SurfaceSamples:
+    def sheet(length, width):
         n = 40
         x, y = np.meshgrid((np.arange(n) + 0.5) / n * length, (np.arange(n) + 0.5) / n * width)
         top = np.column_stack([x.ravel(), y.ravel(), np.full(n * n, 0.003 * length)])
@@ -193,9 +189,7 @@ def test_what_is_farther_than_asked_for_is_told_to_be():
     assert surface_distance(one, other, max_distance=1.01 * far) == far
 
 
-def part(
-    step: float = 0.0, boss: float = 0.0, hole: float = 4.0, sections: int = 32
-) -> SurfaceSamples:
+def part(step=0.0, boss=0.0, hole=4.0, sections=32):
     """A chiral plate of 45 mm with a step, a boss, and a hole of so many segments."""
     plate = trimesh.creation.box((45, 30, 8))
     block = trimesh.creation.box((10, 8, 12))
@@ -208,7 +202,7 @@ def part(
     return sampled(trimesh.boolean.difference([solid, drill], engine="manifold"))
 
 
-def sampled(body: trimesh.Trimesh) -> SurfaceSamples:
+def sampled(body):
     points, faces = trimesh.sample.sample_surface(body, 1500, seed=len(body.faces))
     samples = SurfaceSamples.of(points, body.face_normals[faces], body.area)
     vertices = (body.vertices - points.mean(axis=0)) / body.area**0.5

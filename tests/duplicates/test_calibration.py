@@ -1,7 +1,5 @@
 """What a distance means, against counting; and for whom a calibration holds."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -19,13 +17,13 @@ CONFIG = SignatureConfig(n_eigenpairs=20)
 
 
 @pytest.fixture(scope="module")
-def drawn() -> dict[str, np.ndarray]:
+def drawn():
     generator = np.random.default_rng(0)
     return {kind: (1 + place) * generator.gamma(2.0, size=5000) for place, kind in enumerate(KINDS)}
 
 
 @pytest.fixture
-def calibration(drawn: dict[str, np.ndarray]) -> Calibration:
+def calibration(drawn):
     threshold = Threshold(0.5, 1000, 0, 20, 19)
     return Calibration(
         "same",

@@ -1,7 +1,5 @@
 """Moments against closed forms, and how far apart they tell surfaces to be at least against known moves."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
@@ -17,18 +15,16 @@ Array = NDArray[np.float64]
 MOST = 0.002
 
 
-def of(body: trimesh.Trimesh, scale: float = 1.0) -> Array:
+def of(body, scale=1.0):
     return moments(scale * body.vertices / body.area**0.5, np.asarray(body.faces), MOST)
 
 
-def apart(one: trimesh.Trimesh, other: trimesh.Trimesh, scale: float = 1.0) -> float:
+def apart(one, other, scale=1.0):
     some, others = (torch.from_numpy(found)[None] for found in (of(one), of(other, scale)))
     return float(distance_bounds(some, others))
 
 
-def lump(
-    stretch: tuple[float, float, float], bumps: float = 0.0, subdivisions: int = 3
-) -> trimesh.Trimesh:
+def lump(stretch, bumps=0.0, subdivisions=3):
     """An ellipsoid; with bumps, without any symmetry."""
     body = trimesh.creation.icosphere(subdivisions=subdivisions)
     x, y, z = body.vertices.T

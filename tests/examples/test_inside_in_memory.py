@@ -1,9 +1,6 @@
 """Where inside a signal lies, from the objects of other libraries: each gives the same numbers."""
 
-from __future__ import annotations
-
 import pickle
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +21,7 @@ AFFINE[:3, :3] = TURN * SPACING
 AFFINE[:3, 3] = [-30.0, 12.0, 5.0]
 
 
-def world(affine: np.ndarray = AFFINE, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
+def world(affine=AFFINE, shape=SHAPE):
     """The centres of all voxels."""
     indices = np.indices(shape).reshape(3, -1).T
     return (indices @ affine[:3, :3].T + affine[:3, 3]).reshape(*shape, 3)
@@ -36,19 +33,19 @@ IMAGE = np.exp(-np.linalg.norm(world() - CENTRE - [2, 0, 1], axis=-1) / 4).astyp
 
 
 @pytest.fixture(scope="module")
-def expected() -> dict[str, Any]:
+def expected():
     (row,) = igps.inside(IMAGE, LABELS, SPACING)
     assert row["volume"] == pytest.approx(LABELS.sum() * np.prod(SPACING), rel=0.01)
     return row
 
 
-def check(rows: list[dict[str, Any]], expected: dict[str, Any]) -> None:
+def check(rows, expected):
     assert len(rows) == 1
     for name in column_names(["image"]):
         assert rows[0][name] == pytest.approx(expected[name], abs=2e-3), name
 
 
-def in_nibabel(values: np.ndarray, affine: np.ndarray = AFFINE) -> Any:
+def in_nibabel(values, affine=AFFINE):
     return pytest.importorskip("nibabel").Nifti1Image(values, affine)
 
 

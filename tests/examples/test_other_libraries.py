@@ -1,13 +1,9 @@
 """Examples to copy: descriptions, heads and spectra in PyTorch Geometric, DiffusionNet and pytorch-metric-learning."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.utils.data import DataLoader
 
 import igps
@@ -25,7 +21,7 @@ distances = pytest.importorskip(
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> igps.SignatureDataset:
+def dataset(tmp_path_factory):
     """Eight eggs of two classes."""
     root = tmp_path_factory.mktemp("examples")
     for label, height in (("flat", 0.5), ("long", 2.0)):
@@ -68,16 +64,14 @@ class DiffusionBlock(nn.Module):
     Each channel diffuses for a time of its own in the eigenbasis, and a perceptron mixes the channels of each point.
     """
 
-    def __init__(self, n_channels: int) -> None:
+    def __init__(self, n_channels):
         super().__init__()
         self.log_time = nn.Parameter(torch.full((n_channels,), -3.0))
         self.mix = nn.Sequential(
             nn.Linear(2 * n_channels, n_channels), nn.ReLU(), nn.Linear(n_channels, n_channels)
         )
 
-    def diffused(
-        self, x: Tensor, eigenvalues: Tensor, eigenfunctions: Tensor, mass: Tensor
-    ) -> Tensor:
+    def diffused(self, x, eigenvalues, eigenfunctions, mass):
         """(P, D) values after a time, the constant eigenfunction included, which spectra leave out."""
         mean = (mass @ x) / mass.sum()
         spectral = eigenfunctions.T @ (mass[:, None] * (x - mean))
@@ -85,9 +79,7 @@ class DiffusionBlock(nn.Module):
             (-eigenvalues[:, None] * self.log_time.exp()).exp() * spectral
         )
 
-    def forward(
-        self, x: Tensor, eigenvalues: Tensor, eigenfunctions: Tensor, mass: Tensor
-    ) -> Tensor:
+    def forward(self, x, eigenvalues, eigenfunctions, mass):
         """(P, D) features of points to (P, D)."""
         return x + self.mix(
             torch.cat([x, self.diffused(x, eigenvalues, eigenfunctions, mass)], dim=1)
@@ -140,14 +132,14 @@ def test_a_diffusion_net_reads_the_spectrum_of_a_surface():
 class AsTheirs(distances.BaseDistance):
     """A head's or a descriptor's distance for pytorch-metric-learning; its own are passed on by `compute_mat`."""
 
-    def __init__(self, distances: Any) -> None:
+    def __init__(self, distances):
         super().__init__(normalize_embeddings=False)
         self.distances = distances
 
-    def compute_mat(self, query: Tensor, reference: Tensor) -> Tensor:
+    def compute_mat(self, query, reference):
         return self.distances(query, reference)
 
-    def pairwise_distance(self, query: Tensor, reference: Tensor) -> Tensor:
+    def pairwise_distance(self, query, reference):
         return torch.stack(
             [self.distances(q[None], r[None])[0, 0] for q, r in zip(query, reference, strict=True)]
         )
@@ -195,7 +187,7 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     ours = igps.retrieval_scores(plain.distances(cells, cells), dataset.labels).mean()["nn"]
     assert found == pytest.approx(ours)
 
-    how: dict[str, Any] = {
+    how = {
         "dataloader_num_workers": 0,
         "data_and_label_getter": lambda batch: (batch, batch.labels),
     }

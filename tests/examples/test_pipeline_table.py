@@ -1,24 +1,18 @@
 """Each line of the table of pipelines does what its page says."""
 
-from __future__ import annotations
-
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-
-import igps
 
 PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "pipelines.md").read_text(encoding="utf-8")
 ROWS = {
     int(n): (what, code)
     for n, what, code in re.findall(r"^\| (\d+) \| (.*?) \| `(.*)` \|$", PAGE, re.MULTILINE)
 }
-CHECKS: dict[int, Callable[[Any, dict[str, Any]], bool]] = {
+CHECKS = {
     1: lambda found, space: found[0] == 0 and found[1].name == "biped/00.off",
     2: lambda found, space: [len(one) for one in found] == [3, 3],
     3: lambda found, space: found[0].tolist() == [0, 0, 0, 1, 1, 1] and found[1][0] == "biped",
@@ -53,11 +47,11 @@ NOTHING_COMES_BACK = {19}
 
 
 @pytest.fixture(scope="module")
-def space(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def space(tmp_path_factory):
     """What the page's own lines define, in a folder of their own."""
     match = re.search(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
     assert match is not None
-    found: dict[str, Any] = {}
+    found = {}
     here = Path.cwd()
     os.chdir(tmp_path_factory.mktemp("pipelines"))
     try:
@@ -91,7 +85,7 @@ def test_a_line_of_the_table_works(space, number, monkeypatch):
 
 def test_a_transform_is_set_and_taken_away(space, monkeypatch):
     monkeypatch.chdir(space["folder"])
-    dataset: igps.SignatureDataset = space["dataset"]
+    dataset = space["dataset"]
     whole = len(dataset[0].signature.interior)
     exec(ROWS[4][1], space)
     assert len(dataset[0].signature.interior) == 300 < whole

@@ -1,12 +1,9 @@
 """A gallery of meshes against the comparison with each of them."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -33,7 +30,7 @@ INTERIOR = "own_descriptors:small_interior"
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 
 
-def write_body(path: Path, width: float, height: float) -> None:
+def write_body(path, width, height):
     """A stretched ball of 162 vertices."""
     body = trimesh.creation.icosphere(subdivisions=2)
     body.vertices *= [1.0, width, height]
@@ -42,7 +39,7 @@ def write_body(path: Path, width: float, height: float) -> None:
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     for label, ratio in (("ball", 1.0), ("egg", 2.2)):
         for i in range(3):
             write_body(tmp_path / "meshes" / label / f"{i}.off", 1.0 + 0.06 * i, ratio)
@@ -50,7 +47,7 @@ def root(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def dataset(root: Path, tmp_path: Path) -> SignatureDataset:
+def dataset(root, tmp_path):
     return SignatureDataset(root, CONFIG, tmp_path / "cache")
 
 
@@ -157,7 +154,7 @@ def test_a_query_of_a_gallery_is_that_of_its_folder(root, tmp_path, monkeypatch,
     cache = ["--cache_dir", tmp_path / "cache"]
     by_name = ["--descriptor", INTERIOR, *cache, *SMALL]
 
-    def lines(*arguments: object) -> list[str]:
+    def lines(*arguments):
         run(monkeypatch, *arguments)
         return capsys.readouterr().out.splitlines()
 
@@ -306,7 +303,7 @@ def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(root, tmp_path, m
     scan = os.scandir
     access = os.access
 
-    def refused(path: str) -> Any:
+    def refused(path):
         if Path(path).name == "egg":
             raise PermissionError(13, "Permission denied", str(path))
         return scan(path)
@@ -342,7 +339,7 @@ def test_commands_that_change_a_gallery(root, tmp_path, monkeypatch, capsys):
     gallery = tmp_path / "gallery.igps"
     cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
 
-    def lines(*arguments: object) -> list[str]:
+    def lines(*arguments):
         run(monkeypatch, *arguments)
         return capsys.readouterr().out.splitlines()
 
@@ -371,7 +368,7 @@ def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, monkeypatch):
     table.write_text('{"1": "block", "2": "bar"}')
     monkeypatch.setattr(rows, "MIN_AGE", 0)
 
-    def now() -> SignatureDataset:
+    def now():
         reading = LoadOptions(bodies="labels", names=str(table))
         return SignatureDataset(tmp_path / "scans", CONFIG, tmp_path / "cache", reading=reading)
 
@@ -474,7 +471,7 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), scan)
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "other.nii.gz")
 
-    def now() -> SignatureDataset:
+    def now():
         return SignatureDataset(
             tmp_path / "scans", CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="labels")
         )

@@ -1,7 +1,5 @@
 """Rows of a gallery against the comparison with all of them."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import random
@@ -9,10 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +30,7 @@ ABOUT = {"descriptor": "test", "signature": {"resolution": 32}}
 FURTHER = {"age": float}
 
 
-def histograms(n: int, n_cells: int = 300, seed: int = 0) -> torch.Tensor:
+def histograms(n, n_cells=300, seed=0):
     """Histograms of sum 1, in families of twenty."""
     generator = np.random.default_rng(seed)
     families = generator.gamma(0.5, size=(n // 20 + 1, n_cells)).repeat(20, axis=0)[:n]
@@ -42,12 +38,12 @@ def histograms(n: int, n_cells: int = 300, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy((found / found.sum(axis=1, keepdims=True)).astype(np.float32))
 
 
-def units(n: int, width: int = 16, seed: int = 0) -> torch.Tensor:
+def units(n, width=16, seed=0):
     found = torch.randn(n, width, generator=torch.Generator().manual_seed(seed))
     return torch.nn.functional.normalize(found, dim=1)
 
 
-def told(number: int, mark: str = "a") -> dict[str, Any]:
+def told(number, mark="a"):
     label = "odd" if number % 2 else None
     return {
         "id": f"{number:05}",
@@ -59,26 +55,22 @@ def told(number: int, mark: str = "a") -> dict[str, Any]:
     }
 
 
-def batches(
-    rows: torch.Tensor, first: int = 0, mark: str = "a"
-) -> Iterator[tuple[torch.Tensor, list[dict[str, Any]]]]:
+def batches(rows, first=0, mark="a"):
     for start in range(0, len(rows), 700):
         part = rows[start : start + 700]
         yield part, [told(first + start + i, mark) for i in range(len(part))]
 
 
-def written(path: Path, rows: torch.Tensor, searched_by: Any, mark: str = "a") -> BodyTable:
+def written(path, rows, searched_by, mark="a"):
     _table.write(path, ABOUT, searched_by, batches(rows, mark=mark), FURTHER)
     return BodyTable(path)
 
 
-def numbers(found: tuple[list[dict[str, Any]], torch.Tensor, torch.Tensor]) -> list[int]:
+def numbers(found):
     return [int(row["id"]) for row in found[0]]
 
 
-def recall(
-    table: BodyTable, asked: torch.Tensor, rows: torch.Tensor, distance: Any, **options: Any
-) -> float:
+def recall(table, asked, rows, distance, **options):
     exact = search(asked, rows, top=10, distance=distance).indices.tolist()
     found = [numbers(table.nearest(one[None], distance, top=10, **options)) for one in asked]
     return float(
@@ -202,7 +194,7 @@ def test_weighted_numbers_decide_which_rows_are_candidates(tmp_path):
     """By a distance of the last two numbers alone, the nearest rows are not those by the cosine of all."""
     rows = units(4500, 40)
 
-    def distance(queries: torch.Tensor, gallery: torch.Tensor) -> torch.Tensor:
+    def distance(queries, gallery):
         return torch.cdist(queries[:, 38:], gallery[:, 38:])
 
     found = []
@@ -325,7 +317,7 @@ def test_no_damaged_file_gives_a_wrong_answer(tmp_path, how):
     assert numbers(BodyTable(path).nearest(rows[:1], cosine, top=3)) == right
 
 
-def _answers(path: Path) -> list[list[int]]:
+def _answers(path):
     return [
         numbers(BodyTable(path).nearest(one[None], cosine, top=3)) for one in units(1500)[::150]
     ]
@@ -367,7 +359,7 @@ for turn in range(1000):
 """
 
 
-def killed_writers(folder: Path, n_kills: int, longest: float = 0.25) -> int:
+def killed_writers(folder, n_kills, longest=0.25):
     """Kill two processes while they add, update and remove rows; return how often a change was stored in part.
 
     Each writer has separate rows. A turn writes 40 rows, then updates the class of 20, then removes 10; any state
@@ -401,7 +393,7 @@ def killed_writers(folder: Path, n_kills: int, longest: float = 0.25) -> int:
     return wrong
 
 
-def is_whole(table: BodyTable) -> bool:
+def is_whole(table):
     rows = [row for some in table.batches() for row in zip(*table.decoded(some), strict=True)]
     still = {row["id"]: values for values, row in rows if row["checksum"] == "still"}
     good = len(still) == 50 and all(

@@ -1,7 +1,5 @@
 """From a labelled folder to a model: the head that is chosen, honest scores, and answers to new bodies."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 
@@ -10,7 +8,6 @@ import pytest
 import torch
 import trimesh
 from sklearn.metrics import roc_auc_score
-from torch import Tensor
 
 import igps
 from igps.learning.fitting import classification_scores, classify
@@ -24,7 +21,7 @@ HEIGHTS = {"flat": 0.5, "round": 1.0, "long": 1.8, "rod": 3.0}
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> igps.SignatureDataset:
+def dataset(tmp_path_factory):
     """Four classes of four eggs, of which none is as another."""
     root = tmp_path_factory.mktemp("fitting")
     for label, height in HEIGHTS.items():
@@ -38,7 +35,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> igps.SignatureDataset:
     return found
 
 
-def histograms(dataset: igps.SignatureDataset) -> Tensor:
+def histograms(dataset):
     return igps.describe(dataset, small_interior()).flatten(1)
 
 
@@ -215,5 +212,5 @@ def test_what_tells_the_classes_without_form_is_said(dataset):
 class Below(igps.Descriptor):
     """Gives negative numbers."""
 
-    def describe(self, batch: igps.SignatureBatch) -> Tensor:
+    def describe(self, batch):
         return -batch.eigenvalues[:, :3].float()

@@ -4,7 +4,7 @@ Disturbances turn a valid `Mesh` into another. Damages yield raw triangles that 
 mending of files. `DAMAGES` lists them with their usual strength.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,27 +40,27 @@ class Damage:
     apply: Callable[[Mesh, int], Surface]  # damages a mesh, given a seed
 
 
-def holes(mesh: Mesh, seed: int = 0) -> Surface:
+def holes(mesh, seed=0):
     """Remove a share of the area, in round patches of equal size around random places."""
     return _with_holes(mesh.vertices, mesh.faces, np.random.default_rng(seed))
 
 
-def soup(mesh: Mesh, seed: int = 0) -> Surface:
+def soup(mesh, seed=0):
     """Give each triangle separate corners, in single precision and in random order, as in an STL file."""
     return _as_soup(mesh.vertices, mesh.faces, np.random.default_rng(seed))
 
 
-def turned(mesh: Mesh, seed: int = 0) -> Surface:
+def turned(mesh, seed=0):
     """Turn a random share of the faces inside out."""
     return mesh.vertices.copy(), _with_turned(mesh.faces, np.random.default_rng(seed))
 
 
-def fins(mesh: Mesh, seed: int = 0) -> Surface:
+def fins(mesh, seed=0):
     """Add triangles that stand on edges, as high as a hundredth of the diagonal, and double a share of the faces."""
     return _with_fins(mesh.vertices, mesh.faces, np.random.default_rng(seed))
 
 
-def parts(mesh: Mesh, seed: int = 0) -> Surface:
+def parts(mesh, seed=0):
     """Add a floating ball inside, where the body is thickest, with half the radius that fits, and a speck outside.
 
     The speck is a ball with a thousandth of the area, at 0.6 diagonals from the centre of the bounding box.
@@ -68,7 +68,7 @@ def parts(mesh: Mesh, seed: int = 0) -> Surface:
     return _with_parts(mesh.vertices, mesh.faces, np.random.default_rng(seed), mesh)
 
 
-def halves(mesh: Mesh, seed: int = 0) -> Surface:
+def halves(mesh, seed=0):
     """Cut the body across its longest extent into two closed, overlapping halves; the seed is not used.
 
     Raises:
@@ -93,13 +93,13 @@ def halves(mesh: Mesh, seed: int = 0) -> Surface:
     return np.vstack(vertices), np.vstack([faces[0], faces[1] + len(vertices[0])])
 
 
-def noise(mesh: Mesh, seed: int = 0) -> Surface:
+def noise(mesh, seed=0):
     """Move each vertex along its normal by a random length."""
     noisy = disturbances.noise(mesh, _NOISE, seed)
     return noisy.vertices.copy(), noisy.faces.copy()
 
 
-def everything(mesh: Mesh, seed: int = 0) -> Surface:
+def everything(mesh, seed=0):
     """Apply all of the above; a MeshError if manifold3d does not accept the mesh."""
     generator = np.random.default_rng(seed)
     vertices, faces = halves(disturbances.noise(mesh, _NOISE, seed))
@@ -109,7 +109,7 @@ def everything(mesh: Mesh, seed: int = 0) -> Surface:
     return _as_soup(vertices, _with_turned(faces, generator), generator)
 
 
-DAMAGES: Mapping[str, Damage] = {
+DAMAGES = {
     "holes": Damage("2 % of the surface missing, in three patches", holes),
     "soup": Damage(
         "every triangle with its own corners, in single precision, in random order", soup
@@ -128,7 +128,7 @@ DAMAGES: Mapping[str, Damage] = {
 """The damages by name."""
 
 
-def _with_holes(vertices: Floats, faces: Integers, generator: np.random.Generator) -> Surface:
+def _with_holes(vertices, faces, generator):
     area = face_areas(vertices, faces)
     per_patch = _MISSING / _N_PATCHES * area.sum()
     pairs, _ = undirected_edges(faces, len(vertices))
@@ -147,19 +147,19 @@ def _with_holes(vertices: Floats, faces: Integers, generator: np.random.Generato
     return compact(vertices, faces[is_kept])
 
 
-def _as_soup(vertices: Floats, faces: Integers, generator: np.random.Generator) -> Surface:
+def _as_soup(vertices, faces, generator):
     corners = vertices[generator.permutation(faces)].astype(np.float32).astype(np.float64)
     return corners.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
 
 
-def _with_turned(faces: Integers, generator: np.random.Generator) -> Integers:
+def _with_turned(faces, generator):
     faces = faces.copy()
     chosen = generator.permutation(len(faces))[: round(_TURNED * len(faces))]
     faces[chosen] = faces[chosen, ::-1]
     return faces
 
 
-def _with_fins(vertices: Floats, faces: Integers, generator: np.random.Generator) -> Surface:
+def _with_fins(vertices, faces, generator):
     face = generator.integers(len(faces), size=_N_FINS)
     corner = generator.integers(3, size=_N_FINS)
     a = faces[face, corner]
@@ -171,9 +171,7 @@ def _with_fins(vertices: Floats, faces: Integers, generator: np.random.Generator
     return np.vstack([vertices, tips]), np.vstack([faces, stands, twice])
 
 
-def _with_parts(
-    vertices: Floats, faces: Integers, generator: np.random.Generator, mesh: Mesh
-) -> Surface:
+def _with_parts(vertices, faces, generator, mesh):
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=2)
@@ -192,7 +190,7 @@ def _with_parts(
     )
 
 
-def _deepest_ball(mesh: Mesh) -> tuple[Floats, float]:
+def _deepest_ball(mesh):
     """Return the interior sample farthest from vertices and face centres, and half that distance."""
     points = interior_samples(mesh, min_samples=1)
     surface = np.vstack([mesh.vertices, mesh.vertices[mesh.faces].mean(axis=1)])

@@ -1,9 +1,6 @@
 """The bodies of a file: which there are, each by its name, and what one fault costs the others."""
 
-from __future__ import annotations
-
 import zipfile
-from pathlib import Path
 
 import nibabel
 import numpy as np
@@ -27,7 +24,7 @@ FACES = "".join(
 MESH = f"<mesh><vertices>{CORNERS}</vertices><triangles>{FACES}</triangles></mesh>"
 
 
-def plate(path: Path, objects: str, items: str, unit: str = ' unit="inch"', **members: str) -> Path:
+def plate(path, objects, items, unit=' unit="inch"', **members):
     """A 3MF file."""
     names = 'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02" xmlns:p="http://p"'
     with zipfile.ZipFile(path, "w") as archive:
@@ -42,7 +39,7 @@ def plate(path: Path, objects: str, items: str, unit: str = ' unit="inch"', **me
     return path
 
 
-def parts(path: Path, options: LoadOptions) -> list[str | None]:
+def parts(path, options):
     return [body.part for body in list_bodies(path, options)]
 
 

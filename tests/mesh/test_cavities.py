@@ -1,7 +1,5 @@
 """Bodies with cavities: balls in balls and boxes in boxes, whose areas, volumes and insides are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -29,13 +27,13 @@ BALL = trimesh.creation.icosphere(subdivisions=3)
 Surface = tuple[np.ndarray, np.ndarray]
 
 
-def joined(*parts: Surface) -> Surface:
+def joined(*parts):
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
     faces = [faces + start for (_, faces), start in zip(parts, starts, strict=False)]
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
-def ball(radius: float, at: float = 0.0, *, inwards: bool = False) -> Surface:
+def ball(radius, at=0.0, *, inwards=False):
     faces = np.asarray(BALL.faces)
     return BALL.vertices * radius + [at, 0, 0], faces[:, ::-1] if inwards else faces
 
@@ -259,7 +257,7 @@ def test_of_two_cavities_that_meet_at_a_vertex_both_are_turned_inwards():
     other = one * [-0.8, 0.8, 0.8]  # its mirror image, smaller
     inwards = BALL.faces[:, ::-1]
 
-    def hollow(second: np.ndarray) -> Mesh:
+    def hollow(second):
         vertices, faces = joined((BALL.vertices, BALL.faces), (one, inwards), (other, second))
         n = len(BALL.vertices)
         last = np.delete(np.arange(3 * n), 2 * n + tip)  # the vertex that is there twice

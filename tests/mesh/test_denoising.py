@@ -1,7 +1,5 @@
 """Noise is told from shape, and goes; shape stays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -14,7 +12,7 @@ from igps.mesh.surface import area_vectors
 from igps.shapes import ArticulatedShapes
 
 
-def bumpy() -> Mesh:
+def bumpy():
     """A sphere with 2,562 vertices and bumps of about six edge lengths."""
     surface = trimesh.creation.icosphere(subdivisions=4)
     x, y, z = surface.vertices.T
@@ -117,7 +115,7 @@ def test_edges_of_a_box_stay_sharp():
     assert smooth.volume == pytest.approx(part.volume, rel=0.002)
 
 
-def plate_with_holes(seed: int, longest_edge: float | None = None) -> Mesh:
+def plate_with_holes(seed, longest_edge=None):
     """Long thin triangles between the rims; with shorter edges, slivers."""
     import manifold3d
 
@@ -194,12 +192,12 @@ def test_a_knurled_knob_is_no_noise():
     assert not is_noisy(vertices, np.asarray(knob.faces))
 
 
-def _noise_over_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
+def _noise_over_edge(vertices, faces):
     noise, edge = noise_and_edge(vertices, faces, Neighbours.of(vertices, faces))
     return noise / edge
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def _unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 

@@ -1,7 +1,5 @@
 """The number of triangles is told before a file is read, and too many are refused."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -43,7 +41,7 @@ def test_headers_with_comments_and_lies(tmp_path):
     assert expected_faces(file) == 0
 
 
-def under_limits(program: str, most: int, *words: str) -> list[str]:
+def under_limits(program, most, *words):
     """What a program says under a limit of the address space, and then of data alone, in a process of its own."""
     pytest.importorskip("resource")
     lines = [
@@ -81,7 +79,7 @@ def test_some_memory_is_available():
     assert 0 < free < 1 << 50
 
 
-def group(folder: Path, version: int, most: object, used: int, cached: int) -> None:
+def group(folder, version, most, used, cached):
     """Files of a control group."""
     folder.mkdir(parents=True, exist_ok=True)
     names = ("memory.limit_in_bytes", "memory.usage_in_bytes")

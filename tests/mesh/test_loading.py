@@ -1,9 +1,5 @@
 """Meshes from files: formats, clouds of points, mending, and what makes a file unusable."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -15,7 +11,7 @@ from igps.mesh.loading import load_bodies, load_mesh, read_surface
 from igps.mesh.options import LoadOptions
 
 
-def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+def write_off(path, vertices, faces):
     lines = ["OFF", f"{len(vertices)} {len(faces)} 0", *(" ".join(map(str, v)) for v in vertices)]
     lines += [" ".join(map(str, [len(f), *f])) for f in faces]
     path.write_text("\n".join(lines) + "\n")
@@ -154,7 +150,7 @@ def test_a_polygon_that_crosses_itself_or_has_many_corners_is_cut_all_the_same(n
     assert len(sides) == 3 * len(faces)
 
 
-def by_trimesh(text: str, path: Path) -> trimesh.Trimesh:
+def by_trimesh(text, path):
     """The surface of an OFF file; it knows no comments but in the first line, and reads files that are cut short."""
     text = "\n".join(line.partition("#")[0] for line in text.split("\n"))
     (n_vertices, n_faces, *_), *rows = [
@@ -352,7 +348,7 @@ def test_too_few_vertices_for_the_eigenpairs_are_made_more(tmp_path):
 def test_a_format_without_its_module_says_which_extra_has_it(tmp_path, monkeypatch):
     (tmp_path / "part.dae").write_bytes(b"<COLLADA/>")
 
-    def missing(*_: object, **__: object) -> None:
+    def missing(*_, **__):
         raise ImportError("No module named 'collada'")
 
     monkeypatch.setattr(trimesh, "load_scene", missing)

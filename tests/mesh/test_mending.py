@@ -1,9 +1,5 @@
 """The ladder of mending: each step where it is needed, none where it is not, and the body that comes of it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import trimesh
@@ -18,19 +14,19 @@ from igps.mesh.surface import area_vectors
 from igps.mesh.watertight import watertight
 
 
-def box() -> Mesh:
+def box():
     surface = trimesh.creation.box((1, 2, 3))
     return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name="box")
 
 
-def area(vertices: np.ndarray, faces: np.ndarray) -> float:
+def area(vertices, faces):
     return float(np.linalg.norm(area_vectors(vertices, faces), axis=1).sum())
 
 
-def same_surface(a: Mesh, b: Mesh) -> bool:
+def same_surface(a, b):
     """The same triangles, whatever their order and the numbers of their corners."""
 
-    def canonical(mesh: Mesh) -> np.ndarray:
+    def canonical(mesh):
         corners = np.round(mesh.vertices, 5)[mesh.faces]
         first = np.lexsort(corners.reshape(-1, 3).T[::-1])
         rank = np.empty(len(first), dtype=int)
@@ -191,7 +187,7 @@ def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertig
     assert mesh.volume < 0.95 * crossing.volume
 
 
-def coil(turns: float, pitch: float, radius: float = 0.2) -> Mesh:
+def coil(turns, pitch, radius=0.2):
     """A tube around a helix of radius 1, with flat ends."""
     n = round(90 * turns)
     around = 16
@@ -246,7 +242,7 @@ def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(blob,
     assert mesh.area == pytest.approx(blob.area, rel=1e-5)
 
 
-UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], str]] = {
+UNUSABLE = {
     "empty": (lambda: (np.zeros((0, 3)), np.zeros((0, 3), dtype=int)), "is empty"),
     "triangle": (lambda: (np.eye(3), np.array([[0, 1, 2]])), "a single triangle"),
     "line": (

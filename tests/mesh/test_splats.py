@@ -1,7 +1,5 @@
 """Discs around the points of a cloud."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +7,7 @@ import trimesh
 from igps.mesh.watertight import splats
 
 
-def sphere(n: int) -> np.ndarray:
+def sphere(n):
     points = np.random.default_rng(0).normal(size=(n, 3))
     return points / np.linalg.norm(points, axis=1, keepdims=True)
 

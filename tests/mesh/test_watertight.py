@@ -1,7 +1,5 @@
 """The watertight surface against closed forms: where it lies, what it fills, and what it leaves open."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 
@@ -22,37 +20,35 @@ Surface = tuple[NDArray[np.float64], NDArray[np.int64]]
 BALL = 4 / 3 * np.pi
 
 
-def arrays(*parts: trimesh.Trimesh) -> Surface:
+def arrays(*parts):
     whole = trimesh.util.concatenate(parts)
     return np.asarray(whole.vertices, dtype=np.float64), np.asarray(whole.faces, dtype=np.int64)
 
 
-def ball(
-    radius: float = 1.0, centre: tuple[float, float, float] = (0, 0, 0), subdivisions: int = 3
-) -> trimesh.Trimesh:
+def ball(radius=1.0, centre=(0, 0, 0), subdivisions=3):
     surface = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     surface.apply_translation(centre)
     return surface
 
 
-def cut_ball(height: float) -> Surface:
+def cut_ball(height):
     """The unit sphere without its cap above `height`."""
     surface = ball(subdivisions=4)
     below = surface.triangles_center[:, 2] < height
     return np.asarray(surface.vertices), np.asarray(surface.faces)[below]
 
 
-def turned_profile(profile: list[tuple[float, float]]) -> Surface:
+def turned_profile(profile):
     """A surface of revolution about z."""
     surface = trimesh.creation.revolve(np.array(profile), sections=64)
     return np.asarray(surface.vertices), np.asarray(surface.faces)
 
 
-def is_inside(mesh: Mesh, *points: tuple[float, float, float]) -> list[bool]:
+def is_inside(mesh, *points):
     return (winding_number(mesh.vertices, mesh.faces, np.array(points, dtype=float)) > 0.5).tolist()
 
 
-def assert_closed(mesh: Mesh) -> None:
+def assert_closed(mesh):
     """Every edge is run through once in each direction, counted one by one."""
     seen = Counter((int(f[i]), int(f[i - 1])) for f in mesh.faces for i in range(3))
     assert set(seen.values()) == {1}
@@ -307,7 +303,7 @@ def test_what_is_no_surface_is_refused():
         watertight(*arrays(ball()), resolution=2)
 
 
-def chain(n: int, gap: float) -> Surface:
+def chain(n, gap):
     """Unit balls in a row."""
     return arrays(*(ball(centre=(gap * i, 0, 0), subdivisions=2) for i in range(n)))
 

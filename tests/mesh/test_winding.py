@@ -1,7 +1,5 @@
 """Winding numbers, against closed solids and spherical excess."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -22,7 +20,7 @@ def test_winding_number_is_one_inside_and_zero_outside(mesh):
     )
 
 
-def winding_by_loops(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+def winding_by_loops(vertices, faces, points):
     """Spherical excess of one triangle after another (L'Huilier), signed by the side that the point is on."""
     total = np.zeros(len(points))
     for i, point in enumerate(points):

@@ -3,18 +3,14 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from numpy.typing import NDArray
-from torch import Tensor
 
 import jobs
-from igps.data.batch import Body, SignatureBatch
-from igps.data.dataset import Failure, SignatureDataset
+from igps.data.dataset import SignatureDataset
 from igps.data.requirements import Requirements
 from igps.mesh.errors import MeshError
 from igps.nn.axes import InteriorDistance, Potential
@@ -28,7 +24,7 @@ CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
+def dataset(tmp_path_factory):
     root = tmp_path_factory.mktemp("described")
     for i in range(4):
         body = trimesh.creation.icosphere(subdivisions=2)
@@ -37,15 +33,13 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
     return SignatureDataset(sorted(root.glob("*.off")), CONFIG, root / "cache")
 
 
-def describe_usable(
-    dataset: SignatureDataset, descriptor: torch.nn.Module, **options: Any
-) -> tuple[Tensor, list[Failure]]:
+def describe_usable(dataset, descriptor, **options):
     """Descriptions, and what could not be described."""
-    failures: list[Failure] = []
+    failures = []
     return describe(dataset, descriptor, failures=failures, **options), failures
 
 
-def histogram(n_eigenpairs: int = 12) -> HistogramDescriptor:
+def histogram(n_eigenpairs=12):
     axes = [Potential(2), InteriorDistance(8)]
     return HistogramDescriptor(PairHistogram(axes, SpectralEmbedding(n_eigenpairs=n_eigenpairs)))
 
@@ -56,12 +50,12 @@ class Area(BodyDescriptor):
     name = "area"
     requirements = Requirements(mesh=True)
 
-    def __init__(self, refused: str = "none", dies: bool = False) -> None:
+    def __init__(self, refused="none", dies=False):
         super().__init__()
         self.refused = refused
         self.dies = dies
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body):
         if body.id.endswith(self.refused):
             if self.dies:
                 jobs.die_at_zero(0)
@@ -94,15 +88,15 @@ def test_meshes_come_to_descriptors_that_need_them(dataset):
 
 
 def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(dataset):
-    modes: list[bool] = []
+    modes = []
 
     class Looking(torch.nn.Module):
-        def __init__(self) -> None:
+        def __init__(self):
             super().__init__()
             self.frozen = torch.nn.Dropout().eval()
             self.trained = torch.nn.Dropout()
 
-        def forward(self, batch: SignatureBatch) -> Tensor:
+        def forward(self, batch):
             modes.extend(one.training for one in self.modules())
             assert not torch.is_grad_enabled()
             return self.trained(torch.ones(len(batch), 50))
@@ -170,7 +164,7 @@ def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset):
 
 def test_descriptions_that_are_not_finite_are_failures(dataset):
     class Broken(Area):
-        def describe_body(self, body: Body) -> NDArray[np.float32]:
+        def describe_body(self, body):
             return np.array([np.nan if body.id.endswith("0.off") else 1.0], dtype=np.float32)
 
     values, failures = describe_usable(dataset, Broken(), n_workers=1)
@@ -181,16 +175,16 @@ def test_descriptions_that_are_not_finite_are_failures(dataset):
 class Counting(HistogramDescriptor):
     """Remembers which bodies it was asked for."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(PairHistogram(["interior_distance"], SpectralEmbedding(n_eigenpairs=12)))
         self.asked: list[str] = []
 
-    def describe(self, batch: SignatureBatch) -> Tensor:
+    def describe(self, batch):
         self.asked += [body.id for body in batch.bodies()]
         return super().describe(batch)
 
 
-def asked(dataset: SignatureDataset, cache_tag: str | None = "one") -> tuple[list[str], Tensor]:
+def asked(dataset, cache_tag="one"):
     descriptor = Counting()
     values, failures = describe_usable(dataset, descriptor, cache_tag=cache_tag, n_workers=1)
     assert failures == []
@@ -198,7 +192,7 @@ def asked(dataset: SignatureDataset, cache_tag: str | None = "one") -> tuple[lis
 
 
 @pytest.fixture
-def fresh(tmp_path: Path) -> SignatureDataset:
+def fresh(tmp_path):
     for i in range(3):
         body = trimesh.creation.icosphere(subdivisions=2)
         body.vertices *= [1.0, 1.0 + 0.2 * i, 1.5]
@@ -247,7 +241,7 @@ def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(fresh):
     _, values = asked(fresh, cache_tag=None)
 
     class Meddling(Counting):
-        def describe(self, batch: SignatureBatch) -> Tensor:
+        def describe(self, batch):
             if not self.asked:
                 other = first.with_suffix(".other")
                 first.rename(other)

@@ -1,15 +1,10 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
 
 from batches import alone, scaled, two_bodies
-from igps.data.batch import Body, SignatureBatch
 from igps.data.requirements import Requirements
 from igps.nn.axes import (
     Attribute,
@@ -27,21 +22,21 @@ from igps.retrieval import cosine
 
 
 @pytest.fixture(scope="module")
-def batch() -> SignatureBatch:
+def batch():
     return two_bodies()
 
 
-def paper() -> HistogramDescriptor:
+def paper():
     return HistogramDescriptor(PairHistogram())
 
 
-def learned() -> HistogramDescriptor:
+def learned():
     axes = [Potential(3, learnable=True), Attribute("depth", [0.2, 0.5, 0.9], learnable=True)]
     distances = [InteriorDistance(8, learnable=True), EuclideanDistance(4, learnable=True)]
     return HistogramDescriptor(PairHistogram([*axes, *distances], SpectralEmbedding(n_knots=8)))
 
 
-def oriented(*, in_embedding: bool = False, learnable: bool = False) -> HistogramDescriptor:
+def oriented(*, in_embedding=False, learnable=False):
     angles = EmbeddedPairCosines if in_embedding else PairCosines
     axes = [InteriorDistance(4, 3.0, learnable=learnable), angles(3, learnable=learnable)]
     return HistogramDescriptor(
@@ -49,7 +44,7 @@ def oriented(*, in_embedding: bool = False, learnable: bool = False) -> Histogra
     )
 
 
-def combined() -> HistogramDescriptor:
+def combined():
     """Every kind of part."""
     fine, coarse = (SpectralEmbedding(n_eigenpairs=n) for n in (5, 2))
     two_scales = PairHistogram(
@@ -106,16 +101,14 @@ def test_everything_learns(batch):
     check_gradients(parameters)
 
 
-def check_gradients(parameters: dict[str, nn.Parameter]) -> None:
+def check_gradients(parameters):
     for name, parameter in parameters.items():
         assert parameter.grad is not None, name
         assert torch.isfinite(parameter.grad).all(), name
         assert (parameter.grad != 0).any(), name
 
 
-def gradients(
-    module: nn.Module, batch: SignatureBatch, parameters: list[nn.Parameter]
-) -> tuple[Tensor, ...]:
+def gradients(module, batch, parameters):
     result = module(batch)
     return result.detach(), *torch.autograd.grad(result.square().sum(), parameters)
 
@@ -162,7 +155,7 @@ def test_a_single_histogram_keeps_its_shape_and_a_list_of_one_is_flat(batch):
     assert torch.equal(listed, single.flatten(1))
 
 
-def small(n_eigenpairs: int, n_classes: int, **options: int) -> PairHistogram:
+def small(n_eigenpairs, n_classes, **options):
     axes = [Potential(n_classes), InteriorDistance(16)]
     return PairHistogram(axes, SpectralEmbedding(n_eigenpairs=n_eigenpairs), **options)
 
@@ -185,7 +178,7 @@ class Counting(SpectralEmbedding):
 
     calls = 0
 
-    def forward(self, *arguments: Tensor) -> Tensor:
+    def forward(self, *arguments):
         self.calls += 1
         return super().forward(*arguments)
 
@@ -269,7 +262,7 @@ class Extent(BodyDescriptor):
     name = "extent"
     requirements = Requirements(n_eigenpairs=7, mesh=True)
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body):
         assert body.mesh is body.surface_mesh
         points = body.interior.points
         functions = body.interior.eigenfunctions

@@ -1,11 +1,8 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from igps.nn.embedding import SpectralEmbedding, spectral_embedding, spectral_weights
 
@@ -13,28 +10,26 @@ KINDS = [("commute_time", None), ("diffusion", 0.01), ("biharmonic", None)]
 AREA = 2.7
 
 
-def commute_time_embedding(eigenfunctions: torch.Tensor, eigenvalues: torch.Tensor) -> torch.Tensor:
+def commute_time_embedding(eigenfunctions, eigenvalues):
     """The Global Point Signature as it is defined: φₖ/√λₖ."""
     return eigenfunctions * eigenvalues.rsqrt().to(eigenfunctions.dtype).unsqueeze(-2)
 
 
 @pytest.fixture(scope="module")
-def spectrum() -> tuple[Tensor, Tensor]:
+def spectrum():
     """Eigenfunctions (20, 12) and eigenvalues (12,) of no body in particular."""
     generator = torch.Generator().manual_seed(5)
     eigenvalues = torch.rand(12, generator=generator, dtype=torch.float64).cumsum(0) * 20 + 1
     return torch.randn(20, 12, generator=generator, dtype=torch.float64), eigenvalues
 
 
-def embed(
-    kind: str, time: float | None, functions: Tensor, values: Tensor, area: float = AREA
-) -> Tensor:
+def embed(kind, time, functions, values, area=AREA):
     return spectral_embedding(
         functions, values, torch.tensor(area, dtype=torch.float64), kind=kind, time=time
     )
 
 
-def learned(kind: str, time: float | None) -> SpectralEmbedding:
+def learned(kind, time):
     module = SpectralEmbedding(kind, time=time, n_knots=9)
     assert module.log_gain is not None
     with torch.no_grad():
@@ -141,7 +136,7 @@ def test_gradient_of_the_filter(spectrum):
         6, generator=torch.Generator().manual_seed(2), dtype=torch.float64, requires_grad=True
     )
 
-    def embedding(gain: Tensor) -> Tensor:
+    def embedding(gain):
         area = torch.tensor(AREA, dtype=torch.float64)
         return torch.func.functional_call(module, {"log_gain": gain}, (functions, values, area))
 

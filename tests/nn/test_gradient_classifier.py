@@ -1,7 +1,5 @@
 """Classifiers that are trained by gradients, from a folder's batches."""
 
-from __future__ import annotations
-
 import copy
 
 import pytest
@@ -17,12 +15,12 @@ from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
 
 
-def learnable() -> HistogramDescriptor:
+def learnable():
     axes = [Potential(3, learnable=True), InteriorDistance(7, learnable=True)]
     return HistogramDescriptor(PairHistogram(axes, SpectralEmbedding(n_eigenpairs=6, n_knots=5)))
 
 
-def trained(model: nn.Module) -> float:
+def trained(model):
     """The loss after some steps over that before."""
     batch = two_bodies()
     labels = torch.tensor([0, 1])

@@ -1,14 +1,11 @@
 """A layout that is learned starts as the fixed one, and only what was asked for is learned."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 import igps
 from batches import two_bodies
 from bodies import bumpy_sphere
-from igps.data.batch import SignatureBatch
 from igps.nn.axes import Attribute, InteriorDistance, PairTwist, Potential
 from igps.nn.histograms.pairs import PairHistogram
 
@@ -18,7 +15,7 @@ HISTOGRAMS = ["interior", "gps", "multiscale", "rich", "interior+size", "rich+si
 
 
 @pytest.fixture(scope="module")
-def batch() -> SignatureBatch:
+def batch():
     """A body with hollows and the same stretched, with what every descriptor of histograms needs."""
     config = igps.SignatureConfig(n_surface_samples=150, resolution=10, min_samples=0)
     for name in ("interior", "rich", "pretrained"):

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import runpy
 import sys
 from dataclasses import replace
@@ -13,7 +11,6 @@ from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_metric_learning.losses import TripletMarginLoss
 from torch.utils.data import DataLoader
 
-from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.datamodule import SignatureDataModule
 from igps.fields.molecules.molecular import molecular
@@ -34,13 +31,13 @@ CONFIG = SignatureConfig(n_eigenpairs=20, resolution=12, min_samples=0, n_surfac
 
 
 @pytest.fixture(scope="module")
-def shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shapes(tmp_path_factory):
     root = tmp_path_factory.mktemp("shapes")
     ArticulatedShapes(n_classes=3, n_per_class=6, n_vertices=700).write(root / "meshes")
     return root
 
 
-def data(shapes: Path) -> SignatureDataModule:
+def data(shapes):
     return SignatureDataModule(
         shapes / "meshes",
         n_train=4,
@@ -54,7 +51,7 @@ def data(shapes: Path) -> SignatureDataModule:
 
 
 @pytest.fixture(scope="module")
-def items(shapes: Path) -> list[LabelledSignature]:
+def items(shapes):
     """The training shapes, in memory."""
     module = data(shapes)
     module.prepare_data()
@@ -62,36 +59,36 @@ def items(shapes: Path) -> list[LabelledSignature]:
     return [part[i] for i in range(len(part))]
 
 
-def loader(items: list[LabelledSignature]) -> DataLoader[LabelledSignature]:
+def loader(items):
     """Of no datamodule."""
     return DataLoader(items, batch_size=6, collate_fn=collate)
 
 
-def bins() -> HistogramDescriptor:
+def bins():
     axes = [Potential(2, learnable=True), InteriorDistance(16, learnable=True)]
     return HistogramDescriptor(PairHistogram(axes, SpectralEmbedding(n_knots=5)))
 
 
-def two_parts() -> HistogramDescriptor:
+def two_parts():
     return HistogramDescriptor([bins().histograms[0], PairHistogram([InteriorDistance(9)])])
 
 
-def learner(head: torch.nn.Module | None = None) -> RetrievalLearner:
+def learner(head=None):
     seed_everything(3, verbose=False)
     return RetrievalLearner(bins(), BlendedDistance(head or ProjectionHead(width=8, n_hidden=16)))
 
 
-def state_of(model: torch.nn.Module) -> dict[str, torch.Tensor]:
+def state_of(model):
     return {name: value.clone() for name, value in model.state_dict().items()}
 
 
-def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+def assert_same(one, other):
     assert one.keys() == other.keys()
     for name, value in one.items():
         assert torch.equal(value, other[name]), name
 
 
-def trainer(epochs: int, root: Path) -> Trainer:
+def trainer(epochs, root):
     return Trainer(
         max_epochs=epochs,
         accelerator="cpu",
@@ -157,17 +154,13 @@ def test_the_loss_uses_what_the_miner_chose(shapes, tmp_path):
     class First(torch.nn.Module):
         """One triplet."""
 
-        def forward(
-            self, embeddings: torch.Tensor, labels: torch.Tensor
-        ) -> tuple[torch.Tensor, ...]:
+        def forward(self, embeddings, labels):
             anchor, positive = (labels == labels[0]).nonzero().flatten()[:2]
             negative = (labels != labels[0]).nonzero().flatten()[0]
             return anchor.reshape(1), positive.reshape(1), negative.reshape(1)
 
     class Loss(TripletMarginLoss):
-        def forward(
-            self, embeddings: torch.Tensor, labels: torch.Tensor, chosen: tuple
-        ) -> torch.Tensor:
+        def forward(self, embeddings, labels, chosen):
             seen.append([len(indices) for indices in chosen])
             return super().forward(embeddings, labels, chosen)
 
@@ -250,14 +243,12 @@ def test_any_loader_of_labelled_batches_trains(items, tmp_path, make):
 def test_saving_a_checkpoint_changes_nothing(items, tmp_path):
     model = learner(WhitenedHead())
     run = trainer(1, tmp_path)
-    seen: list[bool] = []
+    seen = []
 
     class Save(Callback):
         """In the midst of an epoch, in training mode."""
 
-        def on_train_batch_end(
-            self, trainer: Trainer, module: RetrievalLearner, *_: object
-        ) -> None:
+        def on_train_batch_end(self, trainer, module, *_):
             before = state_of(module)
             modes = [one.training for one in module.modules()]
             generator = torch.get_rng_state()
@@ -278,14 +269,12 @@ def test_saving_a_checkpoint_changes_nothing(items, tmp_path):
 
 def test_the_mode_of_each_module_outlives_a_fit(items, tmp_path):
     """A module that the caller froze in evaluation mode stays there, whenever the head is fitted."""
-    modes: list[list[bool]] = []
+    modes = []
     frozen = learner()
     frozen.descriptor.eval()
 
     class Look(Callback):
-        def on_train_batch_start(
-            self, trainer: Trainer, module: RetrievalLearner, *_: object
-        ) -> None:
+        def on_train_batch_start(self, trainer, module, *_):
             modes.append([module.training, module.descriptor.training, module.distance.training])
 
     run = trainer(2, tmp_path)
@@ -362,11 +351,11 @@ def test_any_module_describes(items, tmp_path):
     class Plain(torch.nn.Module):
         """Cells that are learned, whatever the shape."""
 
-        def __init__(self) -> None:
+        def __init__(self):
             super().__init__()
             self.cells = torch.nn.Parameter(torch.zeros(5))
 
-        def forward(self, batch: SignatureBatch) -> torch.Tensor:
+        def forward(self, batch):
             means = batch.interior.points.abs().mean(dim=1)
             return (self.cells + means[:, [0, 1, 2, 0, 1]]).softmax(dim=1)
 

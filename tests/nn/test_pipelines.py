@@ -1,13 +1,9 @@
 """Histograms in other people's pipelines: traced, exported, in double precision, differentiated by their inputs."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor, nn
 from torch.autograd import forward_ad
 
 import igps.nn.functional as functional
@@ -25,14 +21,14 @@ from igps.nn.axes import (
 )
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histograms import DescriptionPart, PairHistogram, PointHistogram
+from igps.nn.histograms import PairHistogram, PointHistogram
 
 
-def filtered() -> SpectralEmbedding:
+def filtered():
     return SpectralEmbedding(n_eigenpairs=6, n_knots=5)
 
 
-MODULES: dict[str, Callable[[], DescriptionPart]] = {
+MODULES = {
     "hard": lambda: PairHistogram(
         [Potential(3), InteriorDistance(7)], SpectralEmbedding(n_eigenpairs=6)
     ),
@@ -56,11 +52,11 @@ MODULES: dict[str, Callable[[], DescriptionPart]] = {
 
 
 @pytest.fixture(params=MODULES)
-def module(request: pytest.FixtureRequest) -> DescriptionPart:
+def module(request):
     return MODULES[request.param]()
 
 
-def gradients(module: nn.Module, batch: SignatureBatch) -> list[Tensor]:
+def gradients(module, batch):
     loss = module(batch).square().sum()
     return list(torch.autograd.grad(loss, list(module.parameters()))) if loss.requires_grad else []
 
@@ -84,7 +80,7 @@ def test_what_is_compiled_does_not_grow_with_the_samples(module, monkeypatch):
         for kind in ("interior", "surface")
     }
 
-    def backend(program: torch.fx.GraphModule, _: object) -> Callable[..., object]:
+    def backend(program, _):
         nodes.append(len(program.graph.nodes))
         return program.forward
 
@@ -101,7 +97,7 @@ def test_a_compiled_program_serves_any_number_of_bodies():
     batch = two_bodies()
     programs = []
 
-    def backend(program: torch.fx.GraphModule, _: object) -> Callable[..., object]:
+    def backend(program, _):
         programs.append(program)
         return program.forward
 
@@ -150,7 +146,7 @@ def test_transforms_of_functions_follow_a_histogram(module):
         2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
     )
 
-    def loss(area: Tensor) -> Tensor:
+    def loss(area):
         return (module(replace(batch, area=area)) * upstream).sum()
 
     area = batch.area.clone().requires_grad_()
@@ -180,7 +176,7 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
         2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
     )
 
-    def loss() -> Tensor:
+    def loss():
         moved = replace(
             batch,
             eigenvalues=eigenvalues,

@@ -1,21 +1,17 @@
 """Settings that allow coarse matrix products change no distance bin, and are as they were afterwards."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from torch import Tensor
 
 from igps.nn.axes import euclidean_distances, oriented_pairs
 from igps.nn.batch_features import nearest_directions
 from igps.nn.histograms import joint_histogram, pair_histogram
 
 
-def by_backend(name: str, precision: str) -> Callable[[], None]:
-    def change() -> None:
+def by_backend(name, precision):
+    def change():
         backend = getattr(torch.backends, name, None) if name else torch.backends
         owner = getattr(backend, "matmul", None) if name else backend
         if not hasattr(owner, "fp32_precision"):
@@ -25,11 +21,11 @@ def by_backend(name: str, precision: str) -> Callable[[], None]:
     return change
 
 
-def allow_tf32() -> None:
+def allow_tf32():
     torch.backends.cuda.matmul.allow_tf32 = True
 
 
-SETTINGS: dict[str, Callable[[], None]] = {
+SETTINGS = {
     "medium": lambda: torch.set_float32_matmul_precision("medium"),
     "high": lambda: torch.set_float32_matmul_precision("high"),
     "allow_tf32": allow_tf32,
@@ -39,7 +35,7 @@ SETTINGS: dict[str, Callable[[], None]] = {
 }
 
 
-def state() -> list[str]:
+def state():
     found = []
     try:
         found.append(torch.get_float32_matmul_precision())
@@ -51,7 +47,7 @@ def state() -> list[str]:
 
 
 @pytest.fixture(params=list(SETTINGS))
-def setting(request: pytest.FixtureRequest) -> Iterator[Callable[[], None]]:
+def setting(request):
     yield SETTINGS[request.param]
     if hasattr(torch.backends, "fp32_precision"):
         torch.backends.fp32_precision = "none"
@@ -61,7 +57,7 @@ def setting(request: pytest.FixtureRequest) -> Iterator[Callable[[], None]]:
             backend.matmul.fp32_precision = "none"
 
 
-def kernels() -> list[Tensor]:
+def kernels():
     """All that counts pairs by their distance."""
     generator = torch.Generator().manual_seed(0)
     embedding = torch.randn(300, 64, generator=generator) / 8

@@ -1,13 +1,9 @@
 """Descriptors in files: what was saved comes back to the bit; what is hostile is refused in a sentence."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -26,7 +22,7 @@ from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.specification import specification
 
 
-def learnable() -> HistogramDescriptor:
+def learnable():
     """Two histograms that share one embedding with parameters."""
     embedding = SpectralEmbedding(n_eigenpairs=6, n_knots=5)
     one = PairHistogram(
@@ -129,13 +125,13 @@ def test_a_model_saved_twice_is_the_same_file(tmp_path):
 def test_what_was_changed_since_it_was_made_is_not_saved_as_it_was(tmp_path):
     """It came back as another descriptor, under another name, or not at all."""
 
-    def named(one: HistogramDescriptor) -> None:
+    def named(one):
         one.name = "other"
 
-    def fewer(one: HistogramDescriptor) -> None:
+    def fewer(one):
         one.histograms[0].n_samples = 30
 
-    def replaced(one: HistogramDescriptor) -> None:
+    def replaced(one):
         one.histograms[1].axes[0] = EuclideanDistance(64)
 
     for change, said in (
@@ -158,11 +154,11 @@ def test_what_is_of_others_is_not_saved(tmp_path):
     assert not (tmp_path / "mine.safetensors").exists()
 
 
-def histogram(**arguments: Any) -> dict[str, Any]:
+def histogram(**arguments):
     return {"class_path": "igps.nn.histograms.pairs.PairHistogram", "init_args": arguments}
 
 
-HOSTILE: dict[str, Callable[[], object]] = {
+HOSTILE = {
     "another package": lambda: {"class_path": "subprocess.Popen", "init_args": {"args": "true"}},
     "a function": lambda: {
         "class_path": "igps.nn.specification.load_module",

@@ -1,10 +1,5 @@
 """Distances against scikit-learn, SciPy and closed forms; gradients against finite differences."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -15,10 +10,10 @@ from torch.autograd import forward_ad
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from conftest import torch_threads
-from igps.retrieval import Distance, chi_square, cosine, distances, euclidean
+from igps.retrieval import chi_square, cosine, distances, euclidean
 
 ALL = [chi_square, euclidean, cosine]
-ORACLES: dict[Distance, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+ORACLES = {
     chi_square: lambda a, b: -additive_chi2_kernel(a, b) / 2,
     euclidean: cdist,
     cosine: lambda a, b: cdist(a, b, "cosine"),
@@ -26,12 +21,12 @@ ORACLES: dict[Distance, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 
 
 @pytest.fixture(params=["loops", "tiles"])
-def either_device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def either_device(request, monkeypatch):
     """The distances of the processor's memory, by compiled loops, and those of a device, by PyTorch's tiles."""
     monkeypatch.setattr(distances, "_uses_loops", lambda a, b: request.param == "loops")
 
 
-def histograms(n: int, cells: tuple[int, ...], *, seed: int, filled: float = 0.6) -> Tensor:
+def histograms(n, cells, *, seed, filled=0.6):
     """Random float64 histograms that sum to 1, a share of their cells empty."""
     generator = torch.Generator().manual_seed(seed)
     values = torch.rand(n, *cells, generator=generator, dtype=torch.float64)
@@ -153,7 +148,7 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(distance,
     [gradient] = torch.autograd.grad((distance(*both) * upstream).sum(), leaf)
     expected = (gradient * along).sum()
 
-    def of_side(rows: Tensor) -> Tensor:
+    def of_side(rows):
         given = [one.detach() for one in both]
         given[side] = rows
         return (distance(*given) * upstream).sum()
@@ -223,9 +218,7 @@ def test_chi_square_never_holds_all_triples_of_query_gallery_and_cell():
     class LargestBlock(TorchDispatchMode):
         n_bytes = 0
 
-        def __torch_dispatch__(
-            self, func: Any, types: Any, args: Any = (), kwargs: Any = None
-        ) -> Any:
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
             result = func(*args, **(kwargs or {}))
             if isinstance(result, Tensor) and result.ndim == 3:  # (queries, gallery, cells)
                 self.n_bytes = max(self.n_bytes, result.nbytes)

@@ -1,20 +1,15 @@
 """Re-ranking against the sets and sums of the paper, written out shape by shape, and what it promises."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from igps.retrieval import euclidean, rerank, rerank_candidates, retrieval_scores, search
 
 
-def by_hand(
-    distances: list[list[float]], k: int, n_expanded: int, share: float
-) -> list[list[float]]:
+def by_hand(distances, k, n_expanded, share):
     """Zhong, Zheng, Cao and Li 2017, equations 2, 3, 7, 10, 11 and 12; the units of distance are this library's."""
     n = len(distances)
     ranked = []
@@ -22,7 +17,7 @@ def by_hand(
         others = [j for j in range(n) if j != i]
         ranked.append([i, *sorted(others, key=lambda j, i=i: distances[i][j])])
 
-    def reciprocal(i: int, k: int) -> set[int]:
+    def reciprocal(i, k):
         return {j for j in ranked[i][: k + 1] if i in ranked[j][: k + 1]}
 
     weights = []
@@ -49,7 +44,7 @@ def by_hand(
 
 
 @pytest.fixture
-def points() -> Tensor:
+def points():
     return torch.randn(30, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 

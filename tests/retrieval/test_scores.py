@@ -1,16 +1,12 @@
 """Retrieval scores against hand-worked rankings, scikit-learn and loops over ranks."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from sklearn.metrics import average_precision_score
-from torch import Tensor
 
 from igps.retrieval import (
     chi_square,
@@ -25,7 +21,7 @@ from igps.retrieval.scores import SCORE_NAMES
 LOG3 = math.log2(3)
 
 
-def random_case(*, n: int, n_classes: int, seed: int, ties: bool = False) -> tuple[Tensor, Tensor]:
+def random_case(*, n, n_classes, seed, ties=False):
     """Random distances (n, n), not symmetric, with every class of a size of its own."""
     generator = torch.Generator().manual_seed(seed)
     distances = torch.rand(n, n, generator=generator, dtype=torch.float64)
@@ -35,18 +31,18 @@ def random_case(*, n: int, n_classes: int, seed: int, ties: bool = False) -> tup
     return distances, labels
 
 
-def ranked_relevance(distances: Tensor, labels: list[Any], query: int) -> list[bool]:
+def ranked_relevance(distances, labels, query):
     """Leave-one-out rel(1), rel(2), … of one query, by sorting (distance, index) pairs."""
     others = [other for other in range(len(labels)) if other != query]
     others.sort(key=lambda other: float(distances[query, other]))
     return [labels[other] == labels[query] for other in others]
 
 
-def scores_by_loops(relevant: list[bool]) -> dict[str, float]:
+def scores_by_loops(relevant):
     """All scores of one ranked list, straight from their definitions."""
     n_relevant = sum(relevant)
 
-    def hits(first: int) -> int:
+    def hits(first):
         return sum(relevant[:first])
 
     gain = ideal = 0.0
@@ -71,7 +67,7 @@ def scores_by_loops(relevant: list[bool]) -> dict[str, float]:
     }
 
 
-def line_distances(order: list[int], n: int) -> Tensor:
+def line_distances(order, n):
     """Distances (n, n) in which query 0 ranks the others in the given order, and all other rows are that of index."""
     distances = torch.arange(n, dtype=torch.float64).repeat(n, 1)
     for position, other in enumerate(order, start=1):
@@ -347,7 +343,7 @@ def test_metric_refuses_labels_that_are_not_aligned(descriptors, labels):
         RetrievalScoresMetric().update(descriptors, labels)
 
 
-def _score_part(process: int, folder: str) -> None:
+def _score_part(process, folder):
     """One of two processes: its part of 7 shapes as a distributed sampler deals them out, the first one twice."""
     torch.distributed.init_process_group(
         "gloo", init_method=f"file://{folder}/meeting", rank=process, world_size=2
@@ -362,7 +358,7 @@ def _score_part(process: int, folder: str) -> None:
     torch.distributed.destroy_process_group()
 
 
-def seven_shapes() -> tuple[Tensor, Tensor]:
+def seven_shapes():
     descriptors = torch.tensor([0.0, 0.4, 1.1, 1.9, 3.0, 3.2, 5.0])
     return descriptors[:, None], torch.tensor([0, 1, 0, 1, 0, 1, 1])
 

@@ -1,7 +1,5 @@
 """Short vectors against the distances that they stand for, and against scikit-learn's features and components."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.stats import spearmanr
@@ -11,7 +9,7 @@ from sklearn.kernel_approximation import AdditiveChi2Sampler
 from igps.retrieval.vectors import VectorMap
 
 
-def histograms(n: int, n_cells: int) -> np.ndarray:
+def histograms(n, n_cells):
     """Histograms of sum 1, in families of twenty."""
     generator = np.random.default_rng(0)
     families = generator.gamma(0.5, size=(n // 20 + 1, n_cells)).repeat(20, axis=0)[:n]

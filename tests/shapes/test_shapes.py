@@ -1,35 +1,32 @@
 """Generated shapes: sound meshes, a stable benchmark, files that resume."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np
 import pytest
 import trimesh
-from numpy.typing import NDArray
 from training.shapes.polygons import Prism
 
-from igps.shapes import ArticulatedShapes, GeneratedShape
-from igps.shapes.solids import Arc, Box, Cone, Ring, Solid
+from igps.shapes import ArticulatedShapes
+from igps.shapes.solids import Arc, Box, Cone, Ring
 
 DEFAULTS = ["biped", "quadruped", "octopus", "spider", "hand", "snake", "plier", "mug"]
 
 
 @pytest.fixture(scope="module")
-def default_shapes() -> list[GeneratedShape]:
+def default_shapes():
     """Three shapes of each of the eight default classes."""
     return list(ArticulatedShapes(n_per_class=3))
 
 
 @pytest.fixture(scope="module")
-def all_shapes(default_shapes: list[GeneratedShape]) -> list[GeneratedShape]:
+def all_shapes(default_shapes):
     """These, and one of each of the other four classes."""
     shapes = ArticulatedShapes(n_classes=12, n_per_class=1, seed=3)
     return default_shapes + [shapes[i] for i in range(8, 12)]
 
 
-def directed_edges(faces: NDArray[np.int64]) -> list[tuple[int, int]]:
+def directed_edges(faces):
     return [(int(f[i]), int(f[(i + 1) % 3])) for f in faces for i in range(3)]
 
 
@@ -42,7 +39,7 @@ def test_each_directed_edge_occurs_once_with_its_opposite(all_shapes):
 
 def test_the_faces_at_each_vertex_form_one_fan(all_shapes):
     for shape in all_shapes:
-        after: list[dict[int, int]] = [{} for _ in shape.vertices]
+        after = [{} for _ in shape.vertices]
         for a, b, c in shape.faces.tolist():
             after[a][b], after[b][c], after[c][a] = c, a, b
         for fan in after:
@@ -58,7 +55,7 @@ def test_one_component_of_the_recorded_genus(all_shapes):
         edges = directed_edges(shape.faces)
         parent = list(range(len(shape.vertices)))
 
-        def root(i: int, parent: list[int] = parent) -> int:
+        def root(i, parent=parent):
             while parent[i] != i:
                 parent[i] = i = parent[parent[i]]
             return i
@@ -135,7 +132,7 @@ def test_resolution_follows_n_vertices():
             assert 0.6 <= len(shape.vertices) / n_vertices <= 1.4
 
 
-def distance_histogram(shape: GeneratedShape) -> NDArray[np.float64]:
+def distance_histogram(shape):
     """D2 (Osada, Funkhouser, Chazelle and Dobkin 2002): distances of random surface points, over the area's root."""
     mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
     points, _ = trimesh.sample.sample_surface(mesh, 800, seed=0)
@@ -218,11 +215,11 @@ def test_write_refuses_a_folder_of_other_shapes(tmp_path):
 POINTS = np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3))
 
 
-def nearest_sphere(centres: NDArray[np.float64], radii: NDArray[np.float64]) -> NDArray[np.float64]:
+def nearest_sphere(centres, radii):
     return (np.linalg.norm(POINTS[:, None] - centres[None], axis=2) - radii).min(axis=1)
 
 
-def swept(solid: Solid) -> NDArray[np.float64]:
+def swept(solid):
     """The distance to a union of very many balls along the solid's centre line."""
     t = np.linspace(0.0, 1.0, 4001)
     zero = np.zeros_like(t)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.integrate
@@ -17,7 +15,7 @@ from igps.signature.config import SignatureConfig
 
 
 @pytest.fixture(scope="module")
-def box() -> Mesh:
+def box():
     body = trimesh.creation.box([1.0, 2.0, 3.0])
     for _ in range(4):
         body = body.subdivide()
@@ -25,7 +23,7 @@ def box() -> Mesh:
 
 
 @pytest.fixture(scope="module")
-def points() -> np.ndarray:
+def points():
     return np.random.default_rng(0).uniform(-0.45, 0.45, (40, 3)) * [1, 2, 3]
 
 

@@ -1,7 +1,5 @@
 """The far field: approximate coordinates keep their accuracy, clusters and moments the order of their error."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import logging
@@ -11,7 +9,7 @@ import pytest
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from bodies import Mesh, bumpy_sphere, interior_points, smooth_functions, torus
+from bodies import bumpy_sphere, interior_points, smooth_functions, torus
 from conftest import with_slivers
 from igps.mesh import mesh as geometry
 from igps.signature import mean_value as coordinates
@@ -24,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("approximate_small_meshes")
 
 
 @functools.cache
-def commute_time_embedding(name: str) -> tuple[Mesh, np.ndarray]:
+def commute_time_embedding(name):
     """A mesh, and its first 100 eigenfunctions over √λ (V, 100): their distances are those of the descriptor."""
     if name == "torus":
         mesh = torus(160, 60)
@@ -126,7 +124,7 @@ def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(monkeypatch
     exact = extend(*mesh, functions, points)
     caplog.set_level(logging.INFO, logger=coordinates.logger.name)
 
-    def error(accuracy: float) -> float:
+    def error(accuracy):
         found = extend(*mesh, functions, points, accuracy=accuracy)
         return float(np.quantile(np.abs(pdist(found) / pdist(exact) - 1), 0.99))
 
@@ -145,7 +143,7 @@ def test_where_no_approximation_serves_the_closed_form_does(monkeypatch):
     functions = smooth_functions(mesh[0])
     settings = []
 
-    def never(*_: object) -> float:
+    def never(*_):
         settings.append(1)
         return 1.0
 

@@ -1,7 +1,5 @@
 """Mean value coordinates, extension and winding numbers against closed forms, the published loop and libigl."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -24,7 +22,7 @@ from igps.signature.mean_value import extend
 pytestmark = pytest.mark.usefixtures("approximate_small_meshes")
 
 
-def published_loop(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) -> np.ndarray:
+def published_loop(vertices, faces, point):
     """Weights of one point, as Ju, Schaefer and Warren 2005, figure 4, writes them down."""
     eps = 1e-9
     distances = np.linalg.norm(vertices - point, axis=1)

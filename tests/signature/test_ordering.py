@@ -1,7 +1,5 @@
 """The order of a body's points, and what is chosen along it: the same body, the same choice."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from conftest import as_mesh
-from igps.data.batch import SampleBatch, SignatureBatch
+from igps.data.batch import SampleBatch
 from igps.data.collation import collate
 from igps.mesh.mesh import Mesh
 from igps.nn.axes import EuclideanDistance, InteriorDistance, Potential
@@ -30,7 +28,7 @@ from igps.signature.signature import SignatureConfig, compute_signature
 CONFIG = SignatureConfig(n_eigenpairs=40, resolution=16, min_samples=0, n_surface_samples=400)
 
 
-def renumbered(mesh: Mesh, seed: int = 5) -> Mesh:
+def renumbered(mesh, seed=5):
     generator = np.random.default_rng(seed)
     order = generator.permutation(len(mesh.vertices))
     faces = np.argsort(order)[mesh.faces][generator.permutation(len(mesh.faces))]
@@ -39,7 +37,7 @@ def renumbered(mesh: Mesh, seed: int = 5) -> Mesh:
     return Mesh(mesh.vertices[order], np.take_along_axis(faces, corners, axis=1))
 
 
-def spectrum_of(n_points: int) -> tuple[np.ndarray, np.ndarray]:
+def spectrum_of(n_points):
     generator = np.random.default_rng(2)
     return generator.normal(size=(n_points, 30)), np.sort(generator.uniform(5, 300, 30))
 
@@ -104,7 +102,7 @@ def test_systematic_samples_follow_the_sizes():
     np.testing.assert_allclose(many / 21000, expected, atol=0.004)
 
 
-def bodies() -> dict[str, Mesh]:
+def bodies():
     """One without symmetry, and one that is its own mirror image, with all its samples."""
     made = {}
     for name, lean in (("blob", 0.2), ("mirrored", 0.0)):
@@ -129,7 +127,7 @@ MOVES = {
 
 
 @pytest.fixture(scope="module")
-def histograms() -> list[PairHistogram]:
+def histograms():
     """Of half of the samples, inside and on the surface; with Euclidean distances, which no symmetry of U explains."""
     axes = [Potential(3), InteriorDistance(16), EuclideanDistance(12)]
     return [
@@ -138,7 +136,7 @@ def histograms() -> list[PairHistogram]:
 
 
 @pytest.fixture(scope="module")
-def still() -> dict[str, SignatureBatch]:
+def still():
     return {name: collate([compute_signature(mesh, CONFIG)]) for name, mesh in bodies().items()}
 
 
@@ -204,7 +202,7 @@ def test_the_order_of_form_takes_out_every_numbering(blob):
 def test_the_order_of_form_keeps_the_surface(blob):
     found = in_canonical_order(blob)
 
-    def corners(mesh: Mesh) -> set[bytes]:
+    def corners(mesh):
         """Every face by its corners' places, from each of the three on, so that orientation counts."""
         places = mesh.vertices[mesh.faces]
         return {np.roll(face, k, axis=0).tobytes() for face in places for k in range(3)}

@@ -1,7 +1,5 @@
 """Plain numbers against closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -14,22 +12,22 @@ from igps.signature.measures import measures
 ROTATION = trimesh.transformations.euler_matrix(0.4, 1.1, -0.7)[:3, :3]
 
 
-def ball(*semi_axes: float) -> Mesh:
+def ball(*semi_axes):
     sphere = trimesh.creation.icosphere(subdivisions=4)
     return Mesh(sphere.vertices * semi_axes, sphere.faces)
 
 
-def rod(length: float, radius: float) -> Mesh:
+def rod(length, radius):
     capsule = trimesh.creation.capsule(height=length, radius=radius, count=[48, 48])
     return Mesh(capsule.vertices, capsule.faces)
 
 
-def torus(major: float, minor: float) -> Mesh:
+def torus(major, minor):
     ring = trimesh.creation.torus(major, minor, major_sections=96, minor_sections=48)
     return Mesh(ring.vertices, ring.faces)
 
 
-def of_ball(r: float) -> dict[str, float]:
+def of_ball(r):
     return {
         "volume": 4 / 3 * math.pi * r**3,
         "area": 4 * math.pi * r**2,
@@ -51,7 +49,7 @@ def of_ball(r: float) -> dict[str, float]:
     }
 
 
-def of_ellipsoid(a: float, b: float, c: float) -> dict[str, float]:
+def of_ellipsoid(a, b, c):
     """The area and the integral of the mean curvature by sums over a fine grid of the parameters."""
     u, v = np.meshgrid(np.linspace(0, np.pi, 2001), np.linspace(0, 2 * np.pi, 2001), indexing="ij")
     x = np.sin(u) * np.cos(v)
@@ -78,7 +76,7 @@ def of_ellipsoid(a: float, b: float, c: float) -> dict[str, float]:
     }
 
 
-def of_rod(length: float, r: float) -> dict[str, float]:
+def of_rod(length, r):
     volume = math.pi * r**2 * length + 4 / 3 * math.pi * r**3
     return {
         "volume": volume,
@@ -93,7 +91,7 @@ def of_rod(length: float, r: float) -> dict[str, float]:
     }
 
 
-def of_torus(major: float, minor: float) -> dict[str, float]:
+def of_torus(major, minor):
     volume = 2 * math.pi**2 * major * minor**2
     hull = volume / 2 + math.pi * major**2 * 2 * minor + 4 / 3 * math.pi * minor**3 / 2
     return {

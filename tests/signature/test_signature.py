@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +14,7 @@ from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding
 from igps.nn.histograms.pairs import PairHistogram
 from igps.signature.laplacian import laplacian
-from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
+from igps.signature.signature import Samples, SignatureConfig, compute_signature
 from igps.spectra import ConvergenceError, eigenpairs
 
 CONFIG = SignatureConfig(
@@ -24,13 +22,13 @@ CONFIG = SignatureConfig(
 )
 
 
-def histogram(signature: Signature, samples: str = "interior") -> np.ndarray:
+def histogram(signature, samples="interior"):
     counted = PairHistogram([Potential(4), InteriorDistance(64)], samples=samples)
     return counted(collate([signature]))[0].numpy()
 
 
 @pytest.fixture(scope="module")
-def signature(blob: Mesh) -> Signature:
+def signature(blob):
     return compute_signature(blob, CONFIG)
 
 
@@ -167,7 +165,7 @@ def test_robust_backend_and_seed_are_honoured(blob, signature):
 
 
 @pytest.fixture(scope="module")
-def needles(blob: Mesh) -> Mesh:
+def needles(blob):
     """The blob with two vertices a billionth of its size apart."""
     vertices = blob.vertices.copy()
     a, b = blob.faces[100, :2]
@@ -175,7 +173,7 @@ def needles(blob: Mesh) -> Mesh:
     return Mesh(vertices, blob.faces, name="needles")
 
 
-def limit_residuals(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
+def limit_residuals(monkeypatch, limit):
     monkeypatch.setattr("igps.signature.signature._MAX_RESIDUAL", limit)
     monkeypatch.setattr("igps.spectra.eigensolver.RESIDUAL_LIMIT", limit)
 

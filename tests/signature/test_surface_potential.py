@@ -1,7 +1,5 @@
 """The potential of charged triangles against quadrature and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.integrate
@@ -10,7 +8,7 @@ import trimesh
 from igps.signature.surface_potential import surface_potential
 
 
-def by_quadrature(triangle: np.ndarray, point: np.ndarray) -> float:
+def by_quadrature(triangle, point):
     """∫ dS/r in polar coordinates about the point's projection, where nothing is singular."""
     a, b, c = triangle
     normal = np.cross(b - a, c - a)
@@ -36,7 +34,7 @@ def by_quadrature(triangle: np.ndarray, point: np.ndarray) -> float:
     return total
 
 
-def triangle_of(kind: str) -> np.ndarray:
+def triangle_of(kind):
     generator = np.random.default_rng(3)
     if kind == "any":
         return generator.normal(size=(3, 3))
@@ -103,7 +101,7 @@ def test_centre_of_a_cylinder_of_needles(n_subdivisions):
     np.testing.assert_allclose(result, exact, rtol=1e-5)
 
 
-def body() -> tuple[np.ndarray, np.ndarray]:
+def body():
     """A bent bar with needles, fans and fine triangles beside coarse ones."""
     cylinder = trimesh.creation.cylinder(0.3, 3, sections=90)
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.6)
@@ -113,7 +111,7 @@ def body() -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.vstack([cylinder.faces, ball.faces + len(cylinder.vertices)])
 
 
-def samples(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def samples(vertices, faces):
     """Points inside, outside, far away, at vertices, on edges, on faces and a hair above them."""
     generator = np.random.default_rng(0)
     corners = vertices[faces[generator.integers(len(faces), size=40)]]

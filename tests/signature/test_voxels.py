@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import igl
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from igps.mesh.mesh import Mesh
 from igps.signature.voxels import grid_axes, inside_grid, interior_samples
 
 
-def grid_points(axes: tuple[np.ndarray, ...]) -> np.ndarray:
+def grid_points(axes):
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -57,7 +55,7 @@ def test_grid_lines_through_vertices_and_edges():
     np.testing.assert_array_equal(inside_grid(mesh, exact).ravel(), expected)
 
 
-def _octahedron() -> tuple[np.ndarray, np.ndarray]:
+def _octahedron():
     vertices = np.array(
         [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float
     )

@@ -1,15 +1,11 @@
 """Stiffness and mass of surfaces, without the library under test."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 from scipy import sparse
 
-Problem = tuple[sparse.csr_array, np.ndarray, np.ndarray]
 
-
-def cotangent_problem(mesh: trimesh.Trimesh) -> Problem:
+def cotangent_problem(mesh):
     """Cotangent stiffness, barycentric mass and positions, written without regard to speed."""
     corners = np.asarray(mesh.vertices)[mesh.faces]
     n_vertices = len(mesh.vertices)
@@ -30,7 +26,7 @@ def cotangent_problem(mesh: trimesh.Trimesh) -> Problem:
     return stiffness, mass, np.array(mesh.vertices)
 
 
-def torus(n_major: int = 48, n_minor: int = 24, jitter: float = 0.2) -> trimesh.Trimesh:
+def torus(n_major=48, n_minor=24, jitter=0.2):
     mesh = trimesh.creation.torus(1.0, 0.4, major_sections=n_major, minor_sections=n_minor)
     mesh.vertices += (
         np.random.default_rng(0).uniform(-jitter, jitter, mesh.vertices.shape) / n_minor

@@ -1,7 +1,5 @@
 """The eigensolver against dense solvers, closed forms and invariances."""
 
-from __future__ import annotations
-
 import logging
 import re
 
@@ -10,29 +8,29 @@ import lapy
 import numpy as np
 import pytest
 import trimesh
-from problems import Problem, cotangent_problem, torus
+from problems import cotangent_problem, torus
 from scipy import sparse
 from scipy.linalg import eigh
 
 from conftest import torch_threads
 from igps.mesh.mesh import Mesh
 from igps.signature.laplacian import laplacian
-from igps.spectra import ConvergenceError, Spectrum, eigenpairs, eigensolver
+from igps.spectra import ConvergenceError, eigenpairs, eigensolver
 from igps.spectra._krylov import RitzPairs
 
 
 @pytest.fixture(scope="module")
-def torus_problem() -> Problem:
+def torus_problem():
     return cotangent_problem(torus())
 
 
 @pytest.fixture(scope="module")
-def torus_oracle(torus_problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+def torus_oracle(torus_problem):
     stiffness, mass, _ = torus_problem
     return eigh(stiffness.toarray(), np.diag(mass))
 
 
-def assert_pairs(spectrum: Spectrum, problem: Problem, tolerance: float = 1e-7) -> None:
+def assert_pairs(spectrum, problem, tolerance=1e-07):
     stiffness, mass, _ = problem
     values = spectrum.eigenvalues
     functions = spectrum.eigenfunctions
@@ -67,7 +65,7 @@ def test_sphere_has_multiplets_of_odd_size():
     assert_pairs(spectrum, problem)
 
 
-def copies_of_a_patch(n_copies: int, side: int) -> Problem:
+def copies_of_a_patch(n_copies, side):
     """Identical square grids tied to one vertex: almost every eigenvalue has multiplicity n_copies − 1."""
     path = sparse.diags_array([np.ones(side - 1), np.ones(side - 1)], offsets=[-1, 1])
     grid = sparse.kron(path, sparse.eye_array(side)) + sparse.kron(sparse.eye_array(side), path)
@@ -200,7 +198,7 @@ def test_a_missed_pair_is_noticed_by_inertia(torus_problem, torus_oracle, monkey
     leading = RitzPairs.leading
     calls = []
 
-    def forgetful(self: RitzPairs, n_below: int, tolerance: float) -> np.ndarray:
+    def forgetful(self, n_below, tolerance):
         found = leading(self, n_below, tolerance)
         calls.append(len(found))
         kept = np.arange(len(found)) != 9
@@ -216,7 +214,7 @@ def test_a_missed_pair_is_noticed_by_inertia(torus_problem, torus_oracle, monkey
     assert re.search(r"found \d+ of \d+ eigenvalues below", caplog.text)
 
 
-def fail(*arguments: object) -> None:
+def fail(*arguments):
     raise ConvergenceError("on purpose")
 
 
@@ -245,7 +243,7 @@ def test_a_shift_below_the_spectrum_takes_over(torus_problem, torus_oracle, monk
 def test_the_fallback_too_is_proved_complete(torus_problem, monkeypatch):
     arpack = eigensolver._arpack
 
-    def lossy(*arguments: object) -> tuple[np.ndarray, np.ndarray]:
+    def lossy(*arguments):
         values, functions = arpack(*arguments)
         return np.delete(values, 4), np.delete(functions, 4, axis=1)
 
@@ -347,7 +345,7 @@ def test_what_is_refused(torus_problem):
     stiffness, mass, positions = torus_problem
     n_vertices = len(mass)
 
-    def changed(value: float) -> np.ndarray:
+    def changed(value):
         return np.where(np.arange(n_vertices) == 3, value, mass)
 
     broken = stiffness.copy()

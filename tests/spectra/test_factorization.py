@@ -1,7 +1,5 @@
 """The sparse factorization against dense linear algebra."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
@@ -13,14 +11,14 @@ from scipy import sparse
 
 from conftest import with_slivers
 from igps._threads import Team
-from igps.spectra._multifrontal import Factors, SingularMatrixError, analyse
+from igps.spectra._multifrontal import SingularMatrixError, analyse
 
 # A single block of all unknowns is not cut, with places or without
 SPLITS = [(4, False), (32, True), (10_000, True)]
 EPSILON = float(np.finfo(float).eps)
 
 
-def grid_matrix(n: int, seed: int = 0) -> tuple[sparse.csr_array, np.ndarray]:
+def grid_matrix(n, seed=0):
     """A symmetric indefinite matrix on a jittered, triangulated n × n grid, and the places of its vertices."""
     rng = np.random.default_rng(seed)
     index = np.arange(n * n).reshape(n, n)
@@ -39,7 +37,7 @@ def grid_matrix(n: int, seed: int = 0) -> tuple[sparse.csr_array, np.ndarray]:
     return sparse.csr_array(matrix), places
 
 
-def random_graph_matrix(n: int, seed: int) -> sparse.csr_array:
+def random_graph_matrix(n, seed):
     """A symmetric matrix on a random graph, not connected and without any geometry."""
     pattern = sparse.random_array((n, n), density=min(1, 1.5 / n), rng=np.random.default_rng(seed))
     diagonal = np.random.default_rng(seed).normal(size=n)
@@ -47,7 +45,7 @@ def random_graph_matrix(n: int, seed: int) -> sparse.csr_array:
 
 
 @functools.cache
-def sliver_matrix() -> tuple[sparse.csr_array, np.ndarray]:
+def sliver_matrix():
     """M^-½ L M^-½ of a torus some faces of which are slivers, in units of 1/area, and the places of its vertices."""
     mesh = torus(jitter=0)
     vertices, faces = with_slivers(np.array(mesh.vertices), np.array(mesh.faces), 30)
@@ -58,19 +56,17 @@ def sliver_matrix() -> tuple[sparse.csr_array, np.ndarray]:
 
 
 @functools.cache
-def sliver_eigenvalues() -> np.ndarray:
+def sliver_eigenvalues():
     return np.linalg.eigvalsh(sliver_matrix()[0].toarray())
 
 
-def backward_error(
-    matrix: np.ndarray, solution: np.ndarray, right: np.ndarray, norm: float | None = None
-) -> float:
+def backward_error(matrix, solution, right, norm=None):
     """The relative change of the matrix for which the solution would be exact (Rigal and Gaches 1967)."""
     residual = np.linalg.norm(matrix @ solution - right)
     return float(residual / ((norm or np.linalg.norm(matrix, 2)) * np.linalg.norm(solution)))
 
 
-def eliminations(factors: Factors) -> list[np.ndarray]:
+def eliminations(factors):
     """E of every node that has one."""
     structure = factors.tree.structure
     found = []
@@ -81,7 +77,7 @@ def eliminations(factors: Factors) -> list[np.ndarray]:
     return [elimination for elimination in found if elimination.size]
 
 
-def elimination_growth(factors: Factors) -> float:
+def elimination_growth(factors):
     """The largest norm of the multipliers E of one elimination, at least 1."""
     return max(
         [1.0, *(float(np.linalg.norm(elimination)) for elimination in eliminations(factors))]

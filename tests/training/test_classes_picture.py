@@ -1,7 +1,5 @@
 """The picture of the generated classes shows each class, right side out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -16,10 +14,10 @@ def test_every_class_is_drawn_right_side_out(tmp_path, monkeypatch):
     made = list(shapes)
     is_mirrored = {bool(np.linalg.det(shape.motion) < 0) for shape in made}
     assert is_mirrored == {True, False}
-    drawn: list[trimesh.Trimesh] = []
+    drawn = []
     paint = classes_picture.paint
 
-    def record(panel: object, vertices: object, faces: object, colour: object) -> None:
+    def record(panel, vertices, faces, colour):
         drawn.append(trimesh.Trimesh(vertices, faces, process=False))
         paint(panel, vertices, faces, colour)
 

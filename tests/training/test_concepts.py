@@ -1,11 +1,6 @@
 """The pictures of concepts.md show what NumPy and SciPy compute from dense matrices and exact coordinates."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +9,7 @@ import trimesh
 from docs import concepts
 from docs.benchmarks.weld import TUBE_FACES, facing_vertices, weld
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 from matplotlib.image import imread
-from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
 from bodies import mean_value_coordinates
@@ -32,7 +25,7 @@ CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surfac
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     """Two balls, three long eggs and a rod."""
     for label, ratios in (("ball", (1.0, 1.1)), ("egg", (2.0, 2.1, 2.2)), ("rod", (4.0,))):
         for i, ratio in enumerate(ratios):
@@ -45,7 +38,7 @@ def root(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def open_ring(tmp_path: Path) -> Path:
+def open_ring(tmp_path):
     """A tube along most of a circle, its flat ends close together, in a file."""
     mesh = horseshoe(0.06, n_sections=36, n_around=10)
     path = tmp_path / "ring.off"
@@ -54,12 +47,12 @@ def open_ring(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def drawn(figures_of: Callable[[Any], list[Figure]]) -> list[Figure]:
+def drawn(figures_of):
     """The figures that were made."""
     return figures_of(concepts)
 
 
-def embedding(mesh: Mesh, points: NDArray[np.float64], n_eigenpairs: int) -> NDArray[np.float64]:
+def embedding(mesh, points, n_eigenpairs):
     """The first three eigenvalues, and the commute-time embedding by dense linear algebra."""
     stiffness, mass = laplacian(mesh)
     values, functions = scipy.linalg.eigh(stiffness.toarray(), np.diag(mass))
@@ -68,11 +61,11 @@ def embedding(mesh: Mesh, points: NDArray[np.float64], n_eigenpairs: int) -> NDA
     return weights @ (functions[:, kept] / np.sqrt(values[kept]))
 
 
-def chi_square(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def chi_square(a, b):
     return float(np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2)
 
 
-def histogram(dataset: SignatureDataset, name: str) -> NDArray[np.float64]:
+def histogram(dataset, name):
     """The share of pairs in bins of 1/16 up to 4; each pair is shared by the bins whose centres surround it."""
     signature = dataset[dataset.bodies.names.index(name)].signature
     distances = pdist(signature.interior.eigenfunctions / np.sqrt(signature.eigenvalues))

@@ -1,7 +1,5 @@
 """Crossings of a surface with itself, against every pair of triangles tried one by one."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -10,7 +8,7 @@ import trimesh
 from training.shapes.crossing import crossing_faces
 
 
-def passes(p: np.ndarray, q: np.ndarray, triangle: np.ndarray) -> bool:
+def passes(p, q, triangle):
     """Whether a segment passes through a triangle: the common point, from three equations."""
     a, b, c = triangle
     matrix = np.column_stack([b - a, c - a, p - q])
@@ -20,7 +18,7 @@ def passes(p: np.ndarray, q: np.ndarray, triangle: np.ndarray) -> bool:
     return bool(u > 0 and v > 0 and u + v < 1 and 0 < t < 1)
 
 
-def tried_one_by_one(vertices: np.ndarray, faces: np.ndarray) -> set[tuple[int, int]]:
+def tried_one_by_one(vertices, faces):
     found = set()
     for i, j in itertools.combinations(range(len(faces)), 2):
         if set(faces[i]) & set(faces[j]):

@@ -1,15 +1,12 @@
 """Graded shapes: two levels of labels, one surface a body, and meshes that need no mending."""
 
-from __future__ import annotations
-
 import pickle
-from typing import NoReturn
 
 import numpy as np
 import pytest
 import trimesh
-from training.shapes import GradedShape, GradedShapes, body_of
-from training.shapes.bodies import Pose, draw_body, draw_pose
+from training.shapes import GradedShapes, body_of
+from training.shapes.bodies import draw_body, draw_pose
 from training.shapes.kinds import KINDS, LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, body_classes
 from training.shapes.plates import MACHINES, SHEETS, Plate, machine, sheet
 from training.shapes.springs import Helix
@@ -41,23 +38,23 @@ BENDING = [
 ]
 
 
-def drawn(kind: str, number: int = 0) -> Pose:
+def drawn(kind, number=0):
     body = draw_body(CLASSES[FIRST[kind]], [2, number], [0, number])
     return draw_pose(body, np.random.default_rng([1, number]), 3000)
 
 
 @pytest.fixture(scope="module")
-def poses() -> dict[str, Pose]:
+def poses():
     return {kind: drawn(kind) for kind in FIRST}
 
 
 @pytest.fixture(scope="module")
-def shapes() -> GradedShapes:
+def shapes():
     return GradedShapes(3, 2, 3, seed=2, n_vertices=N_VERTICES)
 
 
 @pytest.fixture(scope="module")
-def made(shapes: GradedShapes) -> list[GradedShape]:
+def made(shapes):
     return list(shapes)
 
 
@@ -87,7 +84,7 @@ def test_a_pose_is_nearly_isometric_to_the_surface_at_rest(poses):
 def test_animals_bend_and_things_do_not(poses):
     """The greatest change of a distance between two vertices, over the body's extent."""
 
-    def change(pose: Pose) -> float:
+    def change(pose):
         some = np.random.default_rng(0).choice(len(pose.rest), 300, replace=False)
         rest, bent = (
             np.linalg.norm(v[some, None] - v[None, some], axis=2) for v in (pose.rest, pose.bent)
@@ -118,7 +115,7 @@ def test_every_sheet_has_the_holes_that_its_name_tells():
 def test_a_body_that_cannot_be_made_is_tried_once(monkeypatch):
     tried = []
 
-    def impossible(*arguments: object) -> NoReturn:
+    def impossible(*arguments):
         tried.append(arguments)
         raise ValueError("no sound body")
 
@@ -146,7 +143,7 @@ def test_shapes_are_read_without_mending(made, tmp_path):
 def test_poses_differ_in_triangles_and_bodies_in_compactness(made):
     """Area^1.5 over volume does not change with motion, scale or bending, and does with the body."""
     assert len({len(shape.vertices) for shape in made}) > 12
-    compactness: dict[str, list[float]] = {}
+    compactness = {}
     for shape in made:
         surface = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
         compactness.setdefault(shape.body, []).append(
@@ -266,7 +263,7 @@ def test_arguments_out_of_range_are_named(arguments):
         GradedShapes(**arguments)
 
 
-def counted_volume(solid: Plate | Helix) -> float:
+def counted_volume(solid):
     """By counting random points of the solid's box, made somewhat larger."""
     low, high = solid.box()
     low = low - 0.05

@@ -1,7 +1,5 @@
 """Individuals of generated bodies differ by as much as they say, in shape, and are bodies themselves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -12,7 +10,7 @@ N_INDIVIDUALS = 3
 
 
 @pytest.fixture(scope="module")
-def shapes() -> GradedShapes:
+def shapes():
     return GradedShapes(2, 1, 2, seed=3, n_vertices=(1500, 1800), n_individuals=N_INDIVIDUALS)
 
 

@@ -1,7 +1,5 @@
 """What the program of benchmarks/molecules.md does to chains, by what must stay and what must change."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from docs.benchmarks import molecules as program
@@ -10,7 +8,7 @@ from igps.fields.molecules.molecule import Molecule
 from igps.retrieval import retrieval_scores
 
 
-def chain(seed: int, n: int = 70) -> Molecule:
+def chain(seed, n=70):
     """A compact walk with helices of 14 residues between turns."""
     generator = np.random.default_rng(seed)
     positions = [np.zeros(3)]

@@ -1,14 +1,11 @@
 """Training by a file of values: a curve, an early end, and going on after an interruption."""
 
-from __future__ import annotations
-
 import csv
 import os
 import runpy
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -29,13 +26,13 @@ COLUMNS = ("ft", "nn", "dcg", "st", "adr", "map")
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     root = tmp_path_factory.mktemp("running")
     ArticulatedShapes(n_classes=3, n_per_class=8, n_vertices=500).write(root / "meshes")
     return root
 
 
-def settings(root: Path, out: Path, epochs: int = 4) -> dict[str, Any]:
+def settings(root, out, epochs=4):
     """The values of configs/train.yaml for small signatures and quick epochs."""
     values = yaml.safe_load(CONFIG.read_text())
     values["data"] |= {
@@ -56,7 +53,7 @@ def settings(root: Path, out: Path, epochs: int = 4) -> dict[str, Any]:
     return values
 
 
-def run(values: dict[str, Any], *more: object) -> None:
+def run(values, *more):
     """Train by a file of these values."""
     file = Path(values["trainer"]["default_root_dir"]).with_suffix(".yaml")
     file.write_text(yaml.safe_dump(values))
@@ -65,12 +62,12 @@ def run(values: dict[str, Any], *more: object) -> None:
         train()
 
 
-def curve(out: Path) -> list[dict[str, str]]:
+def curve(out):
     with (out / "curve.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def checkpoint(out: Path, name: str = "last") -> dict[str, Any]:
+def checkpoint(out, name="last"):
     return torch.load(out / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
@@ -80,7 +77,7 @@ def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(
     run(settings(root, tmp_path / "whole"))
     step = RetrievalLearner.training_step
 
-    def interrupted(self: RetrievalLearner, batch: Any, batch_index: int) -> Any:
+    def interrupted(self, batch, batch_index):
         if self.trainer.current_epoch == 2 and batch_index == 1:
             raise RuntimeError("the power fails")
         return step(self, batch, batch_index)
@@ -170,7 +167,7 @@ def test_a_checkpoint_is_scored_as_by_the_librarys_parts(root, tmp_path):
         assert printed[name] == pytest.approx(expected, abs=0.06), name
 
 
-def run_apart(module: str, *arguments: object) -> str:
+def run_apart(module, *arguments):
     """What a module prints in a process of its own."""
     command = [sys.executable, "-m", module, *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": f"{PROJECT / 'src'}{os.pathsep}{PROJECT}"}

@@ -1,7 +1,5 @@
 """Dual quaternions against rotation matrices, and what bending leaves as it was."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -21,7 +19,7 @@ from training.shapes.skinning import (
 )
 
 from igps.shapes.skeleton import Part, Skeleton, limb
-from igps.shapes.solids import Blob, Solid
+from igps.shapes.solids import Blob
 from igps.shapes.templates import TEMPLATES
 
 Array = NDArray[np.float64]
@@ -29,7 +27,7 @@ g = np.random.default_rng(0)
 POINTS = g.normal(size=(50, 3))
 
 
-def scalar_first(rotation: Rotation) -> Array:
+def scalar_first(rotation):
     return rotation.as_quat()[..., [3, 0, 1, 2]]
 
 
@@ -82,7 +80,7 @@ def test_a_blend_is_rigid_and_half_way_between():
     np.testing.assert_allclose(transform(half, POINTS), expected, atol=1e-13)
 
 
-def cylinder(length: float, radius: float) -> trimesh.Trimesh:
+def cylinder(length, radius):
     """A round bar along z from 0, of triangles much smaller than it is thick."""
     angle, z = np.meshgrid(
         np.linspace(0, 2 * np.pi, 48, endpoint=False), np.linspace(0, length, 121), indexing="ij"
@@ -102,14 +100,14 @@ def cylinder(length: float, radius: float) -> trimesh.Trimesh:
     )
 
 
-def straight_rod(length: float, radius: float, n: int = 61) -> Rod:
+def straight_rod(length, radius, n=61):
     along = np.linspace(0.0, length, n)
     points = np.stack([0 * along, 0 * along, along], axis=1)
     sides = np.tile(np.eye(3)[:, :2], (n, 1, 1))
     return Rod(-1, 0.0, points, along, np.full(n, radius), np.full(n, radius), sides)
 
 
-def bent_bar(turns: Array) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+def bent_bar(turns):
     bar = cylinder(3.0, 0.2)
     rod = straight_rod(3.0, 0.2, len(turns))
     rig = Rig((rod,), np.zeros(1, dtype=np.int64))
@@ -171,7 +169,7 @@ def test_a_hinge_keeps_lengths_near_both_bones():
 
 def test_weights_are_shares_and_follow_the_nearest_rod():
     arm = limb("arm", [0.6, 0.6], [0.15, 0.13, 0.12], [(20, 10), (25, 0)])
-    hub: Solid = Blob((0.4, 0.4, 0.4))
+    hub = Blob((0.4, 0.4, 0.4))
     skeleton = Skeleton(
         Part(hub, children=tuple(arm.joined((0, 0, 0.3 * s), (0, 0, s)) for s in (-1, 1)))
     )

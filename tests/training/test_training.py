@@ -1,12 +1,8 @@
 """Pretraining, and the scores of heads over splits, on generated shapes."""
 
-from __future__ import annotations
-
 import os
 import re
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from statistics import mean, stdev
 
 import numpy as np
@@ -14,13 +10,12 @@ import pytest
 import torch
 import yaml
 from docs.benchmarks import learning
-from torch import Tensor
 from training.shapes import GradedShapes
 from training.shapes.benchmark import GradedShape, body_of
 from training.train import CONFIG
 
 import igps
-from igps.data.splits import Split, split_seen, split_unseen
+from igps.data.splits import split_seen, split_unseen
 from igps.descriptors.pretrained.descriptor import pretrained
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
@@ -32,32 +27,30 @@ COLUMNS = ("ft", "nn", "dcg", "st", "adr", "map")
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     root = tmp_path_factory.mktemp("training")
     ArticulatedShapes(n_classes=4, n_per_class=6, n_vertices=700).write(root / "meshes")
     return root
 
 
 @pytest.fixture(autouse=True)
-def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def one_process(monkeypatch):
     """To start other processes takes longer than the work of these tests."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
 
 
-def scores_by_row(table: str) -> dict[str, list[float]]:
+def scores_by_row(table):
     """The numbers of each line that begins with a word."""
     lines = [line.split() for line in table.splitlines() if re.match(r"\w+ +\d", line)]
     return {words[0]: [float(word) for word in words[1:] if word != "±"] for words in lines}
 
 
-def percents(distances: Tensor, labels: Tensor) -> list[float]:
+def percents(distances, labels):
     scores = retrieval_scores(distances.clamp_min(0), labels).mean()
     return [100 * scores[column] for column in COLUMNS]
 
 
-def expected_scores(
-    histograms: Tensor, labels: Tensor, split: Split, part_cells: Sequence[int]
-) -> dict[str, list[float]]:
+def expected_scores(histograms, labels, split, part_cells):
     """Scores of the test part in percent, of the plain distance and of each head."""
     train = torch.tensor(split.train)
     test = torch.tensor(split.test)
@@ -130,7 +123,7 @@ def test_a_metric_is_the_prior_of_the_heads(root, capsys):
 class QuickShapes(GradedShapes):
     """Graded shapes by name and label; the surface is a small articulated one, stretched, which is quicker to make."""
 
-    def __getitem__(self, index: int) -> GradedShape:
+    def __getitem__(self, index):
         n = self.n_bodies * self.n_poses
         place, number = divmod(index, n)
         articulated = ArticulatedShapes(n_classes=4, n_per_class=n, n_vertices=700)

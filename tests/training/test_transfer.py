@@ -59,18 +59,18 @@ def test_individuals_in_rigid_poses_are_found(tmp_path, capsys):
         people(tmp_path / "bodies", tmp_path / "made")
 
 
-def _rod() -> tuple[np.ndarray, np.ndarray]:
+def _rod():
     """Vertices and faces of a rod of radius 0.5 along z."""
     rod = trimesh.creation.icosphere(subdivisions=4)
     return np.asarray(rod.vertices) * [0.5, 0.5, 3.0], np.asarray(rod.faces)
 
 
-def _bend(points: np.ndarray) -> np.ndarray:
+def _bend(points):
     """Bend the z axis into an arc of radius 4, perpendicular slices staying flat."""
     angles = points[:, 2] / 4.0
     radii = 4.0 + points[:, 0]
     return np.stack([radii * np.cos(angles), points[:, 1], radii * np.sin(angles)], axis=1)
 
 
-def _centred(points: np.ndarray) -> np.ndarray:
+def _centred(points):
     return points - points.mean(axis=0)

@@ -1,9 +1,5 @@
 """Lightning on two processes finds the scores that it finds on one."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 import torch
 from pytorch_lightning import Trainer, seed_everything
@@ -29,7 +25,7 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def module(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataModule:
+def module(tmp_path_factory):
     """Nine shapes to validate and nine to test: on two processes one of each is dealt out twice."""
     root = tmp_path_factory.mktemp("two_processes")
     ArticulatedShapes(n_classes=3, n_per_class=8, n_vertices=500).write(root / "meshes")
@@ -47,7 +43,7 @@ def module(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataModule:
     return data
 
 
-def trainer(n_processes: int, root: Path) -> Trainer:
+def trainer(n_processes, root):
     # Processes of their own for two: those of the tests have no script that could be started again.
     return Trainer(
         max_epochs=2,

@@ -1,7 +1,5 @@
 """Welds: the tube adds one handle, and the gap it bridges is the best of all pairs of vertices."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 import trimesh
 from docs.benchmarks import weld as weld_module
 from docs.benchmarks.weld import TUBE_FACES, facing_vertices, weld, weld_gap
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
@@ -19,7 +16,7 @@ from igps.mesh.mesh import Mesh
 from igps.mesh.surface import vertex_normals
 
 
-def grooved_ball() -> Mesh:
+def grooved_ball():
     """A wide ball with a narrow groove: places face each other, but none is far away along the surface."""
     body = trimesh.creation.icosphere(subdivisions=3)
     z = body.vertices[:, 2:]
@@ -30,7 +27,7 @@ def grooved_ball() -> Mesh:
     return Mesh(body.vertices, body.faces, name="grooved_ball")
 
 
-def paths(mesh: Mesh) -> NDArray[np.float64]:
+def paths(mesh):
     """(V, V) shortest paths along edges."""
     surface = as_trimesh(mesh)
     i, j = surface.edges_unique.T
@@ -154,9 +151,7 @@ def test_narrow_gaps_come_before_wide_ones(monkeypatch):
     mesh = horseshoe()
     asked = []
 
-    def none(
-        self: object, largest_gap: float, least_path: float | None = None
-    ) -> list[tuple[int, int]]:
+    def none(self, largest_gap, least_path=None):
         asked.append((largest_gap / mesh.diagonal, least_path and least_path / mesh.diagonal))
         return []
 

@@ -1,30 +1,24 @@
 """One body for the descriptors that look at one body at a time."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from igps.data.batch import Body
 from igps.data.collation import collate
-from igps.mesh.mesh import Mesh
-from igps.signature.signature import Samples, Signature
+from igps.signature.signature import Samples
 
 
-def of_mesh(mesh: Mesh) -> Body:
+def of_mesh(mesh):
     """A body of which the mesh is known, and no sample and no eigenpair: a descriptor that reads them fails."""
     nothing = Samples(np.zeros((0, 3)), np.zeros((0, 0), dtype=np.float32))
     return Body(np.zeros(0), nothing, nothing, mesh.area, mesh.volume, mesh.name, mesh)
 
 
-def of_signature(signature: Signature) -> Body:
+def of_signature(signature):
     """A body of which the signature is known, and not the mesh: a descriptor that reads it fails."""
     return next(collate([signature]).bodies())
 
 
-def of_points(
-    points: NDArray[np.float64], area: float = 1.0, eigenvalues: NDArray[np.float64] | None = None
-) -> Body:
+def of_points(points, area=1.0, eigenvalues=None):
     """A body of which the samples of the surface, the area and the eigenvalues are known, and nothing else."""
     samples = Samples(points, np.zeros((len(points), 1), dtype=np.float32))
     nothing = Samples(np.zeros((0, 3)), np.zeros((0, 1), dtype=np.float32))

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
@@ -23,11 +21,11 @@ from igps.descriptors.literature.canonical_form import (
 from igps.mesh.mesh import Mesh
 
 
-def distance(a: np.ndarray, b: np.ndarray, descriptor: CanonicalForm) -> float:
+def distance(a, b, descriptor):
     return descriptor.distances(torch.from_numpy(a)[None], torch.from_numpy(b)[None]).item()
 
 
-def sheet(curvature: float) -> Mesh:
+def sheet(curvature):
     """A thin sheet of 2 × 1, rolled up along its length to a circular arc of the given curvature."""
     along, across = np.meshgrid(np.linspace(0, 2, 33), np.linspace(0, 1, 17), indexing="ij")
     u = along.ravel()

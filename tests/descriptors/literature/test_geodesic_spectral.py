@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +12,7 @@ from igps.descriptors.literature.geodesic_spectral import GeodesicSpectral, affi
 from igps.mesh.mesh import Mesh
 
 
-def sphere_eigenvalues(count: int) -> np.ndarray:
+def sphere_eigenvalues(count):
     """Of exp(−θ²/2π²) on the sphere over its area: ½ ∫ exp(−θ²/2π²) Pₗ(cos θ) sin θ dθ, 2l + 1 times (Funk, Hecke)."""
     nodes, weights = np.polynomial.legendre.leggauss(400)
     angle = (nodes + 1) * np.pi / 2
@@ -77,7 +75,7 @@ def test_motion_scale_and_bending(blob):
     assert 0 < near < 0.02 * far
 
 
-def _tube(angle: float) -> Mesh:
+def _tube(angle):
     """A thin capsule of length 6 along z, bent by an angle."""
     cap = np.linspace(0, np.pi / 2, 6)
     profile = np.concatenate(

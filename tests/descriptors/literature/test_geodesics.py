@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import igl
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from conftest import as_mesh
 from igps.mesh.mesh import Mesh
 
 
-def unit_cube(subdivisions: int) -> Mesh:
+def unit_cube(subdivisions):
     """The cube [0, 1]³, refined."""
     surface = trimesh.creation.box((1, 1, 1))
     for _ in range(subdivisions):
@@ -19,7 +17,7 @@ def unit_cube(subdivisions: int) -> Mesh:
     return as_mesh(trimesh.Trimesh(surface.vertices + 0.5, surface.faces, process=False), "cube")
 
 
-def corner_distances(points: np.ndarray) -> np.ndarray:
+def corner_distances(points):
     """From (0, 0, 0) to points of the cube's surface, by unfolding two neighbouring faces into a plane."""
     distances = np.full(len(points), np.inf)
     for i in range(3):
@@ -32,7 +30,7 @@ def corner_distances(points: np.ndarray) -> np.ndarray:
     return distances
 
 
-def exact(mesh: Mesh, source: int) -> np.ndarray:
+def exact(mesh, source):
     none = np.array([], dtype=np.int64)
     vertices = np.asfortranarray(mesh.vertices)
     faces = np.asfortranarray(mesh.faces)
@@ -114,7 +112,7 @@ def test_farthest_points_are_greedy(blob):
     np.testing.assert_allclose(samples.mutual, expected, rtol=1e-12)
 
 
-def renumbered(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:
+def renumbered(mesh, seed):
     """The mesh with vertices, faces and their corners in another order, and the new number of each vertex."""
     generator = np.random.default_rng(seed)
     order = generator.permutation(len(mesh.vertices))

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from itertools import product
 from math import gcd
 
@@ -10,30 +8,29 @@ from scipy.sparse.csgraph import floyd_warshall
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import cdist
 
-from igps.data.batch import Body
 from igps.descriptors.literature.inner_distance import METRICATION, InnerDistance, inner_distances
 from igps.signature.signature import Samples, Signature, SignatureConfig
 
 
-def body_of(points: np.ndarray, area: float = 1.0) -> Body:
+def body_of(points, area=1.0):
     samples = Samples(points, np.zeros((len(points), 1), dtype=np.float32))
     signature = Signature(np.ones(1), samples, samples, area, 1.0, SignatureConfig(n_eigenpairs=1))
     return of_signature(signature)
 
 
-def block(x: int, y: int, z: int) -> np.ndarray:
+def block(x, y, z):
     return np.array(list(product(range(x), range(y), range(z))), dtype=float)
 
 
-def index_of(points: np.ndarray, point: tuple[float, ...]) -> int:
+def index_of(points, point):
     return int(np.argmin(np.linalg.norm(points - point, axis=1)))
 
 
-def every(points: np.ndarray) -> np.ndarray:
+def every(points):
     return inner_distances(points, np.arange(len(points)))
 
 
-def links_by_looking(points: np.ndarray) -> np.ndarray:
+def links_by_looking(points):
     """Lengths of the links between cells, 0 for none: each segment is walked along in small steps."""
     cells = {tuple(int(i) for i in p) for p in points}
     links = np.zeros((len(points), len(points)))

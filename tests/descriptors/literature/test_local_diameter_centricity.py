@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import igl
 import numpy as np
 import pytest
@@ -18,12 +16,12 @@ from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 
 
-def centres(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def centres(mesh):
     """The centroid of every face, as its face and barycentric coordinates."""
     return np.arange(len(mesh.faces)), np.full((len(mesh.faces), 3), 1 / 3)
 
 
-def tube(radius: float, length: float, sections: int, rings: int) -> Mesh:
+def tube(radius, length, sections, rings):
     """A closed cylinder about the z axis, with rounded ends."""
     heights = np.linspace(-length / 2, length / 2, rings)
     ends = radius * np.sin(np.linspace(0, np.pi / 2, 6))[1:]

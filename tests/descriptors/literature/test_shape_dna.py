@@ -1,21 +1,17 @@
 """Shape-DNA where the spectrum is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 from one_body import of_signature
 
 import igps
-from igps.data.batch import Body
 from igps.descriptors.literature.shape_dna import ShapeDNA
-from igps.mesh.mesh import Mesh
 from igps.signature.signature import SignatureConfig, compute_signature
 
 
 @pytest.fixture(scope="module")
-def round_body(sphere: Mesh) -> Body:
+def round_body(sphere):
     config = SignatureConfig(n_eigenpairs=30, resolution=8, min_samples=0, n_surface_samples=4000)
     return of_signature(compute_signature(sphere, config))
 

@@ -1,17 +1,13 @@
 """How samples lie to principal axes, against loops, and what must not change it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from batches import alone, embedded, scaled, two_bodies
-from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements
 from igps.descriptors.pretrained.axial_histogram import AxialHistogram, principal_axes
 from igps.nn.embedding import SpectralEmbedding
@@ -20,7 +16,7 @@ from loops import hat
 EMBEDDING = SpectralEmbedding(n_eigenpairs=6)
 
 
-def moved(batch: SignatureBatch, motion: Tensor, shift: Tensor) -> SignatureBatch:
+def moved(batch, motion, shift):
     surface = batch.surface
     directions = surface.attributes["surface_direction"] @ motion
     attributes = {"surface_direction": directions}

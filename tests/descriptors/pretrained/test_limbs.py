@@ -1,36 +1,29 @@
 """Histograms of branches and of pieces, against loops over components, and on bodies whose limbs are known."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from batches import alone, batch_of, embedded, scaled, two_bodies
-from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements
 from igps.descriptors.pretrained.branch_histogram import BranchHistogram
 from igps.descriptors.pretrained.piece_histogram import PieceHistogram
 from igps.nn.batch_features import N_NEIGHBOURS
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histograms.base import SampleHistogram
 from loops import hat
 
 EMBEDDING = SpectralEmbedding(n_eigenpairs=5)
 LEVELS = (0.1, 0.3, 0.6)
 
-Maker = Callable[..., SampleHistogram]
 BOTH = pytest.mark.parametrize("make", [BranchHistogram, PieceHistogram])
 
 
-def joined(coordinates: np.ndarray) -> list[set[int]]:
+def joined(coordinates):
     """Of each point those that it is joined to: the nearest, and those to which it is near."""
-    found: list[set[int]] = [set() for _ in coordinates]
+    found = [set() for _ in coordinates]
     _, nearest = cKDTree(coordinates).query(coordinates, N_NEIGHBOURS + 1)
     for i, row in enumerate(nearest.tolist()):
         for j in row[1:]:
@@ -39,7 +32,7 @@ def joined(coordinates: np.ndarray) -> list[set[int]]:
     return found
 
 
-def pieces_of(kept: set[int], graph: list[set[int]]) -> list[set[int]]:
+def pieces_of(kept, graph):
     left = set(kept)
     found = []
     while left:
@@ -61,7 +54,7 @@ def test_branches_are_as_long_as_pieces_stay_apart():
         coordinates = embedded(batch, i, "surface", 5).numpy()
         heights = np.log(np.linalg.norm(coordinates, axis=1))
         graph = joined(coordinates)
-        living: dict[int, float] = {}
+        living = {}
         lengths = []
         order = np.argsort(-heights).tolist()
         for n, point in enumerate(order):
@@ -104,7 +97,7 @@ def test_pieces_count_by_their_sizes_and_lengths():
         np.testing.assert_allclose(found[i], expected / expected.sum(), atol=1e-5)
 
 
-def star(n_arms: int, length: float, seed: int) -> SignatureBatch:
+def star(n_arms, length, seed):
     """Arms that start at 1 from the origin and reach to exp(length), in an embedding of as many dimensions."""
     generator = torch.Generator().manual_seed(seed)
     along = torch.linspace(0, length, 60).exp()
@@ -211,10 +204,10 @@ def test_gradients_are_those_of_differences():
     embedding = torch.randn(1, 12, 3, generator=generator, dtype=torch.float64)
     points = torch.rand(1, 12, 3, generator=generator, dtype=torch.float64)
 
-    def branches(values: Tensor) -> Tensor:
+    def branches(values):
         return BranchHistogram(SpectralEmbedding(), n_branches=3).double()(batch_of(values))
 
-    def pieces(values: Tensor) -> Tensor:
+    def pieces(values):
         histogram = PieceHistogram((0.5, 0.9), SpectralEmbedding()).double()
         return histogram(batch_of(embedding, points=values))
 

@@ -1,14 +1,11 @@
 """`rich` is its parts side by side; `pretrained` is the shipped head on top of its own parts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 import torch
 import trimesh
 from safetensors.torch import load_file, save_file
-from torch import Tensor
 from torch.nn.functional import normalize
 from training.pretrain import save_pretrained
 from training.shapes import GradedShapes
@@ -39,7 +36,7 @@ PART_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180, 91)
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
+def dataset(tmp_path_factory):
     """Shapes of a seed that the shipped head was not fitted to."""
     root = tmp_path_factory.mktemp("shapes")
     ArticulatedShapes(n_classes=12, n_per_class=3, seed=7, n_vertices=800).write(root)
@@ -49,7 +46,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
 
 
 @pytest.fixture(scope="module")
-def histograms(dataset: SignatureDataset) -> torch.Tensor:
+def histograms(dataset):
     return describe(dataset, igps.descriptor("rich"))
 
 
@@ -93,7 +90,7 @@ def test_pretrained_is_what_its_parameters_say(dataset):
     roots = describe(part, module.descriptor).double().sqrt()
     stored = {name: tensor.double() for name, tensor in load_file(PRETRAINED).items()}
 
-    def level(name: str, parts: tuple[int, ...]) -> Tensor:
+    def level(name, parts):
         keys = [key for key in stored if f".{name}." in key]
         of_level = {key.rsplit(".", 1)[1]: stored[key] for key in keys}
         assert of_level["part_cells"].long().tolist() == list(PART_CELLS)
@@ -159,7 +156,7 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path):
     dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")
     assert not dataset.precompute(n_workers=1)
 
-    def first_tier(distances: Tensor) -> float:
+    def first_tier(distances):
         return retrieval_scores(distances, dataset.labels).mean()["ft"]
 
     own = describe(dataset, module.descriptor)
@@ -197,7 +194,7 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_nu
     along = torch.randn(1, 200, 3, generator=generator).double()
     upstream = torch.randn(pretrained.n_features, generator=generator).double()
 
-    def loss(points: Tensor) -> Tensor:
+    def loss(points):
         moved = replace(batch, surface=replace(surface, points=points))
         return (pretrained(moved) * upstream).sum()
 
@@ -226,7 +223,7 @@ def test_coordinates_within_a_class_separate_a_small_difference_from_sampling():
     config = descriptor.requirements.apply_to(SignatureConfig())
     ball = trimesh.creation.icosphere(subdivisions=3)
 
-    def described(width: float, seed: int) -> Tensor:
+    def described(width, seed):
         bend = [0.3, 0, 0] * ball.vertices[:, 2:] ** 2
         body = Mesh(ball.vertices * [0.8 * width, 0.6, 1.6] + bend, ball.faces)
         return descriptor(collate([compute_signature(body, replace(config, seed=seed))]))

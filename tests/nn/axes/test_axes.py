@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -26,7 +24,7 @@ from igps.nn.embedding import SpectralEmbedding
 from loops import hat, soft_classes
 
 
-def view(kind: str = "interior") -> SampleFeatures:
+def view(kind="interior"):
     batch = two_bodies()
     return SampleFeatures(batch, kind, getattr(batch, kind))
 

@@ -1,13 +1,10 @@
 """Calibrated probabilities and what is unknown, on histograms whose classes are known."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
 from sklearn.metrics import log_loss
-from torch import Tensor
 
 from igps.nn.heads import ClassifierHead, KernelHead, WhitenedHead
 from igps.nn.heads.classifier import folds
@@ -15,9 +12,7 @@ from igps.nn.heads.classifier import folds
 PARTS = (12, 8)
 
 
-def drawn(
-    n_classes: int, n_of_each: int, noise: float = 0.6, seed: int = 0
-) -> tuple[Tensor, Tensor]:
+def drawn(n_classes, n_of_each, noise=0.6, seed=0):
     """Histograms about a mean of each class, which is the same for every seed; classes 10, 11, ..."""
     means = torch.rand(n_classes, sum(PARTS), generator=torch.Generator().manual_seed(9)) ** 3
     labels = torch.arange(n_classes).repeat_interleave(n_of_each)
@@ -65,7 +60,7 @@ def test_the_temperature_is_the_likeliest_on_what_is_held_out():
         scores.append(kernel.scores(histograms[out]))
         truth += labels[out].tolist()
 
-    def loss(temperature: float) -> float:
+    def loss(temperature):
         return float(
             log_loss(truth, (torch.cat(scores).double() / temperature).softmax(dim=1).numpy())
         )

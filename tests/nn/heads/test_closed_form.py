@@ -1,6 +1,3 @@
-from __future__ import annotations
-
-from collections.abc import Sequence
 from copy import deepcopy
 from itertools import combinations
 from statistics import fmean, pvariance
@@ -10,7 +7,6 @@ import pytest
 import torch
 from scipy.special import softmax
 from sklearn.kernel_ridge import KernelRidge
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from igps.nn.heads.base import Head
@@ -25,7 +21,7 @@ N_CELLS = 60
 
 
 @pytest.fixture
-def collection() -> tuple[Tensor, Tensor]:
+def collection():
     """Histograms of 8 classes of 6 shapes; all classes vary along the same two directions, and much."""
     generator = torch.Generator().manual_seed(0)
     kinds = torch.rand(8, 1, N_CELLS, generator=generator)
@@ -37,7 +33,7 @@ def collection() -> tuple[Tensor, Tensor]:
     return histograms / histograms.sum(dim=1, keepdim=True), torch.arange(8).repeat_interleave(6)
 
 
-def ft(embedding: Tensor, labels: Tensor) -> float:
+def ft(embedding, labels):
     return retrieval_scores(cosine(embedding, embedding), labels).mean()["ft"]
 
 
@@ -199,7 +195,7 @@ def test_errors_name_the_argument(collection):
 
 
 @pytest.fixture
-def prior(collection: tuple[Tensor, Tensor]) -> WhitenedHead:
+def prior(collection):
     """Fitted to the last four classes, in two parts."""
     histograms, labels = collection
     return WhitenedHead().fit(histograms[labels >= 4], labels[labels >= 4], (20, 40))
@@ -208,12 +204,12 @@ def prior(collection: tuple[Tensor, Tensor]) -> WhitenedHead:
 class SquaredPrior(WhitenedHead):
     """A head whose distance is the squared cosine distance for unit vectors, but not for other vectors."""
 
-    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+    def distances(self, queries, gallery):
         return euclidean(queries, gallery) ** 4 / 4
 
 
 @pytest.fixture
-def squared(prior: WhitenedHead) -> SquaredPrior:
+def squared(prior):
     """The prior with that distance."""
     found = SquaredPrior()
     found.load_state_dict(prior.state_dict())
@@ -238,7 +234,7 @@ def test_a_prior_stays_as_it_is(collection, prior, kind):
 class SteppedPrior(WhitenedHead):
     """A head whose distances are 0.01 or 1; the kernel of such distances is not positive definite."""
 
-    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+    def distances(self, queries, gallery):
         return (euclidean(queries, gallery) > 1.1).to(queries.dtype).clamp_min(0.01)
 
 
@@ -313,21 +309,18 @@ def test_parts_beside_a_prior_are_weighted_by_fishers_discriminant(collection, s
 class Stretched(Head):
     """A prior that looks at the first cells alone."""
 
-    def __init__(self, head: WhitenedHead, n_cells: int) -> None:
+    def __init__(self, head, n_cells):
         super().__init__()
         self.head = head
         self.n_cells = n_cells
 
-    def fit(
-        self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None
-    ) -> Stretched:
+    def fit(self, descriptions, labels, part_cells=None):
         raise AssertionError("a prior stays as it is")
 
-    def forward(self, descriptions: Tensor) -> Tensor:
-        vectors: Tensor = self.head(descriptions[:, : self.n_cells])
-        return vectors
+    def forward(self, descriptions):
+        return self.head(descriptions[:, : self.n_cells])
 
-    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+    def distances(self, queries, gallery):
         return self.head.distances(queries, gallery)
 
 
@@ -403,7 +396,7 @@ def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(
     assert torch.isfinite(hard(histograms)).all()  # as no exponential overflows
 
 
-def fitted_heads(collection: tuple[Tensor, Tensor]) -> list[Head]:
+def fitted_heads(collection):
     """All heads that are fitted in closed form, by themselves and with a prior."""
     body_heads = [WCCNHead([part], lengths=True) for part in range(2)]
     prior = TwoLevelHead(WCCNHead([0]), body_heads, scales=(0.1, 0.2), exponents=(0.3, 0.7))

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -15,7 +13,7 @@ from igps.retrieval.distances import euclidean
 
 
 @pytest.fixture
-def histograms() -> torch.Tensor:
+def histograms():
     counts = torch.rand(12, 3, 8, generator=torch.Generator().manual_seed(0)).pow(3)
     counts[:, 1, :3] = 0
     return counts / counts.sum(dim=(1, 2), keepdim=True)

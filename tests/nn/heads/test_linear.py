@@ -1,17 +1,14 @@
 """Logistic regression of form, numbers and size, against the same regression by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 from sklearn.linear_model import LogisticRegression
-from torch import Tensor
 
 from igps.nn.heads import LinearHead
 
 
-def rows(n_classes: int) -> tuple[Tensor, Tensor]:
+def rows(n_classes):
     """Histograms of 20 cells, 3 numbers and size of 60 bodies; the first number tells the classes."""
     generator = torch.Generator().manual_seed(0)
     labels = torch.arange(60) % n_classes

@@ -1,12 +1,9 @@
 """The head of two levels against matrix functions of SciPy and NumPy, and against its formula."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import sqrtm
-from torch import Tensor
 
 from igps.nn.heads.two_level import TwoLevelHead
 from igps.nn.heads.wccn import WCCNHead
@@ -19,7 +16,7 @@ N_CELLS = 40
 
 
 @pytest.fixture
-def collection() -> tuple[Tensor, Tensor, Tensor]:
+def collection():
     """Histograms, classes and bodies; bodies of all classes differ along the same directions, poses along others."""
     generator = torch.Generator().manual_seed(0)
     kinds = torch.randn(N_CLASSES, 1, 1, N_CELLS, generator=generator)
@@ -35,7 +32,7 @@ def collection() -> tuple[Tensor, Tensor, Tensor]:
     return cells / cells.sum(dim=1, keepdim=True), bodies // N_BODIES, bodies
 
 
-def projected(histograms: Tensor, bodies: Tensor, shrinkage: float) -> np.ndarray:
+def projected(histograms, bodies, shrinkage):
     """(N, 10) centred roots, whitened within bodies, along the directions in which the means vary most."""
     roots = histograms.double().sqrt().numpy()
     members = bodies.numpy()

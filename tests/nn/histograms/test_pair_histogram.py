@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from batches import N_POINTS, batch_of, embedded, two_bodies
@@ -20,14 +18,11 @@ from igps.nn.axes import (
     PairAxis,
     PairCosines,
     PairValues,
-    PointAxis,
     Potential,
 )
-from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms import PairHistogram, pair_histogram
 from loops import (
-    Axis,
     cosines,
     distances,
     equal_bins,
@@ -50,7 +45,7 @@ COSINES = [-2 / 3, 0.0, 2 / 3]
 
 
 @pytest.fixture(scope="module")
-def batch() -> SignatureBatch:
+def batch():
     return two_bodies()
 
 
@@ -62,29 +57,29 @@ class Look:
     i: int
     kind: str = "interior"
 
-    def embedding(self, n: int = 6, kind: str | None = None) -> Tensor:
+    def embedding(self, n=6, kind=None):
         return embedded(self.batch, self.i, kind or self.kind, n)
 
-    def positions(self) -> Tensor:
+    def positions(self):
         samples = getattr(self.batch, self.kind)
         points = samples.points[self.i, samples.mask[self.i]].double()
         return points / self.batch.area[self.i].sqrt()
 
-    def attribute(self, name: str) -> Tensor:
+    def attribute(self, name):
         samples = getattr(self.batch, self.kind)
         return samples.attributes[name][self.i, samples.mask[self.i]]
 
-    def interior(self, n_bins: int, reach: float = 4.0, n: int = 6) -> Axis:
+    def interior(self, n_bins, reach=4.0, n=6):
         return distances(self.embedding(n)), equal_bins(n_bins, reach)
 
-    def euclidean(self, n_bins: int, reach: float = 1.0) -> Axis:
+    def euclidean(self, n_bins, reach=1.0):
         return distances(self.positions()), equal_bins(n_bins, reach)
 
-    def in_space(self) -> list[Axis]:
+    def in_space(self):
         features = cosines(self.positions(), self.attribute("surface_direction"))
         return [(values, COSINES) for values in features]
 
-    def in_embedding(self) -> list[Axis]:
+    def in_embedding(self):
         own = self.embedding()
         sign = 1 if self.kind == "interior" else -1
         other = self.embedding(kind="surface" if self.kind == "interior" else "interior")
@@ -96,26 +91,20 @@ class Look:
         features = cosines(own, torch.stack(directions))
         return [(values, COSINES) for values in features]
 
-    def potential(self, n_classes: int, soft: bool = False) -> np.ndarray:
+    def potential(self, n_classes, soft=False):
         potential = self.embedding().norm(dim=1)
         if soft:
             return soft_classes(potential, equal_bins(n_classes, 1.5))
         return hard_classes(potential, [k * 1.5 / n_classes for k in range(1, n_classes)])
 
-    def depth(self, soft: bool = False) -> np.ndarray:
+    def depth(self, soft=False):
         depth = self.attribute("depth")
         if soft:
             return soft_classes(depth, DEPTH)
         return hard_classes(depth, [0.35, 0.7])
 
 
-# What a histogram is made of, and classes and pairs of one shape by the definition.
-Case = tuple[
-    Callable[[], Sequence[PointAxis | PairAxis]],
-    Callable[[Look], list[np.ndarray]],
-    Callable[[Look], list[Axis]],
-]
-CASES: dict[str, Case] = {
+CASES = {
     "potential × interior": (
         lambda: [Potential(3), InteriorDistance(7)],
         lambda look: [look.potential(3)],
@@ -189,7 +178,7 @@ def test_product_of_axes_equals_brute_force_loop(batch, name, kind):
         np.testing.assert_allclose(result[i], expected, atol=1e-6)
 
 
-def learn(*modules: nn.Module) -> None:
+def learn(*modules):
     generator = torch.Generator().manual_seed(4)
     with torch.no_grad():
         for module in modules:
@@ -239,11 +228,11 @@ class DepthDifference(PairAxis):
 
     shape = (3,)
 
-    def requirements(self, embedding: nn.Module) -> Requirements:
+    def requirements(self, embedding):
         return Requirements(attributes=("depth",))
 
-    def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
-        def between(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
+    def pairs(self, features, embedding):
+        def between(rows, columns):
             return (rows[0][:, None, :, None] - columns[0][:, None, None, :]).abs()
 
         return PairValues((features.attribute("depth"),), (torch.tensor([0.0, 0.1, 0.5]),), between)
@@ -326,7 +315,7 @@ def test_a_trained_module_gives_the_same_without_gradient(batch):
     torch.testing.assert_close(with_gradient.detach(), without, atol=1e-6, rtol=0)
 
 
-def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+def some(n_points, seed=0):
     """Embedding, positions and directions of one shape, float64."""
     generator = torch.Generator().manual_seed(seed)
     embedding = torch.randn(n_points, 4, generator=generator, dtype=torch.float64) * 0.6
@@ -382,7 +371,7 @@ def test_gradient_through_classes_and_layout():
     ).double()
     names = ["axes.1.centres.log_gap", "axes.0.centres.log_gap"]
 
-    def histogram(embedding: Tensor, *parameters: Tensor) -> Tensor:
+    def histogram(embedding, *parameters):
         return torch.func.functional_call(
             layer, dict(zip(names, parameters, strict=True)), (batch_of(embedding[None]),)
         )
@@ -398,7 +387,7 @@ def test_gradient_through_classes_and_layout():
 
 
 def test_layout_survives_its_state():
-    def made(reach: float) -> PairHistogram:
+    def made(reach):
         depth = Attribute("depth", [0.1, 0.3], soft=True, learnable=True)
         pairs = [InteriorDistance(6, reach, learnable=True), EuclideanDistance(5, learnable=True)]
         return PairHistogram([Potential(soft=True, learnable=True), depth, *pairs])
@@ -422,7 +411,7 @@ def test_half_precision_and_autocast_count_in_single(device, cosines):
         [Potential(soft=True, learnable=True), InteriorDistance(16, learnable=True), *more]
     ).to(device)
 
-    def run(points: Tensor) -> tuple[Tensor, list[Tensor]]:
+    def run(points):
         leaf = points.clone().requires_grad_()
         result = layer(batch_of(leaf[None]))
         return result, list(torch.autograd.grad(result.square().sum(), [leaf, *layer.parameters()]))

@@ -1,7 +1,5 @@
 """The paper's histogram as a function, against its definition one pair at a time."""
 
-from __future__ import annotations
-
 import math
 from itertools import combinations_with_replacement
 
@@ -12,9 +10,7 @@ import torch
 from igps.nn.histograms import pair_histogram
 
 
-def by_loops(
-    embedding: np.ndarray, potential: np.ndarray, d_max: float, u_max: float, c: int, b: int
-) -> np.ndarray:
+def by_loops(embedding, potential, d_max, u_max, c, b):
     """The definition, one pair at a time."""
     pairs = combinations_with_replacement(range(c), 2)
     rows = {pair: i for i, pair in enumerate(pairs)}
@@ -33,7 +29,7 @@ def by_loops(
 
 
 @pytest.fixture(scope="module")
-def cloud() -> tuple[torch.Tensor, torch.Tensor]:
+def cloud():
     generator = torch.Generator().manual_seed(3)
     embedding = torch.randn(90, 6, generator=generator, dtype=torch.float64) * 0.7
     return embedding, embedding.norm(dim=1)

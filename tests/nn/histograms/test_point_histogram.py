@@ -1,7 +1,5 @@
 """Histograms of samples, against a loop over samples and cells."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -18,7 +16,7 @@ from igps.nn.histograms.points import PointHistogram
 from loops import product, soft_classes
 
 
-def layout(**options: int) -> PointHistogram:
+def layout(**options):
     axes = [
         BallRadius("inside", 0.05, 0.6, n_classes=3),
         BallRadius("outside", 0.05, 0.9, n_classes=2),
@@ -101,7 +99,7 @@ def test_the_function_counts_memberships_by_masks_and_weights():
     )
     given = [torch.from_numpy(array).requires_grad_() for array in (one, other, weights)]
 
-    def count(one: torch.Tensor, other: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    def count(one, other, weights):
         return functional.point_histogram([one, other], torch.from_numpy(mask), weights)
 
     np.testing.assert_allclose(count(*given).detach(), expected)

@@ -1,7 +1,5 @@
 """Radii of the largest balls that touch samples, against their definition and where they are known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -17,12 +15,12 @@ from igps.nn import functional
 Radii = Callable[[Tensor, Tensor], Tensor]
 
 
-def on(mesh: trimesh.Trimesh, n: int) -> tuple[Tensor, Tensor]:
+def on(mesh, n):
     points, faces = trimesh.sample.sample_surface(mesh, n, seed=0)
     return torch.from_numpy(np.array(points)), torch.from_numpy(np.array(mesh.face_normals[faces]))
 
 
-def by_definition(points: Tensor, directions: Tensor, side: int) -> list[float]:
+def by_definition(points, directions, side):
     """Third smallest radius of balls tangent at x through another point that is not close to the tangent plane."""
     radii = []
     for i, (x, n) in enumerate(zip(points.tolist(), directions.tolist(), strict=True)):
@@ -37,11 +35,11 @@ def by_definition(points: Tensor, directions: Tensor, side: int) -> list[float]:
 
 
 @pytest.fixture(params=["compiled", "torch"])
-def ball_radii(request: pytest.FixtureRequest) -> Radii:
+def ball_radii(request):
     """Of one shape, by the compiled loop, and by operations of PyTorch where a gradient is asked for."""
     compiled = request.param == "compiled"
 
-    def radii(points: Tensor, directions: Tensor) -> Tensor:
+    def radii(points, directions):
         leaf = points[None].clone().requires_grad_(not compiled)
         found = functional.ball_radii(
             leaf, directions[None], torch.ones(1, len(points), dtype=torch.bool)

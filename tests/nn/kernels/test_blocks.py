@@ -1,10 +1,7 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from batches import alone, two_bodies
 from igps.data.batch import SignatureBatch
@@ -13,7 +10,7 @@ from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.histograms.pairs import PairHistogram
 
 
-def bodies(*copies: int) -> SignatureBatch:
+def bodies(*copies):
     """Bodies of 40 interior samples, each of which occurs several times."""
     body = alone(two_bodies(), 0)
     found = []
@@ -36,7 +33,7 @@ def test_groups_are_padded_to_their_largest_body(copies, on_cpu, widths, monkeyp
     batch = bodies(*copies)
     found = []
 
-    def sums(group: SignatureBatch) -> Tensor:
+    def sums(group):
         found.append(tuple(group.interior.mask.shape))
         return group.interior.points.sum(dim=(1, 2))
 
@@ -66,7 +63,7 @@ def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several):
     )
     batch = bodies(1, 30, 2)
 
-    def described(batch: SignatureBatch) -> tuple[Tensor, Tensor]:
+    def described(batch):
         functions = batch.interior.eigenfunctions.clone().requires_grad_()
         result = descriptor(
             replace(batch, interior=replace(batch.interior, eigenfunctions=functions))
@@ -87,7 +84,7 @@ def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body():
     descriptor = HistogramDescriptor(PairHistogram(["interior_distance"]))
     batch = bodies(1, 20, 2)
 
-    def second_derivatives(batch: SignatureBatch) -> Tensor:
+    def second_derivatives(batch):
         functions = batch.interior.eigenfunctions.double().requires_grad_()
         result = descriptor(
             replace(batch, interior=replace(batch.interior, eigenfunctions=functions))

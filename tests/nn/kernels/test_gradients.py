@@ -1,7 +1,5 @@
 """Gradients through a descriptor are computed on one thread, and are those without this limit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch
@@ -13,7 +11,7 @@ from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
 
 
-def learned() -> igps.HistogramDescriptor:
+def learned():
     embedding = SpectralEmbedding(n_eigenpairs=7, n_knots=4)
     parts = [PairHistogram(embedding=embedding), PairHistogram(["euclidean_distance"], embedding)]
     descriptor = igps.descriptor(igps.HistogramDescriptor(parts), learnable=True)
@@ -29,7 +27,7 @@ def test_backward_runs_on_one_thread_wherever_it_is_called():
     )
     weights = descriptor.histograms[0].embedding.weights
 
-    def watched(*arguments: torch.Tensor) -> torch.Tensor:
+    def watched(*arguments):
         found = weights(*arguments)
         found.register_hook(lambda gradient: seen.append(torch.get_num_threads()))
         return found
@@ -46,7 +44,7 @@ def test_gradients_of_first_and_second_order_are_those_without_a_limit(monkeypat
     descriptor = learned()
     points = batch.interior.points.clone().requires_grad_()
 
-    def found() -> list[torch.Tensor]:
+    def found():
         # Areas that depend on the points: each derivative must count once.
         area = batch.area * (1 + points.square().mean().double())
         moved = replace(batch, interior=replace(batch.interior, points=points), area=area)

@@ -1,15 +1,11 @@
 """The count of pairs by both back ends, against loops over pairs and against the dense definition for its gradients."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.flop_counter import FlopCounterMode
@@ -23,7 +19,7 @@ from igps.nn.axes import (
     point_pair_features,
 )
 from igps.nn.histograms import joint_histogram
-from loops import Axis, cosines, distances, pair_histogram_by_loops, twists
+from loops import cosines, distances, pair_histogram_by_loops, twists
 
 FEW = [0.3, 0.5, 0.52, 1.9]
 EQUAL = [0.25, 0.75, 1.25, 1.75, 2.25]
@@ -41,18 +37,18 @@ BACK_ENDS = [
 
 
 @pytest.fixture(params=BACK_ENDS)
-def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+def device(request, monkeypatch):
     """Where the points are; on the CPU by compiled loops or by operations of PyTorch."""
     if request.param == "torch":
         monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda _: False)
     return "cuda" if request.param == "cuda" else "cpu"
 
 
-def some(n_points: int = 23, n_classes: int = 3, seed: int = 4) -> dict[str, Tensor]:
+def some(n_points=23, n_classes=3, seed=4):
     """Coordinates, points, directions, and memberships of which many are 0."""
     generator = torch.Generator().manual_seed(seed)
 
-    def normal(width: int) -> Tensor:
+    def normal(width):
         return torch.randn(n_points, width, generator=generator, dtype=torch.float64)
 
     memberships = torch.rand(n_points, n_classes, generator=generator, dtype=torch.float64)
@@ -67,23 +63,23 @@ def some(n_points: int = 23, n_classes: int = 3, seed: int = 4) -> dict[str, Ten
     }
 
 
-def differences(heights: Tensor, centres: Tensor) -> PairValues:
+def differences(heights, centres):
     """Of a height, as an axis of one's own would count it."""
 
-    def between(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
+    def between(rows, columns):
         return (rows[0][:, None, :, None] - columns[0][:, None, None, :]).abs()
 
     return PairValues((heights,), (centres,), between)
 
 
-def centres(values: Sequence[float], like: Tensor) -> Tensor:
+def centres(values, like):
     return torch.tensor(
         values, dtype=torch.promote_types(like.dtype, torch.float32), device=like.device
     )
 
 
 # Layouts of axes, each with what is counted and what a loop counts.
-KINDS: dict[str, tuple[Callable[..., PairValues], Callable[..., list[Axis]]]] = {
+KINDS = {
     "equal": (
         lambda s: euclidean_distances(s["coordinates"], centres(EQUAL, s["points"])),
         lambda s: [(distances(s["coordinates"]), EQUAL)],
@@ -136,7 +132,7 @@ LAYOUTS = [
 
 
 @pytest.fixture(params=[None, (5, 6)])
-def block(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def block(request, monkeypatch):
     """Count all pairs at once, and by blocks of so many rows and columns that no number of points fills the last."""
     if request.param is None:
         return
@@ -146,7 +142,7 @@ def block(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("igps.nn._kernels.count_by_torch._BLOCK", n_rows * 23 * 16)
 
 
-def counted(layout: Sequence[str], given: dict[str, Tensor]) -> Tensor:
+def counted(layout, given):
     return joint_histogram(given["memberships"], [KINDS[kind][0](given) for kind in layout])
 
 
@@ -361,7 +357,7 @@ def test_threads_change_no_bit(monkeypatch):
             assert torch.equal(one, same)
 
 
-def dense(memberships: Tensor, values: Sequence[Tensor], layouts: Sequence[Tensor]) -> Tensor:
+def dense(memberships, values, layouts):
     """The definition over all pairs at once, (pairs,) values of each axis, for its gradients."""
     i, j = torch.triu_indices(len(memberships), len(memberships), 1, device=memberships.device)
     shares = None
@@ -386,7 +382,7 @@ def test_gradients_equal_those_of_the_dense_definition(device, layout, block):
     given = {name: value.to(device).requires_grad_() for name, value in some(29).items()}
     pairs = [KINDS[kind][0](given) for kind in layout]
     leaves, i, j = [given["memberships"]], *torch.triu_indices(29, 29, 1, device=device)
-    values: list[Tensor] = []
+    values = []
     for kind, one in zip(layout, pairs, strict=True):
         leaves += [x for x in one.inputs if x.is_leaf] + [c.requires_grad_() for c in one.centres]
         if "cosines" in kind:
@@ -430,7 +426,7 @@ def test_gradcheck(device, layout):
     ]
     leaves = [given[name].to(device).requires_grad_() for name in names]
 
-    def histogram(logits: Tensor, *others: Tensor) -> Tensor:
+    def histogram(logits, *others):
         moved = dict(zip(names, (logits.softmax(dim=1), *others), strict=True))
         return counted(
             layout, {**{name: value.to(device) for name, value in given.items()}, **moved}
