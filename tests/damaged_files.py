@@ -1,7 +1,5 @@
 """Files that are damaged by hand, one fault each, whose counts are known without the code that mends them."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 
@@ -12,7 +10,8 @@ N_VERTICES, N_FACES = 162, 320
 def ball(width=1.0, height=1.0):
     """A stretched ball."""
     body = trimesh.creation.icosphere(subdivisions=2)
-    assert (len(body.vertices), len(body.faces)) == (N_VERTICES, N_FACES)
+    assert len(body.vertices) == N_VERTICES
+    assert len(body.faces) == N_FACES
     body.vertices *= [1.0, width, height]
     return body
 
@@ -80,7 +79,7 @@ def write_unusable(folder):
     }
 
 
-def without_collada(monkeypatch) -> None:
+def without_collada(monkeypatch):
     """What trimesh knows of COLLADA files where pycollada is not installed, wherever these tests run."""
     error = ModuleNotFoundError("No module named 'collada'")
     monkeypatch.setitem(

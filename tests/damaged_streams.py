@@ -1,15 +1,11 @@
 """Small bodies in every compressed format, and random changes of the compressed bytes."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import io
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Callable
-from pathlib import Path
 
 import meshio
 import nibabel
@@ -19,7 +15,7 @@ import tifffile
 import trimesh
 
 
-def labels() -> np.ndarray:
+def labels():
     """A ball of label 1 beside a smaller one of label 1, in 24 x 20 x 16 voxels of 1 mm."""
     x, y, z = np.indices((24, 20, 16))
     large = (x - 9) ** 2 + (y - 9) ** 2 + (z - 8) ** 2 < 36
@@ -27,27 +23,27 @@ def labels() -> np.ndarray:
     return (large | small).astype(np.uint8)
 
 
-def ball() -> trimesh.Trimesh:
+def ball():
     return trimesh.creation.icosphere(subdivisions=2)
 
 
-def write_nibabel(path: Path) -> None:
+def write_nibabel(path):
     kind = nibabel.MGHImage if path.suffix == ".mgz" else nibabel.Nifti1Image
     kind(labels(), np.eye(4)).to_filename(path)
 
 
-def write_itk(path: Path) -> None:
+def write_itk(path):
     image = SimpleITK.GetImageFromArray(labels().T)
     SimpleITK.WriteImage(image, str(path), useCompression=True)
 
 
-def write_vtu(path: Path) -> None:
+def write_vtu(path):
     mesh = ball()
     cells = [("triangle", mesh.faces)]
     meshio.Mesh(mesh.vertices, cells).write(path, compression="zlib", header_type="UInt32")
 
 
-def write_gifti(path: Path) -> None:
+def write_gifti(path):
     mesh = ball()
     points = nibabel.gifti.GiftiDataArray(
         mesh.vertices.astype(np.float32), "NIFTI_INTENT_POINTSET", "NIFTI_TYPE_FLOAT32"
@@ -58,12 +54,12 @@ def write_gifti(path: Path) -> None:
     nibabel.GiftiImage(darrays=[points, triangles]).to_filename(path)
 
 
-def write_zip(path: Path) -> None:
+def write_zip(path):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("ball.off", ball().export(file_type="off"))
 
 
-def write_tar(path: Path) -> None:
+def write_tar(path):
     content = ball().export(file_type="off").encode()
     with tarfile.open(path, "w:gz") as archive:
         info = tarfile.TarInfo("ball.off")
@@ -71,15 +67,15 @@ def write_tar(path: Path) -> None:
         archive.addfile(info, io.BytesIO(content))
 
 
-def write_gzip(path: Path) -> None:
+def write_gzip(path):
     path.write_bytes(gzip.compress(ball().export(file_type="off").encode()))
 
 
-def write_3mf(path: Path) -> None:
+def write_3mf(path):
     ball().export(path)
 
 
-def write_vtp(path: Path) -> None:
+def write_vtp(path):
     """Points and triangles as blocks of zlib, appended in base64, with headers of 64 bits."""
     mesh = ball()
     offsets = 3 * np.arange(1, len(mesh.faces) + 1)
@@ -104,11 +100,11 @@ def write_vtp(path: Path) -> None:
     path.write_bytes(head.encode() + appended)
 
 
-def write_tiff(path: Path) -> None:
+def write_tiff(path):
     tifffile.imwrite(path, labels().T, compression="zlib")
 
 
-WRITERS: dict[str, Callable[[Path], None]] = {
+WRITERS = {
     "mask.nii.gz": write_nibabel,
     "mask.mgz": write_nibabel,
     "mask.nrrd": write_itk,
@@ -127,12 +123,12 @@ WRITERS: dict[str, Callable[[Path], None]] = {
 STARTS = {"ball.vtu": 0.3, "ball.vtp": 0.2, "ball.gii": 0.4, "mask.tif": 0.25}
 
 
-def stored(path: Path) -> Path:
+def stored(path):
     """Return the file that holds the compressed bytes."""
     return path.with_suffix(".zraw") if path.suffix == ".mhd" else path
 
 
-def start_of_stream(name: str, content: bytes) -> int:
+def start_of_stream(name, content):
     """Return the first place of a file, written as `name`, behind its header."""
     for header_end in (b"ElementDataFile = LOCAL\n", b"\n\n"):
         if name.endswith((".mha", ".nrrd")) and header_end in content:
@@ -140,7 +136,7 @@ def start_of_stream(name: str, content: bytes) -> int:
     return int(STARTS.get(name, 0.0) * len(content))
 
 
-def changed(content: bytes, start: int, generator: np.random.Generator) -> bytes:
+def changed(content, start, generator):
     """Change one to eight bytes behind `start`: other values, left out, or repeated."""
     at = int(generator.integers(start, len(content) - 8))
     n = int(generator.integers(1, 9))

@@ -4,8 +4,6 @@ Once with the lowest versions of all dependencies that pyproject.toml allows, on
 packages and minutes, and is no part of the tests; `tests/test_distribution.py` is the quick form.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -17,16 +15,16 @@ from pathlib import Path
 PROJECT = Path(__file__).parents[1]
 
 
-def lowest(requirements: list[str]) -> list[str]:
+def lowest(requirements):
     """Constraints that pin each requirement to the lowest version it allows."""
     found = []
     for requirement in requirements:
-        name, least = re.match(r"([\w.-]+)(?:\[[\w,-]+\])?.*?>=\s*([\w.]+)", requirement).groups()  # type: ignore[union-attr]
+        name, least = re.match(r"([\w.-]+)(?:\[[\w,-]+\])?.*?>=\s*([\w.]+)", requirement).groups()
         found.append(f"{name}=={least}")
     return found
 
 
-def main() -> None:
+def main():
     """Build, install, try; the first command that fails ends it."""
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     with tempfile.TemporaryDirectory() as name:

@@ -4,8 +4,6 @@ The body is a box, of which area, volume and distances are known; nothing but th
 the README runs as it stands there.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import itertools
 import re

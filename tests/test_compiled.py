@@ -28,12 +28,14 @@ def largest_sum(rows):
 
 def test_a_compiled_loop_may_call_another():
     rows = np.random.default_rng(1).random((7, 40))
-    assert largest_sum(rows) == pytest.approx(rows.sum(axis=1).max())
+    expected = pytest.approx(rows.sum(axis=1).max())
+    assert largest_sum(rows) == expected
 
 
 def test_a_compiled_loop_is_the_function_that_it_was_made_of():
     values = np.random.default_rng(0).random(1000)
-    np.testing.assert_allclose(cumulative(values), np.cumsum(values), rtol=1e-12)
+    expected = np.cumsum(values)
+    np.testing.assert_allclose(cumulative(values), expected, rtol=1e-12)
     assert cumulative.__name__ == "cumulative"
 
 
@@ -80,4 +82,5 @@ def test_of_several_processes_one_compiles(tmp_path):
         subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True)
         for _ in range(3)
     ]
-    assert sum(int(process.communicate()[0]) for process in processes) == 1
+    found = sum(int(process.communicate()[0]) for process in processes)
+    assert found == 1

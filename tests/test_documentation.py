@@ -209,7 +209,8 @@ def check_retrieval(printed, folder):
     ]
     tier = np.mean([ranking[:3].count("biped") / 3 for ranking in rankings])
     first = np.mean([ranking[0] == "biped" for ranking in rankings])
-    assert ast.literal_eval(printed) == {"nn": round(100 * first), "ft": round(100 * tier)}
+    expected = {"nn": round(100 * first), "ft": round(100 * tier)}
+    assert ast.literal_eval(printed) == expected
 
 
 def check_classification(printed, folder):
@@ -251,7 +252,9 @@ def check_fine_tuning(printed, folder):
 def check_anatomy(printed, folder):
     organs = [re.findall(r"s(\d)/\w+\.nii\.gz#(\w+)", line) for line in printed.splitlines()]
     assert len(organs) == len(list((folder / "segmentations").rglob("*.nii.gz"))) == 9
-    assert all(body[0] != other[0] and body[1] == other[1] for body, other in organs)
+    for body, other in organs:
+        assert body[0] != other[0]
+        assert body[1] == other[1]
 
 
 CHECKS = {

@@ -127,12 +127,14 @@ def test_workers_leave_it_to_their_parent_while_they_start(tmp_path):
 
 
 def test_workers_have_one_thread(results):
-    assert {results[number][1] for number in (8, 9)} == {"1"}
+    found = {results[number][1] for number in (8, 9)}
+    assert found == {"1"}
 
 
 def test_nothing_to_do():
     assert all_of(jobs.square, [], n_workers=4) == {}
-    assert all_of(jobs.square, [], n_workers=4, limits=Limits(seconds=1)) == {}
+    found = all_of(jobs.square, [], n_workers=4, limits=Limits(seconds=1))
+    assert found == {}
 
 
 @pytest.mark.parametrize("n_workers", [0, -1])
@@ -143,7 +145,8 @@ def test_fewer_than_one_worker_is_refused(n_workers):
 
 
 def test_one_worker_is_this_process_unless_there_are_limits(limited):
-    assert all_of(jobs.process, [0, 0], n_workers=1)[1][0] == os.getpid()
+    found = all_of(jobs.process, [0, 0], n_workers=1)[1][0]
+    assert found == os.getpid()
     assert limited[0][0] == limited[1][0] != os.getpid()
 
 
@@ -207,7 +210,8 @@ def test_the_machine_is_not_the_jobs_fault(where, job, message):
 
 def test_other_errors_of_the_system_are_those_of_a_job():
     failed = Failed("FileNotFoundError: [Errno 2] ENOENT")
-    assert all_of(jobs.fail_with, [errno.ENOENT], n_workers=1) == {0: failed}
+    found = all_of(jobs.fail_with, [errno.ENOENT], n_workers=1)
+    assert found == {0: failed}
 
 
 @pytest.mark.parametrize(

@@ -99,10 +99,13 @@ def test_settings_are_one_inside_and_as_before_outside(many_cores):
     assert before[:2] == (3, 3)
     environment = dict(os.environ)
     with one_thread():
-        assert (torch.get_num_threads(), blas()) == (1, [1] * len(before[2]))
+        assert torch.get_num_threads() == 1
+        assert blas() == [1] * len(before[2])
         with one_thread():
-            assert (torch.get_num_threads(), n_threads()) == (1, 3)
-        assert (torch.get_num_threads(), blas()) == (1, [1] * len(before[2]))
+            assert torch.get_num_threads() == 1
+            assert n_threads() == 3
+        assert torch.get_num_threads() == 1
+        assert blas() == [1] * len(before[2])
     assert settings() == before
     assert os.environ == environment
 
@@ -141,8 +144,10 @@ def test_threads_that_overlap_leave_each_other_as_they_were():
         worker.start()
     for worker in workers:
         worker.join()
-    assert sorted(found) == [(4, 1, 4), (5, 1, 5), (6, 1, 6), (7, 1, 7)]
-    assert (torch.get_num_threads(), blas()) == (before[0], before[2])
+    expected = [(4, 1, 4), (5, 1, 5), (6, 1, 6), (7, 1, 7)]
+    assert sorted(found) == expected
+    assert torch.get_num_threads() == before[0]
+    assert blas() == before[2]
 
 
 def test_the_last_context_lifts_a_limit_set_by_another_thread():
@@ -256,8 +261,12 @@ def test_jobs_on_threads_have_one_thread_each_and_start_no_more(many_cores):
     def job(i):
         return i, torch.get_num_threads(), n_threads(), sum(on_threads(lambda x: x, [i, i]))
 
-    assert list(on_threads(job, range(7))) == [(i, 1, 1, 2 * i) for i in range(7)]
-    assert list(on_threads(job, range(2), 1)) == [(i, 1, 3, 2 * i) for i in range(2)]
+    found = list(on_threads(job, range(7)))
+    expected = [(i, 1, 1, 2 * i) for i in range(7)]
+    assert found == expected
+    found = list(on_threads(job, range(2), 1))
+    expected = [(i, 1, 3, 2 * i) for i in range(2)]
+    assert found == expected
     assert list(on_threads(job, [])) == []
     assert settings() == before
 
@@ -379,7 +388,9 @@ def test_a_team_does_every_job_once_and_in_order(max_threads):
     with Team(max_threads) as team:
         for size in (0, 1, 3, 40, 2):
             done.clear()
-            assert team.each(square, range(size)) == [(number**2, 1) for number in range(size)]
+            found = team.each(square, range(size))
+            expected = [(number**2, 1) for number in range(size)]
+            assert found == expected
             assert sorted(done) == list(range(size))
 
 
@@ -407,7 +418,8 @@ def test_a_blocked_thread_of_a_team_does_not_delay_other_callers():
         other.start()
         held.wait()  # the other thread and the only one of the team have a job each
         try:
-            assert team.each(abs, range(-3, 0)) == [3, 2, 1]
+            found = team.each(abs, range(-3, 0))
+            assert found == [3, 2, 1]
             assert not ended_jobs
         finally:
             released.set()
@@ -429,7 +441,8 @@ def test_what_a_job_of_a_team_raises_is_raised_when_no_job_runs_any_more():
         ended_jobs = running._value
         threading.Event().wait(0.3)
         assert running._value == ended_jobs
-        assert team.each(abs, [-1, -2]) == [1, 2]
+        found = team.each(abs, [-1, -2])
+        assert found == [1, 2]
 
 
 @pytest.mark.parametrize("inference", [True, False])

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
@@ -16,7 +14,7 @@ from igps.nn.histograms.pairs import PairHistogram
 from igps.signature.signature import Samples, Signature, SignatureConfig
 
 
-def samples(generator: np.random.Generator, n_points: int, n_eigenpairs: int) -> Samples:
+def samples(generator, n_points, n_eigenpairs):
     functions = generator.standard_normal((n_points, n_eigenpairs)).astype(np.float32)
     attributes = {"depth": generator.random(n_points).astype(np.float32)}
     attributes["surface_direction"] = generator.standard_normal((n_points, 3)).astype(np.float32)
@@ -24,7 +22,7 @@ def samples(generator: np.random.Generator, n_points: int, n_eigenpairs: int) ->
 
 
 @pytest.fixture
-def signatures() -> list[Signature]:
+def signatures():
     """Three, of different numbers of samples and of eigenpairs."""
     generator = np.random.default_rng(0)
     return [
@@ -41,7 +39,7 @@ def signatures() -> list[Signature]:
     ]
 
 
-def centred(signature: Signature, room: str) -> np.ndarray:
+def centred(signature, room):
     points = getattr(signature, room).points
     return points - points.mean(axis=0)
 
@@ -145,7 +143,7 @@ def test_nothing_and_unlike_attributes_are_refused(signatures):
         collate([signatures[1], replace(signatures[0], interior=bare)])
 
 
-def of_samples(batch: SampleBatch, i: int) -> set[tuple[float, ...]]:
+def of_samples(batch, i):
     rows = torch.cat([batch.points[i], batch.eigenfunctions[i]], dim=1)[batch.mask[i]]
     return {tuple(row) for row in rows.tolist()}
 
@@ -179,14 +177,14 @@ def test_subset_with_a_seed_depends_on_nothing_but_the_shape(signatures):
     assert not torch.equal(collate(signatures).interior.subset(6).points, first.points)
 
 
-def equal(one: SignatureBatch, other: SignatureBatch) -> bool:
+def equal(one, other):
     """Whether two batches hold the same shapes, however they are padded."""
     if one.ids != other.ids or one.labels.tolist() != other.labels.tolist():
         return False
     return all(map(same_body, one.bodies(), other.bodies()))
 
 
-def same_body(one: Body, other: Body) -> bool:
+def same_body(one, other):
     if (one.area, one.volume) != (other.area, other.volume):
         return False
     if not np.array_equal(one.eigenvalues, other.eigenvalues):
@@ -194,7 +192,7 @@ def same_body(one: Body, other: Body) -> bool:
     return same_samples(one.interior, other.interior) and same_samples(one.surface, other.surface)
 
 
-def same_samples(one: Samples, other: Samples) -> bool:
+def same_samples(one, other):
     pairs = [(one.points, other.points), (one.eigenfunctions, other.eigenfunctions)]
     pairs += [(one.attributes[name], values) for name, values in other.attributes.items()]
     return all(np.array_equal(a, b) for a, b in pairs)
@@ -271,13 +269,13 @@ def test_batches_that_do_not_fit_are_not_joined(signatures):
 class Several(Dataset[Signature]):
     """Signatures in a list, as a Dataset of one's own gives them."""
 
-    def __init__(self, signatures: list[Signature]) -> None:
+    def __init__(self, signatures):
         self.signatures = signatures
 
-    def __len__(self) -> int:
+    def __len__(self):
         return len(self.signatures)
 
-    def __getitem__(self, index: int) -> Signature:
+    def __getitem__(self, index):
         return self.signatures[index]
 
 
@@ -310,14 +308,14 @@ def test_a_batch_is_saved_and_loaded_without_trust(signatures, tmp_path):
     assert equal(loaded, collate(signatures))
 
 
-def thinned(items: list[Signature]) -> SignatureBatch:
+def thinned(items):
     """Views of a batch, and a tensor that lies elsewhere."""
     batch = collate(items)
     half = batch.interior.map(lambda values: values[:, ::2])
     return replace(batch, area=2 * batch.area, interior=half)
 
 
-def numbered(items: list[Signature]) -> SignatureBatch:
+def numbered(items):
     batch = collate(items)
     return replace(batch, labels=torch.arange(len(batch)))
 
@@ -352,7 +350,7 @@ def test_batches_go_to_a_device_and_bodies_come_back(signatures):
         Several(signatures), batch_size=3, num_workers=1, collate_fn=collate, pin_memory=True
     )
     assert pinned.interior.points.is_pinned()
-    batch: SignatureBatch = pinned.to("cuda", non_blocking=True)
+    batch = pinned.to("cuda", non_blocking=True)
     assert equal(
         batch[torch.tensor([2, 0], device="cuda")].to("cpu"),
         collate([signatures[2], signatures[0]]),

@@ -1,7 +1,5 @@
 """Copies of bodies are found among others, from a folder and from an index."""
 
-from __future__ import annotations
-
 import ast
 import math
 import os
@@ -36,11 +34,11 @@ SAME = {frozenset({"lump.off", "lump.stl"}), frozenset({"bar.off", "bar.ply", "b
 BRACKET = (((0, 0, 0), (6, 1, 1)), ((0, 0, 0), (1, 4, 1)), ((5, 0, 0), (6, 1, 3)))
 
 
-def ball(subdivisions: int) -> trimesh.Trimesh:
+def ball(subdivisions):
     return trimesh.creation.icosphere(subdivisions=subdivisions)
 
 
-def lump(subdivisions: int) -> trimesh.Trimesh:
+def lump(subdivisions):
     """Without any symmetry."""
     body = ball(subdivisions)
     x, y, z = body.vertices.T
@@ -48,7 +46,7 @@ def lump(subdivisions: int) -> trimesh.Trimesh:
     return body
 
 
-def bar(subdivisions: int, bend: float = 0.0) -> trimesh.Trimesh:
+def bar(subdivisions, bend=0.0):
     """Long, and bent by so many radians along its length."""
     body = ball(subdivisions)
     x, y, z = (body.vertices * [3.0, 0.8, 0.5]).T
@@ -61,14 +59,14 @@ def bar(subdivisions: int, bend: float = 0.0) -> trimesh.Trimesh:
     return body
 
 
-def copied(body: trimesh.Trimesh, seed: int, scale: float) -> trimesh.Trimesh:
+def copied(body, seed, scale):
     """Scaled, turned, and mirrored."""
     turn = -scale * Rotation.random(random_state=seed).as_matrix()
     return trimesh.Trimesh(body.vertices @ turn.T + 5.0, body.faces[:, ::-1], process=False)
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     root = tmp_path_factory.mktemp("bodies") / "meshes"
     root.mkdir()
     lump(3).export(root / "lump.off")
@@ -85,16 +83,16 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def cache(root: Path) -> Path:
+def cache(root):
     return root.parent / "cache"
 
 
 @pytest.fixture
-def dataset(root: Path, cache: Path) -> SignatureDataset:
+def dataset(root, cache):
     return SignatureDataset(root, CONFIG, cache)
 
 
-def grouped(groups: tuple[tuple[str, ...], ...]) -> set[frozenset[str]]:
+def grouped(groups):
     return set(map(frozenset, groups))
 
 
@@ -147,7 +145,7 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
     """On another grid they are other bodies, as near as a fraction of a voxel, and never those of another label."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
 
-    def labels(side: float) -> np.ndarray:
+    def labels(side):
         x, y, z = np.meshgrid(*(np.arange(0, n, side) for n in (60, 36, 30)), indexing="ij")
         height = z - 12 - (x - 8) * y / 90
         one = ((x - 18) / 14) ** 2 + ((y - 18) / 11) ** 2 + (height / 8) ** 2 < 1
@@ -232,10 +230,10 @@ def test_each_file_of_a_group_has_one_finer_file_beside_it():
     apart = {(0, 1): 0.1, (1, 2): 0.05, (0, 4): 0.2, (3, 4): 0.1, (1, 4): 0.01, (2, 3): 0.3}
 
     class Table:
-        def coarseness(self, i: int) -> float:
+        def coarseness(self, i):
             return float(i != 3) * i
 
-        def distance(self, i: int, j: int, calibration: Calibration) -> float:
+        def distance(self, i, j, calibration):
             return apart.get((min(i, j), max(i, j)), math.inf)
 
     calibration = Calibration.load()

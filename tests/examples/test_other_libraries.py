@@ -45,7 +45,8 @@ def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(dataset):
     bodies = [to_pyg(item.signature, "surface", item.label) for item in dataset]
     assert bodies[0].eigenfunctions.any()
     batch = next(iter(GeometricLoader(bodies, batch_size=8)))
-    assert (batch.pos.shape, batch.eigenfunctions.shape) == ((640, 3), (640, 20))
+    assert batch.pos.shape == (640, 3)
+    assert batch.eigenfunctions.shape == (640, 20)
     assert batch.eigenvalues.shape == (8, 20)
     assert batch.y.tolist() == dataset.labels.tolist()
     # A heat kernel signature (Sun, Ovsjanikov and Guibas 2009) of each sample, pooled over each body: the heat trace.
@@ -215,7 +216,8 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
 
     theirs = LpDistance(normalize_embeddings=False)  # and back: any of theirs is a distance here
     scores = igps.retrieval_scores(theirs(cells, cells), dataset.labels).mean()
-    assert scores == igps.retrieval_scores(torch.cdist(cells, cells), dataset.labels).mean()
+    expected = igps.retrieval_scores(torch.cdist(cells, cells), dataset.labels).mean()
+    assert scores == expected
 
 
 def test_retrieval_scores_accumulate_step_by_step(dataset):

@@ -67,7 +67,8 @@ def test_there_are_twenty_things_that_work_and_reasons_for_the_rest():
     numbers = [int(n) for n in re.findall(r"^\| (\d+) \|", PAGE, re.MULTILINE)]
     assert numbers == list(range(1, 28))
     rest = [line for line in PAGE.splitlines() if line.startswith(("| 24", "| 25", "| 26", "| 27"))]
-    assert all(": " in line or "where" in line for line in rest)
+    for line in rest:
+        assert ": " in line or "where" in line
 
 
 @pytest.mark.parametrize("number", [number for number in ROWS if number != 4])

@@ -58,9 +58,12 @@ def test_it_ranks_as_the_descriptor_does(dataset, root, tmp_path):
     distances = chi_square(histograms[4:5], histograms)[0]
     found = gallery.query(root / "egg" / "1.off", top=4, cache_dir=tmp_path / "cache")
     nearest = torch.argsort(distances, stable=True)[:4].tolist()
-    assert [match.name for match in found] == [dataset.bodies.names[i] for i in nearest]
-    assert [match.label for match in found] == [(dataset.bodies.labels or ())[i] for i in nearest]
-    assert [match.path for match in found] == [dataset.bodies.paths[i].resolve() for i in nearest]
+    expected = [dataset.bodies.names[i] for i in nearest]
+    assert [match.name for match in found] == expected
+    expected = [(dataset.bodies.labels or ())[i] for i in nearest]
+    assert [match.label for match in found] == expected
+    expected = [dataset.bodies.paths[i].resolve() for i in nearest]
+    assert [match.path for match in found] == expected
     np.testing.assert_allclose(
         [match.distance for match in found], distances[nearest], rtol=2e-3, atol=1e-6
     )
@@ -112,7 +115,8 @@ def test_bodies_of_one_file_are_entries_of_their_own(tmp_path):
     }
     found = gallery.nearest(describe(dataset, small_interior()), top=1)
     assert [one.name for (one,) in found] == list(bodies.names)
-    assert {one.path for (one,) in found} == {(tmp_path / "plate.glb").resolve()}
+    expected = {(tmp_path / "plate.glb").resolve()}
+    assert {one.path for (one,) in found} == expected
 
 
 def test_what_cannot_be_described_is_told(root, tmp_path):
@@ -231,11 +235,9 @@ def test_rows_tell_size_class_and_what_labels_tell(root, tmp_path):
     for name, label, age, scanner in labelled:
         assert told[name]["volume"] == pytest.approx(meshes[name].volume)
         assert told[name]["area"] == pytest.approx(meshes[name].area)
-        assert (told[name]["class"], told[name]["age"], told[name]["scanner"]) == (
-            label,
-            age,
-            scanner or None,
-        )
+        assert told[name]["class"] == label
+        assert told[name]["age"] == age
+        assert told[name]["scanner"] == scanner or None
         picture = PIL.Image.open(io.BytesIO(told[name]["thumbnail"]))
         assert np.asarray(picture.convert("L")).max() > 200
     description = describe(dataset, small_interior())[:1]
@@ -249,7 +251,8 @@ def test_rows_tell_size_class_and_what_labels_tell(root, tmp_path):
         if age >= 10 and label == "eggs" and meshes[name].volume > volume
     }
     assert {one.name for one in found} == wanted
-    assert [one.distance for one in found] == sorted(one.distance for one in found)
+    expected = sorted(one.distance for one in found)
+    assert [one.distance for one in found] == expected
     assert gallery.nearest(description, where="age > 99") == [[]]
 
 
@@ -264,20 +267,24 @@ def test_sync_finds_what_is_new_changed_and_gone(root, tmp_path, monkeypatch):
     write_body(tmp_path / "elsewhere" / "o'clock.off", 1.0, 1.5)
     gallery.add(SignatureDataset(tmp_path / "elsewhere", CONFIG, cache), n_workers=1)
     version = gallery.table.table.version
-    assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
+    found = sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
+    assert found == (0, 0, [])
     assert gallery.table.table.version == version
     monkeypatch.setattr(rows, "MIN_AGE", 0)
     sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
     with monkeypatch.context() as context:
         context.setattr(SignatureDataset, "key", lambda *_: pytest.fail("a file was read"))
-        assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
+        found = sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
+        assert found == (0, 0, [])
     write_body(root / "egg" / "new.off", 1.3, 2.0)
     write_body(root / "ball" / "1.off", 3.0, 0.3)
     (root / "egg" / "0.off").unlink()
     (root / "egg" / "broken.off").write_text("OFF\n1 0 0\n0 0 0\n")
     dataset = SignatureDataset(root, CONFIG, cache)
     n_new, n_gone, (failure,) = sync(gallery, dataset, root, n_workers=1)
-    assert (n_new, n_gone, failure.id) == (2, 1, "egg/broken.off")
+    assert n_new == 2
+    assert n_gone == 1
+    assert failure.id == "egg/broken.off"
     (root / "egg" / "broken.off").unlink()
     (root / "labels.csv").write_text(
         "\n".join(
@@ -288,12 +295,14 @@ def test_sync_finds_what_is_new_changed_and_gone(root, tmp_path, monkeypatch):
         )
     )
     dataset = SignatureDataset(root, CONFIG, cache)
-    assert sync(gallery, dataset, root, n_workers=1) == (0, 0, [])
+    found = sync(gallery, dataset, root, n_workers=1)
+    assert found == (0, 0, [])
     assert gallery.remove("name = 'o''clock.off'") == 1
     built, _ = Gallery.build(tmp_path / "built.igps", dataset, small_interior(), n_workers=1)
     described = describe(dataset, small_interior())
     assert gallery.nearest(described) == built.nearest(described)
-    assert {one.label for one in built.nearest(described)[0]} == {"round"}
+    found = {one.label for one in built.nearest(described)[0]}
+    assert found == {"round"}
 
 
 def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(root, tmp_path, monkeypatch):
@@ -320,8 +329,11 @@ def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(root, tmp_path, m
         context.setattr(
             os, "access", lambda path, how: Path(path).name != "egg" and access(path, how)
         )
-        assert sync(gallery, seen, root, n_workers=1) == (0, 1, [])
-    assert {row["name"] for row in gallery.rows("name")} == {*dataset.bodies.names} - {"ball/0.off"}
+        found = sync(gallery, seen, root, n_workers=1)
+        assert found == (0, 1, [])
+    found = {row["name"] for row in gallery.rows("name")}
+    expected = {*dataset.bodies.names} - {"ball/0.off"}
+    assert found == expected
 
 
 def test_it_opens_where_it_was_moved_to(dataset, tmp_path):
@@ -350,7 +362,8 @@ def test_commands_that_change_a_gallery(root, tmp_path, monkeypatch, capsys):
     synced = lines("gallery", "sync", root, "--gallery", gallery, *cache)
     assert synced[-2:] == ["1 body described, 1 removed", f"{gallery}: 5 bodies by {INTERIOR}"]
     info = json.loads("\n".join(lines("gallery", "info", gallery, "--json")))
-    assert (info["bodies"], info["descriptor"]) == (5, INTERIOR)
+    assert info["bodies"] == 5
+    assert info["descriptor"] == INTERIOR
     assert info["columns"]["volume"] == "float"
     query = ["query", root / "egg" / "2.off", "--gallery", gallery, "--where", "class = 'ball'"]
     assert len(lines(*query, "--exact", *cache)) == 1 + 3
@@ -374,9 +387,11 @@ def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, monkeypatch):
 
     gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
     before = {row["part"]: row["volume"] for row in gallery.rows("part", "volume")}
-    assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (0, 0, [])
+    found = sync(gallery, now(), tmp_path / "scans", n_workers=1)
+    assert found == (0, 0, [])
     table.write_text('{"1": "bar", "2": "block"}')
-    assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (2, 0, [])
+    found = sync(gallery, now(), tmp_path / "scans", n_workers=1)
+    assert found == (2, 0, [])
     after = {row["part"]: row["volume"] for row in gallery.rows("part", "volume")}
     assert after == {"block": before["bar"], "bar": before["block"]}
 
@@ -401,7 +416,8 @@ def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gall
             ValueError, match=r"labels.csv: .* do not begin with an underscore, got '_rowid'"
         ):
             change(gallery, SignatureDataset(root, CONFIG, tmp_path / "cache"), n_workers=1)
-    assert len([*Gallery(tmp_path / "g.igps", small_interior()).rows("name")]) == 6
+    found = len([*Gallery(tmp_path / "g.igps", small_interior()).rows("name")])
+    assert found == 6
 
 
 @pytest.mark.parametrize(
@@ -443,7 +459,8 @@ def test_a_folder_linked_twice_gives_each_body_once(root, tmp_path):
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert sorted(row["name"] for row in gallery.rows("name")) == names
     version = gallery.table.table.version
-    assert sync(gallery, dataset, root, n_workers=1) == (0, 0, [])
+    found = sync(gallery, dataset, root, n_workers=1)
+    assert found == (0, 0, [])
     assert gallery.table.table.version == version
     gallery.remove("class = 'egg'")
     gallery.add(dataset, n_workers=1)
@@ -479,11 +496,16 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
     gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
     scan.write_bytes(b"being copied")
     n_new, n_gone, (failure,) = sync(gallery, now(), tmp_path / "scans", n_workers=1)
-    assert (n_new, n_gone, failure.id, len(gallery)) == (0, 0, "scan.nii.gz", 6)
+    assert n_new == 0
+    assert n_gone == 0
+    assert failure.id == "scan.nii.gz"
+    assert len(gallery) == 6
     labels[labels == 3] = 0
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), scan)
-    assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (2, 1, [])
-    assert sorted(row["part"] for row in gallery.rows("part")) == ["1", "1", "2", "2", "3"]
+    found = sync(gallery, now(), tmp_path / "scans", n_workers=1)
+    assert found == (2, 1, [])
+    found = sorted(row["part"] for row in gallery.rows("part"))
+    assert found == ["1", "1", "2", "2", "3"]
 
 
 def test_numbers_stay_as_they_are_written_in_a_column_of_text(root, tmp_path):
@@ -495,9 +517,11 @@ def test_numbers_stay_as_they_are_written_in_a_column_of_text(root, tmp_path):
     )
     gallery, _ = Gallery.build(tmp_path / "g.igps", balls, small_interior(), n_workers=1)
     gallery.add(eggs, n_workers=1)
-    assert {row["age"] for row in gallery.rows("age")} == {"old", "young", "03", "4", None}
+    found = {row["age"] for row in gallery.rows("age")}
+    assert found == {"old", "young", "03", "4", None}
     version = gallery.table.table.version
-    assert sync(gallery, eggs, root / "egg", n_workers=1) == (0, 0, [])
+    found = sync(gallery, eggs, root / "egg", n_workers=1)
+    assert found == (0, 0, [])
     assert gallery.table.table.version == version
 
 
@@ -509,7 +533,8 @@ def test_what_labels_tell_no_more_sync_empties(root, tmp_path):
         tmp_path / "g", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1
     )
     table.write_text("file,label,scanner\nball/0.off,ball,A\negg/0.off,egg,C\n")
-    assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
+    found = sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
+    assert found == (0, 0, [])
     told = {
         row["name"]: (row["age"], row["scanner"]) for row in gallery.rows("name", "age", "scanner")
     }

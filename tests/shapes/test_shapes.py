@@ -87,7 +87,8 @@ def test_arrays_and_triangles_are_sane(all_shapes):
     for shape in all_shapes:
         assert shape.vertices.dtype == np.float64
         assert shape.faces.dtype == np.int64
-        assert len(np.unique(shape.vertices, axis=0)) == len(shape.vertices)
+        found = len(np.unique(shape.vertices, axis=0))
+        assert found == len(shape.vertices)
         assert 1800 <= len(shape.vertices) <= 4200, shape.name
         angles = trimesh.Trimesh(shape.vertices, shape.faces, process=False).face_angles
         assert np.degrees(angles.min()) > 5.0, shape.name
@@ -156,7 +157,8 @@ def test_names_and_labels():
     assert shapes.labels[:4] == ["biped", "biped", "quadruped", "quadruped"]
     assert shapes.names[:3] == ["biped/00", "biped/01", "quadruped/00"]
     last = shapes[-1]
-    assert (last.label, last.name) == ("mug", "mug/01")
+    assert last.label == "mug"
+    assert last.name == "mug/01"
     assert ArticulatedShapes(n_classes=12).class_names[:8] == DEFAULTS
 
 
@@ -254,7 +256,9 @@ def swept(solid):
 )
 def test_distance_to_swept_solids(solid):
     outside = swept(solid) > 0.0
-    np.testing.assert_allclose(solid.distance(*POINTS.T)[outside], swept(solid)[outside], atol=1e-3)
+    found = solid.distance(*POINTS.T)[outside]
+    expected = swept(solid)[outside]
+    np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("solid", [Box((1.0, 0.6, 1.6), 0.1), Prism(4, 0.9, 0.5, 0.05)])

@@ -102,7 +102,8 @@ def test_pose_draws_the_histogram_of_every_mesh(root, tmp_path, drawn, capsys):
     within = np.median([chi_square(eggs[i], eggs[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
     others = np.median([chi_square(egg, ball) for egg in eggs for ball in balls])
     (row,) = re.findall(r"^egg 3 (\S+) (\S+)$", printed, re.MULTILINE)
-    assert [float(x) for x in row] == pytest.approx([within, others], abs=2e-3)
+    found = [float(x) for x in row]
+    assert found == pytest.approx([within, others], abs=2e-3)
     assert others > 3 * within
 
 
@@ -131,7 +132,8 @@ def test_topology_measures_the_change_of_the_same_pairs(open_ring, tmp_path, dra
     assert f"{len(points)} interior samples, {len(change)} pairs, 30 eigenpairs" in printed
     for limit in (3, 10, 14):
         (share,) = re.findall(rf"less than {limit} %: (\S+) %", printed)
-        assert float(share) == pytest.approx(100 * np.mean(change < limit), abs=0.2)
+        expected = pytest.approx(100 * np.mean(change < limit), abs=0.2)
+        assert float(share) == expected
     (largest,) = re.findall(r"largest change: (\S+) %", printed)
     assert float(largest) == pytest.approx(change.max(), rel=0.01)
     stiffness, mass = laplacian(after)
@@ -184,10 +186,12 @@ def test_potential_is_least_in_the_middle(tmp_path, drawn):
     assert outline == pytest.approx(1, abs=0.02)
     places = np.array([[5.0, 6.0, 7.0], [5.0, 7.5, 7.0]])
     exact = np.linalg.norm(embedding(mesh, places, 40), axis=1)
-    assert np.nanmin(found.values) == pytest.approx(exact[0], rel=0.01)
+    expected = pytest.approx(exact[0], rel=0.01)
+    assert np.nanmin(found.values) == expected
     i = int(np.argmin(np.abs(x - centre[0])))
     j = int(np.argmin(np.abs(y - centre[1] - 1.5)))
-    assert found.values[i, j] == pytest.approx(exact[1], rel=0.03)
+    expected = pytest.approx(exact[1], rel=0.03)
+    assert found.values[i, j] == expected
 
     concepts.potential(path, tmp_path / "potential.png", n_eigenpairs=40)
     panel, bar = drawn[0].axes
@@ -202,7 +206,8 @@ def test_upright_turns_without_mirroring():
     points = np.random.default_rng(0).normal(size=(200, 3)) * [1, 4, 2]
     turned = concepts.upright(points)
     frame = np.linalg.lstsq(points, turned, rcond=None)[0]
-    np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-9)
+    expected = np.eye(3)
+    np.testing.assert_allclose(frame.T @ frame, expected, atol=1e-9)
     assert np.linalg.det(frame) == pytest.approx(1)
     # The longest axis is up, and not upside down.
     assert frame[1, 1] > 0.95

@@ -183,7 +183,9 @@ def test_both_levels_are_labels(shapes, made):
         == [shape.label for shape in made]
         == [name.split("/")[0] for name in shapes.names]
     )
-    assert [shape.body for shape in made] == [body_of(name) for name in shapes.names]
+    found = [shape.body for shape in made]
+    expected = [body_of(name) for name in shapes.names]
+    assert found == expected
     assert shapes[-1].name == "octopus/01/02"
     with pytest.raises(IndexError, match="18"):
         shapes[18]
@@ -199,7 +201,8 @@ def test_the_look_alikes_can_be_left_out():
     left = {name.split("-")[0] for name in without.class_names}
     assert left == set(KINDS) - set(LOOK_ALIKE_FAMILIES)
     # What a name tells besides its number is not repeated.
-    assert len({name.rsplit("-", 1)[0] for name in without.class_names}) == 200
+    found = len({name.rsplit("-", 1)[0] for name in without.class_names})
+    assert found == 200
     assert GradedShapes(30).class_names == with_them.class_names[:30]
 
 
@@ -208,7 +211,8 @@ def test_the_other_generator_is_as_it_was():
     shapes = ArticulatedShapes(n_classes=12, n_per_class=2)
     found = [(len(shapes[i].vertices), len(shapes[i].faces)) for i in (0, 13)]
     assert found == COUNTS
-    assert np.abs(shapes[0].vertices).sum() == pytest.approx(SUM, rel=1e-9)
+    expected = pytest.approx(SUM, rel=1e-9)
+    assert np.abs(shapes[0].vertices).sum() == expected
 
 
 def test_write_makes_folders_of_classes_and_bodies(tmp_path):

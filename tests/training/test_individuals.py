@@ -46,7 +46,8 @@ def test_poses_of_individuals_are_bodies_that_names_tell_apart(shapes):
         assert surface.is_watertight
         assert surface.volume > 0
         assert 1 - surface.euler_number // 2 == made.genus
-        assert (made.name, made.body) == (shapes.names[index], body_of(made.name))
+        assert made.name == shapes.names[index]
+        assert made.body == body_of(made.name)
         assert shapes.labels[index] == made.label == made.name.split("/")[0]
     assert [individual_of(name) for name in shapes.names][::2] == [
         f"{name}/00/{one:02d}" for name in shapes.class_names for one in range(N_INDIVIDUALS)
@@ -54,7 +55,8 @@ def test_poses_of_individuals_are_bodies_that_names_tell_apart(shapes):
     assert len({body_of(name) for name in shapes.names}) == 2
     # Whatever else there is
     more = GradedShapes(3, 2, 3, seed=3, n_vertices=(1500, 1800), n_individuals=5)[7]
-    assert (more.name, made.name) == (shapes.names[5], shapes.names[11])
+    assert more.name == shapes.names[5]
+    assert made.name == shapes.names[11]
     assert np.array_equal(shapes[5].vertices, more.vertices)
 
 

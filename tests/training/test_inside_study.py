@@ -25,7 +25,9 @@ def test_values_of_all_bodies_have_the_same_histogram():
     first = random.normal(size=300)
     second = random.gamma(1.0, size=300) * 1000
     values = equal_histogram(first)
-    np.testing.assert_allclose(np.sort(values), np.sort(equal_histogram(second)))
+    found = np.sort(values)
+    expected = np.sort(equal_histogram(second))
+    np.testing.assert_allclose(found, expected)
     np.testing.assert_array_equal(values.argsort(), first.argsort())
 
 
@@ -39,4 +41,5 @@ def test_the_share_of_neighbours_is_counted_among_other_rows():
 def test_groups_are_told_apart_only_if_they_differ(shift):
     rows = np.random.default_rng(1).normal(size=(24, len(column_names(["x"]))))
     rows[12:] += shift
-    assert rejections(rows, 12, 0, has_numbers=True) == [bool(shift)] * 4
+    found = rejections(rows, 12, 0, has_numbers=True)
+    assert found == [bool(shift)] * 4

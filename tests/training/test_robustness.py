@@ -37,13 +37,16 @@ def test_the_table_holds_mean_movements_over_the_distance_between_classes(tmp_pa
     unit = np.median([b - a for a in low for b in high])
     sizes = [root_area(mesh) for mesh in meshes]
     assert name == "root" or name == ROOT
-    assert found["scale"] == pytest.approx(100 * 6 * np.mean(sizes) / unit, rel=1e-3)
+    expected = pytest.approx(100 * 6 * np.mean(sizes) / unit, rel=1e-3)
+    assert found["scale"] == expected
     assert found["motion"] == pytest.approx(0, abs=0.1)
     between_poses = [poses[1] - poses[0], poses[2] - poses[0], poses[2] - poses[1]]
-    assert found["pose"] == pytest.approx(100 * np.mean(between_poses) / unit, rel=1e-2)
+    expected = pytest.approx(100 * np.mean(between_poses) / unit, rel=1e-2)
+    assert found["pose"] == expected
     halves = [np.sqrt(DISTURBANCES["half"].apply(load_mesh(path)).area) for path in meshes]
     moved = np.mean(np.abs(np.subtract(halves, sizes)))
-    assert found["half"] == pytest.approx(100 * moved / unit, rel=0.02, abs=0.1)
+    expected = pytest.approx(100 * moved / unit, rel=0.02, abs=0.1)
+    assert found["half"] == expected
     # A hole has no area, and an egg has no gap to weld.
     assert np.isnan(found["hole"])
     assert np.isnan(found["weld"])

@@ -105,10 +105,13 @@ def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(
         torch.testing.assert_close(again, values, rtol=1e-6, atol=1e-7, msg=name)
     rows = curve(tmp_path / "whole")
     assert [row["epoch"] for row in rows] == ["0", "1", "2", "3"]
-    assert [bool(row["val_ft"]) for row in rows] == [False, True, False, True]
+    found = [bool(row["val_ft"]) for row in rows]
+    expected = [False, True, False, True]
+    assert found == expected
     for row, again in zip(rows, curve(tmp_path / "broken"), strict=True):
         numbers = {key: float(value or -1) for key, value in row.items()}
-        assert numbers == pytest.approx({key: float(value or -1) for key, value in again.items()})
+        expected = pytest.approx({key: float(value or -1) for key, value in again.items()})
+        assert numbers == expected
     assert (tmp_path / "whole" / "curve.svg").read_text().startswith("<?xml")
     assert (tmp_path / "whole" / "config.yaml").is_file()
 

@@ -44,7 +44,8 @@ def test_a_motion_turns_and_then_moves():
     turns = Rotation.random(50, rng=3)
     steps = g.normal(size=(50, 3))
     found = transform(motion(scalar_first(turns), steps), POINTS)
-    np.testing.assert_allclose(found, turns.apply(POINTS) + steps, atol=1e-13)
+    expected = turns.apply(POINTS) + steps
+    np.testing.assert_allclose(found, expected, atol=1e-13)
 
 
 def test_a_turn_about_a_point_leaves_it_where_it_is():
@@ -193,7 +194,9 @@ def test_weights_are_shares_and_follow_the_nearest_rod():
     assert (weights[:, 1] == 0.0).all()  # the other arm is nowhere near
     # Along the arm its arc length, which begins at its root 0.3 from the middle.
     middle = (z > 0.8) & (z < 1.3)
-    np.testing.assert_allclose(binding.arc_lengths[: len(z)][middle, 2], z[middle] - 0.3, atol=0.02)
+    found = binding.arc_lengths[: len(z)][middle, 2]
+    expected = z[middle] - 0.3
+    np.testing.assert_allclose(found, expected, atol=0.02)
     # From the hub to the arm the weights go over without a step.
     levels = np.unique(z)
     mean = np.array([weights[z == level, 2].mean() for level in levels])
@@ -203,7 +206,8 @@ def test_weights_are_shares_and_follow_the_nearest_rod():
 def test_trunks_bend_and_frames_do_not():
     """A wheel without limbs has no joint at all; the trunk of a four-legged animal is a rod, its legs too."""
     wheel = KINDS["wheel"].build(np.random.default_rng(0), 4, 3, "none", "plain")
-    assert all(len(rod.arc_lengths) == 1 for rod in limb_rig(bones_at_rest(wheel, {})).rods)
+    for rod in limb_rig(bones_at_rest(wheel, {})).rods:
+        assert len(rod.arc_lengths) == 1
     rods = limb_rig(bones_at_rest(TEMPLATES["quadruped"](), {})).rods
     assert len(rods[0].joints) == 1  # the spine
     knees = [rod for rod in rods if len(rod.joints) == 2 and not rod.joints[1].is_root]

@@ -26,7 +26,9 @@ def test_a_page_shows_what_was_measured(page):
 
 
 def test_every_result_is_shown():
-    assert {path.stem for path in tables.RESULTS.glob("*.json")} == {name for _, name in SHOWN}
+    found = {path.stem for path in tables.RESULTS.glob("*.json")}
+    expected = {name for _, name in SHOWN}
+    assert found == expected
 
 
 def test_results_become_a_table_of_a_page(tmp_path, monkeypatch):

@@ -29,4 +29,7 @@ def test_a_threshold_may_be_as_large_as_the_rate_allows():
     found = threshold_at([1.0, 2.0, 7.5], np.arange(5.0, 15.0), 0.1)
     assert found.distance == pytest.approx(6.0)
     assert found.distance < 6.0
-    assert (found.n_false, found.n_other, found.n_found, found.n_same) == (1, 10, 2, 3)
+    assert found.n_false == 1
+    assert found.n_other == 10
+    assert found.n_found == 2
+    assert found.n_same == 3

@@ -160,7 +160,8 @@ def test_pretraining_saves_a_metric_and_measures_it(root, tmp_path, monkeypatch,
         root / "meshes", cache_dir=root / "cache", descriptor=pretrained()
     )
     lengths = igps.describe(dataset, pretrained(out)).norm(dim=1)
-    torch.testing.assert_close(lengths, torch.ones(len(lengths)), atol=1e-4, rtol=0)
+    expected = torch.ones(len(lengths))
+    torch.testing.assert_close(lengths, expected, atol=1e-4, rtol=0)
     assert "2 parts of the families" in printed
     assert re.search(r"shape_dna +body NN \d+\.\d FT \d+\.\d ± \d+\.\d", printed)
     assert re.search(r"shape_dna +individual NN \d+\.\d FT \d+\.\d ± \d+\.\d", printed)

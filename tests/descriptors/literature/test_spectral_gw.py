@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -14,11 +12,10 @@ from igps.descriptors.literature.spectral_gw import (
     quantiles,
     time_weight,
 )
-from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
 
-def with_surface(signature: Signature, points: np.ndarray, eigenfunctions: np.ndarray) -> Signature:
+def with_surface(signature, points, eigenfunctions):
     return Signature(
         signature.eigenvalues,
         signature.interior,
@@ -30,19 +27,19 @@ def with_surface(signature: Signature, points: np.ndarray, eigenfunctions: np.nd
 
 
 @pytest.fixture(scope="module")
-def round_signature(sphere: Mesh) -> Signature:
+def round_signature(sphere):
     config = SignatureConfig(n_eigenpairs=120, n_surface_samples=400, resolution=12, min_samples=0)
     return compute_signature(sphere, config)
 
 
 @pytest.fixture(scope="module")
-def blob_signature(blob: Mesh) -> Signature:
+def blob_signature(blob):
     return compute_signature(
         blob, SignatureConfig(n_eigenpairs=100, n_surface_samples=400, resolution=12, min_samples=0)
     )
 
 
-def sphere_kernel(cosine: np.ndarray, time: float) -> np.ndarray:
+def sphere_kernel(cosine, time):
     """4π k of the unit sphere: Σ (2l + 1) exp(−l (l + 1) t) Pₗ(cos θ), time in units of A/8π = ½."""
     total = np.zeros_like(cosine)
     for degree in range(30):
@@ -149,7 +146,7 @@ def test_few_samples_and_the_draw(blob_signature):
 
 
 def test_parameters_are_checked(blob_signature):
-    wrong: list[dict] = [  # type: ignore[type-arg]
+    wrong = [
         {"times": ()},
         {"times": (1.0, 0.0)},
         {"times": (np.nan,)},

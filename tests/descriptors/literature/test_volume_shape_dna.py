@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
@@ -16,18 +14,18 @@ from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 
 
-def cube_frequencies(n: int) -> list[tuple[int, ...]]:
+def cube_frequencies(n):
     triples = sorted(product(range(1, 9), repeat=3), key=lambda t: sum(i * i for i in t))
     return triples[:n]
 
 
-def ball_eigenvalues(n: int) -> np.ndarray:
+def ball_eigenvalues(n):
     """Squared zeros of the spherical Bessel functions, times the unit ball's volume^(2/3)."""
-    values: list[float] = []
+    values = []
     x = np.linspace(0.05, 12, 2000)
     for degree in range(12):
 
-        def radial(r: float, degree: int = degree) -> float:
+        def radial(r, degree=degree):
             return float(spherical_jn(degree, r))
 
         y = np.array([radial(r) for r in x])
@@ -44,8 +42,6 @@ def test_cube_has_the_spectrum_of_its_grid_with_all_multiplets():
     np.testing.assert_allclose(spectrum, expected, rtol=1e-6)
 
 
-
-
 def test_ball_tends_to_zeros_of_bessel_functions():
     exact = ball_eigenvalues(30)
     ball = as_mesh(trimesh.creation.icosphere(subdivisions=4))
@@ -55,8 +51,6 @@ def test_ball_tends_to_zeros_of_bessel_functions():
     assert measured > 1.8
 
 
-
-
 def test_walls_lie_between_the_cells_where_the_surface_is():
     # Walls half a cell beyond the last centre inside, as in a body of whole voxels, would be wrong by more than 1 %.
     cube = trimesh.creation.box((1, 1, 1))
@@ -64,16 +58,16 @@ def test_walls_lie_between_the_cells_where_the_surface_is():
     for _ in range(4):
         turn, _ = np.linalg.qr(generator.standard_normal((3, 3)))
         first = volume_spectrum(Mesh(np.asarray(cube.vertices) @ turn, cube.faces), 1, 4000)
-        assert first[0] == pytest.approx(3 * np.pi**2, rel=0.006)
-
-
+        expected = pytest.approx(3 * np.pi**2, rel=0.006)
+        assert first[0] == expected
 
 
 def test_description_is_the_spectrum(blob):
     description = VolumeShapeDNA(n_eigenvalues=10, n_voxels=500).describe_body(of_mesh(blob))
     assert description.dtype == np.float32
     assert description.shape == (10,)
-    np.testing.assert_allclose(description, volume_spectrum(blob, 10, 500), rtol=1e-6)
+    expected = volume_spectrum(blob, 10, 500)
+    np.testing.assert_allclose(description, expected, rtol=1e-6)
 
 
 def test_distances_are_euclidean():
