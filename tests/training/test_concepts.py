@@ -1,5 +1,6 @@
 """The pictures of concepts.md show what NumPy and SciPy compute from dense matrices and exact coordinates."""
 
+import itertools
 import re
 
 import numpy as np
@@ -92,18 +93,17 @@ def test_pose_draws_the_histogram_of_every_mesh(root, tmp_path, drawn, capsys):
     assert "%" in axes.get_ylabel()
 
     dataset = SignatureDataset(root, CONFIG, cache)
-    names = ["egg/0.off", "egg/1.off", "egg/2.off", "ball/0.off", "ball/1.off"]
-    expected = [histogram(dataset, name) for name in names]
-    for line, curve in zip(lines, expected, strict=True):
-        np.testing.assert_allclose(line.get_xdata(), (np.arange(64) + 0.5) / 16, rtol=1e-6)
+    eggs = [histogram(dataset, f"egg/{i}.off") for i in range(3)]
+    balls = [histogram(dataset, f"ball/{i}.off") for i in range(2)]
+    centres = (np.arange(64) + 0.5) / 16
+    for line, curve in zip(lines, eggs + balls, strict=True):
+        np.testing.assert_allclose(line.get_xdata(), centres, rtol=1e-6)
         np.testing.assert_allclose(line.get_ydata(), 100 * curve, atol=0.02)
-    eggs = expected[:3]
-    balls = expected[3:]
-    within = np.median([chi_square(eggs[i], eggs[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
-    others = np.median([chi_square(egg, ball) for egg in eggs for ball in balls])
+    within = np.median([chi_square(*pair) for pair in itertools.combinations(eggs, 2)])
+    others = np.median([chi_square(*pair) for pair in itertools.product(eggs, balls)])
     (row,) = re.findall(r"^egg 3 (\S+) (\S+)$", printed, re.MULTILINE)
-    found = [float(x) for x in row]
-    assert found == pytest.approx([within, others], abs=2e-3)
+    assert float(row[0]) == pytest.approx(within, abs=2e-3)
+    assert float(row[1]) == pytest.approx(others, abs=2e-3)
     assert others > 3 * within
 
 
@@ -148,12 +148,13 @@ def test_topology_measures_the_change_of_the_same_pairs(open_ring, tmp_path, dra
     assert sum(heights) == pytest.approx(100)
     assert left.get_yscale() == "log"
     assert "(%)" in left.get_xlabel()
-    is_orange = [
-        part.get_facecolor()[0, 0] > 2 * part.get_facecolor()[0, 2] for part in right.collections
-    ]
-    n_paths = [len(part.get_paths()) for part in right.collections]
-    assert np.dot(n_paths, is_orange) == TUBE_FACES
-    assert sum(n_paths) > 2 * TUBE_FACES
+    n_orange = n_drawn = 0
+    for part in right.collections:
+        red, _, blue, _ = part.get_facecolor()[0]
+        n_drawn += len(part.get_paths())
+        n_orange += len(part.get_paths()) * (red > 2 * blue)
+    assert n_orange == TUBE_FACES
+    assert n_drawn > 2 * TUBE_FACES
     assert middle.get_title()
     assert imread(out).std() > 0.05
 

@@ -25,13 +25,14 @@ def tried_one_by_one(vertices, faces):
             continue
         a = vertices[faces[i]]
         b = vertices[faces[j]]
-        sides = [(x[k], x[(k + 1) % 3], y) for x, y in ((a, b), (b, a)) for k in range(3)]
-        if any(passes(*side) for side in sides):
-            found.add((i, j))
+        for k in range(3):
+            following = (k + 1) % 3
+            if passes(a[k], a[following], b) or passes(b[k], b[following], a):
+                found.add((i, j))
     return found
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_all_crossings_are_found(seed):
     g = np.random.default_rng(seed)
     vertices = g.normal(size=(90, 3))
@@ -47,6 +48,5 @@ def test_two_balls():
     ball = trimesh.creation.icosphere(2)
     for gap, crossed in ((2.1, False), (1.5, True)):
         both = trimesh.util.concatenate([ball, ball.copy().apply_translation([gap, 0.013, 0.007])])
-        assert (
-            bool(len(crossing_faces(np.asarray(both.vertices), np.asarray(both.faces)))) == crossed
-        )
+        found = crossing_faces(np.asarray(both.vertices), np.asarray(both.faces))
+        assert bool(len(found)) == crossed

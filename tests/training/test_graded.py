@@ -1,10 +1,12 @@
 """Graded shapes: two levels of labels, one surface a body, and meshes that need no mending."""
 
 import pickle
+import re
 
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.distance import pdist
 from training.shapes import GradedShapes, body_of
 from training.shapes.bodies import draw_body, draw_pose
 from training.shapes.kinds import KINDS, LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, body_classes
@@ -72,7 +74,8 @@ def test_a_pose_is_nearly_isometric_to_the_surface_at_rest(poses):
     area = []
     volume = []
     for pose in poses.values():
-        rest, bent = (trimesh.Trimesh(v, pose.faces, process=False) for v in (pose.rest, pose.bent))
+        rest = trimesh.Trimesh(pose.rest, pose.faces, process=False)
+        bent = trimesh.Trimesh(pose.bent, pose.faces, process=False)
         area.append(abs(bent.area / rest.area - 1))
         volume.append(abs(bent.volume / rest.volume - 1))
     assert np.median(area) < 0.01
@@ -86,15 +89,15 @@ def test_animals_bend_and_things_do_not(poses):
 
     def change(pose):
         some = np.random.default_rng(0).choice(len(pose.rest), 300, replace=False)
-        rest, bent = (
-            np.linalg.norm(v[some, None] - v[None, some], axis=2) for v in (pose.rest, pose.bent)
-        )
+        rest = pdist(pose.rest[some])
+        bent = pdist(pose.bent[some])
         return float(np.abs(rest - bent).max() / rest.max())
 
     for kind in ("mug", "chair", "vessel", "table", "stack", "machine"):
         np.testing.assert_array_equal(poses[kind].bent, poses[kind].rest)
-    assert min(change(poses[kind]) for kind in BENDING) > 0.005  # some poses are nearly at rest
-    assert np.median([change(poses[kind]) for kind in BENDING]) > 0.15
+    changes = [change(poses[kind]) for kind in BENDING]
+    assert min(changes) > 0.005  # some poses are nearly at rest
+    assert np.median(changes) > 0.15
 
 
 def test_every_sheet_has_the_holes_that_its_name_tells():
@@ -102,14 +105,10 @@ def test_every_sheet_has_the_holes_that_its_name_tells():
     for outline in SHEETS:
         without, *others = (sheet(np.random.default_rng(3), outline, n).genus for n in (0, 1, 2, 4))
         assert others == [without + 1, without + 2, without + 4]
-    stars = [
-        i
-        for i, one in enumerate(CLASSES)
-        if one.name.startswith("sheet-star-") and "-0-" not in one.name
-    ]
+    stars = [one for one in CLASSES if re.match("sheet-star-(?!0-)", one.name)]
     assert len(stars) == 3
-    for i in stars:
-        draw_body(CLASSES[i], [0, i], [1, i])  # its surface has that genus, or there is none
+    for i, star in enumerate(stars):
+        draw_body(star, [0, i], [1, i])  # its surface has that genus, or there is none
 
 
 def test_a_body_that_cannot_be_made_is_tried_once(monkeypatch):
@@ -146,46 +145,31 @@ def test_poses_differ_in_triangles_and_bodies_in_compactness(made):
     compactness = {}
     for shape in made:
         surface = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
-        compactness.setdefault(shape.body, []).append(
-            float(np.log(surface.area**1.5 / surface.volume))
-        )
+        compactness.setdefault(shape.body, []).append(np.log(surface.area**1.5 / surface.volume))
     within = max(np.ptp(values) for values in compactness.values())
-    bodies = {body: np.mean(values) for body, values in compactness.items()}
-    between = [
-        abs(bodies[f"{name}/00"] - bodies[f"{name}/01"])
-        for name in {body.split("/")[0] for body in bodies}
-    ]
+    bodies = np.array([np.mean(values) for values in compactness.values()])
+    between = np.abs(bodies[::2] - bodies[1::2])  # two bodies of each class
     assert within < 0.1, (within, between)
     assert max(between) > 0.1
 
 
 def test_same_seed_same_arrays_other_seed_others(made):
     """A shape depends neither on those made before nor on how many classes, bodies and poses there are."""
-    for index, shape in ((17, made[17]), (4, made[4])):
-        body_class, rest = divmod(index, 6)
-        body, pose = divmod(rest, 3)
-        more = GradedShapes(5, 4, 7, seed=2, n_vertices=N_VERTICES)
-        again = more[(body_class * 4 + body) * 7 + pose]
-        assert again.name == shape.name
-        np.testing.assert_array_equal(again.vertices, shape.vertices)
-        np.testing.assert_array_equal(again.faces, shape.faces)
+    more = GradedShapes(5, 4, 7, seed=2, n_vertices=N_VERTICES)
+    again = more[more.names.index(made[17].name)]
+    np.testing.assert_array_equal(again.vertices, made[17].vertices)
+    np.testing.assert_array_equal(again.faces, made[17].faces)
     other = GradedShapes(3, 2, 3, seed=3, n_vertices=N_VERTICES)[4]
-    assert other.vertices.shape != made[4].vertices.shape or not np.allclose(
-        other.vertices, made[4].vertices
-    )
+    assert not np.array_equal(other.vertices, made[4].vertices)
 
 
 def test_both_levels_are_labels(shapes, made):
     assert len(shapes) == len(made) == 18
     assert shapes.names[:4] == ["biped/00/00", "biped/00/01", "biped/00/02", "biped/01/00"]
-    assert (
-        shapes.labels
-        == [shape.label for shape in made]
-        == [name.split("/")[0] for name in shapes.names]
-    )
-    found = [shape.body for shape in made]
-    expected = [body_of(name) for name in shapes.names]
-    assert found == expected
+    for i, shape in enumerate(made):
+        assert shape.name == shapes.names[i]
+        assert shape.label == shapes.labels[i] == shape.name.split("/")[0]
+        assert shape.body == body_of(shape.name) == shape.name.rsplit("/", 1)[0]
     assert shapes[-1].name == "octopus/01/02"
     with pytest.raises(IndexError, match="18"):
         shapes[18]
@@ -221,25 +205,18 @@ def test_write_makes_folders_of_classes_and_bodies(tmp_path):
     files = find_bodies(tmp_path)
     assert files.names == tuple(f"{name}.off" for name in shapes.names)
     assert files.labels == tuple(shapes.labels)
-    assert [body_of(name) for name in files.names] == [
-        "biped/00",
-        "biped/00",
-        "biped/01",
-        "biped/01",
-    ]
+    bodies = [body_of(name) for name in files.names]
+    assert bodies == ["biped/00", "biped/00", "biped/01", "biped/01"]
     read = trimesh.load(files.paths[3], process=False)
     np.testing.assert_array_equal(read.vertices, shapes[3].vertices)
 
-    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files.paths}
-    files.paths[1].write_bytes(before[files.paths[1]][0][:4000])  # as a full disk would leave it
+    before = [path.read_bytes() for path in files.paths]
+    times = [path.stat().st_mtime_ns for path in files.paths]
+    files.paths[1].write_bytes(before[1][:4000])  # as a full disk would leave it
     shapes.write(tmp_path)
-    assert all(path.read_bytes() == before[path][0] for path in files.paths)
-    assert [path.stat().st_mtime_ns == before[path][1] for path in files.paths] == [
-        True,
-        False,
-        True,
-        True,
-    ]
+    assert [path.read_bytes() for path in files.paths] == before
+    assert files.paths[0].stat().st_mtime_ns == times[0]
+    assert files.paths[1].stat().st_mtime_ns > times[1]
     with pytest.raises(ValueError, match="root="):
         GradedShapes(1, 2, 2, seed=5, n_vertices=(1600, 2000)).write(tmp_path)
 
@@ -251,20 +228,20 @@ def test_it_travels_to_other_processes(shapes, made):
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("name", "value"),
     [
-        {"n_classes": 0},
-        {"n_bodies": 0},
-        {"n_poses": 0},
-        {"seed": -1},
-        {"n_vertices": (100, 200)},
-        {"n_vertices": (4000, 3000)},
-        {"n_classes": 100_000},
+        ("n_classes", 0),
+        ("n_classes", 100_000),
+        ("n_bodies", 0),
+        ("n_poses", 0),
+        ("seed", -1),
+        ("n_vertices", (100, 200)),
+        ("n_vertices", (4000, 3000)),
     ],
 )
-def test_arguments_out_of_range_are_named(arguments):
-    with pytest.raises(ValueError, match=next(iter(arguments))):
-        GradedShapes(**arguments)
+def test_arguments_out_of_range_are_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        GradedShapes(**{name: value})
 
 
 def counted_volume(solid):
@@ -295,12 +272,8 @@ def test_a_helix_has_its_volume():
     assert counted_volume(helix) == pytest.approx(expected, rel=0.03)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_genus_of_outlines_and_machine_parts_is_at_least_that_of_their_holes(seed):
-    for position, outline in enumerate(SHEETS):
-        skeleton = sheet(np.random.default_rng([seed, position]), outline, position % 3)
-        assert skeleton.genus >= position % 3
+def test_a_machine_part_with_an_ear_has_a_hole():
     for kind in MACHINES:
         for extra in ("plain", "collar", "shaft", "ear", "pins"):
-            part = machine(np.random.default_rng(seed), kind, extra, 3)
+            part = machine(np.random.default_rng(0), kind, extra, 3)
             assert part.genus >= (extra == "ear"), (kind, extra)

@@ -13,16 +13,14 @@ SHOWN = [(page, name) for page, text in sorted(PAGES.items()) for name in tables
 
 @pytest.mark.parametrize(("page", "name"), SHOWN)
 def test_a_table_is_of_the_signatures_of_today(page, name):
-    assert tables.load_results(name)["signatures"] == SignatureConfig.ALGORITHM_VERSION, (
-        f"{page}: measure {name} again"
-    )
+    version = tables.load_results(name)["signatures"]
+    assert version == SignatureConfig.ALGORITHM_VERSION, f"{page}: measure {name} again"
 
 
 @pytest.mark.parametrize("page", sorted({page for page, _ in SHOWN}))
 def test_a_page_shows_what_was_measured(page):
-    assert tables.with_tables(PAGES[page]) == PAGES[page], (
-        "write it by python -m docs.benchmarks.tables"
-    )
+    remedy = "write it by python -m docs.benchmarks.tables"
+    assert tables.with_tables(PAGES[page]) == PAGES[page], remedy
 
 
 def test_every_result_is_shown():
@@ -36,16 +34,9 @@ def test_results_become_a_table_of_a_page(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "RESULTS", tmp_path / "results")
     page = tmp_path / "page.md"
     page.write_text("# Title\n\n<!-- results: mine -->\nold\n<!-- end of results -->\n\nrest\n")
-    row = {
-        "descriptor": "d2",
-        "nn": 0.5,
-        "ft": 0.25,
-        "st": 1,
-        "dcg": 0,
-        "adr_self": 0.1234,
-        "map": None,
-    }
-    (tmp_path / "compare.json").write_text(json.dumps([{**row, "seconds_per_mesh": 0.042}]))
+    row = {"descriptor": "d2", "nn": 0.5, "ft": 0.25, "st": 1, "dcg": 0, "adr_self": 0.1234}
+    row |= {"map": None, "seconds_per_mesh": 0.042}
+    (tmp_path / "compare.json").write_text(json.dumps([row]))
     tables.record("mine", "scores", tmp_path, "igps compare ROOT")
     lines = page.read_text("utf-8").splitlines()
     assert "| descriptor | NN | FT | ST | DCG | ADR self | mAP | s/body |" in lines

@@ -17,7 +17,6 @@ from training.train import CONFIG
 import igps
 from igps.data.splits import split_seen, split_unseen
 from igps.descriptors.pretrained.descriptor import pretrained
-from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.retrieval import chi_square, retrieval_scores
 from igps.shapes import ArticulatedShapes
@@ -70,7 +69,6 @@ def test_splits_are_scored_as_by_the_librarys_parts(root, name, protocol, capsys
     table = capsys.readouterr().out
     assert f"{name}, {protocol}, n_train={n_train}, seeds (100, 101)" in table
     module = igps.descriptor(name)
-    assert isinstance(module, igps.HistogramDescriptor)
     dataset = igps.SignatureDataset(root / "meshes", descriptor=module, cache_dir=root / "cache")
     labels = dataset.labels
     histograms = igps.describe(dataset, module).flatten(1)
@@ -98,7 +96,6 @@ def test_a_metric_is_the_prior_of_the_heads(root, capsys):
     printed = scores_by_row(capsys.readouterr().out)
     assert list(printed) == ["none", "prior", "whitened", "kernel"]
     module = igps.descriptor("pretrained")
-    assert isinstance(module, EmbeddedDescriptor)
     dataset = igps.SignatureDataset(root / "meshes", descriptor=module, cache_dir=root / "cache")
     labels = dataset.labels
     vectors = igps.describe(dataset, module)
@@ -116,8 +113,9 @@ def test_a_metric_is_the_prior_of_the_heads(root, capsys):
     }
     for name, distances in by_row.items():
         means = printed[name][::2]
+        deviations = printed[name][1::2]
         assert means == pytest.approx(percents(distances, labels[test]), abs=0.06), name
-        assert printed[name][1::2] == [0] * len(COLUMNS)
+        assert not any(deviations)
 
 
 class QuickShapes(GradedShapes):

@@ -69,20 +69,17 @@ def in_two_processes(work):
 
 def test_scores_on_two_processes_are_those_on_one(module, tmp_path):
     seed_everything(3, verbose=False)
-    bins = PairHistogram(
-        [Potential(2, learnable=True), InteriorDistance(16, learnable=True)], SpectralEmbedding()
-    )
-    model = RetrievalLearner(
-        HistogramDescriptor(bins), BlendedDistance(ProjectionHead(width=8, n_hidden=16))
-    )
+    axes = [Potential(2, learnable=True), InteriorDistance(16, learnable=True)]
+    descriptor = HistogramDescriptor(PairHistogram(axes, SpectralEmbedding()))
+    distance = BlendedDistance(ProjectionHead(width=8, n_hidden=16))
+    model = RetrievalLearner(descriptor, distance)
     before = {name: value.clone() for name, value in model.state_dict().items()}
 
     two = trainer(2, tmp_path)
     in_two_processes(lambda: two.fit(model, module))
     trained = {name: float(value) for name, value in two.callback_metrics.items()}
-    moved = [
-        name for name, value in model.state_dict().items() if not torch.equal(value, before[name])
-    ]
+    after = model.state_dict()
+    moved = [name for name in after if not torch.equal(after[name], before[name])]
     assert any("head.layers" in name for name in moved)
     # Bins move by gradients alone, of which there are none where a process has one shape of each class.
     assert any("centres" in name for name in moved)
@@ -93,9 +90,8 @@ def test_scores_on_two_processes_are_those_on_one(module, tmp_path):
     assert {name: trained[name] for name in validated} == pytest.approx(validated, abs=1e-6)
 
     (tested,) = one.test(model, module, verbose=False)
-    (tested_by_two,) = in_two_processes(
-        lambda: trainer(2, tmp_path).test(model, module, verbose=False)
-    )
+    two = trainer(2, tmp_path)
+    (tested_by_two,) = in_two_processes(lambda: two.test(model, module, verbose=False))
     assert tested_by_two == pytest.approx(tested, abs=1e-6)
 
     # The same without Lightning, over the nine shapes.
@@ -106,9 +102,8 @@ def test_scores_on_two_processes_are_those_on_one(module, tmp_path):
         distances = model.distances(found, found)
     assert len(part) == 9
     expected = retrieval_scores(distances, part.labels).mean()
-    assert tested == pytest.approx(
-        {f"test_{name}": value for name, value in expected.items()}, abs=1e-6
-    )
+    by_name = {f"test_{name}": value for name, value in expected.items()}
+    assert tested == pytest.approx(by_name, abs=1e-6)
     # A shape that counted twice would have been told by the scores.
     dealt = [*range(9), 0]
     twice = retrieval_scores(distances[dealt][:, dealt], part.labels[dealt]).mean()
