@@ -35,11 +35,9 @@ def _samples(generator):
     for i, n in enumerate(N_EIGENPAIRS):
         functions[i, :, n:] = 0
     points = torch.rand(2, longest, 3, generator=generator) * mask[:, :, None]
-    attributes = {
-        "depth": torch.rand(2, longest, generator=generator) * mask,
-        "surface_direction": normalize(torch.randn(2, longest, 3, generator=generator), dim=2)
-        * mask[:, :, None],
-    }
+    depths = torch.rand(2, longest, generator=generator) * mask
+    directions = normalize(torch.randn(2, longest, 3, generator=generator), dim=2)
+    attributes = {"depth": depths, "surface_direction": directions * mask[:, :, None]}
     return SampleBatch(points, functions, mask, attributes)
 
 
@@ -90,9 +88,8 @@ def embedded(batch, i, kind="interior", n_eigenpairs=None):
     """(P, K) commute time embedding of one shape's samples, φₖ/√λₖ, float64, by its definition."""
     samples = getattr(batch, kind)
     eigenvalues = batch.eigenvalues[i, torch.isfinite(batch.eigenvalues[i])][:n_eigenpairs]
-    return (
-        samples.eigenfunctions[i, samples.mask[i], : len(eigenvalues)].double() / eigenvalues.sqrt()
-    )
+    functions = samples.eigenfunctions[i, samples.mask[i], : len(eigenvalues)]
+    return functions.double() / eigenvalues.sqrt()
 
 
 def batch_of(embedding, mask=None, points=None, attributes=None):
@@ -101,17 +98,11 @@ def batch_of(embedding, mask=None, points=None, attributes=None):
     All that is given is as it is, gradients and padding included; the surface samples are the interior ones.
     """
     n_shapes, n_points, dimension = embedding.shape
-    mask = (
-        torch.ones(n_shapes, n_points, dtype=torch.bool, device=embedding.device)
-        if mask is None
-        else mask
-    )
-    samples = SampleBatch(
-        torch.zeros_like(embedding[..., :3]) if points is None else points,
-        embedding,
-        mask,
-        attributes or {},
-    )
+    if mask is None:
+        mask = torch.ones(n_shapes, n_points, dtype=torch.bool, device=embedding.device)
+    if points is None:
+        points = torch.zeros_like(embedding[..., :3])
+    samples = SampleBatch(points, embedding, mask, attributes or {})
     ones = torch.ones(n_shapes, dtype=torch.float64, device=embedding.device)
     return SignatureBatch(
         eigenvalues=ones[:, None].expand(-1, dimension),
@@ -133,36 +124,22 @@ class OfTensors(nn.Module):
         self.like = like
 
     def forward(self, eigenvalues, area, volume, kinds, measures):
-        own = ("points", "eigenfunctions", "mask")
-        samples = {
-            kind: SampleBatch(
-                *(one[name] for name in own), {name: one[name] for name in one if name not in own}
-            )
-            for kind, one in kinds.items()
-        }
-        return self.descriptor(
-            replace(
-                self.like,
-                eigenvalues=eigenvalues,
-                area=area,
-                volume=volume,
-                measures=measures,
-                **samples,
-            )
-        )
+        samples = {}
+        for kind, one in kinds.items():
+            attributes = dict(one)
+            own = [attributes.pop(name) for name in ("points", "eigenfunctions", "mask")]
+            samples[kind] = SampleBatch(*own, attributes)
+        given = {"eigenvalues": eigenvalues, "area": area, "volume": volume, "measures": measures}
+        return self.descriptor(replace(self.like, **given, **samples))
 
 
 def tensors(batch):
     """What `OfTensors` takes of a batch."""
-    kinds = {
-        kind: {
-            "points": one.points,
-            "eigenfunctions": one.eigenfunctions,
-            "mask": one.mask,
-            **one.attributes,
-        }
-        for kind, one in (("interior", batch.interior), ("surface", batch.surface))
-    }
+    kinds = {}
+    for kind in ("interior", "surface"):
+        one = getattr(batch, kind)
+        own = {"points": one.points, "eigenfunctions": one.eigenfunctions, "mask": one.mask}
+        kinds[kind] = own | one.attributes
     measures = batch.area[:, None] if batch.measures is None else batch.measures
     return batch.eigenvalues, batch.area, batch.volume, kinds, measures
 
@@ -171,12 +148,9 @@ def exported(descriptor, batch):
     """The program of `OfTensors` that `torch.export` makes for any number of bodies and samples."""
     given = tensors(batch)
     some = {0: torch.export.Dim.AUTO}
-    of_samples = {
-        kind: {name: {**some, 1: torch.export.Dim.AUTO} for name in one}
-        for kind, one in given[3].items()
-    }
+    of_samples = {}
+    for kind, one in given[3].items():
+        of_samples[kind] = {name: {**some, 1: torch.export.Dim.AUTO} for name in one}
     shapes = (some, some, some, of_samples, some)
-    program = torch.export.export(
-        OfTensors(descriptor, batch), given, dynamic_shapes=shapes, strict=False
-    )
-    return program.module()
+    module = OfTensors(descriptor, batch)
+    return torch.export.export(module, given, dynamic_shapes=shapes, strict=False).module()

@@ -14,9 +14,8 @@ def bumpy_sphere(subdivisions, amplitude=0.3):
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     x, y, z = sphere.vertices.T
     radius = 1 + amplitude * np.sin(3 * x + 0.5) * np.cos(2 * y) + 0.2 * amplitude * z
-    return np.asarray(sphere.vertices * radius[:, None] * [1.0, 0.8, 1.3]), np.asarray(
-        sphere.faces, np.int64
-    )
+    vertices = sphere.vertices * radius[:, None] * [1.0, 0.8, 1.3]
+    return np.asarray(vertices), np.asarray(sphere.faces, np.int64)
 
 
 def cube():
@@ -39,17 +38,16 @@ def interior_points(mesh, n, seed=0):
 
 def exterior_points(mesh, n, seed=0):
     vertices, faces = mesh
-    points = np.random.default_rng(seed).uniform(
-        2 * vertices.min(0), 2 * vertices.max(0), (8 * n, 3)
-    )
+    low = 2 * vertices.min(0)
+    high = 2 * vertices.max(0)
+    points = np.random.default_rng(seed).uniform(low, high, (8 * n, 3))
     return points[igl.winding_number(vertices, faces, points) < 0.5][:n]
 
 
 def smooth_functions(vertices):
     x, y, z = vertices.T
-    return np.stack(
-        [np.sin(2 * x), np.cos(3 * y + x), x * y * z, np.exp(z), np.sin(5 * z) * x, x], axis=1
-    )
+    functions = [np.sin(2 * x), np.cos(3 * y + x), x * y * z, np.exp(z), np.sin(5 * z) * x, x]
+    return np.stack(functions, axis=1)
 
 
 def mean_value_coordinates(vertices, faces, points):

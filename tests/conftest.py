@@ -72,24 +72,22 @@ def horseshoe(half_gap=0.05, tube=0.3, n_sections=48, n_around=14):
     u = np.linspace(half_gap, 2 * np.pi - half_gap, n_sections)[:, None]
     v = np.arange(n_around)[None, :] * (2 * np.pi / n_around)
     radius = 1 + tube * jitter * np.cos(v)
-    ring = np.stack(
-        [radius * np.cos(u), radius * np.sin(u), tube * jitter * np.sin(v)], axis=2
-    ).reshape(-1, 3)
+    ring = np.stack([radius * np.cos(u), radius * np.sin(u), tube * jitter * np.sin(v)], axis=2)
+    ring = ring.reshape(-1, 3)
     ends = np.stack([np.cos(u[[0, -1], 0]), np.sin(u[[0, -1], 0]), np.zeros(2)], axis=1)
     i, j = np.mgrid[: n_sections - 1, :n_around]
     a = i * n_around + j
     b = i * n_around + (j + 1) % n_around
-    sides = [
-        np.stack([a, a + n_around, b], axis=-1),
-        np.stack([b, a + n_around, b + n_around], axis=-1),
-    ]
+    lower = np.stack([a, a + n_around, b], axis=-1)
+    upper = np.stack([b, a + n_around, b + n_around], axis=-1)
     here = np.arange(n_around)
     there = (here + 1) % n_around
     last = (n_sections - 1) * n_around
     n = n_sections * n_around
-    caps = [np.stack([here, there, np.full(n_around, n)], axis=1)]
-    caps.append(np.stack([last + there, last + here, np.full(n_around, n + 1)], axis=1))
-    faces = np.concatenate([part.reshape(-1, 3) for part in (*sides, *caps)])
+    first_cap = np.stack([here, there, np.full(n_around, n)], axis=1)
+    last_cap = np.stack([last + there, last + here, np.full(n_around, n + 1)], axis=1)
+    parts = (lower, upper, first_cap, last_cap)
+    faces = np.concatenate([part.reshape(-1, 3) for part in parts])
     return Mesh(np.concatenate([ring, ends]), faces, name="horseshoe")
 
 
@@ -100,9 +98,8 @@ def with_slivers(vertices, faces, n_slivers):
     new = len(vertices) + np.arange(n_slivers)
     a, b, c = faces[split].T
     thirds = [np.stack(corners, axis=1) for corners in ((a, b, new), (b, c, new), (c, a, new))]
-    return np.concatenate([vertices, inside]), np.concatenate(
-        [np.delete(faces, split, axis=0), *thirds]
-    )
+    kept = np.delete(faces, split, axis=0)
+    return np.concatenate([vertices, inside]), np.concatenate([kept, *thirds])
 
 
 def surface_genus(mesh):
@@ -142,7 +139,5 @@ def blob():
 def homer():
     path = SHARED / "data" / "homer.obj"
     if not path.is_file():
-        pytest.skip(
-            "the Homer model is not distributed with the project (expected in ../shared/data)"
-        )
+        pytest.skip("the Homer model is not distributed with the project: ../shared/data")
     return load_mesh(path)

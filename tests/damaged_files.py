@@ -24,12 +24,9 @@ def write_clean(path, width=1.0, height=1.0):
 def write_soup(path, width=1.0, height=1.0):
     """Every triangle with its own corners, as STL files have them."""
     body = ball(width, height)
-    return _written(
-        path,
-        trimesh.Trimesh(
-            body.vertices[body.faces.ravel()], np.arange(3 * N_FACES).reshape(-1, 3), process=False
-        ),
-    )
+    corners = body.vertices[body.faces.ravel()]
+    faces = np.arange(3 * N_FACES).reshape(-1, 3)
+    return _written(path, trimesh.Trimesh(corners, faces, process=False))
 
 
 def write_holed(path, width=1.0, height=1.0):
@@ -82,9 +79,8 @@ def write_unusable(folder):
 def without_collada(monkeypatch):
     """What trimesh knows of COLLADA files where pycollada is not installed, wherever these tests run."""
     error = ModuleNotFoundError("No module named 'collada'")
-    monkeypatch.setitem(
-        trimesh.exchange.load.mesh_loaders, "dae", trimesh.exceptions.ExceptionWrapper(error)
-    )
+    absent = trimesh.exceptions.ExceptionWrapper(error)
+    monkeypatch.setitem(trimesh.exchange.load.mesh_loaders, "dae", absent)
 
 
 def free_edges(path):

@@ -45,12 +45,9 @@ def write_vtu(path):
 
 def write_gifti(path):
     mesh = ball()
-    points = nibabel.gifti.GiftiDataArray(
-        mesh.vertices.astype(np.float32), "NIFTI_INTENT_POINTSET", "NIFTI_TYPE_FLOAT32"
-    )
-    triangles = nibabel.gifti.GiftiDataArray(
-        mesh.faces.astype(np.int32), "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32"
-    )
+    array = nibabel.gifti.GiftiDataArray
+    points = array(mesh.vertices.astype("f4"), "NIFTI_INTENT_POINTSET", "NIFTI_TYPE_FLOAT32")
+    triangles = array(mesh.faces.astype("i4"), "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32")
     nibabel.GiftiImage(darrays=[points, triangles]).to_filename(path)
 
 

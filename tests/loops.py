@@ -1,13 +1,10 @@
 """Histograms by their definition: one pair of points, one dimension at a time."""
 
 import math
-from collections.abc import Sequence
 from functools import reduce
 from itertools import combinations_with_replacement
 
 import numpy as np
-
-Axis = tuple[np.ndarray, Sequence[float]]
 
 
 def hat(value, centres):
@@ -31,9 +28,8 @@ def equal_bins(n, reach):
 
 def hard_classes(values, edges):
     """(P, C) one-hot rows: how many of the edges between classes a value has reached."""
-    return np.array(
-        [np.eye(len(edges) + 1)[sum(float(value) >= edge for edge in edges)] for value in values]
-    )
+    numbers = [sum(float(value) >= edge for edge in edges) for value in values]
+    return np.eye(len(edges) + 1)[numbers]
 
 
 def soft_classes(values, centres):
@@ -86,10 +82,8 @@ def pair_histogram_by_loops(memberships, axes):
     n_pairs = 0
     for i in range(len(m)):
         for j in range(i):
-            share = reduce(
-                np.multiply.outer,
-                [np.array(hat(values[i, j], centres)) for values, centres in axes],
-            )
+            shares = [np.array(hat(values[i, j], centres)) for values, centres in axes]
+            share = reduce(np.multiply.outer, shares)
             for row, (a, b) in enumerate(rows):
                 weight = m[i, a] * m[j, b] + (m[i, b] * m[j, a] if a != b else 0)
                 if weight:

@@ -29,9 +29,8 @@ def main():
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        subprocess.run(
-            [sys.executable, "-m", "build", "--outdir", folder / "dist", PROJECT], check=True
-        )
+        build = [sys.executable, "-m", "build", "--outdir", folder / "dist", PROJECT]
+        subprocess.run(build, check=True)
         (wheel,) = (folder / "dist").glob("*.whl")
         (source,) = (folder / "dist").glob("*.tar.gz")
         # Lightning needs a setuptools that still has pkg_resources in its lowest versions
@@ -41,19 +40,11 @@ def main():
             venv.create(place, with_pip=True)
             python = str(place / "bin" / "python")
             (folder / "constraints.txt").write_text("\n".join(constraints))
-            command = [
-                python,
-                "-m",
-                "pip",
-                "install",
-                "--quiet",
-                "--constraint",
-                folder / "constraints.txt",
-                archive,
-            ]
-            subprocess.run(
-                [*command, *(["setuptools<81"] if which == "lowest" else [])], check=True
-            )
+            command = [python, "-m", "pip", "install", "--quiet", "--constraint"]
+            command += [folder / "constraints.txt", archive]
+            if which == "lowest":
+                command.append("setuptools<81")
+            subprocess.run(command, check=True)
             smoke = [python, PROJECT / "tests" / "smoke.py", project["version"], place]
             subprocess.run(smoke, check=True, cwd=folder)
             print(f"{which} versions, {archive.name}: works")

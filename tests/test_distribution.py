@@ -57,28 +57,15 @@ def test_the_installed_wheel_works(archives, tmp_path):
     if not python.exists():
         pytest.skip("knows only the layout of environments on Unix")
     (there,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-build-isolation",
-        "--no-index",
-    ]
-    subprocess.run([*command, "--target", str(there), str(archives[0])], check=True)
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
+    command += ["--no-build-isolation", "--target", str(there), str(archives[0])]
+    subprocess.run(command, check=True)
     borrowed = [path for path in sys.path if path.endswith("site-packages")]
     # Only their modules: pth files, such as that of an editable install of this very tree, are not read
-    environment = {
-        "PYTHONPATH": ":".join([str(there), *borrowed]),
-        "OMP_NUM_THREADS": "1",
-        "PATH": "/usr/bin:/bin",
-    }
+    environment = {"PYTHONPATH": ":".join([str(there), *borrowed]), "PATH": "/usr/bin:/bin"}
+    environment["OMP_NUM_THREADS"] = "1"
     command = [str(python), str(SMOKE), VERSION, str(there)]
-    done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
-    )
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "works"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import contextlib
 import json
 import os
 import pydoc
@@ -45,9 +44,8 @@ class Block:
 
 
 def blocks(page):
-    found = re.findall(
-        r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```', TEXT[page], flags=re.DOTALL | re.MULTILINE
-    )
+    fence = r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```'
+    found = re.findall(fence, TEXT[page], flags=re.DOTALL | re.MULTILINE)
     return [Block(language, title or None, text) for language, title, text in found]
 
 
@@ -59,9 +57,7 @@ def run(folder, *arguments):
     paths = [str(PROJECT / "src"), str(folder), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *arguments]
-    done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, check=False, env=environment
-    )
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -113,10 +109,25 @@ def first_tier(distances, labels):
 
 
 def histograms_by_loops(dataset):
-    signatures = [dataset[i].signature for i in range(len(dataset))]
-    return [
-        paper_histogram(one.interior.eigenfunctions, one.eigenvalues).ravel() for one in signatures
-    ]
+    histograms = []
+    for item in dataset:
+        samples = item.signature.interior
+        found = paper_histogram(samples.eigenfunctions, item.signature.eigenvalues)
+        histograms.append(found.ravel())
+    return np.array(histograms)
+
+
+def chi_square(one, others):
+    return np.sum((one - others) ** 2 / np.maximum(one + others, 1e-300), axis=1) / 2
+
+
+def without_code(page):
+    return re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE)
+
+
+def extras():
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    return set(project["optional-dependencies"])
 
 
 def test_readme_is_short_and_has_its_example():
@@ -133,9 +144,7 @@ def test_the_ten_lines_print_scores_and_the_nearest(tmp_path):
     assert list(found) == SCORES
     dataset = SignatureDataset(tmp_path / "shapes", cache_dir=tmp_path / "cache")
     cells = histograms_by_loops(dataset)
-    distances = np.array(
-        [[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells]
-    )
+    distances = np.array([chi_square(one, cells) for one in cells])
     labels = list(dataset.bodies.labels or ())
     assert (found["nn"], found["ft"]) == pytest.approx(first_tier(distances, labels))
     expected = [dataset.bodies.names[i] for i in np.argsort(distances[0], kind="stable")[:3]]
@@ -144,21 +153,12 @@ def test_the_ten_lines_print_scores_and_the_nearest(tmp_path):
 
 
 def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path):
-    mine = next(
-        block for block in python("docs/how-to/add-descriptor.md") if block.title == "mine.py"
-    )
+    page = python("docs/how-to/add-descriptor.md")
+    (mine,) = [block for block in page if block.title == "mine.py"]
     (tmp_path / "mine.py").write_text(mine.text)
     ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=600).write(tmp_path / "shapes")
-    options = [
-        "--signature.n_eigenpairs",
-        "5",
-        "--n_workers",
-        "1",
-        "--cache_dir",
-        "cache",
-        "--out",
-        "out",
-    ]
+    options = ["--signature.n_eigenpairs", "5", "--n_workers", "1"]
+    options += ["--cache_dir", "cache", "--out", "out"]
     run(tmp_path, "-m", "igps", "retrieve", "shapes", "--descriptor", "mine:Roundness", *options)
     with np.load(tmp_path / "out" / "distances.npz") as archive:
         distances = archive["distances"]
@@ -182,9 +182,7 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page, tmp_path):
     code, expected = program(page, tmp_path)
     assert code
     if "MDAnalysis" in code:
-        pytest.importorskip(
-            "MDAnalysis", reason="frames of simulations are read by MDAnalysis, of the extra [test]"
-        )
+        pytest.importorskip("MDAnalysis", reason="reads frames of simulations")
     (tmp_path / "page.py").write_text(code)
     printed = run(tmp_path, "page.py")
     shown = iter(printed.splitlines())
@@ -200,13 +198,11 @@ def check_retrieval(printed, folder):
     dataset = SignatureDataset(folder / "shapes", cache_dir=folder / "cache")
     cells = histograms_by_loops(dataset)
     labels = list(dataset.bodies.labels or ())
-    distances = np.array(
-        [[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells]
-    )
     bipeds = [i for i, label in enumerate(labels) if label == "biped"]
-    rankings = [
-        [labels[j] for j in np.argsort(distances[i], kind="stable") if j != i] for i in bipeds
-    ]
+    rankings = []
+    for i in bipeds:
+        order = np.argsort(chi_square(cells[i], cells), kind="stable")
+        rankings.append([labels[j] for j in order if j != i])
     tier = np.mean([ranking[:3].count("biped") / 3 for ranking in rankings])
     first = np.mean([ranking[0] == "biped" for ranking in rankings])
     expected = {"nn": round(100 * first), "ft": round(100 * tier)}
@@ -216,7 +212,7 @@ def check_retrieval(printed, folder):
 def check_classification(printed, folder):
     told = dict(line.split(": ", 1) for line in printed.splitlines() if ": " in line)
     paths = sorted((folder / "shapes").rglob("*.off"))
-    cells = np.array(histograms_by_loops(SignatureDataset(paths, cache_dir=folder / "cache")))
+    cells = histograms_by_loops(SignatureDataset(paths, cache_dir=folder / "cache"))
     labels = np.array([path.parent.name for path in paths])
     from sklearn.metrics.pairwise import chi2_kernel
     from sklearn.model_selection import StratifiedKFold
@@ -225,15 +221,13 @@ def check_classification(printed, folder):
     for train, test in StratifiedKFold(3, shuffle=True, random_state=0).split(cells, labels):
         machine = SVC().fit(np.sqrt(cells[train]), labels[train])
         expected.append(np.mean(machine.predict(np.sqrt(cells[test])) == labels[test]))
-    np.testing.assert_allclose(
-        np.fromstring(told["folds"].strip("[]"), sep=" "), expected, atol=1e-6
-    )
+    folds = [float(word) for word in told["folds"].strip("[]").split()]
+    np.testing.assert_allclose(folds, expected, atol=1e-6)
     assert min(expected) > 1 / 3  # by guessing
     chosen, score = told["chosen"].split()
     assert chosen in ("interior", "d2")
-    assert float(score) >= round(
-        float(np.mean(expected)), 2
-    )  # the first of the grid is this very pipeline
+    # The first of the grid is this very pipeline
+    assert float(score) >= round(float(np.mean(expected)), 2)
     assert told["predicted"] == labels[0]
     kernel = chi2_kernel(cells)
     expected_score = SVC(kernel="precomputed").fit(kernel, labels).score(kernel, labels)
@@ -268,38 +262,34 @@ CHECKS = {
 
 def shell_lines(page):
     """The commands of its shell blocks, and those within sentences."""
-    text = "\n".join(block.text for block in blocks(page) if block.language == "sh").replace(
-        "\\\n", " "
+    text = "\n".join(block.text for block in blocks(page) if block.language == "sh")
+    words = []
+    for line in text.replace("\\\n", " ").splitlines():
+        words += re.split(r";|&&|\|", line.split(" #")[0])
+    words += re.findall(
+        r"`((?:PYTHONPATH=\. )?(?:igps|make|python|pip) [^`]*)`", without_code(page)
     )
-    lines = [line.split(" #")[0] for line in text.splitlines()]
-    words = [part.strip() for line in lines for part in re.split(r";|&&|\|", line)]
-    prose = re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE)
-    inline = re.findall(r"`((?:PYTHONPATH=\. )?(?:igps|make|python|pip) [^`]*)`", prose)
-    return [line for line in words + inline if line and not line.startswith("#")]
-
-
-def known_command(words):
-    """The command of `igps` that words begin with, in one or two words."""
-    name = command_of(words)
-    assert name is not None, f"no command {words[:2]}"
-    return name.split()
+    return [line.strip() for line in words if line.strip() and not line.strip().startswith("#")]
 
 
 def told(page):
     """What the shell is told on a page: each line, without settings for one command, and its words."""
-    lines = [re.sub(r"^([A-Z_]+=\S* )+", "", line) for line in shell_lines(page)]
-    return [
-        (line, [word for word in shlex.split(line) if not word.startswith(">")]) for line in lines
-    ]
+    found = []
+    for line in shell_lines(page):
+        plain = re.sub(r"^([A-Z_]+=\S* )+", "", line)
+        words = [word for word in shlex.split(plain) if not word.startswith(">")]
+        found.append((plain, words))
+    return found
 
 
 def commands_told():
     """Of all pages what `igps` is told, by its command: its help takes half a second to make."""
     found = {}
-    for line, words in (one for page in TEXT for one in told(page)):
-        if words[0] == "igps" and words[:2] != ["igps", "--help"]:
-            with contextlib.suppress(AssertionError):  # which the page's own test tells
-                found.setdefault(" ".join(known_command(words[1:])), []).append((line, words))
+    for page in TEXT:
+        for line, words in told(page):
+            name = command_of(words[1:]) if words[0] == "igps" else None
+            if name is not None:  # of others the page's own test tells
+                found.setdefault(name, []).append((line, words))
     return found
 
 
@@ -311,73 +301,62 @@ def test_what_igps_is_told_exists(command, lines, monkeypatch, capsys):
     text = capsys.readouterr().out
     shared = load_command(command).shared_options()
     for line, words in lines:
-        for option in [word for word in words if word.startswith("--")]:
-            is_known = re.search(rf"{option}\b", text) or option.removeprefix("--") in shared
-            assert is_known, f"{line}: no option {option}"
+        for word in words:
+            if word.startswith("--"):
+                is_known = re.search(rf"{word}\b", text) or word.removeprefix("--") in shared
+                assert is_known, f"{line}: no option {word}"
+
+
+OTHER_PROGRAMS = set("git cd dask sbatch squeue eval source ssh rsync sudo".split())
 
 
 @pytest.mark.parametrize("page", [page for page in TEXT if shell_lines(page)])
 def test_what_the_shell_is_told_exists(page):
-    targets = re.findall(r"^([a-z0-9-]+):", (PROJECT / "Makefile").read_text(), flags=re.MULTILINE)
-    extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"][
-        "optional-dependencies"
-    ]
     for line, words in told(page):
-        if words[0] == "make":
-            wanted = [word for word in words[1:] if "=" not in word]
-            assert wanted
-            assert set(wanted) <= set(targets), line
-        elif words[0] == "python":
-            script = next(word for word in words[1:] if not word.startswith("-"))
-            assert "-m" in words or (PROJECT / script).is_file(), line
-            source = "" if "-m" in words else (PROJECT / script).read_text()
-            for option in (
-                re.findall(r"--([a-z_]+)", line) if source and "LightningCLI" not in source else ()
-            ):
-                assert option == "config" or re.search(rf"\b{option}\b|--{option}\b", source), (
-                    f"{line}: no {option}"
-                )
-        elif words[0] == "pip":
-            assert words[1] == "install", line
-            named = {
-                name for several in re.findall(r"\[([^\]]+)\]", line) for name in several.split(",")
-            }
-            assert named <= set(extras), line
-        elif words[0] == "igps":
-            assert words[1:] == ["--help"] or known_command(words[1:])
-        else:
-            assert words[0] in {
-                "git",
-                "cd",
-                "dask",
-                "sbatch",
-                "squeue",
-                "eval",
-                "source",
-                "ssh",
-                "rsync",
-                "sudo",
-            }, line
+        match words[0]:
+            case "make":
+                wanted = [word for word in words[1:] if "=" not in word]
+                makefile = (PROJECT / "Makefile").read_text()
+                targets = re.findall(r"^([a-z0-9-]+):", makefile, flags=re.MULTILINE)
+                assert wanted
+                assert set(wanted) <= set(targets), line
+            case "python":
+                check_python(line, words)
+            case "pip":
+                assert words[1] == "install", line
+                named = ",".join(re.findall(r"\[([^\]]+)\]", line))
+                assert set(named.split(",")) <= extras() | {""}, line
+            case "igps":
+                assert words[1:] == ["--help"] or command_of(words[1:]), line
+            case other:
+                assert other in OTHER_PROGRAMS, line
+
+
+def check_python(line, words):
+    """The program exists, and has the options that it is given."""
+    if "-m" in words:
+        return
+    script = next(word for word in words[1:] if not word.startswith("-"))
+    source = (PROJECT / script).read_text()
+    if "LightningCLI" not in source:
+        for option in set(re.findall(r"--([a-z_]+)", line)) - {"config"}:
+            assert re.search(rf"\b{option}\b|--{option}\b", source), f"{line}: no {option}"
 
 
 def test_descriptors_and_commands_are_named():
     for name in NAMES:
         assert f"`{name}`" in TEXT["docs/index.md"], name
-    extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"][
-        "optional-dependencies"
-    ]
-    for name in set(extras) - {"test", "lint", "campaign", "docs"}:
-        assert f"`{name}`" in TEXT["docs/index.md"] or f"[{name}]" in "".join(TEXT.values()), name
+    every_page = "".join(TEXT.values())
+    for name in extras() - {"test", "lint", "campaign", "docs"}:
+        assert f"`{name}`" in TEXT["docs/index.md"] or f"[{name}]" in every_page, name
 
 
 def anchors(text):
     """Ids of the headings, as GitHub and MkDocs make them of plain words."""
-    headings = re.findall(
-        r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), flags=re.MULTILINE
-    )
-    return {
-        re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings
-    }
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    headings = re.findall(r"^#+ (.*)$", prose, flags=re.MULTILINE)
+    plain = [re.sub(r"[^\w\- ]", "", heading).strip() for heading in headings]
+    return {heading.lower().replace(" ", "-") for heading in plain}
 
 
 @pytest.mark.parametrize("name", re.findall(r"^::: (\S+)", TEXT["docs/api.md"], re.MULTILINE))
@@ -388,8 +367,7 @@ def test_the_reference_names_what_is_there(name):
 @pytest.mark.parametrize("page", TEXT)
 def test_links_lead_somewhere(page):
     here = PROJECT / page
-    prose = re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE)
-    for target in re.findall(r"\]\(([^)\s]+)\)", prose):
+    for target in re.findall(r"\]\(([^)\s]+)\)", without_code(page)):
         if target.startswith(("https://", "mailto:")):
             continue
         name, _, anchor = target.partition("#")
@@ -399,16 +377,11 @@ def test_links_lead_somewhere(page):
             assert anchor in anchors(path.read_text(encoding="utf-8")), f"{page}: {target}"
 
 
-def outside_code(page):
-    """The lines of a page that are no code."""
-    return re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE).splitlines()
-
-
 @pytest.mark.parametrize("page", TEXT)
 def test_tables_are_whole_and_prose_is_wrapped(page):
     """Each row of a table has as many cells as its head, and a rule below that; text has lines that can be read."""
     head, place = 0, 0
-    for line in outside_code(page):
+    for line in without_code(page).splitlines():
         if not line.startswith("|"):
             place = 0
             assert "{{" not in line, f"{page}: {line}"
@@ -417,15 +390,15 @@ def test_tables_are_whole_and_prose_is_wrapped(page):
         cells = len(re.findall(r"(?<!\\)\|", re.sub(r"`[^`]*`", "", line)))
         head = cells if place == 0 else head
         assert cells == head, f"{page}: {line}"
-        assert (re.fullmatch(r"[|:\- ]+", line) is not None) is (place == 1) or line.strip(
-            "| "
-        ) == "", f"{page}: {line}"
+        is_rule = re.fullmatch(r"[|:\- ]+", line) is not None
+        is_empty = line.strip("| ") == ""
+        assert is_rule is (place == 1) or is_empty, f"{page}: {line}"
         place += 1
 
 
 def table_rows(page, heading):
     """Of the first table that follows a heading, the rows by their first name in code, and their cells by column."""
-    lines = outside_code(page)
+    lines = without_code(page).splitlines()
     start = next(i for i in range(lines.index(heading), len(lines)) if lines[i].startswith("|"))
     columns = [cell.strip() for cell in lines[start].split("|")[1:-1]]
     rows = {}
@@ -441,13 +414,11 @@ def table_rows(page, heading):
 
 def test_the_figures_of_the_descriptors_are_those_that_were_measured():
     shown = table_rows("docs/index.md", "## Which descriptor")
-    measured = json.loads(
-        (PROJECT / "docs" / "benchmarks" / "results" / "shrec07.json").read_text("utf-8")
-    )
-    rows = {
-        row[0].strip("`"): dict(zip(measured["columns"], row, strict=True))
-        for row in measured["rows"]
-    }
+    results = PROJECT / "docs" / "benchmarks" / "results" / "shrec07.json"
+    measured = json.loads(results.read_text("utf-8"))
+    rows = {}
+    for row in measured["rows"]:
+        rows[row[0].strip("`")] = dict(zip(measured["columns"], row, strict=True))
     assert set(shown) == {"interior", "gps", "multiscale", "rich", "pretrained"}
     for name, row in shown.items():
         for score in ("NN", "FT", "ST", "DCG"):

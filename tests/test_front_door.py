@@ -14,33 +14,11 @@ PROJECT = Path(__file__).parents[1]
 PACKAGE = Path(igps.__file__).parent
 
 # Frozen: whoever adds a name takes one away, and says so here and in the documentation.
-NAMES = [
-    "ArticulatedShapes",
-    "BodyDescriptor",
-    "Descriptor",
-    "HistogramDescriptor",
-    "Mesh",
-    "MeshError",
-    "LoadOptions",
-    "PairHistogram",
-    "RetrievalLearner",
-    "SignatureBatch",
-    "SignatureConfig",
-    "SignatureDataset",
-    "SpectralEmbedding",
-    "as_mesh",
-    "collate",
-    "compute_signature",
-    "describe",
-    "descriptor",
-    "fit",
-    "inside",
-    "load",
-    "load_mesh",
-    "measures",
-    "retrieval_scores",
-    "search",
-]
+NAMES = """
+ArticulatedShapes BodyDescriptor Descriptor HistogramDescriptor LoadOptions Mesh MeshError PairHistogram
+RetrievalLearner SignatureBatch SignatureConfig SignatureDataset SpectralEmbedding
+as_mesh collate compute_signature describe descriptor fit inside load load_mesh measures retrieval_scores search
+""".split()
 
 # Import names whose distribution is called otherwise.
 DISTRIBUTIONS = {
@@ -56,10 +34,9 @@ def test_front_door_has_these_names_and_no_others():
     assert sorted(igps.__all__) == sorted(NAMES)
     assert len(set(NAMES)) == len(NAMES) <= 25
     rooms = {path.stem for path in PACKAGE.iterdir()}
-    public = {name for name in vars(igps) if not name.startswith("_")} - rooms - {"annotations"}
-    assert public <= {*NAMES, "importlib", "TYPE_CHECKING", "Any"}, (
-        "a name that __all__ does not tell of"
-    )
+    public = {name for name in vars(igps) if not name.startswith("_")} - rooms
+    untold = public - {*NAMES, "annotations", "importlib", "TYPE_CHECKING", "Any"}
+    assert not untold
 
 
 def test_every_name_opens():
@@ -67,33 +44,31 @@ def test_every_name_opens():
         assert getattr(igps, name).__module__.startswith("igps."), name
 
 
-def test_import_loads_nothing_heavy():
-    heavy = (
-        "torch",
-        "numpy",
-        "scipy",
-        "numba",
-        "trimesh",
-        "sklearn",
-        "skimage",
-        "igl",
-        "matplotlib",
-    )
-    heavy += ("pytorch_lightning", "torchmetrics", "pandas", "jinja2", "nibabel", "argparse")
-    words = f"import sys; import igps; print([name for name in {heavy!r} if name in sys.modules])"
-    command = [sys.executable, "-c", words]
+def printed(words):
+    """What a process of its own prints, which finds this package alone on its path."""
     environment = {"PYTHONPATH": str(PACKAGE.parent), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", words]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout.strip() == "[]"
+    return done.stdout.strip()
+
+
+def test_import_loads_nothing_heavy():
+    heavy = "torch numpy scipy numba trimesh sklearn skimage igl matplotlib".split()
+    heavy += "pytorch_lightning torchmetrics pandas jinja2 nibabel argparse".split()
+    words = f"import sys; import igps; print([name for name in {heavy!r} if name in sys.modules])"
+    assert printed(words) == "[]"
 
 
 def test_lazy_names_do_load_what_they_need():
     words = "import sys, igps; igps.RetrievalLearner; print('pytorch_lightning' in sys.modules)"
-    environment = {"PYTHONPATH": str(PACKAGE.parent), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment
-    )
-    assert done.stdout.strip() == "True"
+    assert printed(words) == "True"
+
+
+def direct_imports(node):
+    """Top-level modules of an import statement."""
+    if isinstance(node, ast.Import):
+        return {alias.name.split(".")[0] for alias in node.names}
+    return {node.module.split(".")[0]} if node.module and not node.level else set()
 
 
 def imported(path):
@@ -101,18 +76,12 @@ def imported(path):
     found = set()
 
     def look(node):
-        if (
-            isinstance(node, ast.If)
-            and isinstance(node.test, ast.Name)
-            and node.test.id == "TYPE_CHECKING"
-        ):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             for child in node.orelse:
                 look(child)
             return
-        if isinstance(node, ast.Import):
-            found.update(alias.name.split(".")[0] for alias in node.names)
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            found.add(node.module.split(".")[0])
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found.update(direct_imports(node))
         for child in ast.iter_child_nodes(node):
             look(child)
 
@@ -134,33 +103,25 @@ def test_what_is_brought_along_is_required_by_what_brings_it():
 
 
 def declared(requirements):
-    return {
-        normal(re.split(r"[\s\[<>=!~;]", requirement, maxsplit=1)[0])
-        for requirement in requirements
-    }
+    names = [re.split(r"[\s\[<>=!~;]", requirement, maxsplit=1)[0] for requirement in requirements]
+    return {normal(name) for name in names}
 
 
 def test_every_import_is_declared():
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     core = declared(project["dependencies"])
-    extras = {
-        name: declared(several)
-        for name, several in project["optional-dependencies"].items()
-        if name not in ("test", "lint", "docs")
-    }
+    extras = project["optional-dependencies"]
+    extras = {name: declared(extras[name]) for name in set(extras) - {"test", "lint", "docs"}}
     optional = set().union(*extras.values()) - {"interior-gps"}
-    own = {"igps", "training", "docs"}
-    programs = [PACKAGE, PROJECT / "training", PROJECT / "docs" / "benchmarks"]
-    for folder in programs:
+    known = core | optional | set(BROUGHT_ALONG)
+    used = set()
+    for folder in (PACKAGE, PROJECT / "training", PROJECT / "docs" / "benchmarks"):
         for path in sorted(folder.rglob("*.py")):
-            for module in imported(path) - set(sys.stdlib_module_names) - own:
-                distribution = normal(DISTRIBUTIONS.get(module, module))
-                assert distribution in core | optional | set(BROUGHT_ALONG), (
-                    f"{path} imports {module}, which pyproject.toml does not declare"
-                )
+            others = imported(path) - set(sys.stdlib_module_names) - {"igps", "training", "docs"}
+            names = {normal(DISTRIBUTIONS.get(module, module)) for module in others}
+            assert names <= known, f"{path} imports what pyproject.toml does not declare"
+            used |= names
     # And nothing is declared that is not used.
-    every = set().union(*(imported(path) for folder in programs for path in folder.rglob("*.py")))
-    used = {normal(DISTRIBUTIONS.get(module, module)) for module in every}
     assert core <= used
     # trimesh imports these, where a format asks for them
     assert optional - extras["formats"] - extras["cad"] <= used
@@ -172,14 +133,10 @@ def test_modules_that_import_at_once_need_no_extra():
     core = declared(project["dependencies"])
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.parse(path.read_text()).body:
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            for module in (
-                {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"igps", ""}
-            ):
-                assert normal(DISTRIBUTIONS.get(module, module)) in core, (
-                    f"{path} needs {module} at once"
-                )
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                modules = direct_imports(node) - set(sys.stdlib_module_names) - {"igps"}
+                needed = {normal(DISTRIBUTIONS.get(module, module)) for module in modules}
+                assert needed <= core, f"{path} needs {needed - core} at once"
 
 
 def test_distributions_are_called_so():

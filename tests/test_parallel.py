@@ -33,6 +33,14 @@ def all_of(*arguments, **options):
     return dict(results)
 
 
+def script_of(folder, text):
+    """The command of a script that has the names of this module."""
+    head = f"import os, signal, sys\nsys.path.append({str(Path(jobs.__file__).parent)!r})\n"
+    head += "import jobs\nfrom igps._failures import Limits\nfrom igps._parallel import run\n"
+    (folder / "script.py").write_text(head + text)
+    return [sys.executable, str(folder / "script.py")]
+
+
 def ended(pid):
     """Whether a process ends within ten seconds."""
     for _ in range(100):
@@ -78,9 +86,8 @@ def limited():
     found += [partial(jobs.allocate, size) for size in (1000, 2 * GIB, 2000)]
     found += [partial(jobs.pages_cleared, PAGES)] * 3
     found += [partial(jobs.sleep, seconds) for seconds in (0.1, 1000.0, 0.2)]
-    return all_of(
-        jobs.call, found, n_workers=1, limits=Limits(seconds=5, memory=GIB if LINUX else None)
-    )
+    limits = Limits(seconds=5, memory=GIB if LINUX else None)
+    return all_of(jobs.call, found, n_workers=1, limits=limits)
 
 
 def test_every_job_has_its_result_in_this_process_and_in_others(results):
@@ -106,21 +113,16 @@ def test_workers_leave_an_interruption_to_their_parent(results):
 @pytest.mark.skipif(os.name == "nt", reason="signals cannot be blocked")
 def test_workers_leave_it_to_their_parent_while_they_start(tmp_path):
     """They import what the script does, for seconds."""
-    script = tmp_path / "script.py"
-    script.write_text(
-        "import os, signal\n"
-        "from igps._failures import Limits\n"
-        "from igps._parallel import run\n"
+    command = script_of(
+        tmp_path,
         "if __name__ == '__mp_main__':\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
         "if __name__ == '__main__':\n"
         "    print(*run(abs, [-7], limits=Limits(seconds=100)))\n"
         "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in jobs in the background
-        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n",
     )
-    done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.stdout == "(0, 7)\n"
     assert done.stderr.count("Traceback") == 1  # the script's own
     assert "KeyboardInterrupt" in done.stderr
@@ -137,11 +139,12 @@ def test_nothing_to_do():
     assert found == {}
 
 
-@pytest.mark.parametrize("n_workers", [0, -1])
-def test_fewer_than_one_worker_is_refused(n_workers):
+def test_fewer_than_one_worker_is_refused():
     """0 took all cores, and -1, which elsewhere stands for all, took one."""
-    with pytest.raises(ValueError, match=rf"n_workers: expected at least 1, got {n_workers}\."):
-        all_of(jobs.square, [1, 2], n_workers=n_workers)
+    for n_workers in (0, -1):
+        words = rf"n_workers: expected at least 1, got {n_workers}\."
+        with pytest.raises(ValueError, match=words):
+            all_of(jobs.square, [1, 2], n_workers=n_workers)
 
 
 def test_one_worker_is_this_process_unless_there_are_limits(limited):
@@ -188,24 +191,18 @@ def test_a_job_that_takes_too_long_is_ended(limited):
         (partial(jobs.fail_with, errno.EMFILE), "EMFILE.*Raise the limit of open files.*run again"),
         (partial(jobs.fail_with, 0), "out of memory. Use fewer workers"),
         (
-            partial(jobs.need_library, "no_such_library"),
-            "No module named 'no_such_library'.*Install it and run again",
+            partial(jobs.need_library, "no_lib"),
+            "No module named 'no_lib'.*Install it and run again",
         ),
     ],
     ids=["disk", "files", "memory", "library"],
 )
 def test_the_machine_is_not_the_jobs_fault(where, job, message):
     """It is told once, and not of every job."""
+    limits = Limits(seconds=100) if where == "workers" else None
     with ThreadPoolExecutor(1) as pool, pytest.raises(MachineError, match=message):
-        list(
-            run(
-                jobs.call,
-                [job] * 3,
-                n_workers=1,
-                executor=pool if where == "executor" else None,
-                limits=Limits(seconds=100) if where == "workers" else None,
-            )
-        )
+        executor = pool if where == "executor" else None
+        list(run(jobs.call, [job] * 3, n_workers=1, executor=executor, limits=limits))
 
 
 def test_other_errors_of_the_system_are_those_of_a_job():
@@ -260,15 +257,8 @@ def test_impossible_limits_are_refused(name, options):
 
 
 def test_a_script_without_a_main_guard_is_told(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(
-        "from igps._failures import Limits\n"
-        "from igps._parallel import run\n"
-        "list(run(abs, [1], limits=Limits(seconds=9)))\n"
-    )
-    told = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False
-    )
+    command = script_of(tmp_path, "list(run(abs, [1], limits=Limits(seconds=9)))\n")
+    told = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert told.returncode != 0
     assert "MachineError: no worker process could be started" in told.stderr
     assert "under `if __name__ == '__main__':`" in told.stderr
@@ -285,21 +275,14 @@ def test_no_process_is_left_when_the_caller_stops_early():
 
 @needs_proc
 def test_workers_end_with_a_killed_parent(tmp_path):
-    script = tmp_path / "parent.py"
-    script.write_text(
-        "import os, signal, sys\n"
-        f"sys.path.append({str(Path(jobs.__file__).parent)!r})\n"
-        "import jobs\n"
-        "from igps._failures import Limits\nfrom igps._parallel import run\n"
+    command = script_of(
+        tmp_path,
         "if __name__ == '__main__':\n"
         "    for _, (worker, _) in run(jobs.process, [0], limits=Limits(seconds=100)):\n"
         "        print(worker, flush=True)\n"
-        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n",
     )
-    with subprocess.Popen(
-        [sys.executable, str(script)], stdout=subprocess.PIPE, text=True
-    ) as parent:
-        assert parent.stdout is not None
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         worker = int(parent.stdout.readline())
     if not ended(worker):
         os.kill(worker, signal.SIGKILL)
