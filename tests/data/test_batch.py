@@ -137,9 +137,8 @@ def test_nothing_and_unlike_attributes_are_refused(signatures):
     with pytest.raises(ValueError, match="at least one"):
         collate([])
     bare = replace(signatures[0].interior, attributes={})
-    with pytest.raises(
-        ValueError, match=r"same sample attributes, got \['depth', 'surface_direction'\] and \[\]"
-    ):
+    words = r"must carry the same, got \['depth', 'surface_direction'\] and \[\]"
+    with pytest.raises(ValueError, match=words):
         collate([signatures[1], replace(signatures[0], interior=bare)])
 
 

@@ -1,17 +1,12 @@
 """Folders of results for the tests of their page, with names that would be markup if they were not escaped."""
 
-from __future__ import annotations
-
 import csv
 import json
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from igps.mesh.mesh import Mesh
-from igps.report.surfaces import PageSurface, surface_of
+from igps.report.surfaces import surface_of
 from igps.signature.signature import SignatureConfig, compute_signature
 
 EVIL = "<script>window.ran = 1</script>"
@@ -29,7 +24,7 @@ NOTE = "3 holes of <i>which</i> & two were filled"
 DESCRIPTORS = ("interior", "gps")
 
 
-def distances_of(seed: int) -> np.ndarray:
+def distances_of(seed):
     """Symmetric, classes mostly together."""
     rng = np.random.default_rng(seed)
     centres = {label: rng.uniform(0, 1.5, 3) for label in dict.fromkeys(LABELS)}
@@ -37,9 +32,7 @@ def distances_of(seed: int) -> np.ndarray:
     return np.linalg.norm(points[:, None] - points[None], axis=2).astype(np.float32)
 
 
-def worst_by_a_loop(
-    distances: np.ndarray, labels: tuple[str, ...], names: tuple[str, ...]
-) -> list[dict[str, Any]]:
+def worst_by_a_loop(distances, labels, names):
     """The worst confusions from their definition: each query is looked at alone, walking down its ranking."""
     found = []
     for query, label in enumerate(labels):
@@ -63,12 +56,12 @@ def worst_by_a_loop(
     return [one for _, one in sorted(found, key=lambda pair: pair[0])][:20]
 
 
-def write_rows(path: Path, rows: list[tuple[str, ...]]) -> None:
+def write_rows(path, rows):
     with path.open("w", newline="") as file:
         csv.writer(file).writerows(rows)
 
 
-def retrieval_folder(folder: Path, labels: tuple[str, ...] = LABELS, seed: int = 0) -> Path:
+def retrieval_folder(folder, labels=LABELS, seed=0):
     """What `igps retrieve` writes."""
     folder.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
@@ -86,7 +79,7 @@ def retrieval_folder(folder: Path, labels: tuple[str, ...] = LABELS, seed: int =
     return folder
 
 
-def answers_folder(folder: Path) -> Path:
+def answers_folder(folder):
     """What `igps retrieve`, `groups` and `outliers` write, with columns of labels.csv."""
     retrieval_folder(folder)
     bodies = [{"file": name} for name in NAMES]
@@ -122,7 +115,7 @@ def answers_folder(folder: Path) -> Path:
     return folder
 
 
-def comparison_folder(folder: Path) -> Path:
+def comparison_folder(folder):
     """What `igps compare` writes; the second descriptor does not describe the last mesh."""
     (folder / "distances").mkdir(parents=True)
     rows = []
@@ -143,7 +136,7 @@ def comparison_folder(folder: Path) -> Path:
     return folder
 
 
-def surfaces(mesh: Mesh) -> dict[str, PageSurface]:
+def surfaces(mesh):
     """The mesh as a picture for all but the last but one of the names."""
     config = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=200)
     one = surface_of(mesh, compute_signature(mesh, config), 300)

@@ -1,10 +1,5 @@
 """The worst confusions, against a loop over the matrix of distances."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -14,9 +9,7 @@ from igps.report.page_data import data_of
 from igps.report.results import Results, System, read_results
 
 
-def random_collection(
-    n: int, n_classes: int, spread: float, seed: int
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def random_collection(n, n_classes, spread, seed):
     """Whole numbers as distances, so that many are equal, between shapes that lie nearer to those of their class."""
     rng = np.random.default_rng(seed)
     codes = rng.integers(n_classes, size=n)
@@ -25,21 +18,21 @@ def random_collection(
     return distances, tuple(f"class {code}" for code in codes)
 
 
-def worst_of(distances: np.ndarray, labels: tuple[str, ...], names: tuple[str, ...]) -> Any:
+def worst_of(distances, labels, names):
     system = System("any", names, labels, torch.from_numpy(distances))
     return data_of(Results("retrieve", names, labels, (system,)), {})["systems"][0]["worst"]
 
 
 @pytest.mark.parametrize("spread", [1.0, 4.0, 8.0, 30.0])
 @pytest.mark.parametrize(("n", "n_classes"), [(12, 3), (60, 5), (90, 40)])
-def test_the_worst_are_those_of_a_loop(n: int, n_classes: int, spread: float) -> None:
+def test_the_worst_are_those_of_a_loop(n, n_classes, spread):
     """From almost nothing wrong to chance; names in an order of their own; of 40 classes some have one shape."""
     distances, labels = random_collection(n, n_classes, spread, seed=n)
     names = tuple(f"{number:03d}.off" for number in np.random.default_rng(1).permutation(n))
     assert worst_of(distances, labels, names) == worst_by_a_loop(distances, labels, names)
 
 
-def test_a_wrong_nearest_comes_before_a_right_one() -> None:
+def test_a_wrong_nearest_comes_before_a_right_one():
     """By hand: on a line, b is far from its class; the a's are wrong only where b takes a place in their first tier."""
     names = ("a0", "a1", "a2", "b0", "b1")
     labels = ("a", "a", "a", "b", "b")
@@ -55,21 +48,24 @@ def test_a_wrong_nearest_comes_before_a_right_one() -> None:
     ]
 
 
-def test_of_many_the_twenty_worst_and_of_right_ones_none() -> None:
+def test_of_many_the_twenty_worst_and_of_right_ones_none():
     distances, labels = random_collection(60, 5, 30.0, seed=2)
-    assert len(worst_of(distances, labels, tuple(map(str, range(60))))) == 20
+    found = len(worst_of(distances, labels, tuple(map(str, range(60)))))
+    assert found == 20
     together = np.array(
         [[0.0 if one == other else 1.0 for other in labels] for one in labels], dtype=np.float32
     )
-    assert worst_of(together, labels, tuple(map(str, range(60)))) == []
+    found = worst_of(together, labels, tuple(map(str, range(60))))
+    assert found == []
 
 
-def test_each_descriptor_has_its_own(tmp_path: Path) -> None:
+def test_each_descriptor_has_its_own(tmp_path):
     """The second does not describe the last mesh; without labels, or with classes of one, there are none."""
     systems = data_of(read_results(comparison_folder(tmp_path / "compare")), {})["systems"]
     for seed, system in enumerate(systems):
         n = len(NAMES) - seed
-        assert system["worst"] == worst_by_a_loop(distances_of(seed)[:n, :n], LABELS[:n], NAMES[:n])
+        expected = worst_by_a_loop(distances_of(seed)[:n, :n], LABELS[:n], NAMES[:n])
+        assert system["worst"] == expected
     assert systems[0]["worst"] != systems[1]["worst"]
     for labels in ((), NAMES):
         (system,) = data_of(read_results(retrieval_folder(tmp_path / "retrieve", labels)), {})[
@@ -78,7 +74,7 @@ def test_each_descriptor_has_its_own(tmp_path: Path) -> None:
         assert system["worst"] is None
 
 
-def test_numbers_are_those_of_all_shapes() -> None:
+def test_numbers_are_those_of_all_shapes():
     """Of a descriptor that does not describe the first mesh."""
     distances, labels = random_collection(12, 3, 8.0, seed=3)
     names = tuple(f"{i:02d}" for i in range(12))

@@ -1,21 +1,15 @@
-from __future__ import annotations
-
 import csv
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from igps.report import drawing
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     for label, ratio in (("ball", 1.0), ("egg", 2.0)):
         for i in range(2):
             body = trimesh.creation.icosphere(subdivisions=2)
@@ -33,9 +27,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_ranked_results_show_each_class_with_hits_and_misses(
-    root: Path, figures_of: Callable[[Any], list[Figure]]
-) -> None:
+def test_ranked_results_show_each_class_with_hits_and_misses(root, figures_of):
     made = figures_of(drawing)
     drawing.ranked_results(root, root / "ranking.csv", root / "out" / "ranked.png", top=3)
     axes = np.array(made[0].axes).reshape(2, 4)
@@ -49,22 +41,25 @@ def test_ranked_results_show_each_class_with_hits_and_misses(
     assert titles[1][0] == "query egg/0.off"
     styles = [[axis.spines["top"].get_linestyle() for axis in row] for row in axes]
     assert styles == [["-", "-", "--", "--"], ["-", "--", "--", "-"]]
-    assert all(axis.collections[0].get_paths() for axis in axes.flat)
+    for axis in axes.flat:
+        assert axis.collections[0].get_paths()
     assert imread(root / "out" / "ranked.png").std() > 0.05
 
 
-def test_turned_body_is_drawn_alike() -> None:
+def test_turned_body_is_drawn_alike():
     body = trimesh.creation.cone(radius=0.4, height=2.0, sections=24)
     turned = body.vertices @ trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3].T
     straight = drawing.front_view(body.vertices)
     back = drawing.front_view(turned)
-    np.testing.assert_allclose(np.ptp(back, axis=0)[1], np.ptp(straight, axis=0)[1], rtol=1e-6)
+    found = np.ptp(back, axis=0)[1]
+    expected = np.ptp(straight, axis=0)[1]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
     for view in (straight, back):
         tip = view[np.argmax(np.linalg.norm(view - view.mean(axis=0), axis=1))]
         assert tip[1] == pytest.approx(view[:, 1].max())  # the slender end is up
 
 
-def test_view_is_no_mirror_image() -> None:
+def test_view_is_no_mirror_image():
     points = np.random.default_rng(0).random((50, 3)) * [1, 2, 3]
     frame = np.linalg.lstsq(points, drawing.front_view(points), rcond=None)[0]
     assert np.linalg.det(frame) == pytest.approx(1)

@@ -1,9 +1,5 @@
 """Exported results, read by nibabel, SimpleITK, trimesh and VTK."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -21,7 +17,7 @@ MARK = [-1.0, 0, 0]  # RAS: the patient's left
 
 
 @pytest.fixture(params=["RAS", "LPS", "oblique"])
-def exported(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, Mesh, np.ndarray]:
+def exported(request, tmp_path):
     """A label image, its body, and the values of its vertices: how far they lie to the left."""
     write(tmp_path / "labels.nii.gz", *marked_ball(ORIENTATIONS[request.param], MARK))
     raw = read_surface(tmp_path / "labels.nii.gz")
@@ -32,13 +28,14 @@ def exported(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, Mesh
     return tmp_path, mesh, values
 
 
-def test_voxels_have_the_grid_of_the_label_image(exported: tuple[Path, Mesh, np.ndarray]) -> None:
+def test_voxels_have_the_grid_of_the_label_image(exported):
     folder, mesh, values = exported
     labels = SimpleITK.ReadImage(str(folder / "labels.nii.gz"))
     found = SimpleITK.ReadImage(str(folder / "out" / "body.nii.gz"))
     assert found.GetSize() == labels.GetSize()
     for read in ("GetSpacing", "GetOrigin", "GetDirection"):
-        np.testing.assert_allclose(getattr(found, read)(), getattr(labels, read)(), atol=1e-4)
+        expected = getattr(labels, read)()
+        np.testing.assert_allclose(getattr(found, read)(), expected, atol=1e-4)
     numbers = SimpleITK.GetArrayFromImage(found)
     assert ((numbers > 0) == (SimpleITK.GetArrayFromImage(labels) > 0)).all()
     inside = mesh.vertices - 1.5 * vertex_normals(mesh.vertices, mesh.faces)  # one voxel
@@ -49,7 +46,7 @@ def test_voxels_have_the_grid_of_the_label_image(exported: tuple[Path, Mesh, np.
     np.testing.assert_allclose(nibabel.load(folder / "out" / "body.nii.gz").get_fdata(), numbers.T)
 
 
-def test_surfaces_are_in_ras(exported: tuple[Path, Mesh, np.ndarray]) -> None:
+def test_surfaces_are_in_ras(exported):
     folder, mesh, values = exported
     image = nibabel.load(folder / "out" / "body.gii")
     points, faces, shape = (array.data for array in image.darrays)
@@ -60,12 +57,13 @@ def test_surfaces_are_in_ras(exported: tuple[Path, Mesh, np.ndarray]) -> None:
     ply = trimesh.load(folder / "out" / "body.ply", process=False)
     np.testing.assert_allclose(ply.vertices, mesh.vertices)
     np.testing.assert_array_equal(ply.faces, mesh.faces)
-    np.testing.assert_allclose(ply.metadata["_ply_raw"]["vertex"]["data"]["value"], values, 1e-6)
+    found = ply.metadata["_ply_raw"]["vertex"]["data"]["value"]
+    np.testing.assert_allclose(found, values, 1e-6)
     for name in ("body.ply", "body.vtk"):
         assert b"SPACE=RAS" in (folder / "out" / name).read_bytes()[:200]
 
 
-def test_vtk_reads_the_surface_and_its_values(exported: tuple[Path, Mesh, np.ndarray]) -> None:
+def test_vtk_reads_the_surface_and_its_values(exported):
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy
 
@@ -82,7 +80,7 @@ def test_vtk_reads_the_surface_and_its_values(exported: tuple[Path, Mesh, np.nda
             np.testing.assert_allclose(found, values, rtol=1e-6)
 
 
-def test_nothing_is_claimed_about_a_body_without_a_frame(tmp_path: Path) -> None:
+def test_nothing_is_claimed_about_a_body_without_a_frame(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2)
     write_places(tmp_path / "s.1", Mesh(ball.vertices, ball.faces), {"value": np.ones(162)})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s.1.ply", "s.1.vtk"]

@@ -6,8 +6,6 @@ import os
 import re
 from html.parser import HTMLParser
 from importlib.resources import files
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +21,6 @@ from pages import (
     surfaces,
 )
 
-from igps.mesh.mesh import Mesh
 from igps.report.page import render_page
 from igps.report.page_data import data_of
 from igps.report.results import read_results
@@ -33,7 +30,7 @@ from igps.retrieval import precision_recall_curve, retrieval_scores
 class Elements(HTMLParser):
     """What a browser would make of the page: its elements and its text outside of scripts."""
 
-    def __init__(self, page: str) -> None:
+    def __init__(self, page):
         super().__init__()
         self.elements: list[tuple[str, dict[str, str | None]]] = []
         self.texts: list[str] = []
@@ -42,33 +39,33 @@ class Elements(HTMLParser):
         self.feed(page)
         self.close()
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
         self.inside = tag
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         self.inside = ""
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         (self.scripts if self.inside in ("script", "style") else self.texts).append(data)
 
     @property
-    def text(self) -> str:
+    def text(self):
         return re.sub(r"\s+", " ", " ".join(self.texts))
 
-    def data(self) -> dict[str, Any]:
+    def data(self):
         return json.loads(
             next(script for script in self.scripts if script.startswith('{"classes"'))
         )
 
 
 @pytest.fixture
-def page(tmp_path: Path, blob: Mesh) -> str:
+def page(tmp_path, blob):
     """A page of a labelled collection, with pictures."""
     return render_page(read_results(retrieval_folder(tmp_path)), surfaces(blob))
 
 
-def test_no_script_or_style_closes_its_own_element() -> None:
+def test_no_script_or_style_closes_its_own_element():
     """They are written into the page as they are."""
     sources = [
         one
@@ -80,7 +77,7 @@ def test_no_script_or_style_closes_its_own_element() -> None:
         assert not re.search(r"</(script|style)", source.read_text("utf-8"), re.IGNORECASE), source
 
 
-def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:
+def test_rankings_and_scores_are_those_of_a_loop(tmp_path):
     data = data_of(read_results(retrieval_folder(tmp_path)), {})
     assert data["classes"] == sorted(set(LABELS))
     (system,) = data["systems"]
@@ -110,29 +107,35 @@ def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:
         scores.per_class()["egg"]["ft"], abs=1e-5
     )
     assert system["per_query"]["nn"][-1] is None  # it has no other of its class
-    assert system["per_query"]["nn"][:-1] == scores.nn[:-1].tolist()
+    found = system["per_query"]["nn"][:-1]
+    expected = scores.nn[:-1].tolist()
+    assert found == expected
     curve = precision_recall_curve(torch.from_numpy(distances), LABELS)
-    assert system["curve"][1] == pytest.approx(curve.precision.tolist(), abs=1e-5)
+    expected = pytest.approx(curve.precision.tolist(), abs=1e-5)
+    assert system["curve"][1] == expected
 
 
-def test_names_from_files_are_harmless_everywhere(page: str) -> None:
+def test_names_from_files_are_harmless_everywhere(page):
     seen = Elements(page)
     tags = {tag for tag, _ in seen.elements}
     assert not {"img", "b", "i", "iframe"} & tags
     assert (
         sum(tag == "script" for tag, _ in seen.elements) == 8
     )  # numbers, surfaces, three.js, and five of ours
-    assert not any(name.startswith("on") for _, attributes in seen.elements for name in attributes)
+    for _, attributes in seen.elements:
+        for name in attributes:
+            assert not name.startswith("on")
     # A name may stand in two elements, of which the first is cut where there is no room.
     text = "".join(seen.text.split())
     for told in (*NAMES, EVIL, NOTE, "bad<b>.off: it is open."):
         assert "".join(told.split()) in text
     assert "49/c.off" not in page
-    assert [shape["name"] for shape in seen.data()["shapes"]] == list(NAMES)
+    found = [shape["name"] for shape in seen.data()["shapes"]]
+    assert found == list(NAMES)
     assert seen.data()["classes"] == sorted(set(LABELS))
 
 
-def test_nothing_is_loaded(page: str) -> None:
+def test_nothing_is_loaded(page):
     seen = Elements(page)
     links = [
         attributes.get(name)
@@ -154,7 +157,7 @@ def test_nothing_is_loaded(page: str) -> None:
     }
 
 
-def test_surfaces_lie_in_the_order_of_the_shapes(tmp_path: Path, blob: Mesh) -> None:
+def test_surfaces_lie_in_the_order_of_the_shapes(tmp_path, blob):
     pictures = surfaces(blob)
     seen = Elements(render_page(read_results(retrieval_folder(tmp_path)), pictures))
     lines = next(script for script in seen.scripts if script.startswith("\n")).strip().split("\n")
@@ -168,7 +171,7 @@ def test_surfaces_lie_in_the_order_of_the_shapes(tmp_path: Path, blob: Mesh) -> 
             assert len(content) == 7 * n_vertices + 6 * n_faces
 
 
-def test_without_classes_only_rankings(tmp_path: Path) -> None:
+def test_without_classes_only_rankings(tmp_path):
     results = read_results(retrieval_folder(tmp_path, labels=()))
     seen = Elements(render_page(results, {}))
     (system,) = seen.data()["systems"]
@@ -179,11 +182,12 @@ def test_without_classes_only_rankings(tmp_path: Path) -> None:
     ids = {attributes.get("id") for _, attributes in seen.elements}
     assert {"shapes", "unused", "repaired"} <= ids
     assert not {"scores", "confusion", "precision-recall", "worst"} & ids
-    assert sum(attributes.get("class") == "shape" for _, attributes in seen.elements) == len(NAMES)
+    found = sum(attributes.get("class") == "shape" for _, attributes in seen.elements)
+    assert found == len(NAMES)
 
 
 @pytest.mark.parametrize("kind", ["classes of one", "one class", "several"])
-def test_scores_and_confusions_need_classes(tmp_path: Path, kind: str) -> None:
+def test_scores_and_confusions_need_classes(tmp_path, kind):
     labels = {"classes of one": NAMES, "one class": ("egg",) * len(NAMES), "several": LABELS}[kind]
     results = read_results(retrieval_folder(tmp_path, labels=labels))
     ids = {attributes.get("id") for _, attributes in Elements(render_page(results, {})).elements}
@@ -191,18 +195,21 @@ def test_scores_and_confusions_need_classes(tmp_path: Path, kind: str) -> None:
     assert ("worst" in ids) == (kind == "several")
 
 
-def test_a_comparison_has_all_descriptors(tmp_path: Path) -> None:
+def test_a_comparison_has_all_descriptors(tmp_path):
     seen = Elements(render_page(read_results(comparison_folder(tmp_path / "compare")), {}))
     systems = seen.data()["systems"]
     assert [system["name"] for system in systems] == ["interior", "gps"]
-    assert [len(system["shapes"]) for system in systems] == [len(NAMES), len(NAMES) - 1]
-    assert sum(tag == "option" and a.get("value") in ("0", "1") for tag, a in seen.elements) == 2
+    found = [len(system["shapes"]) for system in systems]
+    expected = [len(NAMES), len(NAMES) - 1]
+    assert found == expected
+    found = sum(tag == "option" and a.get("value") in ("0", "1") for tag, a in seen.elements)
+    assert found == 2
     assert "gps it has no surface." in seen.text
     assert "all it is open." in seen.text
     assert "7 shapes in 3 classes, 2 descriptors" in seen.text
 
 
-def test_of_several_results_the_last_are_shown(tmp_path: Path) -> None:
+def test_of_several_results_the_last_are_shown(tmp_path):
     retrieval_folder(tmp_path / "both")
     folder = tmp_path / "both"
     rows = [{"descriptor": "gps", "n_models": 0, "seconds_per_mesh": None}]
@@ -214,7 +221,7 @@ def test_of_several_results_the_last_are_shown(tmp_path: Path) -> None:
     assert read_results(folder).command == "compare"
 
 
-def test_what_is_no_folder_of_results_is_told(tmp_path: Path) -> None:
+def test_what_is_no_folder_of_results_is_told(tmp_path):
     with pytest.raises(FileNotFoundError, match="no results found"):
         read_results(tmp_path)
     retrieval_folder(tmp_path)

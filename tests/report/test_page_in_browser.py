@@ -8,10 +8,8 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +33,6 @@ from conftest import as_mesh
 from igps.analysis.clusters import clusters_of
 from igps.analysis.map import body_map
 from igps.cli import main
-from igps.mesh.mesh import Mesh
 from igps.report.page import render_page
 from igps.report.results import Results, System, read_results
 from igps.report.surfaces import surface_of
@@ -52,7 +49,7 @@ PATIENCE = 60_000  # milliseconds
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def browser():
     path = (
         shutil.which("chromium")
         or shutil.which("chromium-browser")
@@ -68,11 +65,11 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A page of each kind of results."""
     body = trimesh.creation.icosphere(subdivisions=3)
     body.vertices *= [1.0, 0.6 + 0.3 * (body.vertices[:, 2] > 0).mean(), 2.2]
-    mesh: Mesh = as_mesh(body)
+    mesh = as_mesh(body)
     root = tmp_path_factory.mktemp("pages")
     pictures = surfaces(mesh)
     made = {
@@ -90,7 +87,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Visit:
     """A page in the browser, and what went wrong or over the network."""
 
-    def __init__(self, browser: Any, path: Path, **options: Any) -> None:
+    def __init__(self, browser, path, **options):
         self.context = browser.new_context(
             **{"viewport": {"width": 1200, "height": 900}, **options}
         )
@@ -106,31 +103,32 @@ class Visit:
         self.address = path.as_uri()
         self.page.goto(self.address)
 
-    def __enter__(self) -> Visit:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *failure: object) -> None:
+    def __exit__(self, *failure):
         self.context.close()
         if failure[0] is None:
             assert self.complaints == []
-            assert {url for url in self.requests if not url.startswith("data:")} == {self.address}
+            found = {url for url in self.requests if not url.startswith("data:")}
+            assert found == {self.address}
 
-    def wait_until(self, is_so: Callable[[], bool]) -> None:
+    def wait_until(self, is_so):
         """The page's policy forbids the waiting of Playwright's own, which evaluates text in the page."""
         end = time.monotonic() + PATIENCE / 1000
         while not is_so():
             assert time.monotonic() < end
             self.page.wait_for_timeout(50)
 
-    def name(self) -> str:
+    def name(self):
         """Of the shape that is open."""
         return str(self.page.locator("#shape-name").inner_text())
 
-    def shown(self) -> list[str]:
+    def shown(self):
         """Names on the wall that the search lets through."""
         return list(self.page.locator("#shapes .shape:visible .name").all_inner_texts())
 
-    def open(self, shape: int) -> Any:
+    def open(self, shape):
         self.page.locator(f'#shapes .shape[data-shape="{shape}"]').click()
         dialog = self.page.locator("dialog[open]")
         dialog.wait_for()
@@ -138,24 +136,20 @@ class Visit:
 
 
 @pytest.fixture
-def retrieval(browser: Any, folder: Path) -> Iterator[Visit]:
+def retrieval(browser, folder):
     with Visit(browser, folder / "retrieve.html") as visit:
         yield visit
 
 
 @pytest.mark.parametrize("kind", ["retrieve", "compare", "unlabelled", "answers"])
-def test_every_kind_opens_without_complaint_or_request(
-    browser: Any, folder: Path, kind: str
-) -> None:
+def test_every_kind_opens_without_complaint_or_request(browser, folder, kind):
     with Visit(browser, folder / f"{kind}.html") as visit:
         assert len(visit.shown()) == len(NAMES)
         visit.open(1).locator("#close").click()
         visit.page.locator("dialog[open]").wait_for(state="detached")
 
 
-def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(
-    browser: Any, tmp_path: Path
-) -> None:
+def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(browser, tmp_path):
     names = ("1.nii#liver", "1.nii#spleen", "2.nii#liver")
     np.savez(
         tmp_path / "distances.npz",
@@ -182,33 +176,35 @@ def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(
 
 
 @pytest.fixture
-def answers(browser: Any, folder: Path) -> Iterator[Visit]:
+def answers(browser, folder):
     with Visit(browser, folder / "answers.html") as visit:
         yield visit
 
 
-def places_on_the_map(visit: Visit) -> np.ndarray:
+def places_on_the_map(visit):
     """(N, 2) centres of the points on the screen."""
     visit.page.locator("#map-plot").scroll_into_view_if_needed()
     boxes = [visit.page.locator(f'[data-point="{i}"]').bounding_box() for i in range(len(NAMES))]
     return np.array([[box["x"] + box["width"] / 2, box["y"] + box["height"] / 2] for box in boxes])
 
 
-def selected(visit: Visit) -> set[int]:
+def selected(visit):
     return {
         int(one.get_attribute("data-point"))
         for one in visit.page.locator('[data-point][aria-selected="true"]').all()
     }
 
 
-def test_the_map_has_the_places_of_the_distances_and_tells_the_one_under_the_mouse(
-    answers: Visit,
-) -> None:
+def test_the_map_has_the_places_of_the_distances_and_tells_the_one_under_the_mouse(answers):
     places = places_on_the_map(answers)
     points = body_map(distances_of(0)).points
     scale = np.ptp(places[:, 0]) / np.ptp(points[:, 0])
-    assert np.diff(places[:, 0]) == pytest.approx(scale * np.diff(points[:, 0]), abs=1)
-    assert np.diff(places[:, 1]) == pytest.approx(-scale * np.diff(points[:, 1]), abs=1)
+    found = np.diff(places[:, 0])
+    expected = pytest.approx(scale * np.diff(points[:, 0]), abs=1)
+    assert found == expected
+    found = np.diff(places[:, 1])
+    expected = pytest.approx(-scale * np.diff(points[:, 1]), abs=1)
+    assert found == expected
     answers.page.mouse.move(*places[1])
     tip = answers.page.locator("#map-tip")
     tip.wait_for()
@@ -221,7 +217,7 @@ def test_the_map_has_the_places_of_the_distances_and_tells_the_one_under_the_mou
     assert answers.name() == NAMES[1]
 
 
-def test_a_brush_selects_what_lies_in_it(answers: Visit) -> None:
+def test_a_brush_selects_what_lies_in_it(answers):
     places = places_on_the_map(answers)
     order = places[:, 0].argsort()
     middle = (places[order[2], 0] + places[order[3], 0]) / 2
@@ -235,7 +231,8 @@ def test_a_brush_selects_what_lies_in_it(answers: Visit) -> None:
     assert selected(answers) == set(order[:3].tolist())
     assert answers.page.locator("#map-chosen").inner_text() == "3 selected"
     shown = answers.page.locator("#map-selected .name").all_inner_texts()
-    assert sorted(shown) == sorted(NAMES[i] for i in order[:3])
+    expected = sorted(NAMES[i] for i in order[:3])
+    assert sorted(shown) == expected
     answers.page.keyboard.down("Shift")
     mouse.move(places[order[-1], 0] - 3, low[1])
     mouse.down()
@@ -247,14 +244,14 @@ def test_a_brush_selects_what_lies_in_it(answers: Visit) -> None:
     assert selected(answers) == set()
 
 
-def test_the_map_is_walked_through_by_the_keyboard(answers: Visit) -> None:
+def test_the_map_is_walked_through_by_the_keyboard(answers):
     page = answers.page
     places = places_on_the_map(answers)
     assert page.locator('[data-point][tabindex="0"]').count() == 1
     page.locator('[data-point="0"]').focus()
     assert NAMES[0] in page.locator("#map-tip").inner_text()
 
-    def here() -> int:
+    def here():
         return int(page.evaluate("document.activeElement.dataset.point"))
 
     walked = {here()}
@@ -285,7 +282,7 @@ def test_the_map_is_walked_through_by_the_keyboard(answers: Visit) -> None:
     assert here() == last
 
 
-def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answers: Visit) -> None:
+def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answers):
     page = answers.page
     distances = np.asarray(distances_of(0), dtype=float)
     distances = (distances + distances.T) / 2
@@ -336,7 +333,7 @@ def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answer
     assert selected(answers) == set()
 
 
-def test_leaves_of_the_tree_have_the_colours_of_the_map(answers: Visit) -> None:
+def test_leaves_of_the_tree_have_the_colours_of_the_map(answers):
     for colour in ("class", "cluster", "column dose"):
         answers.page.locator("#map-colour").select_option(colour)
         for i in range(len(NAMES)):
@@ -358,7 +355,7 @@ def test_leaves_of_the_tree_have_the_colours_of_the_map(answers: Visit) -> None:
         ("cluster", None),
     ],
 )
-def test_the_map_is_coloured(answers: Visit, colour: str, legend: list[str] | None) -> None:
+def test_the_map_is_coloured(answers, colour, legend):
     answers.page.locator("#map-colour").select_option(colour)
     entries = [
         " ".join(one.split()) for one in answers.page.locator("#map-legend li").all_inner_texts()
@@ -380,7 +377,7 @@ def test_the_map_is_coloured(answers: Visit, colour: str, legend: list[str] | No
     assert len(marks) == len(legend)
 
 
-def test_numbers_have_a_scale_of_colours(answers: Visit) -> None:
+def test_numbers_have_a_scale_of_colours(answers):
     answers.page.locator("#map-colour").select_option("column dose")
     assert answers.page.locator("#map-legend li").inner_text().split() == ["0.5", "6.5"]
     colours = [
@@ -392,7 +389,7 @@ def test_numbers_have_a_scale_of_colours(answers: Visit) -> None:
     assert len(set(colours)) == len(NAMES)
 
 
-def test_groups_and_outliers_of_the_same_folder_are_told(answers: Visit) -> None:
+def test_groups_and_outliers_of_the_same_folder_are_told(answers):
     groups = [
         row.inner_text().split("\t") for row in answers.page.locator("#groups tbody tr").all()
     ]
@@ -421,7 +418,7 @@ def test_groups_and_outliers_of_the_same_folder_are_told(answers: Visit) -> None
     assert answers.name() == NAMES[5]
 
 
-def test_names_run_nothing(retrieval: Visit) -> None:
+def test_names_run_nothing(retrieval):
     page = retrieval.page
     assert page.evaluate("window.ran") is None
     assert EVIL in page.locator("#shapes h3").all_inner_texts()[0]
@@ -431,7 +428,7 @@ def test_names_run_nothing(retrieval: Visit) -> None:
     assert page.locator("main img, main b").count() == 0
 
 
-def test_no_other_script_could_run(browser: Any, folder: Path) -> None:
+def test_no_other_script_could_run(browser, folder):
     with Visit(browser, folder / "retrieve.html") as visit:
         visit.page.evaluate(
             "() => { const s = document.createElement('script'); s.text = 'window.ran = 3'; "
@@ -441,7 +438,7 @@ def test_no_other_script_could_run(browser: Any, folder: Path) -> None:
         assert "Content Security Policy" in visit.complaints.pop()
 
 
-def test_pictures_are_drawn(retrieval: Visit) -> None:
+def test_pictures_are_drawn(retrieval):
     page = retrieval.page
     retrieval.wait_until(lambda: page.locator("#shapes canvas.drawn").count() == len(NAMES) - 1)
     pixels = page.evaluate(
@@ -455,20 +452,26 @@ def test_pictures_are_drawn(retrieval: Visit) -> None:
     assert not page.locator(f'#shapes .shape[data-shape="{len(NAMES) - 2}"] canvas.drawn').count()
 
 
-def test_a_click_shows_the_ranking(retrieval: Visit) -> None:
+def test_a_click_shows_the_ranking(retrieval):
     query = 3
     distances = distances_of(0)
     dialog = retrieval.open(query)
     order = sorted((j for j in range(len(NAMES)) if j != query), key=lambda j: distances[query, j])
     cards = dialog.locator("#ranking-list .shape")
-    assert cards.locator(".name").all_inner_texts() == [NAMES[j] for j in order]
+    found = cards.locator(".name").all_inner_texts()
+    expected = [NAMES[j] for j in order]
+    assert found == expected
     for place, j in enumerate(order):
         told = cards.nth(place).inner_text()
         assert str(place + 1) in told
         assert f"{distances[query, j]:.3g}"[:4] in told
         right = LABELS[j] == LABELS[query]
-        assert ("✓" in told, "✗" in told) == (right, not right)
-        assert ("same class" in told, "another class" in told) == (right, not right)
+        words = ("✓", "same class") if right else ("✗", "another class")
+        unwanted = ("✗", "another class") if right else ("✓", "same class")
+        for word in words:
+            assert word in told
+        for word in unwanted:
+            assert word not in told
         border = cards.nth(place).evaluate("button => getComputedStyle(button).borderStyle")
         assert border == ("solid" if right else "dashed")
     cards.nth(0).click()
@@ -479,7 +482,7 @@ def test_a_click_shows_the_ranking(retrieval: Visit) -> None:
     retrieval.page.locator("dialog[open]").wait_for(state="detached")
 
 
-def test_marks_on_the_wall_tell_the_nearest(retrieval: Visit) -> None:
+def test_marks_on_the_wall_tell_the_nearest(retrieval):
     distances = distances_of(0) + np.diag([np.inf] * len(NAMES))
     for i, name in enumerate(NAMES):
         told = retrieval.page.locator(f'#shapes .shape[data-shape="{i}"]').inner_text()
@@ -488,7 +491,7 @@ def test_marks_on_the_wall_tell_the_nearest(retrieval: Visit) -> None:
         assert ("✓" in told, "✗" in told) == (right and not alone, not right and not alone), name
 
 
-def test_repairs_are_told(retrieval: Visit) -> None:
+def test_repairs_are_told(retrieval):
     assert NOTE in retrieval.open(2).locator("#facts").inner_text()
     retrieval.page.locator("#close").click()
     assert NOTE in retrieval.page.locator("#repaired").inner_text()
@@ -498,7 +501,7 @@ def test_repairs_are_told(retrieval: Visit) -> None:
     assert "no repair was needed" in retrieval.open(0).locator("#facts").inner_text()
 
 
-def test_search_and_filter(retrieval: Visit) -> None:
+def test_search_and_filter(retrieval):
     page = retrieval.page
     page.locator("#search").fill("EGG c.off")
     assert retrieval.shown() == [NAMES[2]]
@@ -515,10 +518,11 @@ def test_search_and_filter(retrieval: Visit) -> None:
     page.locator("#only").select_option("missed")
     missed = retrieval.shown()
     page.locator("#only").select_option("found")
-    assert sorted([*missed, *retrieval.shown(), NAMES[-1]]) == sorted(NAMES)
+    found = sorted([*missed, *retrieval.shown(), NAMES[-1]])
+    assert found == sorted(NAMES)
 
 
-def test_a_body_turns(retrieval: Visit) -> None:
+def test_a_body_turns(retrieval):
     dialog = retrieval.open(0)
     page = retrieval.page
     canvas = dialog.locator("#turntable")
@@ -548,13 +552,13 @@ def test_a_body_turns(retrieval: Visit) -> None:
     retrieval.wait_until(lambda: retrieval.name() == NAMES[1])
 
 
-def test_a_shape_without_picture_says_so(retrieval: Visit) -> None:
+def test_a_shape_without_picture_says_so(retrieval):
     dialog = retrieval.open(len(NAMES) - 2)
     assert dialog.locator("#turntable").is_hidden()
     assert "no picture" in dialog.locator("#turntable-hint").inner_text()
 
 
-def test_all_by_keyboard(retrieval: Visit) -> None:
+def test_all_by_keyboard(retrieval):
     page = retrieval.page
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.className") == "skip"
@@ -572,7 +576,7 @@ def test_all_by_keyboard(retrieval: Visit) -> None:
     retrieval.wait_until(lambda: page.evaluate("location.hash") == "")
 
 
-def test_a_shape_that_is_chosen_while_another_closes_is_opened(retrieval: Visit) -> None:
+def test_a_shape_that_is_chosen_while_another_closes_is_opened(retrieval):
     """The browser tells of the closing late, after the next shape was chosen."""
     page = retrieval.page
     for query, following in ((0, 3), (3, 1)):
@@ -586,7 +590,7 @@ def test_a_shape_that_is_chosen_while_another_closes_is_opened(retrieval: Visit)
         retrieval.wait_until(lambda: page.evaluate("location.hash") == "")
 
 
-def test_a_link_leads_to_a_shape(browser: Any, folder: Path) -> None:
+def test_a_link_leads_to_a_shape(browser, folder):
     with Visit(browser, folder / "retrieve.html") as visit:
         visit.page.goto(f"{visit.address}#shape-4")
         visit.page.reload()
@@ -595,7 +599,7 @@ def test_a_link_leads_to_a_shape(browser: Any, folder: Path) -> None:
         visit.requests = [url.partition("#")[0] for url in visit.requests]
 
 
-def test_another_descriptor_ranks_otherwise(browser: Any, folder: Path) -> None:
+def test_another_descriptor_ranks_otherwise(browser, folder):
     with Visit(browser, folder / "compare.html") as visit:
         page = visit.page
         query = 0
@@ -615,7 +619,7 @@ def test_another_descriptor_ranks_otherwise(browser: Any, folder: Path) -> None:
         assert page.locator("#precision-recall .legend li").all_inner_texts() == list(DESCRIPTORS)
 
 
-def test_the_worst_confusions_follow_the_descriptor(browser: Any, folder: Path) -> None:
+def test_the_worst_confusions_follow_the_descriptor(browser, folder):
     with Visit(browser, folder / "compare.html") as visit:
         page = visit.page
         for seed, name in enumerate(DESCRIPTORS):
@@ -633,7 +637,8 @@ def test_the_worst_confusions_follow_the_descriptor(browser: Any, folder: Path) 
                     (j for j in range(n) if j != query), key=lambda j: distances[query, j]
                 )
                 wrong = [order[rank - 1] for rank in one["wrong"]]
-                assert row.locator(".name").all_inner_texts() == [NAMES[j] for j in (query, *wrong)]
+                found = row.locator(".name").all_inner_texts()
+                assert found == [NAMES[j] for j in (query, *wrong)]
                 assert row.locator(".name + .about").all_inner_texts() == [
                     LABELS[j] for j in (query, *wrong)
                 ]
@@ -647,7 +652,7 @@ def test_the_worst_confusions_follow_the_descriptor(browser: Any, folder: Path) 
                 assert row.locator("p").inner_text() == told
 
 
-def test_a_worst_confusion_opens_its_rankings(retrieval: Visit) -> None:
+def test_a_worst_confusion_opens_its_rankings(retrieval):
     """By click and by key; whoever closes the window is where they were, not on the wall."""
     page = retrieval.page
     expected = worst_by_a_loop(distances_of(0), LABELS, NAMES)[0]
@@ -679,7 +684,7 @@ def test_a_worst_confusion_opens_its_rankings(retrieval: Visit) -> None:
     )
 
 
-def test_without_confusions_the_page_says_so(browser: Any, tmp_path: Path) -> None:
+def test_without_confusions_the_page_says_so(browser, tmp_path):
     """All right by the first descriptor, and the second describes one shape of each class."""
     results = comparison_folder(tmp_path / "compare")
     right = np.array([[float(one != other) for other in LABELS] for one in LABELS])
@@ -700,7 +705,7 @@ def test_without_confusions_the_page_says_so(browser: Any, tmp_path: Path) -> No
         assert worst.locator("#worst-list").is_hidden()
 
 
-def test_confusion_and_sorted_scores(retrieval: Visit) -> None:
+def test_confusion_and_sorted_scores(retrieval):
     page = retrieval.page
     rows = page.locator("#confusion-table tbody tr")
     assert rows.count() == 3
@@ -716,12 +721,14 @@ def test_confusion_and_sorted_scores(retrieval: Visit) -> None:
     values = [
         text for text in table.locator("tbody td:nth-child(4)").all_inner_texts() if text != "–"
     ]
-    assert [float(value) for value in values] == sorted(map(float, values))
+    found = [float(value) for value in values]
+    expected = sorted(map(float, values))
+    assert found == expected
     assert table.locator("thead th[aria-sort=ascending]").inner_text().startswith("FT")
 
 
-def test_light_and_dark(browser: Any, folder: Path) -> None:
-    def background(visit: Visit) -> float:
+def test_light_and_dark(browser, folder):
+    def background(visit):
         colour = visit.page.evaluate("getComputedStyle(document.body).backgroundColor")
         return np.mean([float(part) for part in colour.strip("rgb()").split(",")])
 
@@ -735,14 +742,14 @@ def test_light_and_dark(browser: Any, folder: Path) -> None:
         assert background(visit) > 200
 
 
-def test_a_narrow_window_holds_all(browser: Any, folder: Path) -> None:
+def test_a_narrow_window_holds_all(browser, folder):
     with Visit(browser, folder / "compare.html", viewport={"width": 360, "height": 700}) as visit:
         assert visit.page.evaluate("document.documentElement.scrollWidth") <= 360
         dialog = visit.open(0)
         assert dialog.evaluate("dialog => dialog.scrollWidth <= dialog.clientWidth")
 
 
-def test_print_has_all_pictures_and_no_controls(retrieval: Visit) -> None:
+def test_print_has_all_pictures_and_no_controls(retrieval):
     page = retrieval.page
     page.set_viewport_size({"width": 1200, "height": 120})  # most shapes are out of sight
     content = page.pdf()
@@ -764,7 +771,7 @@ def test_print_has_all_pictures_and_no_controls(retrieval: Visit) -> None:
 
 
 @pytest.fixture
-def violations() -> Callable[[Any], list[dict[str, Any]]]:
+def violations():
     """What axe-core finds wrong with a page."""
     axe = pytest.importorskip(
         "axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed"
@@ -774,16 +781,10 @@ def violations() -> Callable[[Any], list[dict[str, Any]]]:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("kind", ["retrieve", "compare", "unlabelled", "answers"])
-def test_nothing_serious_for_accessibility(
-    browser: Any,
-    folder: Path,
-    violations: Callable[[Any], list[dict[str, Any]]],
-    scheme: str,
-    kind: str,
-) -> None:
+def test_nothing_serious_for_accessibility(browser, folder, violations, scheme, kind):
     with Visit(browser, folder / f"{kind}.html", color_scheme=scheme) as visit:
 
-        def serious() -> list[str]:
+        def serious():
             return [
                 f"{one['id']}: {node['html']}: {node['failureSummary']}"
                 for one in violations(visit.page)
@@ -800,21 +801,14 @@ def test_nothing_serious_for_accessibility(
         assert serious() == []
 
 
-def test_the_checker_would_see_a_fault(
-    retrieval: Visit, violations: Callable[[Any], list[dict[str, Any]]]
-) -> None:
+def test_the_checker_would_see_a_fault(retrieval, violations):
     retrieval.page.locator("#theme").evaluate(
         "button => { button.removeAttribute('aria-label'); button.textContent = ''; }"
     )
     assert "button-name" in {one["id"] for one in violations(retrieval.page)}
 
 
-def test_the_demo_ends_with_its_page(
-    browser: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_demo_ends_with_its_page(browser, tmp_path, monkeypatch, capsys):
     """A smaller demo, the last line of which names a page that opens."""
     few = ArticulatedShapes(n_classes=2, n_per_class=2)
     monkeypatch.setattr("igps.shapes.ArticulatedShapes", lambda **_: few)
@@ -830,10 +824,10 @@ def test_the_demo_ends_with_its_page(
 
 
 @pytest.fixture(scope="module")
-def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scans(tmp_path_factory):
     """A page of two organs of three scans in the frame of the patient, with a column of labels.csv."""
     body = trimesh.creation.icosphere(subdivisions=3)
-    mesh: Mesh = as_mesh(body).annotated(frame="RAS", unit="mm")
+    mesh = as_mesh(body).annotated(frame="RAS", unit="mm")
     signature = compute_signature(mesh, SignatureConfig(n_eigenpairs=8, resolution=6))
     names = tuple(f"cohort_{i:02}.nii.gz#{part}" for part in ("1", "2") for i in range(3))
     distances = torch.from_numpy(distances_of(0)[:6, :6])
@@ -852,7 +846,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_columns_of_a_table_are_told_and_filter(browser: Any, scans: Path) -> None:
+def test_columns_of_a_table_are_told_and_filter(browser, scans):
     with Visit(browser, scans) as visit:
         visit.page.locator("select.filter").select_option("=y")
         assert visit.shown() == ["cohort_01.nii.gz#1", "cohort_01.nii.gz#2"]
@@ -861,7 +855,7 @@ def test_columns_of_a_table_are_told_and_filter(browser: Any, scans: Path) -> No
         assert "scannery" in facts
 
 
-def test_bodies_of_one_file_are_laid_together(browser: Any, scans: Path) -> None:
+def test_bodies_of_one_file_are_laid_together(browser, scans):
     with Visit(browser, scans) as visit:
         order = visit.page.locator("#order")
         order.select_option("file")
@@ -872,7 +866,7 @@ def test_bodies_of_one_file_are_laid_together(browser: Any, scans: Path) -> None
         assert visit.shown()[:2] == ["cohort_00.nii.gz#1", "cohort_01.nii.gz#1"]
 
 
-def test_long_names_keep_their_ends(browser: Any, scans: Path) -> None:
+def test_long_names_keep_their_ends(browser, scans):
     with Visit(browser, scans) as visit:
         name = visit.page.locator("#shapes .shape .name").first
         assert name.evaluate(
@@ -881,7 +875,7 @@ def test_long_names_keep_their_ends(browser: Any, scans: Path) -> None:
         assert name.evaluate("e => e.scrollWidth <= e.clientWidth")
 
 
-def test_letters_of_the_patient_follow_the_turns(browser: Any, scans: Path) -> None:
+def test_letters_of_the_patient_follow_the_turns(browser, scans):
     """From the front, the patient's right is on the left; the right arrow key brings the side that was on the right."""
     with Visit(browser, scans) as visit:
         dialog = visit.open(0)

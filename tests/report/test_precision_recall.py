@@ -1,23 +1,14 @@
 """The picture of several descriptors side by side."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from igps.report import answers
 from igps.retrieval import precision_recall_curve
 
 
-def test_curves_are_drawn_in_percent_and_told_apart(
-    tmp_path: Path, figures_of: Callable[[Any], list[Figure]]
-) -> None:
+def test_curves_are_drawn_in_percent_and_told_apart(tmp_path, figures_of):
     made = figures_of(answers)
     labels = [0, 0, 0, 1, 1, 1]
     draws = np.random.default_rng(0).random((12, 6, 6))
@@ -36,5 +27,6 @@ def test_curves_are_drawn_in_percent_and_told_apart(
     assert len(looks) == 12
     assert "%" in axes.get_xlabel()
     assert "%" in axes.get_ylabel()
-    assert [text.get_text() for text in made[0].legends[0].get_texts()] == list(curves)
+    found = [text.get_text() for text in made[0].legends[0].get_texts()]
+    assert found == list(curves)
     assert imread(tmp_path / "deep" / "curves.png").std() > 0.05

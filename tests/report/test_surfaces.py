@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -24,29 +22,33 @@ from igps.signature.signature import SignatureConfig, compute_signature
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=400)
 
 
-def egg() -> trimesh.Trimesh:
+def egg():
     surface = trimesh.creation.icosphere(subdivisions=3)
     surface.vertices *= [1.0, 0.7, 2.5]
     return surface
 
 
-def test_a_surface_keeps_the_form_with_few_vertices() -> None:
+def test_a_surface_keeps_the_form_with_few_vertices():
     """The closed form of an ellipsoid: its axes, longest up, and its volume."""
     mesh = as_mesh(egg())
     one = surface_of(mesh, compute_signature(mesh, CONFIG), 150)
     assert 100 < len(one.vertices) <= 150
     points = one.vertices / 65535
-    np.testing.assert_allclose(np.ptp(points, axis=0), [1.0 / 2.5, 1.0, 0.7 / 2.5], rtol=0.06)
+    found = np.ptp(points, axis=0)
+    expected = [1.0 / 2.5, 1.0, 0.7 / 2.5]
+    np.testing.assert_allclose(found, expected, rtol=0.06)
     body = trimesh.Trimesh(points, one.faces, process=False)
     assert body.is_watertight
     assert body.volume == pytest.approx(
         np.pi / 6 * 0.4 * 0.28, rel=0.06
     )  # positive: not a mirror image
-    assert (one.n_vertices, one.n_faces) == (642, 1280)
-    assert one.volume == pytest.approx(4 / 3 * np.pi * 1.75, rel=0.02)
+    assert one.n_vertices == 642
+    assert one.n_faces == 1280
+    expected = pytest.approx(4 / 3 * np.pi * 1.75, rel=0.02)
+    assert one.volume == expected
 
 
-def test_the_potential_is_that_of_the_nearest_samples() -> None:
+def test_the_potential_is_that_of_the_nearest_samples():
     """Against a loop; and on an egg it is least around the middle and largest at the ends."""
     mesh = as_mesh(egg())
     signature = compute_signature(mesh, CONFIG)
@@ -73,7 +75,7 @@ def test_the_potential_is_that_of_the_nearest_samples() -> None:
         )
 
 
-def test_turned_and_moved_bodies_look_alike() -> None:
+def test_turned_and_moved_bodies_look_alike():
     mesh = horseshoe()
     turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).uniform(size=3))[
         :3, :3
@@ -85,18 +87,20 @@ def test_turned_and_moved_bodies_look_alike() -> None:
     np.testing.assert_allclose(one.vertices / 65535, two.vertices / 65535, atol=2e-3)
 
 
-def test_clusters_are_means_of_cells() -> None:
+def test_clusters_are_means_of_cells():
     surface = egg()
     vertices, faces = clustered(np.asarray(surface.vertices), np.asarray(surface.faces), 120)
     assert 40 < len(vertices) <= 120
     assert components(faces, len(vertices))[0] == 1
     inside = (vertices / [1.0, 0.7, 2.5]) ** 2
     assert (inside.sum(axis=1) <= 1 + 1e-9).all()  # means of points of a convex surface
-    assert trimesh.Trimesh(vertices, faces).area == pytest.approx(surface.area, rel=0.1)
+    found = trimesh.Trimesh(vertices, faces).area
+    expected = pytest.approx(surface.area, rel=0.1)
+    assert found == expected
 
 
-def test_where_quadrics_fail_clusters_serve(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(mesh: object, n_vertices: int) -> None:
+def test_where_quadrics_fail_clusters_serve(monkeypatch):
+    def missing(mesh, n_vertices):
         raise MeshError("a handle is in the way")
 
     monkeypatch.setattr(surfaces, "simplify", missing)
@@ -104,7 +108,7 @@ def test_where_quadrics_fail_clusters_serve(monkeypatch: pytest.MonkeyPatch) -> 
     assert 40 < len(surface_of(mesh, compute_signature(mesh, CONFIG), 150).vertices) <= 150
 
 
-def test_written_and_read_again(tmp_path: Path) -> None:
+def test_written_and_read_again(tmp_path):
     path = tmp_path / "surfaces.npz"
     assert read_surfaces(path) == {}
     mesh = as_mesh(egg())
@@ -124,7 +128,7 @@ def test_written_and_read_again(tmp_path: Path) -> None:
         read_surfaces(path)
 
 
-def test_kept_surfaces_follow_their_files(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_kept_surfaces_follow_their_files(tmp_path, caplog):
     """Made once, again where the file changed, kept where it is gone; one that cannot be read has none."""
     files = [tmp_path / f"{i}.off" for i in range(3)]
     for i, file in enumerate(files):
@@ -133,7 +137,7 @@ def test_kept_surfaces_follow_their_files(tmp_path: Path, caplog: pytest.LogCapt
         surface.export(file)
     kept = tmp_path / "surfaces.npz"
 
-    def keep() -> dict[str, surfaces.PageSurface]:
+    def keep():
         dataset = SignatureDataset(files, CONFIG, tmp_path / "cache")
         return {
             Path(name).name: one for name, one in keep_surfaces(kept, dataset, n_workers=1).items()
@@ -162,7 +166,7 @@ def test_kept_surfaces_follow_their_files(tmp_path: Path, caplog: pytest.LogCapt
     assert "2.off: no picture" in caplog.text
 
 
-def test_many_shapes_share_the_room() -> None:
+def test_many_shapes_share_the_room():
     assert fitting_vertices(0) == fitting_vertices(400) == 1200
     assert 150 < fitting_vertices(2000) < 500
     for n in (1, 400, 1000, 5000):
@@ -170,7 +174,7 @@ def test_many_shapes_share_the_room() -> None:
     assert fitting_vertices(10**6) == 150
 
 
-def test_a_body_of_a_patient_has_its_left_on_the_right_of_the_page() -> None:
+def test_a_body_of_a_patient_has_its_left_on_the_right_of_the_page():
     body = trimesh.creation.icosphere(subdivisions=3)
     body.vertices[body.vertices[:, 0] < -0.9] *= 1.5  # in RAS this is the left
     mesh = as_mesh(body).annotated(unit="mm", frame="RAS")

@@ -1,7 +1,3 @@
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,11 +5,10 @@ from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
 from conftest import as_mesh
-from igps._arrays import Floats
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.report import drawing
-from igps.report.views import View, common_views, draw_view
+from igps.report.views import common_views, draw_view
 
 nibabel = pytest.importorskip("nibabel")
 SimpleITK = pytest.importorskip("SimpleITK")
@@ -29,7 +24,7 @@ ORIENTATIONS = {
 }
 
 
-def marked_ball(axes: Floats, toward: list[float]) -> tuple[np.ndarray, Floats]:
+def marked_ball(axes, toward):
     """Return voxels of a ball with a knob towards a side in RAS, on a grid with these axes, and the affine."""
     affine = np.eye(4)
     affine[:3, :3] = 1.5 * axes
@@ -41,7 +36,7 @@ def marked_ball(axes: Floats, toward: list[float]) -> tuple[np.ndarray, Floats]:
     return (ball | knob).astype(np.uint8), affine
 
 
-def write(path: Path, voxels: np.ndarray, affine: Floats) -> None:
+def write(path, voxels, affine):
     if path.name.endswith(".nii.gz"):
         nibabel.save(nibabel.Nifti1Image(voxels, affine), path)
         return
@@ -53,7 +48,7 @@ def write(path: Path, voxels: np.ndarray, affine: Floats) -> None:
     SimpleITK.WriteImage(image, str(path))
 
 
-def nearest_letter(view: View, point: Floats) -> str:
+def nearest_letter(view, point):
     """Return the letter at the edge, or towards the viewer, to which a point lies from the centre."""
     right, up, toward = (point - CENTRE) @ view.axes
     side = {"from the left": "L", "from the right": "R", "from the front": "A", "from behind": "P"}
@@ -73,9 +68,7 @@ def nearest_letter(view: View, point: Floats) -> str:
         *(("oblique", ending, letter) for ending in ("nrrd", "mha") for letter in MARKS),
     ],
 )
-def test_a_mark_is_at_its_letter_in_every_view(
-    tmp_path: Path, orientation: str, ending: str, letter: str
-) -> None:
+def test_a_mark_is_at_its_letter_in_every_view(tmp_path, orientation, ending, letter):
     path = tmp_path / f"body.{ending}"
     write(path, *marked_ball(ORIENTATIONS[orientation], MARKS[letter]))
     views, (vertices,) = common_views([load_mesh(path)])
@@ -84,7 +77,7 @@ def test_a_mark_is_at_its_letter_in_every_view(
     assert {nearest_letter(view, farthest) for view in views} == {letter}
 
 
-def test_pixels_of_a_mark_on_the_left_are_at_the_letter_l(tmp_path: Path) -> None:
+def test_pixels_of_a_mark_on_the_left_are_at_the_letter_l(tmp_path):
     path = tmp_path / "body.nii.gz"
     write(path, *marked_ball(ORIENTATIONS["LPS"], MARKS["L"]))
     mesh = load_mesh(path)
@@ -109,9 +102,7 @@ def test_pixels_of_a_mark_on_the_left_are_at_the_letter_l(tmp_path: Path) -> Non
     ("header", "frame"),
     [("space: left-posterior-superior", "RAS"), ("space: 3D-right-handed", None)],
 )
-def test_a_frame_is_claimed_only_where_the_file_has_one(
-    tmp_path: Path, header: str, frame: str | None
-) -> None:
+def test_a_frame_is_claimed_only_where_the_file_has_one(tmp_path, header, frame):
     voxels, affine = marked_ball(np.eye(3), MARKS["L"])
     path = tmp_path / "body.nrrd"
     write(path, voxels, affine)
@@ -123,24 +114,27 @@ def test_a_frame_is_claimed_only_where_the_file_has_one(
     assert load_mesh(tmp_path / "body.nii").frame is None
 
 
-def test_bodies_without_a_frame_are_turned_onto_the_first_and_not_mirrored() -> None:
+def test_bodies_without_a_frame_are_turned_onto_the_first_and_not_mirrored():
     body = trimesh.creation.icosphere(subdivisions=4)
     body.vertices *= [3.0, 2.0, 1.0]
     body.vertices += 0.9 * np.exp(-np.square(body.vertices - [2.0, 1.0, 0.5]).sum(axis=1))[:, None]
-    first: Mesh = as_mesh(body)
+    first = as_mesh(body)
     turn = Rotation.from_euler("xyz", [100, 40, -70], degrees=True).as_matrix()
     turned = Mesh(first.vertices @ turn.T + [5.0, -3, 2], first.faces)
     mirrored = Mesh(turned.vertices * [-1, 1, 1], turned.faces[:, ::-1])
     views, (own, moved, other) = common_views([first, turned, mirrored])
-    assert [view.title for view in views] == [f"view {number}" for number in range(1, 7)]
-    assert all(view.letters == () for view in views)
+    found = [view.title for view in views]
+    expected = [f"view {number}" for number in range(1, 7)]
+    assert found == expected
+    for view in views:
+        assert view.letters == ()
     np.testing.assert_allclose(moved, own, atol=0.02)
     assert np.linalg.norm(other - own, axis=1).max() > 0.3
     motion = np.linalg.lstsq(mirrored.vertices - mirrored.vertices.mean(axis=0), other, rcond=None)
     assert np.linalg.det(motion[0]) > 0
 
 
-def test_titles_leave_out_the_folders_that_all_share() -> None:
+def test_titles_leave_out_the_folders_that_all_share():
     names = ["/data/a/s1.nii.gz#liver", "/data/b/s1.nii.gz#liver"]
     assert drawing.titles_of(names) == ["a/s1.nii.gz#liver", "b/s1.nii.gz#liver"]
     assert drawing.titles_of(names[:1]) == ["s1.nii.gz#liver"]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 
 
 class _Lines:
-    def __init__(self) -> None:
+    def __init__(self):
         self.lines: list[str] = []
 
-    def __call__(self, text: str) -> str:
+    def __call__(self, text):
         self.lines.append(f"#{len(self.lines) + 1}={text};")
         return f"#{len(self.lines)}"
 
@@ -18,9 +17,7 @@ class _Lines:
 Place = tuple[float, float, float]
 
 
-def write_step(
-    path: Path, parts: dict[str, list[tuple[Place, Place]]], unit: str = ".MILLI."
-) -> None:
+def write_step(path, parts, unit=".MILLI."):
     """Parts of boxes from their least to their greatest corners, each a solid.
 
     `unit` is a prefix of metres, ".MILLI." or "$".
@@ -53,22 +50,20 @@ def write_step(
     path.write_text(head + schema + "\n".join(add.lines) + "\nENDSEC;\nEND-ISO-10303-21;\n")
 
 
-def _point(add: _Lines, place: tuple[float, ...]) -> str:
+def _point(add, place):
     return add(f"CARTESIAN_POINT('',({','.join(f'{float(x):.6f}' for x in place)}))")
 
 
-def _direction(add: _Lines, way: tuple[float, ...]) -> str:
+def _direction(add, way):
     return add(f"DIRECTION('',({','.join(f'{float(x):.6f}' for x in way)}))")
 
 
-def _placement(
-    add: _Lines, place: tuple[float, ...], axis: tuple[float, ...], reference: tuple[float, ...]
-) -> str:
+def _placement(add, place, axis, reference):
     parts = _point(add, place), _direction(add, axis), _direction(add, reference)
     return add(f"AXIS2_PLACEMENT_3D('',{','.join(parts)})")
 
 
-def _box(add: _Lines, low: tuple[float, float, float], high: tuple[float, float, float]) -> str:
+def _box(add, low, high):
     corners = {
         bits: tuple(high[i] if bits[i] else low[i] for i in range(3))
         for bits in itertools.product((0, 1), repeat=3)
@@ -76,7 +71,7 @@ def _box(add: _Lines, low: tuple[float, float, float], high: tuple[float, float,
     vertices = {
         bits: add(f"VERTEX_POINT('',{_point(add, place)})") for bits, place in corners.items()
     }
-    edges: dict[tuple[tuple[int, ...], tuple[int, ...]], str] = {}
+    edges = {}
     for bits, axis in itertools.product(corners, range(3)):
         if not bits[axis]:
             other = tuple(1 if i == axis else bit for i, bit in enumerate(bits))

@@ -1,9 +1,6 @@
 """A changed byte in a compressed stream: the body is as it was, or refused; never another one in silence."""
 
-from __future__ import annotations
-
 import gzip
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +12,7 @@ from igps.mesh.loading import load_mesh
 N_CHANGES = 40
 
 
-def volume_or_none(path: Path) -> float | None:
+def volume_or_none(path):
     try:
         return load_mesh(path).volume
     except MeshError:
@@ -23,7 +20,7 @@ def volume_or_none(path: Path) -> float | None:
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_changed_bytes_never_give_another_body(name: str, tmp_path: Path) -> None:
+def test_changed_bytes_never_give_another_body(name, tmp_path):
     path = tmp_path / name
     WRITERS[name](path)
     expected = load_mesh(path).volume
@@ -41,7 +38,7 @@ def test_changed_bytes_never_give_another_body(name: str, tmp_path: Path) -> Non
     assert n_refused > N_CHANGES // 2
 
 
-def test_metaimage_without_the_size_of_its_data_is_read(tmp_path: Path) -> None:
+def test_metaimage_without_the_size_of_its_data_is_read(tmp_path):
     write_itk(tmp_path / "mask.mha")
     content = (tmp_path / "mask.mha").read_bytes()
     head, mark, data = content.partition(b"ElementDataFile = LOCAL\n")
@@ -51,7 +48,7 @@ def test_metaimage_without_the_size_of_its_data_is_read(tmp_path: Path) -> None:
     assert load_mesh(tmp_path / "other.mha").volume == load_mesh(tmp_path / "mask.mha").volume
 
 
-def test_a_stream_that_unpacks_to_far_more_than_its_header_says_is_refused(tmp_path: Path) -> None:
+def test_a_stream_that_unpacks_to_far_more_than_its_header_says_is_refused(tmp_path):
     write_nibabel(tmp_path / "mask.nii.gz")
     content = gzip.decompress((tmp_path / "mask.nii.gz").read_bytes())
     bomb = gzip.compress(content + bytes(1 << 27), compresslevel=1)

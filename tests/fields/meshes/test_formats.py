@@ -1,13 +1,10 @@
 """Formats: the same surface from all of them, against the libraries that write them, and what files get wrong."""
 
-from __future__ import annotations
-
 import gzip
 import re
 import tarfile
 import tracemalloc
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import meshio
@@ -22,7 +19,6 @@ from igps.mesh.errors import MeshError
 from igps.mesh.formats import all_formats, format_of, is_searched
 from igps.mesh.loading import list_bodies, load_mesh, read_surface
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Signature
 
 BALL = trimesh.creation.icosphere(subdivisions=2)
 # Exactly representable in single precision; no two faces and no two vertices are alike.
@@ -32,22 +28,22 @@ VERTICES = np.asarray(
 FACES = np.asarray(BALL.faces, dtype=np.int64)
 
 
-def lines(rows: np.ndarray, before: str = "") -> str:
+def lines(rows, before=""):
     return "".join(before + " ".join(map(repr, row)) + "\n" for row in rows.tolist())
 
 
-def off() -> str:
+def off():
     return f"OFF\n{len(VERTICES)} {len(FACES)} 0\n" + lines(VERTICES) + lines(FACES, "3 ")
 
 
-def relative_obj() -> str:
+def relative_obj():
     """Indices that count from the last vertex, with textures and normals, lines that go on, comments."""
     corners = [[f"{i - len(VERTICES)}/-1/-1" for i in face] for face in FACES.tolist()]
     faces = "".join(f"f {a} {b} \\\n {c} # a face\n" for a, b, c in corners)
     return "vt 0 0\nvn 0 0 1\n" + lines(VERTICES, "v ") + faces
 
 
-def polydata(version: str) -> str:
+def polydata(version):
     head = f"# vtk DataFile Version {version}\na ball\nASCII\nDATASET POLYDATA\nPOINTS {len(VERTICES)} double\n"
     if version < "5":
         return (
@@ -61,7 +57,7 @@ def polydata(version: str) -> str:
     return head + lines(VERTICES) + cells + lines(FACES) + f"CELL_DATA {len(FACES)}\n"
 
 
-def binary_polydata() -> bytes:
+def binary_polydata():
     head = f"# vtk DataFile Version 3.0\na ball\nBINARY\nDATASET POLYDATA\nPOINTS {len(VERTICES)} float\n".encode()
     cells = np.column_stack([np.full(len(FACES), 3), FACES]).astype(">i4").tobytes()
     return (
@@ -72,7 +68,7 @@ def binary_polydata() -> bytes:
     )
 
 
-def polydata_of_vtk_9() -> bytes:
+def polydata_of_vtk_9():
     """As VTK 9 writes it: identifiers, which it keeps as 64 bits, as 32, and notes about an array behind it."""
     head = f"# vtk DataFile Version 5.1\nvtk output\nBINARY\nDATASET POLYDATA\nPOINTS {len(VERTICES)} float\n".encode()
     notes = b"\nMETADATA\nCOMPONENT_NAMES\nPOLYGONS\ny\nz\nINFORMATION 0\n\n"
@@ -90,7 +86,7 @@ def polydata_of_vtk_9() -> bytes:
     )
 
 
-def polydata_of_windows() -> bytes:
+def polydata_of_windows():
     """Text with notes about an array, and carriage returns, also in the blank line behind the notes."""
     notes = (
         "METADATA\nINFORMATION 1\nNAME L2_NORM_RANGE LOCATION vtkDataArray\nDATA 2 0 1 \n\nPOLYGONS"
@@ -98,7 +94,7 @@ def polydata_of_windows() -> bytes:
     return polydata("5.1").replace("POLYGONS", notes).replace("\n", "\r\n").encode()
 
 
-def vtp(form: str) -> bytes:
+def vtp(form):
     arrays = {
         "points": VERTICES.astype("<f4"),
         "connectivity": FACES.ravel().astype("<i8"),
@@ -126,7 +122,7 @@ def vtp(form: str) -> bytes:
     return (head + body).encode() + tail + b"</VTKFile>"
 
 
-def gifti(path: Path, encoding: str) -> None:
+def gifti(path, encoding):
     points = nibabel.gifti.GiftiDataArray(
         VERTICES.astype("f4"), "NIFTI_INTENT_POINTSET", encoding=encoding
     )
@@ -136,19 +132,19 @@ def gifti(path: Path, encoding: str) -> None:
     nibabel.save(nibabel.gifti.GiftiImage(darrays=[points, triangles]), path)
 
 
-def zipped(path: Path) -> None:
+def zipped(path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("in/a.off", off())
         archive.writestr("readme.txt", "a ball")
 
 
-def tarred(path: Path) -> None:
+def tarred(path):
     (path.parent / "a.off").write_text(off())
     with tarfile.open(path, "w:gz") as archive:
         archive.add(path.parent / "a.off", "a.off")
 
 
-def strips_ply(order: str) -> bytes:
+def strips_ply(order):
     """A list of strips of one triangle each, as text without an order."""
     kind = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
     head = f"ply\nformat {kind} 1.0\nelement vertex {len(VERTICES)}\nproperty float x\nproperty float y\n"
@@ -167,7 +163,7 @@ def strips_ply(order: str) -> bytes:
 
 SOLID = trimesh.Trimesh(VERTICES, FACES, process=False)
 CELLS = meshio.Mesh(VERTICES, [("triangle", FACES)])
-WRITERS: dict[str, Callable[[Path], object]] = {
+WRITERS = {
     "plain.off": lambda path: path.write_text(off()),
     "relative.obj": lambda path: path.write_text(relative_obj()),
     "binary.ply": lambda path: SOLID.export(path),
@@ -201,7 +197,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
 UNITS = {".glb": "m", ".3mf": "mm", ".gii": "mm", ".pial": "mm"}
 
 
-def numbers(signature: Signature) -> bytes:
+def numbers(signature):
     inside = signature.interior
     outside = signature.surface
     arrays = (
@@ -215,7 +211,7 @@ def numbers(signature: Signature) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def expected(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def expected(tmp_path_factory):
     path = tmp_path_factory.mktemp("plain") / "plain.off"
     path.write_text(off())
     return numbers(
@@ -224,9 +220,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
-def test_every_format_gives_the_same_signature_to_the_byte(
-    name: str, tmp_path: Path, expected: bytes
-) -> None:
+def test_every_format_gives_the_same_signature_to_the_byte(name, tmp_path, expected):
     WRITERS[name](tmp_path / name)
     mesh = load_mesh(tmp_path / name, LoadOptions("never"))
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
@@ -239,7 +233,7 @@ def test_every_format_gives_the_same_signature_to_the_byte(
     )
 
 
-def test_a_binary_stl_with_a_wrong_count_gives_what_is_there(tmp_path: Path) -> None:
+def test_a_binary_stl_with_a_wrong_count_gives_what_is_there(tmp_path):
     path = tmp_path / "count.stl"
     SOLID.export(path)
     content = bytearray(path.read_bytes())
@@ -254,7 +248,7 @@ def test_a_binary_stl_with_a_wrong_count_gives_what_is_there(tmp_path: Path) -> 
         load_mesh(path)
 
 
-def test_corners_in_one_place_are_one_vertex_in_the_order_in_which_they_come() -> None:
+def test_corners_in_one_place_are_one_vertex_in_the_order_in_which_they_come():
     generator = np.random.default_rng(0)
     # Zeros of both signs
     corners = generator.integers(-1, 2, (300, 3)) * generator.choice([1.0, -1.0], (300, 3))
@@ -264,7 +258,7 @@ def test_corners_in_one_place_are_one_vertex_in_the_order_in_which_they_come() -
     np.testing.assert_array_equal(vertices, places)
 
 
-def test_volumes_of_cells_give_the_surface_around_them(tmp_path: Path) -> None:
+def test_volumes_of_cells_give_the_surface_around_them(tmp_path):
     """Two cells of every kind side by side: the wall between them is inside, and the volume is that of both."""
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     cube = np.vstack([square, square + np.array([0, 0, 1])])
@@ -287,10 +281,11 @@ def test_volumes_of_cells_give_the_surface_around_them(tmp_path: Path) -> None:
             mesh = load_mesh(tmp_path / f"cells.{suffix}")
             assert len(mesh.faces) == n_faces
             assert mesh.volume == pytest.approx(volume)
-            assert not any("inside out" in note for note in mesh.notes)
+            for note in mesh.notes:
+                assert "inside out" not in note
 
 
-def test_a_strip_of_a_ply_file_turns_its_triangles_alike(tmp_path: Path) -> None:
+def test_a_strip_of_a_ply_file_turns_its_triangles_alike(tmp_path):
     head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     head += "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
     # The last is none
@@ -301,7 +296,7 @@ def test_a_strip_of_a_ply_file_turns_its_triangles_alike(tmp_path: Path) -> None
     assert mesh.volume == pytest.approx(1 / 6)
 
 
-def test_strips_and_polygons_of_vtk_files(tmp_path: Path) -> None:
+def test_strips_and_polygons_of_vtk_files(tmp_path):
     """A tetrahedron as a strip, and a prism of two pentagons and five quadrilaterals."""
     head = "# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\n"
     corners = "POINTS 4 float\n0 0 0 1 0 0 0 1 0 0 0 1\n"
@@ -316,7 +311,8 @@ def test_strips_and_polygons_of_vtk_files(tmp_path: Path) -> None:
     (tmp_path / "prism.vtk").write_text(head + text)
     mesh = load_mesh(tmp_path / "prism.vtk")
     assert len(mesh.faces) == 16
-    assert mesh.volume == pytest.approx(2.5 * np.sin(2 * np.pi / 5))
+    expected = pytest.approx(2.5 * np.sin(2 * np.pi / 5))
+    assert mesh.volume == expected
 
 
 FAULTY = {
@@ -370,9 +366,7 @@ FAULTY = {
 
 
 @pytest.mark.parametrize("name", sorted(FAULTY))
-def test_what_is_wrong_with_a_file_is_told_in_a_sentence_that_names_it(
-    name: str, tmp_path: Path
-) -> None:
+def test_what_is_wrong_with_a_file_is_told_in_a_sentence_that_names_it(name, tmp_path):
     content, words = FAULTY[name]
     (tmp_path / name).write_bytes(content)
     with pytest.raises(MeshError, match=rf"{name}: not readable as .*{words}.*\. .*[Ee]xport"):
@@ -380,7 +374,7 @@ def test_what_is_wrong_with_a_file_is_told_in_a_sentence_that_names_it(
 
 
 @pytest.mark.parametrize("name", ["text.vtp", "polygons3.vtk", "text.stl"])
-def test_one_long_number_does_not_widen_all_others(name: str, tmp_path: Path) -> None:
+def test_one_long_number_does_not_widen_all_others(name, tmp_path):
     WRITERS[name](tmp_path / name)
     content = (tmp_path / name).read_bytes()
     word = re.findall(rb"\d\.\d{6,}", content)[5]  # those before may be of a normal
@@ -393,7 +387,7 @@ def test_one_long_number_does_not_widen_all_others(name: str, tmp_path: Path) ->
     assert peak < 8e6
 
 
-def test_arrays_in_one_place_count_as_often_as_they_are_named(tmp_path: Path) -> None:
+def test_arrays_in_one_place_count_as_often_as_they_are_named(tmp_path):
     head, piece, tail = re.split(rb"(<Piece>.*</Piece>)", vtp("raw"), maxsplit=1)
     (tmp_path / "a.vtp").write_bytes(head + 20 * piece + tail)
     once = 12 * len(VERTICES) + 32 * len(FACES)
@@ -405,7 +399,7 @@ def test_arrays_in_one_place_count_as_often_as_they_are_named(tmp_path: Path) ->
         load_mesh(tmp_path / "a.vtp", LoadOptions(max_unpacked=10 * once))
 
 
-def test_an_array_that_promises_too_much_is_not_unpacked(tmp_path: Path) -> None:
+def test_an_array_that_promises_too_much_is_not_unpacked(tmp_path):
     gifti(tmp_path / "a.gii", "GIFTI_ENCODING_B64GZ")
     text = (tmp_path / "a.gii").read_text()
     (tmp_path / "a.gii").write_text(text.replace(f'Dim0="{len(VERTICES)}"', 'Dim0="1000000000000"'))
@@ -416,7 +410,7 @@ def test_an_array_that_promises_too_much_is_not_unpacked(tmp_path: Path) -> None
         load_mesh(tmp_path / "a.gii")
 
 
-def bracket() -> tuple[np.ndarray, list[list[int]]]:
+def bracket():
     """A prism over a C of area 10 and perimeter 22: octagons whose first corner sees not all others, and squares."""
     outline = np.array([[4, 0], [4, 1], [1, 1], [1, 3], [4, 3], [4, 4], [0, 4], [0, 0]], float)
     vertices = np.concatenate([np.c_[outline, np.zeros(8)], np.c_[outline, np.ones(8)]])
@@ -424,11 +418,11 @@ def bracket() -> tuple[np.ndarray, list[list[int]]]:
     return vertices, [[*range(7, -1, -1)], [*range(8, 16)], *sides]
 
 
-def text_of(rows: list[list[int]], counted: bool = True) -> str:
+def text_of(rows, counted=True):
     return "".join(f"{len(row)} " * counted + " ".join(map(str, row)) + "\n" for row in rows)
 
 
-def ply_of(vertices: np.ndarray, faces: list[list[int]], order: str = "") -> bytes:
+def ply_of(vertices, faces, order=""):
     """A PLY file with a colour before and behind the corners of each face; as text without an order."""
     kind = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
     head = f"ply\nformat {kind} 1.0\ncomment made here\nelement vertex {len(vertices)}\n"
@@ -453,7 +447,7 @@ def ply_of(vertices: np.ndarray, faces: list[list[int]], order: str = "") -> byt
     return head.encode() + body
 
 
-def polygon_files() -> dict[str, bytes]:
+def polygon_files():
     vertices, faces = bracket()
     places = "".join(" ".join(map(str, row)) + "\n" for row in vertices.tolist())
     size = sum(len(row) + 1 for row in faces)
@@ -477,7 +471,7 @@ def polygon_files() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", polygon_files())
-def test_concave_polygons_of_any_format_do_not_fold(name: str, tmp_path: Path) -> None:
+def test_concave_polygons_of_any_format_do_not_fold(name, tmp_path):
     content = polygon_files()[name]
     (tmp_path / name).write_bytes(content)
     mesh = load_mesh(tmp_path / name, LoadOptions(mend="never"))
@@ -490,9 +484,7 @@ def test_concave_polygons_of_any_format_do_not_fold(name: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("n_corners", [3, 4])
-def test_triangles_and_squares_are_what_trimesh_makes_of_them(
-    n_corners: int, tmp_path: Path
-) -> None:
+def test_triangles_and_squares_are_what_trimesh_makes_of_them(n_corners, tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=1)
     quads = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
     cube = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
@@ -516,19 +508,20 @@ def test_triangles_and_squares_are_what_trimesh_makes_of_them(
         np.testing.assert_array_equal(found.faces, expected.faces)
 
 
-def test_files_are_known_by_the_longest_suffix_and_maps_on_surfaces_are_none() -> None:
-    assert format_of("a.tar.gz").name == "an archive"  # type: ignore[union-attr]
-    assert format_of("A.OFF").name == "OFF"  # type: ignore[union-attr]
+def test_files_are_known_by_the_longest_suffix_and_maps_on_surfaces_are_none():
+    assert format_of("a.tar.gz").name == "an archive"
+    assert format_of("A.OFF").name == "OFF"
     assert format_of("fsaverage/surf/lh.pial") is not None
     assert format_of("pial") is format_of("a.txt") is format_of("a.label.gii") is None
     assert is_searched("a.stl")
     assert not is_searched("a.zip")
     suffixes = [suffix for one in all_formats() for suffix in one.suffixes]
     assert len(set(suffixes)) == len(suffixes)
-    assert all(suffix == suffix.lower() for suffix in suffixes)
+    for suffix in suffixes:
+        assert suffix == suffix.lower()
 
 
-def test_an_unknown_format_is_told_with_those_that_are_known(tmp_path: Path) -> None:
+def test_an_unknown_format_is_told_with_those_that_are_known(tmp_path):
     (tmp_path / "a.blend").write_bytes(b"x")
     with pytest.raises(MeshError, match=r"a\.blend: unknown file format.*\.off.*\.3mf"):
         read_surface(tmp_path / "a.blend")

@@ -1,14 +1,11 @@
 """What is packed: no more is unpacked than allowed, nothing outside of its folder is read or written."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json
 import sys
 import tarfile
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +22,7 @@ LIMIT = 10**6
 BOMB = b"# " + bytes(2 * 10**6)
 
 
-def tar_of(members: dict[str, bytes], compression: str = "") -> bytes:
+def tar_of(members, compression=""):
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode=f"w:{compression}") as archive:
         for name, content in members.items():
@@ -35,7 +32,7 @@ def tar_of(members: dict[str, bytes], compression: str = "") -> bytes:
     return out.getvalue()
 
 
-def zip_of(members: dict[str, bytes]) -> bytes:
+def zip_of(members):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():
@@ -43,7 +40,7 @@ def zip_of(members: dict[str, bytes]) -> bytes:
     return out.getvalue()
 
 
-def packed(content: dict[str, bytes]) -> dict[str, bytes]:
+def packed(content):
     tars = {
         "a.tar.gz": tar_of(content, "gz"),
         "a.tar.xz": tar_of(content, "xz"),
@@ -55,7 +52,7 @@ def packed(content: dict[str, bytes]) -> dict[str, bytes]:
 @pytest.mark.parametrize(
     "name", ["a.zip", "a.tar.gz", "a.tar.xz", "a.tar", "a.off.gz", "a.3mf", "a.zae"]
 )
-def test_more_than_is_allowed_is_refused_and_the_remedy_named(name: str, tmp_path: Path) -> None:
+def test_more_than_is_allowed_is_refused_and_the_remedy_named(name, tmp_path):
     contents = packed({"a.off": BOMB}) | {
         "a.off.gz": gzip.compress(BOMB),
         "a.3mf": zip_of({"3D/3dmodel.model": BOMB}),
@@ -70,7 +67,7 @@ def test_more_than_is_allowed_is_refused_and_the_remedy_named(name: str, tmp_pat
         load_mesh(tmp_path / name)
 
 
-def test_a_size_that_lies_does_not_help(tmp_path: Path) -> None:
+def test_a_size_that_lies_does_not_help(tmp_path):
     """The sizes that a ZIP declares are made small; no more than them is unpacked."""
     content = zip_of({"a.off": BOMB})
     (tmp_path / "a.zip").write_bytes(
@@ -81,9 +78,7 @@ def test_a_size_that_lies_does_not_help(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.zip", "a.tar.gz", "a.tar.xz", "a.txz", "a.tar"])
-def test_files_in_an_archive_are_bodies_and_none_is_written_outside(
-    name: str, tmp_path: Path
-) -> None:
+def test_files_in_an_archive_are_bodies_and_none_is_written_outside(name, tmp_path):
     stl = trimesh.creation.icosphere(subdivisions=1).export(file_type="stl")
     outside = tmp_path / "outside"
     members = {
@@ -98,13 +93,14 @@ def test_files_in_an_archive_are_bodies_and_none_is_written_outside(
         "in/box.off",
         "ball.stl",
     ]
-    assert load_mesh(tmp_path / name, OBJECTS, part="in/box.off").volume == pytest.approx(6)
+    found = load_mesh(tmp_path / name, OBJECTS, part="in/box.off").volume
+    assert found == pytest.approx(6)
     assert len(read_surface(tmp_path / name).faces) == 12 + 80
     assert not outside.exists()
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_links_in_an_archive_lead_nowhere(tmp_path: Path) -> None:
+def test_links_in_an_archive_lead_nowhere(tmp_path):
     (tmp_path / "secret.off").write_bytes(BOX)
     with tarfile.open(tmp_path / "a.tar", "w") as archive:
         link = tarfile.TarInfo("link.off")
@@ -115,7 +111,7 @@ def test_links_in_an_archive_lead_nowhere(tmp_path: Path) -> None:
         load_mesh(tmp_path / "a.tar")
 
 
-def test_a_fault_in_an_archive_names_the_archive(tmp_path: Path) -> None:
+def test_a_fault_in_an_archive_names_the_archive(tmp_path):
     (tmp_path / "a.zip").write_bytes(zip_of({"b.off": b"hello"}))
     with pytest.raises(MeshError, match=rf"^{tmp_path}/a\.zip: "):
         load_mesh(tmp_path / "a.zip")
@@ -124,14 +120,14 @@ def test_a_fault_in_an_archive_names_the_archive(tmp_path: Path) -> None:
         load_mesh(tmp_path / "a.txt.gz")
 
 
-def test_no_body_of_an_archive_takes_vertices_of_another(tmp_path: Path) -> None:
+def test_no_body_of_an_archive_takes_vertices_of_another(tmp_path):
     beyond = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n"
     (tmp_path / "a.zip").write_bytes(zip_of({"a.obj": beyond, "b.off": BOX}))
     with pytest.raises(MeshError, match=r"a\.zip: .*a\.obj refers to vertices that are not there"):
         read_surface(tmp_path / "a.zip")
 
 
-def gltf(uri: str) -> str:
+def gltf(uri):
     """A tetrahedron with its numbers in a file beside."""
     return json.dumps(
         {
@@ -156,9 +152,7 @@ def gltf(uri: str) -> str:
 @pytest.mark.parametrize(
     "how", [{"normalized": True}, {"sparse": {"count": 1, "indices": {}, "values": {}}}, {}]
 )
-def test_coordinates_that_would_be_taken_for_others_are_refused(
-    how: dict[str, object], suffix: str, tmp_path: Path
-) -> None:
+def test_coordinates_that_would_be_taken_for_others_are_refused(how, suffix, tmp_path):
     """Of a scene whose places are whole numbers, as tools that compress make them."""
     scene = json.loads(gltf("numbers.bin"))
     scene["accessors"][0] |= {"componentType": 5122, **how}
@@ -205,9 +199,7 @@ def test_coordinates_that_would_be_taken_for_others_are_refused(
         ({"primitives": 10**4}, "unpacks to .*max_unpacked="),
     ],
 )
-def test_a_scene_that_is_packed_otherwise_is_told(
-    changed: dict[str, object], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scene_that_is_packed_otherwise_is_told(changed, told, tmp_path, monkeypatch):
     """An array without bytes is one that an extension would unpack. A mesh that stands nowhere uses one array often."""
     monkeypatch.setitem(sys.modules, "DracoPy", None)
     scene = json.loads(gltf("numbers.bin"))
@@ -223,7 +215,7 @@ def test_a_scene_that_is_packed_otherwise_is_told(
         load_mesh(tmp_path / "a.gltf", LoadOptions(max_unpacked=LIMIT))
 
 
-def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path: Path) -> None:
+def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype="<f4")
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype="<u4")
     folder = tmp_path / "folder"
@@ -241,18 +233,14 @@ def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["a.zip", "a.tar.gz"])
-def test_hidden_files_that_a_mac_packs_beside_each_are_passed_over(
-    name: str, tmp_path: Path
-) -> None:
+def test_hidden_files_that_a_mac_packs_beside_each_are_passed_over(name, tmp_path):
     content = {"b.off": BOX, "__MACOSX/._b.off": b"\0\5\x16\7\0\2Mac OS X", ".git/c.off": BOX}
     (tmp_path / name).write_bytes(packed(content)[name])
     assert load_mesh(tmp_path / name).volume == pytest.approx(6)
     assert [body.part for body in list_bodies(tmp_path / name, OBJECTS)] == ["b.off"]
 
 
-def test_a_faulty_file_of_an_archive_leaves_the_others_and_is_missed_in_the_whole(
-    tmp_path: Path,
-) -> None:
+def test_a_faulty_file_of_an_archive_leaves_the_others_and_is_missed_in_the_whole(tmp_path):
     (tmp_path / "a.zip").write_bytes(zip_of({"bad.off": b"OFF\n8 12 0\n0 0 0\n", "good.off": BOX}))
     with pytest.raises(MeshError, match=r"a\.zip: bad\.off: not readable as OFF"):
         load_mesh(tmp_path / "a.zip")

@@ -1,17 +1,14 @@
 """Closed forms of the surfaces of balls, and molecules made of balls."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.integrate import quad
 
 from igps.fields.molecules.molecule import Molecule
 
 
-def molecule(positions: ArrayLike, radii: ArrayLike) -> Molecule:
+def molecule(positions, radii):
     positions = np.atleast_2d(np.asarray(positions, dtype=float))
     radii = np.atleast_1d(np.asarray(radii, dtype=float))
     n = len(radii)
@@ -21,17 +18,17 @@ def molecule(positions: ArrayLike, radii: ArrayLike) -> Molecule:
     )
 
 
-def ball(r: float) -> tuple[float, float]:
+def ball(r):
     """Area and volume."""
     return 4 * math.pi * r**2, 4 / 3 * math.pi * r**3
 
 
-def cap(r: float, height: float) -> tuple[float, float]:
+def cap(r, height):
     """Area, without its disc, and volume."""
     return 2 * math.pi * r * height, math.pi * height**2 * (3 * r - height) / 3
 
 
-def union_of_two(r: float, s: float, apart: float) -> tuple[float, float]:
+def union_of_two(r, s, apart):
     """Area and volume of two balls that cross."""
     x = (apart**2 + r**2 - s**2) / (2 * apart)
     parts = ball(r), ball(s), cap(r, r - x), cap(s, s - apart + x)
@@ -39,7 +36,7 @@ def union_of_two(r: float, s: float, apart: float) -> tuple[float, float]:
     return area, volume
 
 
-def saddle(r: float, s: float, apart: float, probe: float) -> tuple[float, float, float, float]:
+def saddle(r, s, apart, probe):
     """Where a probe that touches two balls rolls around them: the inner side of a torus.
 
     Returns:
@@ -66,14 +63,14 @@ def saddle(r: float, s: float, apart: float, probe: float) -> tuple[float, float
     return area, volume, from_first, from_second
 
 
-def excluded_of_two(r: float, s: float, apart: float, probe: float) -> tuple[float, float]:
+def excluded_of_two(r, s, apart, probe):
     """Area and volume of what a probe leaves of the space around two balls nearer than its diameter."""
     area, volume, x, y = saddle(r, s, apart, probe)
     parts = cap(r, r + x), cap(s, s + y)
     return area + parts[0][0] + parts[1][0], volume + parts[0][1] + parts[1][1]
 
 
-def excluded_of_ring(n: int, r: float, apart: float, probe: float) -> tuple[float, float]:
+def excluded_of_ring(n, r, apart, probe):
     """The same of n balls in a ring, each of which the probe touches with its neighbours alone."""
     area, volume, x, _ = saddle(r, r, apart, probe)
     whole = ball(r)

@@ -1,14 +1,11 @@
 """`molecular`: what it counts, what it compares, and that it finds a bent molecule again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from igps.analysis.explanation import explain
 from igps.data.collation import collate
@@ -22,13 +19,13 @@ from igps.learning.fitting import split_head
 from igps.nn.axes import InteriorDistance
 from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
-from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
+from igps.signature.signature import SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=90, n_surface_samples=100, min_samples=300, resolution=16)
 ROTATION = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
 
 
-def trace(seed: int, bend: float, n: int = 60) -> Molecule:
+def trace(seed, bend, n=60):
     """Balls of residues of a random sequence along a bent coil; the seed gives sequence and pitch."""
     names = tuple(np.random.default_rng(seed).choice(sorted(VOLUMES), n).tolist())
     t = np.arange(n)
@@ -50,8 +47,8 @@ def trace(seed: int, bend: float, n: int = 60) -> Molecule:
     return Molecule(f"{seed} {bend}", coil, radii, charges, t, names, coil, np.zeros(n))
 
 
-def moved(molecule: Molecule) -> Molecule:
-    def move(at: NDArray[np.float64]) -> NDArray[np.float64]:
+def moved(molecule):
+    def move(at):
         return at @ ROTATION.T + [10.0, -4.0, 3.0]
 
     return replace(
@@ -61,10 +58,10 @@ def moved(molecule: Molecule) -> Molecule:
     )
 
 
-def signature_of(molecule: Molecule) -> Signature:
+def signature_of(molecule):
     surface = molecular_surface(molecule, spacing=1.0, max_vertices=1200)
 
-    def added(samples: Samples) -> Samples:
+    def added(samples):
         found = {
             name: residue_attribute(molecule, samples.points, name)
             for name in molecular().requirements.sources
@@ -75,16 +72,16 @@ def signature_of(molecule: Molecule) -> Signature:
 
 
 @cache
-def signature(seed: int, bend: float) -> Signature:
+def signature(seed, bend):
     return signature_of(trace(seed, bend))
 
 
-def described(*signatures: Signature, size: bool = True) -> torch.Tensor:
+def described(*signatures, size=True):
     with torch.no_grad():
         return molecular(size=size).eval()(collate(signatures))
 
 
-def test_pairs_are_counted_by_the_shares_of_both_samples() -> None:
+def test_pairs_are_counted_by_the_shares_of_both_samples():
     one = signature(0, 0.0)
     histogram = PairHistogram([Shares("residue_shares", 25), InteriorDistance(4)])
     found = histogram(collate([one]))[0].double().numpy()
@@ -102,15 +99,16 @@ def test_pairs_are_counted_by_the_shares_of_both_samples() -> None:
     np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
-def test_a_bent_molecule_is_nearest_to_itself() -> None:
+def test_a_bent_molecule_is_nearest_to_itself():
     signatures = [signature(seed, bend) for seed in range(4) for bend in (0.0, 2.0)]
     for size in (True, False):
         found = described(*signatures, size=size)
         distances = molecular(size=size).distances(found, found).fill_diagonal_(np.inf)
-        assert distances.argmin(dim=1).tolist() == [1, 0, 3, 2, 5, 4, 7, 6]
+        expected = [1, 0, 3, 2, 5, 4, 7, 6]
+        assert distances.argmin(dim=1).tolist() == expected
 
 
-def test_motion_changes_little() -> None:
+def test_motion_changes_little():
     here, there, other = (
         described(one)
         for one in (signature(0, 0.0), signature_of(moved(trace(0, 0.0))), signature(1, 0.0))
@@ -119,7 +117,7 @@ def test_motion_changes_little() -> None:
     assert distances(here[:, :-2], there[:, :-2]) < 0.2 * distances(here[:, :-2], other[:, :-2])
 
 
-def test_size_is_a_factor_of_the_distance() -> None:
+def test_size_is_a_factor_of_the_distance():
     one = signature(0, 0.0)
     other = signature(1, 2.0)
     larger = replace(other, area=1.5 * one.area, volume=one.volume / 2)
@@ -132,7 +130,7 @@ def test_size_is_a_factor_of_the_distance() -> None:
     assert float(molecular().distances(found[:1], found[:1])) == 0
 
 
-def test_statistics_compare_the_histograms_and_not_the_size() -> None:
+def test_statistics_compare_the_histograms_and_not_the_size():
     """By Hellinger's distance; size alone would be all that counts, as its logarithms are no shares."""
     one = signature(0, 0.0)
     other = signature(1, 2.0)
@@ -144,7 +142,7 @@ def test_statistics_compare_the_histograms_and_not_the_size() -> None:
     assert float((rows[0] - rows[1]).norm()) < 1e-5
 
 
-def test_it_has_a_name_but_is_not_for_any_body() -> None:
+def test_it_has_a_name_but_is_not_for_any_body():
     assert descriptor("molecular").name == "molecular"
     assert "molecular" not in NAMES
     bare = replace(signature(0, 0.0), interior=replace(signature(0, 0.0).interior, attributes={}))
@@ -154,7 +152,7 @@ def test_it_has_a_name_but_is_not_for_any_body() -> None:
         described(bare)
 
 
-def test_shares_of_another_kind_are_named() -> None:
+def test_shares_of_another_kind_are_named():
     with pytest.raises(ValueError, match="expected 'residue_shares' with 7 shares for each sample"):
         PairHistogram([Shares("residue_shares", 7), InteriorDistance(4)])(
             collate([signature(0, 0.0)])
@@ -163,7 +161,7 @@ def test_shares_of_another_kind_are_named() -> None:
         Shares("residue_shares", 2).memberships(torch.tensor([[float("nan"), 1.0]]))
 
 
-def test_a_head_is_fitted_to_the_histograms_and_an_explanation_holds_the_size() -> None:
+def test_a_head_is_fitted_to_the_histograms_and_an_explanation_holds_the_size():
     """The logarithms of area and volume are no cells."""
     found = described(signature(0, 0), signature(1, 0))
     assert found.shape[1] == molecular().n_features
@@ -175,7 +173,8 @@ def test_a_head_is_fitted_to_the_histograms_and_an_explanation_holds_the_size() 
     assert told.distance == pytest.approx(
         float(molecular().distances(found[:1], found[1:])), rel=1e-3
     )
-    assert sum(told.parts.values()) == pytest.approx(told.distance, rel=1e-6)
+    expected = pytest.approx(told.distance, rel=1e-6)
+    assert sum(told.parts.values()) == expected
     assert list(told.parts) == ["form", "fold", "composition", "charges", "size"]
     assert sum(one.sum() for of_body in told.samples for one in of_body.values()) == pytest.approx(
         told.distance

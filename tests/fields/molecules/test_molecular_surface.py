@@ -1,10 +1,7 @@
 """Surfaces of molecules against closed forms and brute force."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tests.fields.molecules.balls_in_contact import (
     ball,
@@ -14,7 +11,7 @@ from tests.fields.molecules.balls_in_contact import (
     union_of_two,
 )
 
-from igps.fields.molecules.molecular_surface import SurfaceKind, molecular_surface
+from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.mesh.errors import MeshError
 
 PROBE = 1.4
@@ -22,7 +19,7 @@ PROBE = 1.4
 ASLANT = np.array([2.0, -1.0, 1.5]) / np.linalg.norm([2.0, -1.0, 1.5])
 
 
-def chain(n: int, seed: int = 0) -> NDArray[np.float64]:
+def chain(n, seed=0):
     """A random walk of steps of 1.5 Å."""
     steps = np.random.default_rng(seed).normal(size=(n, 3))
     return np.cumsum(1.5 * steps / np.linalg.norm(steps, axis=1, keepdims=True), axis=0)
@@ -32,9 +29,10 @@ def chain(n: int, seed: int = 0) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     ("kind", "added"), [("excluded", 0.0), ("accessible", PROBE), ("van_der_waals", 0.0)]
 )
-def test_a_ball_has_its_area_and_volume(kind: SurfaceKind, added: float, radius: float) -> None:
+def test_a_ball_has_its_area_and_volume(kind, added, radius):
     mesh = molecular_surface(molecule([0.1, 0.2, 0.3], radius), kind, spacing=0.5)
-    assert (mesh.area, mesh.volume) == pytest.approx(ball(radius + added), rel=0.01)
+    expected = pytest.approx(ball(radius + added), rel=0.01)
+    assert (mesh.area, mesh.volume) == expected
     away = np.linalg.norm(mesh.vertices - [0.1, 0.2, 0.3], axis=1)
     np.testing.assert_allclose(away, radius + added, rtol=0.02)
     assert mesh.unit == "Å"
@@ -42,9 +40,7 @@ def test_a_ball_has_its_area_and_volume(kind: SurfaceKind, added: float, radius:
 
 @pytest.mark.parametrize("radii", [(1.7, 1.7), (1.9, 1.5)])
 @pytest.mark.parametrize("apart", [0.8, 1.5, 2.5, 3.3, 3.6, 4.2, 4.6])
-def test_the_excluded_surface_of_two_balls_is_two_caps_and_a_saddle(
-    radii: tuple[float, float], apart: float
-) -> None:
+def test_the_excluded_surface_of_two_balls_is_two_caps_and_a_saddle(radii, apart):
     mesh = molecular_surface(molecule([0.3 * ASLANT, (0.3 + apart) * ASLANT], radii), spacing=0.5)
     assert (mesh.area, mesh.volume) == pytest.approx(
         excluded_of_two(*radii, apart, PROBE), rel=0.01
@@ -55,19 +51,20 @@ def test_the_excluded_surface_of_two_balls_is_two_caps_and_a_saddle(
 @pytest.mark.parametrize("radii", [(1.7, 1.7), (1.9, 1.5)])
 @pytest.mark.parametrize("apart", [5.2, 5.35, 5.5, 5.8, 6.2])
 def test_where_the_neck_is_too_thin_for_the_grid_or_none_a_thread_adds_hardly_any_area(
-    radii: tuple[float, float], apart: float
-) -> None:
+    radii, apart
+):
     mesh = molecular_surface(molecule([0.3 * ASLANT, (0.3 + apart) * ASLANT], radii), spacing=0.5)
     closed_form = (
         excluded_of_two(*radii, apart, PROBE)
         if apart < 6
         else np.add(ball(radii[0]), ball(radii[1]))
     )
-    assert (mesh.area, mesh.volume) == pytest.approx(tuple(closed_form), rel=0.01)
+    expected = pytest.approx(tuple(closed_form), rel=0.01)
+    assert (mesh.area, mesh.volume) == expected
     assert mesh.genus == 0
 
 
-def test_far_balls_are_joined_by_threads() -> None:
+def test_far_balls_are_joined_by_threads():
     radii = [1.7, 2.5, 2.0]
     apart = molecule([0 * ASLANT, 9 * ASLANT, [20, 0, 0]], radii)
     whole = molecular_surface(apart, spacing=0.5, max_vertices=600)
@@ -80,7 +77,7 @@ def test_far_balls_are_joined_by_threads() -> None:
 
 
 @pytest.mark.parametrize("apart", [2.0, 2.8, 4.0, 5.0])
-def test_the_accessible_surface_of_two_balls_is_that_of_larger_ones(apart: float) -> None:
+def test_the_accessible_surface_of_two_balls_is_that_of_larger_ones(apart):
     mesh = molecular_surface(
         molecule([0 * ASLANT, apart * ASLANT], [1.9, 1.5]), "accessible", spacing=0.5
     )
@@ -89,19 +86,19 @@ def test_the_accessible_surface_of_two_balls_is_that_of_larger_ones(apart: float
     )
 
 
-def test_a_speck_is_left_out_with_a_note_but_not_what_all_is_made_of(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_speck_is_left_out_with_a_note_but_not_what_all_is_made_of(monkeypatch):
     found = molecular_surface(molecule([[0, 0, 0], [14, 0, 0]], [8.0, 0.9]))
     assert "left out 1 speck" in found.notes
-    assert found.volume == pytest.approx(4 / 3 * np.pi * 8**3, rel=0.01)
+    expected = pytest.approx(4 / 3 * np.pi * 8**3, rel=0.01)
+    assert found.volume == expected
     # As if there were some hundreds
     monkeypatch.setattr("igps.fields.molecules.molecular_surface.SPECK_VOLUME", 0.2)
     found = molecular_surface(molecule([[9.0 * i, 0, 0] for i in range(6)], [1.7] * 6), spacing=0.5)
-    assert found.volume == pytest.approx(6 * 4 / 3 * np.pi * 1.7**3, rel=0.02)
+    expected = pytest.approx(6 * 4 / 3 * np.pi * 1.7**3, rel=0.02)
+    assert found.volume == expected
 
 
-def test_a_ring_of_balls_has_a_hole() -> None:
+def test_a_ring_of_balls_has_a_hole():
     n, apart = 8, 4.2
     mesh = molecular_surface(molecule(_ring(n, apart), np.full(n, 1.7)), spacing=0.5)
     assert (mesh.area, mesh.volume) == pytest.approx(
@@ -110,7 +107,7 @@ def test_a_ring_of_balls_has_a_hole() -> None:
     assert mesh.genus == 1
 
 
-def _ring(n: int, apart: float) -> NDArray[np.float64]:
+def _ring(n, apart):
     angle = 2 * np.pi * np.arange(n) / n
     across = np.cross(ASLANT, [0, 0, 1.0])
     across /= np.linalg.norm(across)
@@ -122,7 +119,7 @@ def _ring(n: int, apart: float) -> NDArray[np.float64]:
     )
 
 
-def test_the_excluded_surface_is_a_probe_away_from_where_a_probe_may_be() -> None:
+def test_the_excluded_surface_is_a_probe_away_from_where_a_probe_may_be():
     """By brute force: places of the probe on fine spheres around all atoms."""
     at = chain(40)
     mesh = molecular_surface(molecule(at, np.full(40, 1.7)), spacing=0.4, max_vertices=None)
@@ -140,16 +137,17 @@ def test_the_excluded_surface_is_a_probe_away_from_where_a_probe_may_be() -> Non
     assert abs(np.mean(distance) - PROBE) < 0.02
 
 
-def test_no_probe_is_the_surface_of_the_balls() -> None:
+def test_no_probe_is_the_surface_of_the_balls():
     two = molecule([0 * ASLANT, 2 * ASLANT], [1.7, 1.7])
     without = molecular_surface(two, probe=0, spacing=0.5)
     np.testing.assert_array_equal(
         without.vertices, molecular_surface(two, "van_der_waals", spacing=0.5).vertices
     )
-    assert without.volume == pytest.approx(union_of_two(1.7, 1.7, 2.0)[1], rel=0.01)
+    expected = pytest.approx(union_of_two(1.7, 1.7, 2.0)[1], rel=0.01)
+    assert without.volume == expected
 
 
-def test_swallowed_and_doubled_balls_change_nothing() -> None:
+def test_swallowed_and_doubled_balls_change_nothing():
     at = chain(30)
     once = molecular_surface(molecule(at, np.full(30, 1.7)))
     more = molecular_surface(
@@ -158,7 +156,7 @@ def test_swallowed_and_doubled_balls_change_nothing() -> None:
     np.testing.assert_allclose(more.vertices, once.vertices, atol=1e-9)
 
 
-def test_hollows_are_filled() -> None:
+def test_hollows_are_filled():
     i = np.arange(120)
     up = 1 - (2 * i + 1) / len(i)
     turn = np.pi * (1 + 5**0.5) * i
@@ -171,7 +169,7 @@ def test_hollows_are_filled() -> None:
     assert any("1 hollow inside: filled" in note for note in mesh.notes)
 
 
-def test_a_simplified_surface_keeps_the_volume() -> None:
+def test_a_simplified_surface_keeps_the_volume():
     body = molecule(chain(200), np.full(200, 1.7))
     whole = molecular_surface(body, max_vertices=None)
     fewer = molecular_surface(body, max_vertices=1500)
@@ -180,7 +178,7 @@ def test_a_simplified_surface_keeps_the_volume() -> None:
     assert fewer.volume == pytest.approx(whole.volume, rel=0.01)
 
 
-def test_a_simplified_surface_has_the_area_of_the_fine_one() -> None:
+def test_a_simplified_surface_has_the_area_of_the_fine_one():
     body = molecule(chain(60), np.full(60, 1.7))
     fine = molecular_surface(body, max_vertices=None)
     coarse = molecular_surface(body, max_vertices=60)
@@ -191,7 +189,7 @@ def test_a_simplified_surface_has_the_area_of_the_fine_one() -> None:
     assert abs(own / fine.area - 1) > 0.01
 
 
-def test_the_accessible_area_is_that_of_points_which_no_other_ball_covers() -> None:
+def test_the_accessible_area_is_that_of_points_which_no_other_ball_covers():
     at = chain(40, seed=1)
     found = molecular_surface(molecule(at, np.full(40, 1.7)), "accessible").area
     directions = np.random.default_rng(0).normal(size=(4000, 3))
@@ -202,10 +200,11 @@ def test_the_accessible_area_is_that_of_points_which_no_other_ball_covers() -> N
             centre + 3.1 * directions[:, None] - np.delete(at, i, axis=0), axis=2
         )
         n_free += int((distance > 3.1).all(axis=1).sum())
-    assert found == pytest.approx(4 * np.pi * 3.1**2 * n_free / 4000, rel=0.01)
+    expected = pytest.approx(4 * np.pi * 3.1**2 * n_free / 4000, rel=0.01)
+    assert found == expected
 
 
-def test_stray_atoms_are_named_with_the_remedy() -> None:
+def test_stray_atoms_are_named_with_the_remedy():
     with pytest.raises(
         MeshError, match=r"balls: expected a grid of .* Raise the spacing, or remove stray atoms"
     ):
@@ -221,6 +220,6 @@ def test_stray_atoms_are_named_with_the_remedy() -> None:
         ({"spacing": 0.0}, "spacing: expected"),
     ],
 )
-def test_wrong_parameters_are_named(wrong: dict[str, object], said: str) -> None:
+def test_wrong_parameters_are_named(wrong, said):
     with pytest.raises(ValueError, match=said):
-        molecular_surface(molecule([0, 0, 0], 1.7), **wrong)  # type: ignore[arg-type]
+        molecular_surface(molecule([0, 0, 0], 1.7), **wrong)

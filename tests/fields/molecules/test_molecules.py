@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import logging
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ import pytest
 from igps.cli import main
 from igps.fields.molecules.bodies import molecule_of
 from igps.fields.molecules.molecular_surface import molecular_surface
-from igps.fields.molecules.molecule import Molecule
 from igps.fields.molecules.residues import VOLUMES
 from igps.fields.molecules.structures import is_structure, read_molecule
 from igps.mesh.errors import MeshError
@@ -46,7 +44,7 @@ class Atom:
     b: float = 20.0
     element: str | None = None
 
-    def line(self) -> str:
+    def line(self):
         element = self.name[0] if self.element is None else self.element
         return (
             f"{self.record:<6}{self.number:>5} {self.name:^4}{self.alternative}{self.residue:>3} "
@@ -55,40 +53,41 @@ class Atom:
         )
 
 
-def residue(
-    number: int, name: str = "ALA", atoms: list[tuple[str, float, float]] = ALANINE, **said: object
-) -> str:
+def residue(number, name="ALA", atoms=ALANINE, **said):
     place = said.pop("place", f"{number:>4} ")
     return "".join(
-        Atom(i, atom, x, y, 3.8 * number, residue=name, place=place, **said).line()  # type: ignore[arg-type]
+        Atom(i, atom, x, y, 3.8 * number, residue=name, place=place, **said).line()
         for i, (atom, x, y) in enumerate(atoms, start=1)
     )
 
 
-def written(folder: Path, text: str, name: str = "made.pdb") -> Path:
+def written(folder, text, name="made.pdb"):
     path = folder / name
     path.write_text(text)
     return path
 
 
-def backbone(atoms: int = 4) -> list[tuple[str, float, float]]:
+def backbone(atoms=4):
     return ALANINE[:atoms]
 
 
-def test_atoms_have_the_radii_of_their_elements(tmp_path: Path) -> None:
+def test_atoms_have_the_radii_of_their_elements(tmp_path):
     (molecule,) = read_molecule(
         written(tmp_path, residue(1) + residue(2, "MET", [*ALANINE, *SULFUR]))
     )
     # Bondi 1964
-    np.testing.assert_allclose(molecule.radii[:5], [1.55, 1.70, 1.70, 1.52, 1.70], atol=1e-6)
+    found = molecule.radii[:5]
+    expected = [1.55, 1.70, 1.70, 1.52, 1.70]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
     assert molecule.radii[-1] == pytest.approx(1.80)
     assert molecule.residue_names == ("ALA", "MET")
     assert molecule.residue_of.tolist() == [0] * 5 + [1] * 8
-    np.testing.assert_allclose(molecule.residue_positions, [[1.46, 0, 3.8], [1.46, 0, 7.6]])
+    expected = [[1.46, 0, 3.8], [1.46, 0, 7.6]]
+    np.testing.assert_allclose(molecule.residue_positions, expected)
     assert molecule.notes == ()
 
 
-def test_pdb_and_mmcif_and_their_gzipped_files_are_one_molecule(tmp_path: Path) -> None:
+def test_pdb_and_mmcif_and_their_gzipped_files_are_one_molecule(tmp_path):
     import gemmi
 
     text = residue(1) + residue(2, "LYS") + "END\n"
@@ -101,7 +100,8 @@ def test_pdb_and_mmcif_and_their_gzipped_files_are_one_molecule(tmp_path: Path) 
         paths.append(path.with_name(path.name + ".gz"))
         paths[-1].write_bytes(gzip.compress(path.read_bytes()))
     one, *others = (read_molecule(path)[0] for path in paths)
-    assert all(is_structure(path) for path in paths)
+    for path in paths:
+        assert is_structure(path)
     for other in others:
         np.testing.assert_allclose(other.positions, one.positions)
         np.testing.assert_array_equal(other.radii, one.radii)
@@ -109,7 +109,7 @@ def test_pdb_and_mmcif_and_their_gzipped_files_are_one_molecule(tmp_path: Path) 
         assert other.residue_names == one.residue_names
 
 
-def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path: Path) -> None:
+def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path):
     """As PyMOL writes several objects into one file; the first alone was read. Blocks of ligands have no atoms."""
     import gemmi
 
@@ -133,19 +133,21 @@ def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path: Path) -> None
         assert len(molecule_of(BodyRef(path, part)).residue_names) == n_residues
 
 
-def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path: Path) -> None:
+def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path):
     rows = "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\nATOM 2 HN ALA A 1 0.5 0.5 0.0 0.30 0.0\n"
     rows += "ATOM 3 CA HIE 2A 1.5 0.0 0.0 0.10 2.00\nHETATM 4 O WAT 3 9 9 9 -0.8 1.6\nTER\nEND\n"
     molecules = read_molecule(written(tmp_path, rows, "made.pqr"), "models")
     (molecule,) = molecules
-    np.testing.assert_allclose(molecule.charges, [-0.3, 0.3, 0.1], rtol=1e-6)
-    np.testing.assert_allclose(molecule.radii, [1.85, 0, 2], atol=1e-6)
+    expected = [-0.3, 0.3, 0.1]
+    np.testing.assert_allclose(molecule.charges, expected, rtol=1e-6)
+    expected = [1.85, 0, 2]
+    np.testing.assert_allclose(molecule.radii, expected, atol=1e-6)
     assert molecule.residue_names == ("ALA", "HIS")
     assert np.isnan(molecule.b_factors).all()
     assert molecule.notes == ("radii and charges are those of the PQR file",)
 
 
-def test_long_numbers_of_a_pqr_file_leave_no_blank_before_them(tmp_path: Path) -> None:
+def test_long_numbers_of_a_pqr_file_leave_no_blank_before_them(tmp_path):
     rows = "ATOM   9999  N   ALA A1000       1.000   2.000   3.000  0.1000 1.8500\n"
     rows += "HETATM10000  O   HOH B1001       9.000   2.000   3.000 -0.8000 1.6000\n"
     rows += "HETATM10001  CA  ALA B1002A     12.000   2.000   3.000  0.2000 1.9000\n"
@@ -168,7 +170,7 @@ def test_long_numbers_of_a_pqr_file_leave_no_blank_before_them(tmp_path: Path) -
         read_molecule(fused)
 
 
-def test_charges_are_those_of_residues_at_ph_7(tmp_path: Path) -> None:
+def test_charges_are_those_of_residues_at_ph_7(tmp_path):
     names = {
         "ASP": "OD1 OD2",
         "GLU": "OE1 OE2",
@@ -187,10 +189,11 @@ def test_charges_are_those_of_residues_at_ph_7(tmp_path: Path) -> None:
     )
     (molecule,) = read_molecule(written(tmp_path, text))
     sums = np.bincount(molecule.residue_of, molecule.charges)
-    np.testing.assert_allclose(sums, [-1, -1, 1, 1, 0.1, 0, -0.5])
+    expected = [-1, -1, 1, 1, 0.1, 0, -0.5]
+    np.testing.assert_allclose(sums, expected)
 
 
-def test_models_and_chains_are_bodies_of_their_own(tmp_path: Path) -> None:
+def test_models_and_chains_are_bodies_of_their_own(tmp_path):
     models = "".join(
         f"MODEL     {i:>4}\n{residue(1)}{residue(2)}TER\n{residue(1, chain='B')}ENDMDL\n"
         for i in range(1, 21)
@@ -200,11 +203,12 @@ def test_models_and_chains_are_bodies_of_their_own(tmp_path: Path) -> None:
     assert [len(molecule.radii) for molecule in of_models] == [15] * 20
     assert of_models[19].name == f"{path}#model 20"
     of_chains = read_molecule(path)
-    assert [len(molecule.radii) for molecule in of_chains] == [10, 5] * 20
+    found = [len(molecule.radii) for molecule in of_chains]
+    assert found == [10, 5] * 20
     assert of_chains[1].name == f"{path}#model 1 chain B"
 
 
-def test_an_assembly_is_built_by_its_operators(tmp_path: Path) -> None:
+def test_an_assembly_is_built_by_its_operators(tmp_path):
     remark = (
         "REMARK 350 BIOMOLECULE: 1\n"
         "REMARK 350 APPLY THE FOLLOWING TO CHAINS: A\n"
@@ -217,12 +221,14 @@ def test_an_assembly_is_built_by_its_operators(tmp_path: Path) -> None:
     )
     (molecule,) = read_molecule(written(tmp_path, remark + residue(1)), "assembly")
     one = molecule.positions[:5]
-    np.testing.assert_allclose(molecule.positions[5:], one * [-1, -1, 1] + [0, 0, 50], atol=1e-4)
+    found = molecule.positions[5:]
+    expected = one * [-1, -1, 1] + [0, 0, 50]
+    np.testing.assert_allclose(found, expected, atol=1e-4)
     (alone,) = read_molecule(written(tmp_path, residue(1)), "assembly")
     assert alone.notes == ("the file defines no assembly: the model was used",)
 
 
-def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_path: Path) -> None:
+def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_path):
     rows = "".join(
         f"REMARK 350   BIOMT{i}   1 {a:9.6f}{b:10.6f}{c:10.6f}        0.00000\n"
         for i, (a, b, c) in enumerate(np.eye(3), start=1)
@@ -235,7 +241,7 @@ def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_pa
         read_molecule(path, "assembly")
 
 
-def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
+def test_water_is_left_out_and_ligands_as_said(tmp_path):
     water = Atom(9, "O", 9, 9, 9, residue="HOH", place=" 101 ", record="HETATM").line()
     ligand = Atom(10, "C1", 5, 5, 5, residue="XYZ", place=" 102 ", record="HETATM").line()
     changed = residue(2, "MSE", [*ALANINE, *SULFUR], record="HETATM")
@@ -249,7 +255,7 @@ def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
         read_molecule(written(tmp_path, water, "water.pdb"))
 
 
-def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path: Path) -> None:
+def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path):
     """A nucleotide whose name gemmi does not know, by the sequence that the file lists; else TER may mean anything."""
     import gemmi
 
@@ -280,7 +286,7 @@ def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path: Pat
     assert read_molecule(written(tmp_path, atoms))[0].residue_names == ("A", "U")
 
 
-def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path: Path) -> None:
+def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path):
     water = [("OW", 9.0, 9.0), ("HW1", 9.5, 9.0), ("HW2", 9.0, 9.5), ("MW", 9.1, 9.1)]
     text = (
         residue(1)
@@ -292,13 +298,13 @@ def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path: Path) -> N
     assert molecule.residue_names == ("ALA", "QQQ")
 
 
-def test_hydrogens_are_left_out_unless_asked_for(tmp_path: Path) -> None:
+def test_hydrogens_are_left_out_unless_asked_for(tmp_path):
     path = written(tmp_path, residue(1, atoms=[*ALANINE, ("H", 0.0, -1.0)]))
     assert len(read_molecule(path)[0].radii) == 5
     assert len(read_molecule(path, hydrogens=True)[0].radii) == 6
 
 
-def test_a_backbone_gets_balls_of_its_side_chains(tmp_path: Path) -> None:
+def test_a_backbone_gets_balls_of_its_side_chains(tmp_path):
     text = (
         residue(1, "LEU", backbone())
         + residue(2, "GLY", backbone())
@@ -306,21 +312,26 @@ def test_a_backbone_gets_balls_of_its_side_chains(tmp_path: Path) -> None:
     )
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.notes == (COMPLETED.format(2),)
-    assert np.bincount(molecule.residue_of).tolist() == [5, 4, 5]
+    found = np.bincount(molecule.residue_of).tolist()
+    assert found == [5, 4, 5]
     leucine = molecule.positions[0], molecule.radii[0]
     volume = 0.89 * (VOLUMES["LEU"] - VOLUMES["GLY"])
-    assert 4 / 3 * np.pi * leucine[1] ** 3 == pytest.approx(volume)
+    found = 4 / 3 * np.pi * leucine[1] ** 3
+    assert found == pytest.approx(volume)
     # It touches Cα, on the side of Cβ, which tetrahedral geometry has away from N and C.
     away = leucine[0] - [1.46, 0, 3.8]
     assert np.linalg.norm(away) == pytest.approx(leucine[1])
     for bonded in ([0.0, 0.0, 3.8], [2.0, 1.4, 3.8]):
         bond = np.array(bonded) - [1.46, 0, 3.8]
         cosine = away @ bond / np.linalg.norm(away) / np.linalg.norm(bond)
-        assert np.degrees(np.arccos(cosine)) == pytest.approx(109.5, abs=4)
-    assert np.bincount(molecule.residue_of, molecule.charges).tolist() == [0, 0, 1]
+        found = np.degrees(np.arccos(cosine))
+        expected = pytest.approx(109.5, abs=4)
+        assert found == expected
+    found = np.bincount(molecule.residue_of, molecule.charges).tolist()
+    assert found == [0, 0, 1]
 
 
-def side_chain(*names: str) -> list[tuple[str, float, float]]:
+def side_chain(*names):
     """Atoms in a line from Cα on, with Cβ as the first."""
     return [(name, 2.0 + 0.6 * i, -0.8 - 1.2 * i) for i, name in enumerate(("CB", *names))]
 
@@ -329,9 +340,7 @@ LYSINE = [*backbone(), *side_chain("CG", "CD", "CE", "NZ")]
 
 
 @pytest.mark.parametrize("n_present", [1, 2, 4])
-def test_a_cut_side_chain_gets_what_it_lacks_at_its_last_atom(
-    n_present: int, tmp_path: Path
-) -> None:
+def test_a_cut_side_chain_gets_what_it_lacks_at_its_last_atom(n_present, tmp_path):
     (whole,) = read_molecule(written(tmp_path, residue(1, "LYS", LYSINE)))
     (cut,) = read_molecule(written(tmp_path, residue(1, "LYS", LYSINE[: 4 + n_present])))
     assert whole.notes == ()
@@ -340,24 +349,27 @@ def test_a_cut_side_chain_gets_what_it_lacks_at_its_last_atom(
     ball = cut.positions[0]
     radius = cut.radii[0]
     share = (5 - n_present) / 5
-    assert 4 / 3 * np.pi * radius**3 == pytest.approx(share * (VOLUMES["LYS"] - VOLUMES["GLY"]))
+    found = 4 / 3 * np.pi * radius**3
+    expected = pytest.approx(share * (VOLUMES["LYS"] - VOLUMES["GLY"]))
+    assert found == expected
     alpha = np.array([1.46, 0, 3.8])
     last = np.array([2.0 + 0.6 * (n_present - 1), -0.8 - 1.2 * (n_present - 1), 3.8])
     out = (last - alpha) / np.linalg.norm(last - alpha)
     np.testing.assert_allclose(ball, last + radius * out, atol=1e-9)
 
 
-def test_names_tell_the_state_of_protonation(tmp_path: Path) -> None:
+def test_names_tell_the_state_of_protonation(tmp_path):
     charges = {"HIP": 1, "HSP": 1, "HSD": 0, "HSE": 0, "HID": 0, "HIE": 0, "HIS": 0.1}
     charges |= {"ASH": 0, "GLH": 0, "LYN": 0, "CYM": -1, "CYX": 0, "CYS": 0}
     for atoms in (backbone(), ALANINE):
         text = "".join(residue(i, name, atoms) for i, name in enumerate(charges, start=1))
         (molecule,) = read_molecule(written(tmp_path, text))
         sums = np.bincount(molecule.residue_of, molecule.charges)
-        np.testing.assert_allclose(sums, list(charges.values()), atol=1e-12)
+        expected = list(charges.values())
+        np.testing.assert_allclose(sums, expected, atol=1e-12)
 
 
-def test_an_atom_that_is_given_twice_counts_once(tmp_path: Path) -> None:
+def test_an_atom_that_is_given_twice_counts_once(tmp_path):
     """As programs that complete side chains leave them, without a letter for alternative locations."""
     twice = [*LYSINE, *LYSINE[-3:]]
     (once,) = read_molecule(written(tmp_path, residue(1, "LYS", LYSINE)))
@@ -366,16 +378,17 @@ def test_an_atom_that_is_given_twice_counts_once(tmp_path: Path) -> None:
     assert molecule.charges.sum() == 1
 
 
-def test_a_trace_has_balls_of_its_residues(tmp_path: Path) -> None:
+def test_a_trace_has_balls_of_its_residues(tmp_path):
     text = "".join(residue(i, "ASP", ALANINE[1:2]) for i in range(1, 9))
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.notes == ("8 residues of Cα alone: a ball of the residue's volume was used",)
-    np.testing.assert_allclose(4 / 3 * np.pi * molecule.radii**3, VOLUMES["ASP"])
+    found = 4 / 3 * np.pi * molecule.radii**3
+    np.testing.assert_allclose(found, VOLUMES["ASP"])
     assert molecule.charges.tolist() == [-1.0] * 8
     assert molecular_surface(molecule).volume > 6 * VOLUMES["ASP"]
 
 
-def test_of_alternatives_the_most_occupied_is_taken(tmp_path: Path) -> None:
+def test_of_alternatives_the_most_occupied_is_taken(tmp_path):
     atoms = [
         Atom(5, "CB", 2, -0.8, 3.8, alternative="A", occupancy=0.4).line(),
         Atom(6, "CB", 2, -0.9, 3.8, alternative="B", occupancy=0.6).line(),
@@ -391,7 +404,7 @@ def test_of_alternatives_the_most_occupied_is_taken(tmp_path: Path) -> None:
     assert molecule.notes == ("2 alternative locations: the one of the highest occupancy was used",)
 
 
-def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path: Path) -> None:
+def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path):
     text = (
         residue(1, place="  -5 ")
         + residue(2, place="  -5A")
@@ -404,10 +417,12 @@ def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path: Path) -> 
     assert molecule.notes == ("1 residues repeat a number: all were kept",)
 
 
-def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path: Path) -> None:
+def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path):
     odd = residue(2, atoms=[*ALANINE, ("X1", 3.0, -2.0), ("1HB", 3.0, -3.0)], element="Xx")
     (molecule,) = read_molecule(written(tmp_path, residue(1, "QQQ") + odd))
-    np.testing.assert_allclose(molecule.radii[5:], [1.55, 1.70, 1.70, 1.52, 1.70, 1.70], atol=1e-6)
+    found = molecule.radii[5:]
+    expected = [1.55, 1.70, 1.70, 1.52, 1.70, 1.70]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
     assert molecule.residue_names == ("QQQ", "ALA")
     assert molecule.notes == (
         "5 atoms without an element: it was inferred from their names",
@@ -416,16 +431,14 @@ def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path: Path) -> N
     )
 
 
-def test_atoms_without_a_position_are_left_out_not_put_at_the_origin(tmp_path: Path) -> None:
+def test_atoms_without_a_position_are_left_out_not_put_at_the_origin(tmp_path):
     text = residue(1).replace("   1.300   2.400", "********   2.400")
     (molecule,) = read_molecule(written(tmp_path, text))
     assert len(molecule.radii) == 4
     assert "1 atoms without a position were left out" in molecule.notes
 
 
-def test_a_chain_without_atoms_costs_no_other_chain(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_chain_without_atoms_costs_no_other_chain(tmp_path, caplog):
     lost = (
         Atom(1, "N", 0, 0, 0, chain="B")
         .line()
@@ -438,12 +451,10 @@ def test_a_chain_without_atoms_costs_no_other_chain(
     assert f"{path}#chain B: no atoms of a polymer, left out" in caplog.text
 
 
-def test_a_surface_that_fails_in_any_way_costs_no_other_chain(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_surface_that_fails_in_any_way_costs_no_other_chain(tmp_path, monkeypatch):
     path = written(tmp_path, residue(1) + residue(1, chain="B") + residue(1, chain="C"))
 
-    def faulty(molecule: Molecule) -> Mesh:
+    def faulty(molecule):
         if "chain B" in molecule.name:
             raise ValueError("of any kind")
         return molecular_surface(molecule)
@@ -459,13 +470,14 @@ def test_a_surface_that_fails_in_any_way_costs_no_other_chain(
     )
 
 
-def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:
+def test_b_factors_are_means_over_residues(tmp_path):
     text = (
         Atom(1, "N", 0, 0, 0, b=10).line()
         + Atom(2, "CA", 1, 0, 0, b=30).line()
         + residue(2, b=70.0)
     )
-    assert read_molecule(written(tmp_path, text))[0].b_factors.tolist() == [20.0, 70.0]
+    found = read_molecule(written(tmp_path, text))[0].b_factors.tolist()
+    assert found == [20.0, 70.0]
 
 
 @pytest.mark.parametrize(
@@ -485,14 +497,12 @@ def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:
         ("other.xyz", "1\n", "expected a structure"),
     ],
 )
-def test_bad_files_are_named_with_the_remedy(
-    tmp_path: Path, name: str, text: str, said: str
-) -> None:
+def test_bad_files_are_named_with_the_remedy(tmp_path, name, text, said):
     with pytest.raises(MeshError, match=rf"{name}: .*{said}"):
         read_molecule(written(tmp_path, text, name))
 
 
-def test_a_gzipped_file_that_is_cut_short_is_named(tmp_path: Path) -> None:
+def test_a_gzipped_file_that_is_cut_short_is_named(tmp_path):
     path = tmp_path / "cut.pdb.gz"
     path.write_bytes(gzip.compress((residue(1) * 50).encode())[:-20])
     with pytest.raises(MeshError, match=r"cut\.pdb\.gz: .*cut short.* Download it again"):
@@ -504,12 +514,12 @@ def test_a_gzipped_file_that_is_cut_short_is_named(tmp_path: Path) -> None:
         read_molecule(tmp_path / "absent.pdb")
 
 
-def test_unknown_bodies_are_refused(tmp_path: Path) -> None:
+def test_unknown_bodies_are_refused(tmp_path):
     with pytest.raises(ValueError, match="bodies: expected one of chains, models, assembly"):
-        read_molecule(written(tmp_path, residue(1)), "residues")  # type: ignore[arg-type]
+        read_molecule(written(tmp_path, residue(1)), "residues")
 
 
-def test_b_factors_that_a_file_lacks_are_unknown(tmp_path: Path) -> None:
+def test_b_factors_that_a_file_lacks_are_unknown(tmp_path):
     whole = residue(1)
     cut = "".join(f"{row[:54]}\n" for row in whole.splitlines())
     blank = "".join(f"{row[:60]}      {row[66:]}\n" for row in whole.splitlines())
@@ -543,7 +553,7 @@ def test_b_factors_that_a_file_lacks_are_unknown(tmp_path: Path) -> None:
         )
 
 
-def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> None:
+def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path):
     names = ["N", "CA", "C", "O", "CB", "CG", "CD", "OE", "NE", "HG"]
     atoms = [(name, float(i), 0.0) for i, name in enumerate(names)]
     rows = [
@@ -562,7 +572,7 @@ def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> Non
     assert molecule.notes == ("1 ligands were left out",)
 
 
-def test_no_line_is_lost_to_marks_of_text_or_to_frames(tmp_path: Path) -> None:
+def test_no_line_is_lost_to_marks_of_text_or_to_frames(tmp_path):
     text = residue(1) + residue(2)
     (usual,) = read_molecule(written(tmp_path, text))
     for number, other in enumerate(
@@ -577,17 +587,16 @@ def test_no_line_is_lost_to_marks_of_text_or_to_frames(tmp_path: Path) -> None:
     assert len(read_molecule(written(tmp_path, f"{text}TER\nEND\n"), "models")) == 1
 
 
-def test_models_whose_number_repeats_are_all_read(tmp_path: Path) -> None:
+def test_models_whose_number_repeats_are_all_read(tmp_path):
     model = f"MODEL        1\n{residue(1)}{residue(2)}ENDMDL\n"
     path = written(tmp_path, 3 * model + "END\n")
     molecules = read_molecule(path, bodies="models")
-    assert [len(molecule.radii) for molecule in molecules] == [10, 10, 10]
+    found = [len(molecule.radii) for molecule in molecules]
+    assert found == [10, 10, 10]
     assert len({molecule.name for molecule in molecules}) == 3
 
 
-def test_completed_residues_are_told_on_the_terminal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_completed_residues_are_told_on_the_terminal(tmp_path, monkeypatch, capsys):
     for name, n_residues in (("one", 9), ("two", 12)):
         text = "".join(residue(i, "LYS", backbone()) for i in range(1, n_residues + 1))
         written(tmp_path, text, f"{name}.pdb")
@@ -599,7 +608,7 @@ def test_completed_residues_are_told_on_the_terminal(
     assert told in capsys.readouterr().out
 
 
-def test_ranges_of_residues_are_bodies(tmp_path: Path) -> None:
+def test_ranges_of_residues_are_bodies(tmp_path):
     text = "".join(residue(i) for i in range(1, 9)) + "".join(
         residue(i, chain="B") for i in range(1, 4)
     )
@@ -607,7 +616,8 @@ def test_ranges_of_residues_are_bodies(tmp_path: Path) -> None:
     for part in ("chain A:2-3,6-7", "A:2-3,6-7"):
         found = molecule_of(BodyRef(path, part))
         assert found.residue_labels == ("A 2", "A 3", "A 6", "A 7")
-        assert found.positions[found.residue_of == 2, 2] == pytest.approx(np.full(5, 3.8 * 6))
+        expected = pytest.approx(np.full(5, 3.8 * 6))
+        assert found.positions[found.residue_of == 2, 2] == expected
         assert "residues 2-3,6-7 alone: 4 of 8" in found.notes
     mesh = load_mesh(path, part="A:2-3")
     assert mesh.vertices[:, 2].min() > 3.8 * 2 - 3
@@ -616,7 +626,7 @@ def test_ranges_of_residues_are_bodies(tmp_path: Path) -> None:
         load_mesh(path, part="A:20-30")
 
 
-def test_coordinates_of_nine_characters_are_read(tmp_path: Path) -> None:
+def test_coordinates_of_nine_characters_are_read(tmp_path):
     """Beyond ±1000 Å, lines of some programs grow by a character for each coordinate."""
     lines = [Atom(i, "CA", 0, 0, 0, place=f"{i:>4} ").line() for i in range(3)]
     wide = "-1234.567-2000.25012345.678"
@@ -628,7 +638,7 @@ def test_coordinates_of_nine_characters_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [4, 40, 60])
-def test_a_pdb_file_that_is_cut_short_is_told(tmp_path: Path, kept: int) -> None:
+def test_a_pdb_file_that_is_cut_short_is_told(tmp_path, kept):
     whole = residue(1)
     last = whole.splitlines()[-1]
     path = written(tmp_path, whole + last[:kept])
@@ -636,7 +646,7 @@ def test_a_pdb_file_that_is_cut_short_is_told(tmp_path: Path, kept: int) -> None
         read_molecule(path)
 
 
-def test_a_header_without_an_end_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_header_without_an_end_is_told(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         read_molecule(written(tmp_path, "HEADER    HYDROLASE\n" + residue(1) + "END\n"))
         assert not caplog.text
@@ -644,7 +654,7 @@ def test_a_header_without_an_end_is_told(tmp_path: Path, caplog: pytest.LogCaptu
     assert "no END, so it may be cut short" in caplog.text
 
 
-def test_atoms_in_one_place_are_refused_and_one_atom_is_told(tmp_path: Path) -> None:
+def test_atoms_in_one_place_are_refused_and_one_atom_is_told(tmp_path):
     atoms = [(name, 0.0, 0.0) for name in ("N", "CA", "C")]
     path = written(tmp_path, residue(1, atoms=atoms))
     with pytest.raises(MeshError, match="all its atoms are in one place"):
@@ -654,12 +664,12 @@ def test_atoms_in_one_place_are_refused_and_one_atom_is_told(tmp_path: Path) -> 
     assert "a single atom: its surface is a ball" in mesh.notes
 
 
-def test_lipids_among_the_atoms_of_polymers_are_told(tmp_path: Path) -> None:
+def test_lipids_among_the_atoms_of_polymers_are_told(tmp_path):
     tail = [(f"C{i}", 1.5 * i, 8.0) for i in range(1, 6)]
     (molecule,) = read_molecule(written(tmp_path, residue(1) + residue(2, "POP", tail)))
     assert any("1 residues" in note and "lipids or detergents" in note for note in molecule.notes)
 
 
-def test_binary_cif_is_refused_with_the_remedy(tmp_path: Path) -> None:
+def test_binary_cif_is_refused_with_the_remedy(tmp_path):
     with pytest.raises(MeshError, match=r"BinaryCIF is not read. Download .* as mmCIF"):
         load_mesh(written(tmp_path, "x", "entry.bcif"))

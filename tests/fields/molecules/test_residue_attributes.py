@@ -1,13 +1,10 @@
 """What residues around a point are like, against sums written out and closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import trimesh
-from numpy.typing import NDArray
 
 from igps.fields.molecules import residue_attributes as module
 from igps.fields.molecules.molecule import Molecule
@@ -25,7 +22,7 @@ from igps.signature.signature import SignatureConfig, compute_signature
 CHARGES = {"ASP": -1.0, "GLU": -1.0, "LYS": 1.0, "ARG": 1.0, "HIS": 0.1}
 
 
-def peptide(*names: str, seed: int = 0) -> Molecule:
+def peptide(*names, seed=0):
     """Residues of one ball each, with its charge."""
     n = len(names)
     at = 6 * np.random.default_rng(seed).normal(size=(n, 3))
@@ -35,11 +32,11 @@ def peptide(*names: str, seed: int = 0) -> Molecule:
     )
 
 
-def points(n: int = 7, seed: int = 1) -> NDArray[np.float64]:
+def points(n=7, seed=1):
     return 6 * np.random.default_rng(seed).normal(size=(n, 3))
 
 
-def mean_written_out(molecule: Molecule, point: NDArray[np.float64], values: list[float]) -> float:
+def mean_written_out(molecule, point, values):
     weights = [
         math.exp(-(math.dist(point, at) ** 2) / (2 * 4.0**2)) for at in molecule.residue_positions
     ]
@@ -57,7 +54,7 @@ def mean_written_out(molecule: Molecule, point: NDArray[np.float64], values: lis
         ("acceptors", lambda name: {"ASP": 2, "GLU": 2, "HIS": 1}.get(name, 0)),
     ],
 )
-def test_an_attribute_is_a_gaussian_mean_over_residues(name: str, of_residue) -> None:
+def test_an_attribute_is_a_gaussian_mean_over_residues(name, of_residue):
     names = ("ASP", "LYS", "ALA", "TRP", "HIS", "GLU", "ARG", "ILE")
     molecule = peptide(*names)
     found = residue_attribute(molecule, points(), name)
@@ -67,13 +64,14 @@ def test_an_attribute_is_a_gaussian_mean_over_residues(name: str, of_residue) ->
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
 
 
-def test_b_factors_are_the_molecules_own() -> None:
+def test_b_factors_are_the_molecules_own():
     molecule = peptide("ALA", "GLY", "SER")
     wanted = [mean_written_out(molecule, point, [0.0, 1.0, 2.0]) for point in points()]
-    np.testing.assert_allclose(residue_attribute(molecule, points(), "b_factor"), wanted, rtol=1e-9)
+    found = residue_attribute(molecule, points(), "b_factor")
+    np.testing.assert_allclose(found, wanted, rtol=1e-9)
 
 
-def test_shares_of_kinds_sum_to_one_and_follow_the_names() -> None:
+def test_shares_of_kinds_sum_to_one_and_follow_the_names():
     molecule = peptide("ALA", "DT", "U", "ZN", "DG")
     shares = residue_attribute(molecule, points(), "residue_shares")
     np.testing.assert_allclose(shares.sum(axis=1), 1)
@@ -88,7 +86,7 @@ def test_shares_of_kinds_sum_to_one_and_follow_the_names() -> None:
     }
 
 
-def test_what_is_not_known_does_not_count_and_is_never_made_up() -> None:
+def test_what_is_not_known_does_not_count_and_is_never_made_up():
     molecule = peptide("ALA", "QQQ", "ILE")
     known = Molecule(
         "known",
@@ -107,7 +105,7 @@ def test_what_is_not_known_does_not_count_and_is_never_made_up() -> None:
     assert np.isnan(residue_attribute(peptide("QQQ", "ZN"), points(), "hydropathy")).all()
 
 
-def test_far_outside_the_nearest_residue_counts() -> None:
+def test_far_outside_the_nearest_residue_counts():
     molecule = peptide("ALA", "ILE", "LYS")
     far = 1e4 * np.eye(3)
     nearest = np.linalg.norm(far[:, None] - molecule.residue_positions, axis=2).argmin(axis=1)
@@ -118,7 +116,7 @@ def test_far_outside_the_nearest_residue_counts() -> None:
     )
 
 
-def test_the_potential_of_one_charge_is_that_of_debye_and_hueckel() -> None:
+def test_the_potential_of_one_charge_is_that_of_debye_and_hueckel():
     ion = Molecule(
         "ion",
         np.zeros((1, 3)),
@@ -141,26 +139,30 @@ def test_the_potential_of_one_charge_is_that_of_debye_and_hueckel() -> None:
     )
 
 
-def test_potentials_add_up() -> None:
+def test_potentials_add_up():
     molecule = peptide("ASP", "ALA", "LYS")
     parts = [
         screened_potential(peptide(*names), points())
         for names in (("ASP", "ALA", "ALA"), ("ALA", "ALA", "LYS"))
     ]
-    np.testing.assert_allclose(screened_potential(molecule, points()), parts[0] + parts[1])
+    found = screened_potential(molecule, points())
+    expected = parts[0] + parts[1]
+    np.testing.assert_allclose(found, expected)
     np.testing.assert_array_equal(screened_potential(peptide("ALA"), points()), 0)
 
 
-def test_many_points_in_blocks_are_as_few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_points_in_blocks_are_as_few_at_once(monkeypatch):
     molecule = peptide("ASP", "ALA", "LYS", "TRP")
     values = np.arange(8.0).reshape(4, 2)
     whole = residue_means(molecule, points(50), values), screened_potential(molecule, points(50))
     monkeypatch.setattr(module, "_BLOCK_SIZE", 12)
-    np.testing.assert_allclose(residue_means(molecule, points(50), values), whole[0])
-    np.testing.assert_allclose(screened_potential(molecule, points(50)), whole[1])
+    found = residue_means(molecule, points(50), values)
+    np.testing.assert_allclose(found, whole[0])
+    found = screened_potential(molecule, points(50))
+    np.testing.assert_allclose(found, whole[1])
 
 
-def test_each_attribute_is_known_by_its_name() -> None:
+def test_each_attribute_is_known_by_its_name():
     molecule = peptide("ASP", "ALA", "LYS", "TRP")
     for name in RESIDUE_ATTRIBUTES:
         values = residue_attribute(molecule, points(), name)
@@ -173,7 +175,7 @@ def test_each_attribute_is_known_by_its_name() -> None:
         residue_attribute(molecule, points(), "colour")
 
 
-def test_a_signature_gets_attributes_and_keeps_its_own() -> None:
+def test_a_signature_gets_attributes_and_keeps_its_own():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=8)
     mesh = Mesh(ball.vertices, ball.faces)
     config = SignatureConfig(

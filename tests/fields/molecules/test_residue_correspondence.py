@@ -1,10 +1,7 @@
 """Residues correspond by their sequences, and an explanation tells which of them moved."""
 
-from __future__ import annotations
-
 import csv
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,12 +20,12 @@ HINGE = 40
 SEQUENCE = np.random.default_rng(0).choice(sorted(VOLUMES), N_RESIDUES).tolist()
 
 
-def coil() -> np.ndarray:
+def coil():
     t = np.arange(N_RESIDUES)
     return np.stack([1.5 * t, 6 * np.cos(1.3 * t), 6 * np.sin(1.3 * t)], axis=1)
 
 
-def write(path: Path, positions: np.ndarray, names: list[str], first: int = 1) -> Path:
+def write(path, positions, names, first=1):
     """Write a trace of Cα."""
     lines = [
         f"ATOM  {i:>5}  CA  {name} A{first + i:>4}    "
@@ -40,7 +37,7 @@ def write(path: Path, positions: np.ndarray, names: list[str], first: int = 1) -
 
 
 @pytest.fixture
-def pair(tmp_path: Path) -> tuple[Path, Path]:
+def pair(tmp_path):
     """A coil, and the same with its last third turned about the hinge, moved as a whole, and numbered otherwise."""
     straight = coil()
     bent = straight.copy()
@@ -52,8 +49,8 @@ def pair(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(
-    pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pair, tmp_path, monkeypatch
+):
     out = tmp_path / "out"
     words = ["explain", *pair, "--descriptor", "interior", "--out", out]
     small = ["--signature.resolution", "12", "--signature.max_vertices", "600"]
@@ -66,7 +63,8 @@ def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(
     steps = np.zeros(N_RESIDUES)
     steps[HINGE:] = np.linalg.norm(Rotation.from_rotvec([0.0, 1.0, 0.0]).apply(arm) - arm, axis=1)
     told = np.array([float(row["displacement"]) for row in rows]).reshape(2, N_RESIDUES)
-    np.testing.assert_allclose(told, np.stack([steps, steps]), atol=0.02)
+    expected = np.stack([steps, steps])
+    np.testing.assert_allclose(told, expected, atol=0.02)
     assert rows[0]["place"] == f"A 1 {SEQUENCE[0]}"
     assert rows[-1]["place"] == f"A 360 {SEQUENCE[-1]}"
     structures = [gemmi.read_structure(str(out / f"explain_{i}.cif"))[0]["A"] for i in (1, 2)]
@@ -93,11 +91,13 @@ def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(
         ("ABCDEFGH", "ABCDXXEFGH", [(i, i + 2 * (i > 3)) for i in range(8)]),
     ],
 )
-def test_sequences_are_aligned(one: str, other: str, pairs: list[tuple[int, int]]) -> None:
-    assert aligned(tuple(one), tuple(other)).tolist() == [list(pair) for pair in pairs]
+def test_sequences_are_aligned(one, other, pairs):
+    found = aligned(tuple(one), tuple(other)).tolist()
+    expected = [list(pair) for pair in pairs]
+    assert found == expected
 
 
-def test_other_sequences_and_other_files_do_not_correspond(tmp_path: Path) -> None:
+def test_other_sequences_and_other_files_do_not_correspond(tmp_path):
     names = np.random.default_rng(1).permutation(SEQUENCE).tolist()
     bodies = [
         BodyRef(write(tmp_path / "one.pdb", coil(), SEQUENCE), "chain A"),

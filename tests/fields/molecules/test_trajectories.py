@@ -1,9 +1,6 @@
 """Frames of a simulation become files that keep charges, and a map that follows the movement."""
 
-from __future__ import annotations
-
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +17,7 @@ ANGLES = np.radians([60, 80, 100, 120, 140])
 N_ARM = 12
 
 
-def hinges() -> np.ndarray:
+def hinges():
     """Two rods of carbon atoms, (frames, atoms, 3), and a hydrogen beside the last atom of each."""
     steps = 1.5 * np.arange(1, N_ARM + 1)[:, None]
     frames = []
@@ -32,7 +29,7 @@ def hinges() -> np.ndarray:
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> tuple[Path, Path]:
+def files(tmp_path):
     """A topology with charges as PQR, and the frames as DCD."""
     frames = hinges()
     names = [f"C{i}" for i in range(1, 2 * N_ARM + 1)] + ["H1", "H2"]
@@ -54,9 +51,7 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
     return topology, trajectory
 
 
-def test_each_frame_keeps_places_charges_and_residues(
-    files: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_each_frame_keeps_places_charges_and_residues(files, tmp_path):
     topology, trajectory = files
     written = write_frames(topology, [trajectory], tmp_path / "frames", "all", 2)
     assert [number for _, number, _ in written] == [0, 2, 4]
@@ -64,34 +59,30 @@ def test_each_frame_keeps_places_charges_and_residues(
     charges[[N_ARM - 1, -1]] += [0.25, -0.15]
     for path, number, _ in written:
         (molecule,) = read_molecule(path, "models")
-        np.testing.assert_allclose(molecule.positions, hinges()[number, : 2 * N_ARM], atol=1e-3)
+        expected = hinges()[number, : 2 * N_ARM]
+        np.testing.assert_allclose(molecule.positions, expected, atol=1e-3)
         np.testing.assert_allclose(molecule.charges, charges, atol=1e-4)
         np.testing.assert_allclose(molecule.radii, 1.7)
         assert molecule.residue_labels == ("A 1",)
 
 
-def test_the_map_follows_an_opening_hinge(
-    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_map_follows_an_opening_hinge(files, tmp_path, monkeypatch):
     out = tmp_path / "out"
     small = ["--signature.resolution", "10", "--signature.max_vertices", "500"]
     fast = [*small, "--n_workers", 1, "--cache_dir", tmp_path / "cache", "--descriptor", "d2"]
     run(monkeypatch, "trajectory", *files, "--select", "all", "--out", out, *fast)
     with (out / "trajectory.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [int(row["frame"]) for row in rows] == [0, 1, 2, 3, 4]
+    found = [int(row["frame"]) for row in rows]
+    expected = [0, 1, 2, 3, 4]
+    assert found == expected
     away = [float(row["distance_to_first"]) for row in rows]
     assert away == sorted(away)
     assert away[0] == 0
     assert (out / "trajectory.png").is_file()
 
 
-def test_what_cannot_be_read_is_told(
-    files: tuple[Path, Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_cannot_be_read_is_told(files, tmp_path, monkeypatch, capsys):
     start = ["trajectory", *files, "--out", tmp_path / "out"]
     told = error_of(monkeypatch, capsys, *start, "--select", "protein and name XX")
     assert "no atom is selected by 'protein and name XX'" in told

@@ -419,7 +419,7 @@ def test_gradients_equal_those_of_the_dense_definition(device, layout, block):
 
 @pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"], ["twists"]])
 def test_gradcheck(device, layout):
-    given = some(7, n_classes=2, seed=1)
+    given = some(5, n_classes=2, seed=1)
     names = [
         "memberships",
         *dict.fromkeys({"many": "coordinates", "own": "heights"}.get(k, "points") for k in layout),
