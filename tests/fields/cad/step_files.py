@@ -14,9 +14,6 @@ class _Lines:
         return f"#{len(self.lines)}"
 
 
-Place = tuple[float, float, float]
-
-
 def write_step(path, parts, unit=".MILLI."):
     """Parts of boxes from their least to their greatest corners, each a solid.
 
