@@ -307,7 +307,7 @@ def test_what_igps_is_told_exists(command, lines, monkeypatch, capsys):
                 assert is_known, f"{line}: no option {word}"
 
 
-OTHER_PROGRAMS = set("git cd dask sbatch squeue eval source ssh rsync sudo".split())
+OTHER_PROGRAMS = {"git", "cd", "dask", "sbatch", "squeue", "eval", "source", "ssh", "rsync", "sudo"}
 
 
 @pytest.mark.parametrize("page", [page for page in TEXT if shell_lines(page)])

@@ -200,9 +200,11 @@ def test_a_job_that_takes_too_long_is_ended(limited):
 def test_the_machine_is_not_the_jobs_fault(where, job, message):
     """It is told once, and not of every job."""
     limits = Limits(seconds=100) if where == "workers" else None
-    with ThreadPoolExecutor(1) as pool, pytest.raises(MachineError, match=message):
+    with ThreadPoolExecutor(1) as pool:
         executor = pool if where == "executor" else None
-        list(run(jobs.call, [job] * 3, n_workers=1, executor=executor, limits=limits))
+        results = run(jobs.call, [job] * 3, n_workers=1, executor=executor, limits=limits)
+        with pytest.raises(MachineError, match=message):
+            list(results)
 
 
 def test_other_errors_of_the_system_are_those_of_a_job():

@@ -14,7 +14,16 @@ import igps
 PACKAGE = Path(igps.__file__).parent
 # From the ground up. A room imports only from the floors below its own, and itself; a new room is one more name here.
 FLOORS = (
-    tuple("_arrays _failures _files _parameters _progress _text _threads _compiled".split()),
+    (
+        "_arrays",
+        "_failures",
+        "_files",
+        "_parameters",
+        "_progress",
+        "_text",
+        "_threads",
+        "_compiled",
+    ),
     ("_workers",),
     ("_parallel", "spectra", "retrieval"),
     ("mesh",),
