@@ -3,12 +3,12 @@
 import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers, Singles, Surface
+from igps.mesh._collapse_loops import collapse_edges
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles
 from igps.mesh.errors import MeshError
 from igps.mesh.surface import (
     directed_edges,
     face_areas,
-    largest,
     longest_side,
     signed_volume,
     vertex_normals,
@@ -47,25 +47,14 @@ def level_surface(field: Singles, name: str) -> Surface:
 
 
 def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Surface:
-    """Simplify a closed surface to about `max_vertices` vertices of the same volume, or return it if that fails."""
+    """Simplify a closed surface to about `max_vertices` vertices of the same volume and topology."""
     if len(vertices) <= max_vertices:
         return vertices, faces
-    import igl
-
+    centre = vertices.mean(axis=0)
     scale = longest_side(vertices)
-    points = vertices / scale
-    triangles = faces
-    # First collapse the many short edges that marching cubes leave: they need no quadrics, so this is much faster.
-    for collapse, n_vertices in ((igl.decimate, 3 * max_vertices), (igl.qslim, max_vertices)):
-        target = len(triangles) - 2 * (len(points) - n_vertices)
-        if len(points) > n_vertices:
-            triangles = np.asfortranarray(triangles.astype(np.int32))
-            points, triangles, *_ = collapse(np.asfortranarray(points), triangles, target)
-    triangles = np.asarray(triangles, dtype=np.int64)
-    is_closed = len(triangles) > 0 and not len(_non_manifold_edges(triangles, len(points)))
-    if not is_closed or not np.isfinite(points).all():
-        return vertices, faces
-    points, triangles = largest(points * scale, triangles)
+    triangles = np.ascontiguousarray(faces, dtype=np.int64)
+    points, triangles = collapse_edges((vertices - centre) / scale, triangles, max_vertices)
+    points = points * scale + centre
     triangles = _flip_edges(points, triangles)
     return restore_volume(points, triangles, signed_volume(vertices, faces)), triangles
 

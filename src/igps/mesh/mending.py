@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
-MENDING_VERSION = 10
+MENDING_VERSION = 11
 """Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
 
 # Steps by the first words of their notes

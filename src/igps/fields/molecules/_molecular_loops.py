@@ -412,3 +412,30 @@ def cubic_values(field: Singles, points: Floats) -> Floats:
         values[p, 2] = along_y
         values[p, 3] = along_z
     return values
+
+
+@compiled()
+def means_at_vertices(values: Floats, vertices: Floats, faces: Integers) -> Floats:
+    """Return the means (V, D), weighted by area, of the values (F, D) of the faces around each vertex."""
+    means = np.zeros((len(vertices), values.shape[1]))
+    total = np.full(len(vertices), 1e-300)
+    for face in range(len(faces)):
+        i, j, k = faces[face]
+        ux, uy, uz = _difference(vertices, j, i)
+        vx, vy, vz = _difference(vertices, k, i)
+        area = math.sqrt(_square(uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx))
+        for at in (i, j, k):
+            total[at] += area
+            for column in range(values.shape[1]):
+                means[at, column] += area * values[face, column]
+    return means / total.reshape(-1, 1)
+
+
+@compiled()
+def _difference(vertices: Floats, a: int, b: int) -> tuple[float, float, float]:
+    """Return the vector from vertex b to vertex a."""
+    return (
+        vertices[a, 0] - vertices[b, 0],
+        vertices[a, 1] - vertices[b, 1],
+        vertices[a, 2] - vertices[b, 2],
+    )

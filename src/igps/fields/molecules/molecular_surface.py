@@ -24,19 +24,22 @@ from igps.fields.molecules._molecular_loops import (
     distances_outside,
     exposed_arcs,
     exposed_areas,
+    means_at_vertices,
 )
 from igps.fields.molecules.molecule import Molecule
 from igps.mesh._isosurface import level_surface, simplify_surface
 from igps.mesh._level_set import MIN_ABS_VALUE, SPECK_VOLUME, fill_bubbles
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import connected, face_areas, signed_volume, stacked, sums, vertex_normals
+from igps.mesh.surface import connected, face_areas, signed_volume, stacked, vertex_normals
 
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 
 # Cells around the balls, and on both sides of the surface, in which distances are computed
 _MARGIN = 2.5
 _MAX_CELLS = 2**28
+# Å, distances between grid points up to so many balls, and at most
+_FINE, _N_FINE, _COARSE = 0.8, 1000, 1.0
 _MAX_STEP = 0.3  # maximal step of vertices towards the surface, in cells
 # Maximal share of the area that threads between pieces add, and maximal width of a thread's end over its triangle's.
 _MAX_THREADS, _MAX_THREAD_WIDTH = 0.003, 0.5
@@ -51,7 +54,7 @@ def molecular_surface(
     kind: SurfaceKind = "excluded",
     *,
     probe: float = 1.4,
-    spacing: float = 0.8,
+    spacing: float | None = None,
     max_vertices: int | None = 3000,
 ) -> Mesh:
     """Compute the closed surface of a molecule, in ångström.
@@ -75,7 +78,8 @@ def molecular_surface(
         kind: "excluded": the space that no probe enters. "accessible": the space that no centre of a probe enters.
             "van_der_waals": the balls themselves.
         probe: radius of the probe, Å; 1.4 for water.
-        spacing: distance between grid points, Å.
+        spacing: distance between grid points, Å; None for 0.8 up to 1000 balls, growing to 1.0 from 1560 on, as
+            large molecules keep fewer vertices than the grid gives.
         max_vertices: larger surfaces are simplified to this number of vertices; None keeps all.
 
     Raises:
@@ -83,12 +87,15 @@ def molecular_surface(
         MeshError: the balls lie too far apart for a grid, or have no closed surface.
     """
     check_one_of(get_args(SurfaceKind), kind=kind)
-    check_positive(spacing=spacing)
+    if spacing is not None:
+        check_positive(spacing=spacing)
     if not 0 <= probe < math.inf:
         raise ValueError(f"probe: expected a radius of at least 0 Å, got {probe}.")
     centres, radii = _outermost(
         molecule.positions, molecule.radii + (0.0 if kind == "van_der_waals" else probe)
     )
+    if spacing is None:
+        spacing = float(np.clip(_FINE * math.sqrt(len(radii) / _N_FINE), _FINE, _COARSE))
     margin = _MARGIN * spacing
     low = (centres - radii[:, None]).min(axis=0) - margin
     sides = np.ceil(((centres + radii[:, None]).max(axis=0) + margin - low) / spacing) + 1
@@ -210,15 +217,15 @@ def _fit_to_field(field: Singles, vertices: Floats, faces: Integers) -> Floats:
     steps, normals = _steps(field, vertices)
     vertices = vertices - steps
     for _ in range(_N_ROUNDS):
-        shift = _mean_at_vertices(vertices[faces].mean(axis=1), vertices, faces) - vertices
+        shift = means_at_vertices(vertices[faces].mean(axis=1), vertices, faces) - vertices
         vertices = vertices + shift - np.einsum("ij,ij->i", shift, normals)[:, None] * normals
         steps, normals = _steps(field, vertices)
         vertices = vertices - steps
     steps, normals = _steps(field, vertices[faces].mean(axis=1))
     heights = np.einsum("ij,ij->i", steps, normals)[:, None]
     # Average at the vertices and back, so that neighbours move alike.
-    heights = _mean_at_vertices(heights, vertices, faces)[faces].mean(axis=1)
-    return vertices - 0.75 * _mean_at_vertices(heights, vertices, faces) * vertex_normals(
+    heights = means_at_vertices(heights, vertices, faces)[faces].mean(axis=1)
+    return vertices - 0.75 * means_at_vertices(heights, vertices, faces) * vertex_normals(
         vertices, faces
     )
 
@@ -230,14 +237,6 @@ def _steps(field: Singles, points: Floats) -> tuple[Floats, Floats]:
     slope = np.maximum(np.linalg.norm(values[:, 1:], axis=1), 0.5)
     normals = values[:, 1:] / slope[:, None]
     return np.clip(values[:, 0] / slope, -_MAX_STEP, _MAX_STEP)[:, None] * normals, normals
-
-
-def _mean_at_vertices(values: Floats, vertices: Floats, faces: Integers) -> Floats:
-    """Return the means (V, D), weighted by area, of the values (F, D) of the faces around each vertex."""
-    areas = face_areas(vertices, faces)[:, None]
-    rows = np.repeat(np.concatenate([areas, areas * values], axis=1), 3, axis=0)
-    totals = sums(faces.ravel(), rows, len(vertices))
-    return totals[:, 1:] / np.maximum(totals[:, :1], np.finfo(float).tiny)
 
 
 def _join(parts: Sequence[Surface]) -> Surface:
