@@ -275,13 +275,13 @@ def test_calls_on_a_body_leave_the_settings(blob):
 
 def test_a_body_is_computed_on_one_thread(blob, monkeypatch):
     seen = []
-    original = igps.signature.signature.eigenpairs
+    original = igps.spectra.eigenpairs
 
     def watched(*arguments, **options):
         seen.append((torch.get_num_threads(), set(blas())))
         return original(*arguments, **options)
 
-    monkeypatch.setattr("igps.signature.signature.eigenpairs", watched)
+    monkeypatch.setattr("igps.spectra.eigenpairs", watched)
     igps.compute_signature(blob, CONFIG)
     assert seen == [(1, {1})]
 

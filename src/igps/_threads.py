@@ -5,6 +5,8 @@ process occupies a core, or a container may use fewer cores than it sees, all th
 takes twenty times as long as on a single thread. Therefore, every call of the library uses one thread of OpenMP and
 OpenBLAS (`one_thread`). Large computations are divided into jobs for at most `n_threads` Python threads, which sleep
 while they wait (`igps._parallel.on_threads`).
+
+Torch, which takes seconds to load, is not loaded here: a process that only reads and measures bodies does without it.
 """
 
 import contextlib
@@ -14,12 +16,11 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import threadpoolctl
-import torch
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -44,7 +45,22 @@ def n_threads() -> int:
     """Return the number of Python threads for a call: the cores, but at most torch's threads outside `one_thread`."""
     if _state.max_threads is not None:
         return _state.max_threads
-    return min(n_cores(), torch.get_num_threads())
+    return min(n_cores(), _n_torch_threads())
+
+
+def _n_torch_threads() -> int:
+    """Return torch's number of threads, or the one that it will have once it is loaded."""
+    torch = _loaded_torch()
+    if torch is not None:
+        return int(torch.get_num_threads())
+    set_by_user = os.environ.get("OMP_NUM_THREADS", "")
+    return int(set_by_user) if set_by_user.isdecimal() else n_cores()
+
+
+def _loaded_torch() -> Any:
+    """Return torch, or None if it is not loaded, or not to its end by another thread."""
+    torch = sys.modules.get("torch")
+    return torch if hasattr(torch, "set_num_threads") else None
 
 
 @contextlib.contextmanager
@@ -55,7 +71,8 @@ def one_thread() -> Iterator[None]:
     for the whole process, which the last thread that leaves the context restores.
     """
     outside = _state.max_threads
-    n_torch = torch.get_num_threads()
+    torch = _loaded_torch()
+    n_torch = 1 if torch is None else torch.get_num_threads()
     _state.max_threads = n_threads()
     try:
         with _blas_on_one_thread():
@@ -103,10 +120,13 @@ class Team:
         results: list[Any] = [None] * len(jobs)
         waiting = iter(range(len(jobs)))
         # The mode is a setting of each thread. Tensors made in inference mode can only be changed in that mode
-        inference = torch.is_inference_mode_enabled()
+        torch = _loaded_torch()
+        mode: Callable[[], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext
+        if torch is not None:
+            mode = partial(torch.inference_mode, torch.is_inference_mode_enabled())
 
         def work() -> None:
-            with torch.inference_mode(inference):
+            with mode():
                 for i in waiting:  # the GIL gives each index to one thread
                     results[i] = function(jobs[i])
 
@@ -133,7 +153,9 @@ _state = _ThreadState()
 
 def _compute_on_one_thread() -> None:
     stay_on_one_thread()
-    torch.set_num_threads(1)
+    torch = _loaded_torch()
+    if torch is not None:
+        torch.set_num_threads(1)
 
 
 class ProcessSetting:

@@ -39,13 +39,10 @@ def precompute(
         failures: CSV file for the meshes that cannot be used.
     """
     from igps.cli.reading import Folder, dataset_from_options, limits_of
-    from igps.data.requirements import Requirements
     from igps.descriptors import descriptor as descriptor_of
     from igps.report.tables import write_rows
 
-    requirements = reduce(
-        or_, (descriptor_of(name).requirements for name in descriptors), Requirements()
-    )
+    requirements = reduce(or_, (descriptor_of(name).requirements for name in descriptors))
     dataset = dataset_from_options(Folder(root), requirements, **collection)
     dataset = dataset.subset(of_shard(len(dataset), shard))
     if not len(dataset):

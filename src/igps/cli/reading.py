@@ -98,9 +98,7 @@ def signatures(
     Raises:
         ValueError: no body could be used.
     """
-    requirements = (
-        reduce(or_, (d.requirements for d in descriptors), Requirements()) if descriptors else None
-    )
+    requirements = reduce(or_, (d.requirements for d in descriptors)) if descriptors else None
     dataset = dataset_from_options(source, requirements, **collection)
     for descriptor in descriptors:
         check_attributes(descriptor, {*dataset.config.attributes, *dataset.pipeline.attributes})
@@ -139,7 +137,7 @@ def described(
     if isinstance(descriptor, str):
         descriptor = with_side(descriptor, mirror, size)
     dataset, failures = signatures(
-        source, [descriptor_of(descriptor)], strict, n_workers, **reading
+        source, [descriptor_of(descriptor)], strict=strict, n_workers=n_workers, **reading
     )
     if isinstance(descriptor, str):
         descriptor = with_size(descriptor, size, dataset)

@@ -31,10 +31,11 @@ from igps.signature.ordering import (
 )
 from igps.signature.sampling import surface_points
 from igps.signature.voxels import interior_samples
-from igps.spectra import ConvergenceError, Spectrum, eigenpairs
 
 if TYPE_CHECKING:
     import trimesh
+
+    from igps.spectra import Spectrum
 
 __all__ = [
     "SAMPLE_KINDS",
@@ -266,6 +267,8 @@ def _without_eigenpairs(mesh: Mesh, points: Floats, config: SignatureConfig) -> 
 
 def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str, ...]]:
     """Compute the eigenpairs; if the cotangent matrices fail, use the intrinsic-Delaunay ones and return a note."""
+    # Loads torch, which plain numbers do without
+    from igps.spectra import ConvergenceError, eigenpairs
 
     def solve(config: SignatureConfig) -> Spectrum:
         matrices = laplacian(mesh, config.backend)

@@ -19,19 +19,24 @@ def check_gzip(path: Path, n_expected: int, *, start: int = 0, n_more: int = 0) 
         start: place in the file where the stream begins.
         n_more: bytes that may follow the expected ones.
     """
-    n_unpacked = 0
     with path.open("rb") as file:
         file.seek(start)
         stream = gzip.GzipFile(fileobj=file)
-        try:
-            while block := stream.read(_BLOCK):
-                n_unpacked += len(block)
-                if n_unpacked > n_expected + n_more:
-                    raise _wrong_length(path, n_expected, "more")
-        except (OSError, EOFError, zlib.error) as error:
-            raise _damaged(path, error) from error
+        n_unpacked = check_rest(stream, path, n_expected + n_more)
     if n_unpacked < n_expected:
         raise _wrong_length(path, n_expected, str(n_unpacked))
+
+
+def check_rest(stream: gzip.GzipFile, path: Path, n_more: int) -> int:
+    """Return how many bytes follow in a gzip stream; a MeshError if it is damaged, or they are too many."""
+    start = stream.tell()
+    try:
+        while stream.read(_BLOCK):
+            if stream.tell() > start + n_more:
+                raise _wrong_length(path, start + n_more, "more")
+    except (OSError, EOFError, zlib.error) as error:
+        raise _damaged(path, error) from error
+    return stream.tell() - start
 
 
 def check_zlib(stream: IO[bytes], path: Path, n_expected: int) -> int:

@@ -1,5 +1,6 @@
 """Readers of volume files by nibabel, SimpleITK, highdicom and tifffile; sizes are checked before voxels are read."""
 
+import gzip
 import json
 import math
 import re
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Floats
-from igps.fields.volumes._streams import check_gzip, check_zlib
+from igps.fields.volumes._streams import check_gzip, check_rest, check_zlib
 from igps.fields.volumes.label_names import names_in_extensions, names_in_tags
 from igps.mesh.errors import MeshError
 from igps.mesh.limits import check_fits
@@ -117,8 +118,14 @@ def _nibabel(path: Path) -> RawVolume:
     import nibabel
 
     image: Any = nibabel.load(path)
+    # Of compressed files, nibabel stops behind the last voxel
+    if isinstance(image, nibabel.Nifti1Pair) and path.suffix.lower() == ".gz":
+        with gzip.open(path) as stream:
+            volume = of_nibabel(type(image).from_stream(stream), path)
+            check_rest(stream, path, n_more=_MAX_TAGS)
+        return volume
     volume = of_nibabel(image, path)
-    if path.suffix.lower() in (".gz", ".mgz"):  # nibabel stops behind the last voxel
+    if path.suffix.lower() == ".mgz":
         (values,) = volume.layers
         n_bytes = values.size * np.dtype(image.get_data_dtype()).itemsize
         check_gzip(path, n_bytes, n_more=_MAX_TAGS)
