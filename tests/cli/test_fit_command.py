@@ -84,7 +84,11 @@ def test_fit_writes_model_and_card(
     assert "`rich` under the head" in page
     lowest = binomtest(6, 6).proportion_ci(method="exact").low
     assert f"of 6 bodies even 100 % means {lowest:.0%} to 100 %" in page
-    assert f"| FT | {100 * card['held_out_scores']['ft']:.1f} |" in page
+    own = card["held_out_scores"]["ft"]
+    plain = card["held_out_scores_of_plain_numbers"]["ft"]
+    assert f"| FT | {100 * own:.1f} | {100 * plain:.1f} |" in page
+    # Eggs of two lengths: their axes tell them
+    assert "the result says little about\nform" in page
 
 
 def test_fit_writes_a_folder_to_share(

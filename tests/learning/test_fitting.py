@@ -168,6 +168,7 @@ def test_fit_takes_size_where_only_size_tells_the_classes_and_says_so(tmp_path):
     assert "size" in model.card["parts"]
     assert model.card["held_out_scores"]["balanced_accuracy"] >= 0.9
     assert model.card["held_out_scores"]["auc"] >= 0.9
+    assert model.card["held_out_scores_of_plain_numbers"]["auc"] >= 0.9
     by_parts = model.card["candidates"]
     assert by_parts["linear of numbers, size, without prior"]["auc"] >= 0.9
     assert by_parts["linear of form, without prior"]["auc"] < 0.9

@@ -149,11 +149,13 @@ def classify(
 
 def _card(model: Descriptor, path: Path) -> str:
     card = model.card
+    own = card["held_out_scores"]
+    plain = card["held_out_scores_of_plain_numbers"]
     scores = "\n".join(
-        f"| {_TITLES[name]} | {100 * value:.1f} |"
-        for name, value in card["held_out_scores"].items()
+        f"| {_TITLES[name]} | {100 * value:.1f} | {_percent(plain.get(name))} |"
+        for name, value in own.items()
     )
-    scores = scores or "| none: no class is large enough to hold bodies out | |"
+    scores = scores or "| none: no class is large enough to hold bodies out | | |"
     classes = ", ".join(f"{name} ({n})" for name, n in card["classes"].items())
     use = {"known": "bodies of its classes", "new": "bodies of classes that it was not fitted to"}[
         card["goal"]
@@ -163,14 +165,29 @@ def _card(model: Descriptor, path: Path) -> str:
 `{card["descriptor"]}` under the head `{card["head"]}`, {"with" if card["prior"] else "without"} a prior metric,
 for {use}. Scores in percent, means over held-out folds that neither the fit nor the choice of the head has seen:
 
-| | |
-|---|---|
+| | this model | plain numbers |
+|---|---|---|
 {scores}
-{_warning(sum(card["classes"].values()))}{_choice(card)}
+{_rivals(own, plain)}{_warning(sum(card["classes"].values()))}{_choice(card)}
 Fitted to {sum(card["classes"].values())} bodies of {len(card["classes"])} classes: {classes}.
 
 Signatures: `{json.dumps(card["signature"])}`. igps {card["version"]}.
 """
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:.1f}"
+
+
+def _rivals(own: Mapping[str, float], plain: Mapping[str, float]) -> str:
+    """Return a paragraph if plain numbers do as well as the model; empty otherwise."""
+    for score in ("balanced_accuracy", "ft"):
+        if score in own and plain.get(score, -1.0) >= own[score]:
+            return """
+Plain numbers, such as volume, axes and thickness, find these classes as well or better: the result says little about
+form.
+"""
+    return ""
 
 
 def _choice(card: Mapping[str, Any]) -> str:

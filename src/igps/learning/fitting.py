@@ -96,7 +96,8 @@ def fit(
     """Fit a head to the classes of a dataset, and return the descriptor under this head.
 
     The `card` of the result holds what was chosen, the scores of all candidates, and scores on folds that neither the
-    fit nor the choice has seen. The returned head is fitted to all bodies.
+    fit nor the choice has seen, beside those of plain numbers with size, see `igps.measures`, on the same folds. The
+    returned head is fitted to all bodies.
 
     Example:
         >>> import tempfile
@@ -148,6 +149,10 @@ def fit(
     fitting = _Fitting(base, metric, goal, names, has_numbers)
     candidates = fitting.candidates(head)
     held_out = fitting.held_out_scores(rows, labels, candidates)
+    plain = {}
+    if has_numbers:
+        numbers = Candidate("linear", False, ("numbers", "size"))
+        plain = fitting.held_out_scores(rows, labels, [numbers])
     chosen, scores = fitting.choose(rows, labels, candidates)
     new_head = fitting.fit_head(chosen, rows, labels)
     model: Descriptor = base
@@ -169,6 +174,7 @@ def fit(
         "candidates": {str(one): score for one, score in scores.items()},
         "classes": {name: counts[name] for name in names},
         "held_out_scores": held_out,
+        "held_out_scores_of_plain_numbers": plain,
         "shortcuts": shortcuts(dataset),
         "signature": dataset.config.as_dict(),
         "reading": dataset.reading.as_dict(),
