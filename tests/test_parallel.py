@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 import jobs
-from igps._failures import Failed, Limits, MachineError
 from igps._parallel import run
+from igps.failures import Failed, Limits, MachineError
 
 GIB = 2**30
 LINUX = sys.platform == "linux"
@@ -36,7 +36,7 @@ def all_of(*arguments, **options):
 def script_of(folder, text):
     """The command of a script that has the names of this module."""
     head = f"import os, signal, sys\nsys.path.append({str(Path(jobs.__file__).parent)!r})\n"
-    head += "import jobs\nfrom igps._failures import Limits\nfrom igps._parallel import run\n"
+    head += "import jobs\nfrom igps.failures import Limits\nfrom igps._parallel import run\n"
     (folder / "script.py").write_text(head + text)
     return [sys.executable, str(folder / "script.py")]
 

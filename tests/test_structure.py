@@ -16,7 +16,7 @@ PACKAGE = Path(igps.__file__).parent
 FLOORS = (
     (
         "_arrays",
-        "_failures",
+        "failures",
         "_files",
         "_parameters",
         "_progress",

@@ -22,10 +22,10 @@ from training.generated import usable_shapes
 
 import igps
 from igps._arrays import Floats
-from igps._failures import Failed
 from igps._parallel import run
 from igps._threads import one_thread
 from igps.cli import errors_as_messages
+from igps.failures import Failed
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 

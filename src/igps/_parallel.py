@@ -9,11 +9,11 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from itertools import islice
 
-from igps._failures import Failed, Limits, MachineError, attempt
 from igps._parameters import check_at_least
 from igps._threads import Job, Result, n_cores, one_thread, stay_on_one_thread
 from igps._threads import n_threads as available_threads
 from igps._workers import WorkerPool
+from igps.failures import Failed, Limits, MachineError, attempt
 
 _MAX_SUBMITTED = 10_000  # jobs in an executor: enough for the workers of a large cluster, few enough for the memory
 

@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
-from igps._failures import Failed, Limits, MachineError, attempt
+from igps.failures import Failed, Limits, MachineError, attempt
 
 # Each worker has one thread for linear algebra; otherwise, n workers on n cores would run n² threads. The thresholds
 # make the allocator of glibc reuse freed memory for the next body, as the system clears each page that it hands out.

@@ -18,9 +18,9 @@ from damaged_files import (
     write_soup,
     write_unusable,
 )
-from igps._failures import Limits
 from igps.analysis.doctor import examine, expected_cost
 from igps.data.sources import find_bodies
+from igps.failures import Limits
 from igps.fields.volumes.label_measures import VoxelMeasures, thinnest_part
 from igps.mesh.options import LoadOptions
 from igps.report.tables import findings_table

@@ -19,9 +19,8 @@ import numpy as np
 import torch
 
 import igps
-from igps.gallery import _table
-from igps.gallery._table import BodyTable
 from igps.gallery.gallery import CANDIDATES
+from igps.gallery.table import BodyTable, write
 from igps.nn.description import describe
 
 BATCH, TOP = 10_000, 10
@@ -152,7 +151,7 @@ def main() -> None:
                 yield rows.batch(first)
 
         about = {"descriptor": "pretrained"}
-        _table.write(path, about, "cosine", batches(), {}, weights=descriptor.search_weights)
+        write(path, about, "cosine", batches(), {}, weights=descriptor.search_weights)
         size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
         seconds = time.monotonic() - start
         print(f"built in {seconds:.0f} s, {size / 2**30:.2f} GiB, {memory()}", flush=True)

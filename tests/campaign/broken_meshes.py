@@ -25,8 +25,8 @@ from outcome import Row
 from reference import confirm
 
 from igps import LoadOptions, MeshError, SignatureConfig, compute_signature, load_mesh
-from igps._failures import Failed, Limits
 from igps._parallel import run
+from igps.failures import Failed, Limits
 from igps.mesh import mending
 from igps.mesh.simplification import simplify
 from igps.mesh.watertight import watertight

@@ -58,12 +58,12 @@ def changed(rows: Rows, writer: int, number: int) -> Rows:
 def _tables() -> Any:
     """Import the module of tables, and with it LanceDB, in a child process, with lower limits to build indices."""
     torch.set_num_threads(1)
-    from igps.gallery import _table
+    from igps.gallery import table
 
     for name, value in {"_MIN_ROWS_FOR_INDEX": N_UNCHANGED // 2, "_INDEX_INTERVAL": 8}.items():
-        assert hasattr(_table, name)
-        setattr(_table, name, value)
-    return _table
+        assert hasattr(table, name)
+        setattr(table, name, value)
+    return table
 
 
 def _vectors_and_rows(rows: Rows) -> tuple[torch.Tensor, list[dict[str, Any]]]:

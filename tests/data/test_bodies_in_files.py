@@ -9,10 +9,10 @@ import pytest
 import trimesh
 
 import igps.data.pipeline as pipeline_module
-from igps._failures import Limits
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import compute
 from igps.data.sources import bodies_of_files, find_bodies
+from igps.failures import Limits
 from igps.mesh.loading import BodyRef, load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions

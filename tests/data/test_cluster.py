@@ -13,10 +13,10 @@ import pytest
 from bodies_on_disk import write_body
 
 from commands import run
-from igps._failures import MachineError
 from igps.cli.precompute import dask_executor, of_shard
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import fill_elsewhere
+from igps.failures import MachineError
 from igps.mesh.loading import BodyRef
 from igps.signature.signature import SignatureConfig
 

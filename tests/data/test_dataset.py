@@ -13,11 +13,11 @@ from torch.utils.data import DataLoader
 
 import igps
 import igps.data.pipeline as pipeline_module
-from igps._failures import Limits, MachineError
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.transforms import FewerSamples, Scale
+from igps.failures import Limits, MachineError
 from igps.mesh.errors import MeshError
 from igps.signature.signature import SignatureConfig
 

@@ -9,10 +9,10 @@ import trimesh
 from bodies_on_disk import write_body
 
 import igps.data.pipeline as pipeline_module
-from igps._failures import Failed
 from igps.data import keys
 from igps.data.cache_hit import CacheHit
 from igps.data.pipeline import SignaturePipeline
+from igps.failures import Failed
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION

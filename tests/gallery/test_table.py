@@ -19,11 +19,10 @@ pytest.importorskip("lancedb", reason="the extra [index]")
 import lancedb
 import pyarrow as pa
 
-from igps.gallery import _table
-from igps.gallery._table import BodyTable
 from igps.gallery.about import check_alike
 from igps.gallery.opening import is_gallery
 from igps.gallery.place import address
+from igps.gallery.table import BodyTable, write
 from igps.retrieval import chi_square, cosine, search
 
 ABOUT = {"descriptor": "test", "signature": {"resolution": 32}}
@@ -62,7 +61,7 @@ def batches(rows, first=0, mark="a"):
 
 
 def written(path, rows, searched_by, mark="a"):
-    _table.write(path, ABOUT, searched_by, batches(rows, mark=mark), FURTHER)
+    write(path, ABOUT, searched_by, batches(rows, mark=mark), FURTHER)
     return BodyTable(path)
 
 
@@ -194,7 +193,7 @@ def test_weighted_numbers_decide_which_rows_are_candidates(tmp_path):
 
     plain = written(tmp_path / "plain.igps", rows, "cosine")
     path = tmp_path / "weighted.igps"
-    _table.write(path, ABOUT, "cosine", batches(rows), FURTHER, weights=weights)
+    write(path, ABOUT, "cosine", batches(rows), FURTHER, weights=weights)
     assert recall(plain, rows[:20], rows, distance, candidates=60) < 0.5
     assert recall(BodyTable(path), rows[:20], rows, distance, candidates=60) >= 0.98
 
@@ -218,7 +217,7 @@ def test_a_gallery_lies_in_an_object_store(tmp_path):
     place = f"file-object-store://{tmp_path}/store/g.igps"
     assert not is_gallery(place)
     rows = units(4500)
-    _table.write(place, ABOUT, "cosine", batches(rows), FURTHER)
+    write(place, ABOUT, "cosine", batches(rows), FURTHER)
     assert is_gallery(place)
     table = BodyTable(place)
     table.add(rows[:10], [told(i, "b") for i in range(10)], {})
@@ -247,7 +246,7 @@ def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path):
     with pytest.raises(ValueError, match="expected finite numbers"):
         table.add(units(1) / 0, [told(0)], {})
     with pytest.raises(ValueError, match="at least one for the gallery"):
-        _table.write(tmp_path / "new.igps", ABOUT, "cosine", [], {})
+        write(tmp_path / "new.igps", ABOUT, "cosine", [], {})
     with pytest.raises(FileNotFoundError, match=r"nowhere: no gallery there"):
         BodyTable(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=r"got a folder with g.igps"):

@@ -12,10 +12,10 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
-from igps._failures import Failed
 from igps._files import atomic_write
 from igps._parallel import run
 from igps._parameters import check_at_least
+from igps.failures import Failed
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder

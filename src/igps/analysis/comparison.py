@@ -13,10 +13,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps._arrays import Singles
-from igps._failures import Failed
 from igps._parallel import run
 from igps._threads import one_thread
 from igps.data.dataset import Failure, SignatureDataset
+from igps.failures import Failed
 from igps.mesh.errors import MeshError
 from igps.nn.description import describe_timed
 from igps.nn.descriptor import Descriptor

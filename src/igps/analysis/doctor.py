@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 from tqdm import tqdm
 
-from igps._failures import Failed, Limits
 from igps._parallel import run
 from igps._text import counted
 from igps.data.filling import group_by_file
 from igps.data.sources import Bodies, BodyRef
+from igps.failures import Failed, Limits
 from igps.fields.volumes.label_measures import VoxelMeasures, measure
 from igps.mesh._tidying import closed_by_rims, weld
 from igps.mesh.errors import MeshError

@@ -9,7 +9,6 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._arrays import Booleans, Floats
-from igps._failures import Failed
 from igps._parallel import run
 from igps._parameters import check_at_least, check_fraction
 from igps._threads import one_thread
@@ -17,6 +16,7 @@ from igps.analysis.alignment import rigid_motion
 from igps.analysis.groups import codes_of, design_of, permutations
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
+from igps.failures import Failed
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh, millimetres
 from igps.mesh.surface import vertex_areas

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Floats, Integers
-from igps._failures import Failed
 from igps._parallel import run
 from igps._threads import n_cores
 from igps.analysis.segmentation import (
@@ -27,6 +26,7 @@ from igps.analysis.segmentation import (
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import group_by_file
 from igps.data.pipeline import SignaturePipeline
+from igps.failures import Failed
 from igps.fields.volumes.label_surface import MIN_VOXELS, TooFewVoxelsError
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef, each_raw_body, surface_body

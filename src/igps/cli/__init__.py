@@ -41,7 +41,7 @@ def errors_as_messages() -> Iterator[None]:
         )
         sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
-        from igps._failures import MachineError, is_machine_error, machine_error_text
+        from igps.failures import MachineError, is_machine_error, machine_error_text
 
         is_system = isinstance(error, OSError) and is_machine_error(error)
         text = machine_error_text(error) if isinstance(error, OSError) and is_system else error

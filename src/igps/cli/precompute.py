@@ -79,8 +79,8 @@ def dask_executor(address: str) -> Iterator[Executor]:
     Raises:
         MachineError: no scheduler answers, or a worker has another version of the library.
     """
-    from igps._failures import MachineError
     from igps.data.pipeline import version
+    from igps.failures import MachineError
 
     try:
         from distributed import Client

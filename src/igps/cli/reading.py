@@ -13,7 +13,6 @@ from typing import Any
 from torch import Tensor
 
 from igps._arrays import Floats, Singles
-from igps._failures import Limits
 from igps._parameters import check_positive
 from igps._text import counted
 from igps.cli.options import ClassRule, Mirror, Size
@@ -26,6 +25,7 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.measures import Measures
 from igps.descriptors.size_and_side import SIDE, SIZE, keeps_size, scale_of
+from igps.failures import Limits
 from igps.fields.volumes.border import border_of
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from igps._failures import Failed, Limits
 from igps.data.attributes import AttributeSource, PointFunction, split_attributes, with_attribute
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.cache import default_cache_dir
@@ -24,6 +23,7 @@ from igps.data.indices import Indices, resolve_indices, scalar_index
 from igps.data.pipeline import PreTransform, SignaturePipeline
 from igps.data.requirements import AnyDescriptor, requirements_of
 from igps.data.sources import Bodies, ClassRule, bodies_of
+from igps.failures import Failed, Limits
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh

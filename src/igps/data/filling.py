@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import get_args
 
-from igps._failures import Failed, Limits, MachineError
 from igps._parallel import run
 from igps._progress import Progress
 from igps._text import counted
@@ -24,6 +23,7 @@ from igps.data.keys import FileDigest
 from igps.data.known_files import KnownFiles
 from igps.data.pipeline import SignaturePipeline, fill_elsewhere, version
 from igps.data.sources import Bodies
+from igps.failures import Failed, Limits, MachineError
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of
 from igps.mesh.loading import BodyRef

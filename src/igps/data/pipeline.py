@@ -12,12 +12,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from igps._arrays import Singles
-from igps._failures import Failed, MachineError, attempt
 from igps.data.attribute_sources import with_load_options
 from igps.data.attributes import AttributeSource, with_attribute
 from igps.data.cache import Cache, Kind, Record, decode, encode
 from igps.data.cache_hit import CacheHit
 from igps.data.keys import Content, FileDigest, derived_key, signature_key
+from igps.failures import Failed, MachineError, attempt
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of, names_of
 from igps.mesh.loading import BodyRef, each_body, load_mesh

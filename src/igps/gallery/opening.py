@@ -15,6 +15,6 @@ def is_gallery(path: str | Path) -> bool:
 
 def tables() -> Any:
     """Import the module that needs LanceDB."""
-    from igps.gallery import _table
+    from igps.gallery import table
 
-    return _table
+    return table

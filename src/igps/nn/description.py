@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from igps._arrays import Singles
-from igps._failures import Failed
 from igps._parallel import on_threads, run
 from igps._progress import Progress
 from igps._threads import n_cores, one_thread
@@ -20,6 +19,7 @@ from igps.data.attribute_sources import attribute_names
 from igps.data.cache import Record
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.keys import derived_key
+from igps.failures import Failed
 from igps.mesh.errors import MeshError
 from igps.nn.axes import Attribute
 from igps.nn.descriptor import BodyDescriptor, Descriptor

@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
-from igps._failures import Failed
 from igps._parallel import run
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
+from igps.failures import Failed
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Frame, Mesh
