@@ -47,7 +47,10 @@ _LOAD_HELP = {
         "table of label names; or freesurfer, totalsegmentator or totalsegmentator_v1, for volumes with no names in "
         "them or beside them"
     ),
-    "threshold": "smallest probability of the voxels of a body, in volumes of probabilities",
+    "threshold": (
+        "smallest value of the voxels of a body: in volumes of probabilities, by default 0.5, and in density "
+        "maps, which need it"
+    ),
     "cavities": "fill hollow bodies, or keep the surfaces of hollows as part of their boundary",
 }
 

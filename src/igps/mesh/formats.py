@@ -43,6 +43,7 @@ class Format:
     is_searched: bool = True
     ignored: tuple[str, ...] = ()  # suffixes of files of this format that hold no surface
     extra: str | None = None  # the extra of this package that installs the modules `read` needs
+    has_triangles: bool = True  # whether the size of a file of one body tells how many there are
     # tells a file of this format whose name ends with no known suffix
     recognises: Callable[[Path], bool] | None = None
     # Finds other files on which the bodies depend

@@ -246,7 +246,7 @@ def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[Raw
     """Read all bodies of a file, or at least the one named `part`."""
     file_format = _format(path)
     kind = _body_kind(file_format, options)
-    if file_format.bodies[0] == "whole":
+    if file_format.bodies[0] == "whole" and file_format.has_triangles:
         check_memory(path)
     part = None if kind in ("whole", "pieces") else part
     with faults(path, file_format):

@@ -1,5 +1,6 @@
 """Options for reading a file as bodies."""
 
+import math
 import os
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
@@ -39,7 +40,8 @@ class LoadOptions:
         max_unpacked: largest unpacked size of a file, in bytes.
         names: file with a table of label names, see `read_label_names`; None for the names in or beside the volume. Or
             "freesurfer", "totalsegmentator" or "totalsegmentator_v1": the names of their labels, for other volumes.
-        threshold: smallest probability of the voxels of a body, in volumes of probabilities.
+        threshold: smallest value of the voxels of a body, in volumes of probabilities, where None is 0.5, and in maps
+            of density, which need it.
         cavities: "fill" fills hollow bodies; "keep" makes the surfaces of hollows part of their boundary.
 
     Raises:
@@ -51,7 +53,7 @@ class LoadOptions:
     bodies: BodyKind | None = None
     max_unpacked: int = MAX_UNPACKED
     names: str | None = None
-    threshold: float = 0.5
+    threshold: float | None = None
     cavities: Cavities = "fill"
 
     def __post_init__(self) -> None:
@@ -64,8 +66,8 @@ class LoadOptions:
                 'allow_open: expected False with mend="always", which closes every surface. '
                 "Leave one of them out."
             )
-        if not 0 < self.threshold <= 1:
-            raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
+        if self.threshold is not None and not math.isfinite(self.threshold):
+            raise ValueError(f"threshold: expected a finite number, got {self.threshold}.")
 
     @property
     def names_anywhere(self) -> str | None:

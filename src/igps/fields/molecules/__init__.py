@@ -1,9 +1,9 @@
 """Molecules: structures, their surfaces, what their residues know, and the descriptor `molecular`."""
 
 from igps.data.attribute_sources import SourceKind
-from igps.fields.molecules import bodies, residue_attributes, residue_correspondence
+from igps.fields.molecules import bodies, maps, residue_attributes, residue_correspondence
 
-FORMATS = (bodies.FORMAT,)
+FORMATS = (bodies.FORMAT, maps.FORMAT)
 ATTRIBUTES = (
     SourceKind(
         lambda name, root: residue_attributes.ResidueAttribute(name),

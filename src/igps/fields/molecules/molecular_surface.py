@@ -186,7 +186,7 @@ def _neighbours(centres: Floats, radii: Floats) -> tuple[Integers, Integers]:
 def _one_piece(
     vertices: Floats, faces: Integers, max_vertices: int | None, notes: list[str]
 ) -> Surface:
-    """Drop specks, simplify each piece to its share of the vertices, and join the pieces."""
+    """Drop specks, simplify, and join the pieces."""
     parts = connected(vertices, faces)
     volumes = np.array([abs(signed_volume(*part)) for part in parts])
     is_speck = volumes < SPECK_VOLUME * volumes.sum()
@@ -197,6 +197,13 @@ def _one_piece(
     elif is_speck.any():
         notes.append(f"left out {counted(int(is_speck.sum()), 'speck')}")
     parts = [part for part, is_small in zip(parts, is_speck, strict=True) if not is_small]
+    return simplified_and_joined(parts, max_vertices, notes)
+
+
+def simplified_and_joined(
+    parts: Sequence[Surface], max_vertices: int | None, notes: list[str]
+) -> Surface:
+    """Simplify each closed piece to its share of the vertices, and join them by threads to one surface."""
     if max_vertices is not None:
         n_vertices = sum(len(points) for points, _ in parts)
         parts = [

@@ -1,5 +1,6 @@
 """Images and grids of values around bodies, as arrays with affines."""
 
+import gzip
 import math
 import re
 from functools import lru_cache
@@ -11,9 +12,14 @@ from numpy.typing import NDArray
 
 from igps._arrays import Floats
 from igps.fields.volumes import _volume_files
+from igps.fields.volumes._streams import check_gzip
 from igps.mesh.errors import MeshError
+from igps.mesh.limits import check_fits
 
-_GRIDS = (".dx", ".mrc", ".map", ".ccp4")
+MAPS = (".mrc", ".map", ".ccp4", ".mrc.gz", ".map.gz", ".ccp4.gz")
+"""Suffixes of density maps."""
+
+_GRIDS = (".dx", *MAPS)
 SUFFIXES = (*_volume_files.READERS, *_GRIDS)
 # Of a value, by the mode of an MRC map (MRC2014)
 _MODE_BYTES = {
@@ -71,15 +77,20 @@ def _read_map(path: Path) -> tuple[NDArray[Any], Floats]:
         import mrcfile
     except ImportError as error:
         raise ImportError('Maps need mrcfile: pip install "interior-gps[molecules]".') from error
-    head = np.fromfile(path, "<i4", 4)
-    head = head.byteswap() if len(head) == 4 and not 0 <= head[3] < 256 else head
-    n_expected = 1024 + (
-        math.prod(map(int, head[:3])) * _MODE_BYTES.get(int(head[3]), 1) if len(head) == 4 else 0
-    )
-    if len(head) < 4 or min(head[:3]) < 1 or path.stat().st_size < n_expected:
-        raise MeshError(
-            f"{path}: expected {n_expected} bytes, got {path.stat().st_size}. Export it again."
-        )
+    is_packed = path.name.lower().endswith(".gz")
+    with gzip.open(path) if is_packed else path.open("rb") as file:
+        head = np.frombuffer(file.read(96), "<i4")
+    if len(head) < 24:
+        raise MeshError(f"{path}: expected a header of 1024 bytes. Export it again.")
+    head = head.byteswap() if not 0 <= head[3] < 256 else head
+    n_values = math.prod(map(int, head[:3]))
+    n_expected = 1024 + max(int(head[23]), 0) + n_values * _MODE_BYTES.get(int(head[3]), 1)
+    n_bytes = n_expected if is_packed else path.stat().st_size
+    if min(head[:3]) < 1 or n_bytes < n_expected:
+        raise MeshError(f"{path}: expected {n_expected} bytes, got {n_bytes}. Export it again.")
+    check_fits(2 * n_expected, f"{path}: the map needs", "Cut out or resample a smaller map.")
+    if is_packed:
+        check_gzip(path, n_expected)
     with mrcfile.open(path) as file:
         header = file.header
         values = file.data

@@ -283,7 +283,7 @@ def _names_of(
 
 
 def _integer_labels(
-    values: NDArray[Any], name: str, threshold: float, notes: list[str]
+    values: NDArray[Any], name: str, threshold: float | None, notes: list[str]
 ) -> NDArray[Any]:
     """Convert values to labels of the smallest unsigned type; probabilities are binarised at the threshold."""
     if values.dtype.kind == "f":
@@ -297,6 +297,11 @@ def _integer_labels(
         )
         # Probabilities may leave [0, 1]: SPM stores bytes times a rounded 1/255, and resampling overshoots
         if len(odd) and values.min() >= -_LABEL_TOLERANCE and values.max() <= 1 + _LABEL_TOLERANCE:
+            threshold = 0.5 if threshold is None else threshold
+            if not 0 < threshold <= 1:
+                raise MeshError(
+                    f"{name}: threshold: expected above 0 and at most 1 for probabilities, got {threshold:g}."
+                )
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
             return (values >= threshold).astype(np.uint8)
         if len(odd):
