@@ -26,10 +26,11 @@ from igps._arrays import Floats, Integers
 from igps._threads import SERIAL, Team
 from igps.mesh.surface import has_area
 from igps.signature._weight_loops import (
+    Touched,
     add_near_faces,
-    fill_cluster_terms,
     fill_hats,
     find_far_clusters,
+    pairs_for,
 )
 from igps.signature.ordering import principal_axes, spatial_order
 
@@ -96,11 +97,20 @@ class HatSurface:
         The series is used where a point is `ratio` or more radii from a hat, the closed form elsewhere. For a point on
         the surface all rows are filled: with barycentric coordinates at the corners of its face, with zeros elsewhere.
         """
-        near = np.zeros((len(hats) + 1, x.shape[1]), dtype=bool)
+        n = x.shape[1]
+        near = np.zeros((len(hats) + 1, n), dtype=bool)
         last_rows = out[len(out) - len(hats) :]
         fill_hats(x, hats, self.hats, ratio, last_rows, near)
+        row_of = np.full(len(self.order), len(hats))
+        row_of[hats] = np.arange(len(hats))
+        near_hats = np.where(near[:-1].any(axis=1), hats, -1)
         surface = (self.faces, self.table, self.face_starts, self.incident_faces)
-        add_near_faces(x, hats, near, surface, out)
+        touched = Touched(np.full(n, -1), np.empty((n, 3)))
+        add_near_faces(x, near_hats, near, surface, row_of, last_rows, touched, pairs_for(n))
+        on_surface = np.flatnonzero(touched.face_at >= 0)
+        corners = self.faces[touched.face_at[on_surface]]
+        out[:, on_surface] = 0
+        last_rows[row_of[corners], on_surface[:, None]] = touched.barycentric[on_surface]
 
 
 def _hats(
@@ -204,7 +214,7 @@ class HatClusters:
         def fill(level: int) -> None:
             terms = np.empty((n_hats, _N_TERMS), functions.dtype)
             size = sizes[level]
-            fill_cluster_terms(hats, size, centres[level], radii[level], terms)
+            _fill_cluster_terms(hats, size, centres[level], radii[level], terms)
             starts = range(0, n_hats, size)
             for cluster, start in enumerate(starts, start=level_starts[level]):
                 part = slice(start, start + size)
@@ -225,3 +235,81 @@ class HatClusters:
             _LEAF_SIZE,
             self.n_hats,
         )
+
+
+def _fill_cluster_terms(
+    hats: Floats, size: int, centres: Floats, radii: Floats, terms: NDArray[np.floating]
+) -> None:
+    """Fill the contribution (V, 19) of each hat to the sums of its cluster, which consists of `size` consecutive hats.
+
+    The moments of n dS about the cluster's centre are F = ∫ λ n, T + F sᵀ, and 2 T s + F E, where T is the symmetric
+    part of ∫ λ n (y − p)ᵀ, E the second moment of y under λ, and s the vector from the cluster's centre to the hat's.
+    They are contracted with the derivatives of u, which are |e|² times e, −4 e eᵀ + |e|², and 24 e e e − 4 |e|² e in
+    each of three ways.
+    """
+    cluster = np.arange(len(hats)) // size
+    scale = 1 / radii[cluster]
+    p = hats.T
+    s0, s1, s2 = scale * (p[:3] - centres[cluster].T)
+    out = terms.T
+    cubed = scale * scale * scale
+    squared = scale * scale
+    f0 = cubed * p[5]
+    f1 = cubed * p[6]
+    f2 = cubed * p[7]
+    # S is −4 dᵀTd, and B is 12 dᵀCd; entries off the diagonal count twice.
+    tilt = -squared * squared / 4
+    spread = squared / 12
+    t00 = tilt * p[12]
+    t01 = tilt * p[13]
+    t02 = tilt * p[14]
+    t11 = tilt * p[15]
+    t12 = tilt * p[16]
+    t22 = tilt * p[17]
+    e00 = spread * p[18] + s0 * s0
+    e11 = spread * p[21] + s1 * s1
+    e22 = spread * p[23] + s2 * s2
+    e01 = spread * p[19] + 2 * s0 * s1
+    e02 = spread * p[20] + 2 * s0 * s2
+    e12 = spread * p[22] + 2 * s1 * s2
+    out[0] = f0
+    out[1] = f1
+    out[2] = f2
+    n00 = t00 + f0 * s0
+    n11 = t11 + f1 * s1
+    n22 = t22 + f2 * s2
+    trace = n00 + n11 + n22
+    out[3] = trace - 4 * n00
+    out[6] = trace - 4 * n11
+    out[8] = trace - 4 * n22
+    out[4] = -4 * (t01 + f0 * s1 + f1 * s0)
+    out[5] = -4 * (t02 + f0 * s2 + f2 * s0)
+    out[7] = -4 * (t12 + f1 * s2 + f2 * s1)
+    trace_t = t00 + t11 + t22
+    trace_e = e00 + e11 + e22
+    g0 = 2 * trace_t * s0 + trace_e * f0 + 2 * (2 * t00 * s0 + t01 * s1 + t02 * s2)
+    g1 = 2 * trace_t * s1 + trace_e * f1 + 2 * (t01 * s0 + 2 * t11 * s1 + t12 * s2)
+    g2 = 2 * trace_t * s2 + trace_e * f2 + 2 * (t02 * s0 + t12 * s1 + 2 * t22 * s2)
+    g0 += 2 * e00 * f0 + e01 * f1 + e02 * f2
+    g1 += e01 * f0 + 2 * e11 * f1 + e12 * f2
+    g2 += e02 * f0 + e12 * f1 + 2 * e22 * f2
+    # 12 (F·e) eᵀEe + 24 (s·e) eᵀTe − 2 (g·e) |e|²
+    f0 = 12 * f0
+    f1 = 12 * f1
+    f2 = 12 * f2
+    s0 = 24 * s0
+    s1 = 24 * s1
+    s2 = 24 * s2
+    g0 = 2 * g0
+    g1 = 2 * g1
+    g2 = 2 * g2
+    out[9] = f0 * e00 + s0 * t00 - g0
+    out[10] = f0 * e01 + f1 * e00 + s0 * t01 + s1 * t00 - g1
+    out[11] = f0 * e02 + f2 * e00 + s0 * t02 + s2 * t00 - g2
+    out[12] = f0 * e11 + f1 * e01 + s0 * t11 + s1 * t01 - g0
+    out[13] = f0 * e12 + f1 * e02 + f2 * e01 + s0 * t12 + s1 * t02 + s2 * t01
+    out[14] = f0 * e22 + f2 * e02 + s0 * t22 + s2 * t02 - g0
+    out[15] = f1 * e11 + s1 * t11 - g1
+    out[16] = f1 * e12 + f2 * e11 + s1 * t12 + s2 * t11 - g2
+    out[17] = f1 * e22 + f2 * e12 + s1 * t22 + s2 * t12 - g1
+    out[18] = f2 * e22 + s2 * t22 - g2

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps._compiled import compiled
+from igps._compiled import ALLOCATES, compiled
 
 # Keeps the logarithm of a side finite at points on the side, where its factor is 0
 _TINY = math.ulp(1.0) ** 2
@@ -33,7 +33,7 @@ class PatchTree(NamedTuple):
     faces: Floats
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def fill_potentials(
     points: Floats,
     block: int,

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
-from igps._arrays import Booleans, Floats, Integers, Singles
-from igps._compiled import FUSE, compiled
+from igps._arrays import Booleans, Floats, Integers
+from igps._compiled import ALLOCATES, FUSE, compiled
 
 SurfaceArrays = tuple[Integers, Floats, Integers, Integers]
 """Faces, table, face_starts and incident_faces of a `HatSurface`."""
@@ -29,7 +29,7 @@ _ARCTAN = tuple(
 )
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def find_far_clusters(
     low: Floats,
     high: Floats,
@@ -79,9 +79,8 @@ def find_far_clusters(
 def fill_hats(
     x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: Floats, near: Booleans
 ) -> None:
-    """Fill the weights (h, n) of the chosen hats (h,), 0 at points within `ratio` radii; mark those in `near`."""
+    """Fill the weights (h, n) of the chosen hats (h,), 0 at points within `ratio` radii; mark zeros in `near`."""
     n = x.shape[1]
-    squared = np.empty(n)
     for k in range(len(chosen)):
         p = hats[chosen[k]]
         p0 = p[0]
@@ -125,9 +124,8 @@ def fill_hats(
             third = a * (b00 * a + b01 * b + b02 * c) + b * (b11 * b + b12 * c) + b22 * c * c
             value = ((third * linear * inverse + second) * inverse + linear) * (inverse * inverse)
             row[i] = 0.0 if distance < limit else value
-            squared[i] = distance
         for i in range(n):
-            near[k, i] = squared[i] < limit
+            near[k, i] = row[i] == 0.0
 
 
 @compiled(fastmath=FUSE)
@@ -187,74 +185,76 @@ class Touched(NamedTuple):
     barycentric: Floats
 
 
+class Pairs(NamedTuple):
+    """Scratch space for up to m pairs of a face and a point that are computed at a time."""
+
+    numbers: Integers  # (2, m) of the face and of the point
+    squares: Floats  # (3, m) squared lengths of the cross products of `add_faces`, then its g
+    cosines: Floats  # (3, m)
+    projections: Floats  # (m, 4) areas λ |n| and height
+
+
+def pairs_for(n_points: int) -> Pairs:
+    """Return the scratch space of `add_near_faces` for n points."""
+    m = n_points + _N_PAIRS
+    return Pairs(np.empty((2, m), np.int64), np.empty((3, m)), np.empty((3, m)), np.empty((m, 4)))
+
+
 @compiled()
 def add_near_faces(
-    x: Floats, chosen: Integers, near: Booleans, surface: SurfaceArrays, weights: Floats
+    x: Floats,
+    hats: Integers,
+    near: Booleans,
+    surface: SurfaceArrays,
+    row_of: Integers,
+    weights: Floats,
+    touched: Touched,
+    pairs: Pairs,
 ) -> None:
-    """Add the closed form to the weights (…, n), whose last h rows are those of the chosen hats (h,).
+    """Add the closed form to the weights (h, n) of hats (h,), where a hat is `near` a point (h + 1, n).
 
-    It is added where a hat is `near` a point (h + 1, n); the last row of `near` is False. For points on the surface all
-    weights are replaced: by the barycentric coordinates in their face, and by zero elsewhere.
+    The hats without a near point are given as -1. The row of each vertex among the hats is `row_of` (V,): that of a
+    vertex that is not among them is h, the last row of `near`, which is False.
     """
-    faces, table, face_starts, incident_faces = surface
-    n = x.shape[1]
-    n_chosen = len(chosen)
-    hat_weights = weights[len(weights) - n_chosen :]
-    row_of = np.empty(len(face_starts) - 1, np.int64)
-    row_of[:] = n_chosen
-    for k in range(n_chosen):
-        row_of[chosen[k]] = k
-    pairs = np.empty((2, n + _N_PAIRS), np.int64)
-    touched = Touched(np.full(n, -1, np.int64), np.empty((n, 3)))
+    faces = surface[0]
+    face_starts = surface[2]
+    incident_faces = surface[3]
+    n_hats = len(hats)
     n_pairs = 0
-    for k in range(n_chosen):
-        hat = chosen[k]
-        if not near[k].any():
+    for k in range(n_hats):
+        hat = hats[k]
+        if hat < 0:
             continue
         for j in range(face_starts[hat], face_starts[hat + 1]):
             face = incident_faces[j]
             # Each face is added once: at its near corner of lowest index. Are corners of lower index near, too?
-            row_1, row_2 = n_chosen, n_chosen
+            row_1, row_2 = n_hats, n_hats
             for corner in range(3):
                 if faces[face, corner] < hat:
                     row_1, row_2 = row_of[faces[face, corner]], row_1
-            for i in range(n):
+            for i in range(x.shape[1]):
                 if near[k, i] and not near[row_1, i] and not near[row_2, i]:
-                    pairs[0, n_pairs] = face
-                    pairs[1, n_pairs] = i
+                    pairs.numbers[0, n_pairs] = face
+                    pairs.numbers[1, n_pairs] = i
                     n_pairs += 1
             if n_pairs >= _N_PAIRS:
-                add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, touched)
+                add_faces(x, n_pairs, surface, row_of, near, weights, touched, pairs)
                 n_pairs = 0
-    add_faces(x, pairs[:, :n_pairs], faces, table, row_of, near, hat_weights, touched)
-    _interpolate_on_faces(touched, faces, row_of, weights, hat_weights)
-
-
-@compiled()
-def _interpolate_on_faces(
-    touched: Touched, faces: Integers, row_of: Integers, weights: Floats, hat_weights: Floats
-) -> None:
-    """Replace all weights of the points on faces by their barycentric coordinates."""
-    for i in range(len(touched.face_at)):
-        if touched.face_at[i] >= 0:
-            weights[:, i] = 0
-            for corner in range(3):
-                row = row_of[faces[touched.face_at[i], corner]]
-                hat_weights[row, i] = touched.barycentric[i, corner]
+    add_faces(x, n_pairs, surface, row_of, near, weights, touched, pairs)
 
 
 @compiled()
 def add_faces(
     x: Floats,
-    pairs: Integers,
-    faces: Integers,
-    table: Floats,
+    n_pairs: int,
+    surface: SurfaceArrays,
     row_of: Integers,
     near: Booleans,
     weights: Floats,
     touched: Touched,
+    pairs: Pairs,
 ) -> None:
-    """Add the closed form for pairs (2, m) of a face and a point, accurate up to the surface.
+    """Add the closed form for m pairs of a face and a point, accurate up to the surface.
 
     If a point is on the surface, the first face that contains it is written to `touched`.
 
@@ -263,13 +263,14 @@ def add_faces(
     N_i·m / (N_i·v_i) becomes ½ [λ_i s/h + h Σ_l g_l e_l·e_i / |n|²] |n|, with g_l = θ_l/|N_l| and s = Σ_l g_l λ_l,
     because N_l = λ_l n + h n̂×e_l. The length of N_l is taken from this identity, too: all terms agree near a side.
     """
-    n_pairs = pairs.shape[1]
-    projections = np.empty((n_pairs, 4))
-    squares = np.empty(3 * n_pairs)
-    cosines = np.empty(3 * n_pairs)
+    faces = surface[0]
+    table = surface[1]
+    squares = pairs.squares
+    cosines = pairs.cosines
+    projections = pairs.projections
     for m in range(n_pairs):
-        row = table[pairs[0, m]]
-        i = pairs[1, m]
+        row = table[pairs.numbers[0, m]]
+        i = pairs.numbers[1, m]
         a0 = row[0] - x[0, i]
         a1 = row[1] - x[1, i]
         a2 = row[2] - x[2, i]
@@ -284,24 +285,25 @@ def add_faces(
         area_0 = -(row[12] * b0 + row[13] * b1 + row[14] * b2)
         area_1 = -(row[15] * c0 + row[16] * c1 + row[17] * c2)
         area_2 = row[21] - area_0 - area_1
-        squares[3 * m] = area_0 * area_0 + row[18] * height * height
-        squares[3 * m + 1] = area_1 * area_1 + row[19] * height * height
-        squares[3 * m + 2] = area_2 * area_2 + row[20] * height * height
-        cosines[3 * m] = b0 * c0 + b1 * c1 + b2 * c2
-        cosines[3 * m + 1] = c0 * a0 + c1 * a1 + c2 * a2
-        cosines[3 * m + 2] = a0 * b0 + a1 * b1 + a2 * b2
+        squares[0, m] = area_0 * area_0 + row[18] * height * height
+        squares[1, m] = area_1 * area_1 + row[19] * height * height
+        squares[2, m] = area_2 * area_2 + row[20] * height * height
+        cosines[0, m] = b0 * c0 + b1 * c1 + b2 * c2
+        cosines[1, m] = c0 * a0 + c1 * a1 + c2 * a2
+        cosines[2, m] = a0 * b0 + a1 * b1 + a2 * b2
         projections[m, 0] = area_0
         projections[m, 1] = area_1
         projections[m, 2] = area_2
         projections[m, 3] = height
-    divide_angles(squares, cosines)
+    for side in range(3):
+        divide_angles(squares[side, :n_pairs], cosines[side, :n_pairs])
     for m in range(n_pairs):
-        face = pairs[0, m]
-        i = pairs[1, m]
+        face = pairs.numbers[0, m]
+        i = pairs.numbers[1, m]
         row = table[face]
         areas = projections[m]
         height = projections[m, 3]
-        g = squares[3 * m : 3 * m + 3]
+        g = squares[:, m]
         sides = table[face, 18:21]
         half = (sides[0] + sides[1] + sides[2]) / 2
         s = g[0] * areas[0] + g[1] * areas[1] + g[2] * areas[2]
@@ -346,85 +348,3 @@ def divide_angles(squares: Floats, cosines: Floats) -> None:
         angle = z * series + (math.pi / 4 if steep else 0.0)
         angle = math.pi / 2 - angle if y > x else angle
         squares[m] = (math.pi - angle if cosine < 0 else angle) / y
-
-
-@compiled(fastmath=FUSE)
-def fill_cluster_terms(
-    hats: Floats, size: int, centres: Floats, radii: Floats, terms: Singles
-) -> None:
-    """Fill the contribution (V, 19) of each hat to the sums of its cluster, which consists of `size` consecutive hats.
-
-    The moments of n dS about the cluster's centre are F = ∫ λ n, T + F sᵀ, and 2 T s + F E, where T is the symmetric
-    part of ∫ λ n (y − p)ᵀ, E the second moment of y under λ, and s the vector from the cluster's centre to the hat's.
-    They are contracted with the derivatives of u, which are |e|² times e, −4 e eᵀ + |e|², and 24 e e e − 4 |e|² e in
-    each of three ways.
-    """
-    for hat in range(len(hats)):
-        p = hats[hat]
-        out = terms[hat]
-        centre = centres[hat // size]
-        scale = 1 / radii[hat // size]
-        s0 = scale * (p[0] - centre[0])
-        s1 = scale * (p[1] - centre[1])
-        s2 = scale * (p[2] - centre[2])
-        cubed = scale * scale * scale
-        squared = scale * scale
-        f0 = cubed * p[5]
-        f1 = cubed * p[6]
-        f2 = cubed * p[7]
-        # S is −4 dᵀTd, and B is 12 dᵀCd; entries off the diagonal count twice.
-        tilt = -squared * squared / 4
-        spread = squared / 12
-        t00 = tilt * p[12]
-        t01 = tilt * p[13]
-        t02 = tilt * p[14]
-        t11 = tilt * p[15]
-        t12 = tilt * p[16]
-        t22 = tilt * p[17]
-        e00 = spread * p[18] + s0 * s0
-        e11 = spread * p[21] + s1 * s1
-        e22 = spread * p[23] + s2 * s2
-        e01 = spread * p[19] + 2 * s0 * s1
-        e02 = spread * p[20] + 2 * s0 * s2
-        e12 = spread * p[22] + 2 * s1 * s2
-        out[0] = f0
-        out[1] = f1
-        out[2] = f2
-        n00 = t00 + f0 * s0
-        n11 = t11 + f1 * s1
-        n22 = t22 + f2 * s2
-        trace = n00 + n11 + n22
-        out[3] = trace - 4 * n00
-        out[6] = trace - 4 * n11
-        out[8] = trace - 4 * n22
-        out[4] = -4 * (t01 + f0 * s1 + f1 * s0)
-        out[5] = -4 * (t02 + f0 * s2 + f2 * s0)
-        out[7] = -4 * (t12 + f1 * s2 + f2 * s1)
-        trace_t = t00 + t11 + t22
-        trace_e = e00 + e11 + e22
-        g0 = 2 * trace_t * s0 + trace_e * f0 + 2 * (2 * t00 * s0 + t01 * s1 + t02 * s2)
-        g1 = 2 * trace_t * s1 + trace_e * f1 + 2 * (t01 * s0 + 2 * t11 * s1 + t12 * s2)
-        g2 = 2 * trace_t * s2 + trace_e * f2 + 2 * (t02 * s0 + t12 * s1 + 2 * t22 * s2)
-        g0 += 2 * e00 * f0 + e01 * f1 + e02 * f2
-        g1 += e01 * f0 + 2 * e11 * f1 + e12 * f2
-        g2 += e02 * f0 + e12 * f1 + 2 * e22 * f2
-        # 12 (F·e) eᵀEe + 24 (s·e) eᵀTe − 2 (g·e) |e|²
-        f0 = 12 * f0
-        f1 = 12 * f1
-        f2 = 12 * f2
-        s0 = 24 * s0
-        s1 = 24 * s1
-        s2 = 24 * s2
-        g0 = 2 * g0
-        g1 = 2 * g1
-        g2 = 2 * g2
-        out[9] = f0 * e00 + s0 * t00 - g0
-        out[10] = f0 * e01 + f1 * e00 + s0 * t01 + s1 * t00 - g1
-        out[11] = f0 * e02 + f2 * e00 + s0 * t02 + s2 * t00 - g2
-        out[12] = f0 * e11 + f1 * e01 + s0 * t11 + s1 * t01 - g0
-        out[13] = f0 * e12 + f1 * e02 + f2 * e01 + s0 * t12 + s1 * t02 + s2 * t01
-        out[14] = f0 * e22 + f2 * e02 + s0 * t22 + s2 * t02 - g0
-        out[15] = f1 * e11 + s1 * t11 - g1
-        out[16] = f1 * e12 + f2 * e11 + s1 * t12 + s2 * t11 - g2
-        out[17] = f1 * e22 + f2 * e12 + s1 * t22 + s2 * t12 - g1
-        out[18] = f2 * e22 + s2 * t22 - g2

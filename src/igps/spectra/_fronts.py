@@ -127,11 +127,11 @@ def forward(
     blocks: Floats,
     x: Floats,
     carried: Floats,
-    max_rows: int,
+    rows: Floats,
 ) -> None:
     """Pass upwards through a range of nodes: x, (V, b) flat, becomes D x, and Eᵀ x is carried to the boundary's owners.
 
-    The right-hand sides are (b, V).
+    The right-hand sides are (b, V). The rows are scratch space of b numbers for each row of the largest front.
     """
     b = len(right)
     order = tree.order
@@ -140,7 +140,6 @@ def forward(
     children = tree.children
     parent_row = tree.parent_row
     carried_start = tree.carried_start
-    rows = np.empty(max_rows * b)
     for node in range(nodes[0], nodes[1]):
         n_own = own_start[node + 1] - own_start[node]
         n_boundary = boundary_start[node + 1] - boundary_start[node]
@@ -191,16 +190,23 @@ def forward(
 
 @compiled()
 def backward(
-    nodes: Nodes, tree: Structure, blocks: Floats, x: Floats, max_rows: int, solution: Floats
+    nodes: Nodes,
+    tree: Structure,
+    blocks: Floats,
+    x: Floats,
+    rows: Floats,
+    boundary_x: Floats,
+    solution: Floats,
 ) -> None:
-    """Pass downwards through a range of nodes: x, (V, b) flat, becomes D x + E x_boundary, the solution (b, V)."""
+    """Pass downwards through a range of nodes: x, (V, b) flat, becomes D x + E x_boundary, the solution (b, V).
+
+    The rows and boundary_x are scratch space, as the rows of `forward`.
+    """
     b = len(solution)
     order = tree.order
     own_start = tree.own_start
     boundary_start = tree.boundary_start
     boundary = tree.boundary
-    boundary_x = np.empty(max_rows * b)
-    rows = np.empty(max_rows * b)
     for node in range(nodes[1] - 1, nodes[0] - 1, -1):
         n_own = own_start[node + 1] - own_start[node]
         n_boundary = boundary_start[node + 1] - boundary_start[node]

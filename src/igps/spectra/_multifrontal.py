@@ -170,13 +170,14 @@ class Factors:
         n_boundary = np.diff(structure.boundary_start)
         x = np.empty(n_vertices * b)
         carried = np.empty((structure.carried_start + n_boundary).max() * b)
-        max_rows = int((np.diff(structure.own_start) + n_boundary).max())
+        size = int((np.diff(structure.own_start) + n_boundary).max()) * b
 
         def forward(nodes: Nodes) -> None:
-            loops.forward(nodes, right, structure, self.blocks, x, carried, max_rows)
+            loops.forward(nodes, right, structure, self.blocks, x, carried, np.empty(size))
 
         def backward(nodes: Nodes) -> None:
-            loops.backward(nodes, structure, self.blocks, x, max_rows, solution.numpy())
+            rows, boundary_x = np.empty((2, size))
+            loops.backward(nodes, structure, self.blocks, x, rows, boundary_x, solution.numpy())
 
         team.each(forward, tree.subtrees)
         for nodes in tree.above:

@@ -1,33 +1,22 @@
-"""Products of small or long matrices, where compiled loops are faster than a BLAS.
+"""Products of small or long matrices, which take most of the time of the eigensolver.
 
-A BLAS is made for matrices with many rows and columns: it first copies its operands into its own layout. Two kinds of
-products of the eigensolver are different, and take most of its time.
-
-*Fronts of some tens of unknowns, and solves with few right-hand sides* (`product`). A tile of the result, ROWS by
-COLUMNS, stays in the processor's registers until it is complete. This takes a third of the time of a BLAS. Numba does
-not find it by itself: with loops that it arranges over rows of four, all of `eigenpairs` takes 1.9 times as long at
-10,000 vertices. The tile is therefore written in LLVM instructions (`_tile`); everything around it is plain Numba.
-
-*A few long rows with many* (`overlaps`), for the Krylov basis. On AMD processors compiled loops take down to half the
-time of a BLAS, and all of `eigenpairs` 0.88 times. On Intel processors with AVX-512, for which MKL is made, they take
-up to twice its time, and all of `eigenpairs` 1.14 times. The processor therefore decides (`loops_beat_blas`).
+A BLAS is made for matrices with many rows and columns: it first copies its operands into its own layout. For fronts of
+some tens of unknowns, and solves with few right-hand sides, `product` keeps a tile of the result, ROWS by COLUMNS, in
+the processor's registers until it is complete. This takes a third of the time of a BLAS. Numba does not find it by
+itself: with loops that it arranges over rows of four, all of `eigenpairs` takes 1.9 times as long at 10,000 vertices.
+The tile is therefore written in LLVM instructions (`_tile`); everything around it is plain Numba.
 """
 
-from functools import cache, partial
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
 import torch
 
-from igps._arrays import Floats
-from igps._compiled import REASSOCIATE, Lazy, compiled
-
-Four = tuple[float, float, float, float]
+from igps._compiled import Lazy, compiled
 
 # Size of a tile: AVX2 has registers for this number of sums, and for the factors.
 ROWS, COLUMNS = 6, 8
-# Number of columns of a few rows that the second-level cache holds.
-CHUNK = 4096
 # Arguments of `product`. A plain 0, 1, True or False would be part of the argument's type, and Numba compile for each.
 ZERO = cast(int, np.int64(0))
 ONE = cast(int, np.int64(1))
@@ -38,24 +27,12 @@ Strided = tuple[np.ndarray, int, int, int]
 """As `Rows`, and the step between columns."""
 
 
-@cache
-def loops_beat_blas() -> bool:
-    """Return whether compiled loops are faster than PyTorch's BLAS for products of a few long rows with many."""
-    from llvmlite import binding
-
-    has_mkl_avx512 = torch.backends.mkl.is_available() and binding.get_host_cpu_features().get(
-        "avx512f", False
-    )
-    return not has_mkl_avx512 or binding.get_host_cpu_name().startswith("znver")
-
-
 def overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Tensor:
-    """Return the products (n, m) of rows (n, V) with other rows (m, V), over a piece of the columns."""
-    if loops_beat_blas():
-        return torch.from_numpy(
-            overlaps_by_loops(rows.numpy(), others.numpy(), piece.start, piece.stop)
-        )
-    return (others[:, piece] @ rows[:, piece].T).T  # MKL is faster with the longer operand first
+    """Return the products (n, m) of rows (n, V) with other rows (m, V), over a piece of the columns.
+
+    For a few long rows NumPy's BLAS takes two thirds of the time of PyTorch's, which is made for Intel processors.
+    """
+    return torch.from_numpy(rows.numpy()[:, piece] @ others.numpy()[:, piece].T)
 
 
 def subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, piece: slice) -> None:
@@ -266,57 +243,3 @@ def product(
                 k,
                 scale,
             )
-
-
-@compiled()
-def overlaps_by_loops(a: Floats, b: Floats, begin: int, end: int) -> Floats:
-    """Return the products (n, m) of rows (n, V) with rows (m, V), over the columns from ``begin`` to ``end``."""
-    products = np.zeros((len(a), len(b)))
-    for start in range(begin, end, CHUNK):
-        stop = min(start + CHUNK, end)
-        for j in range(0, len(b), 6):
-            for i in range(0, len(a), 4):
-                sums = four_by_six(a, i, b, j, start, stop)
-                for column in range(min(6, len(b) - j)):
-                    for row in range(min(4, len(a) - i)):
-                        products[i + row, j + column] += sums[column][row]
-    return products
-
-
-@compiled(fastmath=REASSOCIATE)
-def four_by_six(
-    a: Floats, i: int, b: Floats, j: int, begin: int, end: int
-) -> tuple[Four, Four, Four, Four, Four, Four]:
-    """Return the products of four rows of one array with six rows of another; missing rows are replaced by the last.
-
-    The compiler keeps sums in registers only if each has a name.
-    """
-    last = len(a) - 1
-    last_b = len(b) - 1
-    a0 = a[i]
-    a1 = a[min(i + 1, last)]
-    a2 = a[min(i + 2, last)]
-    a3 = a[min(i + 3, last)]
-    b0 = b[j]
-    b1 = b[min(j + 1, last_b)]
-    b2 = b[min(j + 2, last_b)]
-    b3 = b[min(j + 3, last_b)]
-    b4 = b[min(j + 4, last_b)]
-    b5 = b[min(j + 5, last_b)]
-    s0 = s1 = s2 = s3 = s4 = s5 = (0.0, 0.0, 0.0, 0.0)
-    # Unsigned indices spare Numba the check for negative ones.
-    for v in range(np.uint64(begin), np.uint64(end)):
-        x = a0[v], a1[v], a2[v], a3[v]
-        s0 = added(s0, x, b0[v])
-        s1 = added(s1, x, b1[v])
-        s2 = added(s2, x, b2[v])
-        s3 = added(s3, x, b3[v])
-        s4 = added(s4, x, b4[v])
-        s5 = added(s5, x, b5[v])
-    return s0, s1, s2, s3, s4, s5
-
-
-@compiled(fastmath=REASSOCIATE)
-def added(sums: Four, x: Four, y: float) -> Four:
-    """Return the sums plus x times y."""
-    return sums[0] + x[0] * y, sums[1] + x[1] * y, sums[2] + x[2] * y, sums[3] + x[3] * y

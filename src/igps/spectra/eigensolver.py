@@ -31,7 +31,6 @@ from scipy import sparse
 from scipy.linalg import eigh
 from scipy.sparse.linalg import ArpackError, eigsh
 
-from igps._compiled import compiled
 from igps._threads import one_thread
 from igps.spectra._checks import ROUNDING, checked_mass, checked_stiffness
 from igps.spectra._lanczos import ConvergenceError, gap_after, lanczos
@@ -232,12 +231,14 @@ def _residual(
     A ConvergenceError is raised if a residual exceeds the tolerance by more than rounding, or exceeds RESIDUAL_LIMIT.
     """
     largest = 0.0
-    y = np.ascontiguousarray(vectors)
-    squares, corrections = _defects(matrix.data, matrix.indptr, matrix.indices, eigenvalues, y)
+    corrections = np.empty_like(eigenvalues)
     for start in range(0, len(eigenvalues), 64):
         part = slice(start, start + 64)
         values = eigenvalues[part]
-        residuals = np.sqrt(squares[part]) / np.abs(values)
+        y = np.ascontiguousarray(vectors[:, part])
+        defects = matrix @ y - y * values
+        corrections[part] = np.einsum("vk,vk->k", defects, y)
+        residuals = np.linalg.norm(defects, axis=0) / np.abs(values)
         largest = max(largest, float(residuals.max()))
         if not (residuals <= tolerance).all():
             rounding = (
@@ -254,30 +255,3 @@ def _residual(
                     "repair thin triangles of the surface."
                 )
     return largest, corrections
-
-
-@compiled()
-def _defects(
-    values: np.ndarray,
-    indptr: np.ndarray,
-    indices: np.ndarray,
-    eigenvalues: np.ndarray,
-    vectors: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return squared lengths (K,) of A y − λ y and its products (K,) with y, for a csr matrix A and vectors (V, K)."""
-    n_vertices, n_vectors = vectors.shape
-    defect = np.empty(n_vectors)
-    squares = np.zeros(n_vectors)
-    products = np.zeros(n_vectors)
-    for i in range(n_vertices):
-        for c in range(n_vectors):
-            defect[c] = -eigenvalues[c] * vectors[i, c]
-        for k in range(indptr[i], indptr[i + 1]):
-            value = values[k]
-            j = indices[k]
-            for c in range(n_vectors):
-                defect[c] += value * vectors[j, c]
-        for c in range(n_vectors):
-            squares[c] += defect[c] * defect[c]
-            products[c] += defect[c] * vectors[i, c]
-    return squares, products

@@ -116,7 +116,13 @@ def merge_tree(
     branches = np.empty((len(order), 2), np.int64)
     pieces = np.full((len(counts), len(values)), -1, np.int64)
     n = _merge(
-        order, higher[by_lower], lower[by_lower], np.array(counts, np.int64), branches, pieces
+        order,
+        higher[by_lower],
+        lower[by_lower],
+        np.array(counts, np.int64),
+        np.arange(len(order)),
+        branches,
+        pieces,
     )
     return MergeTree(
         torch.from_numpy(branches[:n, 0]),
@@ -131,16 +137,16 @@ def _merge(
     higher: Integers,
     lower: Integers,
     counts: Integers,
+    parent: Integers,
     branches: Integers,
     pieces: Integers,
 ) -> int:
     """Write the branches and pieces of a merge tree, and return the number of branches.
 
     The points come in descending order. A pair of neighbours is given by the positions of its higher and its lower
-    point in this order; the pairs are sorted by `lower`. The outputs are `branches`, (P, 2) peaks and saddles, and
-    `pieces`, see `MergeTree`, which the caller fills with −1.
+    point in this order; the pairs are sorted by `lower`. At first, each position is its own `parent`. The outputs are
+    `branches`, (P, 2) peaks and saddles, and `pieces`, see `MergeTree`, which the caller fills with −1.
     """
-    parent = np.arange(len(order))
     n_branches = level = pair = 0
     for point in range(len(order)):
         while pair < len(lower) and lower[pair] == point:

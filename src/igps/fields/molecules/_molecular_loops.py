@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Booleans, Floats, Integers, Singles
-from igps._compiled import compiled
+from igps._compiled import ALLOCATES, compiled
 
 _TURN = 2 * math.pi
 
@@ -46,7 +46,7 @@ class _Circle(NamedTuple):
     radius: float
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def exposed_arcs(balls: Balls) -> tuple[Floats, Integers]:
     """Return the arcs in which two spheres intersect outside all other balls, and which balls (A,) are exposed.
 
@@ -188,7 +188,7 @@ def _cover(circle: _Circle, balls: Balls, i: int, j: int, starts: Floats, ends: 
     return n_covered
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def depths(
     centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, margin: float
 ) -> tuple[Singles, NDArray[np.int32]]:
@@ -220,7 +220,7 @@ def depths(
     return depth, owner
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def distances_outside(
     depth: Singles,
     owner: NDArray[np.int32],
@@ -286,7 +286,7 @@ def _is_covered(balls: Balls, i: int, x: float, y: float, z: float) -> bool:
     return False
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def exposed_areas(balls: Balls, directions: Floats) -> Floats:
     """Return the area of each sphere outside all other balls, by the share of its points in these directions (M, 3)."""
     areas = np.zeros(len(balls.radii))
@@ -372,7 +372,7 @@ def _span(low: float, high: float, spacing: float, size: int) -> tuple[int, int]
     return max(math.ceil(low / spacing), 0), min(math.floor(high / spacing) + 1, size)
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def cubic_values(field: Singles, points: Floats) -> Floats:
     """Return the values and gradients (P, 4) of a function at points (P, 3) in cells, by cubic convolution (Keys 1981).
 

@@ -54,7 +54,8 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
         radii = torch.ones_like(points[..., :2])
         for body_radii, x, n, real in zip(radii, points, directions, mask, strict=True):
             curvatures = np.zeros((int(real.sum()), 2), body_radii.numpy().dtype)
-            write_curvatures(_columns(x[real]), _columns(n[real]), _MIN_SINE, curvatures)
+            row = np.empty(len(curvatures), curvatures.dtype)
+            write_curvatures(_columns(x[real]), _columns(n[real]), _MIN_SINE, row, curvatures)
             body_radii[real] = 1 / torch.from_numpy(curvatures)
     return torch.where(mask[:, :, None], radii.clamp(_MIN_RADIUS, _MAX_RADIUS), 1)
 
@@ -88,17 +89,20 @@ def _columns(vectors: Tensor) -> Singles:
 
 @compiled()
 def write_curvatures(
-    points: NDArray[Real], directions: NDArray[Real], min_sine: float, out: NDArray[Real]
+    points: NDArray[Real],
+    directions: NDArray[Real],
+    min_sine: float,
+    row: NDArray[Real],
+    out: NDArray[Real],
 ) -> None:
     """Write 1 / third smallest radius inside and outside at each point to (P, 2); 0 if there are fewer than three.
 
-    Points and directions are (3, P). Pairs are processed row by row, without a matrix of all pairs.
+    Points and directions are (3, P). Pairs are processed row by row, in scratch space (P,), without a matrix of all.
     """
     n = points.shape[1]
     one = points.dtype.type(1)
     min_square = one * min_sine * min_sine
     min_normal = one * _MIN_NORMAL
-    row = np.empty(n, points.dtype)
     for i in range(n):
         x = points[0, i]
         y = points[1, i]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Booleans, Integers
-from igps._compiled import compiled
+from igps._compiled import ALLOCATES, compiled
 
 Numbers = NDArray[Any]
 Indices = NDArray[np.int32]
@@ -39,7 +39,7 @@ class Row(NamedTuple):
     interval: Indices  # (J,) scratch space
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def new_row(axes: Axes, n_columns: int, values: Numbers) -> Row:
     """Allocate a row, in the type of the values."""
     return Row(

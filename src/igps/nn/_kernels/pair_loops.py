@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from igps._arrays import Floats
-from igps._compiled import FUSE, compiled
+from igps._compiled import ALLOCATES, FUSE, compiled
 from igps.nn._kernels.pair_cells import (
     COSINES,
     DISTANCES,
@@ -38,7 +38,7 @@ from igps.nn._kernels.pair_sums import (
 )
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def count_block(
     values: Numbers,
     axes: Axes,
@@ -70,6 +70,7 @@ def count_block(
     by_class = sums.reshape((n_classes, n_cells * n_corners))
     home = (classes[:, column : column + n_columns] * n_cells).astype(np.int32)
     result = new_row(axes, n_columns, values)
+    part = np.empty(n_columns)
     packed = np.zeros((n_classes * n_cells if packs else 0) * LANES, np.int64)
     # Range of cells with counts. With one class for each point, it is all cells: many rows are then flushed together,
     # and adding empty cells takes less time than tracking the range.
@@ -121,7 +122,7 @@ def count_block(
             elif n_axes == 4:
                 add_four_axes(cell, home_m, shares, first, weight, sums)
             else:
-                add_axes(cell, home_m, shares, first, weight, sums)
+                add_axes(cell, home_m, shares, first, weight, part[first:], sums)
     unpack(packed, sums)
     flush(
         by_class,
@@ -134,7 +135,7 @@ def count_block(
     )
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def gradient_block(  # noqa: PLR0913 (the arguments of count_block, and the arrays to fill)
     values: Numbers,
     axes: Axes,

@@ -126,11 +126,19 @@ def add_corners(
 
 @compiled()
 def add_axes(
-    cell: Indices, home: Indices, shares: Numbers, first: int, weights: Floats, sums: Floats
+    cell: Indices,
+    home: Indices,
+    shares: Numbers,
+    first: int,
+    weights: Floats,
+    part: Floats,
+    sums: Floats,
 ) -> None:
-    """`add_one_axis` for two or more axes, whose shares (K, J) are used from column ``first`` on."""
+    """`add_one_axis` for two or more axes, whose shares (K, J) are used from column ``first`` on.
+
+    The parts (n,) of the weights are scratch space.
+    """
     n_outer = len(shares) - 2
-    part = np.empty(len(cell))
     for corner in range(1 << n_outer):
         for j in range(len(cell)):
             part[j] = weights[j]
