@@ -23,12 +23,6 @@ TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 
-@pytest.fixture(params=["loops", "BLAS"])
-def either_processor(request, monkeypatch):
-    """Multiply by compiled loops and by BLAS, whichever is faster on this processor."""
-    monkeypatch.setattr("igps.spectra._products.loops_beat_blas", lambda: request.param == "loops")
-
-
 @pytest.fixture
 def figures_of(monkeypatch):
     """A function from a module to the list of figures that it makes from now on."""

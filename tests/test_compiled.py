@@ -5,10 +5,10 @@ import sys
 import numpy as np
 import pytest
 
-from igps._compiled import compiled
+from igps._compiled import ALLOCATES, compiled
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def cumulative(values):
     total = 0.0
     sums = np.empty_like(values)
@@ -18,7 +18,7 @@ def cumulative(values):
     return sums
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def largest_sum(rows):
     largest = -np.inf
     for row in rows:

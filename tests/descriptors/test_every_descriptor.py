@@ -153,7 +153,7 @@ def test_half_precision_describes_nearly_the_same(name):
 def test_tensors_are_made_on_the_device_of_the_bodies(name, compiled, monkeypatch):
     """With the default device "meta", a tensor that is made without naming a device would have no values."""
     if not compiled:  # as on a GPU
-        monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda _: False)
+        monkeypatch.setattr("igps.nn._kernels.batches.uses_loops", lambda _: False)
     found = with_individuals(name)
     with torch.inference_mode():
         expected = found(body("rod"))
@@ -191,8 +191,8 @@ def test_a_batch_on_a_device_is_described_at_once(name, monkeypatch):
     )
     with torch.inference_mode():
         expected = torch.cat([found(pair[:1]), found(pair[1:])] * 3)
-    monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda _: False)
-    for block in ("blocks.BLOCK", "count_by_torch._BLOCK"):  # all fit
+    monkeypatch.setattr("igps.nn._kernels.batches.uses_loops", lambda _: False)
+    for block in ("batches.BLOCK", "pairs_by_torch._BLOCK"):  # all fit
         monkeypatch.setattr(f"igps.nn._kernels.{block}", 2**40)
     counts = []
     for n in (2, 3):

@@ -72,7 +72,7 @@ def test_the_whole_graph_is_traced(module):
 
 def test_what_is_compiled_does_not_grow_with_the_samples(module, monkeypatch):
     """Thousands of samples are counted in many blocks: unrolled they would take minutes to compile."""
-    monkeypatch.setattr("igps.nn._kernels.count_by_torch._BLOCK", 1)
+    monkeypatch.setattr("igps.nn._kernels.pairs_by_torch._BLOCK", 1)
     batch = two_bodies()
     nodes = []
     twice = {

@@ -44,7 +44,6 @@ def assert_pairs(spectrum, problem, tolerance=1e-07):
     assert np.abs(mass @ functions).max() < 1e-9 * np.sqrt(mass.sum())
 
 
-@pytest.mark.usefixtures("either_processor")
 @pytest.mark.parametrize("n_eigenpairs", [1, 100, 280])
 def test_agrees_with_a_dense_solver(n_eigenpairs, torus_problem, torus_oracle):
     stiffness, mass, positions = torus_problem
@@ -103,7 +102,6 @@ def test_more_copies_than_distinct_eigenvalues():
     assert_pairs(spectrum, problem)
 
 
-@pytest.mark.usefixtures("either_processor")
 def test_threads_change_no_bit(monkeypatch):
     """10,242 vertices: two pieces of the basis, two subtrees; and a team, though the result is small."""
     sphere = trimesh.creation.icosphere(subdivisions=5)
@@ -129,7 +127,6 @@ def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem):
     np.testing.assert_allclose(spectrum.eigenvalues, quotients, rtol=1e-13)
 
 
-@pytest.mark.usefixtures("either_processor")
 def test_a_large_basis_gives_its_place_to_the_eigenvectors(
     torus_problem, torus_oracle, monkeypatch
 ):

@@ -12,6 +12,7 @@ from scipy import sparse
 from conftest import with_slivers
 from igps._threads import Team
 from igps.spectra._multifrontal import SingularMatrixError, analyse
+from igps.spectra._tree import BLOCK
 
 # A single block of all unknowns is not cut, with places or without
 SPLITS = [(4, False), (32, True), (10_000, True)]
@@ -70,8 +71,8 @@ def eliminations(factors):
     """E of every node that has one."""
     structure = factors.tree.structure
     found = []
-    starts = structure.block_start
-    for node, n_own in enumerate(np.diff(structure.own_start)):
+    starts = structure.nodes[BLOCK]
+    for node, n_own in enumerate(structure.n_own):
         block = factors.blocks[starts[node] : starts[node + 1]]
         found.append(block.reshape(n_own, -1)[:, n_own:] if n_own else block)
     return [elimination for elimination in found if elimination.size]
@@ -164,7 +165,7 @@ def test_subtrees_eliminated_side_by_side():
 def test_a_separator_keeps_blocks_small():
     """On an n × n grid the root needs about n unknowns; a cut through the wrong place would need many more."""
     matrix, places = grid_matrix(40)
-    assert np.diff(analyse(matrix, places).structure.own_start)[-1] <= 1.5 * 40
+    assert analyse(matrix, places).structure.n_own[-1] <= 1.5 * 40
 
 
 def test_what_is_refused():

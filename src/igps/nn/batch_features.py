@@ -5,9 +5,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from igps.data.batch import SampleBatch, SignatureBatch
-from igps.nn._kernels.balls import ball_radii
-from igps.nn._kernels.blocks import map_bodies
-from igps.nn._kernels.nearest import smallest
+from igps.nn._kernels.batches import map_bodies
+from igps.nn._kernels.neighbours import ball_radii, smallest
 from igps.nn._precision import full_precision
 from igps.nn.embedding import barycentroid_potential
 from igps.retrieval.distances import row_distances

@@ -22,8 +22,8 @@ from igps.data.batch import Body, SignatureBatch
 from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.mesh.mesh import Mesh
-from igps.nn._kernels import blocks
-from igps.nn._kernels.gradients import on_one_thread
+from igps.nn._kernels import batches
+from igps.nn._kernels.batches import on_one_thread
 from igps.nn.batch_features import BatchFeatures
 from igps.nn.heads.base import Head
 from igps.nn.histograms.base import DescriptionPart
@@ -135,11 +135,11 @@ class Descriptor(Specified, ABC):
                 f"batch: expected a SignatureBatch, got {type(batch).__name__}. Give dataset.batch([0, 1]), or "
                 "igps.collate([item]) for an item or a Signature; igps.describe describes a whole dataset."
             )
-        if blocks.uses_loops(batch.device):
+        if batches.uses_loops(batch.device):
             _check_finite(self)
         self.requirements.check(batch)
         # On other devices, a limit on threads has no advantage; traced code runs later, without the limit.
-        with one_thread() if blocks.uses_loops(batch.device) else contextlib.nullcontext():
+        with one_thread() if batches.uses_loops(batch.device) else contextlib.nullcontext():
             return self.describe(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
@@ -331,7 +331,7 @@ class HistogramDescriptor(Descriptor):
         interior, surface = map(max, n_read)
 
         def described(bodies: SignatureBatch) -> Tensor:
-            return blocks.map_by_size(concatenated, bodies, (interior, surface))
+            return batches.map_by_size(concatenated, bodies, (interior, surface))
 
         return on_one_thread(described, batch, self)
 

@@ -8,7 +8,7 @@ from igps._arrays import Floats
 from igps._compiled import compiled
 from igps.spectra._pivots import STEP, Scratch, invert_front
 from igps.spectra._products import COLUMNS, ONE, ROWS, ZERO, product
-from igps.spectra._tree import Nodes, Structure
+from igps.spectra._tree import BLOCK, BOUNDARY, CARRIED, LEFT, OWN, UPDATE, Nodes, Structure
 
 
 @compiled(inline="always")
@@ -16,8 +16,8 @@ def assemble(
     node: int, tree: Structure, values: Floats, shift: float, updates: Floats, scratch: Scratch
 ) -> None:
     """Write the upper triangle of a node's front (S + B, S + B), including the Schur complements of its children."""
-    own_start = tree.own_start
-    boundary_start = tree.boundary_start
+    own_start = tree.nodes[OWN]
+    boundary_start = tree.nodes[BOUNDARY]
     boundary_row = scratch.boundary_row
     front = scratch.front
     own_begin = own_start[node]
@@ -37,14 +37,14 @@ def assemble(
                 front[i * width + (j - own_begin if j < own_end else boundary_row[j])] += values[k]
         front[i * width + i] -= shift
     for side in range(2):
-        child = tree.children[node, side]
+        child = tree.nodes[LEFT + side, node]
         if child < 0:
             continue
         base = boundary_start[child]
         size = boundary_start[child + 1] - boundary_start[child]
         for i in range(size):
             row = tree.parent_row[base + i] * width
-            source = tree.update_start[child] + i * size
+            source = tree.nodes[UPDATE, child] + i * size
             for j in range(i, size):
                 front[row + tree.parent_row[base + j]] += updates[source + j]
 
@@ -66,8 +66,8 @@ def eliminate(
     taken in another order. The front of that node is assembled.
     """
     n_negative = 0
-    own_start = tree.own_start
-    boundary_start = tree.boundary_start
+    own_start = tree.nodes[OWN]
+    boundary_start = tree.nodes[BOUNDARY]
     front = scratch.front
     inverse = scratch.inverse
     for node in range(nodes[0], nodes[1]):
@@ -82,8 +82,8 @@ def eliminate(
         if n_new < 0:
             return n_negative, node
         n_negative += n_new
-        begin = tree.block_start[node]
-        update_begin = tree.update_start[node]
+        begin = tree.nodes[BLOCK, node]
+        update_begin = tree.nodes[UPDATE, node]
         for i in range(n_own):
             for j in range(n_own):
                 blocks[begin + i * width + j] = inverse[j * padded + i]
@@ -135,11 +135,10 @@ def forward(
     """
     b = len(right)
     order = tree.order
-    own_start = tree.own_start
-    boundary_start = tree.boundary_start
-    children = tree.children
+    own_start = tree.nodes[OWN]
+    boundary_start = tree.nodes[BOUNDARY]
     parent_row = tree.parent_row
-    carried_start = tree.carried_start
+    carried_start = tree.nodes[CARRIED]
     for node in range(nodes[0], nodes[1]):
         n_own = own_start[node + 1] - own_start[node]
         n_boundary = boundary_start[node + 1] - boundary_start[node]
@@ -151,7 +150,7 @@ def forward(
                 own_x[np.uint64(i * b) + c] = right[c, vertex]
         # Contributions of the children: to own unknowns before the product, to boundary rows after it.
         for side in range(2):
-            child = children[node, side]
+            child = tree.nodes[LEFT + side, node]
             if child >= 0:
                 source = carried[carried_start[child] * b :]
                 base = boundary_start[child]
@@ -161,7 +160,7 @@ def forward(
                     add_row(own_x, parent_row[base + k], source, k, b)
                     k += 1
         # D is symmetric: one product with the transposed block gives both D x and Eᵀ x.
-        block = (blocks, tree.block_start[node], width, ONE)
+        block = (blocks, tree.nodes[BLOCK, node], width, ONE)
         product_rows = (rows, ZERO, b)
         product(
             (width, b, n_own),
@@ -175,7 +174,7 @@ def forward(
         for i in range(n_own * b):
             own_x[i] = rows[i]
         for side in range(2):
-            child = children[node, side]
+            child = tree.nodes[LEFT + side, node]
             if child >= 0:
                 source = carried[carried_start[child] * b :]
                 base = boundary_start[child]
@@ -204,8 +203,8 @@ def backward(
     """
     b = len(solution)
     order = tree.order
-    own_start = tree.own_start
-    boundary_start = tree.boundary_start
+    own_start = tree.nodes[OWN]
+    boundary_start = tree.nodes[BOUNDARY]
     boundary = tree.boundary
     for node in range(nodes[1] - 1, nodes[0] - 1, -1):
         n_own = own_start[node + 1] - own_start[node]
@@ -217,7 +216,7 @@ def backward(
             source = np.uint64(boundary[boundary_start[node] + k]) * np.uint64(b)
             for c in range(np.uint64(b)):
                 boundary_x[row + c] = x[source + c]
-        elimination = (blocks, tree.block_start[node] + n_own, ONE, width)
+        elimination = (blocks, tree.nodes[BLOCK, node] + n_own, ONE, width)
         shape = (n_own, b, n_boundary)
         product_rows = (rows, ZERO, b)
         product(

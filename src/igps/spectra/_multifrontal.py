@@ -42,7 +42,7 @@ from igps.spectra import _fronts as loops
 from igps.spectra._checks import checked_entries
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
 from igps.spectra._pivots import Scratch
-from igps.spectra._tree import Nodes, Structure, tree_structure
+from igps.spectra._tree import BLOCK, CARRIED, UPDATE, Nodes, Structure, tree_structure
 
 # Largest number of own unknowns of a node that compiled loops handle. PyTorch handles larger nodes, with a team.
 MAX_COMPILED = 127
@@ -70,7 +70,7 @@ class Tree:
         A ValueError is raised if the matrix stores other entries than the analysed one, a SingularMatrixError if a
         pivot block is singular, as for a shift at an eigenvalue.
         """
-        blocks = np.empty(self.structure.block_start[-1])
+        blocks = np.empty(self.structure.nodes[BLOCK, -1])
         return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
 
     def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = SERIAL) -> int:
@@ -98,9 +98,7 @@ class Tree:
     ) -> int:
         """Eliminate all nodes, write to `blocks` if given, and return the number of negative eigenvalues."""
         matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)
-        n_updates = (
-            self.structure.update_start + np.diff(self.structure.boundary_start) ** 2
-        ).max()
+        n_updates = (self.structure.nodes[UPDATE, :-1] + self.structure.n_boundary**2).max()
         values = matrix.data.astype(np.float64, copy=False)
         updates = np.empty(n_updates)
 
@@ -120,12 +118,14 @@ class Tree:
     ) -> int:
         """Eliminate a range of nodes as `_eliminate`, and write the complements for later nodes to `updates`."""
         (begin, end), structure = nodes, self.structure
-        own_sizes = np.diff(structure.own_start[begin : end + 1])
-        boundary_sizes = np.diff(structure.boundary_start[begin : end + 1])
+        own_sizes = structure.n_own[begin:end]
+        boundary_sizes = structure.n_boundary[begin:end]
         front = np.empty(int((own_sizes + boundary_sizes).max()) ** 2)
         if blocks is None:  # each block overwrites the previous one
             blocks = np.empty(int((own_sizes * (own_sizes + boundary_sizes)).max()))
-            structure = structure._replace(block_start=np.zeros_like(structure.block_start))
+            table = structure.nodes.copy()
+            table[BLOCK] = 0
+            structure = structure._replace(nodes=table)
         padded = min(MAX_COMPILED, int(own_sizes.max())) + loops.STEP
         squares = [np.empty(padded**2) for _ in range(3)]
         strips = [np.empty(loops.STEP * (padded + loops.STEP)) for _ in range(2)]
@@ -141,8 +141,8 @@ class Tree:
             n_own = int(own_sizes[node - begin])
             n_boundary = int(boundary_sizes[node - begin])
             width = n_own + n_boundary
-            block = blocks[structure.block_start[node] :]
-            update = updates[structure.update_start[node] :]
+            block = blocks[structure.nodes[BLOCK, node] :]
+            update = updates[structure.nodes[UPDATE, node] :]
             n_negative += _eliminate_node(
                 torch.from_numpy(front[: width**2].reshape(width, width)),
                 torch.from_numpy(block[: n_own * width].reshape(n_own, width)),
@@ -167,10 +167,10 @@ class Factors:
         n_vertices, b = right_hand_sides.shape
         right = right_hand_sides.T.contiguous().numpy()
         solution = torch.empty(b, n_vertices, dtype=torch.float64, device="cpu")
-        n_boundary = np.diff(structure.boundary_start)
+        n_boundary = structure.n_boundary
         x = np.empty(n_vertices * b)
-        carried = np.empty((structure.carried_start + n_boundary).max() * b)
-        size = int((np.diff(structure.own_start) + n_boundary).max()) * b
+        carried = np.empty((structure.nodes[CARRIED, :-1] + n_boundary).max() * b)
+        size = int((structure.n_own + n_boundary).max()) * b
 
         def forward(nodes: Nodes) -> None:
             loops.forward(nodes, right, structure, self.blocks, x, carried, np.empty(size))

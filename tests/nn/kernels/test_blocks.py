@@ -5,7 +5,7 @@ import torch
 
 from batches import alone, two_bodies
 from igps.data.batch import SignatureBatch
-from igps.nn._kernels.blocks import map_by_size
+from igps.nn._kernels.batches import map_by_size
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.histograms.pairs import PairHistogram
 
@@ -29,7 +29,7 @@ def bodies(*copies):
     ],
 )
 def test_groups_are_padded_to_their_largest_body(copies, on_cpu, widths, monkeypatch):
-    monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda device: on_cpu)
+    monkeypatch.setattr("igps.nn._kernels.batches.uses_loops", lambda device: on_cpu)
     batch = bodies(*copies)
     found = []
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from igps.nn._kernels.nearest import smallest
+from igps.nn._kernels.neighbours import smallest
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

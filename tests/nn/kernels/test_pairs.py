@@ -40,7 +40,7 @@ BACK_ENDS = [
 def device(request, monkeypatch):
     """Where the points are; on the CPU by compiled loops or by operations of PyTorch."""
     if request.param == "torch":
-        monkeypatch.setattr("igps.nn._kernels.blocks.uses_loops", lambda _: False)
+        monkeypatch.setattr("igps.nn._kernels.batches.uses_loops", lambda _: False)
     return "cuda" if request.param == "cuda" else "cpu"
 
 
@@ -137,9 +137,9 @@ def block(request, monkeypatch):
     if request.param is None:
         return
     n_rows, n_columns = request.param
-    monkeypatch.setattr("igps.nn._kernels.count_by_loops._MAX_COLUMNS", n_columns)
-    monkeypatch.setattr("igps.nn._kernels.count_by_loops._BLOCK_SIZE", 2 * n_rows * n_columns)
-    monkeypatch.setattr("igps.nn._kernels.count_by_torch._BLOCK", n_rows * 23 * 16)
+    monkeypatch.setattr("igps.nn._kernels.pairs_by_loops._MAX_COLUMNS", n_columns)
+    monkeypatch.setattr("igps.nn._kernels.pairs_by_loops._BLOCK_SIZE", 2 * n_rows * n_columns)
+    monkeypatch.setattr("igps.nn._kernels.pairs_by_torch._BLOCK", n_rows * 23 * 16)
 
 
 def counted(layout, given):

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from igps.data.requirements import Requirements
-from igps.nn._kernels.pair_values import PairValues, euclidean_distances, pair_twists
 from igps.nn._kernels.pairs import count_pairs
+from igps.nn._kernels.pairs_by_torch import PairValues, euclidean_distances, pair_twists
 from igps.nn.axes import OrderedCentres, PairAxis
 from igps.nn.axes.centres import interval_centres
 from igps.nn.axes.points import attribute_requirements

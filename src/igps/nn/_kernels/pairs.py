@@ -1,8 +1,8 @@
 """The count of pairs of points in a product of classes and bins, with two back ends.
 
 All histograms of pairs are computed by `count_pairs`. On the CPU, compiled loops count, with their own gradient
-(`count_by_loops`); on other devices, in programs of `torch.export`, and for second derivatives, operations of PyTorch
-(`count_by_torch`). Both back ends count in double precision, do not store a matrix of all pairs, and have gradients by
+(`pairs_by_loops`); on other devices, in programs of `torch.export`, and for second derivatives, operations of PyTorch
+(`pairs_by_torch`). Both back ends count in double precision, do not store a matrix of all pairs, and have gradients by
 the inputs of the values, the weights and the centres. For `torch.compile` the count is a single operator, as compiling
 the blocks of a few large bodies would take minutes.
 """
@@ -14,11 +14,16 @@ from typing import Any
 import torch
 from torch import Tensor, library
 
-from igps.nn._kernels import blocks
-from igps.nn._kernels.count_by_loops import CompiledCount, Layout
-from igps.nn._kernels.count_by_torch import count_by_torch
-from igps.nn._kernels.pair_cells import VALUES
-from igps.nn._kernels.pair_values import TEMPLATES, PairValues, centres_of, with_tensors
+from igps.nn._kernels import batches
+from igps.nn._kernels.pair_loops import VALUES
+from igps.nn._kernels.pairs_by_loops import CompiledCount, Layout
+from igps.nn._kernels.pairs_by_torch import (
+    TEMPLATES,
+    PairValues,
+    centres_of,
+    count_by_torch,
+    with_tensors,
+)
 
 # Exists since PyTorch 2.7. Exported programs must run without this library, and therefore without its operator.
 _is_exporting = getattr(torch.compiler, "is_exporting", lambda: False)
@@ -74,7 +79,7 @@ def _count(
     tensors: list[Tensor],
 ) -> Tensor:
     """Return float64 counts (N, C(C+1)/2, B, ...), by the back end for the device and type of the tensors."""
-    if blocks.uses_loops(classes.device) and tensors[0].dtype in (torch.float32, torch.float64):
+    if batches.uses_loops(classes.device) and tensors[0].dtype in (torch.float32, torch.float64):
         counts: Tensor = CompiledCount.apply(
             Layout(classes, n_classes, tuple(pairs), mask), *tensors
         )

@@ -4,7 +4,7 @@ An axis of your own is a subclass of `PointAxis` or `PairAxis`. To add an axis t
 folder, export it here, and enter it in `AXES` if it can be constructed without arguments.
 """
 
-from igps.nn._kernels.pair_values import (
+from igps.nn._kernels.pairs_by_torch import (
     PairValues,
     euclidean_distances,
     oriented_pairs,

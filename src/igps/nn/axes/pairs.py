@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from igps._parameters import check_at_least
 from igps.data.requirements import Requirements, embedding_requirements
-from igps.nn._kernels.pair_values import (
+from igps.nn._kernels.pairs_by_torch import (
     PairValues,
     euclidean_distances,
     oriented_pairs,

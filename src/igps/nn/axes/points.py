@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from igps._parameters import check_at_least, check_one_of
 from igps.data.attribute_sources import named_source
 from igps.data.requirements import Requirements, embedding_requirements
-from igps.nn._kernels.intervals import find_intervals
+from igps.nn._kernels.pairs_by_torch import find_intervals
 from igps.nn.axes.centres import OrderedCentres, interval_centres
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import barycentroid_potential

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements, embedding_requirements
-from igps.nn._kernels.blocks import map_by_size
-from igps.nn._kernels.gradients import on_one_thread
+from igps.nn._kernels.batches import map_by_size, on_one_thread
 from igps.nn.axes.pairs import DistanceAxis, EmbeddedPairCosines, PairAxis
 from igps.nn.axes.points import PointAxis
 from igps.nn.batch_features import BatchFeatures, SampleFeatures

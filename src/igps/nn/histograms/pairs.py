@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
 from igps._parameters import check_at_least, check_positive
-from igps.nn._kernels.pair_values import PairValues, centres_of, euclidean_distances
 from igps.nn._kernels.pairs import check_pairs, class_pairs, count_pairs
+from igps.nn._kernels.pairs_by_torch import PairValues, centres_of, euclidean_distances
 from igps.nn.axes import PairAxis, PointAxis, axis_of
 from igps.nn.axes.points import largest_members
 from igps.nn.batch_features import SampleFeatures

@@ -1,13 +1,18 @@
-"""Values of pairs of points, such as distances, which axes of pairs sort into bins."""
+"""Values of pairs of points, and their count in operations of PyTorch: for any device, and for tracing."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
-from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES
-from igps.retrieval.distances import row_distances
+from igps.nn._kernels.batches import BLOCK as _BLOCK
+from igps.nn._kernels.pair_loops import COSINES, DISTANCES, VALUES
+from igps.nn._precision import full_precision
+from igps.retrieval.distances import in_transforms, row_distances
 
 Inputs = Sequence[Tensor]
 
@@ -24,7 +29,7 @@ class PairValues:
     centres: tuple[Tensor, ...]  # (B,) ascending, for each of the k values
     # Differentiable function from inputs (N, I, ...) of I points and (N, J, ...) of J points to values (N, k, I, J)
     between: Callable[[Inputs, Inputs], Tensor]
-    # How compiled loops obtain the values, see `pair_cells`; by default from `between`
+    # How compiled loops obtain the values, see `pair_loops`; by default from `between`
     kinds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -172,3 +177,104 @@ def with_tensors(pairs: Sequence[PairValues], tensors: Sequence[Tensor]) -> list
         )
         for p in pairs
     ]
+
+
+def find_intervals(values: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the interval of centres (B,) that contains each value of (..., P), and its position there from 0 to 1.
+
+    Values beyond the outer centres are in the first or last of the B − 1 intervals, at position 0 or 1. The position is
+    differentiable in both arguments.
+    """
+    # A copy of the boundaries, as up to PyTorch 2.11 code compiled for a GPU ignores the offset of a view.
+    below = torch.bucketize(
+        values.detach().contiguous(), centres.detach()[1:-1].clone(), right=True
+    )
+    # Not centres[below], whose gradient on a GPU adds all contributions to a centre sequentially.
+    rows = torch.atleast_2d(below).flatten(0, -2)
+    start, end = (
+        centres.expand(rows.shape[0], -1).gather(1, i).view_as(values) for i in (rows, rows + 1)
+    )
+    return below, ((values - start) / (end - start)).clamp(0, 1)
+
+
+def count_by_torch(
+    classes: Tensor,
+    n_classes: int,
+    pairs: Sequence[PairValues],
+    mask: Tensor,
+    weights: Tensor,
+    *tensors: Tensor,
+) -> Tensor:
+    """Return float64 counts (N, C(C+1)/2, B, ...), see `count_pairs`."""
+    # Padding may hold infinity, and 0 times infinity is NaN.
+    clean = [
+        t.masked_fill(~mask.view(*mask.shape, *[1] * (t.ndim - 2)), 0) if t.ndim > 1 else t
+        for t in tensors
+    ]
+    weights = weights.masked_fill(~mask[:, :, None], 0)
+    n_shapes, n_points, n_members = classes.shape
+    bins = [len(centres) for centres in centres_of(pairs)]
+    n_cells = n_classes * math.prod(bins)
+    total = torch.zeros(n_shapes, n_classes, n_cells, dtype=torch.float64, device=classes.device)
+    n_rows = n_points
+    firsts = range(1)
+    # A program for any number of shapes or points has one block, as a number of blocks would be fixed by tracing.
+    if not any(isinstance(n, torch.SymInt) for n in (n_shapes, n_points)):
+        n_rows = max(1, _BLOCK // (n_shapes * max(n_cells, n_points * n_members * 2 ** len(bins))))
+        firsts = range(0, n_points - 1, n_rows)
+    for first in firsts:
+        task = partial(_count_rows, first, first + n_rows, classes, n_classes, pairs)
+        # The gradient computes the values of pairs again, as storing them takes much more memory than the points.
+        if torch.is_grad_enabled() and not in_transforms():
+            total = total + checkpoint(task, weights, *clean, use_reentrant=False)
+        else:
+            total = total + task(weights, *clean)
+    total = total.view(n_shapes, n_classes, n_classes, *bins)
+    total = total + total.transpose(1, 2)
+    a, b = torch.triu_indices(n_classes, n_classes, device=classes.device)
+    return total[:, a, b] * torch.where(a == b, 0.5, 1.0).view(-1, *[1] * len(bins))
+
+
+def _count_rows(
+    first: int,
+    end: int,
+    classes: Tensor,
+    n_classes: int,
+    pairs: Sequence[PairValues],
+    weights: Tensor,
+    *others: Tensor,
+) -> Tensor:
+    """Return counts (N, C, C·cells), by both classes, of pairs of the points [first, end) with later points."""
+    pairs = with_tensors(pairs, others)
+    bins = [len(centres) for centres in centres_of(pairs)]
+    with full_precision():
+        values = [
+            p.between([x[:, first:end] for x in p.inputs], [x[:, first:] for x in p.inputs])
+            for p in pairs
+        ]
+    # Each row is first counted separately, by the class of the column's point only, as this adds fewer numbers, and few
+    # to the same cell. Indices and weights are (N, I, J, M), finally (N, I, J, M·2^K), for the corners of each cell.
+    index = classes[:, None, first:]
+    # Pairs of a point with itself or with an earlier point have weight 0.
+    weight = weights[:, None, first:] * torch.ones_like(values[0][0, 0]).triu(1).unsqueeze(2)
+    shares = []
+    for value, centres in zip(torch.cat(values, dim=1).unbind(1), centres_of(pairs), strict=True):
+        below, share = find_intervals(value, centres)
+        shares.append(share)
+        index = index * len(centres) + below.unsqueeze(3)
+    stride = math.prod(bins)
+    for share, n_bins in zip(shares, bins, strict=True):
+        stride //= n_bins
+        upper = weight * share.unsqueeze(3)
+        # Not weight·(1 − share), nor a difference of sums, as rounding could make them negative.
+        weight = torch.cat([weight - upper, upper], dim=3)
+        index = torch.cat([index, index + stride], dim=3)
+    own = weights[:, first:end].double()
+    n_cells = n_classes * math.prod(bins)
+    rows = own.new_zeros(*own.shape[:2], n_cells).scatter_add(
+        2, index.flatten(2), weight.double().flatten(2)
+    )
+    memberships = own.new_zeros(*own.shape[:2], n_classes).scatter_add(
+        2, classes[:, first:end], own
+    )
+    return memberships.mT @ rows

@@ -13,14 +13,30 @@ from torch.nn.utils.rnn import pad_sequence
 
 from igps._arrays import Booleans, Floats
 from igps._threads import SERIAL, Result, Team
-from igps.nn._kernels.count_by_torch import count_by_torch
-from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Indices, Numbers
-from igps.nn._kernels.pair_loops import count_block, gradient_block
-from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
+from igps.nn._kernels.pair_loops import (
+    COSINES,
+    DISTANCES,
+    VALUES,
+    Axes,
+    Derivatives,
+    Indices,
+    Numbers,
+    count_block,
+    gradient_block,
+    new_row,
+    new_sums,
+)
+from igps.nn._kernels.pairs_by_torch import (
+    PairValues,
+    centres_of,
+    cosine_factors,
+    count_by_torch,
+    with_tensors,
+)
 from igps.nn._precision import full_precision
 
 # Maximum numbers of values and of columns in a block, which then stays in a core's second-level cache. A larger block
-# could overflow the integers of `pair_sums`.
+# could overflow the integers of `add_whole_pairs`.
 _BLOCK_SIZE = 2**18
 _MAX_COLUMNS = 2048
 _STRIP_ROWS = 128  # rows of a block whose inner products are computed by one matrix product
@@ -137,10 +153,10 @@ class _Shapes:
         centres = [x.detach() for x in centres_of(with_tensors(layout.pairs, tensors))]
         self.bins = [len(x) for x in centres]
         self.dtype = centres[0].dtype
-        self.n_counts = (
-            layout.n_classes * (layout.n_classes + 1) // 2,
-            math.prod(self.bins) << len(self.bins),
-        )
+        n_cells = math.prod(self.bins)
+        n_corners = 2 ** len(self.bins)
+        self.sums_shape = layout.n_classes, n_cells, n_corners
+        self.n_counts = layout.n_classes * (layout.n_classes + 1) // 2, n_cells * n_corners
         kinds = [kind for pair in layout.pairs for kind in pair.kinds]
         self.n_values = sum(kind != COSINES for kind in kinds)
         self.n_oriented = kinds.count(COSINES)
@@ -237,9 +253,11 @@ class _Shape:
         for row, column in blocks:
             values = self._view(buffer, row, column)
             self._write_values(values, row, column)
-            count_block(
-                values.numpy(), self.axes, row, column, *self.members, self.packs, total.numpy()
-            )
+            n_columns = values.shape[2]
+            sums = new_sums(self.members, column, n_columns, self.shapes.sums_shape, self.packs)
+            result = new_row(self.axes, n_columns)
+            place = (row, column)
+            count_block(values.numpy(), self.axes, place, self.members, total.numpy(), sums, result)
         return [total]
 
     def gradients(self, blocks: Blocks) -> list[Tensor]:
@@ -253,16 +271,20 @@ class _Shape:
             values = self._view(value_buffer, row, column)
             by_cosines = self._view(cosine_buffer, row, column)
             self._write_values(values, row, column)
-            gradient_block(
-                values.numpy(),
-                self.axes,
-                row,
-                column,
-                *self.members,
-                self.upstream,
+            derivatives = Derivatives(
                 by_cosines.view(-1, 4, *by_cosines.shape[1:]).numpy(),
                 by_weights.numpy(),
                 by_centres.numpy(),
+                np.empty(len(by_centres)),
+            )
+            gradient_block(
+                values.numpy(),
+                self.axes,
+                (row, column),
+                self.members,
+                self.upstream,
+                derivatives,
+                new_row(self.axes, values.shape[2]),
             )
             rows = slice(row, row + values.shape[1])
             columns = slice(column, column + values.shape[2])
