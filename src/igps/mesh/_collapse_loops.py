@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers, Surface
-from igps._compiled import compiled
+from igps._compiled import ALLOCATES, compiled
 
 # Weight of the squared length of an edge in its cost. Without it, flat places get long thin triangles.
 _LENGTH_WEIGHT = 1e-2
@@ -33,7 +33,7 @@ class _Rings(NamedTuple):
     is_gone: Booleans
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def collapse_edges(vertices: Floats, faces: Integers, n_vertices: int) -> Surface:
     """Collapse the edges of a closed surface, cheapest first, until about `n_vertices` vertices are left.
 
@@ -95,7 +95,7 @@ def _next(corner: int) -> int:
     return corner - 2 if corner % 3 == 2 else corner + 1
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def _rings(faces: Integers, n_vertices: int) -> _Rings:
     """List the corners at each vertex."""
     vertex = faces.copy().reshape(-1)
@@ -157,7 +157,7 @@ def _merge(rings: _Rings, a: int, b: int, at_b: Integers) -> None:
     rings.last[a] = rings.last[b]
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def _quadrics(points: Floats, faces: Integers) -> Floats:
     """Return sums over the triangles around each vertex: area times nn' (6), nd (3) and dd, for the plane nx = d."""
     quadrics = np.zeros((len(points), 10))

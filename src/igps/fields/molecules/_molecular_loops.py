@@ -414,7 +414,7 @@ def cubic_values(field: Singles, points: Floats) -> Floats:
     return values
 
 
-@compiled()
+@compiled(**ALLOCATES)
 def means_at_vertices(values: Floats, vertices: Floats, faces: Integers) -> Floats:
     """Return the means (V, D), weighted by area, of the values (F, D) of the faces around each vertex."""
     means = np.zeros((len(vertices), values.shape[1]))
