@@ -52,6 +52,10 @@ _LOAD_HELP = {
         "maps, which need it"
     ),
     "cavities": "fill hollow bodies, or keep the surfaces of hollows as part of their boundary",
+    "first_model": "take only the first model of each file of molecules",
+    "min_plddt": (
+        "leave out residues of predicted molecules whose pLDDT, in place of the B-factor, is lower, such as 70"
+    ),
 }
 
 _SIGNATURE_HELP = {

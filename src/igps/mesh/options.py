@@ -43,6 +43,8 @@ class LoadOptions:
         threshold: smallest value of the voxels of a body, in volumes of probabilities, where None is 0.5, and in maps
             of density, which need it.
         cavities: "fill" fills hollow bodies; "keep" makes the surfaces of hollows part of their boundary.
+        first_model: take only the first model of each file of molecules.
+        min_plddt: leave out residues of predicted molecules whose pLDDT, in place of the B-factor, is lower.
 
     Raises:
         ValueError: an invalid value.
@@ -55,6 +57,8 @@ class LoadOptions:
     names: str | None = None
     threshold: float | None = None
     cavities: Cavities = "fill"
+    first_model: bool = False
+    min_plddt: float | None = None
 
     def __post_init__(self) -> None:
         check_one_of(get_args(Mending), mend=self.mend)
@@ -66,6 +70,8 @@ class LoadOptions:
                 'allow_open: expected False with mend="always", which closes every surface. '
                 "Leave one of them out."
             )
+        if self.min_plddt is not None and not 0 < self.min_plddt <= 100:
+            raise ValueError(f"min_plddt: expected above 0 and at most 100, got {self.min_plddt}.")
         if self.threshold is not None and not math.isfinite(self.threshold):
             raise ValueError(f"threshold: expected a finite number, got {self.threshold}.")
 

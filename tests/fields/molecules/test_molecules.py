@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gzip
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -15,8 +15,9 @@ from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.fields.molecules.residues import VOLUMES
 from igps.fields.molecules.structures import is_structure, read_molecule
 from igps.mesh.errors import MeshError
-from igps.mesh.loading import BodyRef, each_body, load_mesh
+from igps.mesh.loading import BodyRef, each_body, list_bodies, load_mesh
 from igps.mesh.mesh import Mesh
+from igps.mesh.options import LoadOptions
 
 pytest.importorskip("gemmi")
 
@@ -673,3 +674,38 @@ def test_lipids_among_the_atoms_of_polymers_are_told(tmp_path):
 def test_binary_cif_is_refused_with_the_remedy(tmp_path):
     with pytest.raises(MeshError, match=r"BinaryCIF is not read. Download .* as mmCIF"):
         load_mesh(written(tmp_path, "x", "entry.bcif"))
+
+
+def test_the_first_model_alone_is_read_if_asked_for(tmp_path):
+    models = [f"MODEL        {k}\n{residue(1)}{residue(2, chain='B')}ENDMDL\n" for k in (3, 4)]
+    path = written(tmp_path, "".join(models))
+    first = LoadOptions(first_model=True)
+    parts = [body.part for body in list_bodies(path, first)]
+    assert parts == ["model 3 chain A", "model 3 chain B"]
+    assert len(list_bodies(path)) == 4
+    models = replace(first, bodies="models")
+    assert [body.part for body in list_bodies(path, models)] == ["model 3"]
+    with pytest.raises(MeshError, match="expected chains or models as bodies with first_model"):
+        load_mesh(path, replace(first, bodies="whole"))
+
+
+def test_residues_of_low_plddt_are_left_out_of_the_body_and_its_attributes(tmp_path):
+    text = "".join(residue(i, b=90.0 - 10 * i) for i in range(1, 6))
+    path = written(tmp_path, text)
+    options = LoadOptions(min_plddt=60)
+    (body,) = list_bodies(path, options)
+    assert body.part == "chain A:plddt60"
+    assert molecule_of(body).residue_labels == ("A 1", "A 2", "A 3")
+    mesh = load_mesh(path, options, part=body.part)
+    assert "2 of 5 residues have a pLDDT below 60: left out" in mesh.notes
+    assert mesh.volume < load_mesh(path).volume
+    both = BodyRef(path, "A:2-9:plddt60.0")
+    assert molecule_of(both).residue_labels == ("A 2", "A 3")
+    with pytest.raises(MeshError, match="no residue has a pLDDT of 95; the largest is 80"):
+        load_mesh(path, part="A:plddt95")
+
+
+def test_b_factors_that_are_no_plddt_are_refused_as_such(tmp_path):
+    path = written(tmp_path, residue(1, b=120.0) + residue(2))
+    with pytest.raises(MeshError, match=r"expected a pLDDT .* got B-factors of 20 to 120"):
+        load_mesh(path, LoadOptions(min_plddt=70))

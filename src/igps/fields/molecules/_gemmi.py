@@ -135,7 +135,7 @@ def gemmi_module() -> Any:
 def _read_text(path: Path) -> bytes:
     if suffix_of(path) == ".bcif":
         raise MeshError(
-            f"{path}: BinaryCIF is not read. Download the same entry as mmCIF (.cif) or convert it."
+            f"{path}: BinaryCIF is not read. Download the same entry as mmCIF (.cif), or convert it, as with ChimeraX."
         )
     if suffix_of(path) not in SUFFIXES:
         raise MeshError(

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     import gemmi
 
 
-_RANGES = re.compile(r"(.*):(-?\d+--?\d+(?:,-?\d+--?\d+)*)")
+_RANGES = re.compile(r"-?\d+--?\d+(?:,-?\d+--?\d+)*")
+_PLDDT = re.compile(r"plddt(\d+(?:\.\d+)?)")
 _RANGE = re.compile(r"(-?\d+)-(-?\d+)")
 _NUMBER = re.compile(r"(-?\d+)\D*$")  # of a residue, at the end of its label
 
@@ -51,29 +52,55 @@ def _kind_of(part: str) -> MoleculeBodies:
 
 
 def chosen(molecules: Mapping[str, Molecule], part: str) -> Molecule | None:
-    """Return the molecule of a part, or of ranges of its residues, as "A:10-120,150-160"; None if there is none.
+    """Return the molecule of a part, or some of its residues, as "A:10-120,150-160:plddt70"; None if there is none.
 
     Raises:
-        MeshError: the molecule has no residue in the ranges.
+        MeshError: the molecule has no such residues.
     """
-    if part in molecules:
-        return molecules[part]
-    match = _RANGES.fullmatch(part)
-    base = part if match is None else match[1]
-    found = molecules.get(base, molecules.get(f"chain {base}"))
-    if found is None or match is None:
+    found = molecules.get(part, molecules.get(f"chain {part}"))
+    base, colon, selection = part.rpartition(":")
+    if found is not None or not colon:
         return found
-    numbers = np.array([_residue_number(label) for label in found.residue_labels])
+    whole = chosen(molecules, base)
+    if whole is None:
+        return None
+    if match := _PLDDT.fullmatch(selection):
+        return _confident(whole, float(match[1]))
+    return _in_ranges(whole, selection) if _RANGES.fullmatch(selection) else None
+
+
+def _in_ranges(molecule: Molecule, ranges: str) -> Molecule:
+    """Return the residues in ranges of numbers, such as "10-120,150-160"."""
+    numbers = np.array([_residue_number(label) for label in molecule.residue_labels])
     is_chosen = np.zeros(len(numbers), dtype=bool)
-    for first, last in _RANGE.findall(match[2]):
+    for first, last in _RANGE.findall(ranges):
         is_chosen |= (numbers >= int(first)) & (numbers <= int(last))
     if not is_chosen.any():
         raise MeshError(
-            f"{found.name}: no residue is in {match[2]}; their numbers are {numbers.min()} to "
+            f"{molecule.name}: no residue is in {ranges}; their numbers are {numbers.min()} to "
             f"{numbers.max()}. Choose among them."
         )
-    return found.subset(
-        is_chosen, f"residues {match[2]} alone: {is_chosen.sum()} of {len(numbers)}"
+    return molecule.subset(
+        is_chosen, f"residues {ranges} alone: {is_chosen.sum()} of {len(numbers)}"
+    )
+
+
+def _confident(molecule: Molecule, least: float) -> Molecule:
+    """Return the residues of a predicted molecule whose pLDDT, in place of the B-factor, is at least `least`."""
+    scores = molecule.b_factors
+    if not np.isfinite(scores).all() or scores.min() < 0 or scores.max() > 100:
+        raise MeshError(
+            f"{molecule.name}: expected a pLDDT of 0 to 100 for each residue, got B-factors of "
+            f"{scores.min():g} to {scores.max():g}. Leave out min_plddt for structures that were not predicted."
+        )
+    is_kept = scores >= least
+    if not is_kept.any():
+        raise MeshError(
+            f"{molecule.name}: no residue has a pLDDT of {least:g}; the largest is {scores.max():g}. Lower it."
+        )
+    n_left_out = int(np.count_nonzero(~is_kept))
+    return molecule.subset(
+        is_kept, f"{n_left_out} of {len(scores)} residues have a pLDDT below {least:g}: left out"
     )
 
 
@@ -121,14 +148,29 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         options.bodies if options.bodies in ("chains", "assembly") else "models"
     )
     molecules = molecules_by_part(path, stat_key(path), bodies)
-    if part is not None:
-        found = chosen(molecules, part)
-        molecules = {} if found is None else {part: found}
-    return [deferred(partial(_surface, each), name, "Å") for name, each in molecules.items()]
+    parts = list(molecules) if part is None else [part] * (chosen(molecules, part) is not None)
+    if part is None and options.first_model:
+        first = _model_of(parts[0])
+        parts = [name for name in parts if _model_of(name) == first]
+    if part is None and options.min_plddt is not None:
+        parts = [f"{name}:plddt{options.min_plddt:g}" for name in parts]
+    if options.bodies == "whole" and parts != list(molecules):
+        raise MeshError(
+            f"{path}: expected chains or models as bodies with first_model or min_plddt, got the whole file. "
+            "Choose by bodies, on the command line --bodies."
+        )
+    return [deferred(partial(_surface, molecules, name), name, "Å") for name in parts]
 
 
-def _surface(molecule: Molecule) -> Mesh:
-    """Return the surface of a molecule; raise a MeshError if all its atoms are in one place."""
+def _model_of(part: str) -> str:
+    """Return the part of a name that tells the model."""
+    return part.partition("chain ")[0].partition("assembly ")[0].strip()
+
+
+def _surface(molecules: Mapping[str, Molecule], part: str) -> Mesh:
+    """Return the surface of a part; raise a MeshError if all its atoms are in one place."""
+    molecule = chosen(molecules, part)
+    assert molecule is not None
     places = molecule.positions
     if len(places) > 1 and not np.ptp(places, axis=0).any():
         raise MeshError(
