@@ -314,6 +314,42 @@ def test_explain_writes_shares_that_add_up(
     assert imread(tmp_path / "explain.png").std() > 0.02
 
 
+def test_explain_paints_the_voxels_in_which_an_attribute_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two equal bodies, one with a bright spot in noise: it has the share."""
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+    affine = np.diag([1.0, 1.0, 1.5, 1.0])
+    x, y, z = np.indices((22, 18, 14)) - np.array([10.5, 8.5, 6.5]).reshape(3, 1, 1, 1)
+    label = (x / 9) ** 2 + (y / 7) ** 2 + (z / 5) ** 2 < 1
+    spot = ((x - 5) ** 2 + y**2 + z**2 < 9) & label
+    generator = np.random.default_rng(0)
+    for name, values in (("plain", np.zeros(label.shape)), ("bright", 1.0 * spot)):
+        image = (values + 0.05 * generator.normal(size=label.shape)).astype(np.float32)
+        nibabel.save(nibabel.Nifti1Image(image, affine), tmp_path / f"{name}_ct.nii.gz")
+        nibabel.save(
+            nibabel.Nifti1Image(label.astype(np.uint8), affine), tmp_path / f"{name}.nii.gz"
+        )
+    files = [tmp_path / "plain.nii.gz", tmp_path / "bright.nii.gz"]
+    samples = ["--signature.n_eigenpairs", "50", "--signature.resolution", "14"]
+    cache = ["--cache_dir", tmp_path / "cache", *SMALL, *samples, "--size", "ignore"]
+    ct = ["--attribute", f"ct={tmp_path}/{{stem}}_ct.nii.gz", "--with", "ct"]
+    words = ["explain", *files, *OWN, *ct, *cache, "--out", tmp_path / "out"]
+    monkeypatch.setattr(sys, "argv", ["igps", *map(str, words), "--json"])
+    main()
+    told = json.loads(capsys.readouterr().out)
+    rows = table(tmp_path / "out" / "explain_ct.csv")
+    shares = np.array([float(row["share"]) for row in rows])
+    assert shares.sum() == pytest.approx(told["attributes"]["ct"], rel=1e-6)
+    found = nibabel.load(tmp_path / "out" / "explain_bright.nii.gz_bright_ct.nii.gz")
+    density = found.get_fdata()
+    np.testing.assert_allclose(found.affine, affine)
+    assert density[spot].mean() > 4 * density[label & ~spot].mean()
+    assert density[label].mean() == pytest.approx(1, abs=0.1)  # each body has half of the distance
+    assert not density[~label].any()
+    assert imread(tmp_path / "out" / "explain_ct.png").std() > 0.02
+
+
 def test_explain_and_groups_paint_where_an_organ_differs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

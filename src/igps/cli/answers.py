@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -291,6 +291,8 @@ class _Explained:
     lines: list[str]  # to print
     moved: Movement | None = None
     meaning: str | None = None  # of the distance, in words
+    # What each attribute of the descriptor adds to the distance
+    attributes: Mapping[str, Explanation] = field(default_factory=dict)
 
 
 def explain(
@@ -315,13 +317,15 @@ def explain(
         level: family-wise error rate, for two groups: only histogram cells and places that differ significantly count.
         out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and
             explain.svg and explain.png: two bodies painted with their shares, or the mean difference of two groups;
-            the same for viewers as explain_BODY.ply, .vtk, .gii and .nii.gz;
+            the same for viewers as explain_BODY.ply, .vtk, .gii and .nii.gz; of each attribute of --with also
+            explain_ATTRIBUTE.csv and slices, and explain_BODY_ATTRIBUTE for viewers;
             of two molecules of one sequence also explain_residues.csv, and both superposed as explain_1.cif and
             explain_2.cif with the shares of residues in percent in place of B-factors.
     """
     from igps.analysis.explanation import without_head
     from igps.cli.reading import Folder, check_files, files_or_folder
     from igps.descriptors import descriptor as descriptor_of
+    from igps.descriptors.with_attributes import split_attributes
     from igps.report.answers import painted_figure, write_analysis, write_movement, write_painted
     from igps.report.drawing import file_names
 
@@ -342,7 +346,7 @@ def explain(
             )
         check_files(source)
     # Raises for other descriptors before anything is computed
-    without_head(descriptor_of(descriptor))
+    without_head(split_attributes(descriptor_of(descriptor))[0])
     if not isinstance(source, Folder):
         found = _explain_files(source, descriptor, **describing)
     elif axis is not None:
@@ -357,6 +361,8 @@ def explain(
     print(f"{of_names}: {explanation.distance:.4g} by {found.descriptor}: {explanation.summary()}")
     for line in found.lines:
         print(line)
+    for name, told in found.attributes.items():
+        print(f"{name}: {told.distance:.4g} more, by where its values lie inside")
     parts = [{"histogram": name, "share": share} for name, share in explanation.parts.items()]
     if out is not None:
         rows = _sample_rows(found.dataset, found.pair, explanation)
@@ -368,25 +374,52 @@ def explain(
         write_painted(out, files, found.painted, found.dataset)
         if found.moved is not None:
             write_movement(out, names, found.moved)
+        _write_attributes(out, found)
         print(f"written to {out}")
     return {
         "bodies": names,
         "distance": explanation.distance,
         "meaning": found.meaning,
         "shares": parts,
+        "attributes": {name: told.distance for name, told in found.attributes.items()},
     }
+
+
+def _write_attributes(out: Path, found: _Explained) -> None:
+    """Write the share of each attribute back on both bodies: tables, slices, and files for viewers."""
+    from igps.report.answers import slices_figure, write_analysis, write_painted
+    from igps.report.drawing import file_names
+
+    legend = "share of the distance, over that of an even spread"
+    for name, told in found.attributes.items():
+        painted = []
+        rows = []
+        for i, shares in zip(found.pair, told.samples, strict=True):
+            samples = found.dataset[i].signature.interior
+            body = _painted_inside(found.dataset, i, shares["interior"], told.distance)
+            painted.append(body)
+            values = samples.attributes[name].tolist()
+            columns = zip(samples.points.tolist(), values, shares["interior"].tolist(), strict=True)
+            for point, value, share in columns:
+                place = dict(zip("xyz", point, strict=True))
+                rows.append({"name": body.name, **place, name: value, "share": share})
+        write_analysis(out, f"explain_{name}", rows, slices_figure(painted, legend))
+        files = [f"explain_{body}_{name}" for body in file_names([one.name for one in painted])]
+        write_painted(out, files, painted, found.dataset)
 
 
 def _explain_groups(folder: Folder, descriptor: str, level: float, **describing: Any) -> _Explained:
     """Return the medoids of two groups, and their mean difference, painted on the body nearest to the mean."""
     import numpy as np
 
+    from igps.analysis.explanation import explain as explain_pair
     from igps.analysis.explanation import explain_groups, without_head
     from igps.analysis.groups import squared_distances
     from igps.cli.places import places_of_groups
     from igps.cli.reading import described
     from igps.descriptors.fingerprint import cache_tag
     from igps.descriptors.size_and_side import SIZE
+    from igps.descriptors.with_attributes import split_attributes
     from igps.nn.description import describe
 
     result = described(folder, descriptor, **describing)
@@ -394,7 +427,8 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
     assert folder.check is not None
     labels = folder.check(dataset.bodies)  # without the bodies that could not be used
     _print_kinds(dataset, folder.body)
-    inner = without_head(result.descriptor)
+    form, attributes = split_attributes(result.descriptor)
+    inner = without_head(form)
     n_workers = describing.get("n_workers")
     descriptions = describe(
         dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True
@@ -405,9 +439,7 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
     pair = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]
     batches = [dataset.batch([i]) for i in pair]
     first, second = (descriptions[own] for own in members)
-    explanation, is_significant = explain_groups(
-        result.descriptor, first, second, batches, level=level
-    )
+    explanation, is_significant = explain_groups(form, first, second, batches, level=level)
     n_cells = f"{int(is_significant.sum())} of {len(is_significant)}"
     print(f"{n_cells} cells differ significantly; their samples: in the medoid of each group")
     places = places_of_groups(
@@ -419,9 +451,16 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
         n_workers=n_workers,
         level=level,
     )
-    name = result.descriptor.name
-    painted = [places.painted]
-    return _Explained(name, dataset, pair, explanation, painted, places.legend, [places.words])
+    return _Explained(
+        form.name,
+        dataset,
+        pair,
+        explanation,
+        [places.painted],
+        places.legend,
+        [places.words],
+        attributes={name: explain_pair(one, *batches) for name, one in attributes.items()},
+    )
 
 
 def _explain_axis(folder: Folder, descriptor: str, axis: int, **describing: Any) -> _Explained:
@@ -455,19 +494,25 @@ def _explain_files(files: Sequence[Path], descriptor: str, **describing: Any) ->
 
 
 def _explain_pair(result: Described, pair: list[int], descriptor: str) -> _Explained:
+    from igps.analysis.explanation import explain as explain_pair
     from igps.analysis.explanation import explain_bodies
     from igps.analysis.superposition import movement
+    from igps.descriptors.with_attributes import split_attributes
 
     dataset = result.dataset.subset(pair)
     moved = movement(*dataset.bodies)
-    explanation = explain_bodies(result.descriptor, dataset, moved)
+    form, attributes = split_attributes(result.descriptor)
+    explanation = explain_bodies(form, dataset, moved)
+    batches = (dataset.batch([0]), dataset.batch([1]))
     painted = [_painted(dataset, i, explanation, i) for i in (0, 1)]
     legend = "share of the distance, over that of an even spread"
     meaning = _meaning(descriptor, dataset, explanation.distance)
     lines = [meaning or f"what this distance means is known for {CALIBRATED} alone"]
     lines += _extents(painted, moved)
-    name = result.descriptor.name
-    return _Explained(name, dataset, [0, 1], explanation, painted, legend, lines, moved, meaning)
+    told = {name: explain_pair(one, *batches) for name, one in attributes.items()}
+    return _Explained(
+        form.name, dataset, [0, 1], explanation, painted, legend, lines, moved, meaning, told
+    )
 
 
 def _print_kinds(dataset: SignatureDataset, body: str | None) -> None:
@@ -544,6 +589,21 @@ def _painted(dataset: SignatureDataset, i: int, explanation: Explanation, side: 
     density = share_density(shares, samples, mesh.vertices)
     even = explanation.distance / 2 or 1.0
     return Painted(dataset.bodies.names[i], mesh, density / even)
+
+
+def _painted_inside(dataset: SignatureDataset, i: int, shares: Any, distance: float) -> Painted:
+    """Return a body with the shares (P,) of its interior samples in a distance, over those of an even spread."""
+    from igps.analysis.explanation import share_density
+    from igps.report.answers import Painted
+
+    mesh = dataset.mesh(i)
+    points = dataset[i].signature.interior.points
+
+    def inside(places: Any) -> Any:
+        density = share_density({"interior": shares}, {"interior": points}, places)
+        return density / (distance / 2 or 1.0)
+
+    return Painted(dataset.bodies.names[i], mesh, inside(mesh.vertices), inside=inside)
 
 
 def _extent(values: Any, areas: Any) -> str:

@@ -1,12 +1,13 @@
 """Descriptors that are combined with histograms of attributes of the samples."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from igps.data.batch import SignatureBatch
-from igps.descriptors.size_and_side import SCALES, scale_of
+from igps.descriptors.size_and_side import SCALES, SizeAndSide, scale_of
 from igps.nn.axes import Attribute, InteriorDistance
 from igps.nn.descriptor import Descriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
@@ -74,11 +75,16 @@ class WithAttributes(Descriptor):
         form, *histograms = self._split(queries)
         forms, *gallery_histograms = self._split(gallery)
         distances = self.descriptor.distances(form, forms)
-        for weight, own, others in zip(self.weights, histograms, gallery_histograms, strict=True):
-            for n_merged in _N_MERGED_BINS:
-                difference = chi_square(_merged(own, n_merged), _merged(others, n_merged))
-                distances = distances + weight / len(_N_MERGED_BINS) * difference
+        of_attributes = self.of_attributes().values()
+        for one, own, others in zip(of_attributes, histograms, gallery_histograms, strict=True):
+            distances = distances + one.distances(own, others)
         return distances
+
+    def of_attributes(self) -> dict[str, HistogramDescriptor]:
+        """Return by name what each attribute adds: its histogram, and the weighted distance by it."""
+        pairs = zip(self.inside.parts, self.weights, strict=True)
+        added = [_OfAttribute(histograms, weight) for histograms, weight in pairs]
+        return {one.parts[0][0].axes[0].name: one for one in added}
 
     def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, ≤ D + cells) coordinates of the descriptor, then square roots of the weighted histograms."""
@@ -94,6 +100,32 @@ class WithAttributes(Descriptor):
         n_form = descriptions.shape[1] - sum(sizes)
         form, *histograms = torch.split(descriptions, [n_form, *sizes], dim=1)
         return [form.unflatten(1, self.descriptor.description_shape), *histograms]
+
+
+class _OfAttribute(HistogramDescriptor):
+    """The histogram of an attribute, compared at all widths of the distance bins."""
+
+    def __init__(self, histograms: Any, weight: float) -> None:
+        super().__init__([list(histograms)])
+        self.weight = weight
+
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, cells) and (G, cells) to (Q, G) distances."""
+        distances = [
+            chi_square(_merged(queries, n_merged), _merged(gallery, n_merged))
+            for n_merged in _N_MERGED_BINS
+        ]
+        return self.weight * torch.stack(distances).mean(dim=0)
+
+
+def split_attributes(descriptor: Descriptor) -> tuple[Descriptor, dict[str, HistogramDescriptor]]:
+    """Return a descriptor without attributes, and what each attribute adds, by name, before size counts."""
+    if isinstance(descriptor, SizeAndSide):
+        form, attributes = split_attributes(descriptor.descriptor)
+        return descriptor.wrap(form), attributes
+    if isinstance(descriptor, WithAttributes):
+        return descriptor.descriptor, descriptor.of_attributes()
+    return descriptor, {}
 
 
 def _merged(cells: Tensor, n_merged: int) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
@@ -35,6 +35,7 @@ from igps.report.page_data import finite
 from igps.report.tables import write_rows
 from igps.report.views import common_views, draw_view, reach_of
 from igps.retrieval import PrecisionRecallCurve
+from igps.signature.voxels import grid_axes, inside_grid, interior_samples
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,10 +49,12 @@ class Painted:
     mesh: Mesh
     values: Floats  # (V,) at its vertices
     is_held: Booleans | None = None  # (V,) where the values count; they are pale elsewhere
+    inside: Callable[[Floats], Floats] | None = None  # the values (P,) at points (P, 3) inside
 
 
 LEVEL = 0.05
 """Largest false discovery rate of bodies that are marked as significant."""
+_SLICE_RESOLUTION = 128  # pixels along the longest side of a body
 _SIGNIFICANT = PALETTE[0]
 _OTHER = "#777777"
 
@@ -181,7 +184,51 @@ def write_painted(
         if ref.path.is_file():
             raw = read_surface(ref.path, dataset.reading, part=ref.part)
             voxels = None if raw.voxels is None else raw.voxels()
-        write_places(out / stem, body.mesh, values, voxels)
+        write_places(out / stem, body.mesh, values, voxels, body.inside)
+
+
+def slices_figure(painted: Sequence[Painted], legend: str) -> Figure:
+    """Draw three slices of each body through the place of its largest value inside: red positive, blue negative."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    colours = LinearSegmentedColormap.from_list("shares", [_BLUE, _WHITE, _RED])
+    figure = new_figure(7.5, 2.6 * len(painted))
+    all_axes = figure.subplots(len(painted), 3, squeeze=False)
+    slices = [_slices(body) for body in painted]
+    everything = np.concatenate([values[~np.isnan(values)] for own in slices for values, *_ in own])
+    largest = float(np.quantile(np.abs(everything), 0.98)) or 1.0
+    names = titles_of([body.name for body in painted])
+    for row, name, body, own in zip(all_axes, names, painted, slices, strict=True):
+        for axes, (values, extent, title) in zip(row, own, strict=True):
+            drawn = axes.imshow(
+                values.T, colours, vmin=-largest, vmax=largest, origin="lower", extent=extent
+            )
+            axes.set_title(f"{title} {body.mesh.unit or ''}", fontsize=7)
+            axes.set_axis_off()
+        row[0].set_title(f"{name}\n\n", fontsize=7, loc="left")
+    bar = figure.colorbar(drawn, ax=all_axes, shrink=0.6)
+    bar.ax.tick_params(labelsize=6)
+    bar.set_label(legend, fontsize=7)
+    return figure
+
+
+def _slices(body: Painted) -> list[tuple[Floats, tuple[float, ...], str]]:
+    """Return the values (X, Y) of three slices, NaN outside of the body, where they lie, and their places in words."""
+    assert body.inside is not None
+    points = interior_samples(body.mesh)
+    middle = points[body.inside(points).argmax()]
+    slices = []
+    for i, axis in enumerate("xyz"):
+        lines = list(grid_axes(body.mesh, _SLICE_RESOLUTION))
+        lines[i] = middle[i : i + 1]
+        is_inside = inside_grid(body.mesh, (lines[0], lines[1], lines[2]))
+        grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
+        values = np.full(is_inside.shape, np.nan)
+        values[is_inside] = body.inside(grid[is_inside])
+        across = [line for k, line in enumerate(lines) if k != i]
+        extent = tuple(float(line[end]) for line in across for end in (0, -1))
+        slices.append((values.squeeze(i), extent, f"{axis} = {middle[i]:.4g}"))
+    return slices
 
 
 def map_figure(body_map: BodyMap, values: Sequence[str] | Sequence[float], title: str) -> Figure:

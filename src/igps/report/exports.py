@@ -1,6 +1,6 @@
 """Results on the surface and in the voxels of bodies, in files that 3D Slicer, FreeView and ParaView open."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,25 @@ from igps.mesh.raw_body import LabelVoxels
 
 
 def write_places(
-    stem: Path, mesh: Mesh, values: Mapping[str, Floats], voxels: LabelVoxels | None = None
+    stem: Path,
+    mesh: Mesh,
+    values: Mapping[str, Floats],
+    voxels: LabelVoxels | None = None,
+    inside: Callable[[Floats], Floats] | None = None,
 ) -> None:
     """Write values on a body, as STEM.ply and STEM.vtk; of a body in the frame of a patient also as STEM.gii.
 
     Coordinates are those of the body. In the frame of a patient they are RAS in the unit of the body; the headers say
     so, by which 3D Slicer does not take them for LPS. With its voxels, the first of the values is also written as
-    STEM.nii.gz, in the grid of the label image: each voxel of the body has the value of the nearest vertex, others 0.
+    STEM.nii.gz, in the grid of the label image: each voxel of the body has the value inside, or that of the nearest
+    vertex, others 0.
 
     Args:
         stem: path without an ending, which is appended.
         mesh: the body.
         values: (V,) numbers by name.
         voxels: of the body, if it was read from a volume.
+        inside: returns the values (P,) at points (P, 3) inside the body, if there are such.
     """
     stem.parent.mkdir(parents=True, exist_ok=True)
     _with_ending(stem, ".ply").write_bytes(_ply(mesh, values))
@@ -35,7 +41,9 @@ def write_places(
         _write_gifti(_with_ending(stem, ".gii"), mesh, values)
     if voxels is not None:
         first = next(iter(values.values()))
-        _write_nifti(_with_ending(stem, ".nii.gz"), mesh, first, voxels)
+        nearest = cKDTree(mesh.vertices)
+        of_points = inside or (lambda points: first[nearest.query(points)[1]])
+        _write_nifti(_with_ending(stem, ".nii.gz"), mesh, of_points, voxels)
 
 
 def _with_ending(stem: Path, ending: str) -> Path:
@@ -104,14 +112,15 @@ def _write_gifti(path: Path, mesh: Mesh, values: Mapping[str, Floats]) -> None:
     nibabel.save(GiftiImage(darrays=arrays), path)
 
 
-def _write_nifti(path: Path, mesh: Mesh, values: Floats, voxels: LabelVoxels) -> None:
+def _write_nifti(
+    path: Path, mesh: Mesh, of_points: Callable[[Floats], Floats], voxels: LabelVoxels
+) -> None:
     import nibabel
 
     index = np.argwhere(voxels.mask) + voxels.low
     centres = index @ voxels.affine[:3, :3].T + voxels.affine[:3, 3]
-    _, nearest = cKDTree(mesh.vertices).query(centres)
     grid = np.zeros(voxels.grid, dtype=np.float32)
-    grid[tuple(index.T)] = values[nearest]
+    grid[tuple(index.T)] = of_points(centres)
     image = nibabel.Nifti1Image(grid, voxels.affine)
     image.header.set_xyzt_units("mm")
     if mesh.frame is None:  # as in the label image, nothing is said about the patient
