@@ -17,10 +17,10 @@ from igps._parallel import run
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
 from igps.failures import Failed
+from igps.mesh._collapse_loops import collapse_edges
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Frame, Mesh
-from igps.mesh.simplification import simplify
 from igps.mesh.surface import compact, longest_side
 from igps.report.drawing import axes_of
 from igps.report.views import patient_views
@@ -113,12 +113,14 @@ def _surface_of_body(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef
 
 def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "") -> PageSurface:
     """Return a surface of at most `n_vertices` vertices, with the potential interpolated from surface samples."""
-    try:
-        simplified = simplify(mesh, n_vertices)
-        vertices = simplified.vertices
-        faces = simplified.faces
-    except MeshError:  # a surface whose handles close is good enough for display
-        vertices, faces = clustered(mesh.vertices, mesh.faces, n_vertices)
+    vertices = mesh.vertices
+    faces = mesh.faces
+    if len(vertices) > n_vertices:
+        scale = longest_side(vertices)
+        vertices, faces = collapse_edges(vertices / scale, faces, n_vertices)
+        vertices = vertices * scale
+    if len(vertices) > n_vertices:  # fewer would close handles, which is good enough for display
+        vertices, faces = clustered(vertices, faces, n_vertices)
     samples = signature.surface.points
     potential = np.sqrt(
         np.square(signature.surface.eigenfunctions, dtype=np.float64) @ (1 / signature.eigenvalues)
