@@ -124,14 +124,19 @@ def bent_chain(chain: Molecule, degrees: float, generator: np.random.Generator) 
     """Return the chain with its second half turned about the middle residue, around a random axis."""
     positions = chain.residue_positions.copy()
     middle = len(positions) // 2
+    pivot = positions[middle]
+    turn = turning(degrees, generator)
+    positions[middle:] = (positions[middle:] - pivot) @ turn.T + pivot
+    return replace(chain, residue_positions=positions)
+
+
+def turning(degrees: float, generator: np.random.Generator) -> Floats:
+    """Return a rotation (3, 3) around a random axis (Rodrigues)."""
     axis = generator.normal(size=3)
     x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.radians(degrees)
-    turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    pivot = positions[middle]
-    positions[middle:] = (positions[middle:] - pivot) @ turn.T + pivot
-    return replace(chain, residue_positions=positions)
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def deformed(chain: Molecule, generator: np.random.Generator) -> Molecule:

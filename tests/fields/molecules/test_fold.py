@@ -35,9 +35,9 @@ def walk(seed: int, n: int = 150) -> Floats:
 
 
 def directions_of(residues: Floats) -> Floats:
-    """(n, 3) unit vectors along a chain without gaps."""
-    vectors = np.gradient(residues, axis=0)
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    """(n, 3) unit vectors along a chain without gaps, over three residues before and after."""
+    vectors = [residues[i : i + 4][-1] - residues[max(i - 3, 0)] for i in range(len(residues))]
+    return np.array(vectors) / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def signature(residues: Floats, places: Floats, nearest: NDArray[np.int64]) -> Signature:
@@ -71,7 +71,7 @@ def test_every_residue_counts_once_in_the_row_of_its_separation() -> None:
     )
     wanted = np.einsum("ps,pd,pc,pt->sdct", separation, *axes, optimize=True)
     n_pairs = wanted.sum(axis=(1, 2, 3))
-    weights = n_pairs / (n_pairs + 2000) / (1 + SEPARATIONS[2:] / 20)
+    weights = n_pairs / (n_pairs + 2000) / (1 + SEPARATIONS[2:] / 10)
     weights /= weights.sum() * n_pairs
     np.testing.assert_allclose(found, wanted * weights[:, None, None, None], atol=2e-6)
 
@@ -160,4 +160,4 @@ def test_it_is_found_by_name_and_asks_for_a_trace() -> None:
     assert igps.descriptor("fold").n_features == 13 * 8 * 25
     with pytest.raises(ValueError, match="needs signatures with trace"):
         fold()(collate([BALL]))
-    assert FoldHistogram(n_bins=5, n_samples=None).shape == (13, 5, 5, 5)
+    assert FoldHistogram().shape == (13, 8, 5, 5)

@@ -15,7 +15,6 @@ from igps.data.requirements import Requirements
 from igps.nn._kernels.pairs import count_pairs
 from igps.nn._kernels.pairs_by_torch import PairValues, euclidean_distances, pair_twists
 from igps.nn.axes import OrderedCentres, PairAxis
-from igps.nn.axes.centres import interval_centres
 from igps.nn.axes.points import attribute_requirements
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.descriptor import HistogramDescriptor
@@ -29,14 +28,12 @@ TRACE = "trace"
 _SEPARATIONS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 9.0, 12.5, 17.5, 25.0, 37.0, 57.0, 89.0, 130.0)
 _N_NEIGHBOURS = 2
 # The separation at which a class counts half as much as near ones: far residues move as domains move.
-_HALF_SEPARATION = 20.0
+_HALF_SEPARATION = 10.0
 # The number of pairs at which a class counts half as much as one of many pairs: few pairs tell little.
 _FEW_PAIRS = 2000.0
-_N_BINS = 8
-_REACH = 40.0  # Å
+_DISTANCES = (2.5, 7.5, 12.5, 17.5, 22.5, 27.5, 32.5, 37.5)  # Å
 # Centres of the classes of the angle and of the twist between two directions of the chain.
-_COSINES = (-0.8, -0.4, 0.0, 0.4, 0.8)
-_TWISTS = (-0.8, -0.4, 0.0, 0.4, 0.8)
+_TURNS = (-0.8, -0.4, 0.0, 0.4, 0.8)
 _N_SAMPLES = 2000
 
 
@@ -94,26 +91,22 @@ class ChainTwist(_TraceAxis):
 class FoldHistogram(SampleHistogram):
     """Distances, angles and twists of pairs of residues, a histogram for each class of separation along the chain.
 
-    The weight of a class falls to a half at a separation of 20 residues, as far residues move with domains, and is a
+    The weight of a class falls to a half at a separation of 10 residues, as far residues move with domains, and is a
     half with 2000 pairs, as fewer pairs scatter more. The weights of all classes sum to 1. Every residue that is the
     nearest of a sample counts once, however many samples are near it.
 
     Args:
-        n_bins, reach: bins of the distance, see `ResidueDistance`.
         n_samples: see `SampleHistogram`.
     """
 
     degree = 2
     label = "fold"
 
-    def __init__(
-        self, n_bins: int = _N_BINS, reach: float = _REACH, *, n_samples: int | None = _N_SAMPLES
-    ) -> None:
+    def __init__(self, n_samples: int | None = _N_SAMPLES) -> None:
         super().__init__("interior", n_samples)
         self.separation = ChainSeparation(_SEPARATIONS)
-        distances = interval_centres(n_bins, reach, "n_bins").tolist()
         self.others = torch.nn.ModuleList(
-            [ResidueDistance(distances), ChainCosine(_COSINES), ChainTwist(_TWISTS)]
+            [ResidueDistance(_DISTANCES), ChainCosine(_TURNS), ChainTwist(_TURNS)]
         )
         self.embedding = SpectralEmbedding(n_eigenpairs=1)  # the axes use none
 

@@ -33,6 +33,10 @@ BJERRUM_LENGTH = 7.14
 DEBYE_LENGTH = 7.85
 """Distance over which salt water screens a charge, Å, at 0.15 mol/l."""
 
+# Residues between the ends of a direction of the chain and its middle. Neighbours alone would turn with each residue of
+# a helix; so many give the direction of the helix or strand.
+_REACH = 3
+
 # Largest number of entries of a matrix of points by residues
 _BLOCK_SIZE = 2**22
 
@@ -75,17 +79,20 @@ def trace(molecule: Molecule, points: Floats) -> Floats:
     """Return the nearest residue of a polymer to points (P, 3), as (P, 7): position, direction of the chain, place.
 
     Positions, Å, are relative to the mean of the residues, as attributes have single precision. Directions, of length
-    1, point from the residue before to the residue after; 0 for a residue without both.
+    1, point from the third residue before to the third after, or to the last ones without a gap; 0 for one alone.
     """
     is_linked = np.isfinite(molecule.places)
     if not is_linked.any():
         return np.full((len(points), 7), np.nan)
     positions = molecule.residue_positions[is_linked]
     places = molecule.places[is_linked]
-    steps = np.diff(positions, axis=0) * (np.diff(places) == 1)[:, None]
-    directions = np.zeros_like(positions)
-    directions[1:] += steps
-    directions[:-1] += steps
+    run = np.cumsum(np.diff(places, prepend=places[0]) != 1)
+    first = np.searchsorted(run, run)
+    last = np.searchsorted(run, run, side="right") - 1
+    order = np.arange(len(run))
+    before = np.maximum(order - _REACH, first)
+    after = np.minimum(order + _REACH, last)
+    directions = positions[after] - positions[before]
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     directions /= np.maximum(lengths, 1e-9)
     rows = np.column_stack([positions - positions.mean(axis=0), directions, places])
@@ -179,7 +186,7 @@ class ResidueAttribute:
 
     def cache_tag(self, body: BodyRef) -> str:
         """Return the name. The molecule is the body's own file, which is part of the key of its Signature."""
-        return f"residues 2 {self.name}"
+        return f"residues 3 {self.name}"
 
     def __call__(self, body: BodyRef, points: Floats) -> Floats:
         """Return values (P,) or (P, C) at points (P, 3), Å; raise a MeshError if the body has no such values."""
