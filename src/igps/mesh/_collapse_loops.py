@@ -63,7 +63,8 @@ def collapse_edges(vertices: Floats, faces: Integers, n_vertices: int) -> Surfac
             continue
         n_a = _list_corners(rings, a, at_a)
         n_b = _list_corners(rings, b, at_b)
-        if _n_common(rings, at_a[:n_a], at_b[:n_b], mark) != 2:
+        # Each vertex keeps three triangles at least; the last of a ball are a tetrahedron
+        if n_a + n_b < 7 or _n_common(rings, at_a[:n_a], at_b[:n_b], mark) != 2:
             continue
         _best_place(quadrics[a], quadrics[b], points[a], points[b], place)
         if _turns(rings, points, at_a[:n_a], b, place):

@@ -90,13 +90,15 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
     """
     for _ in range(_MAX_FLIPS):
         side, other, corners = _quadrilaterals(faces, len(vertices))
-        a, b, c, d = corners
         ends = vertices[corners]
         gain = _angle(ends[2], ends[0], ends[1]) + _angle(ends[3], ends[1], ends[0]) - np.pi
-        can_flip = (gain > _MIN_GAIN) & _are_flat(*ends) & (c != d)
+        flips = np.flatnonzero(gain > _MIN_GAIN)
+        c, d = corners[2:, flips]
+        can_flip = _are_flat(*ends[:, flips]) & (c != d)
         can_flip &= ~_are_edges(c, d, faces, len(vertices))
-        flips = np.nonzero(can_flip)[0]
-        new_edges = np.minimum(c, d)[flips] * len(vertices) + np.maximum(c, d)[flips]
+        flips = flips[can_flip]
+        _, _, c, d = corners[:, flips]
+        new_edges = np.minimum(c, d) * len(vertices) + np.maximum(c, d)
         left = side[flips] // 3
         right = other[flips] // 3
         chosen = _independent(left, right, gain[flips], new_edges)

@@ -6,6 +6,7 @@ import numpy as np
 
 from igps._arrays import Floats, Integers, Surface
 from igps._parameters import check_at_least
+from igps.mesh._collapse_loops import collapse_edges
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import longest_side, undirected_edges
@@ -14,8 +15,8 @@ from igps.mesh.surface import longest_side, undirected_edges
 def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     """Simplify a mesh to at most `max_vertices` vertices, by quadric edge collapse (Garland and Heckbert 1997).
 
-    A mesh that is small enough is returned unchanged. No collapse changes the topology (libigl's `qslim` checks each),
-    so a closed manifold stays closed.
+    A mesh that is small enough is returned unchanged. No collapse changes the topology, so a closed manifold stays
+    closed. Open surfaces are simplified by libigl's `qslim`.
 
     Raises:
         MeshError: `max_vertices` cannot be reached, or the simplified surface bounds no body.
@@ -24,15 +25,14 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     surplus = len(mesh.vertices) - max_vertices
     if surplus <= 0:
         return mesh
-    import igl
-
-    # In unit size, because quadrics are sums of squares. A collapse on a closed surface removes a vertex and two faces.
+    # In unit size, because quadrics are sums of squares.
     centre = mesh.vertices.mean(axis=0)
     scale = longest_side(mesh.vertices)
-    points = np.asfortranarray((mesh.vertices - centre) / scale)
-    faces = np.asfortranarray(mesh.faces)
-    n_faces = max(len(faces) - 2 * surplus, 4)
-    points, faces, *_ = igl.qslim(points, faces, n_faces)
+    points = (mesh.vertices - centre) / scale
+    if mesh.allow_open:
+        points, faces = _simplified_open(points, mesh.faces, surplus)
+    else:
+        points, faces = collapse_edges(points, mesh.faces, max_vertices)
     if len(points) > max_vertices:
         fault = f"{mesh.name}: simplification reached only {len(points)} vertices, expected {max_vertices}"
         raise MeshError(f"{fault}; fewer would change the topology. Raise max_vertices.")
@@ -44,6 +44,16 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
         raise MeshError(
             f"{error} Simplification caused this: raise max_vertices above {max_vertices}."
         ) from error
+
+
+def _simplified_open(points: Floats, faces: Integers, surplus: int) -> Surface:
+    """Collapse edges of a surface that may have a boundary, until `surplus` vertices fewer are left."""
+    import igl
+
+    # A collapse removes a vertex and two faces
+    n_faces = max(len(faces) - 2 * surplus, 4)
+    points, faces, *_ = igl.qslim(np.asfortranarray(points), np.asfortranarray(faces), n_faces)
+    return points, faces
 
 
 def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
