@@ -8,8 +8,9 @@ from typing import Any
 from igps._parameters import check_at_least
 from igps.signature.config import SignatureConfig
 
-# A third of the time of the default, as frames are many
-FRAME = SignatureConfig(max_vertices=1000, resolution=20, min_samples=500)
+# A fifth of the time of the default, as frames are many. Distances between 7 frames of a kinase correlate by 0.996 with
+# those of full surfaces.
+FRAME = SignatureConfig(max_vertices=700, resolution=20, min_samples=500)
 
 
 def trajectory(
@@ -25,7 +26,7 @@ def trajectory(
 
     The frames are written as PQR files into the folder `frames` of `out`, without hydrogens, whose charges their
     neighbours have. All other commands read them too. It needs MDAnalysis. Unless options of signatures are given,
-    these are coarser than elsewhere, with 1000 vertices.
+    these are coarser than elsewhere, with 700 vertices.
 
     Args:
         files: the topology, such as a PSF or PDB file, and one or several files of frames, such as DCD or XTC.

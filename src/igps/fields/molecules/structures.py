@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Iterator
 from itertools import groupby
@@ -301,7 +302,7 @@ class _Builder:
                 atom.element = gemmi.Element("X")
             if _is_hydrogen(atom) and not self.hydrogens:
                 continue
-            if not np.isfinite(atom.pos.tolist()).all():
+            if not math.isfinite(atom.pos.length()):
                 self._count["nowhere"] += 1
                 continue
             # Programs that complete side chains may leave an atom twice, without a letter
