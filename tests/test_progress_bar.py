@@ -7,6 +7,11 @@ import pytest
 from igps._progress import Progress
 
 
+class Terminal(StringIO):
+    def isatty(self):
+        return True
+
+
 @pytest.fixture
 def clock(monkeypatch):
     """The time in seconds that bars see."""
@@ -17,7 +22,7 @@ def clock(monkeypatch):
 
 def test_the_first_result_does_not_count_in_the_estimate(clock):
     """Loops are compiled for 30 seconds, then each body takes 2: of 10 bodies, 7 are left after 34 seconds."""
-    text = StringIO()
+    text = Terminal()
     with Progress(total=10, desc="bodies", file=text) as bar:
         for seconds in (30, 32, 34):
             clock[0] = seconds
@@ -33,3 +38,16 @@ def test_a_bar_without_progress_prints_nothing():
     with Progress(total=2, disable=True, file=text) as bar:
         bar.update()
     assert text.getvalue() == ""
+
+
+def test_in_a_file_a_bar_is_a_line_a_minute_and_one_at_its_end(clock):
+    text = StringIO()
+    with Progress(total=10, desc="bodies", file=text) as bar:
+        for seconds in range(0, 190, 19):
+            clock[0] = seconds
+            bar.update()
+    assert text.getvalue().splitlines() == [
+        "bodies: 5/10 [01:16<01:35]",
+        "bodies: 9/10 [02:32<00:19]",
+        "bodies: 10/10 [02:51<00:00]",
+    ]

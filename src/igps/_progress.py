@@ -1,22 +1,45 @@
 """A bar on standard error that tells how far a long computation is."""
 
+import sys
+from collections.abc import Callable
 from typing import Any
 
 from tqdm import tqdm
 
+_SECONDS = 60  # between the lines in a file
+
 
 class Progress(tqdm):
-    """A bar whose estimate leaves out the first result, and says that this one takes longer.
+    """One bar at a time: it makes way for the next when it ends. In a file, it is a line a minute and one at its end.
 
-    Until then, worker processes start, and a new installation compiles its loops. This time says nothing about the
-    results that follow.
+    Of a bar that is updated by hand, the estimate leaves out the first result. Until then, worker processes start, and
+    a new installation compiles its loops, which says nothing about the results that follow.
     """
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self._is_first = not self.disable
-        if self._is_first and self.n < self.total:
-            self.set_postfix_str("the first takes longer")
+    def __init__(self, iterable: Any = None, **options: Any) -> None:
+        self._is_in_file = not (options.get("file") or sys.stderr).isatty()
+        if self._is_in_file:
+            options |= {"delay": _SECONDS, "mininterval": _SECONDS, "maxinterval": _SECONDS}
+            options["bar_format"] = "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
+        super().__init__(iterable, leave=False, **options)
+        self._is_first = iterable is None and not self.disable
+        if self._is_first and self.n < (self.total or 0):
+            self.set_postfix_str(
+                "the first takes longer: loops are compiled once", not self._is_in_file
+            )
+
+    @staticmethod
+    def status_printer(file: Any) -> Callable[[str], None]:
+        """Return a function that writes a state over the last one, or on a line of its own in a file."""
+        if file.isatty():
+            printer: Callable[[str], None] = tqdm.status_printer(file)
+            return printer
+
+        def write_line(text: str) -> None:
+            file.write(text + "\n")
+            file.flush()
+
+        return write_line
 
     def update(self, n: float | None = 1) -> bool | None:
         """Add n results; the clock of the estimate starts at the first."""
@@ -26,5 +49,17 @@ class Progress(tqdm):
         self.n += n or 0
         self.last_print_n = self.n
         self.unpause()
-        self.set_postfix_str("")
+        self.set_postfix_str("", not self._is_in_file)
         return True
+
+    def moveto(self, n: int) -> None:
+        """Move the cursor to the bar n lines below the first; the lines of a file have one order."""
+        if not self._is_in_file:
+            super().moveto(n)
+
+    def close(self) -> None:
+        """Take the bar away, or write the last line."""
+        if self._is_in_file and not self.disable:
+            self.display()
+            self.sp = None  # nothing is left to clear
+        super().close()

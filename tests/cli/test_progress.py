@@ -12,8 +12,8 @@ from igps.cli import main
 from own_descriptors import SMALL, write_egg
 
 INTERIOR = "own_descriptors:small_interior"
-# Such as "signatures: 100%|█████| 4/4 [00:03<00:00,  1.2it/s]": share, how many of how many, time taken and left
-BAR = re.compile(r"([\w -]+): +(\d+)%\|[^|]*\| (\d+)/(\d+) \[\d\d:\d\d<(?:\d\d:\d\d|\?),")
+# Such as "signatures: 4/4 [00:03<00:00]": how many of how many, time taken and left
+BAR = re.compile(r"^([\w -]+): (\d+)/(\d+) \[\d\d:\d\d<(?:\d\d:\d\d|\?)\]$", re.MULTILINE)
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def root(tmp_path: Path) -> Path:
 def bars(text: str) -> dict[str, tuple[int, int]]:
     """Of the longest bar of each name, where it stood last and where it ends."""
     found: dict[str, tuple[int, int]] = {}
-    for name, _, done, total in BAR.findall(text):
+    for name, done, total in BAR.findall(text):
         if int(total) >= found.get(name.strip(), (0, 0))[1]:
             found[name.strip()] = (int(done), int(total))
     return found

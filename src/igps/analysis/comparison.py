@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from igps._arrays import Singles
 from igps._parallel import run
+from igps._progress import Progress
 from igps._threads import one_thread
 from igps.data.dataset import Failure, SignatureDataset
 from igps.failures import Failed
@@ -97,7 +97,7 @@ def compare(
     pending: dict[int, _Description | Failure] = {}
     n_done = 0
     with (
-        tqdm(total=len(jobs), desc="descriptions", disable=not progress) as bar,
+        Progress(total=len(jobs), desc="descriptions", disable=not progress) as bar,
         contextlib.closing(run(describe_timed, jobs, n_workers=n_workers)) as outcomes,
     ):
         for number, outcome in outcomes:
@@ -162,7 +162,7 @@ def pair_distances(
     """Return the distances (N, N) of descriptions (N, ...), computed in blocks of queries to limit memory."""
     n_queries = max(1, _BLOCK_ENTRIES // max(1, descriptions.numel()))
     blocks = []
-    bar = tqdm(
+    bar = Progress(
         total=len(descriptions), desc=f"distances by {descriptor.name}", disable=not progress
     )
     with torch.inference_mode(), one_thread(), bar:

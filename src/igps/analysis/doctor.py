@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from tqdm import tqdm
 
 from igps._parallel import run
+from igps._progress import Progress
 from igps._text import counted
 from igps.data.filling import group_by_file
 from igps.data.sources import Bodies, BodyRef
@@ -90,7 +90,7 @@ def examine(
     )
     findings: dict[int, Finding] = {}
     with (
-        tqdm(total=len(files), desc="bodies", disable=not progress) as bar,
+        Progress(total=len(files), desc="bodies", disable=not progress) as bar,
         contextlib.closing(outcomes),
     ):
         for number, outcome in outcomes:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from tqdm import tqdm
 
 from igps._arrays import Booleans, Floats
 from igps._parallel import run
 from igps._parameters import check_at_least, check_fraction
+from igps._progress import Progress
 from igps._threads import one_thread
 from igps.analysis.alignment import rigid_motion
 from igps.analysis.groups import codes_of, design_of, permutations
@@ -68,7 +68,7 @@ def offsets_of_bodies(
     work = partial(_offsets_of_body, dataset.pipeline, reference, keep_size)
     bodies = [dataset.bodies[i] for i in members]
     with contextlib.closing(run(work, bodies, n_workers=n_workers)) as outcomes:
-        for number, outcome in tqdm(outcomes, total=len(bodies), desc="offsets"):
+        for number, outcome in Progress(outcomes, total=len(bodies), desc="offsets"):
             if not isinstance(outcome, Failed):
                 rows[number] = outcome
     return rows

@@ -60,8 +60,8 @@ def groups(
         seed: seed of the permutations, bootstraps and folds.
     """
     import numpy as np
-    from tqdm import tqdm
 
+    from igps._progress import Progress
     from igps.analysis.groups import group_test, with_q_values
     from igps.cli.inside import check_has_attribute, inside_vectors
     from igps.cli.reading import Folder, described, print_failures
@@ -111,7 +111,7 @@ def groups(
 
     def tested(jobs: list[tuple[str, list[int], Any]]) -> list[GroupTest]:
         found = []
-        for body, i, rows in tqdm(jobs, desc="tests"):
+        for body, i, rows in Progress(jobs, desc="tests"):
             test = group_test(
                 rows,
                 labels[i].tolist(),

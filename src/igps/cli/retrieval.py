@@ -324,8 +324,8 @@ def _write_retrieval(
 ) -> None:
     import numpy as np
     import torch
-    from tqdm import tqdm
 
+    from igps._progress import Progress
     from igps.cli.reading import write_mending_notes
     from igps.report.results import write_sources
     from igps.report.tables import write_rows
@@ -342,7 +342,7 @@ def _write_retrieval(
 
     def ranking() -> Iterator[tuple[Any, ...]]:
         asks = torch.tensor(is_query or [False] * len(names))
-        for i, order in enumerate(tqdm(rank(distances["distances"]), desc="rankings")):
+        for i, order in enumerate(Progress(rank(distances["distances"]), desc="rankings")):
             if is_query is not None and not is_query[i]:
                 continue
             # Much faster than access to single entries of a tensor

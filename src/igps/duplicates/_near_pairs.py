@@ -6,8 +6,8 @@ from functools import cache
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
+from igps._progress import Progress
 from igps.data.dataset import SignatureDataset
 from igps.duplicates._moments import distance_bounds
 from igps.mesh.mesh import millimetres
@@ -21,7 +21,7 @@ NearPairs = Iterator[tuple[int, int]]  # indices i < j
 
 def near_pairs(moments: Tensor, limit: float, progress: bool) -> NearPairs:
     """Yield the pairs i < j of bodies whose distance may be at most the limit, by their `moments` (N, 7, 6)."""
-    with tqdm(desc="compared", total=len(moments), disable=not progress) as bar:
+    with Progress(desc="compared", total=len(moments), disable=not progress) as bar:
         for start in range(0, len(moments), _ROWS):
             rows = moments[start : start + _ROWS]
             with torch.inference_mode():

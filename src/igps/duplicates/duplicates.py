@@ -10,9 +10,9 @@ from itertools import islice
 from pathlib import Path
 
 from scipy.cluster.hierarchy import DisjointSet
-from tqdm import tqdm
 
 from igps._parallel import on_threads
+from igps._progress import Progress
 from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors.size_and_side import Size, keeps_size
 from igps.duplicates._near_pairs import NearPairs, near_pairs, of_one_size
@@ -146,7 +146,7 @@ def _join(near: NearPairs, surfaces: Surfaces, work: _Work) -> Pairs:
         distances = on_threads(
             lambda pair: surfaces.distance(*pair, work.calibration), pairs, work.n_workers
         )
-        bar = tqdm(
+        bar = Progress(
             distances, desc="aligned", total=len(pairs), leave=False, disable=not work.progress
         )
         for (i, j), distance in zip(pairs, bar, strict=True):
@@ -167,6 +167,6 @@ def _regroup(joined: Pairs, surfaces: Surfaces, work: _Work) -> Pairs:
     regrouped = on_threads(
         lambda members: assigned(members, surfaces, work.calibration), large, work.n_workers
     )
-    for pairs in tqdm(regrouped, desc="groups", total=len(large), disable=not work.progress):
+    for pairs in Progress(regrouped, desc="groups", total=len(large), disable=not work.progress):
         final |= pairs
     return final

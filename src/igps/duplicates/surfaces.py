@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from scipy.linalg import orthogonal_procrustes
 from torch import Tensor
-from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
 from igps._parallel import on_threads
+from igps._progress import Progress
 from igps.data.dataset import Failure, SignatureDataset
 from igps.duplicates._alignment import (
     SurfaceSamples,
@@ -221,7 +221,7 @@ class Surfaces:
             return None
 
         results = on_threads(moments_of, range(len(self._dataset)), n_workers)
-        bar = tqdm(results, desc="surfaces", total=len(self._dataset), disable=not progress)
+        bar = Progress(results, desc="surfaces", total=len(self._dataset), disable=not progress)
         usable = [result for result in bar if result is not None]
         if not usable:
             raise MeshError(self.failures[0].error)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
+from igps._progress import Progress
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.known_files import MIN_AGE
 from igps.data.sources import LABELS_FILE, Bodies, is_number
@@ -40,7 +40,7 @@ def described_rows(
     """Yield descriptions and rows of the bodies whose checksums are not `known`; append failures to the list."""
     dataset = each_body_once(dataset)
     bodies = dataset.bodies
-    with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
+    with Progress(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _BATCH_SIZE):
             indices = range(start, min(start + _BATCH_SIZE, len(dataset)))
             # Time stamps are taken before files are read: a file that changes meanwhile is described again next time

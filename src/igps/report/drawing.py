@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
+from igps._progress import Progress
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
@@ -204,7 +204,7 @@ def ranked_results(
     figure = new_figure(1.25 * (top + 1), 1.45 * len(queries) + 0.6)
     axes = figure.subplots(len(queries), top + 1, squeeze=False)
     rows = zip(axes, queries, strict=True)
-    for row_axes, query in tqdm(
+    for row_axes, query in Progress(
         rows, desc="ranked results", total=len(queries), disable=not progress
     ):
         shown = [(query, f"query {query}", _QUERY)]

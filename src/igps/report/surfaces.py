@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
 from igps._parallel import run
+from igps._progress import Progress
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
 from igps.failures import Failed
@@ -99,7 +99,7 @@ def _made(
     names = list(bodies)
     surfaces: dict[str, PageSurface] = {}
     with contextlib.closing(run(make, list(bodies.values()), n_workers=n_workers)) as outcomes:
-        for number, outcome in tqdm(outcomes, total=len(names), desc="pictures"):
+        for number, outcome in Progress(outcomes, total=len(names), desc="pictures"):
             if isinstance(outcome, Failed):
                 logger.warning("%s: no picture: %s", names[number], outcome.reason)
             else:

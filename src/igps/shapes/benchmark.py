@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
 from igps._files import atomic_write
 from igps._parameters import check_at_least
+from igps._progress import Progress
 from igps.shapes.meshing import defect, mesh, roughen
 from igps.shapes.skeleton import pose
 from igps.shapes.templates import TEMPLATES
@@ -144,7 +144,7 @@ class ArticulatedShapes:
             n_vertices=self.n_vertices,
         )
         for index, name in enumerate(
-            tqdm(self.names, desc="shapes", unit="shape", disable=not progress)
+            Progress(self.names, desc="shapes", unit="shape", disable=not progress)
         ):
             path = folder / f"{name}.off"
             if not is_whole_off(path):

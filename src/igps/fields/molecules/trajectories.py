@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from igps._arrays import Floats
 from igps._files import atomic_write
+from igps._progress import Progress
 from igps.fields.molecules._gemmi import gemmi_module
 from igps.fields.molecules.residues import CHARGED_ATOMS, PHOSPHATES
 from igps.mesh.errors import MeshError
@@ -65,7 +65,7 @@ def write_frames(
     starts, ends, atoms = _columns(atoms)
     written = []
     n_digits = len(str(len(universe.trajectory)))
-    for frame in tqdm(universe.trajectory[::step], desc="frames"):
+    for frame in Progress(universe.trajectory[::step], desc="frames"):
         path = folder / f"frame_{frame.frame:0{n_digits}}.pqr"
         lines = [
             f"{start} {x:.3f} {y:.3f} {z:.3f} {end}\n"
