@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from igps.mesh.mesh import Mesh
-from igps.signature.measures import measures
+from igps.signature.measures import local_thickness, measures
 
 ROTATION = trimesh.transformations.euler_matrix(0.4, 1.1, -0.7)[:3, :3]
 
@@ -123,6 +123,13 @@ def test_measures_are_those_of_closed_forms_in_any_position(name):
     found = measures(moved)
     for measure in expected.keys() - {"hull"}:
         assert found[measure] == pytest.approx(expected[measure], rel=0.01), measure
+
+
+def test_no_ball_leaves_the_body_from_a_point_just_below_a_fine_surface() -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=5)
+    points = (1 - 1e-7) * sphere.triangles_center[::50]
+    found = local_thickness(Mesh(sphere.vertices, sphere.faces), points)
+    assert 1.9 < found.min() <= found.max() < 2.01
 
 
 def test_thickness_of_a_box_falls_towards_its_edges_as_its_closed_form():

@@ -14,12 +14,13 @@ from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats, Integers
 from igps._threads import one_thread
+from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, components, directed_edges, undirected_edges, unit
 from igps.signature.sampling import surface_points
 from igps.signature.voxels import interior_samples
 
-MEASURES_VERSION = 5
+MEASURES_VERSION = 6
 """Part of every cache key: raise it whenever the same mesh would give other numbers."""
 
 POWERS: Mapping[str, int] = {
@@ -60,9 +61,11 @@ _N_DIAMETER_STEPS = 3
 _N_THICKNESS_POINTS = 400
 _N_THICKNESS_STEPS = 16
 _LAST_STEP = 0.01
+_OPPOSITE = 0.05  # length of the sum of two unit vectors that are opposite to each other
 _LEAST_GROWTH = 1e-6  # more than rounding
-# Share of the largest radius at which a ball counts as one of the largest
+# Shares of the largest radius at which a ball counts as one of the largest, and as large
 _NEARLY_LARGEST = 0.995
+_LARGE = 0.9
 # Samples of the surface in which nearest points are looked for, over area³/volume², and their largest number: their
 # spacing is about a third of the thickness of a plate.
 _SAMPLES_PER_THICKNESS = 8
@@ -158,20 +161,24 @@ def local_thickness(mesh: Mesh, points: Floats) -> Floats:
     comes near, a centre turns and moves on between both. The thickness at a point is the largest diameter of all such
     balls that contain it.
     """
-    points = _even_selection(points)
     surface = _NearestPoints(mesh)
+    points = _even_selection(points)
+    points = points[surface.depths(points)[0] > 0]
+    if not len(points):
+        raise MeshError(
+            f"{mesh.name}: expected points inside the body, got none. Give it some thickness."
+        )
     centres = points.copy()
-    radii, away = surface.distances(centres)
-    heading = away.copy()
+    radii, away = surface.depths(centres)
+    heading = surface.inward(centres)
     step = np.maximum(radii, radii.max() - radii)
     moving = np.arange(len(points))
     for _ in range(_N_THICKNESS_STEPS):
         ahead = heading[moving]
         length = step[moving]
         moved = centres[moving] + length[:, None] * ahead
-        radius, new_away = surface.distances(moved)
+        radius, new_away = surface.depths(moved)
         growth = radius - radii[moving]
-        # No ball around a point outside of the body contains a point inside
         contains_point = np.linalg.norm(moved - points[moving], axis=1) <= radius
         is_larger = growth > _LEAST_GROWTH * radius
         grows = is_larger & contains_point
@@ -180,6 +187,14 @@ def local_thickness(mesh: Mesh, points: Floats) -> Floats:
         new_slope = _dots(new_away, ahead)
         level = (growth - length * new_slope) / np.maximum(slope - new_slope, 1e-9)
         shorter = np.where(is_larger, length / 2, np.clip(level, 0, length / 2))
+        # In the middle between two walls, a ball can only grow along both; of large ones, which decide the greatest
+        # thickness, this is tried
+        along = away[moving] + new_away
+        turns = ~is_larger & (shorter < _LAST_STEP * radii[moving])
+        turns &= radii[moving] > _LARGE * radii.max()
+        turns &= np.linalg.norm(along, axis=1) > _OPPOSITE
+        shorter[turns] = radii[moving][turns] / 2
+        heading[moving[turns]] = unit(along[turns])
         step[moving] = np.where(grows, radius / 2, shorter)
         grown = moving[grows]
         centres[grown] = moved[grows]
@@ -239,9 +254,17 @@ class _NearestPoints:
         # A row of a face times a point minus the first corner is the point's weight at the second or the third corner
         self._weights = np.stack([np.cross(second, normal), np.cross(normal, first)], axis=1)
         self._weights /= np.maximum(squares, np.finfo(float).tiny)[:, None]
+        self._normals = unit(normal)
 
-    def distances(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return the distances (P,) of points (P, 3), and unit vectors (P, 3) away from the surface."""
+    def inward(self, points: Floats) -> Floats:
+        """Return the inward normals (P, 3) of the faces near points (P, 3), of use where no sample is as near."""
+        return -self._normals[self._tree.query(points)[1]]
+
+    def depths(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return the distances (P,) of points (P, 3) from the surface, negative outside, and in which directions they grow.
+
+        Directions are unit vectors (P, 3), away from the nearest point of the surface or, outside, towards it.
+        """
         nearest = self._tree.query(points, _N_NEAREST)[1]
         corners = self._corners[nearest]
         offsets = points[:, None] - corners[:, :, 0]
@@ -256,7 +279,10 @@ class _NearestPoints:
         squared = np.einsum("pki,pki->pk", vectors, vectors)
         best = _first_largest(-squared)
         rows = np.arange(len(points))
-        return np.sqrt(squared[rows, best]), unit(vectors[rows, best])
+        away = vectors[rows, best]
+        normals = self._normals[nearest[rows, best % _N_NEAREST]]
+        side = np.where(_dots(away, normals) > 0, -1, 1)
+        return side * np.sqrt(squared[rows, best]), side[:, None] * unit(away)
 
 
 def _moments(mesh: Mesh) -> tuple[Floats, Floats, Floats]:
