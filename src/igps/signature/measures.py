@@ -261,9 +261,9 @@ class _NearestPoints:
         return -self._normals[self._tree.query(points)[1]]
 
     def depths(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return the distances (P,) of points (P, 3) from the surface, negative outside, and in which directions they grow.
+        """Return the distances (P,) of points (P, 3) from the surface, negative outside, and the directions of growth.
 
-        Directions are unit vectors (P, 3), away from the nearest point of the surface or, outside, towards it.
+        These are unit vectors (P, 3), away from the nearest point of the surface or, outside, towards it.
         """
         nearest = self._tree.query(points, _N_NEAREST)[1]
         corners = self._corners[nearest]
