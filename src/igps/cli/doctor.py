@@ -22,6 +22,7 @@ def doctor(
     time_limit: float | None = None,
     memory_limit: float | None = None,
     attribute: list[str] | None = None,
+    cache_dir: Path | None = None,
     **load: Any,
 ) -> Verdict:
     """Check each body of a folder: list its defects, how they are repaired, and the expected cost of its signature.
@@ -37,13 +38,15 @@ def doctor(
     from igps.analysis.doctor import examine
     from igps.cli.reading import limits_of
     from igps.data.attribute_sources import attribute_sources
+    from igps.data.cache import default_cache_dir
     from igps.data.sources import find_bodies
     from igps.report.tables import findings_table, write_rows
 
     reading = LoadOptions(**load)
     limits = limits_of(time_limit, memory_limit)
     attributes = attribute_sources(attribute or (), root)
-    bodies = find_bodies(root, reading, attributes=attributes.values())
+    cache = cache_dir or default_cache_dir()
+    bodies = find_bodies(root, reading, attributes=attributes.values(), cache_dir=cache)
     findings = examine(bodies, reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(findings))
     if out is not None:

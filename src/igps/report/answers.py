@@ -117,17 +117,19 @@ def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
 
 
 def outliers_figure(pictured: Sequence[tuple[Outlier, str, Mesh]]) -> Figure:
-    """Draw bodies with their scores, names and reasons, four in a row."""
+    """Draw bodies with their scores, names and reasons, four in a row; those of a class from the same side."""
     n_rows = -(-len(pictured) // 4)
     figure = new_figure(9, 2.6 * n_rows)
     all_axes = list(figure.subplots(n_rows, 4, squeeze=False).flat)
     for axes in all_axes:
         axes.set_axis_off()
     names = titles_of([name for _, name, _ in pictured])
+    first_of_class: dict[str, Mesh] = {}
     for axes, name, (outlier, _, mesh) in zip(all_axes, names, pictured, strict=False):
         small = thumbnail(mesh)
-        views, (vertices,) = common_views([small])
-        draw_view(axes, views[0], small, vertices, GREY)
+        like = first_of_class.setdefault(outlier.label, small)
+        views, bodies = common_views([small] if like is small else [like, small])
+        draw_view(axes, views[0], small, bodies[-1], GREY)
         title = "\n".join(wrap(f"{outlier.score:.1f}  {name}", 38) + wrap(outlier.reason, 38))
         axes.set_title(title, fontsize=6, color=_SIGNIFICANT if outlier.is_outlier else "#000000")
     return figure
