@@ -1,7 +1,7 @@
 """Identities: the content of files, the key of a Signature, and the keys of all that is made from it.
 
-The key of a Signature is the hash of everything that it depends on: the content of its files, the load options, the
-configuration, and the versions of mending, of the measures and of the algorithm. Whatever is made from a Signature (an
+The key of a Signature is the hash of everything that it depends on: the content of its files, the number of a label or
+the name of another body, the load options, the configuration, and the versions of mending, of the measures and of the algorithm. Whatever is made from a Signature (an
 attribute, a transformed Signature, a description) has the hash of that key and of its own parameters as key, see
 `derived_key`.
 """
