@@ -1,9 +1,9 @@
 """Identities: the content of files, the key of a Signature, and the keys of all that is made from it.
 
 The key of a Signature is the hash of everything that it depends on: the content of its files, the number of a label or
-the name of another body, the load options, the configuration, and the versions of mending, of the measures and of the algorithm. Whatever is made from a Signature (an
-attribute, a transformed Signature, a description) has the hash of that key and of its own parameters as key, see
-`derived_key`.
+the name of another body, the load options, the configuration, and the versions of mending, of the measures and of the
+algorithm. Whatever is made from a Signature (an attribute, a transformed Signature, a description) has the hash of that
+key and of its own parameters as key, see `derived_key`.
 """
 
 import hashlib
