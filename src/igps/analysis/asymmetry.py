@@ -134,7 +134,7 @@ def asymmetries(
     size_scores, _ = deviations_of(known_sizes, codes, "volume", n_per_subject)
     found = []
     for i, pair in enumerate(pairs):
-        scores = [None, None]
+        scores: list[float | None] = [None, None]
         if is_scored[i]:
             scores = [float(form_scores[i]), float(size_scores[i])]
         found.append(Asymmetry(pair, forms[i], float(sizes[i]), *scores))

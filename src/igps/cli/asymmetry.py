@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from igps._parameters import check_at_least
+
+if TYPE_CHECKING:
+    from igps.analysis.asymmetry import Pair
+    from igps.data.sources import Bodies
 
 
 def asymmetry(
@@ -36,19 +40,21 @@ def asymmetry(
 
     check_at_least(0, top=top)
 
-    def check(bodies: Any) -> None:
-        if not find_pairs(bodies):
+    def paired(bodies: Bodies) -> list[Pair]:
+        pairs = find_pairs(bodies)
+        if not pairs:
             raise ValueError(
                 f"{root}: no body has a partner on the other side by its name, as kidney_left has in kidney_right. "
                 "Name labels by --names."
             )
+        return pairs
 
     result = described(
-        Folder(root, check=check), descriptor, size="ignore", mirror="same", **reading
+        Folder(root, check=paired), descriptor, size="ignore", mirror="same", **reading
     )
     dataset = result.dataset
     names = dataset.bodies.names
-    pairs = find_pairs(dataset.bodies)
+    pairs = paired(dataset.bodies)  # without the bodies that could not be used
     volumes = np.array([signature.volume for signature in dataset.signatures()])
     borders = [border_of(notes) for notes in dataset.all_notes()]
     is_cut = [border is not None for border in borders]
