@@ -425,7 +425,7 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
     result = described(folder, descriptor, **describing)
     dataset = result.dataset
     assert folder.check is not None
-    labels = folder.check(dataset.bodies)  # without the bodies that could not be used
+    labels: Any = folder.check(dataset.bodies)  # without the bodies that could not be used
     _print_kinds(dataset, folder.body)
     form, attributes = split_attributes(result.descriptor)
     inner = without_head(form)

@@ -29,7 +29,7 @@ def border_notes(voxels: LabelVoxels, area: float, frame: Frame) -> tuple[str, .
     """Return a note if a label reaches the border of the image: sides, and share of the area of its surface."""
     axes = voxels.affine[:3, :3]
     is_first = voxels.low == 0
-    is_last = voxels.low + voxels.mask.shape == voxels.grid
+    is_last = np.equal(voxels.low + np.array(voxels.mask.shape), voxels.grid)
     sides = []
     cut_area = 0.0
     for axis in range(3):
