@@ -84,23 +84,21 @@ def test_the_odd_pair_comes_first_and_cut_ones_are_not_judged():
     assert (last.pair.subject, last.score) == ("s6.nii", None)
 
 
-def test_the_command_finds_the_subject_whose_kidney_lost_a_pole(tmp_path, monkeypatch, capsys):
+def test_the_command_finds_the_subject_whose_kidney_is_flat(tmp_path, monkeypatch, capsys):
     """Six subjects; a right kidney is the mirror image of the left one, but for a few percent of each axis."""
     x, y, z = np.indices((20, 20, 24)) - np.array([9.5, 9.5, 11.5]).reshape(3, 1, 1, 1)
     random = np.random.default_rng(0)
 
     def kidney(axes):
         a, b, c = axes * random.uniform(0.96, 1.04, 3)
-        ball = (x / 6 / a) ** 2 + (y / 7 / b) ** 2 + (z / 10 / c) ** 2 < 1
-        return ball & (np.hypot(x - 6 * a, y + 2) > 3.5)
+        twisted = x - y * z / 20
+        return (twisted / 6 / a) ** 2 + (y / 7 / b) ** 2 + (z / 10 / c) ** 2 < 1
 
     (folder := tmp_path / "subjects").mkdir()
     for subject in range(6):
         axes = random.uniform(0.95, 1.05, 3)
         left = kidney(axes)
-        right = kidney(axes)[::-1]
-        if subject == 4:
-            right = right & (z < 2)
+        right = kidney(axes * [1, 0.5 if subject == 4 else 1, 1])[::-1]
         labels = np.concatenate([right * 2, left * 3]).astype(np.uint8)
         nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), folder / f"s{subject}.nii.gz")
     words = ["--descriptor", "own_descriptors:small_interior", "--cache_dir", tmp_path / "cache"]
