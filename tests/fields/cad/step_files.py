@@ -61,13 +61,11 @@ def _placement(add, place, axis, reference):
 
 
 def _box(add, low, high):
-    corners = {
-        bits: tuple(high[i] if bits[i] else low[i] for i in range(3))
-        for bits in itertools.product((0, 1), repeat=3)
-    }
-    vertices = {
-        bits: add(f"VERTEX_POINT('',{_point(add, place)})") for bits, place in corners.items()
-    }
+    corners = {}
+    vertices = {}
+    for bits in itertools.product((0, 1), repeat=3):
+        corners[bits] = tuple(high[i] if bits[i] else low[i] for i in range(3))
+        vertices[bits] = add(f"VERTEX_POINT('',{_point(add, corners[bits])})")
     edges = {}
     for bits, axis in itertools.product(corners, range(3)):
         if not bits[axis]:
@@ -97,9 +95,8 @@ def _box(add, low, high):
         loop = add(f"EDGE_LOOP('',({','.join(oriented)}))")
         bound = add(f"FACE_OUTER_BOUND('',{loop},.T.)")
         outward = tuple((1.0 if side else -1.0) * (i == axis) for i in range(3))
-        plane = add(
-            f"PLANE('',{_placement(add, corners[ring[0]], outward, tuple(float(i == u) for i in range(3)))})"
-        )
+        sideways = tuple(float(i == u) for i in range(3))
+        plane = add(f"PLANE('',{_placement(add, corners[ring[0]], outward, sideways)})")
         faces.append(add(f"ADVANCED_FACE('',({bound}),{plane},.T.)"))
     shell = add(f"CLOSED_SHELL('',({','.join(faces)}))")
     return add(f"MANIFOLD_SOLID_BREP('',{shell})")

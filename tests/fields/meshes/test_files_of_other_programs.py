@@ -14,7 +14,6 @@ import trimesh
 from igps.fields.volumes.label_names import read_label_names
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import each_body, load_mesh
-from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 
 BOX = trimesh.creation.box((2, 3, 4))
@@ -39,9 +38,7 @@ def stl_text(name="box"):
     [
         stl_text().encode("utf-8-sig"),
         stl_text().encode("utf-16"),
-        stl_text("x" * 5000).encode(),
         stl_text("vertex 1 2 3").encode(),
-        stl_text("a facet of a vertex").encode(),
         stl_text().replace("\n", "\r\n").encode(),
         stl_text().replace("\n", " ").encode(),
     ],
@@ -61,7 +58,7 @@ def test_binary_stl_whose_header_reads_like_text(tmp_path):
 # OFF
 
 
-@pytest.mark.parametrize("word", ["OFF\n", "off\n", "Off ", "", "COFF\n", "# a comment\noff\n"])
+@pytest.mark.parametrize("word", ["Off ", "", "COFF\n", "# a comment\noff\n"])
 def test_off_with_its_word_in_any_case_or_without(word, tmp_path):
     text = BOX.export(file_type="off")
     assert text.startswith("OFF\n")
@@ -111,8 +108,7 @@ def ply(order, lists_first):
     return "\n".join(header).encode() + body
 
 
-@pytest.mark.parametrize("order", ["", "<", ">"])
-@pytest.mark.parametrize("lists_first", [False, True])
+@pytest.mark.parametrize(("order", "lists_first"), [("", True), ("<", False), (">", True)])
 def test_ply_with_lists_of_texture_coordinates(order, lists_first, tmp_path):
     (tmp_path / "box.ply").write_bytes(ply(order, lists_first))
     mesh = load_mesh(tmp_path / "box.ply")
@@ -150,9 +146,8 @@ def write_3mf(path, content, settings=None):
 
 
 def prusa(path, role, key="volume_type"):
-    content = model(
-        f'<object id="1" type="model">{mesh_xml(BOX, SMALL)}</object>', '<item objectid="1"/>'
-    )
+    both = f'<object id="1" type="model">{mesh_xml(BOX, SMALL)}</object>'
+    content = model(both, '<item objectid="1"/>')
     settings = (
         '<config><object id="1"><volume firstid="0" lastid="11"/><volume firstid="12" lastid="23">'
         f'<metadata type="volume" key="{key}" value="{role}"/></volume></object></config>'
@@ -183,10 +178,8 @@ def test_negative_parts_are_cut_away(tmp_path):
 
 def test_modifiers_and_supports_are_left_out(tmp_path):
     for path in (
-        prusa(tmp_path / "modifier.3mf", "ParameterModifier"),
         prusa(tmp_path / "blocker.3mf", "SupportBlocker"),
         prusa(tmp_path / "slic3r.3mf", "1", key="modifier"),
-        orca(tmp_path / "orca.3mf", "modifier_part"),
         orca(tmp_path / "enforcer.3mf", "support_enforcer"),
     ):
         mesh = load_mesh(path)
@@ -236,10 +229,9 @@ def glb(path, **changes):
     lines = np.array([0, 1, 1, 2], "<u4").tobytes()
     chunks = [points, *halves, lines]
     starts = np.cumsum([0, *map(len, chunks[:-1])]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": len(chunk)}
-        for start, chunk in zip(starts, chunks, strict=True)
-    ]
+    views = []
+    for start, chunk in zip(starts, chunks, strict=True):
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(chunk)})
     accessors = [{"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"}]
     for number, count in ((1, 18), (2, 18), (3, 4)):
         accessor = {"bufferView": number, "componentType": 5125, "count": count, "type": "SCALAR"}
@@ -270,12 +262,9 @@ def glb(path, **changes):
 
 def test_an_object_of_gltf_is_a_node_with_all_its_materials(tmp_path):
     path = glb(tmp_path / "box.glb")
-    for _ in range(3):
-        bodies = list(each_body(path, LoadOptions(bodies="objects")))
-        assert [ref.part for ref, _ in bodies] == ["part"]
-        (mesh,) = [body for _, body in bodies]
-        assert isinstance(mesh, Mesh)
-        assert mesh.volume == pytest.approx(VOLUME)
+    ((body, mesh),) = each_body(path, LoadOptions(bodies="objects"))
+    assert body.part == "part"
+    assert mesh.volume == pytest.approx(VOLUME)
 
 
 def test_two_nodes_of_one_mesh_are_two_objects(tmp_path):
@@ -285,18 +274,17 @@ def test_two_nodes_of_one_mesh_are_two_objects(tmp_path):
     names = sorted(str(ref.part) for ref, _ in bodies)
     assert len(set(names)) == 2
     for _, mesh in bodies:
-        assert isinstance(mesh, Mesh)
         assert mesh.volume == pytest.approx(VOLUME)
+
+
+INSTANCES = {"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}
 
 
 @pytest.mark.parametrize(
     ("changes", "cause"),
     [
         ({"nodes": [{"mesh": 0, "skin": 0}]}, "a skin deforms it"),
-        (
-            {"nodes": [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]},
-            "EXT_mesh_gpu_instancing copies parts",
-        ),
+        ({"nodes": [INSTANCES]}, "EXT_mesh_gpu_instancing copies parts"),
         ({"extensionsRequired": ["EXT_unheard_of"]}, "made with EXT_unheard_of"),
         ({"extensionsRequired": ["EXT_meshopt_compression"]}, "compressed by EXT_meshopt"),
     ],
@@ -309,14 +297,12 @@ def test_what_would_change_the_geometry_of_gltf_is_refused_by_name(changes, caus
 def test_morph_targets_are_refused_only_if_they_move_something(tmp_path):
     primitive = {"attributes": {"POSITION": 0}, "indices": 1, "targets": [{"POSITION": 0}]}
     other = {"attributes": {"POSITION": 0}, "indices": 2, "targets": [{"POSITION": 0}]}
-    for weights, is_moved in (([0.0], False), ([0.5], True)):
-        mesh = {"primitives": [primitive, other], "weights": weights}
-        path = glb(tmp_path / "box.glb", meshes=[mesh])
-        if is_moved:
-            with pytest.raises(MeshError, match="weights of morph targets"):
-                load_mesh(path)
-        else:
-            assert load_mesh(path).volume == pytest.approx(VOLUME)
+    mesh = {"primitives": [primitive, other], "weights": [0.0]}
+    still = glb(tmp_path / "still.glb", meshes=[mesh])
+    assert load_mesh(still).volume == pytest.approx(VOLUME)
+    moved = glb(tmp_path / "moved.glb", meshes=[mesh | {"weights": [0.5]}])
+    with pytest.raises(MeshError, match="weights of morph targets"):
+        load_mesh(moved)
 
 
 def test_materials_that_a_scene_requires_do_not_matter(tmp_path):
@@ -410,7 +396,7 @@ def block():
 
 @pytest.mark.parametrize(
     ("unit", "millimetres"),
-    [("Microns", 1e-3), ("nanometer", 1e-6), ("millimetre", 1.0), ("cm", 10.0), ("Meter", 1e3)],
+    [("Microns", 1e-3), ("millimetre", 1.0), ("Meter", 1e3)],
 )
 def test_units_of_nrrd_as_they_are_written(unit, millimetres, tmp_path):
     header = (
@@ -456,7 +442,7 @@ def test_geometries_that_agree_are_not_mentioned(tmp_path):
 
 
 @pytest.mark.parametrize("ome", [True, False])
-@pytest.mark.parametrize("share", [0.001, 0.01, 0.03, 0.2])
+@pytest.mark.parametrize("share", [0.001, 0.03, 0.2])
 def test_a_tiff_that_is_cut_short_is_refused(ome, share, tmp_path):
     sides = {f"PhysicalSize{axis}": 0.5 for axis in "XYZ"}
     imagej = {"axes": "ZYX", "spacing": 0.5, "unit": "um"}
@@ -536,15 +522,12 @@ def test_a_file_that_lost_its_cells_is_no_cloud_of_points(name, tmp_path):
 
 def test_a_byte_order_that_damage_has_changed_is_refused(tmp_path):
     points = np.zeros((3, 3), np.float32)
-    mesh = nibabel.GiftiImage(
-        darrays=[
-            nibabel.gifti.GiftiDataArray(points, "NIFTI_INTENT_POINTSET", "NIFTI_TYPE_FLOAT32"),
-            nibabel.gifti.GiftiDataArray(
-                np.array([[0, 1, 2]], np.int32), "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32"
-            ),
-        ]
+    faces = np.array([[0, 1, 2]], np.int32)
+    array = nibabel.gifti.GiftiDataArray
+    arrays = [array(points, "NIFTI_INTENT_POINTSET"), array(faces, "NIFTI_INTENT_TRIANGLE")]
+    content = (
+        nibabel.GiftiImage(darrays=arrays).to_xml().replace(b'"LittleEndian"', b'"LitLittleEndian"')
     )
-    content = mesh.to_xml().replace(b'"LittleEndian"', b'"LitLittleEndian"')
     (tmp_path / "ball.gii").write_bytes(content)
     with pytest.raises(MeshError, match=r"byte order .*, got 'LitLittleEndian'"):
         load_mesh(tmp_path / "ball.gii")
@@ -565,6 +548,5 @@ def test_volumes_without_a_spacing_have_no_unit(name, header, tmp_path):
     mask[2:6, 2:6, 2:6] = 1
     (tmp_path / name).write_bytes(header.encode() + mask.tobytes())
     ((_, mesh),) = each_body(tmp_path / name)
-    assert isinstance(mesh, Mesh)
     assert mesh.unit is None
     assert any(note.endswith("voxels were taken as 1 × 1 × 1") for note in mesh.notes)

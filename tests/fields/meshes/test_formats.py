@@ -22,9 +22,8 @@ from igps.mesh.options import LoadOptions
 
 BALL = trimesh.creation.icosphere(subdivisions=2)
 # Exactly representable in single precision; no two faces and no two vertices are alike.
-VERTICES = np.asarray(
-    BALL.vertices * [1, 0.8, 1.3] + 0.1 * BALL.vertices**2, dtype=np.float32
-).astype(np.float64)
+PLACES = BALL.vertices * [1, 0.8, 1.3] + 0.1 * BALL.vertices**2
+VERTICES = np.asarray(PLACES, dtype=np.float32).astype(np.float64)
 FACES = np.asarray(BALL.faces, dtype=np.int64)
 
 
@@ -46,12 +45,8 @@ def relative_obj():
 def polydata(version):
     head = f"# vtk DataFile Version {version}\na ball\nASCII\nDATASET POLYDATA\nPOINTS {len(VERTICES)} double\n"
     if version < "5":
-        return (
-            head
-            + lines(VERTICES)
-            + f"POLYGONS {len(FACES)} {4 * len(FACES)}\n"
-            + lines(FACES, "3 ")
-        )
+        cells = f"POLYGONS {len(FACES)} {4 * len(FACES)}\n"
+        return head + lines(VERTICES) + cells + lines(FACES, "3 ")
     offsets = " ".join(map(str, range(0, 3 * len(FACES) + 1, 3)))
     cells = f"POLYGONS {len(FACES) + 1} {3 * len(FACES)}\nOFFSETS vtktypeint64\n{offsets}\nCONNECTIVITY vtktypeint64\n"
     return head + lines(VERTICES) + cells + lines(FACES) + f"CELL_DATA {len(FACES)}\n"
@@ -60,12 +55,8 @@ def polydata(version):
 def binary_polydata():
     head = f"# vtk DataFile Version 3.0\na ball\nBINARY\nDATASET POLYDATA\nPOINTS {len(VERTICES)} float\n".encode()
     cells = np.column_stack([np.full(len(FACES), 3), FACES]).astype(">i4").tobytes()
-    return (
-        head
-        + VERTICES.astype(">f4").tobytes()
-        + f"\nPOLYGONS {len(FACES)} {4 * len(FACES)}\n".encode()
-        + cells
-    )
+    counts = f"\nPOLYGONS {len(FACES)} {4 * len(FACES)}\n".encode()
+    return head + VERTICES.astype(">f4").tobytes() + counts + cells
 
 
 def polydata_of_vtk_9():
@@ -73,17 +64,9 @@ def polydata_of_vtk_9():
     head = f"# vtk DataFile Version 5.1\nvtk output\nBINARY\nDATASET POLYDATA\nPOINTS {len(VERTICES)} float\n".encode()
     notes = b"\nMETADATA\nCOMPONENT_NAMES\nPOLYGONS\ny\nz\nINFORMATION 0\n\n"
     cells = f"POLYGONS {len(FACES) + 1} {3 * len(FACES)}\nOFFSETS vtktypeint64\n".encode()
-    cells += (
-        np.arange(0, 3 * len(FACES) + 1, 3).astype(">i8").tobytes() + b"\nCONNECTIVITY vtkIdType\n"
-    )
-    return (
-        head
-        + VERTICES.astype(">f4").tobytes()
-        + notes
-        + cells
-        + FACES.astype(">i4").tobytes()
-        + b"\n"
-    )
+    cells += np.arange(0, 3 * len(FACES) + 1, 3).astype(">i8").tobytes()
+    cells += b"\nCONNECTIVITY vtkIdType\n" + FACES.astype(">i4").tobytes() + b"\n"
+    return head + VERTICES.astype(">f4").tobytes() + notes + cells
 
 
 def polydata_of_windows():
@@ -113,22 +96,17 @@ def vtp(form):
         appended += np.uint32(array.nbytes).tobytes() + array.tobytes()
     points, connectivity, offsets = (text + "</DataArray>" for text in written.values())
     body = f"<PolyData><Piece><Points>{points}</Points><Polys>{connectivity}{offsets}</Polys></Piece></PolyData>"
-    tail = (
-        b""
-        if form == "ascii"
-        else b'<AppendedData encoding="raw">\n_' + appended + b"\n</AppendedData>"
-    )
+    tail = b""
+    if form != "ascii":
+        tail = b'<AppendedData encoding="raw">\n_' + appended + b"\n</AppendedData>"
     head = '<?xml version="1.0"?><VTKFile type="PolyData" byte_order="LittleEndian">'
     return (head + body).encode() + tail + b"</VTKFile>"
 
 
 def gifti(path, encoding):
-    points = nibabel.gifti.GiftiDataArray(
-        VERTICES.astype("f4"), "NIFTI_INTENT_POINTSET", encoding=encoding
-    )
-    triangles = nibabel.gifti.GiftiDataArray(
-        FACES.astype("i4"), "NIFTI_INTENT_TRIANGLE", encoding=encoding
-    )
+    array = nibabel.gifti.GiftiDataArray
+    points = array(VERTICES.astype("f4"), "NIFTI_INTENT_POINTSET", encoding=encoding)
+    triangles = array(FACES.astype("i4"), "NIFTI_INTENT_TRIANGLE", encoding=encoding)
     nibabel.save(nibabel.gifti.GiftiImage(darrays=[points, triangles]), path)
 
 
@@ -151,14 +129,12 @@ def strips_ply(order):
     head += (
         "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
     )
-    row = np.concatenate(
-        [[4 * len(FACES)], np.column_stack([FACES, np.full(len(FACES), -1)]).ravel()]
-    )
+    strips = np.column_stack([FACES, np.full(len(FACES), -1)])
+    row = np.concatenate([[4 * len(FACES)], strips.ravel()])
     if not order:
         return (head + lines(VERTICES) + lines(row[None])).encode()
-    return (
-        head.encode() + VERTICES.astype(f"{order}f4").tobytes() + row.astype(f"{order}i4").tobytes()
-    )
+    places = VERTICES.astype(f"{order}f4").tobytes()
+    return head.encode() + places + row.astype(f"{order}i4").tobytes()
 
 
 SOLID = trimesh.Trimesh(VERTICES, FACES, process=False)
@@ -194,19 +170,15 @@ WRITERS = {
     "one.tar.gz": tarred,
     "one.off.gz": lambda path: path.write_bytes(gzip.compress(off().encode())),
 }
+CONFIG = SignatureConfig(n_eigenpairs=10, min_samples=100)
 UNITS = {".glb": "m", ".3mf": "mm", ".gii": "mm", ".pial": "mm"}
 
 
 def numbers(signature):
     inside = signature.interior
     outside = signature.surface
-    arrays = (
-        signature.eigenvalues,
-        inside.points,
-        inside.eigenfunctions,
-        outside.points,
-        outside.eigenfunctions,
-    )
+    arrays = [signature.eigenvalues, inside.points, inside.eigenfunctions]
+    arrays += [outside.points, outside.eigenfunctions]
     return b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
 
 
@@ -214,9 +186,7 @@ def numbers(signature):
 def expected(tmp_path_factory):
     path = tmp_path_factory.mktemp("plain") / "plain.off"
     path.write_text(off())
-    return numbers(
-        compute_signature(load_mesh(path), SignatureConfig(n_eigenpairs=10, min_samples=100))
-    )
+    return numbers(compute_signature(load_mesh(path), CONFIG))
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
@@ -227,10 +197,7 @@ def test_every_format_gives_the_same_signature_to_the_byte(name, tmp_path, expec
     assert len(mesh.vertices) == len(VERTICES)
     assert mesh.notes == ()
     assert mesh.unit == UNITS.get(Path(name).suffix)
-    assert (
-        numbers(compute_signature(mesh, SignatureConfig(n_eigenpairs=10, min_samples=100)))
-        == expected
-    )
+    assert numbers(compute_signature(mesh, CONFIG)) == expected
 
 
 def test_a_binary_stl_with_a_wrong_count_gives_what_is_there(tmp_path):
@@ -263,9 +230,7 @@ def test_volumes_of_cells_give_the_surface_around_them(tmp_path):
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     cube = np.vstack([square, square + np.array([0, 0, 1])])
     twice = np.vstack([cube, square + np.array([0, 0, 2])])
-    hexahedra = meshio.Mesh(
-        twice, [("hexahedron", [[0, 1, 2, 3, 4, 5, 6, 7], [4, 5, 6, 7, 8, 9, 10, 11]])]
-    )
+    hexahedra = meshio.Mesh(twice, [("hexahedron", [[*range(8)], [*range(4, 12)]])])
     wedges = meshio.Mesh(cube, [("wedge", [[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]])])
     tips = np.vstack([square, [[0.5, 0.5, 1], [0.5, 0.5, -1]]])
     pyramids = meshio.Mesh(tips, [("pyramid", [[0, 1, 2, 3, 4], [0, 3, 2, 1, 5]])])
@@ -391,10 +356,8 @@ def test_arrays_in_one_place_count_as_often_as_they_are_named(tmp_path):
     head, piece, tail = re.split(rb"(<Piece>.*</Piece>)", vtp("raw"), maxsplit=1)
     (tmp_path / "a.vtp").write_bytes(head + 20 * piece + tail)
     once = 12 * len(VERTICES) + 32 * len(FACES)
-    assert (
-        len(list_bodies(tmp_path / "a.vtp", LoadOptions(bodies="objects", max_unpacked=20 * once)))
-        == 20
-    )
+    options = LoadOptions(bodies="objects", max_unpacked=20 * once)
+    assert len(list_bodies(tmp_path / "a.vtp", options)) == 20
     with pytest.raises(MeshError, match=r"a\.vtp: unpacks to .*max_unpacked="):
         load_mesh(tmp_path / "a.vtp", LoadOptions(max_unpacked=10 * once))
 
@@ -433,17 +396,12 @@ def ply_of(vertices, faces, order=""):
     head += "property uchar red\nend_header\n"
     if not order:
         rows = "".join(" ".join(map(str, row)) + " 9\n" for row in vertices.tolist())
-        return (
-            head + rows + "".join(f"5 {len(row)} {' '.join(map(str, row))} 9\n" for row in faces)
-        ).encode()
+        polygons = "".join(f"5 {len(row)} {' '.join(map(str, row))} 9\n" for row in faces)
+        return (head + rows + polygons).encode()
     body = b"".join(np.array(row, f"{order}f4").tobytes() + b"\x09" for row in vertices)
     for row in faces:
-        body += (
-            np.array(5, f"{order}i2").tobytes()
-            + bytes([len(row)])
-            + np.array(row, f"{order}i4").tobytes()
-            + b"\x09"
-        )
+        body += np.array(5, f"{order}i2").tobytes() + bytes([len(row)])
+        body += np.array(row, f"{order}i4").tobytes() + b"\x09"
     return head.encode() + body
 
 
@@ -483,24 +441,13 @@ def test_concave_polygons_of_any_format_do_not_fold(name, tmp_path):
         load_mesh(tmp_path / name)
 
 
-@pytest.mark.parametrize("n_corners", [3, 4])
-def test_triangles_and_squares_are_what_trimesh_makes_of_them(n_corners, tmp_path):
-    ball = trimesh.creation.icosphere(subdivisions=1)
-    quads = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
-    cube = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
-    vertices, faces = (
-        (cube, quads)
-        if n_corners == 4
-        else (ball.vertices.astype("f4").astype(float), ball.faces.tolist())
-    )
-    places = "".join(" ".join(map(repr, row)) + "\n" for row in vertices.tolist())
-    (tmp_path / "one.off").write_text(
-        f"OFF\n{len(vertices)} {len(faces)} 0\n{places}{text_of(faces)}"
-    )
-    for order in ("", "<", ">"):
-        (tmp_path / f"one{'t<>'.find(order or 't')}.ply").write_bytes(
-            ply_of(vertices, faces, order)
-        )
+def test_squares_are_what_trimesh_makes_of_them(tmp_path):
+    faces = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    vertices = np.concatenate([square, square + np.array([0, 0, 1])])
+    (tmp_path / "one.off").write_text(f"OFF\n8 6 0\n{lines(vertices)}{text_of(faces)}")
+    for name, order in (("text", ""), ("little", "<"), ("big", ">")):
+        (tmp_path / f"{name}.ply").write_bytes(ply_of(vertices, faces, order))
     for path in tmp_path.iterdir():
         found = load_mesh(path)
         expected = trimesh.load(path, process=False)

@@ -12,10 +12,8 @@ def molecule(positions, radii):
     positions = np.atleast_2d(np.asarray(positions, dtype=float))
     radii = np.atleast_1d(np.asarray(radii, dtype=float))
     n = len(radii)
-    names = tuple("X" * n)
-    return Molecule(
-        "balls", positions, radii, np.zeros(n), np.arange(n), names, positions, np.zeros(n)
-    )
+    none = np.zeros(n)
+    return Molecule("balls", positions, radii, none, np.arange(n), ("X",) * n, positions, none)
 
 
 def ball(r):
@@ -51,15 +49,17 @@ def saddle(r, s, apart, probe):
     from_second = (apart - x) * s / b
     ends = -math.asin((x - from_first) / probe), math.asin((apart - x - from_second) / probe)
     cusp = math.acos(radius / probe) if radius < probe else 0.0
+
+    def width(t):
+        return radius - probe * math.cos(t)
+
+    def slice_of(t):
+        return width(t) ** 2 * probe * math.cos(t)
+
     area = volume = 0.0
     for low, high in ((ends[0], -cusp), (cusp, ends[1])):
-        area += 2 * math.pi * probe * quad(lambda t: radius - probe * math.cos(t), low, high)[0]
-        volume += (
-            math.pi
-            * quad(lambda t: (radius - probe * math.cos(t)) ** 2 * probe * math.cos(t), low, high)[
-                0
-            ]
-        )
+        area += 2 * math.pi * probe * quad(width, low, high)[0]
+        volume += math.pi * quad(slice_of, low, high)[0]
     return area, volume, from_first, from_second
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from igps.cli import main
+from commands import run
 from igps.fields.molecules.bodies import molecule_of
 from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.fields.molecules.residues import VOLUMES
@@ -73,9 +73,8 @@ def backbone(atoms=4):
 
 
 def test_atoms_have_the_radii_of_their_elements(tmp_path):
-    (molecule,) = read_molecule(
-        written(tmp_path, residue(1) + residue(2, "MET", [*ALANINE, *SULFUR]))
-    )
+    text = residue(1) + residue(2, "MET", [*ALANINE, *SULFUR])
+    (molecule,) = read_molecule(written(tmp_path, text))
     # Bondi 1964
     found = molecule.radii[:5]
     expected = [1.55, 1.70, 1.70, 1.52, 1.70]
@@ -116,9 +115,8 @@ def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path):
 
     blocks = []
     for name, n_residues in (("one", 1), ("chainless", 2)):
-        structure = gemmi.read_pdb_string(
-            "".join(residue(i) for i in range(1, n_residues + 1)) + "END\n"
-        )
+        text = "".join(residue(i) for i in range(1, n_residues + 1))
+        structure = gemmi.read_pdb_string(text + "END\n")
         structure.name = name
         structure.setup_entities()
         blocks.append(structure.make_mmcif_document().as_string())
@@ -126,10 +124,8 @@ def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path):
     found = read_molecule(path)
     assert [one.name for one in found] == [f"{path}#one chain A", f"{path}#chainless chain A"]
     assert [len(one.radii) for one in found] == [5, 10]
-    assert [one.name for one in read_molecule(path, "models")] == [
-        f"{path}#one",
-        f"{path}#chainless",
-    ]
+    models = read_molecule(path, "models")
+    assert [one.name for one in models] == [f"{path}#one", f"{path}#chainless"]
     for part, n_residues in (("chainless chain A", 2), ("chainless", 2), ("one", 1)):
         assert len(molecule_of(BodyRef(path, part)).residue_names) == n_residues
 
@@ -153,41 +149,23 @@ def test_long_numbers_of_a_pqr_file_leave_no_blank_before_them(tmp_path):
     rows += "HETATM10000  O   HOH B1001       9.000   2.000   3.000 -0.8000 1.6000\n"
     rows += "HETATM10001  CA  ALA B1002A     12.000   2.000   3.000  0.2000 1.9000\n"
     one, other = read_molecule(written(tmp_path, rows, "made.pqr"))
-    assert [one.name[-7:], one.residue_names, one.radii.round(2).tolist()] == [
-        "chain A",
-        ("ALA",),
-        [1.85],
-    ]
-    assert [other.name[-7:], other.residue_names, other.radii.round(2).tolist()] == [
-        "chain B",
-        ("ALA",),
-        [1.9],
-    ]
+    for molecule, chain, radius in ((one, "A", 1.85), (other, "B", 1.9)):
+        assert molecule.name.endswith(f"chain {chain}")
+        assert molecule.residue_names == ("ALA",)
+        assert molecule.radii == pytest.approx([radius])
     fused = written(tmp_path, "ATOM 1 HG11VAL A 1 0.0 0.0 0.0 -0.30 1.85\n", "fused.pqr")
-    with pytest.raises(
-        MeshError,
-        match=r"fused\.pqr: line 1 is no atom .* Write it again, with blanks between fields",
-    ):
+    words = r"fused\.pqr: line 1 is no atom .* Write it again, with blanks between fields"
+    with pytest.raises(MeshError, match=words):
         read_molecule(fused)
 
 
 def test_charges_are_those_of_residues_at_ph_7(tmp_path):
-    names = {
-        "ASP": "OD1 OD2",
-        "GLU": "OE1 OE2",
-        "LYS": "NZ",
-        "ARG": "NH1 NH2",
-        "HIS": "ND1 NE2",
-        "SER": "OG",
-        "DA": "OP1",
-    }
-    side = {
-        name: [(atom, 3.0 + i, -2.0) for i, atom in enumerate(atoms.split())]
-        for name, atoms in names.items()
-    }
-    text = "".join(
-        residue(i, name, [*ALANINE, *side[name]]) for i, name in enumerate(names, start=1)
-    )
+    names = {"ASP": "OD1 OD2", "GLU": "OE1 OE2", "LYS": "NZ", "ARG": "NH1 NH2"}
+    names |= {"HIS": "ND1 NE2", "SER": "OG", "DA": "OP1"}
+    text = ""
+    for number, (name, atoms) in enumerate(names.items(), start=1):
+        side = [(atom, 3.0 + i, -2.0) for i, atom in enumerate(atoms.split())]
+        text += residue(number, name, [*ALANINE, *side])
     (molecule,) = read_molecule(written(tmp_path, text))
     sums = np.bincount(molecule.residue_of, molecule.charges)
     expected = [-1, -1, 1, 1, 0.1, 0, -0.5]
@@ -195,11 +173,8 @@ def test_charges_are_those_of_residues_at_ph_7(tmp_path):
 
 
 def test_models_and_chains_are_bodies_of_their_own(tmp_path):
-    models = "".join(
-        f"MODEL     {i:>4}\n{residue(1)}{residue(2)}TER\n{residue(1, chain='B')}ENDMDL\n"
-        for i in range(1, 21)
-    )
-    path = written(tmp_path, models)
+    model = f"{residue(1)}{residue(2)}TER\n{residue(1, chain='B')}ENDMDL\n"
+    path = written(tmp_path, "".join(f"MODEL     {i:>4}\n{model}" for i in range(1, 21)))
     of_models = read_molecule(path, "models")
     assert [len(molecule.radii) for molecule in of_models] == [15] * 20
     assert of_models[19].name == f"{path}#model 20"
@@ -236,9 +211,8 @@ def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_pa
     )
     text = f"REMARK 350 BIOMOLECULE: 1\nREMARK 350 APPLY THE FOLLOWING TO CHAINS: A, Q\n{rows}"
     path = written(tmp_path, text + residue(1))
-    with pytest.raises(
-        MeshError, match=r"made\.pdb: assembly 1 cannot be made .*no chain Q.*bodies"
-    ):
+    words = r"made\.pdb: assembly 1 cannot be made .*no chain Q.*bodies"
+    with pytest.raises(MeshError, match=words):
         read_molecule(path, "assembly")
 
 
@@ -260,24 +234,13 @@ def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path):
     """A nucleotide whose name gemmi does not know, by the sequence that the file lists; else TER may mean anything."""
     import gemmi
 
-    sugar = [
-        ("P", 0.0, 0.0),
-        ("O5'", 1.5, 0.0),
-        ("C5'", 2.2, 1.2),
-        ("C1'", 3.0, 2.0),
-        ("N9", 4.0, 2.0),
-    ]
-    chain = (
-        residue(1, "A", sugar)
-        + residue(2, "QQQ", sugar, record="HETATM")
-        + residue(3, "U", sugar)
-        + "TER\n"
-    )
-    atoms = (
-        chain
-        + residue(4, "QQX", sugar, record="HETATM")
-        + residue(5, "NH2", [("N", 9.0, 9.0)], record="HETATM")
-    )
+    names = ("P", "O5'", "C5'", "C1'", "N9")
+    sugar = [(name, 1.5 * i, 0.0) for i, name in enumerate(names)]
+    unknown = residue(2, "QQQ", sugar, record="HETATM")
+    chain = residue(1, "A", sugar) + unknown + residue(3, "U", sugar) + "TER\n"
+    ligands = residue(4, "QQX", sugar, record="HETATM")
+    ligands += residue(5, "NH2", [("N", 9.0, 9.0)], record="HETATM")
+    atoms = chain + ligands
     listed = written(tmp_path, "SEQRES   1 A    3    A QQQ   U\n" + atoms, "listed.pdb")
     structure = gemmi.read_structure(str(listed))
     structure.setup_entities()
@@ -289,12 +252,8 @@ def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path):
 
 def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path):
     water = [("OW", 9.0, 9.0), ("HW1", 9.5, 9.0), ("HW2", 9.0, 9.5), ("MW", 9.1, 9.1)]
-    text = (
-        residue(1)
-        + residue(2, "SOL", water)
-        + residue(3, "SOD", [("NA", 9.0, 0.0)])
-        + residue(4, "QQQ")
-    )
+    ion = residue(3, "SOD", [("NA", 9.0, 0.0)])
+    text = residue(1) + residue(2, "SOL", water) + ion + residue(4, "QQQ")
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.residue_names == ("ALA", "QQQ")
 
@@ -306,11 +265,8 @@ def test_hydrogens_are_left_out_unless_asked_for(tmp_path):
 
 
 def test_a_backbone_gets_balls_of_its_side_chains(tmp_path):
-    text = (
-        residue(1, "LEU", backbone())
-        + residue(2, "GLY", backbone())
-        + residue(3, "LYS", backbone())
-    )
+    names = ("LEU", "GLY", "LYS")
+    text = "".join(residue(i, name, backbone()) for i, name in enumerate(names, start=1))
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.notes == (COMPLETED.format(2),)
     found = np.bincount(molecule.residue_of).tolist()
@@ -390,28 +346,20 @@ def test_a_trace_has_balls_of_its_residues(tmp_path):
 
 
 def test_of_alternatives_the_most_occupied_is_taken(tmp_path):
-    atoms = [
-        Atom(5, "CB", 2, -0.8, 3.8, alternative="A", occupancy=0.4).line(),
-        Atom(6, "CB", 2, -0.9, 3.8, alternative="B", occupancy=0.6).line(),
-    ]
-    kinds = residue(2, "GLY", backbone(), alternative="A", occupancy=0.3) + residue(
-        2, alternative="B", occupancy=0.7
-    )
-    (molecule,) = read_molecule(
-        written(tmp_path, residue(1, atoms=backbone()) + "".join(atoms) + kinds)
-    )
+    text = residue(1, atoms=backbone())
+    text += Atom(5, "CB", 2, -0.8, 3.8, alternative="A", occupancy=0.4).line()
+    text += Atom(6, "CB", 2, -0.9, 3.8, alternative="B", occupancy=0.6).line()
+    text += residue(2, "GLY", backbone(), alternative="A", occupancy=0.3)
+    text += residue(2, alternative="B", occupancy=0.7)
+    (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.positions[4, 1] == pytest.approx(-0.9)
     assert molecule.residue_names == ("ALA", "ALA")
     assert molecule.notes == ("2 alternative locations: the one of the highest occupancy was used",)
 
 
 def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path):
-    text = (
-        residue(1, place="  -5 ")
-        + residue(2, place="  -5A")
-        + residue(3, "GLY", backbone())
-        + residue(4, place="   3 ")
-    )
+    text = residue(1, place="  -5 ") + residue(2, place="  -5A")
+    text += residue(3, "GLY", backbone()) + residue(4, place="   3 ")
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.residue_names == ("ALA", "ALA", "GLY", "ALA")
     assert len(molecule.radii) == 19
@@ -440,11 +388,8 @@ def test_atoms_without_a_position_are_left_out_not_put_at_the_origin(tmp_path):
 
 
 def test_a_chain_without_atoms_costs_no_other_chain(tmp_path, caplog):
-    lost = (
-        Atom(1, "N", 0, 0, 0, chain="B")
-        .line()
-        .replace("   0.000   0.000   0.000", "     nan     nan     nan")
-    )
+    lost = Atom(1, "N", 0, 0, 0, chain="B").line()
+    lost = lost.replace("   0.000   0.000   0.000", "     nan     nan     nan")
     path = written(tmp_path, residue(1) + lost)
     with caplog.at_level(logging.WARNING):
         (molecule,) = read_molecule(path)
@@ -462,23 +407,20 @@ def test_a_surface_that_fails_in_any_way_costs_no_other_chain(tmp_path, monkeypa
 
     monkeypatch.setattr("igps.fields.molecules.bodies.molecular_surface", faulty)
     found = {body.part: mesh for body, mesh in each_body(path)}
-    assert [name for name, mesh in found.items() if isinstance(mesh, Mesh)] == [
-        "chain A",
-        "chain C",
-    ]
-    assert str(found["chain B"]).startswith(
-        f"{path}#chain B: not readable as a structure (ValueError: "
-    )
+    assert isinstance(found["chain A"], Mesh)
+    assert isinstance(found["chain C"], Mesh)
+    told = f"{path}#chain B: not readable as a structure (ValueError: "
+    assert str(found["chain B"]).startswith(told)
 
 
 def test_b_factors_are_means_over_residues(tmp_path):
-    text = (
-        Atom(1, "N", 0, 0, 0, b=10).line()
-        + Atom(2, "CA", 1, 0, 0, b=30).line()
-        + residue(2, b=70.0)
-    )
+    text = Atom(1, "N", 0, 0, 0, b=10).line() + Atom(2, "CA", 1, 0, 0, b=30).line()
+    text += residue(2, b=70.0)
     found = read_molecule(written(tmp_path, text))[0].b_factors.tolist()
     assert found == [20.0, 70.0]
+
+
+PQR_LINE = "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\n"
 
 
 @pytest.mark.parametrize(
@@ -486,11 +428,7 @@ def test_b_factors_are_means_over_residues(tmp_path):
     [
         ("cut.pdb", residue(1) + "ATOM      6  N   ALA A   2      11.1", "cut short"),
         ("cut.cif", "data_x\nloop_\n_atom_site.id\n_atom_site.Cartn_x\n1 2\n3\n", "cut short"),
-        (
-            "cut.pqr",
-            "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\nATOM 2 CA ALA A 1 0.0",
-            "line 2 .*cut short",
-        ),
+        ("cut.pqr", f"{PQR_LINE}ATOM 2 CA ALA A 1 0.0", "line 2 .*cut short"),
         ("negative.pqr", "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 -1.85\n", "radius of at least 0"),
         ("empty.pdb", "  \n", "the file is empty"),
         ("words.pdb", "no structure at all\n", "no atoms of a molecule"),
@@ -524,48 +462,36 @@ def test_b_factors_that_a_file_lacks_are_unknown(tmp_path):
     whole = residue(1)
     cut = "".join(f"{row[:54]}\n" for row in whole.splitlines())
     blank = "".join(f"{row[:60]}      {row[66:]}\n" for row in whole.splitlines())
-    columns = [
-        "group_PDB",
-        "type_symbol",
-        "label_atom_id",
-        "label_alt_id",
-        "label_comp_id",
-        "label_asym_id",
-        "label_seq_id",
-    ]
-    columns += ["id", "Cartn_x", "Cartn_y", "Cartn_z"]
+    columns = "group_PDB type_symbol label_atom_id label_alt_id label_comp_id label_asym_id"
+    columns = f"{columns} label_seq_id id Cartn_x Cartn_y Cartn_z".split()
     row = "ATOM C CA . ALA A 1 1 0.0 0.0 0.0"
     loop = "data_made\nloop_\n" + "".join(f"_atom_site.{name}\n" for name in columns)
-    pairs = "data_made\n" + "".join(
-        f"_atom_site.{name} {value}\n" for name, value in zip(columns, row.split(), strict=True)
-    )
+    pairs = "data_made\n"
+    for name, value in zip(columns, row.split(), strict=True):
+        pairs += f"_atom_site.{name} {value}\n"
     known = loop + "_atom_site.B_iso_or_equiv\n" + row
     texts = {"cut.pdb": cut, "blank.pdb": blank, "loop.cif": f"{loop}{row}\n", "pairs.cif": pairs}
     texts["asked.cif"] = f"{known} ?\n"
     for name, text in texts.items():
         (molecule,) = read_molecule(written(tmp_path, text, name))
         assert np.isnan(molecule.b_factors).all(), name
-    assert read_molecule(written(tmp_path, f"{known} 7\n", "known.cif"))[0].b_factors.tolist() == [
-        7
-    ]
+    (molecule,) = read_molecule(written(tmp_path, f"{known} 7\n", "known.cif"))
+    assert molecule.b_factors.tolist() == [7]
+    lacking = pairs.replace("_atom_site.label_alt_id .\n", "")
     with pytest.raises(MeshError, match="no label_alt_id"):
-        read_molecule(
-            written(tmp_path, pairs.replace("_atom_site.label_alt_id .\n", ""), "lacking.cif")
-        )
+        read_molecule(written(tmp_path, lacking, "lacking.cif"))
 
 
 def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path):
     names = ["N", "CA", "C", "O", "CB", "CG", "CD", "OE", "NE", "HG"]
     atoms = [(name, float(i), 0.0) for i, name in enumerate(names)]
-    rows = [
-        f"{row[:12]}{row[12:16].strip():<4}{row[16:66]}"
-        for row in residue(1, "GLN", atoms).splitlines()
-    ]
-    (molecule,) = read_molecule(written(tmp_path, "\n".join(rows)))
+    text = ""
+    for row in residue(1, "GLN", atoms).splitlines():
+        text += f"{row[:12]}{row[12:16].strip():<4}{row[16:66]}\n"
+    (molecule,) = read_molecule(written(tmp_path, text))
     # Bondi 1964
-    np.testing.assert_allclose(
-        molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.7, 1.52, 1.55], atol=1e-6
-    )
+    expected = [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.7, 1.52, 1.55]
+    np.testing.assert_allclose(molecule.radii, expected, atol=1e-6)
     # And calcium, which some write as an atom of the polymer, is no residue.
     ion = Atom(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA").line()
     (molecule,) = read_molecule(written(tmp_path, residue(1) + ion))
@@ -576,10 +502,8 @@ def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path):
 def test_no_line_is_lost_to_marks_of_text_or_to_frames(tmp_path):
     text = residue(1) + residue(2)
     (usual,) = read_molecule(written(tmp_path, text))
-    for number, other in enumerate(
-        (f"\ufeff{text}", text.replace("\n", "\r"), text.replace("\n", "\r\n"))
-    ):
-        path = tmp_path / f"{number}.pdb"
+    path = tmp_path / "other.pdb"
+    for other in (f"\ufeff{text}", text.replace("\n", "\r"), text.replace("\n", "\r\n")):
         path.write_bytes(other.encode())
         np.testing.assert_array_equal(read_molecule(path)[0].positions, usual.positions)
     frames = f"CRYST1\n{text}END\n{residue(1)}END\n"
@@ -601,18 +525,16 @@ def test_completed_residues_are_told_on_the_terminal(tmp_path, monkeypatch, caps
     for name, n_residues in (("one", 9), ("two", 12)):
         text = "".join(residue(i, "LYS", backbone()) for i in range(1, n_residues + 1))
         written(tmp_path, text, f"{name}.pdb")
-    arguments = ["extract", str(tmp_path), "--descriptor", "d2", "--out", str(tmp_path / "out.npz")]
-    options = ["--signature.resolution", "8", "--signature.min_samples", "20", "--n_workers", "1"]
-    monkeypatch.setattr("sys.argv", ["igps", *arguments, *options, "--cache_dir", str(tmp_path)])
-    main()
+    arguments = ["extract", tmp_path, "--descriptor", "d2", "--out", tmp_path / "out.npz"]
+    options = ["--signature.resolution", 8, "--signature.min_samples", 20, "--n_workers", 1]
+    run(monkeypatch, *arguments, *options, "--cache_dir", tmp_path)
     told = "21 residues were completed: balls stand for missing atoms of side chains (in 2 of 2"
     assert told in capsys.readouterr().out
 
 
 def test_ranges_of_residues_are_bodies(tmp_path):
-    text = "".join(residue(i) for i in range(1, 9)) + "".join(
-        residue(i, chain="B") for i in range(1, 4)
-    )
+    text = "".join(residue(i) for i in range(1, 9))
+    text += "".join(residue(i, chain="B") for i in range(1, 4))
     path = written(tmp_path, text)
     for part in ("chain A:2-3,6-7", "A:2-3,6-7"):
         found = molecule_of(BodyRef(path, part))

@@ -1,6 +1,7 @@
 """What residues around a point are like, against sums written out and closed forms."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,9 +28,9 @@ def peptide(*names, seed=0):
     n = len(names)
     at = 6 * np.random.default_rng(seed).normal(size=(n, 3))
     charges = np.array([CHARGES.get(name, 0.0) for name in names])
-    return Molecule(
-        "peptide", at, np.full(n, 2.0), charges, np.arange(n), names, at, np.arange(n, dtype=float)
-    )
+    numbers = np.arange(n)
+    b_factors = numbers.astype(float)
+    return Molecule("peptide", at, np.full(n, 2.0), charges, numbers, names, at, b_factors)
 
 
 def points(n=7, seed=1):
@@ -37,10 +38,16 @@ def points(n=7, seed=1):
 
 
 def mean_written_out(molecule, point, values):
-    weights = [
-        math.exp(-(math.dist(point, at) ** 2) / (2 * 4.0**2)) for at in molecule.residue_positions
-    ]
-    return sum(w * v for w, v in zip(weights, values, strict=True)) / sum(weights)
+    total = weights = 0.0
+    for at, value in zip(molecule.residue_positions, values, strict=True):
+        weight = math.exp(-(math.dist(point, at) ** 2) / (2 * 4.0**2))
+        total += weight * value
+        weights += weight
+    return total / weights
+
+
+def means_written_out(molecule, values):
+    return [mean_written_out(molecule, point, values) for point in points()]
 
 
 @pytest.mark.parametrize(
@@ -58,15 +65,13 @@ def test_an_attribute_is_a_gaussian_mean_over_residues(name, of_residue):
     names = ("ASP", "LYS", "ALA", "TRP", "HIS", "GLU", "ARG", "ILE")
     molecule = peptide(*names)
     found = residue_attribute(molecule, points(), name)
-    wanted = [
-        mean_written_out(molecule, point, [of_residue(one) for one in names]) for point in points()
-    ]
+    wanted = means_written_out(molecule, [of_residue(one) for one in names])
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
 
 
 def test_b_factors_are_the_molecules_own():
     molecule = peptide("ALA", "GLY", "SER")
-    wanted = [mean_written_out(molecule, point, [0.0, 1.0, 2.0]) for point in points()]
+    wanted = means_written_out(molecule, [0.0, 1.0, 2.0])
     found = residue_attribute(molecule, points(), "b_factor")
     np.testing.assert_allclose(found, wanted, rtol=1e-9)
 
@@ -75,33 +80,20 @@ def test_shares_of_kinds_sum_to_one_and_follow_the_names():
     molecule = peptide("ALA", "DT", "U", "ZN", "DG")
     shares = residue_attribute(molecule, points(), "residue_shares")
     np.testing.assert_allclose(shares.sum(axis=1), 1)
-    weight = [mean_written_out(molecule, point, [0, 1, 1, 0, 0]) for point in points()]
+    weight = means_written_out(molecule, [0, 1, 1, 0, 0])
     np.testing.assert_allclose(shares[:, RESIDUE_KINDS.index("U")], weight)
-    used = shares.max(axis=0) > 0
-    assert {kind for kind, one in zip(RESIDUE_KINDS, used, strict=True) if one} == {
-        "ALA",
-        "U",
-        "G",
-        "other",
-    }
+    used = {RESIDUE_KINDS[i] for i in np.flatnonzero(shares.max(axis=0))}
+    assert used == {"ALA", "U", "G", "other"}
 
 
 def test_what_is_not_known_does_not_count_and_is_never_made_up():
     molecule = peptide("ALA", "QQQ", "ILE")
-    known = Molecule(
-        "known",
-        molecule.positions,
-        molecule.radii,
-        molecule.charges,
-        molecule.residue_of,
-        ("ALA", "ILE"),
-        molecule.residue_positions[[0, 2]],
-        molecule.b_factors[[0, 2]],
+    known = replace(
+        molecule, residue_names=("ALA", "ILE"), residue_positions=molecule.positions[[0, 2]]
     )
-    np.testing.assert_allclose(
-        residue_attribute(molecule, points(), "hydropathy"),
-        residue_attribute(known, points(), "hydropathy"),
-    )
+    found = residue_attribute(molecule, points(), "hydropathy")
+    expected = residue_attribute(known, points(), "hydropathy")
+    np.testing.assert_allclose(found, expected)
     assert np.isnan(residue_attribute(peptide("QQQ", "ZN"), points(), "hydropathy")).all()
 
 
@@ -109,44 +101,32 @@ def test_far_outside_the_nearest_residue_counts():
     molecule = peptide("ALA", "ILE", "LYS")
     far = 1e4 * np.eye(3)
     nearest = np.linalg.norm(far[:, None] - molecule.residue_positions, axis=2).argmin(axis=1)
-    np.testing.assert_allclose(
-        residue_attribute(molecule, far, "hydropathy"),
-        [HYDROPATHY[molecule.residue_names[i]] for i in nearest],
-        rtol=1e-6,
-    )
+    found = residue_attribute(molecule, far, "hydropathy")
+    expected = [HYDROPATHY[molecule.residue_names[i]] for i in nearest]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_the_potential_of_one_charge_is_that_of_debye_and_hueckel():
-    ion = Molecule(
-        "ion",
-        np.zeros((1, 3)),
-        np.array([1.5]),
-        np.array([-2.0]),
-        np.zeros(1, int),
-        ("X",),
-        np.zeros((1, 3)),
-        np.zeros(1),
-    )
+    at = np.zeros((1, 3))
+    radius = np.array([1.5])
+    charge = np.array([-2.0])
+    ion = Molecule("ion", at, radius, charge, np.zeros(1, int), ("X",), at, np.zeros(1))
     distance = np.array([0.0, 1.0, 1.5, 4.0, 15.0])
     counted = np.maximum(distance, 1.5)
     found = screened_potential(ion, distance[:, None] * [[0.6, 0, 0.8]])
     # e² / (4 π ε₀ ε k T) in Å, of water (ε = 78.4) at 298.15 K; 0.304 nm / √0.15 of salt of one valence.
-    bjerrum = (
-        1.602176634e-19**2 / (4 * np.pi * 8.8541878128e-12 * 78.4 * 1.380649e-23 * 298.15) * 1e10
-    )
-    np.testing.assert_allclose(
-        found, -2 * bjerrum * np.exp(-counted / (3.04 / np.sqrt(0.15))) / counted, rtol=5e-3
-    )
+    thermal = 4 * np.pi * 8.8541878128e-12 * 78.4 * 1.380649e-23 * 298.15
+    bjerrum = 1.602176634e-19**2 / thermal * 1e10
+    screened = np.exp(-counted * np.sqrt(0.15) / 3.04)
+    expected = -2 * bjerrum * screened / counted
+    np.testing.assert_allclose(found, expected, rtol=5e-3)
 
 
 def test_potentials_add_up():
     molecule = peptide("ASP", "ALA", "LYS")
-    parts = [
-        screened_potential(peptide(*names), points())
-        for names in (("ASP", "ALA", "ALA"), ("ALA", "ALA", "LYS"))
-    ]
+    expected = screened_potential(peptide("ASP", "ALA", "ALA"), points())
+    expected += screened_potential(peptide("ALA", "ALA", "LYS"), points())
     found = screened_potential(molecule, points())
-    expected = parts[0] + parts[1]
     np.testing.assert_allclose(found, expected)
     np.testing.assert_array_equal(screened_potential(peptide("ALA"), points()), 0)
 
@@ -169,31 +149,25 @@ def test_each_attribute_is_known_by_its_name():
         columns = {"residue_shares": (len(RESIDUE_KINDS),), "trace": (7,), "composition": (26,)}
         assert values.shape == (7, *columns.get(name, ()))
         assert np.isfinite(values).all()
-    with pytest.raises(
-        ValueError, match=r"attributes: expected names among charge, .*, got 'colour'"
-    ):
+    words = r"attributes: expected names among charge, .*, got 'colour'"
+    with pytest.raises(ValueError, match=words):
         residue_attribute(molecule, points(), "colour")
 
 
 def test_a_signature_gets_attributes_and_keeps_its_own():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=8)
     mesh = Mesh(ball.vertices, ball.faces)
-    config = SignatureConfig(
-        n_eigenpairs=10, n_surface_samples=50, min_samples=100, attributes=("surface_direction",)
-    )
-    signature = compute_signature(mesh, config)
+    few = {"n_eigenpairs": 10, "n_surface_samples": 50, "min_samples": 100}
+    signature = compute_signature(mesh, SignatureConfig(attributes=("surface_direction",), **few))
     molecule = peptide("ASP", "LYS")
-    found = signature.map_samples(
-        lambda samples: samples.with_attributes(
-            {"charge": residue_attribute(molecule, samples.points, "charge")}
-        )
-    )
+
+    def charged(samples):
+        charge = residue_attribute(molecule, samples.points, "charge")
+        return samples.with_attributes({"charge": charge})
+
+    found = signature.map_samples(charged)
     for samples in (found.interior, found.surface):
         assert set(samples.attributes) == {"surface_direction", "charge"}
-        np.testing.assert_allclose(
-            samples.attributes["charge"],
-            residue_attribute(molecule, samples.points, "charge"),
-            rtol=1e-5,
-            atol=1e-6,
-        )
+        expected = residue_attribute(molecule, samples.points, "charge")
+        np.testing.assert_allclose(samples.attributes["charge"], expected, rtol=1e-5, atol=1e-6)
     assert set(signature.interior.attributes) == {"surface_direction"}

