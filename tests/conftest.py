@@ -24,6 +24,31 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 
 @pytest.fixture
+def many_cores(monkeypatch):
+    """As on a machine of eight cores."""
+    monkeypatch.setattr("igps._threads.n_cores", lambda: 8)
+
+
+@pytest.fixture
+def without_loops(monkeypatch):
+    """Describe by operations of PyTorch, as on a GPU."""
+    monkeypatch.setattr("igps.nn._kernels.batches.uses_loops", lambda _: False)
+
+
+@pytest.fixture
+def trust_recent_files(monkeypatch):
+    """Tests cannot set the time of the last change of a file's metadata (ctime)."""
+    monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
+
+
+@pytest.fixture
+def on_path(tmp_path, monkeypatch):
+    """A folder on the Python path."""
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def figures_of(monkeypatch):
     """A function from a module to the list of figures that it makes from now on."""
 

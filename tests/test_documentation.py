@@ -19,7 +19,7 @@ import pytest
 import trimesh
 from sklearn.svm import SVC
 
-from igps.cli import main
+from commands import run as run_here
 from igps.cli.commands import command_of, load_command
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES
@@ -295,9 +295,8 @@ def commands_told():
 
 @pytest.mark.parametrize(("command", "lines"), commands_told().items())
 def test_what_igps_is_told_exists(command, lines, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["igps", *command.split(), "--help"])
     with pytest.raises(SystemExit, match="0"):
-        main()
+        run_here(monkeypatch, *command.split(), "--help")
     text = capsys.readouterr().out
     shared = load_command(command).shared_options()
     for line, words in lines:

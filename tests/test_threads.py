@@ -14,10 +14,10 @@ from threadpoolctl import threadpool_info
 from torch.utils.data import DataLoader
 
 import igps
+from commands import run
 from conftest import torch_threads
 from igps._parallel import on_threads
 from igps._threads import Team, n_cores, n_threads, one_thread
-from igps.cli import main
 from igps.data.batch import LabelledSignature
 from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.signature.signature import SignatureConfig
@@ -49,11 +49,6 @@ def three_threads():
     """An unusual number, so that what restores another is seen."""
     with torch_threads(3):
         yield
-
-
-@pytest.fixture
-def many_cores(monkeypatch):
-    monkeypatch.setattr("igps._threads.n_cores", lambda: 8)
 
 
 def test_cores_are_at_most_those_of_the_machine_and_of_the_affinity():
@@ -333,9 +328,8 @@ def test_a_command_leaves_the_settings(monkeypatch, capsys):
         raise ValueError("no meshes")
 
     monkeypatch.setattr("igps.cli.reading.find_bodies", watched)
-    monkeypatch.setattr(sys, "argv", ["igps", "retrieve", "nowhere"])
     with pytest.raises(SystemExit):
-        main()
+        run(monkeypatch, "retrieve", "nowhere")
     assert "no meshes" in capsys.readouterr().err
     assert seen == [1]
     assert settings() == before

@@ -42,17 +42,14 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(folder)
 
 
-def test_the_example_is_short() -> None:
+def test_the_example_is_short():
     text = file_of_the_page("volumes.py") + file_of_the_page("pyproject.toml")
     assert len(text.splitlines()) <= 30
 
 
 def test_an_installed_command_runs_with_the_options_of_reading(
-    installed: None,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    installed, tmp_path, monkeypatch, capsys
+):
     for name, height in (("flat", 0.5), ("long", 2.0)):
         write_egg(tmp_path / "eggs" / f"{name}.off", height, subdivisions=2)
     options = ["--least", 3, "--cache_dir", tmp_path / "cache", "--n_workers", 1]
@@ -66,9 +63,7 @@ def test_an_installed_command_runs_with_the_options_of_reading(
     assert "no such folder" in words
 
 
-def test_help_lists_an_installed_command(
-    installed: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_lists_an_installed_command(installed, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="0"):
         run(monkeypatch, "--help")
     assert re.search(r"volumes +from volumes", capsys.readouterr().out)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +12,11 @@ import pytest
 import trimesh
 from matplotlib.image import imread
 
+from commands import run
 from igps.analysis.clusters import clusters_of
 from igps.analysis.groups import group_test
 from igps.analysis.map import body_map
 from igps.analysis.outliers import LIMIT
-from igps.cli import main
 from igps.cli.answers import _extent
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
@@ -49,8 +48,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def igps(monkeypatch: pytest.MonkeyPatch, root: Path, *arguments: object) -> None:
     cache = ["--cache_dir", root.parent / "cache"]
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, [*arguments, *cache, *SMALL])])
-    main()
+    run(monkeypatch, *arguments, *cache, *SMALL)
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -606,10 +604,9 @@ def test_what_labels_do_not_tell_is_refused_before_anything_is_computed(
 ) -> None:
     cache = ["--cache_dir", tmp_path / "cache"]
     where = next(i for i, word in enumerate(command) if word.startswith("--"))
-    words = ["igps", *command[:where], root, *command[where:], *OWN, *cache, *SMALL]
-    monkeypatch.setattr(sys, "argv", list(map(str, words)))
+    words = [*command[:where], root, *command[where:], *OWN, *cache, *SMALL]
     with pytest.raises(SystemExit, match="1"):
-        main()
+        run(monkeypatch, *words)
     assert message in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()
 
@@ -619,12 +616,8 @@ def test_three_classes_are_refused_before_anything_is_computed(
 ) -> None:
     for label in "abc":
         write_egg(tmp_path / "eggs" / label / "0.off", 1.0, subdivisions=2)
-    monkeypatch.setattr(
-        sys,
-        "argv",
-        ["igps", "explain", str(tmp_path / "eggs"), "--cache_dir", str(tmp_path / "cache")],
-    )
+    words = ["explain", tmp_path / "eggs", "--cache_dir", tmp_path / "cache"]
     with pytest.raises(SystemExit, match="1"):
-        main()
+        run(monkeypatch, *words)
     assert "expected a folder of two groups, got 3" in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()

@@ -1,9 +1,5 @@
 """`igps precompute`: what it computes; and files in place of folders."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from commands import run
@@ -15,8 +11,8 @@ INTERIOR = "own_descriptors:small_interior"
 
 
 def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     write_egg(tmp_path / "eggs" / "0.off", 2.0, subdivisions=2)
     run(
         monkeypatch,
@@ -35,9 +31,7 @@ def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_i
     assert None not in dataset.cached_keys()
 
 
-def test_a_mesh_in_place_of_a_folder_is_told_as_such(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mesh_in_place_of_a_folder_is_told_as_such(tmp_path, monkeypatch, capsys):
     write_egg(tmp_path / "egg.off", 2.0, subdivisions=2)
     for command in (
         ["retrieve", tmp_path / "egg.off"],

@@ -35,9 +35,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "meshes"
 
 
-def test_command_prints_and_writes_what_python_computes(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_prints_and_writes_what_python_computes(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     words = ["shape_dna", "d2", "own_descriptors:small_interior"]
     cache = ["--cache_dir", root.parent / "cache"]
@@ -58,7 +56,8 @@ def test_command_prints_and_writes_what_python_computes(
         expected.pop("seconds_per_mesh")
         assert row == expected
         (line,) = [line for line in printed if line.startswith(name)]
-        assert line.split()[1:9] == [f"{100 * expected[key]:.1f}" for key in KEYS[1:9]]
+        found = line.split()[1:9]
+        assert found == [f"{100 * expected[key]:.1f}" for key in KEYS[1:9]]
         assert line.split()[9] == "6"
         with np.load(out / "distances" / f"{name}.npz") as archive:
             np.testing.assert_array_equal(archive["distances"], result.distances)
@@ -68,9 +67,7 @@ def test_command_prints_and_writes_what_python_computes(
     assert imread(out / "precision_recall.png").std() > 0.05
 
 
-def test_the_papers_the_learned_and_the_compared_run_side_by_side(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_papers_the_learned_and_the_compared_run_side_by_side(tmp_path, monkeypatch, capsys):
     ArticulatedShapes(n_classes=2, n_per_class=2, seed=5, n_vertices=500).write(tmp_path / "meshes")
     options = [
         "--signature.resolution",
@@ -108,8 +105,8 @@ def test_the_papers_the_learned_and_the_compared_run_side_by_side(
 
 
 def test_command_lists_failures_by_descriptor_and_of_signatures(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    root, tmp_path, monkeypatch, capsys
+):
     logging.disable(logging.WARNING)
     bad = root / "egg" / "bad.off"
     bad.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
@@ -128,7 +125,9 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
         run(monkeypatch, *arguments, *chosen)
         rows = list(csv.reader((tmp_path / "failures.csv").open(newline="")))
         assert rows[0] == ["descriptor", "name", "error"]
-        assert [row[:2] for row in rows[1:]] == [["all", "egg/bad.off"], ["picky", "egg/1.off"]]
+        found = [row[:2] for row in rows[1:]]
+        expected = [["all", "egg/bad.off"], ["picky", "egg/1.off"]]
+        assert found == expected
         assert "a single triangle" in rows[1][2]
         assert "too much" in rows[2][2]
         printed = capsys.readouterr().out
@@ -149,8 +148,8 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
 
 
 def test_unknown_descriptor_is_named_before_anything_is_computed(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    root, tmp_path, monkeypatch, capsys
+):
     with pytest.raises(SystemExit, match="1"):
         run(
             monkeypatch,

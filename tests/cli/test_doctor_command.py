@@ -1,9 +1,6 @@
 """`igps doctor`: its table, its file, and its exit status."""
 
-from __future__ import annotations
-
 import csv
-from pathlib import Path
 
 import pytest
 
@@ -22,9 +19,7 @@ from damaged_files import (
 FEW = ["--signature.n_eigenpairs", "20", "--n_workers", "1"]
 
 
-def test_table_and_file_of_a_folder_that_can_be_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_table_and_file_of_a_folder_that_can_be_used(tmp_path, monkeypatch, capsys):
     root = tmp_path / "meshes"
     out = tmp_path / "deep" / "doctor.csv"
     write_clean(root / "a" / "clean.off")
@@ -35,9 +30,12 @@ def test_table_and_file_of_a_folder_that_can_be_used(
     assert header.split() == ["vertices", "after", "seconds", "MB", "unit", "remarks"]
     cells = {line.split()[0]: line.split()[1:] for line in lines}
     size = str(N_VERTICES)
-    assert cells["a/clean.off"][:2] + cells["a/clean.off"][4:] == [size, size, "none", "none"]
+    found = cells["a/clean.off"][:2] + cells["a/clean.off"][4:]
+    assert found == [size, size, "none", "none"]
     soup = cells["a/soup.off"]
-    assert soup[:2] + soup[4:] == [str(3 * N_FACES), size, "none", "welded"]
+    found = soup[:2] + soup[4:]
+    expected = [str(3 * N_FACES), size, "none", "welded"]
+    assert found == expected
     assert cells["b/box.off"][0] == "8"
     assert cells["b/box.off"][4:] == ["none", "subdivided"]
     assert total.startswith("3 bodies: 2 repaired, 0 cannot be used; about ")
@@ -49,7 +47,8 @@ def test_table_and_file_of_a_folder_that_can_be_used(
         assert [row["vertices"], row["vertices_after"], row["seconds"], row["megabytes"]] == cells[
             name
         ][:4]
-        assert (row["usable"], row["error"]) == ("yes", "")
+        assert row["usable"] == "yes"
+        assert row["error"] == ""
         assert float(row["seconds"]) > 0
         assert float(row["megabytes"]) > 0
     assert (
@@ -62,9 +61,7 @@ def test_table_and_file_of_a_folder_that_can_be_used(
     assert rows["a/soup.off"]["notes"] == f"welded {3 * N_FACES - N_VERTICES} coincident vertices"
 
 
-def test_status_is_1_if_a_file_cannot_be_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_status_is_1_if_a_file_cannot_be_used(tmp_path, monkeypatch, capsys):
     without_collada(monkeypatch)
     root = tmp_path / "meshes"
     out = tmp_path / "doctor.csv"
@@ -88,14 +85,11 @@ def test_status_is_1_if_a_file_cannot_be_used(
         "clean.off": "yes",
         **dict.fromkeys(sentences, "no"),
     }
-    assert all(
-        rows[name]["error"] == f"{root / name}: {sentence}" for name, sentence in sentences.items()
-    )
+    for name, sentence in sentences.items():
+        assert rows[name]["error"] == f"{root / name}: {sentence}"
 
 
-def test_options_choose_the_mending(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_choose_the_mending(tmp_path, monkeypatch, capsys):
     write_holed(tmp_path / "holed.off")
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, "doctor", tmp_path, "--mend", "never", *FEW)
@@ -104,17 +98,13 @@ def test_options_choose_the_mending(
     assert "; watertight; closed 1 opening" in capsys.readouterr().out.splitlines()[1]
 
 
-def test_a_folder_without_meshes_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_without_meshes_is_an_error(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, "doctor", tmp_path, *FEW)
     assert f"igps: {tmp_path}: no body found" in capsys.readouterr().err
 
 
-def test_files_that_bodies_bring_along_are_not_examined(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_files_that_bodies_bring_along_are_not_examined(tmp_path, monkeypatch, capsys):
     write_clean(tmp_path / "a" / "clean.off")
     write_clean(tmp_path / "a" / "clean_fields.off")
     run(monkeypatch, "doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from igps.cli import main
+from commands import run
 from igps.signature.measures import POWERS
 from own_descriptors import SMALL
 
@@ -37,24 +36,11 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def extract(monkeypatch: pytest.MonkeyPatch, root: Path, out: Path, *options: str) -> None:
     cache = ["--cache_dir", str(root.parent / "cache"), "--n_workers", "1"]
-    words = [
-        "extract",
-        str(root),
-        "--out",
-        str(out),
-        "--descriptor",
-        INTERIOR,
-        *SMALL,
-        *cache,
-        *options,
-    ]
-    monkeypatch.setattr(sys, "argv", ["igps", *words])
-    main()
+    words = ["extract", root, "--out", out, "--descriptor", INTERIOR]
+    run(monkeypatch, *words, *SMALL, *cache, *options)
 
 
-def test_a_row_for_each_body_tells_what_is_known_of_it(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_row_for_each_body_tells_what_is_known_of_it(root, tmp_path, monkeypatch, capsys):
     extract(monkeypatch, root, tmp_path / "features.csv")
     printed = capsys.readouterr().out
     assert "4 bodies written to" in printed
@@ -93,9 +79,7 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_a_wide_table_has_a_row_for_each_file(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
-) -> None:
+def test_a_wide_table_has_a_row_for_each_file(root, tmp_path, monkeypatch, suffix):
     if suffix == "parquet":
         pytest.importorskip("pyarrow", reason="the extra [table]")
     read = pd.read_csv if suffix == "csv" else pd.read_parquet
@@ -105,7 +89,8 @@ def test_a_wide_table_has_a_row_for_each_file(
     wide = read(tmp_path / f"wide.{suffix}")
     first = ["file", "class", "age", "unit", "liver.at_border", "liver.border_sides", "liver.notes"]
     assert wide.columns.tolist()[:7] == first
-    assert len(wide.columns) == 4 + 2 * (3 + len(POWERS) + 642)
+    expected = 4 + 2 * (3 + len(POWERS) + 642)
+    assert len(wide.columns) == expected
     assert wide["class"].tolist() == ["well", "ill"]
     assert wide["age"].sum() == 40  # a number in Parquet, too
     for part in ("liver", "spleen"):
@@ -114,9 +99,7 @@ def test_a_wide_table_has_a_row_for_each_file(
             assert wide[f"{part}.{column}"].tolist() == rows[column].tolist()
 
 
-def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, monkeypatch, capsys):
     """As TotalSegmentator writes them: two subjects with a cube and a bar, the third without the bar."""
     for i, sides in enumerate(
         [
@@ -139,8 +122,10 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
     extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     assert wide["folder"].tolist() == [f"s{i}/segmentations" for i in range(3)]
-    np.testing.assert_allclose(wide["cube.volume_mm3"], [512, 729, 1000], rtol=1e-3)
-    np.testing.assert_allclose(wide["bar.volume_mm3"], [375, 425, np.nan], rtol=1e-3)
+    expected = [512, 729, 1000]
+    np.testing.assert_allclose(wide["cube.volume_mm3"], expected, rtol=1e-3)
+    expected = [375, 425, np.nan]
+    np.testing.assert_allclose(wide["bar.volume_mm3"], expected, rtol=1e-3)
     assert wide["folder of labels.csv"].tolist() == [
         "a",
         "a",
@@ -152,12 +137,12 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
     # Of a single subject
     extract(monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide")
     one = pd.read_csv(tmp_path / "one.csv")
-    np.testing.assert_allclose(one[["bar.volume_mm3", "cube.volume_mm3"]], [[375, 512]], rtol=1e-3)
+    found = one[["bar.volume_mm3", "cube.volume_mm3"]]
+    expected = [[375, 512]]
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
 
 
-def test_masks_that_are_numbered_have_a_row_each(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_masks_that_are_numbered_have_a_row_each(tmp_path, monkeypatch):
     """Two subjects of each class: a number is no organ's name."""
     sides = {("ill", 0): 5, ("ill", 1): 6, ("well", 0): 7, ("well", 1): 8}
     for (label, number), side in sides.items():
@@ -168,7 +153,8 @@ def test_masks_that_are_numbered_have_a_row_each(
     extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     border = ["at_border", "border_sides"]
-    assert wide.columns.tolist()[:6] == ["file", "class", "unit", *border, "notes"]
+    found = wide.columns.tolist()[:6]
+    assert found == ["file", "class", "unit", *border, "notes"]
     assert wide["file"].tolist() == [f"{label}/{number}.nii.gz" for label, number in sides]
     np.testing.assert_allclose(
         wide["volume_mm3"], [49 * side for side in sides.values()], rtol=1e-3
@@ -176,9 +162,7 @@ def test_masks_that_are_numbered_have_a_row_each(
 
 
 @pytest.mark.parametrize("options", [[], ["--wide"]])
-def test_columns_that_are_called_as_ours_are_kept_beside_them(
-    options: list[str], root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_columns_that_are_called_as_ours_are_kept_beside_them(options, root, tmp_path, monkeypatch):
     (tmp_path / "labels.csv").write_text(
         f"file,volume_mm3,unit,v0,age\n{root / '1.nii.gz'},7,left,x,40\n{root / '2.nii.gz'},8,right,y,50\n"
     )
@@ -193,9 +177,7 @@ def test_columns_that_are_called_as_ours_are_kept_beside_them(
     assert table["unit"].tolist() == ["mm"] * len(table)
 
 
-def test_a_body_that_a_file_lacks_has_no_values(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_body_that_a_file_lacks_has_no_values(root, tmp_path, monkeypatch):
     for name in ("1.nii.gz", "2.nii.gz", "1.csv", "2.csv"):
         (tmp_path / name).write_bytes((root / name).read_bytes())
     (tmp_path / "labels.csv").write_text(
@@ -204,7 +186,8 @@ def test_a_body_that_a_file_lacks_has_no_values(
     extract(monkeypatch, tmp_path, tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     assert wide["liver.class"].tolist() == ["a", "b"]
-    assert wide.loc[:, "spleen.class":].isna().all(axis=1).tolist() == [True, False]
+    found = wide.loc[:, "spleen.class":].isna().all(axis=1).tolist()
+    assert found == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -215,30 +198,22 @@ def test_a_body_that_a_file_lacks_has_no_values(
     ],
 )
 def test_a_file_of_another_kind_is_refused_before_anything_is_computed(
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    options: list[str],
-    words: str,
-) -> None:
+    root, tmp_path, monkeypatch, capsys, options, words
+):
     with pytest.raises(SystemExit, match="1"):
         extract(monkeypatch, root, tmp_path / options[0], *options[1:])
     assert words in capsys.readouterr().err.replace("one of ", "")
 
 
-def test_plain_numbers_alone_need_no_descriptor_and_notes_stand_in_the_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plain_numbers_alone_need_no_descriptor_and_notes_stand_in_the_row(tmp_path, monkeypatch):
     mask = np.zeros((16, 16, 16), dtype=np.uint8)
     mask[2:11, 2:11, 2:11] = 1
     mask[14, 14, 14] = 1
     nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), tmp_path / "cube.nii.gz")
-    words = ["extract", str(tmp_path), "--out", str(tmp_path / "plain.csv"), "--no_vector"]
-    cache = ["--cache_dir", str(tmp_path / "cache"), "--n_workers", "1"]
-    monkeypatch.setattr(sys, "argv", ["igps", *words, *cache])
+    words = ["extract", tmp_path, "--out", tmp_path / "plain.csv", "--no_vector"]
+    cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
     monkeypatch.setattr("igps.spectra.eigenpairs", None)  # plain numbers need none
-    main()
+    run(monkeypatch, *words, *cache)
     table = pd.read_csv(tmp_path / "plain.csv", keep_default_na=False)
     own = ["file", "part", "name", "class", "unit", "at_border", "border_sides", "notes"]
     assert table.columns.tolist()[:8] == own

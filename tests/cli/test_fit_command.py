@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import torch
 from scipy.stats import binomtest
 
 import igps as library
-from igps.cli import main
+from commands import run
 from igps.learning.fitting import classify
 from igps.nn.description import describe
 from own_descriptors import write_egg
@@ -42,17 +41,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def call(monkeypatch: pytest.MonkeyPatch, root: Path, *words: object) -> None:
-    command = [
-        "igps",
-        *map(str, words),
-        "--cache_dir",
-        str(root / "cache"),
-        "--n_workers",
-        "1",
-        *SMALL,
-    ]
-    monkeypatch.setattr(sys, "argv", command)
-    main()
+    run(monkeypatch, *words, "--cache_dir", root / "cache", "--n_workers", 1, *SMALL)
 
 
 @pytest.fixture
@@ -71,9 +60,7 @@ def dataset(root: Path, model: Path) -> library.SignatureDataset:
     )
 
 
-def test_fit_writes_model_and_card(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fit_writes_model_and_card(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "mine.safetensors"
     call(monkeypatch, root, "fit", root / "eggs", "--descriptor", "rich", "--out", out, "--json")
     told = json.loads(capsys.readouterr().out)
@@ -91,9 +78,7 @@ def test_fit_writes_model_and_card(
     assert "the result says little about\nform" in page
 
 
-def test_fit_writes_a_folder_to_share(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fit_writes_a_folder_to_share(root, tmp_path, monkeypatch, capsys):
     words = [
         "fit",
         root / "eggs",
@@ -119,25 +104,15 @@ def test_fit_writes_a_folder_to_share(
 
 @pytest.mark.parametrize("cavities", ["fill", "keep"])
 def test_bodies_that_are_read_otherwise_than_those_of_the_fit_are_told(
-    root: Path,
-    model: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    cavities: str,
-) -> None:
+    root, model, monkeypatch, capsys, cavities
+):
     call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--cavities", cavities)
     assert ("read with --cavities fill, not keep" in capsys.readouterr().out) == (
         cavities == "keep"
     )
 
 
-def test_every_command_takes_the_file(
-    root: Path,
-    model: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_every_command_takes_the_file(root, model, tmp_path, monkeypatch, capsys):
     found = library.load(model)
     expected = describe(dataset(root, model), found)
     call(
@@ -202,28 +177,13 @@ def test_every_command_takes_the_file(
     moved.write_bytes(model.read_bytes())
     for options in ([], ["--descriptor", "moved.safetensors"]):
         capsys.readouterr()
-        words = [
-            *map(str, query),
-            "--gallery",
-            "eggs.igps",
-            *options,
-            "--cache_dir",
-            str(root / "cache"),
-        ]
-        monkeypatch.setattr(sys, "argv", ["igps", *words])
-        main()
-        assert [row["name"] for row in json.loads(capsys.readouterr().out)] == [
-            row["name"] for row in nearest
-        ]
+        words = [*query, "--gallery", "eggs.igps", *options, "--cache_dir", root / "cache"]
+        run(monkeypatch, *words)
+        found = json.loads(capsys.readouterr().out)
+        assert [row["name"] for row in found] == [row["name"] for row in nearest]
 
 
-def test_classify_tells_what_python_computes(
-    root: Path,
-    model: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_classify_tells_what_python_computes(root, model, tmp_path, monkeypatch, capsys):
     out = tmp_path / "classes.csv"
     call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--out", out, "--json")
     told: list[dict[str, Any]] = json.loads(capsys.readouterr().out)
@@ -247,13 +207,7 @@ def test_classify_tells_what_python_computes(
     )
 
 
-def test_what_is_unlike_everything_is_said(
-    root: Path,
-    model: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_is_unlike_everything_is_said(root, model, tmp_path, monkeypatch, capsys):
     import trimesh
 
     box = trimesh.creation.box((1, 1, 12)).subdivide().subdivide().subdivide().subdivide()
@@ -274,13 +228,7 @@ def test_what_is_unlike_everything_is_said(
     assert next(line for line in lines if "1.off" in line).endswith("flat")
 
 
-def test_wrong_files_cost_one_sentence(
-    root: Path,
-    model: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_wrong_files_cost_one_sentence(root, model, tmp_path, monkeypatch, capsys):
     (tmp_path / "bad.safetensors").write_bytes(model.read_bytes()[:-10])
     for words, message in (
         (
@@ -308,8 +256,8 @@ def test_wrong_files_cost_one_sentence(
 
 
 def test_what_no_file_can_hold_is_refused_before_anything_is_computed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     for label in "ab":
         write_egg(tmp_path / "eggs" / label / "0.off", 1.0)
     options = ["--descriptor", "own_descriptors:Height", "--out", tmp_path / "mine.safetensors"]
@@ -321,30 +269,19 @@ def test_what_no_file_can_hold_is_refused_before_anything_is_computed(
 
 @pytest.mark.parametrize("goal", ["known", "new"])
 def test_too_few_classes_are_told_before_anything_is_computed(
-    goal: str,
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    goal, root, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(
         library.SignatureDataset,
         "precompute",
         lambda *_, **__: pytest.fail("signatures are computed"),
     )
     folder = tmp_path / "few"
-    for label in ("one", "two")[: 1 + (goal == "new")]:
-        shutil.copytree(
-            next(path for path in (root / "eggs").iterdir() if path.is_dir()), folder / label
-        )
-    monkeypatch.setattr(
-        sys,
-        "argv",
-        ["igps", "fit", f"{folder}", "--goal", goal, "--out", f"{tmp_path}/m.safetensors"],
-    )
+    n_classes = 2 if goal == "new" else 1
+    classes = [path for path in sorted((root / "eggs").iterdir()) if path.is_dir()]
+    for body_class in classes[:n_classes]:
+        shutil.copytree(body_class, folder / body_class.name)
     with pytest.raises(SystemExit, match="1"):
-        main()
-    assert (
-        f"classes: expected at least {4 if goal == 'new' else 2}, one of them"
-        in capsys.readouterr().err
-    )
+        run(monkeypatch, "fit", folder, "--goal", goal, "--out", tmp_path / "m.safetensors")
+    told = f"classes: expected at least {2 * n_classes}, one of them"
+    assert told in capsys.readouterr().err

@@ -5,15 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from commands import run
 from igps.analysis.inside import column_names
 from igps.analysis.inside_collection import inside_config, inside_table
-from igps.cli import main
 from igps.data.attribute_sources import attribute_source
 from igps.data.dataset import SignatureDataset
 from igps.signature.signature import SignatureConfig
@@ -52,13 +51,10 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def igps(monkeypatch: pytest.MonkeyPatch, root: Path, *words: object) -> None:
     cache = ["--cache_dir", root.parent / "cache"]
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, [*words, *cache, *SMALL])])
-    main()
+    run(monkeypatch, *words, *cache, *SMALL)
 
 
-def test_the_table_is_what_python_computes(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_table_is_what_python_computes(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "inside.csv"
     igps(monkeypatch, root, "inside", root, "--attribute", "ct=ct/{file}", "--out", out)
     printed = capsys.readouterr().out
@@ -85,9 +81,7 @@ def test_the_table_is_what_python_computes(
         assert float(rows["core"][name]) == pytest.approx(number, rel=1e-6), name
 
 
-def test_rows_are_cached_and_printed_as_json(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_are_cached_and_printed_as_json(root, monkeypatch, capsys):
     words = ["inside", root / "rim.nii.gz", "--attribute", f"ct={root}/ct/{{file}}", "--json"]
     igps(monkeypatch, root, *words)
     first = json.loads(capsys.readouterr().out)
@@ -98,8 +92,8 @@ def test_rows_are_cached_and_printed_as_json(
 
 
 def test_one_image_of_two_subjects_and_another_unit_are_remarked(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    root, tmp_path, monkeypatch, capsys
+):
     for i in range(4):
         write(tmp_path / f"s{i}.nii.gz", (radius(1 + i / 50) < 1).astype(np.uint8))
         shutil.copy(root / "ct" / "rim.nii.gz", tmp_path / f"s{i}_ct.nii.gz")
@@ -112,8 +106,8 @@ def test_one_image_of_two_subjects_and_another_unit_are_remarked(
 
 
 def test_a_body_of_three_voxels_and_no_attribute_are_refused_with_a_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     label = np.zeros(SHAPE, np.uint8)
     label[5:8, 5, 5] = 1
     write(tmp_path / "a.nii.gz", label)
@@ -126,9 +120,7 @@ def test_a_body_of_three_voxels_and_no_attribute_are_refused_with_a_sentence(
     assert "attribute: expected at least one" in capsys.readouterr().err
 
 
-def test_groups_tests_where_the_signal_lies_beside_shape(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_groups_tests_where_the_signal_lies_beside_shape(tmp_path, monkeypatch, capsys):
     """Two groups of equal form and equal values, which lie at the rim in one and in the core of the other."""
     random = np.random.default_rng(0)
     for i in range(14):
@@ -144,7 +136,8 @@ def test_groups_tests_where_the_signal_lies_beside_shape(
     printed = capsys.readouterr().out
     with (tmp_path / "out" / "groups.csv").open(newline="") as file:
         rows = {row["body"]: row for row in csv.DictReader(file)}
-    assert set(rows) == {"all", "all, inside", *(f"all, {name}" for name in column_names(["ct"]))}
+    expected = {"all", "all, inside", *(f"all, {name}" for name in column_names(["ct"]))}
+    assert set(rows) == expected
     assert float(rows["all"]["permanova_p"]) > 0.05
     assert float(rows["all, inside"]["permanova_p"]) <= 0.01
     assert float(rows["all, ct.rim.contrast"]["permanova_q"]) <= 0.01

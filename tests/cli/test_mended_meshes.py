@@ -61,12 +61,11 @@ def check_notes(path: Path) -> None:
     }
     assert found["ball/soup.off"] == found["egg/soup.off"] == WELDED
     assert found["ball/holed.off"] == "filled 1 small hole"
-    assert all(found[f"box/{i}.off"].startswith("subdivided from 8 to ") for i in (1, 2))
+    for i in (1, 2):
+        assert found[f"box/{i}.off"].startswith("subdivided from 8 to ")
 
 
-def test_retrieve_says_what_was_mended_from_the_cache_too(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_retrieve_says_what_was_mended_from_the_cache_too(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     for _ in range(2):
         run(monkeypatch, "retrieve", root, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
@@ -84,9 +83,7 @@ def test_retrieve_says_what_was_mended_from_the_cache_too(
     assert not (out / "notes.csv").exists()
 
 
-def test_extract_and_compare_write_the_same_notes(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_extract_and_compare_write_the_same_notes(root, tmp_path, monkeypatch, capsys):
     cache = ["--cache_dir", tmp_path / "cache"]
     run(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *cache, *ONE)
     assert capsys.readouterr().out.splitlines()[0] == SUMMARY
@@ -106,9 +103,7 @@ def test_extract_and_compare_write_the_same_notes(
     check_notes(tmp_path / "out" / "notes.csv")
 
 
-def test_never_and_always(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_never_and_always(root, tmp_path, monkeypatch, capsys):
     logging.disable(logging.WARNING)
     out = ["--out", tmp_path / "out", "--cache_dir", tmp_path / "cache"]
     try:
@@ -129,7 +124,8 @@ def test_never_and_always(
         }
         assert "6 boundary edges" in refused["ball/holed.off"]
         assert "expected at least 22 vertices for 20 eigenpairs" in refused["box/1.off"]
-        assert all(error.startswith(str(root)) for error in refused.values())
+        for error in refused.values():
+            assert error.startswith(str(root))
     finally:
         logging.disable(logging.NOTSET)
     run(monkeypatch, "retrieve", root, "--mend", "always", *out, *ONE)
@@ -140,23 +136,20 @@ def test_never_and_always(
     assert made == {"ball/holed.off"}
 
 
-def test_an_unknown_way_to_mend_is_refused_by_the_command(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_way_to_mend_is_refused_by_the_command(root, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         run(monkeypatch, "retrieve", root, "--mend", "perhaps", *ONE)
     error = capsys.readouterr().err
     assert "mend" in error
-    assert all(word in error for word in ("auto", "never", "always"))
+    for word in ("auto", "never", "always"):
+        assert word in error
 
 
 READS = [name for name in COMMANDS if "mend" in load_command(name).shared_options()]
 
 
 @pytest.mark.parametrize("command", READS)
-def test_every_command_that_reads_meshes_has_the_choice(
-    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_that_reads_meshes_has_the_choice(command, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="0"):
         run(monkeypatch, *command.split(), "--help")
     text = capsys.readouterr().out
@@ -164,7 +157,7 @@ def test_every_command_that_reads_meshes_has_the_choice(
     assert "auto repairs a surface as little as possible" in " ".join(text.split())
 
 
-def test_the_commands_that_read_no_meshes() -> None:
+def test_the_commands_that_read_no_meshes():
     """The demo makes its own; a report reads those of its results; the others read none."""
     others = {"report", "demo", "help", "gallery remove", "gallery info"}
     assert set(COMMANDS) - set(READS) == others
@@ -172,12 +165,8 @@ def test_the_commands_that_read_no_meshes() -> None:
 
 @pytest.mark.parametrize("command", ["retrieve", "extract"])
 def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
-    command: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    command, tmp_path, monkeypatch, capsys, caplog
+):
     without_collada(monkeypatch)
     root = tmp_path / "meshes"
     out = tmp_path / "out"

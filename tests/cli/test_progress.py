@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
 
-from igps.cli import main
+from commands import run
 from own_descriptors import SMALL, write_egg
 
 INTERIOR = "own_descriptors:small_interior"
@@ -71,13 +70,8 @@ def bars(text: str) -> dict[str, tuple[int, int]]:
     ids=lambda value: value.split(" ROOT")[0].split(" MESH")[0] if isinstance(value, str) else "",
 )
 def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
-    command: str,
-    expected: dict[str, int | None],
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    command, expected, root, tmp_path, monkeypatch, capsys
+):
     """The bars have the names, and the ends that the number of files sets, and they reach them."""
     words = {
         "ROOT": str(root),
@@ -92,12 +86,12 @@ def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
     )
     reads_signatures = not command.startswith("doctor")
     cache = ["--cache_dir", str(tmp_path / "cache")] if reads_signatures else []
-    monkeypatch.setattr(sys, "argv", ["igps", *line.split(), *cache])
-    main()
+    run(monkeypatch, *line.split(), *cache)
     printed = capsys.readouterr()
     shown = bars(printed.err)
     assert {name for name in expected if name not in shown} == set(), printed.err
-    assert all(done == total for done, total in shown.values())
+    for done, total in shown.values():
+        assert done == total
     assert {name: shown[name][1] for name, total in expected.items() if total is not None} == {
         name: total for name, total in expected.items() if total is not None
     }

@@ -249,11 +249,10 @@ def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path):
         assert found == pytest.approx(ball.volume)
 
 
-def test_what_is_read_beside_a_file_counts(tmp_path, monkeypatch):
+def test_what_is_read_beside_a_file_counts(tmp_path, trust_recent_files):
     """Two subjects whose headers are alike, a table of names that is put right, and numbers of a scene beside it."""
     sitk = pytest.importorskip("SimpleITK")
     nibabel = pytest.importorskip("nibabel")
-    monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
     labels = np.zeros((20, 20, 20), dtype=np.uint8)
     labels[2:8, 4:16, 4:16] = 1
     labels[10:18, 4:16, 4:16] = 2
@@ -386,7 +385,9 @@ def test_a_folder_for_each_subject(tmp_path):
     assert sorted(labels) == ["1", "1", "1", "2", "2"]
 
 
-def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(tmp_path, caplog, monkeypatch):
+def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(
+    tmp_path, caplog, trust_recent_files, monkeypatch
+):
     root = tmp_path / "masks"
     root.mkdir()
     for name, n in {"liver": 8, "spleen": 7, "rib_1": 0, "rib_2": 0, "rib_3": 0, "lung": 1}.items():
@@ -395,7 +396,6 @@ def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(tmp_path, ca
         path = root / f"{name}.nii.gz"
         nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), path)
         os.utime(path, (1e9, 1e9))
-    monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
 
     def run():
         caplog.clear()

@@ -22,10 +22,7 @@ def dataset(tmp_path):
     return SignatureDataset(tmp_path / "meshes", CONFIG, tmp_path / "cache")
 
 
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
-    """Trust recent files, too, because tests cannot set the time of the last change of a file's metadata (ctime)."""
-    monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
+pytestmark = pytest.mark.usefixtures("trust_recent_files")
 
 
 @pytest.fixture

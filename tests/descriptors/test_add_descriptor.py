@@ -21,11 +21,11 @@ def file_of_the_page(name):
 
 
 @pytest.fixture
-def installed(tmp_path, monkeypatch):
+def installed(on_path):
     """The package of the page, laid out on the Python path as pip would do it."""
     project = tomllib.loads(file_of_the_page("pyproject.toml"))["project"]
-    (tmp_path / "mine.py").write_text(file_of_the_page("mine.py"))
-    info = tmp_path / f"{project['name']}-{project['version']}.dist-info"
+    (on_path / "mine.py").write_text(file_of_the_page("mine.py"))
+    info = on_path / f"{project['name']}-{project['version']}.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(
         f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
@@ -35,7 +35,6 @@ def installed(tmp_path, monkeypatch):
         lines.append(f"[{group}]")
         lines += [f"{name} = {place}" for name, place in places.items()]
     (info / "entry_points.txt").write_text("\n".join(lines))
-    monkeypatch.syspath_prepend(tmp_path)
 
 
 def test_the_example_is_short():
@@ -57,10 +56,9 @@ def test_a_wrong_name_lists_installed_descriptors_too(installed):
         igps.descriptor("round")
 
 
-def test_a_name_of_the_library_stays_its_own(tmp_path, monkeypatch):
-    info = tmp_path / "other-1.0.dist-info"
+def test_a_name_of_the_library_stays_its_own(on_path):
+    info = on_path / "other-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[igps.descriptors]\nd2 = math:pi\n")
-    monkeypatch.syspath_prepend(tmp_path)
     assert igps.descriptor("d2").name == "d2"

@@ -150,10 +150,10 @@ def test_half_precision_describes_nearly_the_same(name):
 
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("name", [*NAMES, "rich+", "pretrained+"])
-def test_tensors_are_made_on_the_device_of_the_bodies(name, compiled, monkeypatch):
+def test_tensors_are_made_on_the_device_of_the_bodies(name, compiled, request):
     """With the default device "meta", a tensor that is made without naming a device would have no values."""
     if not compiled:  # as on a GPU
-        monkeypatch.setattr("igps.nn._kernels.batches.uses_loops", lambda _: False)
+        request.getfixturevalue("without_loops")
     found = with_individuals(name)
     with torch.inference_mode():
         expected = found(body("rod"))

@@ -59,13 +59,12 @@ def nothing():
 
 
 @pytest.fixture
-def own(tmp_path, monkeypatch):
+def own(on_path):
     """A package with a module of one's own on the Python path."""
-    package = f"mine_{tmp_path.name}"
-    (tmp_path / package).mkdir()
-    (tmp_path / package / "__init__.py").write_text("")
-    (tmp_path / package / "shapes.py").write_text(OWN)
-    monkeypatch.syspath_prepend(tmp_path)
+    package = f"mine_{on_path.name}"
+    (on_path / package).mkdir()
+    (on_path / package / "__init__.py").write_text("")
+    (on_path / package / "shapes.py").write_text(OWN)
     return f"{package}.shapes"
 
 

@@ -6,7 +6,6 @@ import itertools
 import json
 import os
 import shutil
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -29,10 +28,10 @@ from pages import (
     worst_by_a_loop,
 )
 
+from commands import run
 from conftest import as_mesh
 from igps.analysis.clusters import clusters_of
 from igps.analysis.map import body_map
-from igps.cli import main
 from igps.report.page import render_page
 from igps.report.results import Results, System, read_results
 from igps.report.surfaces import surface_of
@@ -812,8 +811,7 @@ def test_the_demo_ends_with_its_page(browser, tmp_path, monkeypatch, capsys):
     """A smaller demo, the last line of which names a page that opens."""
     few = ArticulatedShapes(n_classes=2, n_per_class=2)
     monkeypatch.setattr("igps.shapes.ArticulatedShapes", lambda **_: few)
-    monkeypatch.setattr(sys, "argv", ["igps", "demo", "--out", str(tmp_path), "--n_workers", "1"])
-    main()
+    run(monkeypatch, "demo", "--out", tmp_path, "--n_workers", 1)
     *_, last = capsys.readouterr().out.splitlines()
     path = Path(last.removeprefix("page of results: "))
     assert path == tmp_path / "report.html"

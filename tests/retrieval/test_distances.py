@@ -81,8 +81,7 @@ def test_cosine_ignores_length_even_at_the_ends_of_the_dtype(scale):
 
 
 @pytest.mark.parametrize("distance", ALL)
-def test_threads_change_no_bit(distance, monkeypatch):
-    monkeypatch.setattr("igps._threads.n_cores", lambda: 8)
+def test_threads_change_no_bit(distance, many_cores, monkeypatch):
     monkeypatch.setattr(distances, "_TRIPLES_PER_THREAD", 0)
     queries = histograms(70, (40,), seed=21)
     gallery = histograms(9, (40,), seed=22)

@@ -37,10 +37,10 @@ BACK_ENDS = [
 
 
 @pytest.fixture(params=BACK_ENDS)
-def device(request, monkeypatch):
+def device(request):
     """Where the points are; on the CPU by compiled loops or by operations of PyTorch."""
     if request.param == "torch":
-        monkeypatch.setattr("igps.nn._kernels.batches.uses_loops", lambda _: False)
+        request.getfixturevalue("without_loops")
     return "cuda" if request.param == "cuda" else "cpu"
 
 
@@ -334,9 +334,8 @@ def test_shapes_of_any_sizes_are_counted_as_alone(device):
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
-def test_threads_change_no_bit(monkeypatch):
+def test_threads_change_no_bit(many_cores):
     """700 points, several blocks for each share, and the gradient."""
-    monkeypatch.setattr("igps._threads.n_cores", lambda: 8)
     given = {name: value.requires_grad_() for name, value in some(700).items()}
     upstream = None
     results = []
