@@ -56,7 +56,7 @@ def test_molecules_have_rows_of_composition_and_length(tmp_path):
         labels=["ag", "ag", "l", "l"],
     )
     dataset.precompute(n_workers=1, progress=False, strict=True)
-    described = igps.describe(dataset, composition)
+    described = igps.describe(dataset, composition, n_workers=1)
     assert described[:, 0].tolist() == [0.5, 0.5, 0, 0]  # alanine
     distances = composition.distances(described, described)
     assert retrieval_scores(distances, ["ag", "ag", "l", "l"]).mean()["nn"] == 1

@@ -321,7 +321,7 @@ def test_values_at_the_vertices_of_a_cavity_count(tmp_path):
     for cavities in ("keep", "fill"):
         dataset = SignatureDataset(
             tmp_path / "bodies",
-            SignatureConfig(n_eigenpairs=10),
+            CONFIG,
             tmp_path / "cache",
             reading=LoadOptions(cavities=cavities),
             attributes={"heat": VertexAttribute("{stem}.ply", tmp_path)},

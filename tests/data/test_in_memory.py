@@ -38,12 +38,12 @@ def test_they_have_the_signatures_of_their_files(tmp_path):
     in_memory = SignatureDataset(given, CONFIG, tmp_path / "memory", labels=["x", "y", "z"])
     assert in_memory.bodies.names == ("a#2", "a#5", "a#9", "b", "c")
     assert in_memory.bodies.labels == ("x", "x", "x", "y", "z")
-    errors = [failure.error for failure in in_memory.precompute(progress=False)]
+    errors = [failure.error for failure in in_memory.precompute(n_workers=1, progress=False)]
     assert errors[0].startswith("a#9: expected at least 8 voxels, got 3,")
     assert errors[1].startswith("c: 64 voxels are NaN")
     assert len(errors) == 2
-    usable = in_memory.usable(in_memory.precompute(progress=False))
-    of_files = of_files.usable(of_files.precompute(progress=False))
+    usable = in_memory.usable(in_memory.precompute(n_workers=1, progress=False))
+    of_files = of_files.usable(of_files.precompute(n_workers=1, progress=False))
     for one, other in zip(usable.signatures(), of_files.signatures(), strict=True):
         np.testing.assert_array_equal(one.eigenvalues, other.eigenvalues)
         np.testing.assert_array_equal(one.interior.points, other.interior.points)
@@ -58,7 +58,7 @@ def test_arrays_have_their_spacing_and_are_cached_by_what_they_hold(tmp_path):
     volumes = []
     for spacing in ((1, 1, 2), (1, 1, 1)):  # under one name
         dataset = SignatureDataset({"a": (labels == 2, spacing)}, CONFIG, tmp_path)
-        assert dataset.precompute(progress=False) == []
+        assert dataset.precompute(n_workers=1, progress=False) == []
         volumes.append(dataset[0].signature.volume)
         assert dataset.bodies.names == ("a",)
         again = SignatureDataset({"b": (labels == 2, spacing)}, CONFIG, tmp_path)

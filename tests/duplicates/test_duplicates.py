@@ -168,7 +168,8 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
     nibabel.save(
         nibabel.Nifti1Image(labels(1.4), np.diag([1.4, 1.4, 1.4, 1])), tmp_path / "sampled.nii"
     )
-    found = duplicates(SignatureDataset(tmp_path, CONFIG), tolerance=0.01)
+    dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
+    found = duplicates(dataset, tolerance=0.01, n_workers=1)
     names = ("given.nii.gz", "mgh.mgz", "turned.nii", "cropped.nii")
     assert grouped(found.groups) == {
         frozenset(f"{name}#{label}" for name in names) for label in (1, 2)
