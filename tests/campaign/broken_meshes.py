@@ -30,7 +30,7 @@ from igps.failures import Failed, Limits
 from igps.mesh import mending
 from igps.mesh.simplification import simplify
 from igps.mesh.watertight import watertight
-from igps.spectra._lanczos import ConvergenceError
+from igps.spectra import ConvergenceError
 
 SEED = 13
 CONFIG = SignatureConfig(n_eigenpairs=6, resolution=9, min_samples=0, n_surface_samples=40)

@@ -6,7 +6,6 @@ import trimesh
 from one_body import of_mesh
 
 from conftest import as_mesh
-from igps.descriptors.literature._linear_histogram import linear_histogram
 from igps.descriptors.literature.local_diameter_centricity import (
     LocalDiameterCentricity,
     centricity,
@@ -126,21 +125,6 @@ def test_values_beyond_the_range_go_to_the_last_bins(sphere):
     descriptor = LocalDiameterCentricity(max_diameter=0.1, max_centricity=0.1)
     histogram = descriptor.describe_body(of_mesh(sphere))
     assert histogram[-1, -1] == pytest.approx(1, abs=1e-5)
-
-
-def test_histogram_equals_a_loop_over_the_samples():
-    generator = np.random.default_rng(0)
-    first = generator.uniform(0, 1.3, 50)
-    second = generator.uniform(0, 1.1, 50)
-    expected = np.zeros((8, 5))
-    for x, y in zip(first * 8 - 0.5, second * 5 - 0.5, strict=True):
-        for i in range(8):
-            for j in range(5):
-                row = max(0.0, 1 - abs(min(max(x, 0.0), 7.0) - i))
-                column = max(0.0, 1 - abs(min(max(y, 0.0), 4.0) - j))
-                expected[i, j] += row * column / 50
-    found = linear_histogram([first, second], [8, 5])
-    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_triangles_count_by_their_area():

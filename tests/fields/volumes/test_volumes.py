@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from igps.fields.volumes._volume_files import _WORK_BYTES
 from igps.fields.volumes.label_names import read_label_names
 from igps.fields.volumes.label_volume import (
     LabelVolume,
@@ -667,7 +666,7 @@ def test_labels_as_floating_point_numbers_take_no_more_memory_than_is_asked_for(
     tracemalloc.stop()
     expected = [(7, "7", 70 * 50 * 90), (300, "300", 10 * 120 * 120)]
     assert label_bodies(volume) == expected
-    assert peak < _WORK_BYTES * labels.size
+    assert peak < 4 * labels.size
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float64])
