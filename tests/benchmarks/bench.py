@@ -19,7 +19,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -65,22 +64,18 @@ class Figure:
     note: str = ""
 
 
-spreads: list[float] = []
+spreads = []
 """Range of the repetitions over their median, for all timings in this process."""
 
 
-def timed(
-    ours: Callable[[], object], baseline: Callable[[], object], repeat: int = 3
-) -> tuple[float, float]:
+def timed(ours, baseline, repeat=3):
     """Median seconds of both functions, over alternating repetitions."""
     return timed_by(lambda: _seconds(ours), lambda: _seconds(baseline), repeat)
 
 
-def timed_by(
-    ours: Callable[[], float], baseline: Callable[[], float], repeat: int = 3
-) -> tuple[float, float]:
+def timed_by(ours, baseline, repeat=3):
     """Like `timed`, for functions that return their own seconds."""
-    seconds: tuple[list[float], list[float]] = ([], [])
+    seconds = ([], [])
     for _ in range(repeat):
         for times, function in zip(seconds, (ours, baseline), strict=True):
             times.append(function())
@@ -88,7 +83,7 @@ def timed_by(
     return median(seconds[0]), median(seconds[1])
 
 
-def _seconds(function: Callable[[], object]) -> float:
+def _seconds(function):
     start = time.perf_counter()
     function()
     return time.perf_counter() - start
@@ -100,21 +95,21 @@ class Machine:
     Values that the system does not provide are NaN.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         self._start = self._ticks()
 
-    def load(self) -> float:
+    def load(self):
         """Mean number of runnable processes over a minute, those of the benchmark included."""
         return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
 
-    def steal(self) -> float:
+    def steal(self):
         """Share of the processor time that other virtual machines took."""
         total, stolen = self._start
         total_now, stolen_now = self._ticks()
         return (stolen_now - stolen) / (total_now - total) if total_now > total else float("nan")
 
     @staticmethod
-    def _ticks() -> tuple[float, float]:
+    def _ticks():
         try:
             ticks = [
                 int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
@@ -124,22 +119,16 @@ class Machine:
         return float(sum(ticks[:8])), float(ticks[7])  # user time includes the time of guests
 
 
-def against(
-    name: str,
-    ours: Callable[[], object],
-    baseline: Callable[[], object],
-    repeat: int = 3,
-    note: str = "",
-) -> Figure:
+def against(name, ours, baseline, repeat=3, note=""):
     seconds, reference = timed(ours, baseline, repeat)
     return Figure(seconds, "s", reference, name, reference / seconds, note)
 
 
-def within(limit: float, seconds: float, note: str = "") -> Figure:
+def within(limit, seconds, note=""):
     return Figure(seconds, "s", limit, "target", limit / seconds, note)
 
 
-def model(data: Path | None, n_vertices: int, subdivisions: int = 0) -> Mesh:
+def model(data, n_vertices, subdivisions=0):
     """A SHREC'07 model or a generated body of about `n_vertices` vertices, after subdivision at edge midpoints."""
     start = n_vertices // 4**subdivisions
     if data is not None:
@@ -155,23 +144,19 @@ def model(data: Path | None, n_vertices: int, subdivisions: int = 0) -> Mesh:
     return Mesh(vertices, faces, name=mesh.name)
 
 
-def vertex_count(path: Path) -> int:
+def vertex_count(path):
     with path.open() as file:
         file.readline()
         return int(file.readline().split()[0])
 
 
-def by_eigsh(
-    stiffness: sparse.csr_matrix, mass: np.ndarray, k: int = K
-) -> tuple[np.ndarray, np.ndarray]:
+def by_eigsh(stiffness, mass, k=K):
     return sparse.linalg.eigsh(
         stiffness.tocsc(), k + 1, sparse.diags(mass, format="csc"), sigma=-0.01 / mass.sum()
     )
 
 
-def eigen(
-    data: Path | None, n_vertices: int, subdivisions: int = 0, repeat: int = 3, k: int = K
-) -> Figure:
+def eigen(data, n_vertices, subdivisions=0, repeat=3, k=K):
     mesh = model(data, n_vertices, subdivisions)
     stiffness, mass = laplacian(mesh)
     spectrum = eigenpairs(stiffness, mass, k, positions=mesh.vertices)
@@ -188,14 +173,14 @@ def eigen(
     )
 
 
-def eigen_against_lapy(data: Path | None) -> Figure:
+def eigen_against_lapy(data):
     from lapy import Solver, TriaMesh
 
     mesh = model(data, 11_000)
     vertices = np.array(mesh.vertices)
     faces = np.array(mesh.faces)
 
-    def ours() -> None:
+    def ours():
         stiffness, mass = laplacian(mesh)
         eigenpairs(stiffness, mass, K, positions=mesh.vertices)
 
@@ -207,18 +192,18 @@ def eigen_against_lapy(data: Path | None) -> Figure:
     )
 
 
-def eigen_against_robust(data: Path | None) -> Figure:
+def eigen_against_robust(data):
     import robust_laplacian
 
     mesh = model(data, 11_000)
     vertices = np.array(mesh.vertices)
     faces = np.array(mesh.faces)
 
-    def ours() -> None:
+    def ours():
         stiffness, mass = laplacian(mesh, "robust")
         eigenpairs(stiffness, mass, K, positions=mesh.vertices)
 
-    def theirs() -> None:
+    def theirs():
         stiffness, mass = robust_laplacian.mesh_laplacian(vertices, faces)
         by_eigsh(stiffness.tocsr(), mass.diagonal())
 
@@ -227,13 +212,13 @@ def eigen_against_robust(data: Path | None) -> Figure:
     )
 
 
-def coordinates_25k(data: Path | None) -> Figure:
+def coordinates_25k(data):
     mesh = model(data, 25_273)
     stiffness, mass = laplacian(mesh)
     spectrum = eigenpairs(stiffness, mass, K, positions=mesh.vertices)
     points = interior_samples(mesh)
 
-    def evaluate(accuracy: float | None) -> np.ndarray:
+    def evaluate(accuracy):
         return extend(mesh.vertices, mesh.faces, spectrum.eigenfunctions, points, accuracy=accuracy)
 
     embedding = [
@@ -245,7 +230,7 @@ def coordinates_25k(data: Path | None) -> Figure:
     return against("our exact evaluation", lambda: evaluate(1e-3), lambda: evaluate(None), 2, note)
 
 
-def voxels_128(data: Path | None) -> Figure:
+def voxels_128(data):
     import igl
 
     mesh = model(data, 25_273)
@@ -264,7 +249,7 @@ def voxels_128(data: Path | None) -> Figure:
     return Figure(seconds, "s", reference, "libigl winding number", reference / seconds, note)
 
 
-def winding_25k_exact(data: Path | None) -> Figure:
+def winding_25k_exact(data):
     import igl
 
     mesh = model(data, 25_273)
@@ -279,11 +264,11 @@ def winding_25k_exact(data: Path | None) -> Figure:
     )
 
 
-def histogram_pairs(data: Path | None) -> Figure:
+def histogram_pairs(data):
     embedding = torch.randn(4096, K, generator=torch.Generator().manual_seed(0)) * 0.06
     potential = embedding.norm(dim=1)
 
-    def plain() -> torch.Tensor:
+    def plain():
         return torch.histc(torch.pdist(embedding), 64, 0, 4)
 
     pair_histogram(embedding, potential)  # compiled at the first call
@@ -300,7 +285,7 @@ def histogram_pairs(data: Path | None) -> Figure:
     )
 
 
-def histogram_backward(data: Path | None) -> Figure:
+def histogram_backward(data):
     embedding = torch.randn(4096, K, generator=torch.Generator().manual_seed(0)) * 0.06
     potential = embedding.norm(dim=1)
     classes = Potential(4, learnable=True)
@@ -309,11 +294,11 @@ def histogram_backward(data: Path | None) -> Figure:
     centres = torch.linspace(0.03, 3.97, 64, requires_grad=True)
     small = embedding[:1024]
 
-    def ours() -> None:
+    def ours():
         distances = axes.euclidean_distances(embedding, bins.centres())
         (joint_histogram(classes.memberships(potential), [distances]) * upstream).sum().backward()
 
-    def by_autograd() -> None:
+    def by_autograd():
         # The same kernel without classes, by autograd on an array (pairs, bins), for a sixteenth of the pairs
         position = torch.pdist(small)[:, None] - centres
         (torch.relu(1 - position.abs() * 16).sum(dim=0) * upstream[0]).sum().backward()
@@ -325,7 +310,7 @@ def histogram_backward(data: Path | None) -> Figure:
     return Figure(rate, "M pairs/s", reference, "dense autograd", rate / reference, note)
 
 
-def chi_square_distances(data: Path | None) -> Figure:
+def chi_square_distances(data):
     from sklearn.metrics.pairwise import additive_chi2_kernel
 
     histograms = torch.rand(2000, 512, generator=torch.Generator().manual_seed(0))
@@ -339,7 +324,7 @@ def chi_square_distances(data: Path | None) -> Figure:
     )
 
 
-def euclidean_distances(data: Path | None) -> Figure:
+def euclidean_distances(data):
     vectors = torch.randn(4000, 252, generator=torch.Generator().manual_seed(0))
     euclidean(vectors[:2], vectors[:2])  # compiled at the first call
     return against(
@@ -350,7 +335,7 @@ def euclidean_distances(data: Path | None) -> Figure:
     )
 
 
-def oriented_pairs(data: Path | None) -> Figure:
+def oriented_pairs(data):
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(1000, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=generator), dim=1)
@@ -362,11 +347,11 @@ def oriented_pairs(data: Path | None) -> Figure:
     n = directions.double().numpy()
     i, j = np.triu_indices(1000, 1)
 
-    def ours() -> None:
+    def ours():
         with torch.inference_mode():
             joint_histogram(one_class, [distances, oriented])
 
-    def by_numpy() -> None:
+    def by_numpy():
         line = x[j] - x[i]
         distance = np.linalg.norm(line, axis=1)
         a, b = ((sign * n[end] * line).sum(axis=1) / distance for sign, end in ((1, i), (-1, j)))
@@ -389,7 +374,7 @@ def oriented_pairs(data: Path | None) -> Figure:
     )
 
 
-def describe_before(data: Path | None) -> dict[str, Figure]:
+def describe_before(data):
     """Processor time for the description of a signature on one thread, against commit 8140bb3."""
     mesh = model(data, 10_000)
     requirements = igps.descriptor("multiscale").requirements | igps.descriptor("rich").requirements
@@ -408,7 +393,7 @@ def describe_before(data: Path | None) -> dict[str, Figure]:
     return figures
 
 
-def signature_1500(data: Path | None) -> Figure:
+def signature_1500(data):
     """The signature of a small body as `pretrained` requires it, on one thread, against version 0.2.0."""
     mesh = model(data, 1_500)
     config = igps.descriptor("pretrained").requirements.apply_to(igps.SignatureConfig())
@@ -422,7 +407,7 @@ def signature_1500(data: Path | None) -> Figure:
     return Figure(ours, "s", before, "version 0.2.0", before / ours, note)
 
 
-def epoch(data: Path | None) -> dict[str, Figure]:
+def epoch(data):
     """An epoch over 400 stored signatures, without and with workers, against version 0.2.0 and each other."""
     figures = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -446,7 +431,7 @@ def epoch(data: Path | None) -> dict[str, Figure]:
     return figures
 
 
-def learned_step(data: Path | None) -> Figure:
+def learned_step(data):
     """A training step of `rich` with learnable bins, 40 shapes of 400 samples, on one thread, against version 0.2.0."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "meshes"
@@ -458,7 +443,7 @@ def learned_step(data: Path | None) -> Figure:
     )
 
 
-def together(data: Path | None) -> dict[str, Figure]:
+def together(data):
     """Processor time for the description of 32 bodies as one batch, on one thread, against batches of one body."""
     torch.set_num_threads(1)
     requirements = (
@@ -482,9 +467,7 @@ def together(data: Path | None) -> dict[str, Figure]:
         for name in ("interior", "pretrained"):
             descriptor = igps.descriptor(name)
 
-            def seconds(
-                batches: Sequence[igps.SignatureBatch], descriptor: igps.Descriptor = descriptor
-            ) -> float:
+            def seconds(batches, descriptor=descriptor):
                 start = time.process_time()
                 with torch.no_grad():
                     for batch in batches:
@@ -500,9 +483,7 @@ def together(data: Path | None) -> dict[str, Figure]:
 
 
 @contextlib.contextmanager
-def two_versions(
-    script: str, path: Path, commit: str
-) -> Iterator[Callable[[str], tuple[float, float]]]:
+def two_versions(script, path, commit):
     """Run a script of this folder with the current igps and with that of a commit, each on one thread.
 
     Gives a function from a line of input to the seconds that both scripts print, medians of seven repetitions.
@@ -526,20 +507,20 @@ def two_versions(
             stack.enter_context(process)
             processes.append(process)
 
-        def seconds_of(line: str) -> tuple[float, float]:
-            seconds: tuple[list[float], list[float]] = ([], [])
+        def seconds_of(line):
+            seconds = ([], [])
             for _ in range(7):
                 for times, process in zip(seconds, processes, strict=True):
                     print(line, file=process.stdin, flush=True)
-                    times.append(float(process.stdout.readline()))  # type: ignore[union-attr]
+                    times.append(float(process.stdout.readline()))
             return median(seconds[0]), median(seconds[1])
 
         yield seconds_of
         for process in processes:
-            process.stdin.close()  # type: ignore[union-attr]
+            process.stdin.close()
 
 
-def descriptor_15k(data: Path | None) -> Figure:
+def descriptor_15k(data):
     """Growth of the peak memory by the histogram of a body of 15,000 samples, which have 112 million pairs."""
     embedding = torch.randn(15_000, K, generator=torch.Generator().manual_seed(0)) * 0.06
     potential = embedding.norm(dim=1)
@@ -556,30 +537,30 @@ def descriptor_15k(data: Path | None) -> Figure:
     )
 
 
-def mesh_to_histogram(mesh: Mesh) -> float:
+def mesh_to_histogram(mesh):
     start = time.perf_counter()
     signature = igps.compute_signature(mesh, igps.SignatureConfig.paper())
     igps.descriptor("interior")(igps.collate([signature]))
     return time.perf_counter() - start
 
 
-def mesh_10k(data: Path | None) -> Figure:
+def mesh_10k(data):
     mesh = model(data, 10_000)
     note = f"{len(mesh.vertices)} vertices; the paper reports about 200 s on its machine"
     return within(1.5, min(mesh_to_histogram(mesh) for _ in range(3)), note)
 
 
-def mesh_250k(data: Path | None) -> Figure:
+def mesh_250k(data):
     mesh = model(data, 250_000, 2)
     return within(12, mesh_to_histogram(mesh), f"{len(mesh.vertices)} vertices")
 
 
-def mesh_1m(data: Path | None) -> Figure:
+def mesh_1m(data):
     mesh = model(data, 1_000_000, 3)
     return within(90, mesh_to_histogram(mesh), f"{len(mesh.vertices)} vertices, in 6 GiB at most")
 
 
-def shrec07(data: Path | None) -> dict[str, Figure]:
+def shrec07(data):
     """Retrieval of all models by the command line: without cache against commit BEFORE, and from the cache."""
     if data is None:
         return {}
@@ -593,9 +574,7 @@ def shrec07(data: Path | None) -> dict[str, Figure]:
         subprocess.run(["tar", "x", "-C", before], check=True, input=archive)
         environment_before = {**os.environ, "PYTHONPATH": str(before / "src")}
 
-        def retrieve(
-            descriptor: str, option: str, cache: str, environment: dict[str, str] | None = None
-        ) -> float:
+        def retrieve(descriptor, option, cache, environment=None):
             command = [
                 sys.executable,
                 "-m",
@@ -627,7 +606,7 @@ def shrec07(data: Path | None) -> dict[str, Figure]:
     return figures
 
 
-def company(data: Path | None) -> dict[str, Figure]:
+def company(data):
     """Each task beside two busy processes: with the library's choice of threads, against one thread.
 
     Libraries read their number of threads when they are loaded. So each setting has a worker process, and one waits for
@@ -657,7 +636,7 @@ def company(data: Path | None) -> dict[str, Figure]:
 
 
 @contextlib.contextmanager
-def busy() -> Iterator[None]:
+def busy():
     """Run a process that keeps a core busy."""
     process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
@@ -668,7 +647,7 @@ def busy() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def worker(data: Path | None, environment: dict[str, str]) -> Iterator[Callable[[str], float]]:
+def worker(data, environment):
     """Start a process that runs tasks of `COMPANY`. Gives a function from the name of a task to its seconds."""
     command = [sys.executable, __file__, "--worker"] + (["--data", str(data)] if data else [])
     process = subprocess.Popen(
@@ -679,7 +658,7 @@ def worker(data: Path | None, environment: dict[str, str]) -> Iterator[Callable[
     write = process.stdin
     read = process.stdout
 
-    def run(task: str) -> float:
+    def run(task):
         print(task, file=write, flush=True)
         return float(read.readline())
 
@@ -692,7 +671,7 @@ def worker(data: Path | None, environment: dict[str, str]) -> Iterator[Callable[
             write.close()
 
 
-def work(data: Path | None) -> None:
+def work(data):
     """Run tasks by the names on standard input, and print the seconds of each; the main function of a `worker`."""
     mesh = model(data, 3_600)
     descriptor = igps.descriptor("rich")
@@ -701,7 +680,7 @@ def work(data: Path | None) -> None:
         trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
         dataset = igps.SignatureDataset([path], descriptor=descriptor, cache_dir=folder)
         step = training_step(igps.collate([dataset[0]] * 4))
-        tasks: dict[str, Callable[[], object]] = {
+        tasks = {
             "signature": lambda: igps.compute_signature(mesh),
             "describe": lambda: igps.describe(dataset, descriptor),
             "step": step,
@@ -713,7 +692,7 @@ def work(data: Path | None) -> None:
 COMPANY = ("signature", "describe", "step")
 
 
-def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
+def training_step(batch):
     """A training step by Lightning, with loss, gradients and update, on four shapes of two classes."""
     from pytorch_lightning import Trainer
     from torch.utils.data import DataLoader
@@ -727,11 +706,11 @@ def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
         descriptor, BlendedDistance(ProjectionHead(width=16, n_hidden=32))
     )
     batch = replace(batch, labels=torch.tensor([0, 0, 1, 1]))
-    loader: DataLoader[igps.SignatureBatch] = DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
-    learner.on_train_start = lambda: None  # type: ignore[method-assign]  # a step does not include the fit of the head
-    learner.on_train_epoch_end = lambda: None  # type: ignore[method-assign]
+    loader = DataLoader([batch], batch_size=None)
+    learner.on_train_start = lambda: None  # a step does not include the fit of the head
+    learner.on_train_epoch_end = lambda: None
 
-    def step() -> None:
+    def step():
         trainer = Trainer(
             max_steps=1,
             accelerator="cpu",
@@ -746,10 +725,10 @@ def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
     return step
 
 
-def starting(data: Path | None) -> dict[str, Figure]:
+def starting(data):
     """Time of `import igps` beyond `import torch`, and of the command line's help."""
 
-    def run(*arguments: str) -> Callable[[], object]:
+    def run(*arguments):
         return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
 
     ours, torch_alone = timed(run("-c", "import igps"), run("-c", "import torch"), 5)
@@ -759,7 +738,7 @@ def starting(data: Path | None) -> dict[str, Figure]:
     return {"import_igps": within(1.5, difference, note), "igps_help": within(3, help_seconds)}
 
 
-FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
+FIGURES = {
     "eigen_11k": lambda data: eigen(data, 11_000),
     "eigen_25k": lambda data: eigen(data, 25_273),
     "eigen_100k": lambda data: eigen(data, 101_092, 1, repeat=1),
@@ -792,7 +771,7 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
 WITH_PROCESSES = ("company", "import", "shrec07")
 
 
-def run_one(name: str, data: Path | None) -> None:
+def run_one(name, data):
     result = FIGURES[name](data)
     figures = result if isinstance(result, dict) else {name: result}
     processes = resource.RUSAGE_CHILDREN if name in WITH_PROCESSES else resource.RUSAGE_SELF
@@ -801,10 +780,10 @@ def run_one(name: str, data: Path | None) -> None:
     print(json.dumps({key: {**asdict(figure), **columns} for key, figure in figures.items()}))
 
 
-def least_disturbed(name: str, data: Path | None) -> dict[str, dict[str, float | str]]:
+def least_disturbed(name, data):
     """Measure the rows of a figure, again if the measurement was disturbed."""
     command = [sys.executable, __file__, "--here", name] + (["--data", str(data)] if data else [])
-    best: dict[str, dict[str, float | str]] = {}
+    best = {}
     min_disturbance = float("inf")
     for attempt in range(1, ATTEMPTS + 1):
         machine = Machine()
@@ -827,7 +806,7 @@ def least_disturbed(name: str, data: Path | None) -> dict[str, dict[str, float |
     return best
 
 
-def main() -> None:
+def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, help="folder of the SHREC'07 meshes")
     parser.add_argument("--out", type=Path, default=Path("build/bench.json"))
@@ -841,7 +820,7 @@ def main() -> None:
     if options.here:
         run_one(options.here, options.data)
         return
-    table: dict[str, dict[str, float | str]] = {}
+    table = {}
     print(
         f"{os.cpu_count()} cores, of which {n_cores()} may be used; load average {Machine().load():.1f}"
     )

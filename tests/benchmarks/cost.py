@@ -6,8 +6,6 @@ errors: for the bodies of the fit, and for each body in turn by a fit to the oth
 eigensolver or the coordinates. Measurements are stored in --table, and not repeated.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json
@@ -20,7 +18,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from igps.analysis.doctor import expected_cost
@@ -37,7 +34,7 @@ N_CLASSES = {40_000: 4, 100_000: 3}
 TOLERANCE = 1.5  # factor between expected and measured cost
 
 
-def measure(path: Path, n_eigenpairs: int) -> dict[str, float]:
+def measure(path, n_eigenpairs):
     """Measure seconds of processor time for one signature, and the peak memory of this process."""
     mesh = load_mesh(path, least_vertices=n_eigenpairs + 2)
     start = time.process_time()
@@ -52,12 +49,12 @@ def measure(path: Path, n_eigenpairs: int) -> dict[str, float]:
     }
 
 
-def terms(vertices: NDArray[np.float64], eigenpairs: NDArray[np.float64]) -> NDArray[np.float64]:
+def terms(vertices, eigenpairs):
     """The terms of the cost: a constant, vertices, and vertices times eigenpairs."""
     return np.stack([np.ones_like(vertices), vertices, vertices * eigenpairs], axis=1)
 
 
-def fitted(columns: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def fitted(columns, values):
     """Fit non-negative constants by least squares of relative errors.
 
     The errors are relative to the geometric mean of a value and its fit in the previous pass, so that values that are
@@ -70,7 +67,7 @@ def fitted(columns: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray
     return np.asarray(constants)
 
 
-def accuracy(expected: NDArray[np.float64], measured: NDArray[np.float64]) -> str:
+def accuracy(expected, measured):
     ratio = expected / measured
     factor = np.exp(np.abs(np.log(ratio)))
     return (
@@ -79,7 +76,7 @@ def accuracy(expected: NDArray[np.float64], measured: NDArray[np.float64]) -> st
     )
 
 
-def report(rows: list[dict[str, float]]) -> None:
+def report(rows):
     vertices, eigenpairs, bodies = (
         np.array([row[key] for row in rows]) for key in ("vertices", "eigenpairs", "body")
     )
@@ -104,7 +101,7 @@ def report(rows: list[dict[str, float]]) -> None:
         )
 
 
-def main() -> None:
+def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -119,7 +116,7 @@ def main() -> None:
     if options.here:
         print(json.dumps(measure(Path(options.here[0]), int(options.here[1]))))
         return
-    rows: list[dict[str, float]] = []
+    rows = []
     if options.table.is_file():
         with options.table.open(newline="") as file:
             rows = [

@@ -5,14 +5,11 @@
 Each line of standard input names a descriptor. The script prints the seconds of processor time for each.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,14 +22,14 @@ except ModuleNotFoundError:  # its place in commit 8140bb3
 KINDS = ("interior", "surface")
 
 
-def save(signature: Signature, path: Path) -> None:
+def save(signature, path):
     """Write the fields of a signature that both versions have."""
-    arrays: dict[str, Any] = {
+    arrays = {
         "eigenvalues": signature.eigenvalues,
         "scalars": [signature.area, signature.volume],
     }
     for kind in KINDS:
-        samples: Samples = getattr(signature, kind)
+        samples = getattr(signature, kind)
         arrays |= {
             f"{kind} points": samples.points,
             f"{kind} eigenfunctions": samples.eigenfunctions,
@@ -43,7 +40,7 @@ def save(signature: Signature, path: Path) -> None:
     np.savez(path, **arrays)
 
 
-def load(path: Path) -> Signature:
+def load(path):
     with np.load(path) as arrays:
         samples = []
         for kind in KINDS:
@@ -57,7 +54,7 @@ def load(path: Path) -> Signature:
         return Signature(arrays["eigenvalues"], *samples, area, volume, SignatureConfig())
 
 
-def main() -> None:
+def main():
     signature = load(Path(sys.argv[1]))
     torch.set_num_threads(1)
     if importlib.util.find_spec("igps.descriptors") is not None:
@@ -67,10 +64,10 @@ def main() -> None:
         presets = importlib.import_module("igps.nn.presets")
         collate = importlib.import_module("igps.data.dataset").collate
 
-        def make(name: str) -> Any:
+        def make(name):
             return presets.preset(name).make()
 
-    made: dict[str, Any] = {}
+    made = {}
     with torch.inference_mode():
         for line in sys.stdin:
             name = line.strip()

@@ -6,15 +6,12 @@ Each line of standard input is a number of worker processes, followed by "memory
 prints the seconds of an epoch in batches of 16 for each, without the start of the workers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import sys
 import time
 import warnings
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch.utils.data import DataLoader
@@ -24,17 +21,17 @@ import igps
 N_ITEMS = 400
 
 
-def main() -> None:
+def main():
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     root = Path(sys.argv[1])
     version = hashlib.sha256(igps.__file__.encode()).hexdigest()[:8]
     config = igps.SignatureConfig(n_eigenpairs=64)
-    dataset: Any = igps.SignatureDataset(root, config, root.parent / f"cache-{version}")
+    dataset = igps.SignatureDataset(root, config, root.parent / f"cache-{version}")
     dataset.precompute(n_workers=1, progress=False)
     indices = [i % len(dataset) for i in range(N_ITEMS)]
     collate = importlib.import_module("igps").collate
-    loaders: dict[str, Any] = {}
+    loaders = {}
     for line in sys.stdin:
         n_workers, *where = line.split()
         if line not in loaders:
@@ -52,7 +49,7 @@ def main() -> None:
         print(epoch(loaders[line]), flush=True)
 
 
-def epoch(loader: Any) -> float:
+def epoch(loader):
     start = time.perf_counter()
     n_seen = sum(len(batch.ids) for batch in loader)
     assert n_seen == N_ITEMS

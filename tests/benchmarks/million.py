@@ -6,14 +6,10 @@ little of any other body and noise. The script prints the cost of building the g
 Another seed gives other rows and other queries.
 """
 
-from __future__ import annotations
-
 import argparse
 import resource
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +31,7 @@ CONDITIONS = {
 }
 
 
-def condition(name: str, own: int) -> str | None:
+def condition(name, own):
     """The condition for a query of the class `own`."""
     template = CONDITIONS[name]
     if template is None:
@@ -46,7 +42,7 @@ def condition(name: str, own: int) -> str | None:
 class Rows:
     """Descriptions that vary those of generated bodies."""
 
-    def __init__(self, folder: Path, seed: int) -> None:
+    def __init__(self, folder, seed):
         described = folder / "described.npz"
         if not described.exists():
             _describe_bodies(folder, described)
@@ -56,7 +52,7 @@ class Rows:
         self.members = [np.flatnonzero(labels == label) for label in np.unique(labels)]
         self.seed = seed
 
-    def descriptions(self, n: int, *keys: int) -> tuple[np.ndarray, np.ndarray]:
+    def descriptions(self, n, *keys):
         """Return n descriptions of length 1 and their classes."""
         generator = np.random.default_rng([self.seed, *keys])
         classes = generator.integers(len(self.members), size=n)
@@ -73,7 +69,7 @@ class Rows:
         mixed += NOISE / np.sqrt(mixed.shape[1]) * noise
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True), classes
 
-    def batch(self, start: int) -> tuple[torch.Tensor, list[dict[str, Any]]]:
+    def batch(self, start):
         """Return the rows of the table from a position on."""
         descriptions, classes = self.descriptions(BATCH, 1, start)
         generator = np.random.default_rng([self.seed, 2, start])
@@ -88,7 +84,7 @@ class Rows:
         return torch.from_numpy(descriptions), rows
 
 
-def _describe_bodies(folder: Path, out: Path) -> None:
+def _describe_bodies(folder, out):
     shapes = igps.ArticulatedShapes(n_classes=N_CLASSES, n_per_class=50, n_vertices=700)
     shapes.write(folder / "meshes")
     descriptor = igps.descriptor("pretrained")
@@ -100,9 +96,7 @@ def _describe_bodies(folder: Path, out: Path) -> None:
     np.savez(out, descriptions=descriptions, labels=np.array(dataset.bodies.labels))
 
 
-def exact_nearest(
-    table: BodyTable, queries: torch.Tensor, classes: np.ndarray, distance: Any
-) -> dict[str, np.ndarray]:
+def exact_nearest(table, queries, classes, distance):
     """Return the names (Q, 10) of the nearest rows under each condition, by comparison with all rows."""
     distances = {name: np.full((len(queries), TOP), np.inf) for name in CONDITIONS}
     names = {name: np.zeros((len(queries), TOP), np.int64) for name in CONDITIONS}
@@ -130,7 +124,7 @@ def exact_nearest(
     return names
 
 
-def main() -> None:
+def main():
     """Build the gallery if it does not exist, and search it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--n", type=int, default=1_000_000)
@@ -146,7 +140,7 @@ def main() -> None:
     if not path.exists():
         start = time.monotonic()
 
-        def batches() -> Iterator[Any]:
+        def batches():
             for first in range(0, arguments.n, BATCH):
                 yield rows.batch(first)
 
@@ -158,8 +152,8 @@ def main() -> None:
     table = BodyTable(path)
     descriptions, classes = rows.descriptions(arguments.n_queries, 3)
     queries = torch.from_numpy(descriptions)
-    found: dict[str, list[list[int]]] = {name: [] for name in CONDITIONS}
-    seconds_of: dict[str, list[float]] = {name: [] for name in CONDITIONS}
+    found = {name: [] for name in CONDITIONS}
+    seconds_of = {name: [] for name in CONDITIONS}
     for name in CONDITIONS:
         for query, own in zip(queries, classes.tolist(), strict=True):
             where = condition(name, own)
@@ -183,7 +177,7 @@ def main() -> None:
         print(f"{name}: recall {np.mean(shares):.4f} at {TOP}", flush=True)
 
 
-def memory() -> str:
+def memory():
     """The peak memory of this process."""
     return f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB"
 

@@ -6,8 +6,6 @@ The archive holds the vertices and faces. Each line of standard input is a confi
 seconds of processor time for each.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time
@@ -18,7 +16,7 @@ import torch
 import igps
 
 
-def main() -> None:
+def main():
     torch.set_num_threads(1)
     with np.load(sys.argv[1]) as arrays:
         mesh = igps.Mesh(arrays["vertices"], arrays["faces"])

@@ -7,33 +7,29 @@ descriptions of 40 shapes of 4 classes with 400 samples each, all pairwise dista
 and the update.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import sys
 import time
 import warnings
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
 
 import igps
 
 N_SHAPES, N_CLASSES, N_SAMPLES = 40, 4, 400
 
 
-def main() -> None:
+def main():
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     root = Path(sys.argv[1])
     version = hashlib.sha256(igps.__file__.encode()).hexdigest()[:8]
     rich = importlib.import_module("igps.descriptors.rich").rich
-    options: Any = {"learnable": True, "n_training_samples": N_SAMPLES}
+    options = {"learnable": True, "n_training_samples": N_SAMPLES}
     try:
-        descriptor: Any = igps.descriptor("rich", **options).train()
+        descriptor = igps.descriptor("rich", **options).train()
     except TypeError:  # of an earlier version
         descriptor = rich(**options).train()
     config = igps.SignatureConfig(
@@ -41,7 +37,7 @@ def main() -> None:
         attributes=("depth", "electrostatic_potential", "surface_direction"),
         n_surface_samples=2000,
     )
-    dataset: Any = igps.SignatureDataset(root, config, root.parent / f"cache-{version}")
+    dataset = igps.SignatureDataset(root, config, root.parent / f"cache-{version}")
     batch = importlib.import_module("igps").collate(
         [dataset[i % len(dataset)] for i in range(N_SHAPES)]
     )
@@ -54,7 +50,7 @@ def main() -> None:
         print(time.process_time() - start, flush=True)
 
 
-def step(descriptor: Any, optimizer: torch.optim.Optimizer, batch: Any, classes: Tensor) -> None:
+def step(descriptor, optimizer, batch, classes):
     roots = descriptor(batch).flatten(1).clamp(min=1e-9).sqrt()
     is_self = torch.eye(len(classes), dtype=torch.bool)
     similarity = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import cycle
@@ -17,7 +17,7 @@ import nibabel
 import numpy as np
 import tifffile
 import trimesh
-from damage import Generator, broken_bytes
+from damage import broken_bytes
 from numpy.typing import NDArray
 
 sys.path.append(str(Path(__file__).parents[2]))
@@ -49,12 +49,12 @@ class BodyFile:
     options: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def name(self) -> str:
+    def name(self):
         """Name of the file of the bodies."""
         return next(iter(self.files))
 
 
-def body_file(seed: int, number: int) -> BodyFile:
+def body_file(seed, number):
     """Make the file of a seed and a number. Kinds alternate, and faults are random."""
     generator = np.random.default_rng([seed, number])
     make = (_volume, _molecule, _image, _volume, _molecule, _scene, _pqr, _beside, _dicom, _beside)[
@@ -63,11 +63,11 @@ def body_file(seed: int, number: int) -> BodyFile:
     return make(generator)
 
 
-def _drawn(generator: Generator, faults: Iterable[str]) -> str:
+def _drawn(generator, faults):
     return str(generator.choice(list(faults)))
 
 
-def _damaged(generator: Generator, given: BodyFile, packed: bool) -> BodyFile:
+def _damaged(generator, given, packed):
     """Damage bytes or words of a file, inside or outside the compression."""
     name = given.name
     content = given.files[given.name]
@@ -89,7 +89,7 @@ _VOLUMES = ("nii", "nii.gz", "mgz", "nrrd", "mha", "tif")
 
 
 @cache
-def labels() -> Array:
+def labels():
     """Three ellipsoids; two of them touch, and one is at the border."""
     x, y, z = np.indices(SHAPE)
     volume = np.zeros(SHAPE, dtype=np.int16)
@@ -104,7 +104,7 @@ def labels() -> Array:
     return volume
 
 
-def _volume(generator: Generator) -> BodyFile:
+def _volume(generator):
     suffix = str(generator.choice(_VOLUMES))
     values = labels().copy()
     affine = AFFINE.copy()
@@ -113,7 +113,7 @@ def _volume(generator: Generator) -> BodyFile:
         whole = BodyFile("volume", {f"x.{suffix}": written_volume(suffix, values, affine)}, None)
         return _damaged(generator, whole, suffix in ("nii.gz", "mgz"))
     cell = 1.0 if suffix == "tif" else abs(np.linalg.det(affine[:3, :3]))
-    expected: Any = {str(label): cell * float((values == label).sum()) for label in LABELS}
+    expected = {str(label): cell * float((values == label).sum()) for label in LABELS}
     beside = {}
     options = {}
     if (change := _ON_VOLUMES[fault]) is not None:
@@ -162,7 +162,7 @@ def _volume(generator: Generator) -> BodyFile:
     )
 
 
-def written_volume(suffix: str, values: Array, affine: Array) -> bytes:
+def written_volume(suffix, values, affine):
     """Write an array, valid or not, in a format."""
     if suffix in ("nii", "nii.gz"):
         image = nibabel.Nifti1Image(values, None, dtype=values.dtype)
@@ -204,11 +204,11 @@ def written_volume(suffix: str, values: Array, affine: Array) -> bytes:
     return rows.encode() + gzip.compress(raw, mtime=0)
 
 
-def _words(numbers: Iterable[float]) -> str:
+def _words(numbers):
     return " ".join(repr(float(x)) for x in numbers)
 
 
-def _oversized(generator: Generator, suffix: str) -> bytes:
+def _oversized(generator, suffix):
     """A file with few voxels, whose header declares 10^13 voxels or more."""
     content = written_volume(suffix, labels(), AFFINE)
     if suffix in ("nrrd", "mha"):
@@ -226,25 +226,23 @@ def _oversized(generator: Generator, suffix: str) -> bytes:
     return gzip.compress(bytes(head), mtime=0) if packed else bytes(head)
 
 
-def _refusing(
-    change: Callable[[Generator, Array, Array], tuple[Array, Array]],
-) -> Callable[..., tuple[Array, Array, bool]]:
+def _refusing(change):
     return lambda generator, values, affine: (*change(generator, values, affine), True)
 
 
-def _poked(values: Array, kind: Any, value: Any) -> Array:
+def _poked(values, kind, value):
     values = values.astype(kind)
     values[5, 5, 5] = value
     return values
 
 
-def _colours(values: Array) -> Array:
+def _colours(values):
     colours = np.zeros(values.shape, dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")])
     colours["R"] = values
     return colours
 
 
-_ON_VOLUMES: dict[str, Callable[..., tuple[Array, Array, bool]] | None] = {
+_ON_VOLUMES = {
     "nothing": None,
     "promises": None,
     "seven voxels": None,
@@ -271,7 +269,7 @@ _ON_VOLUMES: dict[str, Callable[..., tuple[Array, Array, bool]] | None] = {
 
 
 @cache
-def segmentation() -> bytes:
+def segmentation():
     """A DICOM SEG file of the ellipsoids."""
     with tempfile.NamedTemporaryFile(suffix=".dcm") as file:
         masks = test_volumes.masks_of(labels())
@@ -279,13 +277,11 @@ def segmentation() -> bytes:
         return Path(file.name).read_bytes()
 
 
-def _dicom(generator: Generator) -> BodyFile:
+def _dicom(generator):
     content = segmentation()
     fault = _drawn(generator, ("nothing", "an image", "no modality", "damage", "damage"))
     cell = abs(np.linalg.det(test_volumes.AFFINE[:3, :3]))
-    expected: Any = {
-        name: cell * float((labels() == label).sum()) for label, name in LABELS.items()
-    }
+    expected = {name: cell * float((labels() == label).sum()) for label, name in LABELS.items()}
     if fault == "damage":
         return _damaged(generator, BodyFile("volume", {"x.dcm": content}, None), False)
     if fault != "nothing":
@@ -300,7 +296,7 @@ def _dicom(generator: Generator) -> BodyFile:
 
 
 @cache
-def helices() -> tuple[str, ...]:
+def helices():
     """Lines of a PDB file of two helices, A and B, without hydrogens."""
     lines = []
     serial = 0
@@ -335,7 +331,7 @@ class Atom:
     at: Iterable[float]
     record: str = "ATOM"
 
-    def line(self) -> str:
+    def line(self):
         """The line of the atom in the file."""
         position = "".join(f"{x:8.3f}"[:8] for x in self.at)
         return (
@@ -345,11 +341,11 @@ class Atom:
         )
 
 
-def _molecule(generator: Generator) -> BodyFile:
+def _molecule(generator):
     lines = list(helices())
     suffix = str(generator.choice(["pdb", "pdb.gz", "cif", "ent"]))
     fault = _drawn(generator, _ON_MOLECULES) if generator.random() < 0.65 else "damage"
-    expected: Any = {"chain A": AS_IT_IS, "chain B": AS_IT_IS}
+    expected = {"chain A": AS_IT_IS, "chain B": AS_IT_IS}
     if fault != "damage":
         lines, changed = _ON_MOLECULES[fault](generator, lines)
         expected = {**expected, **changed} if isinstance(changed, dict) else changed
@@ -372,29 +368,27 @@ def _molecule(generator: Generator) -> BodyFile:
 Change = tuple[list[str], Any]
 
 
-def _each_atom(lines: list[str], change: Callable[[str, int], str | None]) -> list[str]:
+def _each_atom(lines, change):
     """Change the line of each atom, or leave it out if the change is None."""
     changed = [change(line, i) if line.startswith("ATOM") else line for i, line in enumerate(lines)]
     return [line for line in changed if line is not None]
 
 
-def _of_chain_a(
-    change: Callable[[str], str], last: int = 10**6
-) -> Callable[[Generator, list[str]], list[str]]:
+def _of_chain_a(change, last=10**6):
     return lambda g, lines: _each_atom(
         lines, lambda line, i: change(line) if line[21] == "A" and i <= last else line
     )
 
 
-def _numbered(line: str, number: int) -> str:
+def _numbered(line, number):
     return f"{line[:22]}{number:>4}{line[26:]}"
 
 
-def _placed(line: str, at: Iterable[float]) -> str:
+def _placed(line, at):
     return line[:30] + "".join(f"{x:8.3f}"[:8] for x in at) + line[54:]
 
 
-def _alternatives(generator: Generator, lines: list[str]) -> Change:
+def _alternatives(generator, lines):
     found = []
     for line in lines:
         if line.startswith("ATOM") and generator.random() < 0.2:
@@ -407,7 +401,7 @@ def _alternatives(generator: Generator, lines: list[str]) -> Change:
     return found, {}
 
 
-_ON_MOLECULES: dict[str, Callable[[Generator, list[str]], Change]] = {
+_ON_MOLECULES = {
     "nothing": lambda g, lines: (lines, {}),
     "alternatives": _alternatives,
     "negative numbers": lambda g, lines: (
@@ -481,7 +475,7 @@ _ON_MOLECULES: dict[str, Callable[[Generator, list[str]], Change]] = {
 }
 
 
-def _pqr(generator: Generator) -> BodyFile:
+def _pqr(generator):
     """A PQR file: words separated by spaces, with charges and radii in the last columns."""
     lines = [
         f"ATOM {line[6:11]} {line[12:16]} {line[17:20]} {line[21]} {line[22:26]} {line[30:54]} {charge:.4f} 1.80"
@@ -492,7 +486,7 @@ def _pqr(generator: Generator) -> BodyFile:
     fault = _drawn(
         generator, ("nothing", "remarks", "no chains", "radius", "charge", "damage", "damage")
     )
-    expected: Any = {"chain A": None, "chain B": None}
+    expected = {"chain A": None, "chain B": None}
     if fault == "remarks":
         lines = ["REMARK   1 PQR file generated by PDB2PQR", "", *lines, "TER", "END"]
     elif fault == "no chains":
@@ -519,7 +513,7 @@ def _pqr(generator: Generator) -> BodyFile:
 # Scenes and CAD files.
 
 
-def _scene(generator: Generator) -> BodyFile:
+def _scene(generator):
     boxes = {"shaft": (1.0, 2.0, 3.0), "wheel": (2.0, 2.0, 1.0), "plate": (4.0, 3.0, 0.5)}
     step = generator.random() < 0.4
     fault = str(
@@ -548,7 +542,7 @@ def _scene(generator: Generator) -> BodyFile:
                 )
             scene.export(path)
         content = path.read_bytes()
-    expected: Any = {name: float(np.prod(sides)) for name, sides in boxes.items()}
+    expected = {name: float(np.prod(sides)) for name, sides in boxes.items()}
     if fault == "not finite":
         expected["wheel"] = REFUSED
     if fault == "repeat":
@@ -562,12 +556,12 @@ def _scene(generator: Generator) -> BodyFile:
 # Images beside bodies.
 
 
-def field_at(points: Array) -> Array:
+def field_at(points):
     """Values of the image at points (P, 3)."""
     return 100 + points @ np.array([2.0, -3.0, 1.0])
 
 
-def _image(generator: Generator) -> BodyFile:
+def _image(generator):
     suffix = str(generator.choice(["nii.gz", "nrrd", "mha", "nii"]))
     fault = _drawn(
         generator, ("nothing", "some holes", "border", "half", "of another", "not finite", "damage")
@@ -598,7 +592,7 @@ def _image(generator: Generator) -> BodyFile:
     return BodyFile("image", {"x.off": body, **beside}, expected, f"{suffix}: {fault}")
 
 
-def _beside(generator: Generator) -> BodyFile:
+def _beside(generator):
     """A grid or values at vertices, beside a ball."""
     suffix = str(generator.choice(["dx", "mrc", "map", "ply", "vtk", "shape.gii", "curv"]))
     is_grid = suffix in ("dx", "mrc", "map")
@@ -623,7 +617,7 @@ def _beside(generator: Generator) -> BodyFile:
     return BodyFile("image", {"x.off": body, **beside}, expected, f"{suffix}: {fault}")
 
 
-def _holed(generator: Generator, values: Array, fault: str) -> Array:
+def _holed(generator, values, fault):
     if fault == "some holes":
         values.flat[values.size // 2] = generator.choice([np.nan, np.inf, 7e18])
     elif fault == "not finite":
@@ -631,7 +625,7 @@ def _holed(generator: Generator, values: Array, fault: str) -> Array:
     return values
 
 
-def _grid(generator: Generator, suffix: str, fault: str, ball: trimesh.Trimesh) -> bytes:
+def _grid(generator, suffix, fault, ball):
     side = np.array([0.5, 0.6, 0.4])
     shape = np.array([17, 15, 21])
     origin = -side * (shape - 1) / 2 + np.array(
@@ -671,11 +665,11 @@ def _grid(generator: Generator, suffix: str, fault: str, ball: trimesh.Trimesh) 
     return head.tobytes() + values.astype("<f4").tobytes(order="F")
 
 
-def _integers(numbers: Iterable[int]) -> str:
+def _integers(numbers):
     return " ".join(str(int(x)) for x in numbers)
 
 
-def _at_vertices(generator: Generator, suffix: str, fault: str, ball: trimesh.Trimesh) -> bytes:
+def _at_vertices(generator, suffix, fault, ball):
     """A file of values at vertices. GIFTI is written by nibabel, other formats are assembled here."""
     values = _holed(generator, field_at(ball.vertices).astype(np.float32), fault)
     values = values[:-1] if fault == "of another" else values

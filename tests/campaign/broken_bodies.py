@@ -3,8 +3,6 @@
 `python tests/campaign/broken_bodies.py --case 123` repeats the trial of one file, and stores the file.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import tempfile
@@ -12,15 +10,13 @@ import traceback
 import warnings
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import nibabel
 import numpy as np
 import SimpleITK
 import trimesh
-from body_files import AS_IT_IS, REFUSED, BodyFile, body_file, field_at, helices
+from body_files import AS_IT_IS, REFUSED, body_file, field_at, helices
 from broken_meshes import Verdict, count_verdicts
-from outcome import Row
 from scipy import ndimage
 
 from igps import LoadOptions, Mesh, MeshError
@@ -34,13 +30,13 @@ VOLUME, EXACT = 5e-3, 1e-5
 _REMEDY = re.compile(r"[.;:] [A-Z][^.]*.*[.)]$", re.DOTALL)
 
 
-def examine(job: tuple[int, int]) -> Verdict:
+def examine(job):
     """Try the file of a seed and a number, in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
         return judge(body_file(*job), Path(folder))
 
 
-def judge(given: BodyFile, folder: Path) -> Verdict:
+def judge(given, folder):
     """Read the bodies of a file, and check the result."""
     for name, content in given.files.items():
         (folder / name).write_bytes(content)
@@ -75,7 +71,7 @@ def judge(given: BodyFile, folder: Path) -> Verdict:
         return _judge_bodies(given, path, bodies)
 
 
-def _refused(error: Exception, name: Path | str, folder: Path) -> Verdict:
+def _refused(error, name, folder):
     """The verdict on a message, which must contain a name and a remedy."""
     text = str(error)
     if str(name) not in text:
@@ -85,9 +81,7 @@ def _refused(error: Exception, name: Path | str, folder: Path) -> Verdict:
     return Verdict("refused", text.replace(str(folder), "FOLDER"))
 
 
-def _judge_bodies(
-    given: BodyFile, path: Path, bodies: dict[str, tuple[BodyRef, Mesh | MeshError]]
-) -> Verdict:
+def _judge_bodies(given, path, bodies):
     expected = given.expected
     if expected is not None and set(expected) != set(bodies):
         return Verdict("wrong", f"{sorted(bodies)} were read, {sorted(expected)} expected")
@@ -126,13 +120,13 @@ def _judge_bodies(
     return Verdict(kind, "; ".join(refusals), ("bodies",) * n_confirmed)
 
 
-def _bounds(path: Path) -> dict[str, tuple[float, float]]:
+def _bounds(path):
     """Lower and upper bounds of the volume of each label, by another reader.
 
     The lower bound counts the larger connected components, the upper bound all voxels and filled holes.
     """
     if path.name.endswith(("nii", "gz", "mgz")):
-        image: Any = nibabel.load(path)
+        image = nibabel.load(path)
         values = np.asanyarray(image.dataobj).squeeze()
         affine = np.array(image.affine)
         scale = {"meter": 1e3, "micron": 1e-3}
@@ -160,7 +154,7 @@ def _bounds(path: Path) -> dict[str, tuple[float, float]]:
 
 
 @cache
-def _clean() -> dict[str, float]:
+def _clean():
     """Volumes of the molecule without a fault."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "x.pdb"
@@ -170,7 +164,7 @@ def _clean() -> dict[str, float]:
         }
 
 
-def _judge_image(given: BodyFile, path: Path) -> Verdict:
+def _judge_image(given, path):
     image = next(name for name in given.files if name != given.name)
     points = np.random.default_rng(0).normal(size=(200, 3))
     points *= 2.5 / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 2.5)
@@ -199,7 +193,7 @@ def _judge_image(given: BodyFile, path: Path) -> Verdict:
     return Verdict("confirmed", "", ("values",))
 
 
-def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
+def campaign(n_cases, n_workers=None):
     """Try `n_cases` files."""
     return count_verdicts(
         "broken bodies",
@@ -212,7 +206,7 @@ def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
     )
 
 
-def main() -> None:
+def main():
     """Repeat one case and print its verdict."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--case", type=int, required=True, help="number of the file")

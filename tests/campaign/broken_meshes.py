@@ -11,8 +11,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from damage import Broken, broken_mesh
+from damage import broken_mesh
 from outcome import Row
 from reference import confirm
 
@@ -60,14 +59,14 @@ class Verdict:
     checks: tuple[str, ...] = ()
 
 
-def examine(job: tuple[int, int]) -> Verdict:
+def examine(job):
     """Try the file of a seed and a number, in a temporary folder."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
         return judge(broken_mesh(*job), Path(folder), number=job[1])
 
 
-def judge(broken: Broken, folder: Path, number: int) -> Verdict:
+def judge(broken, folder, number):
     """Read and describe a file with the options of its number, and check the result."""
     path = folder / broken.name
     path.write_bytes(broken.content)
@@ -107,7 +106,7 @@ def judge(broken: Broken, folder: Path, number: int) -> Verdict:
     )
 
 
-def _options(number: int) -> tuple[LoadOptions, bool]:
+def _options(number):
     """Options for reading the file of a number, and whether they may change the surface."""
     mend = ("never", "auto", "never", "auto", "never", "auto", "never", "always")[number % 8]
     allow_open = number % 3 == 1 and mend != "always"
@@ -115,14 +114,14 @@ def _options(number: int) -> tuple[LoadOptions, bool]:
     return LoadOptions(mend=mend, allow_open=allow_open), mend != "never"
 
 
-def _grid(number: int) -> AbstractContextManager[object]:
+def _grid(number):
     """A context in which surfaces are made watertight on the grid of the file of a number."""
     if number % DEFAULT_GRID_EVERY == 0:
         return nullcontext()
     return patch.object(mending, "watertight", partial(watertight, resolution=COARSE_RESOLUTION))
 
 
-def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
+def campaign(n_cases, n_workers=None):
     """Try `n_cases` files."""
     return count_verdicts(
         "broken meshes",
@@ -135,20 +134,12 @@ def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
     )
 
 
-def count_verdicts(
-    part: str,
-    what: str,
-    target: str,
-    examine: Callable[[tuple[int, int]], Verdict],
-    jobs: Sequence[tuple[int, int]],
-    story: Callable[[int], str],
-    n_workers: int | None,
-) -> list[Row]:
+def count_verdicts(part, what, target, examine, jobs, story, n_workers):
     """Examine the file of each job, a seed and a number, and make the row. A story tells how a file was broken."""
     start = time.monotonic()
-    kinds: Counter[str] = Counter()
-    reasons: Counter[str] = Counter()
-    checks: Counter[str] = Counter()
+    kinds = Counter()
+    reasons = Counter()
+    checks = Counter()
     missed = []
     for index, verdict in run(
         examine, jobs, n_workers=n_workers, limits=Limits(MAX_SECONDS, MAX_BYTES)
@@ -180,7 +171,7 @@ def count_verdicts(
     ]
 
 
-def main() -> None:
+def main():
     """Repeat one case and print its verdict."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--case", type=int, required=True, help="number of the file")

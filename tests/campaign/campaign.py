@@ -3,8 +3,6 @@
 It prints a table of the results, writes it to a JSON file, and ends with status 1 if a target is missed.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json
@@ -12,17 +10,16 @@ import multiprocessing
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 # One thread for each of the parallel processes. Libraries read this variable when they are imported.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from outcome import Row, table
+from outcome import table
 
 # Number of cases of each part, in the whole campaign and in the small one of two minutes. None leaves a part out.
-_AMOUNTS: dict[str, tuple[int, int | None]] = {
+_AMOUNTS = {
     "broken_meshes": (10_000, 200),
     "broken_bodies": (3_000, 90),
     "changed_streams": (2_000, 20),
@@ -42,8 +39,8 @@ _STAGES = (
 )
 
 
-def _run(part: str, amount: int) -> list[Row]:
-    run: Callable[..., list[Row]] = importlib.import_module(part).campaign
+def _run(part, amount):
+    run = importlib.import_module(part).campaign
     start = time.monotonic()
     before = os.times()
     rows = run(amount) if amount else run()
@@ -55,7 +52,7 @@ def _run(part: str, amount: int) -> list[Row]:
     return rows
 
 
-def _line(parts: Sequence[tuple[str, int]]) -> dict[str, list[Row]]:
+def _line(parts):
     """Run the parts of a line, each in a separate process.
 
     So parts do not share the processes that they start and kill, such as the resource tracker of multiprocessing.
@@ -67,7 +64,7 @@ def _line(parts: Sequence[tuple[str, int]]) -> dict[str, list[Row]]:
     return results
 
 
-def main() -> None:
+def main():
     """Run the campaign, or parts of it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--small", action="store_true", help="run the campaign of two minutes")
@@ -79,7 +76,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     amounts = {part: amount[arguments.small] for part, amount in _AMOUNTS.items()}
-    results: dict[str, list[Row]] = {}
+    results = {}
     for stage in _STAGES:
         lines = [
             [(part, amounts[part]) for part in line if part in arguments.parts] for line in stage

@@ -1,7 +1,5 @@
 """Compressed streams with one to eight changed bytes: the body is as it was, refused, or has a note."""
 
-from __future__ import annotations
-
 import logging
 import sys
 import tempfile
@@ -23,7 +21,7 @@ SEED = 20261129
 KINDS = ("equal", "refused", "note", "wrong")
 
 
-def body_in(path: Path) -> tuple[list[bytes], tuple[str, ...]]:
+def body_in(path):
     """Return the arrays that make a body, and the notes; voxels where the file has voxels."""
     if path.name.startswith("mask"):
         volume = read_label_volume(path)
@@ -32,7 +30,7 @@ def body_in(path: Path) -> tuple[list[bytes], tuple[str, ...]]:
     return [raw.vertices.tobytes(), raw.faces.tobytes()], raw.notes
 
 
-def verdict(path: Path, content: bytes, sound: list[bytes]) -> str:
+def verdict(path, content, sound):
     """Return one of `KINDS` for a file that gets this content."""
     stored(path).write_bytes(content)
     try:
@@ -44,7 +42,7 @@ def verdict(path: Path, content: bytes, sound: list[bytes]) -> str:
     return "note" if notes else "wrong"
 
 
-def examine(name: str, n_cases: int) -> Row:
+def examine(name, n_cases):
     """Change the stream of one format `n_cases` times."""
     start = time.monotonic()
     counts = dict.fromkeys(KINDS, 0)
@@ -68,7 +66,7 @@ def examine(name: str, n_cases: int) -> Row:
     return Row("changed streams", name, n_cases, target, measured, missed, seconds=seconds)
 
 
-def campaign(n_cases: int) -> list[Row]:
+def campaign(n_cases):
     """Change `n_cases` streams of each format."""
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # it logs each of thousands of faults
     return [examine(name, n_cases) for name in WRITERS]

@@ -1,14 +1,12 @@
 """A descriptor of very low cost, for runs that are killed many times."""
 
-from __future__ import annotations
-
 from igps import HistogramDescriptor, PairHistogram, SpectralEmbedding
 from igps.nn.axes import InteriorDistance, Potential
 
 N_EIGENPAIRS = 6
 
 
-def cheap() -> HistogramDescriptor:
+def cheap():
     """The histogram of `interior` with few eigenpairs and few bins."""
     embedding = SpectralEmbedding(n_eigenpairs=N_EIGENPAIRS)
     return HistogramDescriptor(

@@ -6,7 +6,6 @@ import io
 import re
 import struct
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -86,7 +85,7 @@ class Broken:
 
 
 @cache
-def valid_surfaces() -> tuple[Surface, ...]:
+def valid_surfaces():
     """Closed surfaces of a few hundred vertices, of genus 0 and 1, smooth and with edges, none of them symmetric."""
     box = trimesh.creation.box(extents=(1.0, 0.7, 0.4))
     for _ in range(3):
@@ -116,7 +115,7 @@ def valid_surfaces() -> tuple[Surface, ...]:
     return tuple(surfaces)
 
 
-def broken_mesh(seed: int, number: int) -> Broken:
+def broken_mesh(seed, number):
     """Make the file of a seed and a number: a valid surface in a random format with one to three faults.
 
     One file in twenty has no fault.
@@ -152,13 +151,13 @@ def broken_mesh(seed: int, number: int) -> Broken:
     )
 
 
-def broken_bytes(generator: Generator, content: bytes) -> tuple[str, bytes]:
+def broken_bytes(generator, content):
     """Break a file of any format, and return the name of the fault and the broken content."""
     fault = str(generator.choice(["bytes", "tokens"]))
     return fault, _ON_FILES[fault](generator, content, "")
 
 
-def written(vertices: NDArray[np.float64], faces: NDArray[np.int64], kind: str) -> bytes:
+def written(vertices, faces, kind):
     """Write arrays in a format, even invalid ones, which no exporter would write."""
     points = [" ".join(repr(float(x)) for x in row) for row in vertices]
     if kind == "off":
@@ -178,9 +177,7 @@ def written(vertices: NDArray[np.float64], faces: NDArray[np.int64], kind: str) 
     return _glb(vertices, faces) if kind == "glb" else _3mf(points, faces)
 
 
-def _ply(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], points: list[str], text: bool
-) -> bytes:
+def _ply(vertices, faces, points, text):
     header = (
         f"ply\nformat {'ascii' if text else 'binary_little_endian'} 1.0\nelement vertex {len(vertices)}\n"
         "property double x\nproperty double y\nproperty double z\n"
@@ -197,7 +194,7 @@ def _ply(
     return header + np.asarray(vertices, "<f8").tobytes() + corners.tobytes()
 
 
-def _stl(vertices: NDArray[np.float64], faces: NDArray[np.int64], text: bool) -> bytes:
+def _stl(vertices, faces, text):
     corners = vertices[np.clip(faces, 0, len(vertices) - 1)]
     if text:
         rows = ["solid campaign"]
@@ -213,7 +210,7 @@ def _stl(vertices: NDArray[np.float64], faces: NDArray[np.int64], text: bool) ->
     return b"campaign".ljust(80) + struct.pack("<I", len(faces)) + records.tobytes()
 
 
-def _glb(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bytes:
+def _glb(vertices, faces):
     positions = np.asarray(vertices, "<f4")
     indices = np.asarray(faces % 2**32, "<u4")
     low, high = (np.nan_to_num(f(positions, axis=0)).tolist() for f in (np.min, np.max))
@@ -238,7 +235,7 @@ def _glb(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-def _3mf(points: list[str], faces: NDArray[np.int64]) -> bytes:
+def _3mf(points, faces):
     vertices = "".join('<vertex x="{}" y="{}" z="{}"/>'.format(*point.split()) for point in points)
     triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in faces)
     model = (
@@ -250,14 +247,14 @@ def _3mf(points: list[str], faces: NDArray[np.int64]) -> bytes:
     return _archive(model.encode())
 
 
-def _archive(model: bytes) -> bytes:
+def _archive(model):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(zipfile.ZipInfo("3D/3dmodel.model"), model)
     return stream.getvalue()
 
 
-def _in_archive(fault: Callable[..., bytes], generator: Generator, content: bytes) -> bytes:
+def _in_archive(fault, generator, content):
     """Break the model within the archive, so that the archive's checksum does not reveal every fault."""
     if generator.random() < 0.2:
         return fault(generator, content, "zip")
@@ -280,7 +277,7 @@ def _in_archive(fault: Callable[..., bytes], generator: Generator, content: byte
 # Faults of the file.
 
 
-def _bytes(generator: Generator, content: bytes, suffix: str) -> bytes:
+def _bytes(generator, content, suffix):
     data = bytearray(content)
     if not data:
         return content
@@ -305,7 +302,7 @@ def _bytes(generator: Generator, content: bytes, suffix: str) -> bytes:
     return bytes(data)
 
 
-def _tokens(generator: Generator, content: bytes, suffix: str) -> bytes:
+def _tokens(generator, content, suffix):
     if _is_text(content):
         tokens = list(re.finditer(rb"[-+.0-9eE]+|[a-zA-Z_]+", content))
         if not tokens:
@@ -325,7 +322,7 @@ def _tokens(generator: Generator, content: bytes, suffix: str) -> bytes:
     return bytes(data)
 
 
-def _counts(generator: Generator, content: bytes, suffix: str) -> bytes:
+def _counts(generator, content, suffix):
     """Change a declared count, or delete or repeat lines."""
     replacement = generator.choice([-1, 0, 1, 2, 7, 100, 10**6, 2**31 - 1, 2**32 - 1])
     wrong = int(replacement) if generator.random() < 0.5 else None
@@ -363,7 +360,7 @@ def _counts(generator: Generator, content: bytes, suffix: str) -> bytes:
     return b"".join(lines)
 
 
-def _is_text(content: bytes) -> bool:
+def _is_text(content):
     return (
         b"\0" not in content[:2000]
         and b"binary" not in content[:100]
@@ -374,57 +371,49 @@ def _is_text(content: bytes) -> bool:
 # Faults of the surface.
 
 
-def _flip(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _flip(generator, vertices, faces):
     chosen = generator.random(len(faces)) < generator.choice([0.01, 0.5, 1.0])
     faces[chosen] = faces[chosen, ::-1]
     return vertices, faces
 
 
-def _hole(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _hole(generator, vertices, faces):
     return vertices, np.delete(
         faces, generator.integers(len(faces), size=generator.choice([1, 2, 20])), axis=0
     )
 
 
-def _double(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _double(generator, vertices, faces):
     copies = faces[generator.integers(len(faces), size=generator.choice([1, 5]))]
     return vertices, np.concatenate(
         [faces, copies[:, ::-1] if generator.random() < 0.5 else copies]
     )
 
 
-def _glue(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _glue(generator, vertices, faces):
     """Merge two vertices, which makes a pinch or an edge of more than two faces."""
     a, b = generator.integers(len(vertices), size=2)
     faces[faces == a] = b
     return vertices, faces
 
 
-def _fin(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _fin(generator, vertices, faces):
     return vertices, np.concatenate(
         [faces, generator.integers(len(vertices), size=(generator.choice([1, 3]), 3))]
     )
 
 
-def _index(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _index(generator, vertices, faces):
     wrong = int(generator.choice([-1, len(vertices), 10**6, 2**31 - 1, -(2**31), int(faces.max())]))
     faces[generator.integers(len(faces)), generator.integers(3)] = wrong
     return vertices, faces
 
 
-def _strays(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _strays(generator, vertices, faces):
     return np.concatenate([vertices, generator.normal(size=(generator.choice([1, 5]), 3))]), faces
 
 
-def _twins(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _twins(generator, vertices, faces):
     """Add a second body, outside, touching or inside."""
     offset = generator.choice([0.0, 0.1, 5.0])
     factor = generator.choice([1.0, 0.5, 1e-3])
@@ -433,7 +422,7 @@ def _twins(
     )
 
 
-def _seam(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _seam(generator, vertices, faces):
     """Give some or all faces separate vertices."""
     chosen = generator.random(len(faces)) < generator.choice([0.02, 0.5, 1.0])
     # An earlier fault may have made invalid indices
@@ -444,27 +433,21 @@ def _seam(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np
     return np.concatenate([vertices, vertices[corners]]), split
 
 
-def _order(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _order(generator, vertices, faces):
     order = generator.permutation(len(vertices))
     position = np.argsort(order)
     is_valid = (faces >= 0) & (faces < len(vertices))
     return vertices[order], np.where(is_valid, position[np.where(is_valid, faces, 0)], faces)
 
 
-def _not_finite(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _not_finite(generator, vertices, faces):
     vertices[generator.integers(len(vertices)), generator.integers(3)] = generator.choice(
         [np.nan, np.inf, -np.inf]
     )
     return vertices, faces
 
 
-def _spike(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _spike(generator, vertices, faces):
     exponent = generator.choice([generator.uniform(0, 3), generator.uniform(-300, 300)])
     vertices[generator.integers(len(vertices)), generator.integers(3)] = (
         generator.choice([-1, 1]) * 10**exponent
@@ -472,20 +455,16 @@ def _spike(
     return vertices, faces
 
 
-def _noise(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _noise(generator, vertices, faces):
     return vertices + generator.normal(size=vertices.shape) * 10 ** generator.uniform(-8, 0), faces
 
 
-def _flat(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+def _flat(generator, vertices, faces):
     vertices[:, generator.integers(3)] *= generator.choice([0.0, 1e-12, 1e-6, 1e-3, 1e-1])
     return vertices, faces
 
 
-def _slivers(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _slivers(generator, vertices, faces):
     """Move some vertices to a neighbour, or almost to it."""
     for face in faces[generator.integers(len(faces), size=generator.choice([1, 10]))]:
         corners = face[(face >= 0) & (face < len(vertices))]
@@ -495,21 +474,15 @@ def _slivers(
     return vertices, faces
 
 
-def _scale(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _scale(generator, vertices, faces):
     return vertices * 10 ** generator.uniform(-300, 300), faces
 
 
-def _modest_scale(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _modest_scale(generator, vertices, faces):
     return vertices * 10 ** generator.uniform(-12, 12), faces
 
 
-def _far_away(
-    generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> Surface:
+def _far_away(generator, vertices, faces):
     return vertices + generator.normal(size=3) * 10 ** generator.uniform(0, 20), faces
 
 

@@ -1,15 +1,11 @@
 """Two processes write to a gallery and are killed at random times; it holds all finished changes, no partial one."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import signal
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,19 +27,19 @@ Rows = dict[str, tuple[float, int]]
 """Volume, and seed of the vector, by id."""
 
 
-def vector(seed: int) -> np.ndarray:
+def vector(seed):
     values = np.random.default_rng(seed).standard_normal(WIDTH, dtype=np.float32)
     return values / np.linalg.norm(values)
 
 
-def change(writer: int, number: int) -> tuple[str, list[int], int]:
+def change(writer, number):
     """A change by a writer: its kind, the chosen ids, and a value."""
     generator = np.random.default_rng([SEED, writer, number])
     chosen = generator.choice(N_IDS, int(generator.integers(1, 60)), replace=False).tolist()
     return str(generator.choice(["add", "add", "remove", "update"])), chosen, number
 
 
-def changed(rows: Rows, writer: int, number: int) -> Rows:
+def changed(rows, writer, number):
     """The rows of a writer after a change."""
     kind, chosen, value = change(writer, number)
     ids = [f"{writer}/{i}" for i in chosen]
@@ -55,7 +51,7 @@ def changed(rows: Rows, writer: int, number: int) -> Rows:
     return {id_: (float(value), row[1]) if id_ in ids else row for id_, row in rows.items()}
 
 
-def _tables() -> Any:
+def _tables():
     """Import the module of tables, and with it LanceDB, in a child process, with lower limits to build indices."""
     torch.set_num_threads(1)
     from igps.gallery import table
@@ -66,20 +62,20 @@ def _tables() -> Any:
     return table
 
 
-def _vectors_and_rows(rows: Rows) -> tuple[torch.Tensor, list[dict[str, Any]]]:
+def _vectors_and_rows(rows):
     vectors = torch.from_numpy(np.stack([vector(seed) for _, seed in rows.values()]))
     return vectors, [
         {"id": id_, "name": id_, "volume": volume} for id_, (volume, _) in rows.items()
     ]
 
 
-def _create(path: Path) -> None:
+def _create(path):
     about = about_of(SignatureConfig(), LoadOptions(), "interior")
     unchanged = {f"unchanged/{i}": (1.0, 10**9 + i) for i in range(N_UNCHANGED)}
     _tables().write(path, about, "cosine", [_vectors_and_rows(unchanged)], {})
 
 
-def _write(path: Path, writer: int, number: int, journal: Path) -> None:
+def _write(path, writer, number, journal):
     """Make changes until the process is killed, and write the number of each finished change to the journal."""
     _tables()
     gallery = igps.gallery.gallery.Gallery(path)
@@ -98,7 +94,7 @@ def _write(path: Path, writer: int, number: int, journal: Path) -> None:
             number += 1
 
 
-def _read(path: Path, out: Path) -> None:
+def _read(path, out):
     """Write all rows of the table to a file, and whether some of them are found as nearest to themselves."""
     table = _tables().BodyTable(path)
     rows = {
@@ -114,7 +110,7 @@ def _read(path: Path, out: Path) -> None:
     out.write_bytes(pickle.dumps((arrays, are_nearest)))
 
 
-def _fork(function: Any, *arguments: Any) -> int:
+def _fork(function, *arguments):
     """Call a function in a fork of this process, and return the id of the fork."""
     pid = os.fork()
     if pid == 0:
@@ -131,7 +127,7 @@ def _fork(function: Any, *arguments: Any) -> int:
     return pid
 
 
-def _succeeds(pid: int) -> bool:
+def _succeeds(pid):
     """Wait for the end of a process, and return whether its exit status is 0."""
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
@@ -145,7 +141,7 @@ class _Round:
         numbers: of each writer, how many changes it finished in earlier rounds.
     """
 
-    def __init__(self, folder: Path, number: int, numbers: Sequence[int]) -> None:
+    def __init__(self, folder, number, numbers):
         self.number = number
         self.missed = list[str]()
         self.n_killed = 0
@@ -156,7 +152,7 @@ class _Round:
             _fork(_write, self._gallery, i, numbers[i], self._journals[i]) for i in range(2)
         ]
 
-    def wait(self) -> None:
+    def wait(self):
         """Wait until both writers have finished a change."""
         start = time.monotonic()
         while not all(path.exists() and path.stat().st_size for path in self._journals):
@@ -165,7 +161,7 @@ class _Round:
                 return
             time.sleep(0.005)
 
-    def kill(self, generator: np.random.Generator) -> None:
+    def kill(self, generator):
         """Kill one writer after the other, at random moments."""
         for writer in generator.permutation(2):
             time.sleep(generator.uniform(0, _MAX_DELAY / 2))
@@ -177,7 +173,7 @@ class _Round:
             else:
                 self.miss(f"writer {writer} ended by itself")
 
-    def read(self) -> dict[str, Any] | None:
+    def read(self):
         """Return the rows of the gallery, or None if it cannot be read."""
         if not _succeeds(_fork(_read, self._gallery, self._out)):
             self.miss("the gallery cannot be read")
@@ -187,18 +183,16 @@ class _Round:
             self.miss("a row is not the nearest to itself")
         return rows
 
-    def n_finished(self, writer: int) -> int:
+    def n_finished(self, writer):
         """How many changes the writer finished in this round."""
         return len(self._journals[writer].read_text().splitlines())
 
-    def miss(self, what: str) -> None:
+    def miss(self, what):
         """Record a miss of the target."""
         self.missed.append(f"round {self.number}: {what}")
 
 
-def _check_rows(
-    played: _Round, actual: dict[str, Any], rows: list[Rows], numbers: list[int]
-) -> int:
+def _check_rows(played, actual, rows, numbers):
     """Compare the rows with the changes that were finished, bring `rows` and `numbers` up to date, and count them."""
     n_changes = 0
     for i in range(2):
@@ -224,7 +218,7 @@ def _check_rows(
     return n_changes
 
 
-def campaign(n_kills: int) -> list[Row]:
+def campaign(n_kills):
     """Kill both writers of a round, one after the other, while they add, remove and update rows."""
     start = time.monotonic()
     missed = list[str]()
@@ -260,7 +254,7 @@ def campaign(n_kills: int) -> list[Row]:
     return [row]
 
 
-def _equal(actual: dict[str, Any], expected: Rows) -> bool:
+def _equal(actual, expected):
     return actual.keys() == expected.keys() and all(
         actual[id_][0] == volume and np.allclose(actual[id_][1], vector(seed), atol=1e-6)
         for id_, (volume, seed) in expected.items()

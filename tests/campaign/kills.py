@@ -1,13 +1,10 @@
 """Processes are killed at random times; later runs compute the same results as an undisturbed run."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,13 +26,13 @@ _TARGET = "table equals the undisturbed one"
 
 
 @contextmanager
-def _workplace() -> Iterator[Path]:
+def _workplace():
     with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
         write_shapes(Path(folder) / "shapes")
         yield Path(folder)
 
 
-def campaign(n_kills: int) -> list[Row]:
+def campaign(n_kills):
     """Kill workers and parents (a quarter of the kills each), and some of eight processes on one cache (half)."""
     with _workplace() as folder:
         seconds = {}
@@ -59,31 +56,31 @@ def campaign(n_kills: int) -> list[Row]:
 class _Run:
     """A run with a separate cache and output folder."""
 
-    def __init__(self, folder: Path, name: str) -> None:
+    def __init__(self, folder, name):
         self.shapes = folder / "shapes"
         self.cache = folder / "caches" / name
         self.out = folder / "out" / name
 
-    def command(self, n_workers: int, out: Path | None = None) -> Command:
+    def command(self, n_workers, out=None):
         return Command(self.shapes, self.cache, out or self.out, n_workers)
 
-    def table(self):  # type: ignore[no-untyped-def]
+    def table(self):
         return table(self.out)
 
-    def blames_mesh(self) -> bool:
+    def blames_mesh(self):
         """Whether a mesh was skipped because its worker was killed twice."""
         failures = self.out / "failures.csv"
         return failures.exists() and "killed twice" in failures.read_text()
 
-    def has_message(self) -> bool:
+    def has_message(self):
         """Whether the log ends with a message of the command, and without a traceback."""
         return "igps:" in self.log_end() and "Traceback" not in self.log_end()
 
-    def log_end(self) -> str:
+    def log_end(self):
         return self.out.with_suffix(".log").read_text()[-300:]
 
 
-def _check_rerun(run: _Run, expected: object, what: str) -> list[str]:
+def _check_rerun(run, expected, what):
     """Run once more without disturbance, and return what is wrong with the results."""
     shutil.rmtree(run.out, ignore_errors=True)
     status = run.command(1).wait()
@@ -92,9 +89,9 @@ def _check_rerun(run: _Run, expected: object, what: str) -> list[str]:
     return [] if run.table() == expected else [f"{what}: the run afterwards leaves another table"]
 
 
-def _workers(folder: Path, expected: object, n_kills: int, seconds: float) -> Row:
+def _workers(folder, expected, n_kills, seconds):
     start = time.monotonic()
-    missed: list[str] = []
+    missed = []
     n_same = n_explained = n_killed = number = 0
     while n_killed < n_kills and number < 4 * n_kills:
         generator = np.random.default_rng([SEED, 0, number])
@@ -139,10 +136,10 @@ def _workers(folder: Path, expected: object, n_kills: int, seconds: float) -> Ro
     )
 
 
-def _parents(folder: Path, expected: object, n_kills: int, seconds: dict[int, float]) -> Row:
+def _parents(folder, expected, n_kills, seconds):
     """Kill up to three successive runs on each cache, followed by an undisturbed run."""
     start = time.monotonic()
-    missed: list[str] = []
+    missed = []
     n_killed = n_orphans = n_caches = number = 0
     while n_killed < n_kills and number < 4 * n_kills:
         run = _Run(folder, f"parent-{n_caches}")
@@ -173,9 +170,9 @@ def _parents(folder: Path, expected: object, n_kills: int, seconds: dict[int, fl
     )
 
 
-def _eight(folder: Path, expected: object, n_kills: int) -> Row:
+def _eight(folder, expected, n_kills):
     start = time.monotonic()
-    missed: list[str] = []
+    missed = []
     n_killed = number = n_survivors = 0
     seconds = 1.0
     while n_killed < n_kills and number < 4 * n_kills:
@@ -213,7 +210,7 @@ def _eight(folder: Path, expected: object, n_kills: int) -> Row:
     )
 
 
-def _leftovers(folder: Path, expected: object) -> Row:
+def _leftovers(folder, expected):
     """Partially written files of killed processes are removed by a run two days later."""
     start = time.monotonic()
     caches = sorted((folder / "caches").iterdir())
@@ -245,7 +242,7 @@ def _leftovers(folder: Path, expected: object) -> Row:
     )
 
 
-def _kill(pid: int) -> bool:
+def _kill(pid):
     try:
         os.kill(pid, signal.SIGKILL)
     except ProcessLookupError:
@@ -253,14 +250,14 @@ def _kill(pid: int) -> bool:
     return True
 
 
-def _alive_after(pids: list[int], seconds: float) -> list[int]:
+def _alive_after(pids, seconds):
     deadline = time.monotonic() + seconds
     while (alive := [pid for pid in pids if _is_running(pid)]) and time.monotonic() < deadline:
         time.sleep(0.05)
     return alive
 
 
-def _is_running(pid: int) -> bool:
+def _is_running(pid):
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:

@@ -1,12 +1,10 @@
 """A fault of the machine is named, ends the command with status 2, and loses no finished work."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,10 +24,10 @@ Attempt = Callable[[Path, Expected], tuple[list[str], str]]
 _YEAR = 365 * 24 * 3600.0
 
 
-def campaign() -> list[Row]:
+def campaign():
     """Try each fault once."""
     resumes, same = "status 2, named, resumes", "status 0, same table"
-    attempts: tuple[tuple[str, str, Attempt], ...] = (
+    attempts = (
         ("disk full, in the cache", resumes, _disk_full),
         ("disk full, for the results", resumes, _results_full),
         ("cache on a file system to be read only", resumes, _read_only),
@@ -57,7 +55,7 @@ def campaign() -> list[Row]:
     return rows
 
 
-def _disk_full(place: Path, expected: Expected) -> tuple[list[str], str]:
+def _disk_full(place, expected):
     cache = place / "cache"
     cache.mkdir()
     with _tmpfs(cache, "size=100k") as mounted:
@@ -71,7 +69,7 @@ def _disk_full(place: Path, expected: Expected) -> tuple[list[str], str]:
     return missed, f"{len(kept)} of 12 signatures kept ({'tmpfs' if mounted else 'shim'})"
 
 
-def _results_full(place: Path, expected: Expected) -> tuple[list[str], str]:
+def _results_full(place, expected):
     out = place / "out"
     out.mkdir()
     with _tmpfs(out, "size=4k") as mounted:
@@ -84,7 +82,7 @@ def _results_full(place: Path, expected: Expected) -> tuple[list[str], str]:
     return missed, "tmpfs of one page"
 
 
-def _read_only(place: Path, expected: Expected) -> tuple[list[str], str]:
+def _read_only(place, expected):
     cache = place / "cache"
     cache.mkdir()
     with _tmpfs(cache, "size=4m,ro") as mounted:
@@ -97,7 +95,7 @@ def _read_only(place: Path, expected: Expected) -> tuple[list[str], str]:
     return missed, "tmpfs"
 
 
-def _another_user(place: Path, expected: Expected) -> tuple[list[str], str]:
+def _another_user(place, expected):
     """A folder without write permission. Root, which may write everywhere, gives up this capability first."""
     cache = place / "cache"
     out = place / "out"
@@ -115,7 +113,7 @@ def _another_user(place: Path, expected: Expected) -> tuple[list[str], str]:
     return missed, "root without its right to write everywhere" if root else "this user"
 
 
-def _no_rename(place: Path, expected: Expected) -> tuple[list[str], str]:
+def _no_rename(place, expected):
     """Four processes compute the same signatures; none can replace a file that another one wrote before."""
     cache = place / "cache"
     outs = [place / f"out-{i}" for i in range(4)]
@@ -140,7 +138,7 @@ def _no_rename(place: Path, expected: Expected) -> tuple[list[str], str]:
     return missed, f"{len(runs)} processes at once; with a damaged file status {run.returncode}"
 
 
-def _clock_back(place: Path, expected: Expected) -> tuple[list[str], str]:
+def _clock_back(place, expected):
     cache = place / "cache"
     missed = []
     first = Command(place / "shapes", cache, place / "out", 1)
@@ -160,7 +158,7 @@ def _clock_back(place: Path, expected: Expected) -> tuple[list[str], str]:
     return missed, f"{len(kept)} signatures of the future kept"
 
 
-def _is_named(run: subprocess.CompletedProcess[str], *words: str) -> list[str]:
+def _is_named(run, *words):
     """What is wrong with the message about a fault of the machine."""
     output = run.stderr[-400:]
     missed = []
@@ -174,7 +172,7 @@ def _is_named(run: subprocess.CompletedProcess[str], *words: str) -> list[str]:
     return missed
 
 
-def _resumes(place: Path, cache: Path, expected: Expected, kept: dict[Path, int]) -> list[str]:
+def _resumes(place, cache, expected, kept):
     """What is wrong with a run after the fault: other results, or signatures of the cache that are computed again."""
     run = retrieve(place / "shapes", cache, place / "out")
     if run.returncode:
@@ -192,12 +190,12 @@ def _resumes(place: Path, cache: Path, expected: Expected, kept: dict[Path, int]
     return missed
 
 
-def _stamps(cache: Path) -> dict[Path, int]:
+def _stamps(cache):
     return {path: path.stat().st_mtime_ns for path in cache.rglob("*.safetensors")}
 
 
 @contextmanager
-def _tmpfs(folder: Path, options: str) -> Iterator[bool]:
+def _tmpfs(folder, options):
     """Mount a small file system on a folder, and yield whether that was possible."""
     mounted = _run("mount", "-t", "tmpfs", "-o", f"{options},mode=1777", "tmpfs", str(folder))
     try:
@@ -207,12 +205,12 @@ def _tmpfs(folder: Path, options: str) -> Iterator[bool]:
             _run("umount", "-l", str(folder))
 
 
-def _mount(options: str, folder: Path) -> None:
+def _mount(options, folder):
     if not _run("mount", "-o", options, str(folder)):
         raise RuntimeError(f"{folder}: cannot be mounted again with {options}")
 
 
-def _run(*command: str) -> bool:
+def _run(*command):
     try:
         return subprocess.run(command, capture_output=True, check=False).returncode == 0
     except FileNotFoundError:

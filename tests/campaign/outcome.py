@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -34,16 +33,16 @@ class Row:
     seconds: float = 0.0
 
     @property
-    def met(self) -> bool:
+    def met(self):
         """Whether the target was met."""
         return not self.missed
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self):
         """The row for a JSON file."""
         return {**asdict(self), "met": self.met}
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows):
     """Format rows as a Markdown table, followed by the misses and notes."""
     header = ("part", "what", "tried", "target", "measured", "met", "s")
     lines = [
@@ -60,7 +59,7 @@ def table(rows: Sequence[Row]) -> str:
     ]
     widths = [max(len(line[i]) for line in (header, *lines)) for i in range(len(header))]
 
-    def formatted(line: Sequence[str]) -> str:
+    def formatted(line):
         return (
             "| "
             + " | ".join(word.ljust(width) for word, width in zip(line, widths, strict=True))

@@ -7,7 +7,7 @@ in percent of the median distance between different bodies.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -16,7 +16,6 @@ import torch
 import trimesh
 from hypothesis import HealthCheck, Phase, given, seed, settings, target
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from outcome import Row
 from scipy.spatial.transform import Rotation
 
@@ -24,8 +23,8 @@ from igps import Mesh, SignatureConfig, collate, compute_signature, descriptor
 from igps.data.requirements import Requirements
 from igps.descriptors import NAMES
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
-from igps.retrieval import Distance, cosine
-from igps.signature.signature import Samples, Signature
+from igps.retrieval import cosine
+from igps.signature.signature import Samples
 
 SEED = 13
 
@@ -64,7 +63,7 @@ class Bound:
 
 
 # Known movements above the bound, and their reasons
-KNOWN: dict[tuple[str, str], str] = {
+KNOWN = {
     # The worst body moves by 14 % from one subdivision to two, and by 2 % from two to three.
     (
         "subdivision",
@@ -73,7 +72,7 @@ KNOWN: dict[tuple[str, str], str] = {
 }
 
 
-def bound(prop: str, name: str) -> Bound:
+def bound(prop, name):
     """Bound for a property and a descriptor."""
     exact = prop != "subdivision" and not (prop == "motion" and name in _GRID | _RAYS)
     return Bound(EXACT if exact else DISCRETE, KNOWN.get((prop, name), ""))
@@ -84,7 +83,7 @@ CONFIG = SignatureConfig(resolution=20, min_samples=0)
 
 
 @cache
-def bodies() -> tuple[Mesh, ...]:
+def bodies():
     """Bodies of three to six hundred vertices, of genus 0 and 1, none symmetric, that all descriptors can describe."""
     box = trimesh.creation.box(extents=(1.0, 0.8, 0.5))
     for _ in range(3):
@@ -112,7 +111,7 @@ def bodies() -> tuple[Mesh, ...]:
 
 
 @cache
-def _subdivided(number: int, n_times: int) -> Mesh:
+def _subdivided(number, n_times):
     """A body after subdivision of each face into four, repeated `n_times`."""
     mesh = bodies()[number]
     for _ in range(n_times):
@@ -121,7 +120,7 @@ def _subdivided(number: int, n_times: int) -> Mesh:
     return mesh
 
 
-def _distance(module: Descriptor) -> Distance:
+def _distance(module):
     """Distance of a descriptor; the cosine distance for embeddings, as a head's distance may ignore small movements."""
     return cosine if isinstance(module, EmbeddedDescriptor) else module.distances
 
@@ -129,7 +128,7 @@ def _distance(module: Descriptor) -> Distance:
 class Describer:
     """Descriptions by every descriptor, and the scale of their distances."""
 
-    def __init__(self, names: Sequence[str] = NAMES) -> None:
+    def __init__(self, names=NAMES):
         self.descriptors: dict[str, Descriptor] = {name: descriptor(name) for name in names}
         requirements = Requirements()
         for module in self.descriptors.values():
@@ -147,9 +146,7 @@ class Describer:
                 distances[~torch.eye(len(descriptions), dtype=torch.bool)].median()
             )
 
-    def describe(
-        self, signature: Signature, mesh: Mesh, names: Sequence[str] | None = None
-    ) -> dict[str, torch.Tensor]:
+    def describe(self, signature, mesh, names=None):
         """Description (1, ...) by each descriptor, or by some of them."""
         batch = collate([signature], [mesh])
         with torch.inference_mode():
@@ -159,12 +156,12 @@ class Describer:
             }
 
     @cache  # noqa: B019 (there is one describer in a campaign)
-    def describe_subdivided(self, number: int, n_times: int) -> dict[str, torch.Tensor]:
+    def describe_subdivided(self, number, n_times):
         """Descriptions of a body after subdivision of each face into four, repeated `n_times`."""
         mesh = _subdivided(number, n_times)
         return self.describe(compute_signature(mesh, self.config), mesh)
 
-    def simplifying(self, mesh: Mesh) -> list[str]:
+    def simplifying(self, mesh):
         """Names of the descriptors that simplify a mesh first."""
         limits = {
             name: getattr(module, "max_vertices", None) for name, module in self.descriptors.items()
@@ -175,9 +172,7 @@ class Describer:
             if limit is not None and limit < len(mesh.vertices)
         ]
 
-    def movements(
-        self, before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]
-    ) -> dict[str, float]:
+    def movements(self, before, after):
         """Movement by each descriptor, in percent of the median distance."""
         return {
             name: 100
@@ -195,13 +190,13 @@ _numbers = st.integers(0, len(bodies()) - 1)
 _seeds = st.integers(0, 2**32 - 1)
 
 
-def _moved_mesh(describer: Describer, number: int, mesh: Mesh) -> Pair:
+def _moved_mesh(describer, number, mesh):
     return describer.unchanged[number], describer.describe(
         compute_signature(mesh, describer.config), mesh
     )
 
 
-def _motion(describer: Describer, data: st.DataObject) -> Pair:
+def _motion(describer, data):
     """A rotation and a shift, with or without a reflection."""
     number = data.draw(_numbers)
     generator = np.random.default_rng(data.draw(_seeds))
@@ -214,7 +209,7 @@ def _motion(describer: Describer, data: st.DataObject) -> Pair:
     return _moved_mesh(describer, number, moved)
 
 
-def _turned_grid(describer: Describer, data: st.DataObject) -> Pair:
+def _turned_grid(describer, data):
     """A rotation of the cube, which keeps the order of faces and corners."""
     number = data.draw(_numbers)
     order = data.draw(st.permutations(range(3)))
@@ -224,7 +219,7 @@ def _turned_grid(describer: Describer, data: st.DataObject) -> Pair:
     return _moved_mesh(describer, number, replace(mesh, vertices=mesh.vertices[:, order] * signs))
 
 
-def _scale(describer: Describer, data: st.DataObject) -> Pair:
+def _scale(describer, data):
     number = data.draw(_numbers)
     mesh = bodies()[number]
     return _moved_mesh(
@@ -234,12 +229,12 @@ def _scale(describer: Describer, data: st.DataObject) -> Pair:
     )
 
 
-def _vertices(describer: Describer, data: st.DataObject) -> Pair:
+def _vertices(describer, data):
     number = data.draw(_numbers)
     return _moved_mesh(describer, number, _renumbered(bodies()[number], data.draw(_seeds)))
 
 
-def _many_vertices(describer: Describer, data: st.DataObject) -> Pair:
+def _many_vertices(describer, data):
     """A renumbering of large meshes, for descriptors that simplify them before they choose samples."""
     number = data.draw(_numbers)
     mesh = _renumbered(_subdivided(number, 1), data.draw(_seeds))
@@ -249,12 +244,12 @@ def _many_vertices(describer: Describer, data: st.DataObject) -> Pair:
     return describer.describe_subdivided(number, 1), after
 
 
-def _renumbered(mesh: Mesh, seed: int) -> Mesh:
+def _renumbered(mesh, seed):
     order = np.random.default_rng(seed).permutation(len(mesh.vertices))
     return replace(mesh, vertices=mesh.vertices[order], faces=np.argsort(order)[mesh.faces])
 
 
-def _faces(describer: Describer, data: st.DataObject) -> Pair:
+def _faces(describer, data):
     number = data.draw(_numbers)
     mesh = bodies()[number]
     generator = np.random.default_rng(data.draw(_seeds))
@@ -264,13 +259,13 @@ def _faces(describer: Describer, data: st.DataObject) -> Pair:
     return _moved_mesh(describer, number, replace(mesh, faces=turned))
 
 
-def _subdivision(describer: Describer, data: st.DataObject) -> Pair:
+def _subdivision(describer, data):
     """From one subdivision to two. The original meshes are too coarse for 250 meaningful eigenpairs."""
     number = data.draw(_numbers)
     return describer.describe_subdivided(number, 1), describer.describe_subdivided(number, 2)
 
 
-def _signs(describer: Describer, data: st.DataObject) -> Pair:
+def _signs(describer, data):
     """Random signs of all eigenfunctions."""
     number = data.draw(_numbers)
     generator = np.random.default_rng(data.draw(_seeds))
@@ -281,7 +276,7 @@ def _signs(describer: Describer, data: st.DataObject) -> Pair:
     return describer.unchanged[number], after
 
 
-def _multiplet(describer: Describer, data: st.DataObject) -> Pair:
+def _multiplet(describer, data):
     """A random basis of a multiplet. Neighbouring eigenvalues are averaged before and after the change to make one."""
     number = data.draw(_numbers)
     generator = np.random.default_rng(data.draw(_seeds))
@@ -303,10 +298,8 @@ def _multiplet(describer: Describer, data: st.DataObject) -> Pair:
     return degenerate, turned
 
 
-def _in_basis(
-    signature: Signature, basis: NDArray[np.float64], values: NDArray[np.float64]
-) -> Signature:
-    def turned(samples: Samples) -> Samples:
+def _in_basis(signature, basis, values):
+    def turned(samples):
         return replace(
             samples,
             eigenfunctions=(samples.eigenfunctions.astype(np.float64) @ basis).astype(np.float32),
@@ -320,14 +313,14 @@ def _in_basis(
     )
 
 
-def _padding(describer: Describer, data: st.DataObject) -> Pair:
+def _padding(describer, data):
     """A batch with a body of more samples and more eigenpairs, in any order."""
     number = data.draw(_numbers)
     other = data.draw(_numbers)
     repeated = describer.signatures[other]
 
-    def longer(samples: Samples) -> Samples:
-        def twice(values: NDArray) -> NDArray:
+    def longer(samples):
+        def twice(values):
             return np.concatenate([values, values])
 
         attributes = {name: twice(values) for name, values in samples.attributes.items()}
@@ -350,7 +343,7 @@ def _padding(describer: Describer, data: st.DataObject) -> Pair:
     return describer.unchanged[number], after
 
 
-def _batch_size(describer: Describer, data: st.DataObject) -> Pair:
+def _batch_size(describer, data):
     numbers = data.draw(st.lists(_numbers, min_size=2, max_size=3))
     batch = collate([describer.signatures[i] for i in numbers], [bodies()[i] for i in numbers])
     with torch.inference_mode():
@@ -358,7 +351,7 @@ def _batch_size(describer: Describer, data: st.DataObject) -> Pair:
     return describer.unchanged[numbers[-1]], after
 
 
-def _threads(describer: Describer, data: st.DataObject) -> Pair:
+def _threads(describer, data):
     number = data.draw(_numbers)
     before = torch.get_num_threads()
     torch.set_num_threads(data.draw(st.integers(2, 4)))
@@ -369,7 +362,7 @@ def _threads(describer: Describer, data: st.DataObject) -> Pair:
         torch.set_num_threads(before)
 
 
-CHANGES: dict[str, tuple[Change, ...]] = {
+CHANGES = {
     "motion": (_motion,),
     "turned grid": (_turned_grid,),
     "scale": (_scale,),
@@ -383,19 +376,19 @@ CHANGES: dict[str, tuple[Change, ...]] = {
 }
 
 
-def campaign(n_examples: int, names: Sequence[str] = NAMES) -> list[Row]:
+def campaign(n_examples, names=NAMES):
     """Try `n_examples` examples of each change."""
     torch.set_num_threads(1)
     describer = Describer(names)
     return [_row(describer, prop, changes, n_examples) for prop, changes in CHANGES.items()]
 
 
-def _row(describer: Describer, prop: str, changes: tuple[Change, ...], n_examples: int) -> Row:
+def _row(describer, prop, changes, n_examples):
     start = time.monotonic()
     largest = dict.fromkeys(describer.descriptors, 0.0)
     tried = 0
 
-    def example(data: st.DataObject) -> None:
+    def example(data):
         nonlocal tried
         for change in changes:
             tried += 1

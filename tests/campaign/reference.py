@@ -1,7 +1,5 @@
 """An independent reference for the numbers of a mesh: libigl's matrices, a dense eigensolver and NumPy loops."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations_with_replacement
 
@@ -13,10 +11,9 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from igps import Mesh, PairHistogram, SignatureConfig, SpectralEmbedding, collate, compute_signature
+from igps import PairHistogram, SpectralEmbedding, collate, compute_signature
 from igps.descriptors.literature.d2 import D2
 from igps.nn.axes import InteriorDistance, Potential
-from igps.signature.signature import Signature
 
 Floats = NDArray[np.float64]
 Surface = tuple[Floats, NDArray[np.int64]]
@@ -32,9 +29,7 @@ _MAX_DENSE = 500
 _N_CHECKED = 25
 
 
-def confirm(
-    mesh: Mesh, signature: Signature, written: Surface | None, config: SignatureConfig, suffix: str
-) -> tuple[list[str], list[str]]:
+def confirm(mesh, signature, written, config, suffix):
     """Compare a signature with the reference.
 
     Args:
@@ -47,10 +42,10 @@ def confirm(
     Returns:
         Sentences about numbers that are not confirmed, and the names of the confirmed numbers.
     """
-    doubts: list[str] = []
-    checks: list[str] = []
+    doubts = []
+    checks = []
 
-    def check(name: str, is_confirmed: bool, doubt: str = "") -> None:
+    def check(name, is_confirmed, doubt=""):
         if is_confirmed:
             checks.append(name)
         else:
@@ -135,7 +130,7 @@ def confirm(
     return doubts, checks
 
 
-def _check_motion(mesh, signature, histograms, config, check) -> None:  # type: ignore[no-untyped-def]
+def _check_motion(mesh, signature, histograms, config, check):
     """Check that a quarter turn, which maps the grid to itself, and a shift leave the numbers as they are."""
     turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     centred = mesh.vertices - _centre(mesh)
@@ -154,7 +149,7 @@ def _check_motion(mesh, signature, histograms, config, check) -> None:  # type: 
         check(f"{name} moved", error < 0.02, f"{error:.2g} of the pairs are in other cells")
 
 
-def _describe(signature: Signature) -> dict[str, Floats]:
+def _describe(signature):
     batch = collate([signature])
     histograms = {"d2": D2()(batch)[0].double().numpy()}
     if len(signature.interior) > 1:
@@ -167,17 +162,17 @@ def _describe(signature: Signature) -> dict[str, Floats]:
     return histograms
 
 
-def _centre(mesh: Mesh) -> Floats:
+def _centre(mesh):
     return (mesh.vertices.min(axis=0) / 2 + mesh.vertices.max(axis=0) / 2).astype(np.float64)
 
 
-def _in_unit_scale(mesh: Mesh) -> tuple[Floats, NDArray[np.int64], float]:
+def _in_unit_scale(mesh):
     centred = mesh.vertices - _centre(mesh)
     scale = float(np.abs(centred).max())
     return centred / scale, np.asarray(mesh.faces), scale
 
 
-def _scaled(value: float, scale: float, power: int) -> float:
+def _scaled(value, scale, power):
     """value · scale ** power, without overflow of the power itself."""
     with np.errstate(all="ignore"):
         for _ in range(power):
@@ -185,13 +180,13 @@ def _scaled(value: float, scale: float, power: int) -> float:
     return value
 
 
-def _close(value: float, expected: float, tolerance: float) -> bool:
+def _close(value, expected, tolerance):
     return bool(
         np.isfinite(value) and value > 0 and abs(value - expected) <= tolerance * abs(expected)
     )
 
 
-def _same_arrays(mesh: Mesh, written: Surface, single: bool) -> tuple[bool, str]:
+def _same_arrays(mesh, written, single):
     vertices, faces = written
     if single:
         vertices = vertices.astype(np.float32).astype(np.float64)
@@ -204,7 +199,7 @@ def _same_arrays(mesh: Mesh, written: Surface, single: bool) -> tuple[bool, str]
     return bool(np.array_equal(mesh.vertices, vertices) and same_faces), "other than those written"
 
 
-def _is_surface(vertices: Floats, faces: NDArray[np.int64], allow_open: bool) -> tuple[bool, str]:
+def _is_surface(vertices, faces, allow_open):
     """Whether a surface is closed (unless it may be open), connected and oriented, without edges of three faces."""
     surface = trimesh.Trimesh(vertices, faces, process=False)
     edges, count = np.unique(np.sort(surface.edges, axis=1), axis=0, return_counts=True)
@@ -223,20 +218,18 @@ def _is_surface(vertices: Floats, faces: NDArray[np.int64], allow_open: bool) ->
     ), f"trimesh finds {n_components} components and an edge of {count.max()} faces"
 
 
-def _area_and_volume(vertices: Floats, faces: NDArray[np.int64]) -> tuple[float, float]:
+def _area_and_volume(vertices, faces):
     area = float(igl.doublearea(vertices, faces).sum() / 2)
     corners = (vertices - vertices.mean(axis=0))[faces]
     return area, float(np.linalg.det(corners).sum() / 6)
 
 
-def _thinness(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
+def _thinness(vertices, faces):
     lengths = igl.edge_lengths(vertices, faces)
     return np.asarray(igl.doublearea(vertices, faces) / np.square(lengths).max(axis=1))
 
 
-def eigenpairs(
-    vertices: Floats, faces: NDArray[np.int64], n_eigenpairs: int
-) -> tuple[Floats, Floats]:
+def eigenpairs(vertices, faces, n_eigenpairs):
     """Eigenpairs (K,) and (V, K) of libigl's cotangent stiffness and mixed Voronoi mass, without the zero mode.
 
     They are computed by a dense solver, or for larger surfaces by ARPACK with a shift below the spectrum.
@@ -258,9 +251,7 @@ def eigenpairs(
     return values, root @ vectors
 
 
-def mean_values(
-    vertices: Floats, faces: NDArray[np.int64], points: Floats, functions: Floats
-) -> Floats:
+def mean_values(vertices, faces, points, functions):
     """(P, K) mean value interpolation of functions (V, K), point by point (Ju, Schaefer and Warren 2005)."""
     values = np.empty((len(points), functions.shape[1]))
     for i, point in enumerate(points):
@@ -290,9 +281,7 @@ def mean_values(
     return values
 
 
-def _samples_confirmed(
-    mesh: Mesh, signature: Signature, vertices: Floats, faces: NDArray[np.int64], resolution: int
-) -> tuple[bool, str]:
+def _samples_confirmed(mesh, signature, vertices, faces, resolution):
     """Whether the samples are the cell centres of winding number above one half, except for centres on the surface."""
     low = vertices.min(axis=0)
     high = vertices.max(axis=0)
@@ -310,7 +299,7 @@ def _samples_confirmed(
     scale = np.abs(mesh.vertices - _centre(mesh)).max()
     points = (signature.interior.points - _centre(mesh)) / scale
 
-    def cells(centres: Floats) -> set[tuple[int, ...]]:
+    def cells(centres):
         return {
             tuple(index)
             for index in np.rint((centres - [axis[0] for axis in axes]) / cell).astype(int)
@@ -324,9 +313,7 @@ def _samples_confirmed(
     )
 
 
-def distances_histogram(
-    points: Floats, n_bins: int = 64, reach: float = 2.0
-) -> tuple[Floats, float]:
+def distances_histogram(points, n_bins=64, reach=2.0):
     """D2 by a loop, and the share of distances so close to an edge of a bin that their bin depends on rounding."""
     counts = np.zeros(n_bins)
     doubtful = 0
@@ -338,7 +325,7 @@ def distances_histogram(
     return counts / counts.sum(), doubtful / counts.sum()
 
 
-def interior_histogram(embedding: Floats) -> tuple[Floats, float]:
+def interior_histogram(embedding):
     """The histogram of Rustamov 2010 by loops, and the share of pairs whose class depends on rounding."""
     embedding = np.asarray(embedding, dtype=np.float64)
     level = np.linalg.norm(embedding, axis=1) * N_CLASSES / 1.5

@@ -8,9 +8,7 @@ import os
 import subprocess
 import sys
 import types
-from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +20,7 @@ HERE = Path(__file__).parent
 SHAPES_PER_CLASS = 4
 
 
-def write_shapes(folder: Path) -> None:
+def write_shapes(folder):
     """Write three classes of four closed surfaces of about two hundred vertices, a folder for each class."""
     meshes = {
         "ball": trimesh.creation.icosphere(subdivisions=2),
@@ -41,7 +39,7 @@ def write_shapes(folder: Path) -> None:
             )
 
 
-def arguments(shapes: Path, cache: Path, out: Path, n_workers: int) -> list[str]:
+def arguments(shapes, cache, out, n_workers):
     """Arguments of the command, without its name."""
     signature = {"n_eigenpairs": 6, "resolution": 10, "min_samples": 0, "n_surface_samples": 20}
     return [
@@ -62,21 +60,14 @@ def arguments(shapes: Path, cache: Path, out: Path, n_workers: int) -> list[str]
     ]
 
 
-def environment(fault: str = "") -> dict[str, str]:
+def environment(fault=""):
     """Environment of a command that can import the descriptor, with a fault of the machine if one is named."""
     paths = [str(HERE), *([str(HERE / "shims")] if fault else []), *sys.path]
     path = os.pathsep.join(dict.fromkeys(path for path in paths if path))
     return {**os.environ, "PYTHONPATH": path, "IGPS_CAMPAIGN_FAULT": fault, "OMP_NUM_THREADS": "1"}
 
 
-def retrieve(
-    shapes: Path,
-    cache: Path,
-    out: Path,
-    n_workers: int = 1,
-    fault: str = "",
-    under: Sequence[str] = (),
-) -> subprocess.CompletedProcess[str]:
+def retrieve(shapes, cache, out, n_workers=1, fault="", under=()):
     """Run the command to its end, with a fault of the machine, or under another command."""
     command = [*under, sys.executable, "-m", "igps", *arguments(shapes, cache, out, n_workers)]
     return subprocess.run(
@@ -87,7 +78,7 @@ def retrieve(
 class Command:
     """The command in a fork of this process, which starts at once, because all modules are imported already."""
 
-    def __init__(self, shapes: Path, cache: Path, out: Path, n_workers: int) -> None:
+    def __init__(self, shapes, cache, out, n_workers):
         out.parent.mkdir(parents=True, exist_ok=True)
         self.log = out.with_suffix(".log")
         words = ["igps", *arguments(shapes, cache, out, n_workers)]
@@ -98,25 +89,25 @@ class Command:
             _become(words, self.log)
         self._status: int | None = None
 
-    def children(self) -> list[int]:
+    def children(self):
         """Return the process ids of the command's workers."""
         return children(self.pid)
 
-    def status(self) -> int | None:
+    def status(self):
         """Return the exit status, minus the signal that ended the command, or None while it runs."""
         if self._status is None:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             self._status = os.waitstatus_to_exitcode(status) if pid else None
         return self._status
 
-    def wait(self) -> int:
+    def wait(self):
         """Wait for the end of the command and return its exit status."""
         if self._status is None:
             self._status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         return self._status
 
 
-def _become(words: list[str], log: Path) -> None:
+def _become(words, log):
     status = 70
     try:
         os.setsid()
@@ -144,13 +135,13 @@ def _become(words: list[str], log: Path) -> None:
         os._exit(status)
 
 
-def _command() -> Callable[[], None]:
+def _command():
     from igps.cli import main
 
     return main
 
 
-def children(pid: int) -> list[int]:
+def children(pid):
     """Return the ids of the child processes of a process."""
     try:
         return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
@@ -158,7 +149,7 @@ def children(pid: int) -> list[int]:
         return []
 
 
-def is_python_worker(pid: int) -> bool:
+def is_python_worker(pid):
     """Return whether a process is a worker, and not the resource tracker of multiprocessing."""
     try:
         return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -166,7 +157,7 @@ def is_python_worker(pid: int) -> bool:
         return False
 
 
-def table(out: Path) -> Mapping[str, Any] | None:
+def table(out):
     """Return the complete results of a run, bit by bit; None if they are incomplete."""
     try:
         scores = json.loads((out / "scores.json").read_text())
@@ -186,7 +177,7 @@ def table(out: Path) -> Mapping[str, Any] | None:
     }
 
 
-def partials(cache: Path) -> list[Path]:
+def partials(cache):
     """Return partially written files of a cache, without the database of known files, which repairs itself."""
     others = [path for path in cache.rglob("*") if path.is_file() and path.suffix != ".safetensors"]
     return [path for path in others if not path.name.startswith("known_files.sqlite")]
