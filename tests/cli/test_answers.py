@@ -333,8 +333,7 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(
     cache = ["--cache_dir", tmp_path / "cache", *SMALL, *samples, "--size", "ignore"]
     ct = ["--attribute", f"ct={tmp_path}/{{stem}}_ct.nii.gz", "--with", "ct"]
     words = ["explain", *files, *OWN, *ct, *cache, "--out", tmp_path / "out"]
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, words), "--json"])
-    main()
+    run(monkeypatch, *words, "--json")
     told = json.loads(capsys.readouterr().out)
     rows = table(tmp_path / "out" / "explain_ct.csv")
     shares = np.array([float(row["share"]) for row in rows])
