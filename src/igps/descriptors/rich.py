@@ -23,7 +23,7 @@ def rich() -> HistogramDescriptor:
     """Interior distances joined with Euclidean distances, directions and attributes of the samples, in three parts.
 
     - Interior distances, some jointly with Euclidean distances, depth and surface potential of the samples. The surface
-      potential is that of a uniform surface_potential on the surface, see `electrostatic_potential`.
+      potential tells how much surface is near; it is of the form alone, not of the charges of a molecule.
     - Interior distances of interior samples, jointly with the angles of their directions to the surface.
     - Euclidean distances of surface samples, jointly with the angles of their directions.
     """

@@ -36,8 +36,8 @@ class SignatureConfig:
         max_vertices: meshes with more vertices are simplified first; None keeps them.
         accuracy: largest relative error of 99 % of the interior distances; mean value coordinates are approximated
             within this bound to save time. None evaluates them exactly.
-        attributes: attributes of the samples: "depth" and "electrostatic_potential" (interior only) and
-            "surface_direction", see `interior_attributes` and `surface_attributes`.
+        attributes: attributes of the samples: "depth" and "electrostatic_potential" (interior only; of a uniform charge
+            on the surface, so of the form alone) and "surface_direction", see `interior_attributes`.
         seed: seed of the surface samples and of the eigensolver's start vectors.
         least_vertices: meshes with fewer vertices are subdivided when they are read, unless `mend` is "never"; None for
             two more than the number of eigenpairs, the fewest from which these can be computed.

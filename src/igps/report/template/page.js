@@ -165,7 +165,7 @@ function picture(shape) {
     "button",
     { type: "button", class: "shape", "data-shape": shape, title: shapes[shape].name },
     canvas,
-    element("span", { class: "name" }, element("span", { class: "head" }, shapes[shape].name.slice(0, -9)), shapes[shape].name.slice(-9)),
+    element("span", { class: "name" }, shapes[shape].name),
     element("span", { class: "about" }, classes[shapes[shape].label] ?? ""),
   );
   pictures.watch(canvas);
